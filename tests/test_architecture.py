@@ -23,6 +23,7 @@ HOMES = {
         "calib.dynamics.kernels",
         "calib.dynamics.shape_kernels",
         "calib.rooms.parallel.mechanism.closure_kernels",
+        "calib.rooms.parallel.mechanism.simulation_kernels",
         "calib.robot.capsule_kernels",
         "calib.rooms.closed_loop.loop_kernels",
         "calib.rooms.studies.methods.tangent_kernels",

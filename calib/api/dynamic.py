@@ -179,15 +179,15 @@ def identify_dynamics(
     progress = progress_shown(progress)
     chosen = options if isinstance(options, IdentifyOptions) else read_options(optional(options))
     chosen = chosen if settings is None else options_of(settings)
+    designed = [] if excitation is None else [coefficients.read(Path(excitation))]
     if (stage := stage_of(robot, "identify", base, tip)) is not None:
         return stage.run(
             listed(recordings), listed(validate), options=chosen, method=method, friction=friction, seed=seed,
-            on_read=on_read, progress=progress,
+            designed=designed, on_read=on_read, progress=progress,
         )  # fmt: skip
     given = inputs.gather(
         cast(Any, robot), listed(recordings), listed(validate), options=chosen, method=method, friction=friction,
-        base=base, tip=tip, seed=seed, designed=[] if excitation is None else [coefficients.read(Path(excitation))],
-        progress=progress,
+        base=base, tip=tip, seed=seed, designed=designed, progress=progress,
     )  # fmt: skip
     if on_read is not None:
         on_read(given)

@@ -104,13 +104,10 @@ def identify_dynamics(
             recordings that have none (methods with a [loop])
     """
     from calib.api.dynamic import identify_dynamics as identified
+    from calib.procedure.excitation import prediction
     from calib.procedure.report.dynamics_section import read_lines
 
     check_destination("identify", robot, out, [options, *recordings, *(validate or [])])
-    if excitation is not None:
-        from calib.procedure.excitation import prediction
-
-        prediction.check_folder(excitation)
 
     def read(given: Any) -> None:
         check_destination("identify", robot, out, [given.source, given.source.parent])
@@ -119,15 +116,12 @@ def identify_dynamics(
     with progress() as show:
         found = identified(
             robot, recordings, validate=validate or (), method=method, friction=friction, options=options, base=base,
-            excitation=excitation,
-            tip=tip, seed=seed, on_read=read, progress=show,
+            excitation=excitation, tip=tip, seed=seed, on_read=read, progress=show,
         )  # fmt: skip
         show("writing")
         found.save(out, plots=plots)
     compared = []
-    if excitation is not None:
-        from calib.procedure.excitation import prediction
-
+    if excitation is not None and (excitation / prediction.NAME).is_file():
         compared = [prediction.compared_with_identification(excitation, found)]
     say_written([*found.renderables(), *compared], out, found.verdict.level)
 

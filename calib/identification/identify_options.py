@@ -13,6 +13,7 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
     drives = "Ia Fv Fc off"          # a text for all joints, or one per joint; default by rows: motor as here, link
                                      # Fvl Fcl offl, drive Ia Fvm Fcm offm, both all seven
     passive = "Fv Fc"                # friction of a parallel robot's passive joints; default none
+    identical_legs = true            # of a parallel robot: one set of inertial parameters for all, friction apart
     v0 = 0.01                        # smoothing of the Coulomb sign [rad/s or m/s], or one per joint
     rows = "motor"                   # which torques are explained: motor; with joint torque sensors (columns tau_l and
                                      # tau_m or tau) also link (Model 1), both (Model 2), drive (Model 3: tau_m - tau_l)

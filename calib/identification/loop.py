@@ -4,6 +4,7 @@ Instrumental variables (method iv) simulate that loop; with another method and a
 whether least squares is biased. iv, didim and cloe take joint torque sensors (rows link, both), clie rows both.
 friction = "auto": iv and didim simulate the steps chosen by least squares, cloe and clie standard friction; all take
 stated steps, cloe and clie those with derivatives (not load, presliding). Recordings may carry different payloads.
+Parallel robots take iv, didim, pc-iv and pc-didim with rows motor or platform: a controller per actuator, no `design`.
 Gains are what the joints feel, torque per position error on the joint side::
 
     [loop]

@@ -60,6 +60,7 @@ class Choices:
 
     Attributes:
         passive: drive terms of a parallel robot's passive joints, one text for all.
+        identical_legs: whether a parallel robot's legs have the same inertial parameters.
         v0: smoothing of the Coulomb sign [rad/s or m/s], one per joint, or one for all.
         friction: ``auto``, ``standard`` or a step (`calib.identification.friction.friction_ladder`).
         method: name of the method, see `calib.identification.methods.least_squares`.
@@ -79,6 +80,7 @@ class Choices:
     """
 
     passive: Text = ""
+    identical_legs: Flag = False
     v0: Annotated[tuple[Positive, ...], Spread()] = (V0,)
     friction: Annotated[str, OneOf(NAMES)] = "auto"
     method: Annotated[str, OneOf(tuple(METHODS))] = "wls"
@@ -124,7 +126,7 @@ class IdentificationSettings(Choices):
 
 def make_model(chain: Chain, settings: IdentificationSettings) -> IdentificationModel:
     """Return the model of a chain: bodies, payloads at the tip, and standard drive terms."""
-    require(not settings.passive, f"passive = '{settings.passive}': a serial arm has no passive joints", UsageError)
+    require(not (settings.passive or settings.identical_legs), "passive, identical_legs: arms have no legs", UsageError)
     bodies = bodies_of(chain)
     if settings.gravity is not None:
         bodies = bodies.with_gravity(np.array(settings.gravity))

@@ -15,7 +15,9 @@ import argparse
 import json
 import os
 import time
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +29,11 @@ from calib.data.recordings.recording import Recording
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.estimation.essential import Rule, eliminate
 from calib.estimation.estimate import Estimate
-from calib.estimation.triangles import Triangles, retriangulate
 from calib.identification.identify import Identification, identify_model
 from calib.identification.prediction import predict
 from calib.identification.rows import Case, make_case
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.excitation.settings import ExcitationSettings
-from calib.records import frozen
 from calib.rooms.parallel.excite import ParallelExcitation, design_parallel
 from calib.rooms.parallel.mechanism.parallel_model import make_parallel_model, rows_named
 from calib.rooms.parallel.mechanism.velocities import distributed, overconstraint
@@ -106,7 +106,8 @@ def designed(seed: int) -> ParallelExcitation:
     robot = Robot()
     settings = ExcitationSettings(period=0.5, harmonics=5, starts=1, evaluations=MOST, seed=seed, rate=RATE)
     limits = np.array([ACCELERATION, ACCELERATION, np.inf])
-    return design_parallel(find("dualv"), robot.model, robot.values, settings, acceleration=limits, preload=PRELOAD)
+    loaded = replace(robot.model, preload=(PRELOAD,))
+    return design_parallel(find("dualv"), loaded, robot.values, settings, acceleration=limits)
 
 
 class Robot:
@@ -142,16 +143,12 @@ class Method:
         settings = IdentificationSettings(prior="none", essential="none", torque_rows=rows)
         cases = [case(k, runs, load) for k, runs in enumerate(seen) for load in LOADS]
         self.found: Identification = identify_model(self.model, cases, settings)
-        pooled = self.found.fitted.pooled
         self.all = self.found.fitted.estimate
-        self.free = self._kept(pooled, Rule.RSD, ratio=10.0)
-        self.nine = self._kept(pooled, Rule.RSD, ratio=np.inf, drop=_others(pooled.names))
-        tied = _tied(pooled, LEGS)
-        self.equal_legs = self._kept(tied, Rule.RSD, ratio=np.inf, drop=_others(tied.names))
-
-    def _kept(self, pooled: Triangles, rule: Rule, **limits: Any) -> Estimate:
-        fitted = self.found.fitted
-        return eliminate(pooled, rule, std=fitted.std, inflation=fitted.inflation, **limits).essential.estimate
+        self.free = _kept(self.found, ratio=10.0)
+        self.nine = _kept(self.found, NINE)
+        if name == "pim":
+            alike = identify_model(replace(self.model, identical_legs=True), cases, settings)
+            self.equal_legs = _kept(alike, NINE)
 
     def predicted(self, estimate: Estimate) -> np.ndarray:
         """Return the torques that estimated base parameters predict for the validation motion."""
@@ -169,20 +166,12 @@ class Method:
         return [float(x) for x in np.linalg.norm(y - found, axis=0) / np.linalg.norm(y, axis=0)]
 
 
-def _tied(data: Triangles, same: tuple[str, ...]) -> Triangles:
-    """Return the R factors with the parameters of a set made equal: the sum of their columns replaces the first."""
-    kept = [name for name in data.names if name not in same[1:]]
-    sums = np.zeros((data.parameters + 1, len(kept) + 1))
-    for k, name in enumerate(data.names):
-        sums[k, kept.index(same[0] if name in same else name)] = 1.0
-    sums[-1, -1] = 1.0
-    factors = np.stack([retriangulate(factor @ sums) for factor in data.factors])
-    units = dict(zip(data.names, data.units))
-    return Triangles(tuple(kept), tuple(units[name] for name in kept), frozen(factors), data.rows)
-
-
-def _others(names: tuple[str, ...]) -> list[str]:
-    return [name for name in names if name not in NINE]
+def _kept(found: Identification, names: Sequence[str] = (), ratio: float = np.inf) -> Estimate:
+    """Return the parameters that elimination keeps: down to `names`, or until max σ% / min σ% < ratio."""
+    fitted, every = found.fitted, found.fitted.pooled.names
+    drop = [name for name in every if name not in names] if names else ()
+    limits: Any = {"ratio": ratio, "drop": drop, "std": fitted.std, "inflation": fitted.inflation}
+    return eliminate(fitted.pooled, Rule.RSD, **limits).essential.estimate
 
 
 class Trial:

@@ -18,7 +18,7 @@ from calib.rooms.studies.methods.simulated_robot import believed_robot
 
 
 def comparison(problem: IdentificationProblem, method: str) -> _Comparison:
-    loops = close_loops(problem.model.bodies, problem.cases, problem.decimator, problem.loop)
+    loops = close_loops(problem.model, problem.cases, problem.decimator, problem.loop)
     return _Comparison(problem, believed_robot(problem, METHODS[method]), loops, method == "clie")
 
 

@@ -26,7 +26,7 @@ def closed(shift: int = 0, timing: str = "checked", copied=None, **gains) -> Clo
         q_ref=np.roll(asked, shift, axis=0)[rows],
     )  # fmt: skip
     case = make_case("log", make_motion(late, FilterOptions(cutoff=40.0, band=20.0, clock="stamps")))
-    return close_loops(model.bodies, [case], case.motion.decimator, replace(small_arm.LOOP, timing=timing, **gains))
+    return close_loops(model, [case], case.motion.decimator, replace(small_arm.LOOP, timing=timing, **gains))
 
 
 def smoothed(q: np.ndarray) -> np.ndarray:

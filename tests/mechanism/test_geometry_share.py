@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from platform_sines import recorded
+from platform_sines import fitted, recorded
 
 from calib.folders import read_covariance
 from calib.identification.geometry_uncertainty import estimate, estimator
@@ -13,20 +13,11 @@ from calib.identification.identify_options import parse_options
 from calib.identification.rows import make_case, observe
 from calib.rooms.parallel.identification import ParallelDynamics, identify_parallel
 from calib.rooms.parallel.mechanism.closure import ClosedRobot, closed
-from calib.rooms.parallel.mechanism.geometric_fit import LoopCovariance, changed, fit_loops, visible_directions
+from calib.rooms.parallel.mechanism.geometric_fit import changed, visible_directions
 from calib.rooms.parallel.mechanism.parallel_model import rows_named
-from calib.rooms.parallel.robots import ParallelMechanism, find
+from calib.rooms.parallel.robots import find
 
 LOADED = {"payload": {"5": {}}, "files": {"load1.csv": {"payload": ["5"]}}, "essential": "none"}
-
-
-def fitted(known: ClosedRobot, seed: int = 0) -> ParallelMechanism:
-    """Return a robot calibrated by 60 poses with 0.2 mrad (mm) of noise on each encoder; the true one is `known`."""
-    robot, rng = known.robot, np.random.default_rng(seed)
-    x = rng.uniform(robot.lower, robot.upper, (60, robot.r))
-    q = known.place(x).q[:, robot.actuated]
-    found = fit_loops(known, q + 2e-4 * rng.normal(size=q.shape), x)
-    return ParallelMechanism(found.known, find(robot.name).source, LoopCovariance.fitted(found))
 
 
 def refitted(found: ParallelDynamics, known: ClosedRobot) -> np.ndarray:

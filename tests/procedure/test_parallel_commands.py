@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -28,14 +29,14 @@ def folder(tmp_path_factory):
     """
     path = tmp_path_factory.mktemp("dualv")
     known = find("dualv").known
-    model = make_parallel_model(known, ["Fv Fc"], v0=0.05, payloads=["5"])
+    model = replace(make_parallel_model(known, ["Fv Fc"], v0=0.05, payloads=["5"]), preload=(10.0,))
     values = np.concatenate([model.known_parameters(), np.tile([0.05, 0.3], 4)])
     values[model.names.index("M5")] = 5.37
     t, rng = np.arange(1000) / 1000.0, np.random.default_rng(0)
     for name, carried in (("empty", ()), ("load", ("5",)), ("other", ("5",))):
         x, v, a = sines(t, (1.5, 2.5, 4.0, 5.5), np.array([0.02, 0.02, 0.12]), rng)
         q = along(known, x, v, a).posture.q[:, known.robot.actuated] + 1e-5 * rng.normal(size=(len(t), 4))
-        plan = PlatformRegressor(model, np.arange(model.p), values, 10.0, carried)
+        plan = PlatformRegressor(model, np.arange(model.p), values, carried)
         tau = plan.torques(plan.motion(x, v, a))
         tau = tau + 0.5 * rng.normal(size=tau.shape)
         table = np.column_stack([t, q, tau])
@@ -51,6 +52,7 @@ def folder(tmp_path_factory):
             np.savetxt(path / "three.csv", table, delimiter=",", header="t,q1,q2,q3,tau1,tau2,tau3", comments="")
     files = '[payload.5]\n[files."load.csv"]\npayload = ["5"]\n[files."other.csv"]\npayload = ["5"]\n'
     (path / "options.toml").write_text(files)
+    (path / "dropped.toml").write_text('drop = ["Fc11"]\n' + files)
     (path / "power.toml").write_text('rows = "power"\n' + files)
     parameters = loop_parameters(known)
     true = closed(changed(known.robot, parameters, 1e-3 * rng.normal(size=len(parameters))))
@@ -86,6 +88,9 @@ def test_identify_finds_the_payload_and_predicts_other_motion(folder, tmp_path, 
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["validation"]["other.csv"]["filtered"]["relative_error_percent"]["total"] < 5.0
     assert metrics["verdict"] == "pass"
+    preloads = [one["values"] for one in metrics["noticed"] if one["code"] == "preload"]
+    assert len(preloads) == 2 and all(abs(one["mean"] - 10.0) < 3.0 * one["sigma"] < 0.5 for one in preloads)
+    assert table["preload"] == [np.mean([one["mean"] for one in preloads])]
     assert metrics["rows"] == (["power"] if options == "power" else ["x", "y", "rz"])
     assert calib("export", out, "--into", tmp_path / "all") == 0
     exported = json.loads((tmp_path / "all" / "parameters.json").read_text())["dynamics"]
@@ -235,11 +240,12 @@ def test_what_is_wrong_is_said(folder, tmp_path, capsys, words, code, said):
     assert said in "".join(capsys.readouterr())
 
 
-def test_encoders_passive_joints_and_payloads_are_noted(folder, tmp_path):
-    words = ["--options", folder / "options.toml", "--out", tmp_path, "--no-plots"]
+def test_encoders_passive_joints_payloads_and_dropped_parameters_are_noted(folder, tmp_path):
+    words = ["--options", folder / "dropped.toml", "--out", tmp_path, "--no-plots"]
     assert calib("identify", "dualv", folder / "shifted.csv", *words) == 0
-    codes = {one["code"] for one in json.loads((tmp_path / "metrics.json").read_text())["noticed"]}
-    assert {"encoders-contradict", "passive-joints-unread", "payload-never"} <= codes
+    noticed = {one["code"]: one["values"] for one in json.loads((tmp_path / "metrics.json").read_text())["noticed"]}
+    assert {"encoders-contradict", "passive-joints-unread", "payload-never"} <= set(noticed)
+    assert noticed["needed-parameters-dropped"]["names"] == ["Fc11"]
 
 
 def test_parallel_robots_are_in_no_list_of_serial_arms():

@@ -17,7 +17,7 @@ from calib.data.signals.filtering import Decimator
 from calib.dynamics.base import Base
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.regressor_model import RegressorModel
-from calib.dynamics.torque_rows import TorqueRows
+from calib.dynamics.torque_rows import POWER, TorqueRows
 from calib.errors import CannotSimulate, Diverged, NotConverged, Unidentifiable
 from calib.estimation.estimate import Estimate, whitened
 from calib.estimation.linear import LinearFit
@@ -224,7 +224,7 @@ class Method(ABC):
 
     def takes(self, rows: TorqueRows) -> bool:
         """Return whether it estimates from these torque rows; who simulates a motion needs the bodies in them."""
-        simulable = rows.has_bodies and rows.projection is None
+        simulable = rows.has_bodies and rows is not POWER
         return rows.motors_alone or (self.takes_models and (simulable or not self.needs_simulation))
 
     def __str__(self) -> str:

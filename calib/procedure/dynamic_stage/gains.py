@@ -103,7 +103,8 @@ def _from_pair(chain: Chain, options: IdentifyOptions, pair: GainPair, motions: 
     files = ", ".join(Path(parse_cut(name)[0]).name for name in (*pair.unloaded, *pair.loaded))
     notes = [
         f"drive gains from {files} ({found.scale}): {told}",
-        f"gains and payload are estimated from {files}: these files are not independent validation data",
+        f"gains and payload are estimated from {files}: no independent validation data; no σ of a parameter contains "
+        "that of the gains",
     ]
     notes += _unsure(found)
     chosen = replace(options, settings=replace(settings, payload_values=loads))

@@ -191,7 +191,10 @@ def parameter_findings(found: Identification[Any]) -> tuple[Finding, ...]:
     """Return the findings on the parameters, for any robot: condition, bounds, signs, prior."""
     rests = resting_parameters(found)
     prior = finding("regularised", count=len(rests.names), parameters=rests.of, source=rests.origin, names=rests.names)
-    condition = settle([finding("motion-condition", condition=found.condition[1])])
+    steps = () if found.elimination is None else found.elimination.steps
+    needed = [one.name for one in sorted(steps, key=lambda one: -one.f) if one.p < found.settings.level]
+    gone = finding("needed-parameters-dropped", count=len(needed), names=needed)
+    condition = settle([finding("motion-condition", condition=found.condition[1]), gone])
     held = found.fitted.held.findings if found.fitted.held is not None else ()
     return *condition, *held, *_negative(found), *([prior] if rests.names else [])
 

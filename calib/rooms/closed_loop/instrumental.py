@@ -17,13 +17,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from calib.data.signals.filtering import Decimator, low_pass, slope
+from calib.data.signals.motion import Motion
 from calib.dynamics.base import Base
 from calib.dynamics.drives import DriveTerm, standard
 from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.torque_rows import POWER
 from calib.errors import CalibError, CannotSimulate, Diverged, NotConverged, UsageError, one_of
 from calib.estimation.linear import LinearFit, settled_std, wls
 from calib.estimation.triangles import Triangles, combine
@@ -36,7 +39,7 @@ from calib.rooms.alternatives.parameter_constraints import Constraints, hold, ma
 from calib.rooms.closed_loop import instrumental_variables
 from calib.rooms.closed_loop.instrumental_variables import Instruments, InstrumentStrength
 from calib.rooms.closed_loop.loop_recordings import Loop, low_passed, simulated_case, simulated_samples
-from calib.rooms.closed_loop.simulation import Plant, Sensing, SimulatedRun, simulate
+from calib.rooms.closed_loop.simulation import Plant, Sensing, SimulatedRun, plant_of
 
 MAX_ROUNDS = 10  # iterations; 3 to 6 are usual
 MAX_FOLLOWING = 1.25  # times the speed's noise, by which the simulated motion may be off the measured one (our choice)
@@ -142,8 +145,9 @@ class Instrumental:
         sizes = np.maximum(np.sum((simulated @ estimate.values) ** 2, axis=1), 1e-300)
         # the torques' share that is unsure makes e_s = q_ref - q_s unsure, too
         unsure = np.sqrt(np.einsum("gij,jk,gik->g", simulated, estimate.covariance, simulated) / sizes)
+        unsure = unsure[-len(self.stray) :] if len(unsure) >= len(self.stray) else unsure.max()  # rows of the motors
         away = np.abs(np.log(np.maximum(np.nan_to_num(self.stray, nan=1.0), 1e-3)))
-        return np.flatnonzero(away > np.log(MAX_GAIN_RATIO) + 5.0 * unsure[-len(away) :])  # rows of the motors
+        return np.flatnonzero(away > np.log(MAX_GAIN_RATIO) + 5.0 * unsure)
 
     @property
     def unexplained(self) -> np.ndarray:
@@ -220,10 +224,10 @@ def identify_instrumental(
     """
     one_of(method, ROUNDS, "method", UsageError)
     rows = model.torque_rows
-    if not rows.has_bodies or rows.projection is not None or not cases:
+    if not rows.has_bodies or rows is POWER or not cases:
         raise UsageError(
-            f"instruments from simulation need a recording with its reference, and rows motor, link or both; found "
-            f"'{rows.name}'"
+            "instruments from simulation need a recording with its reference, and rows motor, link or both (of a "
+            f"parallel robot motor or platform); found '{rows.name}'"
         )
     observed = [replace(observe(model, base.kept, case, decimator), names=base.names) for case, _ in cases]
     data, friction = pool(triangulate(observed), model.rows), _Friction((), model, decimator, None)
@@ -301,7 +305,7 @@ class _Fixed:
         """Return the simulated robot with an estimate; without motor torques, its motor inertias J are unchanged."""
         own, b = found.fit.estimate.values, self.base.b
         values = np.concatenate([self.base.to_standard(own[:b]), own[b:]])
-        regular = old.parameters[len(values) :] * (not self.model.torque_rows.with_motors)
+        regular = old.parameters[len(values) :] * (not self.model.torque_rows.driven)
         return old.with_parameters(np.concatenate([values, regular]))
 
 
@@ -354,9 +358,15 @@ def _with_signs(
     return replace(rows, matrix=np.where(drowned, simulated, rows.matrix))
 
 
+def sign_noise(model: Any, motion: Motion) -> np.ndarray:
+    """Return the velocity noise of all joints that drive terms of a model act on, passive ones included."""
+    noise = motion.velocity_noise()
+    return model.joint_noise(noise) if hasattr(model, "joint_noise") else noise
+
+
 def _drowned_signs(model: IdentificationModel, columns: np.ndarray, case: Case) -> np.ndarray:
     """Return the mask (p,) of Coulomb columns of joints whose velocity noise exceeds the sign's smoothing."""
-    noise, found = case.motion.velocity_noise(), np.zeros(len(columns), dtype=bool)
+    noise, found = sign_noise(model, case.motion), np.zeros(len(columns), dtype=bool)
     for place, k in enumerate(columns - model.inertial):
         if k < 0 or model.columns[k].shape != "sign":
             continue
@@ -391,27 +401,20 @@ def _regular(model: IdentificationModel, terms: Sequence[DriveTerm], loop: Loop,
             inertia = loop.controller.kd**2 / (2.0 * loop.controller.kp)
         if not np.all(np.isfinite(inertia)) or not np.all(inertia > 0.0):
             raise UsageError("kd² / (2 kp) of these gains is no inertia above 0; give the inertia (n,) [kg m²]")
-    n = model.bodies.n
-    extra = tuple(replace(one, name=f"regular {one.name}") for one in standard(["Ia"] * n))
+    extra = tuple(replace(one, name=f"regular {one.name}") for one in standard(["Ia"] * model.n))
     values = np.concatenate([np.zeros(model.p + len(terms)), inertia])
-    return Plant(model.bodies, (*model.columns, *terms, *extra), values)
+    return plant_of(model, values, (*terms, *extra))
 
 
 def _runs(plant: Plant, cases: Sequence[tuple[Case, Loop]]) -> Runs:
     """Return the noise-free simulation of every recording's loop."""
     result: Runs = []
     for case, loop in cases:
-        robot, controller = _loaded(plant, case), loop.controller
+        robot, controller = plant.carrying(case.carried), loop.controller
         if loop.design is not None:
             controller = controller.scaled(robot.inertia_diagonal(loop.reference.q[::200]) / loop.design)
-        result.append(((case, loop), simulate(robot, controller, loop.reference, Sensing(every=loop.every))))
+        result.append(((case, loop), robot.run(controller, loop.reference, Sensing(every=loop.every))))
     return result
-
-
-def _loaded(plant: Plant, case: Case) -> Plant:
-    """Return the plant with only the payloads of the case."""
-    there = IdentificationModel(plant.bodies).carried_columns(case.carried)
-    return plant.with_parameters(plant.parameters * np.append(there, np.ones(len(plant.terms))))
 
 
 def _simulate_new(

@@ -173,7 +173,7 @@ def dynamics(tree, body, linear, q, v, work, matrix, out):
 
 
 @njit(**JOINED)
-def _factorise(matrix):
+def factorise(matrix):
     """Overwrite the lower triangle with L, the diagonal with 1 / D, M = L D Lᵀ; False where M is not definite."""
     for i in range(matrix.shape[0]):
         for j in range(i):
@@ -324,7 +324,7 @@ def accelerate(tree, body, linear, kinds, acts, memory, loads, q, v, tau, work, 
         out[j] = tau[j]
     dynamics(tree, body, linear, q, v, work, matrix, out)
     loaded = _friction(linear, kinds, acts, memory, q, v, out)
-    if not _factorise(matrix):
+    if not factorise(matrix):
         return False
     substitute(matrix, out)
     if loaded:

@@ -8,6 +8,7 @@ reference. Its motion then takes the place of the recorded one: the same instant
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -15,11 +16,9 @@ from scipy.interpolate import CubicSpline
 from calib.data.signals.bandwidth import USABLE
 from calib.data.signals.filtering import Decimator, border, curvature, low_pass, slope
 from calib.data.signals.motion import Motion
-from calib.dynamics.bodies import Bodies
 from calib.errors import CalibError, NotConverged, UsageError, refuse_data
 from calib.identification.loop import Controller, LoopSettings
 from calib.identification.rows import Case, segments
-from calib.records import frozen
 from calib.rooms.closed_loop.controllers import (
     IdentifiedController,
     Reference,
@@ -27,8 +26,8 @@ from calib.rooms.closed_loop.controllers import (
     identify_controller,
     stated_controller,
 )
-from calib.rooms.closed_loop.simulation import Plant, SimulatedRun, feed_forward
-from calib.rooms.closed_loop.timing import check_no_copy, reference_shift
+from calib.rooms.closed_loop.simulation import SimulatedRun, plant_of
+from calib.rooms.closed_loop.timing import check_no_copy, motor_torques, reference_shift
 
 DEGREES = 180.0 / np.pi
 
@@ -70,12 +69,12 @@ class ClosedLoops:
 
 
 def close_loops(
-    bodies: Bodies, cases: Sequence[Case], decimator: Decimator, loop: LoopSettings, cad: np.ndarray | None = None
+    model: Any, cases: Sequence[Case], decimator: Decimator, loop: LoopSettings, cad: np.ndarray | None = None
 ) -> ClosedLoops:
     """Return the closed control loops of recordings whose motions contain `q_ref`.
 
     Args:
-        bodies: the model's.
+        model: of the robot, simulable (`plant_of`).
         decimator: of the rows; stretches that it eats up are left out.
         cad: standard parameters by the robot's description, for a feed-forward of kind ``cad``; None: not known.
 
@@ -98,13 +97,13 @@ def close_loops(
     shifts: dict[str, float] = {}
     for part in ordered:  # the longest part of each recording tells
         if part.name not in shifts and loop.timing != "stated":
-            shifts[part.name], said = _shift(part, loop, partial(_fed_forward, controller, loop, cad, bodies))
+            shifts[part.name], said = _shift(part, loop, partial(_fed_forward, controller, loop, cad, model))
             notes += said
-    design = loop.per_joint("design", bodies.n) if loop.design else None
+    design = loop.per_joint("design", model.n) if loop.design else None
     pairs = []
     for part in stretches:
         reference, every = _make_reference(part.motion, loop.rate, shifts.get(part.name, 0.0))
-        own = _fed_forward(controller, loop, cad, bodies, part.motion, reference, every)
+        own = _fed_forward(controller, loop, cad, model, part.motion, reference, every)
         if loop.reference_velocity == "difference":
             late = np.diff(reference.q, axis=0) / reference.period  # by half a period
             reference = replace(reference, v=np.vstack([reference.v[:1], late]))
@@ -178,7 +177,7 @@ def _shift(part: Case, loop: LoopSettings, fed_forward: Callable[..., Controller
         UsageError: for a designed motion without motor torques to time it by.
     """
     motion, estimated = part.motion, part.motion.located is not None or loop.timing == "estimated"
-    if not part.torque_rows.with_motors:
+    if motor_torques(part) is None:
         if estimated:
             raise UsageError(
                 f"{part.name}: no motor torques (rows = '{part.torque_rows.name}') tell when its reference was played; "
@@ -270,14 +269,15 @@ def _controller(loop: LoopSettings, case: Case) -> tuple[Controller, IdentifiedC
     if loop.controller != "identify":
         return stated_controller(loop, n), None, ()
     motion = case.motion
-    if not case.torque_rows.with_motors:
+    tau = motor_torques(case)
+    if tau is None:
         raise UsageError(f"[loop] controller = 'identify' needs motor torques, not rows = '{case.torque_rows.name}'")
     band = min(loop.band, float(motion.cutoff.min()), 0.4 * motion.rate)
 
     def identified(shift: float) -> IdentifiedController:
         reference, _ = _make_reference(motion, loop.rate, shift)
         orders = (1, 2) if loop.integral else (0, 1)
-        return identify_controller(reference, motion.q, case.target[:, -n:], motion.rate, band, orders, loop.integral)
+        return identify_controller(reference, motion.q, tau, motion.rate, band, orders, loop.integral)
 
     found = identified(_best_shift(identified) if motion.located is not None or loop.timing == "estimated" else 0.0)
     kp, kd = found.controller.kp, found.controller.kd
@@ -303,7 +303,7 @@ def _best_shift(identified: Callable[[float], IdentifiedController]) -> float:
 
 
 def _fed_forward(
-    controller: Controller, loop: LoopSettings, cad: np.ndarray | None, bodies: Bodies, motion: Motion,
+    controller: Controller, loop: LoopSettings, cad: np.ndarray | None, model: Any, motion: Motion,
     reference: Reference, every: float,
 ) -> Controller:  # fmt: skip
     """Return the controller with its feedforward torques along the reference."""
@@ -316,8 +316,8 @@ def _fed_forward(
         return controller.with_feedforward(CubicSpline(grid, motion.tau_ff)(np.arange(len(reference.t)) / every))
     if cad is None:
         raise UsageError("[loop] feedforward = 'cad': the robot's description states no masses")
-    inertial = frozen(np.concatenate([cad, np.zeros(10 * bodies.count - len(cad))]))
-    return controller.with_feedforward(feed_forward(Plant(bodies, (), inertial), reference))
+    believed = plant_of(model, np.append(cad, np.zeros(model.p - len(cad))))
+    return controller.with_feedforward(believed.feed_forward(reference))
 
 
 def simulated_case(case: Case, run: SimulatedRun, loop: Loop) -> Case:

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from calib.dynamics.drives import DriveTerm
-from calib.dynamics.idim import IdentificationModel
 from calib.errors import CalibError, Finding, UsageError, finding
 from calib.estimation.triangles import Triangles
 from calib.identification.loop import LoopDisagreement, LoopMetrics, LoopResults
@@ -15,8 +14,9 @@ from calib.identification.methods.least_squares import WLS
 from calib.identification.methods.method import IdentificationProblem, Method, MethodEstimate, attempted
 from calib.rooms.alternatives.estimators import CONSISTENT, CONSTRAINED
 from calib.rooms.alternatives.parameter_constraints import constraints_of
-from calib.rooms.closed_loop.instrumental import Instrumental, identify_instrumental
+from calib.rooms.closed_loop.instrumental import Instrumental, identify_instrumental, sign_noise
 from calib.rooms.closed_loop.loop_recordings import ClosedLoops, close_loops
+from calib.rooms.closed_loop.simulation import simulable
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -66,7 +66,7 @@ class _Simulated(Method):
         Raises:
             UsageError, MeasurementError: for a loop or recordings that no simulation can start from.
         """
-        if problem.loop is None or not isinstance(problem.model, IdentificationModel):
+        if problem.loop is None or not simulable(problem.model):
             raise UsageError(f"method '{self.name}' needs a [loop], and a robot that can be simulated")
         plain = WLS.estimate(problem)
         if not plain.found:
@@ -79,10 +79,11 @@ class _Simulated(Method):
         self, problem: IdentificationProblem, plain: MethodEstimate, terms: Sequence[DriveTerm] = ()
     ) -> LoopEstimate:
         """Return the estimate, starting from the least-squares estimate `plain`, with the richer friction `terms`."""
-        model, loop = problem.model, problem.loop
-        if loop is None or not isinstance(model, IdentificationModel):
+        model: Any = problem.model
+        loop = problem.loop
+        if loop is None or not simulable(model):
             raise UsageError("instruments from simulation need a [loop], and a robot that can be simulated")
-        loops = close_loops(model.bodies, problem.cases, problem.decimator, loop, problem.cad)
+        loops = close_loops(model, problem.cases, problem.decimator, loop, problem.cad)
         inertia = loop.per_joint("inertia", model.n) if loop.inertia else None
 
         def estimate() -> LoopEstimate:
@@ -202,10 +203,10 @@ def _blurred(found: Instrumental, loops: ClosedLoops) -> list[Finding]:
     """Return the finding on joints whose Coulomb sign is mainly velocity noise, which instruments cannot correct."""
     if not found.estimator.measured:
         return []
-    noise, max_blur = loops.pairs[0][0].motion.velocity_noise(), 3.0  # widths of the sign (our choice)
-    widths = {one.acts[0][0]: one.settings[-1] for one in found.plant.terms if one.shape == "sign"}
-    blurred = [(j, noise[j] / width) for j, width in widths.items() if noise[j] > max_blur * width]
-    joints = [f"{size:.2g} at joint {j + 1}" for j, size in blurred]
+    noise, max_blur = sign_noise(found.plant, loops.pairs[0][0].motion), 3.0  # widths of the sign (our choice)
+    signs = [one for one in found.plant.terms if one.shape == "sign"]
+    blurred = {one.name: noise[one.acts[0][0]] / one.settings[-1] for one in signs}
+    joints = [f"{size:.2g} at {name}" for name, size in blurred.items() if size > max_blur]
     return [finding("noisy-signs", joints=joints)] if joints else []
 
 

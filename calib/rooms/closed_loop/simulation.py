@@ -15,8 +15,9 @@ Shiriaev & Jubien 2019, section 7): an error of torque that the feedback swallow
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_banded
@@ -78,6 +79,19 @@ class Plant:
     def with_parameters(self, parameters: np.ndarray) -> Plant:
         """Return the robot model with other parameters."""
         return replace(self, parameters=parameters)
+
+    def carrying(self, carried: Collection[str]) -> Plant:
+        """Return the robot model with these payloads alone."""
+        there = IdentificationModel(self.bodies).carried_columns(carried)
+        return self.with_parameters(self.parameters * np.append(there, np.ones(len(self.terms))))
+
+    def run(self, controller: Controller, reference: Reference, sensing: Sensing | None = None) -> SimulatedRun:
+        """Return the simulated motion of the robot that follows a reference; see `simulate`."""
+        return simulate(self, controller, reference, sensing)
+
+    def feed_forward(self, reference: Reference) -> np.ndarray:
+        """Return the torques (N, n) along a reference; see `feed_forward`."""
+        return feed_forward(self, reference)
 
     def inertia(self, q: np.ndarray) -> np.ndarray:
         """Return the inertia matrices (N, n, n), motor inertia included, at configurations q (N, n)."""
@@ -344,3 +358,15 @@ def tracking_error(
     """
     run = simulate(robot, controller if ahead is None else controller.with_feedforward(ahead), reference, push=push)
     return np.sqrt(np.mean((run.q - reference.q) ** 2, axis=0))
+
+
+def plant_of(model: Any, values: np.ndarray, terms: Sequence[DriveTerm] = ()) -> Any:
+    """Return the robot of a model with its values and those of further terms: of an arm, or the model's own `plant`."""
+    if isinstance(model, IdentificationModel):
+        return Plant(model.bodies, (*model.columns, *terms), values)
+    return model.plant(values, terms)
+
+
+def simulable(model: Any) -> bool:
+    """Return whether a model's motion can be simulated."""
+    return isinstance(model, IdentificationModel) or hasattr(model, "plant")

@@ -82,14 +82,14 @@ class _Law:
         self.controller = controller
         self.t = np.arange(len(case.motion)) / rate
         place = np.arange(len(self.t)) * every
-        parts = (reference.at(place)[0], case.motion.q, case.target[:, -n:])
+        parts = (reference.at(place)[0], case.motion.q, motor_torques(case))
         self.asked, self.measured, self.torque = (CubicSpline(self.t, low_pass(x, rate, band)) for x in parts)
         self.ahead = np.zeros((len(self.t), n))
         if controller.ahead is not None:
             ahead = CubicSpline(np.arange(len(controller.ahead)), controller.ahead)(place)
             self.ahead = low_pass(ahead, rate, band)
         edge = border(rate, band)
-        free = (np.abs(case.target[:, -n:]) < 0.98 * controller.limit).all(axis=1)  # saturated ones follow no law
+        free = (np.abs(parts[2]) < 0.98 * controller.limit).all(axis=1)  # saturated ones follow no law
         inside = (np.arange(len(self.t)) >= edge) & (np.arange(len(self.t)) < len(self.t) - edge)
         self.rows = np.flatnonzero(inside & free)
         self.late = controller.delay * reference.period
@@ -125,6 +125,14 @@ def _by_positions(asked: CubicSpline, measured: CubicSpline, t: np.ndarray) -> f
         if abs(step) < 1e-9:
             break
     return shift
+
+
+def motor_torques(case: Case) -> np.ndarray | None:
+    """Return the motors' torques (N, n) of a case [N m or N]; None where its rows or recording do not hold them."""
+    if case.torque_rows.with_motors:
+        return case.target[:, -case.motion.n :]
+    projected = case.torque_rows.projection is not None and case.motion.kind == "torque"
+    return np.asarray(case.motion.effort) if projected else None
 
 
 def check_no_copy(motion: Motion, asked: np.ndarray) -> None:

@@ -2,7 +2,13 @@
 
 from pathlib import Path
 
-OFFERS = {"topics": ":TOPICS", "robots": "robots:find", "library": ":LIBRARY", "stages": "verbs:STAGES"}
+OFFERS = {
+    "topics": ":TOPICS",
+    "robots": "robots:find",
+    "library": ":LIBRARY",
+    "stages": "verbs:STAGES",
+    "drive_gains": "gains:drive_gains",
+}
 LIBRARY = Path(__file__).parent / "mechanism" / "library"
 TOPICS = {
     "parallel": (

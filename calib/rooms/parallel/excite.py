@@ -215,7 +215,6 @@ def design_parallel(
     settings: ExcitationSettings,
     *,
     acceleration: np.ndarray | None = None,
-    preload: float = 0.0,
     purpose: Purpose | None = None,
     map: Callable = map,
     progress: Callable[[str], None] | None = None,
@@ -226,11 +225,10 @@ def design_parallel(
     home; `GUARD` of the torque limits stays free.
 
     Args:
-        model: of the robot, with what it carries.
+        model: of the robot, with what it carries and the preload of redundant actuators.
         values: (p,) parameters that predict the actuators' torques.
         settings: period, harmonics, starts, evaluations, seed, rate.
         acceleration: (r,) limits of the coordinates' second derivatives; infinite where there is none.
-        preload: overconstraint of redundant actuators [N m or N].
         purpose: what the motion is designed for; None: all base parameters, on the platform's coordinates.
 
     Raises:
@@ -239,7 +237,7 @@ def design_parallel(
     """
     known, own = model.known, model.known.robot
     bounds = actuator_bounds(known)
-    purpose = purpose or whole(model, values, preload)
+    purpose = purpose or whole(model, values)
     plan: Any = purpose.model.exact
     rows = getattr(plan, "row_names", own.joint_names)
     coordinates = tuple(f"platform {name}" for name in own.freedom)

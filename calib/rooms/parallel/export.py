@@ -33,6 +33,7 @@ import numpy as np
 
 from calib import files
 from calib.dynamics import pseudo_inertia
+from calib.dynamics.bodies import STANDARD
 from calib.errors import RobotError, UsageError
 from calib.folders import (
     COVARIANCE,
@@ -240,20 +241,22 @@ def _side_by_side(model: ParallelModel, bodies: np.ndarray | None) -> tuple[Any,
 
     Bodies without known masses are rods of 1 kg each, a leg's between its joints.
     """
-    count = len(model.labels) - len(model.payloads)
+    labels = tuple(name.removeprefix(STANDARD[0]) for name in model.names[: model.inertial : 10])
+    count = len(labels) - len(model.payloads)
     if bodies is None:
         rods = [pseudo_inertia.ball(1.0, RADIUS)] * count
-        ends = [x[:3, 3] for leg in model.known.robot.legs for x in _next_frames(leg)[: leg.bodies]]
+        legs = model.known.robot.legs[: 1 if model.identical_legs else None]
+        ends = [x[:3, 3] for leg in legs for x in _next_frames(leg)[: leg.bodies]]
         bodies = np.array([*(pseudo_inertia.rod(1.0, end, RADIUS / 4) for end in ends), *rods[len(ends) :]])
     own = bodies.reshape(-1, 10)[:count]
-    joints = tuple(Joint(label) for label in model.labels[:count])
+    joints = tuple(Joint(label) for label in labels[:count])
     elements = tuple(Element(joint.name, "rz", joint=k, owner=k) for k, joint in enumerate(joints))
     chain = Chain(model.known.robot.name, joints, elements, inertias=own)
     coordinates = np.array([*range(count), *[-1] * len(model.payloads)])
     n = int(model.known.robot.starts[-1])
     named = SimpleNamespace(
-        bodies=SimpleNamespace(count=len(model.labels), n=n, labels=model.labels, coordinates=coordinates),
-        columns=model.terms,
+        bodies=SimpleNamespace(count=len(labels), n=n, labels=labels, coordinates=coordinates),
+        columns=model.columns,
         names=model.names,
         inertial=model.inertial,
         torque_rows=model.torque_rows,
@@ -274,16 +277,17 @@ def _identified(robot: ParallelMechanism, folder: Path, prior: str) -> _Source:
         RobotError: of an identification by an earlier version, which did not write how parameters regroup.
     """
     refuse_currents(folder, "an export of masses")
-    model, values = read_model(robot, folder)
+    model, own = read_model(robot, folder)
     chain, named = _side_by_side(model, model.known_parameters())
-    estimate = information.read(folder, (chain, Dynamics(named, values)))
-    found = find_possible(estimate, prior=prior)
-    drives = drive_table(Dynamics(named, found.dynamics.values), found.covariance)
+    estimate = information.read(folder, (chain, Dynamics(named, own)))
+    found, single = find_possible(estimate, prior=prior), model.single
+    values, covariance = model.spread(found.dynamics.values), found.covariance[np.ix_(model.owners, model.owners)]
+    drives = drive_table(Dynamics(_side_by_side(single, single.known_parameters())[1], values), covariance)
     same = ("possible", "nearest", "distance", "allowed", "weight", "prior", "notes")
     table = {
         "base": {key: getattr(estimate, key) for key in ("names", "units", "values", "covariance")},
-        "standard": {"names": model.names, "units": model.units, "values": found.dynamics.values}
-        | {"covariance": found.covariance, "frames": "about the frame of each link (robot.toml)"},
+        "standard": {"names": single.names, "units": single.units, "values": values}
+        | {"covariance": covariance, "frames": "about the frame of each link (robot.toml)"},
         "consistency": {key: getattr(found, key) for key in same},
     }
     notes = [_consistency(found, estimate.b), *found.notes]
@@ -291,7 +295,7 @@ def _identified(robot: ParallelMechanism, folder: Path, prior: str) -> _Source:
         notes.append(f"not in URDF and MJCF, but in parameters.json: {', '.join(('offsets', *drives.left))}")
     if model.payloads:
         notes.append(f"payloads are not part of the robot: {', '.join(model.payloads)} are in parameters.json alone")
-    return _Source(OpenedRobot(model, found.dynamics.values, drives), {"dynamics": table}, tuple(notes))
+    return _Source(OpenedRobot(single, values, drives), {"dynamics": table}, tuple(notes))
 
 
 def _consistency(found: PossibleBodies, count: int) -> str:

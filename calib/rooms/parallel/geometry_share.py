@@ -11,7 +11,7 @@ so that closure, Jacobians and regressor are solved again on changed geometries,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,7 +36,7 @@ def propagate(
     found: Identification[ParallelModel],
     covariance: LoopCovariance,
     cases: Sequence[Case],
-    torques: Sequence[np.ndarray],
+    torques: Callable[[Case], np.ndarray],
     progress: Callable[[str], None] | None = None,
 ) -> GeometryUncertainty:
     """Return the covariance of identified parameters with the share of the geometry's covariance.
@@ -44,14 +44,14 @@ def propagate(
     Args:
         found: the identification.
         covariance: of the geometry that it was made on.
-        cases: its training data; torques: (N, n) of the actuators in each [N m or N].
+        cases: its training data; torques: of the actuators (N, n) in a case [N m or N].
 
     Raises:
         RobotError: for a covariance of another robot.
     """
     known = found.dynamics.model.known
     parameters = covariance.of(known)
-    differences = _Differences.of(found, parameters, dict(zip([case.name for case in cases], torques)))
+    differences = _Differences.of(found, parameters, torques)
     matrix, felt, left = solve_sensitivity(found, cases, differences, SAMPLES, progress)
     own = matrix[:, : len(parameters)]
     deviations = np.sqrt(np.clip(np.diag(covariance.matrix), 0.0, None))
@@ -71,20 +71,20 @@ class _Differences:
         found: the identification.
         pairs: models on a geometry moved along a direction by `STEP`, and back.
         by_direction: (directions, K + 2) what each constant, and each tilt, is of the directions.
-        torques: of the actuators (N, n) by the case's name.
+        torques: of the actuators (N, n) in a case.
     """
 
     found: Identification[ParallelModel]
     pairs: Sequence[tuple[ParallelModel, ParallelModel]]
     by_direction: np.ndarray
-    torques: Mapping[str, np.ndarray]
+    torques: Callable[[Case], np.ndarray]
 
     @classmethod
     def of(
         cls,
         found: Identification[ParallelModel],
         parameters: Sequence[LoopParameter],
-        torques: Mapping[str, np.ndarray],
+        torques: Callable[[Case], np.ndarray],
     ) -> _Differences:
         """Return the derivatives by constants of the loops of an identification's robot."""
         model = found.dynamics.model
@@ -131,4 +131,4 @@ class _Differences:
         W = model.on_rows(model.platform_regressor(motion, case.carried), motion)[:, :, kept]
         if model.torque_rows.name != PLATFORM:
             return W, 0.0
-        return W, np.einsum("nar,na->nr", motion.jacobians.readings, self.torques[case.name][span])
+        return W, np.einsum("nar,na->nr", motion.jacobians.readings, self.torques(case)[span])

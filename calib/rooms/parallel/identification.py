@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,8 @@ from calib.api.dynamic import DynamicsModel
 from calib.data.recordings.recording import Recording
 from calib.dynamics.regressor_model import RegressorModel
 from calib.errors import Finding, UsageError, finding
+from calib.estimation.whiteness import inflation
+from calib.identification.checks.recorded_motion import DesignedMotion
 from calib.identification.friction.passivity import MIN_ENERGY_SHARE
 from calib.identification.identify import Identification, identify_model
 from calib.identification.identify_options import IdentifyOptions
@@ -34,12 +37,15 @@ from calib.procedure.dynamic_stage.verdict import (
 from calib.procedure.findings import Verdict, lines_of, settle
 from calib.procedure.robot_kinds import refuse_unread
 from calib.rooms.parallel.geometry_share import propagate
+from calib.rooms.parallel.identical_legs import legs_differ
 from calib.rooms.parallel.mechanism.closure import ClosedRobot
 from calib.rooms.parallel.mechanism.parallel_model import PLATFORM, ParallelModel, make_parallel_model, rows_named
+from calib.rooms.parallel.mechanism.velocities import loop_jacobians, overconstraint
 from calib.rooms.parallel.robots import ParallelMechanism
 from calib.workers.threads import one_blas_thread
 
-OF_ARMS = {"couplings", "terms", "loop", "gravity", "payload_values"}  # settings
+OF_ARMS = {"couplings", "terms", "gravity", "payload_values"}  # settings
+SIMULATED = ("iv", "didim", "pc-iv", "pc-didim")  # methods that simulate any robot
 MAX_SAMPLES = 200  # of a recording, at which redundant encoders are compared
 
 Recorded = str | Path | Recording
@@ -68,6 +74,7 @@ def identify_parallel(
     method: str | None = None,
     friction: str | None = None,
     seed: int = 0,
+    designed: Sequence[DesignedMotion] = (),
     on_read: Callable[[IdentificationInputs], None] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> ParallelDynamics:
@@ -78,6 +85,7 @@ def identify_parallel(
         options: filters, payloads, drives, method; ``rows``: motor (on the platform's coordinates where actuators are
             redundant) or power; ``passive``: friction of the passive joints.
         method, friction: in place of the options'.
+        designed: motions of `calib excite`, the reference of recordings that have none, for options with a [loop].
 
     Raises:
         UsageError: for options that only serial arms know.
@@ -90,33 +98,60 @@ def identify_parallel(
     options = replace(options, settings=replace(options.settings, torque_rows=rows, seed=seed, **chosen))
     refuse_options_of_arms(options.settings, options)
     settings = options.settings
-    inputs = gather(robot, recordings, validate, options=options, seed=seed, progress=progress)
+    inputs = gather(robot, recordings, validate, options=options, seed=seed, designed=designed, progress=progress)
     if on_read is not None:
         on_read(inputs)
-    model = make_parallel_model(
-        known, settings.sets, per_joint(settings.v0, 1, "v0")[0], rows, tuple(settings.payloads), settings.passive
-    )
+    model = model_of(known, settings)
     found: Any = identify_model(model, inputs.cases, settings, cad=model.known_parameters(), progress=progress)
     noticed = [*_payloads(model, found, inputs.cases)]
+    if settings.identical_legs:
+        noticed += legs_differ(found, inputs.cases)
     if known.robot.redundant:
         noticed.append(finding("torques-projected", actuators=known.robot.n, freedoms=known.robot.r))
-    noticed = (*parameter_findings(found), *settle(noticed))
+        preloads = [_preload(known, inputs, case) for case in inputs.cases]
+        noticed += [one for own in preloads for one in own]
+        mean = np.mean([[one.values["mean"] for one in own] for own in preloads], axis=0)
+        found = replace(found, dynamics=replace(found.dynamics, model=replace(model, preload=tuple(mean.tolist()))))
+    noticed = (*parameter_findings(found), *found.loop.findings, *settle(noticed))
     findings = ModelFindings(resting_parameters(found), noticed=noticed)
     judged = assess(inputs, found, findings)
     carried = None
     if robot.covariance is not None:
         (progress or (lambda words: None))("the geometry's share of the covariance")
-        torques = [actuator_torques(inputs, case) for case in inputs.cases]
-        carried = propagate(found, robot.covariance, inputs.cases, torques, progress)
+        carried = propagate(found, robot.covariance, inputs.cases, partial(actuator_torques, inputs), progress)
     return ParallelDynamics(
         **vars(judged), inputs=inputs, found=found, findings=findings, carried=carried, seed=settings.seed
     )
+
+
+def model_of(known: ClosedRobot, settings: IdentificationSettings) -> ParallelModel:
+    """Return the model of a robot that the settings ask for, with their torque rows."""
+    v0 = per_joint(settings.v0, 1, "v0")[0]
+    return make_parallel_model(
+        known, settings.sets, v0, settings.torque_rows, tuple(settings.payloads), settings.passive,
+        settings.identical_legs,
+    )  # fmt: skip
 
 
 def actuator_torques(inputs: IdentificationInputs, case: Case) -> np.ndarray:
     """Return the torques (N, n) of the actuators in a recording [N m or N; A where no gain is known]."""
     gains = inputs.currents.for_motion(case.motion, inputs.options.file_settings(case.motion.file))
     return np.asarray(case.motion.effort if gains is None else case.motion.effort * gains)
+
+
+def _preload(known: ClosedRobot, inputs: IdentificationInputs, case: Case) -> list[Finding]:
+    """Return findings on the overconstraint of redundant actuators in a recording: mean with sigma, and spread."""
+    jacobians = loop_jacobians(known, known.locate(case.motion.q))
+    own = overconstraint(known, jacobians, actuator_torques(inputs, case))
+    own = case.motion.in_band(own)[:: case.motion.decimator.factor]
+    unit = "N" if known.robot.joints[0].kind == "prismatic" else "N m"
+    return [
+        finding(
+            "preload", file=case.name, number=k, mean=x.mean(), spread=x.std(), unit=unit,
+            sigma=x.std() * np.sqrt(inflation(x) / len(x)),
+        )
+        for k, x in enumerate(own.T, 1)
+    ]  # fmt: skip
 
 
 def assess(inputs: IdentificationInputs, found: Identification[RegressorModel], findings: ModelFindings) -> Assessment:
@@ -150,7 +185,7 @@ def _driven_joints(
 ) -> tuple[str, ...]:
     """Return the names of joints whose identified friction would drive the motion: a wrong sign of power."""
     joints = [joint.name for leg in model.known.robot.legs for joint in leg.chain.joints]
-    friction = np.array([False] * model.inertial + [one.form.dissipative for one in model.terms])
+    friction = np.array([False] * model.inertial + [one.form.dissipative for one in model.columns])
     values, taken, moved = np.where(friction, found.dynamics.values, 0.0), np.zeros(len(joints)), 0.0
     for case in cases:
         every = max(1, len(case.motion) // (10 * MAX_SAMPLES))
@@ -166,7 +201,7 @@ def refuse_options_of_arms(settings: IdentificationSettings, options: IdentifyOp
     """Raise an error for settings and options that apply to serial arms only."""
     read = {each.name for each in fields(settings)} - OF_ARMS
     refuse_unread(settings, IdentificationSettings(), read, options.source)
-    read = {each.name for each in fields(options)} - {"gain_pair", "cut_slow"}
+    read = {each.name for each in fields(options)} - {"cut_slow"}
     refuse_unread(options, IdentifyOptions(), read, options.source)
     if settings.friction not in ("auto", "standard"):
         raise UsageError(f"friction = '{settings.friction}': a parallel robot has standard friction only (Fv Fc off)")
@@ -179,7 +214,7 @@ def refuse_options_of_arms(settings: IdentificationSettings, options: IdentifyOp
 
 def _of_arms(method: Method) -> bool:
     """Return whether a method requires the model of a serial arm."""
-    return method.needs_simulation or method.name == "ml"
+    return method.name in ("ml", "gtls") or (method.needs_simulation and method.name not in SIMULATED)
 
 
 def _encoders(known: ClosedRobot, cases: Sequence[Case]) -> Iterator[Finding]:

@@ -3,7 +3,8 @@
 Waypoints are a CSV, a row each, in order: the platform's coordinates (``x [mm]``, ``rz [deg]``), counted from home in
 the base's axes; or readings of all actuators under their names. The path is a spline through them in the platform's
 coordinates (a straight line between each two, where asked for); its timing is that of serial arms
-(`trajectories.timing.time_scaling`) on the actuators' own motion along it, redundant torques those of least norm.
+(`trajectories.timing.time_scaling`) on the actuators' own motion along it, redundant torques those of least norm with
+the identified preload.
 """
 
 from collections.abc import Callable
@@ -23,7 +24,6 @@ from calib.rooms.parallel.excite import actuator_bounds, write_motion
 from calib.rooms.parallel.loop_fit import read_coordinates, read_rows
 from calib.rooms.parallel.mechanism.closure import ClosedRobot, coordinates_of
 from calib.rooms.parallel.mechanism.parallel_model import ParallelModel
-from calib.rooms.parallel.mechanism.velocities import distributed
 from calib.rooms.parallel.purpose import read_model
 from calib.rooms.parallel.robots import ParallelMechanism
 from trajectories.setpoints import joined
@@ -69,11 +69,10 @@ class _PlatformDynamics:
         return self._torque(self.values, q, v, a)
 
     def _torque(self, values: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        motion = self.model.moved(q, v, a)
-        return distributed(self.model.known, motion.jacobians, self.model.platform_force(values, motion, self.carried))
+        return self.model.actuator_torques(values, self.model.moved(q, v, a), self.carried)
 
     def _rubbing(self) -> np.ndarray:
-        own = [one.shape in ("velocity", "sign") for one in self.model.terms]
+        own = [one.shape in ("velocity", "sign") for one in self.model.columns]
         return np.array([False] * self.model.inertial + own)
 
 

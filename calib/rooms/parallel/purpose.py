@@ -31,7 +31,7 @@ from calib.procedure.excitation.inputs import (
 from calib.procedure.excitation.limits import DEFAULT_RISE
 from calib.procedure.excitation.prediction import MotionOutlook, MotionPrediction, PredictedSigma
 from calib.procedure.excitation.settings import DRIVES, ExcitationSettings
-from calib.rooms.parallel.identification import refuse_options_of_arms
+from calib.rooms.parallel.identification import model_of, refuse_options_of_arms
 from calib.rooms.parallel.mechanism.parallel_model import (
     ParallelModel,
     PlatformRegressor,
@@ -101,13 +101,7 @@ def read_model(robot: ParallelMechanism, folder: Path | None, drives: str = "") 
     """
     if folder is None:
         model = make_parallel_model(robot.known, (drives,), v0=0.05)
-        bodies = model.known_parameters()
-        if bodies is None:
-            raise UsageError(
-                f"{robot.source} has no inertias, so torque limits cannot be applied; state them there, or name an "
-                "identified model (--model)"
-            )
-        return model, np.append(bodies, np.zeros(len(model.terms)))
+        return model, np.append(file_bodies(robot, model), np.zeros(len(model.terms)))
     path, tree = folder / MODEL, robot.known.robot
     try:
         table = json.loads(path.read_text(encoding="utf-8"))
@@ -118,6 +112,9 @@ def read_model(robot: ParallelMechanism, folder: Path | None, drives: str = "") 
             robot.known, [texts[j] for j in tree.actuated], v0=float(table.get("v0", V0)),
             payloads=[str(label) for label in table.get("payloads", ())], passive=passive,
         )  # fmt: skip
+        model = replace(
+            model, identical_legs=bool(table.get("identical_legs")), preload=tuple(map(float, table.get("preload", ())))
+        )
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise RobotError(
             f"{path} contains no model of a parallel robot ({error!r}); give a folder of calib identify"
@@ -125,6 +122,21 @@ def read_model(robot: ParallelMechanism, folder: Path | None, drives: str = "") 
     if missing := [name for name in model.names[: model.inertial] if name not in known]:
         raise RobotError(f"{path} is of another robot: parameter {missing[0]} is missing")
     return model, np.array([known.get(name, 0.0) for name in model.names])
+
+
+def file_bodies(robot: ParallelMechanism, model: ParallelModel) -> np.ndarray:
+    """Return the inertial parameters (inertial,) of a model by the robot's file.
+
+    Raises:
+        UsageError: where the file has none.
+    """
+    bodies = model.known_parameters()
+    if bodies is None:
+        raise UsageError(
+            f"{robot.source} has no inertias, so torque limits cannot be applied; state them there, or name an "
+            "identified model (--model)"
+        )
+    return bodies
 
 
 def of_options(
@@ -137,10 +149,10 @@ def of_options(
     refuse_options_of_arms(asked.settings, asked)
     made = asked.settings
     rows = rows_named(robot.known, "" if made.torque_rows.name == MOTOR.name else made.torque_rows.name)
-    model = make_parallel_model(robot.known, made.sets, SMOOTH, rows, tuple(made.payloads), made.passive)
-    bodies = read_model(robot, None)[1]
+    model = model_of(robot.known, replace(made, torque_rows=rows, v0=(SMOOTH,)))
     payloads, notes = stated_payloads(made)
-    values = np.concatenate([bodies, *payloads, np.zeros(len(model.terms))])
+    values = np.append(file_bodies(robot, model), np.zeros(len(model.columns)))
+    values[model.inertial - 10 * len(payloads) : model.inertial] = np.ravel(payloads)
     return model, values, loads_of(settings.loads, model.payloads, with_payloads=True), tuple(notes)
 
 
@@ -229,11 +241,11 @@ def _inverse(information: np.ndarray) -> np.ndarray:
     return np.linalg.inv(information * unit * unit[:, None]) * unit * unit[:, None]
 
 
-def whole(model: ParallelModel, values: np.ndarray, preload: float) -> Purpose:
+def whole(model: ParallelModel, values: np.ndarray) -> Purpose:
     """Return the purpose of all base parameters, rows in units of what equal noise of all torques makes of them."""
     known = model.known
     base = bases.find(ParallelModel(known, model.terms, rows_named(known), ()))
     columns = np.array([model.names.index(base.standard[k]) for k in base.kept])
-    plan: Any = PlatformRegressor(model, columns, values, preload)
+    plan: Any = PlatformRegressor(model, columns, values)
     sigmas = np.linalg.norm(loop_jacobians(known, known.home).readings[0], axis=0)
     return Purpose(ExcitedModel(plan, plan, None, None, False), IdentifiableColumns(None, sigmas, base.names))

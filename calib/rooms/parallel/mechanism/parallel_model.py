@@ -11,9 +11,12 @@ last joints, payloads on it after that. χ: ten standard parameters of each body
 `PlatformRegressor` has the same rows as functions of platform coordinates x(t), with gradients for motion design.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -98,14 +101,23 @@ class ParallelModel:
         terms: the drives' terms; their joints are those of the tree.
         torque_rows: ``platform``, ``motor`` or ``power`` rows (`rows_named`).
         payloads: labels of bodies that the platform may carry.
+        identical_legs: whether the legs' bodies and motor inertias are alike: one set of parameters, under the first
+            leg's names. Friction and offsets stay each joint's own.
+        preload: (n - r,) mean overconstraint of redundant actuators (`velocities.overconstraint`) [N m or N]; (): 0.
     """
 
     known: ClosedRobot
     terms: tuple[DriveTerm, ...]
     torque_rows: TorqueRows
     payloads: tuple[str, ...] = ()
+    identical_legs: bool = False
+    preload: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
+        legs = self.known.robot.legs
+        kinds = [(leg.bodies, [joint.kind for joint in leg.chain.joints]) for leg in legs]
+        for leg, kind in zip(legs, kinds if self.identical_legs else ()):
+            require(kind == kinds[0], f"identical_legs: {leg.name} is built unlike {legs[0].name}", UsageError)
         if doubled := sorted({name for name in self.names if self.names.count(name) > 1}):
             raise CalibError(f"parameter '{doubled[0]}' occurs twice; give the payload or term another name")
 
@@ -121,9 +133,52 @@ class ParallelModel:
         legs = [robot.labels[a + j] for leg, a in zip(robot.legs, robot.starts) for j in range(leg.bodies)]
         return (*legs, robot.platform_label, *self.payloads)
 
+    @cached_property
+    def single(self) -> ParallelModel:
+        """The model in which each leg has parameters of its own."""
+        return replace(self, identical_legs=False) if self.identical_legs else self
+
+    @cached_property
+    def _first(self) -> np.ndarray:
+        """For each parameter of `single` (p_1,), which of them stands for it: itself, or the first leg's."""
+        first = np.arange(self._bodies + len(self.terms))
+        if self.identical_legs:
+            size, starts = self.legs[0][2].stop, self.known.robot.starts
+            first[: size * len(self.legs)] %= size
+            motors = {one.joint: k for k, one in enumerate(self.terms, self._bodies) if one.name.startswith("Ia")}
+            for joint, k in motors.items():
+                first[k] = motors.get(joint % int(starts[1]), k)
+        return first
+
+    @cached_property
+    def owners(self) -> np.ndarray:
+        """For each parameter of `single` (p_1,), the index of the one that it is here."""
+        return np.unique(self._first, return_inverse=True)[1]
+
+    def spread(self, values: np.ndarray) -> np.ndarray:
+        """Return the parameters of `single` (p_1,) from those here (p,)."""
+        return np.asarray(values, dtype=float)[self.owners]
+
+    def _merged(self, columns: np.ndarray) -> np.ndarray:
+        """Return columns (p, …) of the parameters from those of `single` (p_1, …)."""
+        if not self.identical_legs:
+            return columns
+        result = np.zeros((self.p, *columns.shape[1:]))
+        for owner, column in zip(self.owners, columns):
+            result[owner] += column
+        return result
+
+    def _chosen(self, every: Sequence[Any]) -> tuple[Any, ...]:
+        return tuple(every[k] for k in np.unique(self._first))
+
     @property
-    def inertial(self) -> int:
+    def _bodies(self) -> int:
+        """Number of the bodies' parameters in `single`."""
         return 10 * len(self.labels)
+
+    @cached_property
+    def inertial(self) -> int:
+        return int(np.sum(np.unique(self._first) < self._bodies))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -132,19 +187,19 @@ class ParallelModel:
     @cached_property
     def _names(self) -> tuple[str, ...]:
         bodies = (name + label for label in self.labels for name in STANDARD)
-        return (*bodies, *(one.name for one in self.terms))
+        return self._chosen((*bodies, *(one.name for one in self.terms)))
 
     @property
     def units(self) -> tuple[str, ...]:
-        return (*UNITS * len(self.labels), *(one.unit for one in self.terms))
+        return self._chosen((*UNITS * len(self.labels), *(one.unit for one in self.terms)))
 
     @property
     def p(self) -> int:
         return len(self.names)
 
-    @property
+    @cached_property
     def columns(self) -> tuple[DriveTerm, ...]:
-        return self.terms
+        return self._chosen((*[None] * self._bodies, *self.terms))[self.inertial :]
 
     @property
     def rows(self) -> int:
@@ -187,7 +242,7 @@ class ParallelModel:
     def platform_regressor(self, motion: LoopMotion, carried: Collection[str] | None = None) -> np.ndarray:
         """Return the regressor W (N, r, p) in platform coordinates, stored in the order (p, r, N)."""
         robot, J = self.known.robot, motion.jacobians
-        out = np.zeros((self.p, robot.r, len(motion.v)))
+        out = np.zeros((self._bodies + len(self.terms), robot.r, len(motion.v)))
         for bodies, joints, columns in self.legs:
             W = rigid_body.regressor(bodies, motion.posture.q[:, joints], motion.v[:, joints], motion.a[:, joints])
             W = W[:, :, : columns.stop - columns.start]
@@ -197,19 +252,25 @@ class ParallelModel:
         motions = [motion.posture.q.T, motion.v.T, motion.a.T, None]
         for k, one in enumerate(self.terms):
             for joint, column in one.acting(motions, np.zeros((0, len(motion.v)))):
-                out[self.inertial + k] += J.joints[:, joint].T * column
-        return out.transpose(2, 1, 0)
+                out[self._bodies + k] += J.joints[:, joint].T * column
+        return self._merged(out).transpose(2, 1, 0)
 
     def platform_force(
         self, values: np.ndarray, motion: LoopMotion, carried: Collection[str] | None = None
     ) -> np.ndarray:
         """Return the forces and moments (N, r) in platform coordinates for parameters (p,)."""
         robot, J = self.known.robot, motion.jacobians
-        values = np.asarray(values, dtype=float)
         tree = self.tree_torque(values, motion)
         fixed = self.platform_parameters(values, carried)
         wrench = wrench_regressor(motion.posture.pose, motion.twist, motion.change, robot.gravity) @ fixed
         return np.einsum("ntr,nt->nr", J.joints, tree) + np.einsum("nkr,nk->nr", J.platform, wrench)
+
+    def actuator_torques(
+        self, values: np.ndarray, motion: LoopMotion, carried: Collection[str] | None = None
+    ) -> np.ndarray:
+        """Return the torques (N, n) of the actuators for parameters (p,): of redundant ones with the preload."""
+        forces = self.platform_force(values, motion, carried)
+        return distributed(self.known, motion.jacobians, forces, np.array(self.preload or [0.0]))
 
     def tree_torque(self, values: np.ndarray, motion: LoopMotion) -> np.ndarray:
         """Return the torques (N, n_t) of the opened legs with their drives, without the platform."""
@@ -219,7 +280,7 @@ class ParallelModel:
             for (bodies, joints, _), parameters in zip(self.legs, self.leg_parameters(values))
         ]
         result = np.concatenate(parts, axis=1)
-        for one, value in zip(self.terms, values[self.inertial :]):
+        for one, value in zip(self.terms, self.spread(values)[self._bodies :]):
             for joint, column in one.acting([*(x.T for x in own), None], np.zeros((0, len(result)))):
                 result[:, joint] += value * column
         return result
@@ -227,13 +288,13 @@ class ParallelModel:
     def leg_parameters(self, values: np.ndarray) -> list[np.ndarray]:
         """Return the parameters of each leg's bodies; those of a last link that is the platform are zero."""
         return [
-            np.append(values[columns], np.zeros(10 * bodies.count + columns.start - columns.stop))
+            np.append(self.spread(values)[columns], np.zeros(10 * bodies.count + columns.start - columns.stop))
             for bodies, _, columns in self.legs
         ]
 
     def platform_parameters(self, values: np.ndarray, carried: Collection[str] | None = None) -> np.ndarray:
         """Return the ten standard parameters of the platform together with the payloads on board."""
-        own = values[self.legs[-1][2].stop : self.inertial].reshape(-1, 10)
+        own = self.spread(values)[self.legs[-1][2].stop : self._bodies].reshape(-1, 10)
         present = [True, *(carried is None or label in carried for label in self.payloads)]
         return own[present].sum(axis=0)
 
@@ -243,18 +304,18 @@ class ParallelModel:
 
     def energies(self, motion: LoopMotion, carried: Collection[str] | None = None) -> np.ndarray:
         """Return the columns h (N, p) of kinetic and potential energy; zero for friction (eq. 3 of the power paper)."""
-        out = np.zeros((self.p, len(motion.v)))
+        out = np.zeros((self._bodies + len(self.terms), len(motion.v)))
         for bodies, joints, columns in self.legs:
             own = rigid_body.energies(bodies, motion.posture.q[:, joints], motion.v[:, joints])
             out[columns] = own[:, : columns.stop - columns.start].T
         platform = energy_columns(motion.posture.pose, motion.twist, self.known.robot.gravity)
         self._fill_platform(out, platform.T, carried)
-        drives.fill_energies(self.terms, out[self.inertial :], motion.v.T)
-        return out.T
+        drives.fill_energies(self.terms, out[self._bodies :], motion.v.T)
+        return self._merged(out).T
 
     def _fill_platform(self, out: np.ndarray, own: np.ndarray, carried: Collection[str] | None) -> None:
         """Write the ten columns of the platform, and ten columns for each payload on board."""
-        for first, label in zip(range(self.legs[-1][2].stop, self.inertial, 10), (None, *self.payloads)):
+        for first, label in zip(range(self.legs[-1][2].stop, self._bodies, 10), (None, *self.payloads)):
             if label is None or carried is None or label in carried:
                 out[first : first + 10] = own
 
@@ -276,10 +337,24 @@ class ParallelModel:
                 rank = "late" if c in last or c == 9 else "moments" if c > 5 else "inertias"
                 ranks[rank].append(10 * i + int(own[c]))
         platform = 10 * len(order)
-        drive = range(self.inertial, self.p)
+        drive = range(self._bodies, self._bodies + len(self.terms))
         first = range(platform, platform + 10)
-        payloads = range(platform + 10, self.inertial)
-        return np.array([*first, *ranks["moments"], *ranks["inertias"], *drive, *ranks["late"], *payloads], dtype=int)
+        payloads = range(platform + 10, self._bodies)
+        every = [*first, *ranks["moments"], *ranks["inertias"], *drive, *ranks["late"], *payloads]
+        return np.array(list(dict.fromkeys(self.owners[every])), dtype=int)
+
+    def plant(self, values: np.ndarray, terms: Sequence[DriveTerm] = ()) -> Any:
+        """Return the robot to simulate with values of its parameters and of further terms of the actuated joints."""
+        from calib.rooms.parallel.mechanism.simulation import ParallelPlant  # stands on this module
+
+        joints = [int(self.known.robot.actuated[one.acts[0][0]]) for one in terms]
+        own = (replace(one, acts=((j, ((j, 1.0),)),)) for one, j in zip(terms, joints))
+        return ParallelPlant(replace(self, terms=(*self.terms, *own)), values)
+
+    def joint_noise(self, noise: np.ndarray) -> np.ndarray:
+        """Return the velocity noise (n_t,) of all joints at home from that of the actuated ones (n,)."""
+        at_home = loop_jacobians(self.known, self.known.home)
+        return np.sqrt((at_home.joints[0] @ np.linalg.pinv(at_home.readings[0])) ** 2 @ noise**2)
 
     def load_cases(self) -> Loads:
         return (None, ()) if self.payloads else (None,)
@@ -295,12 +370,17 @@ class ParallelModel:
         return States(posture.q[:, own], motion.v[:, own], motion.a[:, own])
 
     def known_parameters(self) -> np.ndarray | None:
-        """Return the inertial parameters of the robot's file (inertial,), zero for payloads; None if it has none."""
+        """Return the inertial parameters of the robot's file (inertial,), zero for payloads; None if it has none.
+
+        Identical legs have the mean of the file's.
+        """
         robot = self.known.robot
         parts = [leg.chain.inertias[: leg.bodies] for leg in robot.legs if leg.chain.inertias is not None]
         if len(parts) < len(robot.legs) or robot.platform is None:
             return None
-        return np.concatenate([*parts, robot.platform[None], np.zeros((len(self.payloads), 10))]).ravel()
+        every = np.concatenate([*parts, robot.platform[None], np.zeros((len(self.payloads), 10))]).ravel()
+        own = self.owners[: self._bodies]
+        return np.bincount(own, every) / np.bincount(own)
 
     def on_rows(self, W: np.ndarray, motion: LoopMotion) -> np.ndarray:
         """Return the regressor (N, rows, p) of the torque rows from the one in platform coordinates, W (N, r, p)."""
@@ -338,7 +418,7 @@ def rows_named(known: ClosedRobot, name: str = "") -> TorqueRows:
 
 def make_parallel_model(
     known: ClosedRobot, sets: Sequence[str] = (), v0: float = V0, rows: TorqueRows | None = None,
-    payloads: Sequence[str] = (), passive: str = "",
+    payloads: Sequence[str] = (), passive: str = "", identical_legs: bool = False,
 ) -> ParallelModel:  # fmt: skip
     """Return the identification model of a robot: bodies, drive terms of actuated joints, friction of passive joints.
 
@@ -347,6 +427,7 @@ def make_parallel_model(
             off.
         v0: smoothing of the Coulomb sign [rad/s or m/s].
         passive: names for all passive joints, e.g. ``Fv Fc``.
+        identical_legs: see `ParallelModel`.
     """
     robot = known.robot
     each = list(sets) or ["Ia Fv Fc off"]
@@ -360,7 +441,7 @@ def make_parallel_model(
     linear = [joint.kind == "prismatic" for joint in joints]
     plain = drives.standard(texts, v0, linear)
     terms = tuple(replace(one, name=_renamed(one, robot.labels)) for one in plain)
-    return ParallelModel(known, terms, rows or rows_named(known), tuple(payloads))
+    return ParallelModel(known, terms, rows or rows_named(known), tuple(payloads), identical_legs)
 
 
 def _renamed(one: DriveTerm, labels: Sequence[str]) -> str:
@@ -417,13 +498,11 @@ class PlatformRegressor:
         model: of the robot.
         columns: (b,) of the model's that count.
         values: (p,) parameters that predict torques; None where unknown.
-        preload: overconstraint of redundant actuators [N m or N].
     """
 
     model: ParallelModel
     columns: np.ndarray
     values: np.ndarray | None = None
-    preload: float = 0.0
     carried: Collection[str] | None = None
 
     def motion(self, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> LoopMotion:
@@ -441,10 +520,9 @@ class PlatformRegressor:
         return self.slopes(x, v, a, self._columns, weights)
 
     def torques(self, motion: LoopMotion) -> np.ndarray:
-        """Return the actuators' torques (N, n) of a motion, by the model's `values`."""
+        """Return the actuators' torques (N, n) of a motion, by the model's `values` and preload."""
         assert self.values is not None
-        forces = self.model.platform_force(self.values, motion, self.carried)
-        return distributed(self.model.known, motion.jacobians, forces, self.preload)
+        return self.model.actuator_torques(self.values, motion, self.carried)
 
     def speeds(self, motion: LoopMotion) -> np.ndarray:
         """Return the actuators' speeds (N, n) of a motion."""

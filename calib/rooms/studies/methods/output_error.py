@@ -76,8 +76,7 @@ class _OutputError(Method):
         plain = WLS.estimate(problem)
         if not plain.found:
             return replace(plain, method=self.name)
-        bodies = serial_arm(problem, self).bodies
-        loops = close_loops(bodies, problem.cases, problem.decimator, problem.loop, problem.cad)
+        loops = close_loops(serial_arm(problem, self), problem.cases, problem.decimator, problem.loop, problem.cad)
         return attempted_in_loop(self.name, problem, loops, lambda: self._estimate(problem, plain, loops))
 
     def _estimate(self, problem: IdentificationProblem, plain: MethodEstimate, loops: ClosedLoops) -> MethodEstimate:

@@ -1,4 +1,7 @@
-"""Compiled kernels (numba) of a simulated run of a parallel robot; notation of `closure_kernels` of the mechanism."""
+"""Compiled closed loop (numba): a parallel robot under a sampled controller of its actuators, midpoint rule in between.
+
+The platform's coordinates are integrated, the legs follow, their gaps closed on the way; notation of `closure_kernels`.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,18 @@ import numpy as np
 from numba import njit
 
 from calib.dynamics.kernels import OPTIONS, inverse_dynamics
+from calib.rooms.closed_loop.loop_kernels import (
+    DIVERGED,
+    FINE,
+    MAX_STEPS,
+    MIDPOINT_STEP,
+    SINGULAR,
+    STIFF,
+    STIFF_REACH,
+    command,
+    factorise,
+    substitute,
+)
 from calib.rooms.parallel.mechanism.closure_kernels import SCALE, invert, one_leg
 
 
@@ -175,6 +190,9 @@ def _leg_share(links, constants, parameters, drives, held, inverse, carried, shi
 def _accelerate(robot, values, q, pose, rate, tau, rates, twist, change):
     """Write v̇ (r,) into `change`, q̇ (n_t,) into `rates`, t (6,) into `twist`; close the gaps in q and pose on the way.
 
+    Returns a bound [1/s] on the fastest decay of friction near standstill, the trace of M⁻¹ Jᵀ D J with the signs'
+    steepest slopes D, or -1 where M is not positive definite.
+
     Args:
         robot: of L legs of B bodies or fewer: links (L, B, 4 + B), constants (L, B + 1, 13), tails and attachments
             (L, 4, 4), starts, held, selected, actuated, gravity, and whether the platform's twist is always the
@@ -230,12 +248,23 @@ def _accelerate(robot, values, q, pose, rate, tau, rates, twist, change):
             for b in range(6):
                 for m in range(r):
                     M[i, m] += D[a, i] * whole[a, b] * D[b, m]
-    solved = np.empty((r, r))
-    invert(M, solved)
     for i in range(r):
-        change[i] = 0.0
-        for k in range(r):
-            change[i] -= solved[i, k] * h[k]
+        change[i] = -h[i]
+    if not factorise(M):
+        return -1.0
+    substitute(M, change)
+    decay = 0.0
+    for j in range(n_t):
+        slope = drives[j, 1]
+        if abs(rates[j]) < STIFF_REACH * drives[j, 4]:
+            slope += drives[j, 2] / drives[j, 4]
+        if slope != 0.0:
+            for i in range(r):
+                h[i] = J[j, i]
+            substitute(M, h)
+            for i in range(r):
+                decay += abs(slope * J[j, i] * h[i])
+    return decay
 
 
 @njit(**OPTIONS)
@@ -255,52 +284,61 @@ def _turn(factor, twist, pose, out):
 
 
 @njit(**OPTIONS)
-def run(robot, values, q, pose, rate, plan, noise, limit, gains, step, far, read, held):
-    """Simulate a run under computed torque; see `computed_torque`. -1, or the sample it leaves at.
+def run(robot, values, q, pose, rate, mixing, gains, reference, encoder, period, smoothing, late, far, out):
+    """Run the loop: measure, command, hold the torque for one period, integrate. Return (status, period reached).
 
     Args:
-        q, pose, rate: the state it starts from, changed: that of the last sample.
-        plan: reference of the encoders (N, n), forces (N, r), inertia (N, r, r), J⁺ (N, r, n), preload (N, n).
-        noise: (N, n) of the encoders; limit (n,); gains: of the error and of its rate.
-        read, held: (N, n) what is written: readings, and torques held from sample to sample.
+        robot, values: see `_accelerate`.
+        q, pose, rate: the state at the beginning, overwritten.
+        mixing: (N, n, n) that the feedback is multiplied by; none: (0, n, n).
+        gains: (6, n) of the actuators' controller, reference (4, N, n): see `loop_kernels.closed_loop`.
+        encoder: (N, n) noise of the readings.
+        far: distance from the reference [rad or m] at which a run has diverged.
+        out: (3, N, n) true and measured positions, torque held from instant to instant.
     """
-    wanted, forces, inertia, back, preload = plan
     actuated, n, r = robot[7], robot[7].shape[0], rate.shape[0]
-    rates, change, twist, push = np.zeros(q.shape[0]), np.zeros(r), np.zeros(6), np.zeros(r)
     q2, pose2, rate2 = q.copy(), pose.copy(), rate.copy()
-    for k in range(wanted.shape[0]):
-        for i in range(r):
-            push[i] = 0.0
+    rates, change, twist = np.zeros(q.shape[0]), np.zeros(r), np.zeros(6)
+    speed, read, before, integral = reference[1, 0].copy(), np.zeros(n), np.zeros(n), np.zeros(n)
+    wish, tau, waiting = np.zeros(n), np.zeros(n), np.zeros((late + 1, n))
+    for k in range(reference.shape[1]):
         for j in range(n):
-            read[k, j] = q2[actuated[j]] + noise[k, j]
-            off = wanted[k, j] - read[k, j]
-            if not abs(off) < far:
-                return k
-            slow = (wanted[k, j] - wanted[k - 1, j] - read[k, j] + read[k - 1, j]) / step if k else 0.0
-            for i in range(r):
-                push[i] += back[k, i, j] * (gains[0] * off + gains[1] * slow)
+            read[j] = q2[actuated[j]] + encoder[k, j]
+            if not abs(reference[0, k, j] - read[j]) < far:
+                return DIVERGED, k
+            if k:
+                speed[j] += smoothing * ((read[j] - before[j]) / period - speed[j])
+            before[j] = read[j]
+        command(gains, reference[0, k], reference[1, k], read, speed, integral, period, wish)
         for j in range(n):
-            total = preload[k, j]
-            for i in range(r):
-                force = forces[k, i]
-                for m in range(r):
-                    force += inertia[k, i, m] * push[m]
-                total += back[k, i, j] * force
-            held[k, j] = min(max(total, -limit[j]), limit[j])
-        for half in range(2):  # one call of what is joined into this loop by the compiler: two take it twice as long
-            _accelerate(robot, values, q2, pose2, rate2, held[k], rates, twist, change)
-            length = step if half else 0.5 * step
-            if not half:
-                for i in range(3):
-                    for m in range(4):
-                        pose[i, m] = pose2[i, m]
-            for i in range(q.shape[0]):
+            asked = reference[2, k, j] + (0.0 if mixing.shape[0] else wish[j])
+            for m in range(n * (mixing.shape[0] > 0)):
+                asked += mixing[k, j, m] * wish[m]
+            held = min(max(asked, -gains[4, j]), gains[4, j])
+            if held != asked and (reference[0, k, j] - read[j]) * asked > 0.0:
+                integral[j] -= period * (reference[0, k, j] - read[j])  # no winding up against the limit
+            waiting[k % (late + 1), j] = held
+            tau[j] = waiting[(k + 1) % (late + 1) if k >= late else 0, j]
+            out[0, k, j], out[1, k, j], out[2, k, j] = q2[actuated[j]], read[j], tau[j]
+        left, span = period, 0.0
+        while left > 1e-9 * period:
+            for half in range(
+                2
+            ):  # one call of what is joined into this loop by the compiler: two take it twice as long
+                decay = _accelerate(robot, values, q2, pose2, rate2, tau, rates, twist, change)
+                if decay < 0.0:
+                    return SINGULAR, k
                 if not half:
-                    q[i] = q2[i]
-                q2[i] = q[i] + length * rates[i]
-            for i in range(r):
-                if not half:
-                    rate[i] = rate2[i]
-                rate2[i] = rate[i] + length * change[i]
-            _turn(length, twist, pose, pose2)
-    return -1
+                    pieces = int(left * decay / MIDPOINT_STEP) + 1
+                    if pieces * period > 2 * MAX_STEPS * left:
+                        return STIFF, k
+                    span = left / pieces
+                    q[:], pose[:], rate[:] = q2, pose2, rate2
+                length = span if half else 0.5 * span
+                for i in range(q.shape[0]):
+                    q2[i] = q[i] + length * rates[i]
+                for i in range(r):
+                    rate2[i] = rate[i] + length * change[i]
+                _turn(length, twist, pose, pose2)
+            left -= span
+    return FINE, reference.shape[1]
