@@ -1,6 +1,6 @@
 """The variance of the networks, as multiples of that of ordinary least squares; the survey has the neuron above 10.
 
-    python examples/survey/network_variance.py [--conditions MCS-TX40-1-1,MCS-TX40-1-2] [--data-sets 12] [--guesses 5]
+    python examples/survey/network_variance.py [--conditions MCS-TX40-1-1,MCS-TX40-1-2] [--data-sets 8] [--guesses 3]
 
 For each network, rate and number of steps, as multiples of least squares' variance over data sets (medians over the
 parameters): the variance over data sets from one guess, and over guesses on one data set. Besides, the median error [%]
@@ -47,8 +47,8 @@ def estimated(condition: Condition, sets: int) -> tuple[dict[str, np.ndarray], d
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--conditions", default="MCS-TX40-1-1,MCS-TX40-1-2")
-    parser.add_argument("--data-sets", type=int, default=12)
-    parser.add_argument("--guesses", type=int, default=5)
+    parser.add_argument("--data-sets", type=int, default=8)
+    parser.add_argument("--guesses", type=int, default=3)
     given = parser.parse_args()
     for condition in read_study(given.conditions.split(",")).conditions:
         values, errors = estimated(replace(condition, guesses=given.guesses), given.data_sets)

@@ -127,7 +127,7 @@ class Condition:
         duration: [s].
         guess: relative error of the parameters that methods start from which ask for some.
         resimulated: data sets below it get the survey's position error.
-        motion: one of `MOTIONS`.
+        motion: one of `MOTIONS`, or the folder of a `calib excite`.
         rate: of the log [Hz]; 0 for the robot's own.
         guesses: start values of each data set; trial k is of data set k // guesses and guess k % guesses.
     """

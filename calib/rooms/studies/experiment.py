@@ -10,6 +10,7 @@ same limits of the joints (self-collisions of random ones are not looked at).
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -100,8 +101,9 @@ def _set_up(robot: str, duration: float, motion: str) -> Setup:
     plant = known_robots.plant(robot)
     known = known_robots.truth(robot)["control"]
     rate, every = float(known["rate"]), float(known["rate"]) / float(known["sampling"])
-    if motion == "designed":
-        found, t = coefficients.read(LIBRARY / robot), np.arange(round(duration * rate) + 1) / rate
+    if motion != "random":
+        found = coefficients.read(LIBRARY / robot if motion == "designed" else Path(motion))
+        t = np.arange(round(duration * rate) + 1) / rate
         return Setup(chain, plant, Reference(t, *found.orders(t)), _drawn(chain, duration, rate, VALIDATION), every)
     model = known_robots.model(plant)
     kept = _nominal_base(robot).kept
