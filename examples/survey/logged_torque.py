@@ -31,7 +31,7 @@ def with_case(data: Experiment, case: Case) -> Experiment:
 
 def variants(condition: Condition, seed: int) -> dict[str, Experiment]:
     """Return three variants of a data set: as logged, with mean torque, and with encoder noise outside the loop."""
-    data, setup = make_experiment(condition, seed), set_up(condition.robot, condition.duration)
+    data, setup = make_experiment(condition, seed), set_up(condition)
     case, every = data.problem.cases[0], int(setup.every)
     sensing = Sensing(condition.sigma_q, sigma_tau=condition.sigma_tau)
     rng = np.random.default_rng([seed, 20_211])  # that of `make_experiment`: the same noise in the loop

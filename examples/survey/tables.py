@@ -13,16 +13,18 @@ import csv
 import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from calib.identification.methods.registry import METHODS
-from calib.rooms.studies.conditions import read_study
+from calib.rooms.studies.conditions import Condition, read_study
 from calib.rooms.studies.store import read_rows
 from calib.rooms.studies.summary import ConditionSummary, MethodSummary, summarise
 from calib.rooms.studies.trial import TrialRow
 
 HERE = Path(__file__).parent
-STUDIES = ("MCS-*", "unfiltered", "wrong-beliefs")
+STUDIES = ("MCS-*", "unfiltered", "wrong-beliefs", "designed", "low-rate", "controller")
+MERITS = ("MCS-TX40-1-1", "MCS-TX40-4-2", "MCS-RV2SQ-1-2")  # conditions of which all figures are shown
 
 
 def number(value: float) -> str:
@@ -61,7 +63,8 @@ def _runs(one: ConditionSummary) -> str:
 
 def merit_table(one: ConditionSummary) -> Iterator[str]:
     """Yield a table of all figures of one condition, one line per method."""
-    header = ("runs", "failed", "torque [%]", "β [%]", "in σ", "covered [%]", "d_τ [%]", "d_q [%]", "rounds", "sims")
+    header = ("runs", "failed", "torque [%]", "β [%]", "in σ", "covered [%]", "d_τ [%]", "d_q [%]")
+    header += ("iterations", "simulations")
     yield f"| method | {' | '.join(header)} | CPU [s] |"
     yield f"|---|{'---:|' * (len(header) + 1)}"
     for method in one.methods:
@@ -85,6 +88,28 @@ def coverage_table(conditions: Sequence[ConditionSummary], names: Sequence[str])
         cells = ["" if own is None else number(own.figures["coverage"].median) for own in found]
         if any(cells):
             yield f"| {name} | {' | '.join(cells)} |"
+
+
+def motion_table(random: Sequence[ConditionSummary], designed: Sequence[ConditionSummary]) -> Iterator[str]:
+    """Yield median torque and parameter errors [%] on random and on designed motions, for conditions that have both."""
+    pairs = [(one, own) for own in designed for one in random if one.condition == _as_random(own, one) and own.methods]
+    names = [f"{what}, {one.condition.name.removeprefix('MCS-')}" for one, _ in pairs for what in ("torque", "β")]
+    yield f"| random → designed [%] | {' | '.join(names)} |"
+    yield f"|---|{'---:|' * len(names)}"
+    for name in METHODS:
+        cells = []
+        for pair in pairs:
+            both = [method for one in pair for method in one.methods if method.method == name]
+            medians = [[number(one.figures[key].median) for one in both] for key in ("torque_error", "beta_error")]
+            cells += [" → ".join(own) if len(own) == 2 else "" for own in medians]
+        if any(cells):
+            yield f"| {name} | {' | '.join(cells)} |"
+
+
+def _as_random(one: ConditionSummary, other: ConditionSummary) -> Condition:
+    """Return a condition with motion, guesses and name of another."""
+    theirs = other.condition
+    return replace(one.condition, motion=theirs.motion, guesses=theirs.guesses, name=theirs.name)
 
 
 GROUPS = {"RV2SQ": ("rv2sq", 1), "TX40": ("tx40", 1), "TX40, decimated": ("tx40", 4)}
@@ -134,14 +159,21 @@ def _recorded(row: dict[str, str]) -> str:
 def sections(rows: Sequence[TrialRow], recordings: Path) -> dict[str, list[str]]:
     """Return the lines of each table, by the name of its place in the README."""
     made: dict[str, list[str]] = {}
+    survey: list[ConditionSummary] = []
     for name in STUDIES:
-        conditions = summarise(read_study([name]), rows)
+        conditions = [one for one in summarise(read_study([name]), rows) if one.methods]
         lines = made.setdefault(name.removesuffix("-*"), [])
         for part in range(0, len(conditions), 5):
             lines += [*torque_table(conditions[part : part + 5]), ""]
         if name == "MCS-*":
             shown = ("TX40-1-1", "TX40-1-2", "TX40-1-3", "TX40-4-1", "TX40-4-2", "RV2SQ-1-1", "RV2SQ-1-2")
             made["coverage"] = list(coverage_table(conditions, shown))
+            for one in conditions:
+                if one.condition.name in MERITS:
+                    made.setdefault("merit", []).extend([f"{one.condition.name}:", "", *merit_table(one), ""])
+            survey = conditions
+        if name == "designed":
+            lines += motion_table(survey, conditions)
     made["cost"] = list(cost_table(rows))
     made["recordings"] = list(recordings_table(recordings))
     return made

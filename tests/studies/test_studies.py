@@ -13,8 +13,10 @@ from calib.errors import UsageError
 from calib.identification.methods.registry import VERSIONS
 from calib.procedure.report.page import rendered
 from calib.rooms.studies.conditions import Condition, Study, read_study, shipped
-from calib.rooms.studies.experiment import make_experiment
+from calib.rooms.studies.experiment import ACCELERATION, REACH, SPEED, data_set, make_experiment, set_up
 from calib.rooms.studies.report import condition_table
+from calib.rooms.studies.run import _missing
+from calib.rooms.studies.store import opened
 from calib.rooms.studies.summary import MIN_DATA_SETS, sign_test, summarise
 from calib.rooms.studies.trial import FOUND, NOT_RECORDED, TrialRow, run_trial
 
@@ -78,6 +80,9 @@ def test_what_a_condition_is_called_is_no_part_of_what_it_is():
         ('"iv"]', '"ivv"]', "there is no method 'ivv' .did you mean 'iv'"),
         ("runs_loop", "runs_lop", "no key 'runs_lop' .did you mean 'runs_loop'"),
         ("[[noise]]", "[noise]", "noise"),
+        ("runs_loop", 'motion = "design"\nruns_loop', "did you mean 'designed'"),
+        ("runs_loop", "guesses = 0\nruns_loop", "guesses"),
+        ("runs_loop", "rate = 90\nruns_loop", "expected less than 45 Hz, half the rate of the rv2sq's log"),
         ('"1e-4 deg"', "30.0", "at most 0.1"),
         ('"rv2sq"', '"rv2"', "did you mean 'rv2sq'"),
         ("duration", "cutoff = 70\nduration", "expected less than 70 Hz, half the rate of the rv2sq's log"),
@@ -95,11 +100,62 @@ def test_a_study_that_does_not_ship_is_told_its_neighbour():
         read_study(["MCS-TX40-11"])
 
 
+def forget() -> None:
+    """Forget the data sets that were made."""
+    make_experiment.cache_clear()
+    data_set.cache_clear()
+
+
+def test_methods_that_take_start_values_run_from_each_guess(tmp_path: Path):
+    """The others once per data set: their estimate would be the same."""
+    study = read_study([written(tmp_path, FILE.replace('"iv"]', '"hopfield"]\nguesses = 3'))])
+    with opened(tmp_path / "out") as store:
+        tasks = list(_missing(study, store))
+    seeds = {name: [one.seed for one in tasks if name in one.methods] for name in ("wls", "hopfield")}
+    assert seeds == {"wls": [0, 3, 6], "hopfield": list(range(9))}
+
+
+def test_guesses_are_the_same_for_every_data_set():
+    one, two, three = (make_experiment(replace(SHORT, guesses=2), seed).problem for seed in range(3))
+    assert one.rows is two.rows and not np.array_equal(one.rows[0].target, three.rows[0].target)
+    assert one.start is not None and np.array_equal(one.start, np.asarray(three.start))
+    assert not np.array_equal(one.start, np.asarray(two.start))
+
+
+def test_of_several_guesses_the_first_is_compared(small):
+    """A method that is worse from other guesses has a larger median, and the same p."""
+    (study, row), p = small, []
+    for guesses, others in ((1, ()), (3, (1, 2))):
+        condition = replace(study.conditions[0], guesses=guesses)
+        own = [replace(row, digest=condition.digest, seed=guesses * k, torque_error=1.0 + k) for k in range(9)]
+        more = [replace(one, method="iv", torque_error=0.9 * one.torque_error) for one in own]
+        more += [replace(one, seed=one.seed + k, torque_error=99.0) for one in more for k in others]
+        (found,) = summarise(replace(study, conditions=(condition,)), [*own, *more])
+        p.append({one.method: one.p for one in found.methods if one.method == "wls" or others})
+    assert p[1]["iv"] == p[0]["wls"] < 0.05
+
+
+@pytest.mark.parametrize("robot", ["tx40", "rv2sq"])
+def test_designed_motions_keep_the_limits_of_random_ones(robot: str):
+    setup = set_up(replace(SHORT, robot=robot, duration=10.0, motion="designed"))
+    (lower, upper), motion = setup.chain.sampling_limits(), setup.reference
+    inside = 0.5 * (1.0 - REACH) * (upper - lower)
+    assert (motion.q >= lower + inside).all() and (motion.q <= upper - inside).all()
+    assert (np.abs(motion.v) <= SPEED * np.array([joint.velocity for joint in setup.chain.joints])).all()
+    assert np.abs(motion.a).max() <= ACCELERATION
+    assert np.allclose([motion.v[0], motion.a[0]], 0.0, atol=1e-9)
+
+
+def test_a_log_has_the_rate_that_is_stated():
+    (case,) = make_experiment(replace(SHORT, rate=50.0, cutoff=20.0), 0).problem.cases
+    assert case.motion.rate == pytest.approx(50.0)
+
+
 def test_a_trial_is_pure():
     """Same condition, method and seed: the same row but for the times, whatever ran before; another seed: another."""
     first = run_trial(SHORT, "wls", 3)
     other = run_trial(SHORT, "wls", 4)
-    make_experiment.cache_clear()
+    forget()
     again = run_trial(SHORT, "wls", 3)
     timeless = [{k: v for k, v in asdict(row).items() if k not in ("seconds", "cpu")} for row in (first, again)]
     assert str(timeless[0]) == str(timeless[1])
@@ -114,9 +170,9 @@ def test_a_loop_that_cannot_be_recorded_is_a_row(monkeypatch: pytest.MonkeyPatch
 
     stiff = known_robots.controller("rv2sq").scaled(100.0)
     monkeypatch.setattr(known_robots, "controller", lambda name: replace(stiff, limit=np.full(6, np.inf)))
-    make_experiment.cache_clear()
+    forget()
     row = run_trial(SHORT, "wls", 0)
-    make_experiment.cache_clear()
+    forget()
     assert row.status == NOT_RECORDED
     assert row.message
 

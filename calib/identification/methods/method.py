@@ -199,6 +199,7 @@ class Method(ABC):
             have stored before are discarded and computed again.
         takes_prior: whether it uses a prior, ridges of richer friction, and a stated noise of the rows.
         needs_controller: whether it simulates the closed loop of a recording.
+        takes_start: whether its estimate depends on the problem's start values.
         needs_simulation: whether it needs a model whose motion can be computed from torques.
         takes_models: whether it takes joint torque sensors and richer friction; otherwise motor torques alone.
         takes_constraints: whether its estimate satisfies the options' [constraints].
@@ -213,6 +214,7 @@ class Method(ABC):
     version: int = field(default=1, kw_only=True)
     takes_prior: bool = field(default=False, kw_only=True)
     needs_controller: bool = field(default=False, kw_only=True)
+    takes_start: bool = field(default=False, kw_only=True)
     needs_simulation: bool = field(default=False, kw_only=True)
     takes_models: bool = field(default=True, kw_only=True)
     takes_constraints: bool = field(default=False, kw_only=True)

@@ -1,10 +1,12 @@
 """The study file: compared methods, simulated experiments, and number of runs.
 
-TOML; SI units. Every combination of robot, noise, decimation, cutoff and mismatch is a condition::
+TOML; SI units. Every combination of robot, motion, rate, noise, decimation, cutoff and mismatch is a condition::
 
     name = "small"
     about = "what it is for"
     robot = ["tx40", "rv2sq"]        # those two: their true inertias, friction and controller are known
+    motion = "designed"              # by calib excite; default random: the best of 20 random Fourier series
+    rate = [200, 50]                 # of the log [Hz]; default 0: the toolbox's, 1000 (tx40) and 140 (rv2sq)
     decimation = [1, 4]              # one sample in so many is kept, behind the parallel low-pass
     cutoff = 50.0                    # of the positions' zero-phase Butterworth filter [Hz], or a list; 0: none to speak
                                      # of (0.8 of the Nyquist frequency)
@@ -20,7 +22,8 @@ TOML; SI units. Every combination of robot, noise, decimation, cutoff and mismat
     runs_of = { iv = 10 }            # for single methods
     seed = 0                         # number of the first data set
     duration = 10.0                  # of the motion [s]
-    guess = 0.15                     # relative error of what cloe, clie and the Kalman filters start from
+    guess = 0.15                     # relative error of what cloe, clie, Kalman filters and networks start from
+    guesses = 25                     # of these, the same for every data set: such methods run once from each; default 1
     resimulated = 3                  # data sets whose estimate is simulated once more, for the survey's position error
     [[noise]]                        # at least one
     name = "1"
@@ -52,17 +55,22 @@ from calib.errors import UsageError, require, suggestion
 from calib.identification.methods.registry import METHODS, method_named
 
 ROBOTS = ("tx40", "rv2sq")
+MOTIONS = ("random", "designed")
 MISMATCHES = ("none", "geometry", "calibrated", "controller", "friction", "payload", "clock")
+LIBRARY = Path(str(resources.files("calib.rooms.studies").joinpath("library")))
 TRIAL = 1
 """Number raised whenever the trials of all methods change: rows with a lower number do not count.
 
 Where one method changes, its `calib.identification.methods.method.Method.version` is raised."""
 
+_LATER = {"motion": "random", "rate": 0.0, "guesses": 1}  # no part of a digest: rows from before these fields count
 _Few = Spread(words="a value, or a list of them")
 Robots = Annotated[
     tuple[Annotated[str, OneOf(ROBOTS, "simulated robots only; for recordings: calib compare")], ...], _Few
 ]
 Wholes = Annotated[tuple[Annotated[int, Whole(1, 100)], ...], _Few]
+Motions = Annotated[tuple[Annotated[str, OneOf(MOTIONS)], ...], _Few]
+Rates = Annotated[tuple[Annotated[float, Real(least=0, most=5000)], ...], _Few]
 Cutoffs = Annotated[tuple[Annotated[float, Real(least=0, words="0 or more, Hz without a unit")], ...], _Few]
 Mismatches = Annotated[tuple[Annotated[str, OneOf(MISMATCHES)], ...], _Few]
 Methods = Annotated[tuple[Name, ...], _Few]
@@ -88,6 +96,8 @@ class StudyFile:
     noise: Annotated[tuple[Noise, ...], MinLen(1)]
     robot: Robots
     about: Text = ""
+    motion: Motions = ("random",)
+    rate: Rates = (0.0,)
     decimation: Wholes = (1,)
     cutoff: Cutoffs = (50.0,)
     mismatch: Mismatches = ("none",)
@@ -99,6 +109,7 @@ class StudyFile:
     seed: Count = 0
     duration: Annotated[float, Real(least=2.0, most=600.0, unit="s")] = 10.0
     guess: Annotated[float, Real(least=0, most=10.0)] = 0.15
+    guesses: Annotated[int, Whole(1, 1000)] = 1
     resimulated: Count = 3
 
 
@@ -115,7 +126,10 @@ class Condition:
         mismatch: what is believed wrongly, one of `MISMATCHES`.
         duration: [s].
         guess: relative error of the parameters that methods start from which ask for some.
-        resimulated: seeds below it get the survey's position error.
+        resimulated: data sets below it get the survey's position error.
+        motion: one of `MOTIONS`, or the folder of a `calib excite`.
+        rate: of the log [Hz]; 0 for the robot's own.
+        guesses: start values of each data set; trial k is of data set k // guesses and guess k % guesses.
     """
 
     name: str
@@ -128,11 +142,15 @@ class Condition:
     duration: float = 10.0
     guess: float = 0.15
     resimulated: int = 3
+    motion: str = "random"
+    rate: float = 0.0
+    guesses: int = 1
 
     @property
     def digest(self) -> str:
         """Key of the condition's rows in the store; conditions that differ only in name have the same key."""
         content = {key: value for key, value in asdict(self).items() if key not in ("name", "resimulated")}
+        content = {key: value for key, value in content.items() if value != _LATER.get(key)}
         return hashlib.sha256(json.dumps([TRIAL, content], sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -162,8 +180,7 @@ class Study:
 
 def shipped() -> dict[str, Path]:
     """Return the study files shipped with the toolkit, by name."""
-    folder = Path(str(resources.files("calib.rooms.studies").joinpath("library")))
-    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+    return {path.stem: path for path in sorted(LIBRARY.glob("*.toml"))}
 
 
 def read_study(
@@ -205,7 +222,7 @@ def _check_cutoffs(conditions: Sequence[Condition]) -> None:
     from calib.rooms.cells import known_robots  # slow to load
 
     for one in conditions:
-        most = 0.5 * float(known_robots.truth(one.robot)["control"]["sampling"])
+        most = 0.5 * (one.rate or float(known_robots.truth(one.robot)["control"]["sampling"]))
         if one.cutoff >= most:
             raise UsageError(
                 f"{one.name}: cutoff: expected less than {most:g} Hz, half the rate of the {one.robot}'s log, found "
@@ -244,8 +261,8 @@ def _parse(path: Path) -> StudyFile:
 def _expanded(study: StudyFile) -> list[Condition]:
     """Return the conditions of a study: all combinations of its values, each with a name."""
     axes: dict[str, tuple[Any, ...]] = {
-        "robot": study.robot, "noise": study.noise, "decimation": study.decimation, "cutoff": study.cutoff,
-        "mismatch": study.mismatch,
+        "robot": study.robot, "motion": study.motion, "rate": study.rate, "noise": study.noise,
+        "decimation": study.decimation, "cutoff": study.cutoff, "mismatch": study.mismatch,
     }  # fmt: skip
     result = []
     for values in product(*axes.values()):
@@ -255,15 +272,16 @@ def _expanded(study: StudyFile) -> list[Condition]:
         result.append(
             Condition(
                 "-".join([study.name, *parts]), sigma_q=noise.sigma_q, sigma_tau=noise.sigma_tau,
-                duration=study.duration, guess=study.guess, resimulated=study.resimulated, **chosen,
+                duration=study.duration, guess=study.guess, guesses=study.guesses, resimulated=study.resimulated,
+                **chosen,
             )
         )  # fmt: skip
     return result
 
 
 def _word(axis: str, value: Any) -> str:
-    if axis == "cutoff":
-        return f"{value:g}Hz" if value else "unfiltered"
+    if axis in ("cutoff", "rate"):
+        return f"{value:g}Hz" if value else "unfiltered" if axis == "cutoff" else "own"
     return value.name if isinstance(value, Noise) else f"r{value}" if axis == "decimation" else str(value)
 
 

@@ -1,14 +1,16 @@
 """Simulated data sets: a robot with known parameters in its control loop, and the input of the methods.
 
-The robot follows a motion in its controller's loop at 5 kHz, logged at 1 kHz (TX40) or 140 Hz (RV-2SQ); the encoders'
-noise enters the loop, the torque's is that of the log. Positions are low-passed and differentiated, rows decimated, as
-`calib identify` does it. What is believed of the robot may differ from what it is (`Condition.mismatch`). All data sets
-of a condition share the motion: the best by condition number of `MOTION_TRIES` random Fourier series within the limits
-(self-collisions are not looked at).
+The robot follows a motion in its controller's loop at 5 kHz, logged at 1 kHz (TX40), 140 Hz (RV-2SQ) or a stated rate;
+the encoders' noise enters the loop, the torque's is that of the log. Positions are low-passed and differentiated, rows
+decimated, as `calib identify` does it. What is believed of the robot may differ from what it is (`Condition.mismatch`).
+All data sets of a condition share the motion: the best by condition number of `MOTION_TRIES` random Fourier series, or
+one that `calib excite` designed (``library/ROBOT``, by ``examples/survey/limits.toml``), of the same family within the
+same limits of the joints (self-collisions of random ones are not looked at).
 """
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -29,6 +31,7 @@ from calib.identification.constraint_settings import ConstraintSettings
 from calib.identification.loop import Controller, LoopSettings
 from calib.identification.methods.method import IdentificationProblem
 from calib.identification.rows import Case, make_case, observe
+from calib.procedure.excitation import coefficients
 from calib.robot.chain import Chain, random_joints
 from calib.robot.library import load
 from calib.rooms.cells import known_robots
@@ -37,10 +40,11 @@ from calib.rooms.cells.known_robots import random_fourier
 from calib.rooms.cells.virtual_cells import perturbed_cell, rigid
 from calib.rooms.closed_loop.controllers import Reference
 from calib.rooms.closed_loop.simulation import Plant, Sensing, SimulatedRun, feed_forward, simulate
-from calib.rooms.studies.conditions import Condition
+from calib.rooms.studies.conditions import LIBRARY, Condition
 
 # our choices
 MOTION_TRIES, HARMONICS = 20, 12  # motions to take the best of; harmonics of each
+VALIDATION = 10_000  # number of the random motion that validates
 REACH, SPEED, ACCELERATION = 0.9, 0.8, 40.0  # shares of the limits; largest in any joint [rad/s²]
 THIN = 50  # of the control rate: instants at which a motion's condition and the validation torques are taken
 BELIEVED = 1.3, 0.7  # factors of kp, kd
@@ -85,24 +89,24 @@ class Experiment:
     torque: np.ndarray
 
 
+def set_up(condition: Condition) -> Setup:
+    """Return the data shared by all data sets of a condition."""
+    shared = _set_up(condition.robot, condition.duration, condition.motion)
+    return replace(shared, every=1.0 / (shared.reference.period * condition.rate)) if condition.rate else shared
+
+
 @lru_cache(maxsize=4)
-def set_up(robot: str, duration: float) -> Setup:
-    """Return the data shared by all data sets of a robot."""
+def _set_up(robot: str, duration: float, motion: str) -> Setup:
     chain = load(robot)
     plant = known_robots.plant(robot)
     known = known_robots.truth(robot)["control"]
     rate, every = float(known["rate"]), float(known["rate"]) / float(known["sampling"])
+    if motion != "random":
+        found = coefficients.read(LIBRARY / robot if motion == "designed" else Path(motion))
+        t = np.arange(round(duration * rate) + 1) / rate
+        return Setup(chain, plant, Reference(t, *found.orders(t)), _drawn(chain, duration, rate, VALIDATION), every)
     model = known_robots.model(plant)
     kept = _nominal_base(robot).kept
-
-    def draw(number: int) -> Reference:
-        lower, upper = chain.sampling_limits()
-        middle, half = 0.5 * (lower + upper), 0.5 * REACH * (upper - lower)
-        speed = SPEED * np.array([joint.velocity for joint in chain.joints])
-        return random_fourier(
-            middle - half, middle + half, speed, duration, rate, HARMONICS, acceleration=ACCELERATION,
-            seed=np.random.default_rng([number, HARMONICS]),
-        )  # fmt: skip
 
     def condition(reference: Reference) -> float:
         part = slice(None, None, 2 * THIN)
@@ -110,8 +114,19 @@ def set_up(robot: str, duration: float) -> Setup:
         matrix = matrix.reshape(-1, len(kept))
         return float(np.linalg.cond(matrix / np.linalg.norm(matrix, axis=0)))
 
-    training = min((draw(number) for number in range(MOTION_TRIES)), key=condition)
-    return Setup(chain, plant, training, draw(10_000), every)
+    training = min((_drawn(chain, duration, rate, number) for number in range(MOTION_TRIES)), key=condition)
+    return Setup(chain, plant, training, _drawn(chain, duration, rate, VALIDATION), every)
+
+
+def _drawn(chain: Chain, duration: float, rate: float, number: int) -> Reference:
+    """Return a random Fourier series within the limits, always the same for a number."""
+    lower, upper = chain.sampling_limits()
+    middle, half = 0.5 * (lower + upper), 0.5 * REACH * (upper - lower)
+    speed = SPEED * np.array([joint.velocity for joint in chain.joints])
+    return random_fourier(
+        middle - half, middle + half, speed, duration, rate, HARMONICS, acceleration=ACCELERATION,
+        seed=np.random.default_rng([number, HARMONICS]),
+    )  # fmt: skip
 
 
 @lru_cache(maxsize=4)
@@ -121,12 +136,24 @@ def _nominal_base(robot: str) -> Base:
 
 @lru_cache(maxsize=2)
 def make_experiment(condition: Condition, seed: int) -> Experiment:
-    """Return the simulated data set of a condition and a seed; always the same.
+    """Return the simulated data set of a condition and a trial's seed, with its start values; always the same.
 
     Raises:
         CalibError: where the true robot cannot be recorded.
     """
-    setup = set_up(condition.robot, condition.duration)
+    number, guess = divmod(seed, condition.guesses)
+    data = data_set(condition, number)
+    values = _guess(set_up(condition).plant, condition.guess, guess if condition.guesses > 1 else seed)
+    problem = replace(data.problem, start=data.problem.base.transform @ values)
+    if guess:
+        vars(problem)["pooled"] = data.problem.pooled  # the same rows: reduced once for all guesses
+    return replace(data, problem=problem)
+
+
+@lru_cache(maxsize=2)
+def data_set(condition: Condition, seed: int) -> Experiment:
+    """Return the simulated data set of a condition and a seed, without start values; always the same."""
+    setup = set_up(condition)
     controller = known_robots.controller(condition.robot)
     true, model, base, truth = _robots(condition, setup, seed)
     case = _recorded(condition, setup, true, controller, seed)
@@ -135,8 +162,7 @@ def make_experiment(condition: Condition, seed: int) -> Experiment:
     terms = tuple(None if k < model.inertial else model.columns[k - model.inertial] for k in base.kept)
     problem = IdentificationProblem(
         model, base, (case,), decimator, (rows,), terms, np.full(base.b, -1),
-        loop=_loop(condition, controller), start=base.transform @ _guess(setup.plant, condition.guess, seed),
-        constraints=ConstraintSettings(bodies=True),
+        loop=_loop(condition, controller), constraints=ConstraintSettings(bodies=True),
     )  # fmt: skip
     part = slice(None, None, THIN)
     thin = Reference(*(series[part] for series in (setup.other.t, setup.other.q, setup.other.v, setup.other.a)))

@@ -179,11 +179,13 @@ def reasons(conditions: Sequence[ConditionSummary]) -> list[str]:
 
 
 def _described(one: Condition) -> str:
-    """Return a condition as one line: robot, noise, decimation, cutoff, mismatch."""
+    """Return a condition as one line: robot, motion, rate, noise, decimation, cutoff, mismatch, guesses."""
     filtered = f"{one.cutoff:g} Hz" if one.cutoff else "unfiltered"
     wrong = "" if one.mismatch == "none" else f", {one.mismatch}"
+    wrong += f", {one.guesses} guesses" if one.guesses > 1 else ""
+    what = one.robot + (f" {one.motion}" if one.motion != "random" else "") + (f" {one.rate:g} Hz" if one.rate else "")
     degrees = math.degrees(one.sigma_q)
-    return f"{one.robot}, {degrees:.3g}°, {one.sigma_tau:g} N·m, r = {one.decimation}, {filtered}{wrong}"
+    return f"{what}, {degrees:.3g}°, {one.sigma_tau:g} N·m, r = {one.decimation}, {filtered}{wrong}"
 
 
 def condition_table(one: ConditionSummary, names: Sequence[str] = ON_CONSOLE) -> Table:

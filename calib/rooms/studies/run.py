@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 from calib.errors import TaskLost
+from calib.identification.methods.registry import method_named
 from calib.rooms.studies.conditions import Study
 from calib.rooms.studies.store import RowStore
 from calib.rooms.studies.trial import Trials, grouped, run_trials
@@ -62,15 +63,18 @@ def span(seconds: float) -> str:
 
 
 def _missing(study: Study, store: RowStore) -> Iterator[Trials]:
-    """Yield the tasks that have no rows in the store, data set by data set over all conditions."""
+    """Yield the tasks that have no rows in the store, data set by data set over all conditions.
+
+    Methods that take no start values run once per data set, the others from each guess.
+    """
     most = max((max(runs.values(), default=0) for runs in study.runs), default=0)
     for number in range(most):
         for condition, runs, first in zip(study.conditions, study.runs, study.seeds):
-            seed, digest = first + number, condition.digest
-            wanted = [
-                name for name, count in runs.items() if number < count and not store.holds((digest, name, seed))
-            ]  # fmt: skip
-            yield from grouped(condition, wanted, seed)
+            digest, asked = condition.digest, [method_named(name) for name, count in runs.items() if number < count]
+            for guess in range(condition.guesses):
+                seed = (first + number) * condition.guesses + guess
+                own = [one.name for one in asked if one.takes_start or not guess]
+                yield from grouped(condition, [name for name in own if not store.holds((digest, name, seed))], seed)
 
 
 def run(study: Study, store: RowStore, workers: Workers, say: Callable[[Progress], None]) -> Progress:

@@ -2,7 +2,7 @@
 
 Failures count: a trial without an estimate has an infinite error, in medians and in comparisons. Methods are compared
 on the same data sets, pair by pair, by the sign test (Conover 1999, section 3.4), since errors of two methods on one
-data set go together and their distributions have long tails.
+data set go together and their distributions have long tails; of several guesses the first one is compared.
 
 The rule: of the methods that give an estimate in at least `RELIABLE` of the trials, those whose torque error on unseen
 motion cannot be distinguished from the best one's (`LEVEL`), or larger by no more than `SLACK` in the median data set,
@@ -122,7 +122,8 @@ def summarise(study: Study, rows: Iterable[TrialRow]) -> list[ConditionSummary]:
 
 def _ranked(condition: Condition, rows: Mapping[str, Sequence[TrialRow]]) -> ConditionSummary:
     lost = float("inf")  # error of a trial without an estimate
-    errors = {name: {row.seed: row.torque_error if row.found else lost for row in own} for name, own in rows.items()}
+    first = {name: [row for row in own if not row.seed % condition.guesses] for name, own in rows.items()}
+    errors = {name: {row.seed: row.torque_error if row.found else lost for row in own} for name, own in first.items()}
     plain = [_summary(name, own) for name, own in rows.items()]
     plain.sort(key=lambda one: (not one.reliable, one.figures["torque_error"].median))
     if not plain:

@@ -32,7 +32,8 @@ class TrialRow:
         method, seed: of the trial.
         status: how it ended: ``found``, another of `EstimateStatus`, ``not recorded``, ``failed``.
         message: why, in a line.
-        robot, sigma_q, sigma_tau, decimation, cutoff, mismatch, duration, guess: of the condition.
+        robot, sigma_q, sigma_tau, decimation, cutoff, mismatch, duration, guess: of the condition; what else there is
+            of it, digest and name tell.
         beta_error: 100 ‖β̂ - β‖ / ‖β‖ [%].
         beta_distance: the survey's d_β = 100 (2/p) Σ |β̂_j - β_j| / (|β̂_j| + |β_j|) [%].
         beta_sigma: rms of (β̂_j - β_j) / σ_j: 1 where the stated σ match the error.
@@ -40,7 +41,7 @@ class TrialRow:
         torque_error: 100 ‖τ̂ - τ‖ / ‖τ‖ along the validation motion, τ noise-free [%].
         torque_worst: the same of the worst joint.
         survey_tau: the survey's d_τ = 100 mean_k ‖τ_m - W β̂‖ / ‖τ_m‖ on its own data set, noise included [%].
-        survey_q: the survey's d_q = 100 mean_k ‖q - q_s‖ / ‖q‖, q_s simulated with β̂ [%]; of the first seeds only.
+        survey_q: the survey's d_q = 100 mean_k ‖q - q_s‖ / ‖q‖, q_s simulated with β̂ [%]; of the first data sets.
         iterations, simulations: of the method.
         seconds, cpu: wall and processor time of the method [s].
         version: of the toolkit; behind it that of the method, where it has changed: ``0.1.0``, ``0.1.0 method 2``.
@@ -113,7 +114,7 @@ def run_trials(trials: Trials) -> list[TrialRow]:
 
 def run_trial(condition: Condition, method: str, seed: int) -> TrialRow:
     """Return the row of a condition, a method and a seed; always the same, except for the times."""
-    known = {key: value for key, value in asdict(condition).items() if key not in ("name", "resimulated")}
+    known = {key: value for key, value in asdict(condition).items() if key in COLUMNS}
     head = {"condition": condition.name, "digest": condition.digest, "method": method, "seed": seed, **known}
     own = method_named(method)
     try:
@@ -170,9 +171,9 @@ def _survey_tau(data: Experiment, values: np.ndarray) -> float:
 
 def _resimulated(condition: Condition, data: Experiment, values: np.ndarray, seed: int) -> float:
     """Return the survey's position error d_q [%] of an estimate, simulated again without noise; NaN if unavailable."""
-    if seed >= condition.resimulated:
+    if seed // condition.guesses >= condition.resimulated:
         return NAN
-    setup, problem, model = set_up(condition.robot, condition.duration), data.problem, data.model
+    setup, problem, model = set_up(condition), data.problem, data.model
     plant = Plant(model.bodies, model.terms, problem.base.to_standard(values))
     controller, sensing = known_robots.controller(condition.robot), Sensing(every=setup.every)
     try:

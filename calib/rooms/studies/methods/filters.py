@@ -42,6 +42,7 @@ class _KalmanFilter(Method):
     """
 
     needs_simulation: bool = field(default=True, kw_only=True)
+    takes_start: bool = field(default=True, kw_only=True)
     auto_friction: str = field(default="standard", kw_only=True)
     takes_models: bool = field(default=False, kw_only=True)
     kind: Filter

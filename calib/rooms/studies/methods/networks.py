@@ -98,6 +98,7 @@ class _Network(Method):
 
     tunes: tuple[str, ...] = field(default=("learning rate", f"{STEPS:,} steps"), kw_only=True)
     version: int = field(default=2, kw_only=True)
+    takes_start: bool = field(default=True, kw_only=True)
     rate: float = 1.0
     steps: int = STEPS
 

@@ -54,6 +54,7 @@ class _OutputError(Method):
 
     needs_controller: bool = field(default=True, kw_only=True)
     needs_simulation: bool = field(default=True, kw_only=True)
+    takes_start: bool = field(default=True, kw_only=True)
     auto_friction: str = field(default="standard", kw_only=True)
     tunes: tuple[str, ...] = field(default=("damping", "tolerance 0.05 sigma"), kw_only=True)
     torques: bool
