@@ -160,7 +160,7 @@ def torque_slack(joints: tuple[int, ...], given: ExcitationInputs, where: str) -
     values = values if given.model.friction else values + exact.base.transform @ _typical_friction(given)
     rows = tuple(exact.limited[:, list(joints)].ravel().tolist())
     label = f"torque slack of joints {', '.join(str(j + 1) for j in joints)}"
-    return TorqueSlack(rows, values, exact.of_rows(limits), label=label)
+    return TorqueSlack(rows, values, exact.of_rows(limits), given.model.smooth.torque_gradient, label=label)
 
 
 def _typical_friction(given: ExcitationInputs) -> np.ndarray:

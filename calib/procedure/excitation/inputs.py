@@ -10,7 +10,7 @@ import numpy as np
 from calib.config import Tables
 from calib.dynamics import base as base_parameters
 from calib.dynamics import drives
-from calib.dynamics.base import Base, columns_at_rest, information, standard_name
+from calib.dynamics.base import Base, BaseModel, columns_at_rest, information, standard_name
 from calib.dynamics.bodies import STANDARD, Bodies, bodies_of, standard_parameters, with_payload
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.load_cases import LoadCases
@@ -332,7 +332,7 @@ def _identified(chain: Chain, folder: Path, texts: Sequence[str]) -> ExcitedMode
         name = model.names[int(np.argmin(np.isfinite(parameters)))]
         raise UsageError(f"{folder}: parameter {name} of the model is not finite")
     made = excited_model(model, loads, parameters, any(one.shape == "sign" for one in model.columns), notes)
-    covariance = _covariance(folder, made.exact.names)
+    covariance = _covariance(folder, made.exact)
     if covariance is None:
         notes.append(f"{folder}/covariance.csv has other columns than the design: no torque margin for uncertainty")
     return replace(made, covariance=covariance, notes=tuple(notes))
@@ -377,13 +377,11 @@ def excited_model(
     )
 
 
-def _covariance(folder: Path, names: Sequence[str]) -> np.ndarray | None:
-    """Return the covariance of the named columns; None if the file has other columns."""
+def _covariance(folder: Path, model: BaseModel) -> np.ndarray | None:
+    """Return the covariance of a model's columns; None if the file has other columns."""
     known, covariance = read_covariance(folder) if (folder / COVARIANCE).is_file() else ((), np.empty((0, 0)))
-    if not set(names) <= set(known):
-        return None
-    index = [known.index(name) for name in names]
-    return covariance[np.ix_(index, index)]
+    index = model.among(known)
+    return None if index is None else covariance[np.ix_(index, index)]
 
 
 def _read_locked(texts: Sequence[str], chain: Chain, limits: BoxLimit) -> dict[int, float | None]:

@@ -62,8 +62,8 @@ def geometry_spread(
     before = np.zeros((len(exact.names), errors.shape[1]))
     if stored is not None:
         names, *columns = csv_table.read_table(stored).cells  # an element each, then two tilts
-        rows = dict(zip(names.tolist(), np.column_stack(columns[: len(errors)]) @ errors))
-        if not set(exact.names) <= set(rows):
+        index = exact.among(names.tolist())
+        if index is None:
             return None
-        before = np.array([rows[name] for name in exact.names])
+        before = (np.column_stack(columns[: len(errors)]) @ errors)[index]
     return GeometrySpread(tuple((moved(one), moved(-one)) for one in errors.T), before)
