@@ -156,7 +156,7 @@ def select_poses(
     * ``polish`` moves all joint values of that set at once (`poses.continuous.local`).
     * ``local`` does so from one random set of the candidates, ``multistart`` from `starts` of them
       (`poses.continuous.multistart`): the study's deterministic search and its remedy.
-    * ``mlsl`` looks for the best start everywhere by NLopt's multi-level single linkage (`poses.continuous.global_local`).
+    * ``mlsl`` looks for the best start everywhere, by NLopt's MLSL (`poses.continuous.global_local`).
     * ``tabu`` is IMHATR, the two-stage meta-heuristic (`poses.continuous.tabu`).
 
     Args:

@@ -7,6 +7,7 @@ so, or a predicate, are those of the start. Half of the effort is for MLSL, the 
 """
 
 import time
+from contextlib import suppress
 from dataclasses import replace
 
 import nlopt
@@ -66,10 +67,8 @@ def mlsl_search(
     solver.set_lower_bounds(np.tile(space.lower, len(start)))
     solver.set_upper_bounds(np.tile(space.upper, len(start)))
     solver.set_maxeval(max(1, evaluations // 2))
-    try:
+    with suppress(nlopt.ForcedStop, nlopt.RoundoffLimited):  # the best set stands
         solver.optimize(start.ravel())
-    except (nlopt.ForcedStop, nlopt.RoundoffLimited):  # the best set stands
-        pass
     found = restored(space, found)
     bad = ~is_feasible(space, found, FEASIBLE)
     found[bad] = start[bad]
@@ -78,9 +77,7 @@ def mlsl_search(
     return replace(run, evaluations=spent + run.evaluations, interrupted=interrupted or run.interrupted)
 
 
-def _charged(
-    space: SearchSpace, q: np.ndarray, index: Index, existing: np.ndarray | None
-) -> tuple[float, np.ndarray]:
+def _charged(space: SearchSpace, q: np.ndarray, index: Index, existing: np.ndarray | None) -> tuple[float, np.ndarray]:
     """Return the smoothed merit of poses less the charge for violated constraints, and its gradient by q (m, n)."""
     value, gradient = merit_of(space, q, index, existing, SHARPNESS[0])
     broken = np.maximum(constraint_values(space, q), 0.0)

@@ -1,8 +1,8 @@
 """Search for exciting motions: sequential quadratic programming from several feasible starts, gradients exact.
 
 A start is a random motion inside the joint limits (`trajectories.design.starts`); if it breaks another constraint it is
-repaired (the squared excess is minimised), then searched from (`trajectories.design.search`). After the first stage,
-the cheapest, the better ones go on, and the best one goes on to the end (successive halving, Jamieson & Talwalkar 2016).
+repaired (the squared excess is minimised), then searched from (`trajectories.design.search`). After each round of
+stages only the best go on (successive halving, Jamieson & Talwalkar 2016).
 """
 
 import time
@@ -30,7 +30,7 @@ class Round(NamedTuple):
         return max(1, round(self.share * starts))
 
 
-ROUNDS = (Round(STAGES[:1], 1.0), Round(STAGES[1:2], 1 / 4), Round(STAGES[2:], 1 / 8))
+ROUNDS = (Round(STAGES[:1], 1.0), Round(STAGES[1:2], 1 / 2), Round(STAGES[2:], 1 / 6))
 """Our choice."""
 
 

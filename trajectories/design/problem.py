@@ -13,14 +13,7 @@ import numpy as np
 
 from trajectories.basis import Basis, Family, SampledMotion, sample_times
 from trajectories.constraints import MotionConstraint, Product, Regressor, Smoothed, smoothed
-from trajectories.design.objectives import (
-    Excitation,
-    FrictionCoverage,
-    Objective,
-    Observed,
-    TorqueSlack,
-    Value,
-)
+from trajectories.design.objectives import Excitation, FrictionCoverage, Objective, Observed, TorqueSlack, Value
 from trajectories.errors import BadInput, require
 
 _Matrix = tuple[int, int, int]
