@@ -7,7 +7,7 @@ import numpy as np
 
 from calib.data import csv_table
 from calib.dynamics.load_cases import LoadCases
-from calib.procedure.dynamic_stage.geometry_tables import SENSITIVITY
+from calib.procedure.dynamic_stage.geometry_tables import SENSITIVITY, TORQUE_COVARIANCE
 from calib.procedure.excitation.inputs import ExcitedModel, bodies_with
 from calib.robot import calibrated
 from calib.robot.calibrated import CalibratedChain
@@ -48,8 +48,10 @@ def geometry_spread(
         covariance = robot.covariance
     else:
         covariance = calibrated.read(path).covariance if path.suffix == ".toml" else None
-    if covariance is None or values is None or not (stored is None or stored.is_file()):
+    if covariance is None or values is None:
         return None
+    if after is not None and not all((after / name).is_file() for name in (SENSITIVITY, TORQUE_COVARIANCE)):
+        return None  # an earlier version's
     sizes, axes = np.linalg.eigh(covariance)
     errors = (axes * np.sqrt(np.maximum(sizes, 0.0)))[:, sizes > 1e-12 * sizes[-1]]
     own = exact.model.bodies
