@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from poses.by_index import exchanged_by_index, merits
 from poses.candidates import draw_candidates
+from poses.continuous.global_local import mlsl_search
 from poses.continuous.local import Improved, improved
 from poses.continuous.multistart import multistart_search, random_starts
 from poses.continuous.tabu import DEFAULT_RULE, TabuRule, tabu_search
@@ -22,7 +23,7 @@ from poses.information import Candidates, checked, log_det, prepared
 from poses.space import SearchSpace, is_feasible
 from poses.whole_space import Ceiling, bound_over_space
 
-Method = Literal["detmax", "polish", "local", "multistart", "tabu"]
+Method = Literal["detmax", "polish", "local", "multistart", "mlsl", "tabu"]
 Progress = Callable[[int, int, str], None]
 
 
@@ -155,6 +156,7 @@ def select_poses(
     * ``polish`` moves all joint values of that set at once (`poses.continuous.local`).
     * ``local`` does so from one random set of the candidates, ``multistart`` from `starts` of them
       (`poses.continuous.multistart`): the study's deterministic search and its remedy.
+    * ``mlsl`` looks for the best start everywhere, by NLopt's MLSL (`poses.continuous.global_local`).
     * ``tabu`` is IMHATR, the two-stage meta-heuristic (`poses.continuous.tabu`).
 
     Args:
@@ -192,6 +194,8 @@ def select_poses(
             chosen = _polished(task)
         case "local" | "multistart":
             chosen = _multistart(task, settings.starts if method == "multistart" else 1)
+        case "mlsl":
+            chosen = _mlsl(task)
         case "tabu":
             chosen = _tabu(task)
     return _selection(task, chosen, baseline, began)
@@ -337,9 +341,19 @@ def _multistart(task: _Request, starts: int) -> _Chosen:
     )  # fmt: skip
 
 
+def _mlsl(task: _Request) -> _Chosen:
+    """Look for a set everywhere within the limits, beginning at a random set of candidates."""
+    space, joints = _movable(task)
+    task.progress(0, 1, "global search")
+    start, effort = random_starts(joints, task.m, 1, task.seed)[0], task.settings
+    return _of(
+        mlsl_search(space, start, task.index, task.before, evaluations=effort.evaluations, seconds=effort.seconds)
+    )
+
+
 def _movable(task: _Request) -> tuple[SearchSpace, np.ndarray]:
     if task.space is None or task.q is None:
-        raise BadInput("polish, local and multistart change joint values: give space, and q with jacobians")
+        raise BadInput(f"{task.settings.method} changes joint values: give space, and q with jacobians")
     return task.space, task.q
 
 

@@ -111,6 +111,16 @@ class BaseModel:
     def units(self) -> tuple[str, ...]:
         return self.base.units
 
+    def among(self, names: Sequence[str]) -> list[int] | None:
+        """Return where each base parameter stands among others' names; None if one does not.
+
+        What is regrouped into it, and so the R of its name, may differ by another geometry or by joint corrections.
+        """
+        standard = self.model.names
+        place = {standard_name(name, standard): k for k, name in enumerate(names)}
+        own = [standard[k] for k in self.base.kept]
+        return [place[name] for name in own] if set(own) <= set(place) else None
+
     def regressor(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the base regressor (N, rows, b) at q, v, a (N, n), with all payloads."""
         full = self.model.regressor(q, v, a)

@@ -157,14 +157,13 @@ class IdentificationModel:
             values: (p,) of the parameters.
             weights: (N, rows) of the torques.
         """
-        if self.torque_rows.projection is not None or len(self.torque_rows.blocks) > 1:
-            return self.regressor_gradient(q, v, a, weights[:, :, None] * values)
         out = np.zeros((3, *np.shape(q)))
+        of_side = {side: self.torque_rows.fold(weights[:, :, None], (side,))[:, :, 0] for side in set(self.sides)}
         if self.inertial and values[: self.inertial].any():
-            out[:] = rigid_body.torque_gradient(self.bodies, values[: self.inertial], q, v, a, weights)
+            out[:] = rigid_body.torque_gradient(self.bodies, values[: self.inertial], q, v, a, of_side[BODIES])
         motions = [np.ascontiguousarray(np.asarray(x, dtype=float).T) for x in (q, v, a)]
         terms = [(one, value) for one, value in zip(self.columns, values[self.inertial :]) if value]
-        share = np.array([value for _, value in terms])[:, None, None] * weights.T
+        share = np.array([value * of_side[one.side].T for one, value in terms])
         drives.slopes([one for one, _ in terms], motions, share, [out[0].T, out[1].T, out[2].T])
         return out[0], out[1], out[2]
 

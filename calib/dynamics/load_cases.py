@@ -53,8 +53,10 @@ class LoadCases(BaseModel):
         one = super().regressor(q, v, a)
         if self._plain:
             return one
-        columns = one.transpose(2, 1, 0)
-        return np.concatenate([columns * mask[:, None, None] for mask in self._masks], axis=1).transpose(2, 1, 0)
+        columns, rows = np.concatenate([one.transpose(2, 1, 0)] * len(self.loads), axis=1), self.model.rows
+        for k, absent in enumerate(self._absent):
+            columns[absent, k * rows : (k + 1) * rows] = 0.0
+        return columns.transpose(2, 1, 0)
 
     def regressor_gradient(
         self, q: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray
@@ -62,17 +64,17 @@ class LoadCases(BaseModel):
         """Return the derivatives of Σ weights · regressor by q, v, a, each (N, n); weights (N, all rows, b)."""
         if self._plain:
             return super().regressor_gradient(q, v, a, weights)
-        parts = np.split(weights, len(self.loads), axis=1)
-        return super().regressor_gradient(
-            q, v, a, np.sum([part * mask for part, mask in zip(parts, self._masks)], axis=0)
-        )
+        parts = np.split(weights.transpose(2, 1, 0), len(self.loads), axis=1)
+        columns = sum(np.where(absent[:, None, None], 0.0, part) for part, absent in zip(parts, self._absent))
+        return super().regressor_gradient(q, v, a, np.transpose(columns, (2, 1, 0)))
 
     def torque_gradient(
         self, q: np.ndarray, v: np.ndarray, a: np.ndarray, values: np.ndarray, weights: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the derivatives of Σ weights · regressor values by q, v, a, each (N, n); weights (N, all rows)."""
-        parts = zip(np.split(weights, len(self.loads), axis=1), self._masks)
-        each = [super(LoadCases, self).torque_gradient(q, v, a, values * mask, part) for part, mask in parts]
+        parts = zip(np.split(weights, len(self.loads), axis=1), self._absent)
+        own = super().torque_gradient
+        each = [own(q, v, a, np.where(absent, 0.0, values), part) for part, absent in parts]
         by_q, by_v, by_a = (np.sum(one, axis=0) for one in zip(*each))
         return by_q, by_v, by_a
 
@@ -84,13 +86,13 @@ class LoadCases(BaseModel):
 
     @property
     def _plain(self) -> bool:
-        return len(self.loads) == 1 and bool(self._masks[0].all())
+        return len(self.loads) == 1 and not self._absent[0].any()
 
     @cached_property
-    def _masks(self) -> list[np.ndarray]:
-        """Factors (b,) of each load: zero for columns of payloads that are absent."""
+    def _absent(self) -> list[np.ndarray]:
+        """Columns (b,) of each load whose payloads are absent."""
         model, result = self.model, []
         for carried in self.loads:
             present = np.ones(model.inertial) if carried is None else model.carried_columns(carried)
-            result.append(np.append(present, np.ones(model.p - model.inertial))[self.base.kept])
+            result.append(np.append(present, np.ones(model.p - model.inertial))[self.base.kept] == 0.0)
         return result

@@ -13,6 +13,7 @@ power alone, vᵀ tau (`power`).
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from itertools import groupby
 
 import numpy as np
@@ -185,7 +186,7 @@ class TorqueRows:
             return weights
         n = weights.shape[1] // len(self.blocks)
         parts = [weights[:, k * n : (k + 1) * n] * used for k, used in enumerate(seen)]
-        return np.add.reduce(parts[::-1])
+        return reduce(np.add, parts[::-1])  # in the weights' memory order
 
     def target(self, motor: np.ndarray, sensor: np.ndarray | None, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Return the measured torques of the rows (N, rows).

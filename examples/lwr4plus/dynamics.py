@@ -2,14 +2,12 @@
 
 Kolyubin, Shiriaev & Jubien (2019), Int. J. Adv. Manuf. Technol. 101, 243-259, sections 4 and 6.2, on a simulated arm:
 the calibrated column of their Table 2, a 3.28 kg payload, joint torque sensors, 1 kHz, 10 Hz Butterworth, decimation to
-2 Hz. *Calibrated* is the geometry fitted to 17 measured poses. Motion: the best by condition number of 40 random
-Fourier series of five harmonics and 25 s, not their designed Trajectory B.
+2 Hz. *Calibrated* is the geometry fitted to 17 measured poses. The motion is Trajectory B of 44 columns, as
+`excitation.py` designs it; torques are predicted on it again, and on a random Fourier series of 25 s and five harmonics.
 
-By construction, so no evidence about a real arm: motor inertias and total friction are the published ones of another
-unit (Jubien, Gautier & Janot 2014); their split between the sides, offsets and noise are chosen with Table 4 in view;
-the truth obeys the model. The counts, and which inertial parameters turn out essential, do not depend on that. How many
-are essential depends on the noise and the rule: the paper supervised its rule by hand; here an F-test, then whatever
-has an RSD above 10 % goes, and the paper's own ratio of RSDs is shown beside it.
+What is by construction: see `simulated_arm.py`. The counts, and which inertial parameters turn out essential, do not
+depend on that. How many are essential depends on the noise and the rule: the paper supervised its rule by hand; here an
+F-test, then whatever has an RSD above 10 % goes, and the paper's own ratio of RSDs is shown beside it.
 
     python examples/lwr4plus/dynamics.py --out lwr4plus-dynamics [--quick] [--seed 0]
 """
@@ -17,102 +15,40 @@ has an RSD above 10 % goes, and the paper's own ratio of RSDs is shown beside it
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
+import excitation
 import geometry
 import numpy as np
 import study_options
 import study_tables
 from matplotlib.figure import Figure
+from simulated_arm import TABLE_4, Data, collected, controller, model, nominal_base, record, true_chain, true_parameters
 
 from calib import files
-from calib.data.recordings.recording import Recording
-from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics import base as bases
-from calib.dynamics import drives
 from calib.dynamics.base import Base
-from calib.dynamics.bodies import bodies_of, standard_parameters, with_payload
 from calib.dynamics.idim import IdentificationModel
-from calib.dynamics.torque_rows import BOTH, LINK, MODELS, MOTOR, TorqueRows
+from calib.dynamics.torque_rows import BOTH, MODELS, MOTOR, TorqueRows
 from calib.estimation.essential import Elimination, Rule, eliminate
 from calib.estimation.linear import LinearFit, settled_std, wls
-from calib.estimation.triangles import Triangles, absorb, empty
-from calib.identification.loop import Controller
-from calib.identification.rows import Case, make_case, observe
+from calib.identification.rows import observe
 from calib.procedure.report.style import AFTER, INK, PAGE_WIDTH, QUIET, save, sheet, styled
 from calib.robot.chain import Chain
-from calib.rooms.cells import known_robots, lwr4plus
+from calib.rooms.cells import lwr4plus
 from calib.rooms.cells.known_robots import random_fourier
-from calib.rooms.closed_loop.controllers import Reference, pd
-from calib.rooms.closed_loop.simulation import Plant, Sensing, feed_forward, simulate, tracking_error
-from calib.transforms import pose
+from calib.rooms.closed_loop.controllers import Reference
+from calib.rooms.closed_loop.simulation import Plant, feed_forward, tracking_error
 
-PAYLOAD = "8"
-RATE = 1000.0
+RATE = excitation.RATE
 REACH = 0.8 * np.deg2rad([170.0, 120.0, 170.0, 120.0, 170.0, 90.0, 170.0])
 SPEED = 0.8 * np.deg2rad([110.0, 110.0, 128.0, 128.0, 204.0, 184.0, 184.0])
-TORQUE = np.array([176.0, 176.0, 100.0, 100.0, 100.0, 38.0, 38.0])
 PAPER_JOINT_6 = 0.5  # [N m], within which Fig. 8's joint 6 stays "along most of the validation trajectory"
 RATIO, POOR = 30.0, 10.0  # r_σ of the paper's rule; RSD [%] above which a parameter goes
-FILTERS = FilterOptions(cutoff=10.0, band=2.0, clock="stamps")
-TABLE_4 = (
-    "Ia1", "Fvm1", "Fcm1", "Ia2", "Fvm2", "Fcm2", "Ia3", "Fvm3", "Fcm3", "Fvm4", "Ia5", "Fvm5", "Fcm5", "Ia6", "Fvm6",
-    "Fcm6", "Ia7", "Fvm7", "Fcm7", "offm7", "Fcl1", "Fcl2", "offl2", "Fcl3", "Fcl4", "offl4", "Fcl5", "offl5", "Fcl7",
-    "offl7", "XX2R", "ZZ2R", "MY2R", "XX4R", "ZZ4R", "MY4R", "MY5R", "MY6R", "XX8", "YY8", "YZ8", "MY8", "MZ8", "M8",
-)  # fmt: skip
 # Jubien, Gautier & Janot (2014), another unit, by way of kukaKDL's kukakdl_const.hpp; ZZ2R there holds Ia2. Its motor
 # inertias and friction are the truth here (by construction), so only the links' parameters are compared.
 PUBLISHED = {"XX2R": 1.31, "ZZ2R + Ia2": 4.46, "MY2R": 3.37, "XX4R": 0.368, "MY4R": -1.37, "MY5R": 0.049, "MY6R": 0.042}
-
-
-@dataclass(frozen=True)
-class Data:
-    """One motion, recorded without and with the payload."""
-
-    empty: Recording
-    loaded: Recording
-
-    def cases(self, kind: TorqueRows) -> list[Case]:
-        motions = [make_motion(part, FILTERS) for part in (self.empty, self.loaded)]
-        return [
-            make_case("empty", motions[0], kind, carried=()),
-            make_case("loaded", motions[1], kind, carried=(PAYLOAD,)),
-        ]
-
-
-def model(
-    chain: Chain, kind: TorqueRows, gravity: np.ndarray | None = None, v0: float = drives.V0
-) -> IdentificationModel:
-    """Return the study's model: seven links and a payload, seven drive terms each; the payload's move nothing.
-
-    The sign of Coulomb friction is smoothed over v0 [rad/s].
-    """
-    bodies = with_payload(
-        bodies_of(chain), pose(position=np.array([0.0, 0.0, known_robots.truth("lwr4plus")["payload"]["r"]]))
-    )
-    bodies = bodies if gravity is None else bodies.with_gravity(gravity)
-    terms = drives.standard([" ".join(known_robots.SIDED)] * chain.n, v0)
-    return IdentificationModel(bodies, (*terms, *drives.without_effect(PAYLOAD)), kind)
-
-
-def true_chain() -> Chain:
-    """Return the simulated arm: the calibrated column of Table 2 with the library's inertias."""
-    return lwr4plus.arm(lwr4plus.table_2()[1])
-
-
-def true_parameters(chain: Chain) -> np.ndarray:
-    """Return the standard parameters (136,) of the simulated arm, in the order of `model` of both rows."""
-    known = known_robots.truth("lwr4plus")
-    sided = [known["drives"][name][joint] for joint in range(chain.n) for name in known_robots.SIDED]
-    return np.concatenate([standard_parameters(chain), known["payload"]["inertia"], sided, np.zeros(7)])
-
-
-@cache
-def nominal_base(kind: TorqueRows) -> Base:
-    """Return the base columns of a model, chosen on the CAD geometry."""
-    return bases.find(model(lwr4plus.nominal_chain(), kind))
 
 
 def counts() -> dict[str, int]:
@@ -133,54 +69,15 @@ def counts() -> dict[str, int]:
     return found
 
 
-def choose_motion(chain: Chain, quick: bool, seed: int) -> Reference:
-    """Return the best of a few random motions by the condition number of Model 2's base columns at unit norm."""
-    both = model(chain, BOTH)
-    kept = nominal_base(BOTH).kept
-
-    def condition(reference: Reference) -> float:
-        part = slice(None, None, 250)
-        states = (reference.q[part], reference.v[part], reference.a[part])
-        rows = [both.regressor(*states, carried=load)[:, :, kept].reshape(-1, len(kept)) for load in ((), (PAYLOAD,))]
-        stacked = np.vstack(rows)
-        return float(np.linalg.cond(stacked / np.linalg.norm(stacked, axis=0)))
-
-    return min((fourier([seed, number]) for number in range(5 if quick else 40)), key=condition)
+def trajectory_b(quick: bool, seed: int) -> Reference:
+    """Return one period of Trajectory B, 44 columns, designed with the current estimate of the arm."""
+    effort = (1, 60) if quick else (excitation.STARTS, excitation.EVALUATIONS)
+    return excitation.designed(excitation.Plan("B", 44, seed=seed), excitation.estimate(seed), *effort)[0]
 
 
 def fourier(seed: list[int]) -> Reference:
+    """Return a random motion that no model is fitted to."""
     return random_fourier(-REACH, REACH, SPEED, 25.0, RATE, 5, seed=np.random.default_rng(seed))
-
-
-def record(chain: Chain, reference: Reference, seed: list[int]) -> Data:
-    """Let the true arm follow a motion, empty and loaded, and log positions, motor torques and joint torques."""
-    parts = [_record(chain, reference, loaded, [*seed, int(loaded)]) for loaded in (False, True)]
-    return Data(*parts)
-
-
-def _record(chain: Chain, reference: Reference, loaded: bool, seed: list[int]) -> Recording:
-    noise, values = known_robots.truth("lwr4plus")["noise"], true_parameters(chain)
-    whole = model(chain, MOTOR)
-    if not loaded:
-        values[10 * chain.n : 10 * (chain.n + 1)] = 0.0
-    plant = Plant(whole.bodies, whole.terms, values)
-    run = simulate(plant, controller(plant, reference), reference, Sensing(noise["sigma_q"]), seed)
-    link = model(chain, LINK)
-    shared = np.array([name in link.names for name in whole.names])
-    tau_l = np.einsum("kij,j->ki", link.regressor(run.q, run.v, run.a), values[shared])
-    rng = np.random.default_rng([*seed, 2])
-    sensed = tau_l + noise["sigma_tau_l"] * TORQUE * rng.normal(size=tau_l.shape)
-    motor = run.torque + noise["sigma_tau_m"] * TORQUE * rng.normal(size=tau_l.shape)
-    return Recording(
-        run.t, run.measured, motor, "torque", tuple(f"joint_{j + 1}" for j in range(chain.n)), tau_link=sensed
-    )
-
-
-def controller(plant: Plant, reference: Reference) -> Controller:
-    """Return a PD controller (8 Hz, damping 0.8, our choice) with feed-forward of gravity and friction."""
-    omega, inertia = 2 * np.pi * 8.0, plant.inertia_diagonal(reference.q[::500])
-    slow = replace(reference, a=0.0 * reference.a)
-    return pd(omega**2 * inertia, 2 * 0.8 * omega * inertia).with_feedforward(feed_forward(plant, slow))
 
 
 @dataclass(frozen=True)
@@ -212,16 +109,6 @@ def identify(chain: Chain, kind: TorqueRows, data: Data) -> Fit:
         f"F, RSD < {POOR:g} %": len(supervised.kept),
     }
     return Fit(own, base, wls(rows, std), supervised, rules)
-
-
-def collected(own: IdentificationModel, base: Base, data: Data) -> Triangles:
-    """Return the filtered and decimated rows of both loads, in one triangle per torque."""
-    result = empty(base.names, base.units, own.rows)
-    for case in data.cases(own.torque_rows):
-        rows = observe(own, base.kept, case, case.motion.decimator)
-        for row in range(own.rows):
-            result = absorb(result, rows.matrix[:, row], rows.target[:, row], row)
-    return result
 
 
 def values_of(found: Fit) -> np.ndarray:
@@ -309,8 +196,9 @@ def run(out: Path, quick: bool = False, seed: int = 0) -> dict[str, Any]:
     """Run the study; write and return the metrics."""
     nominal, truth = lwr4plus.nominal_chain(), true_chain()
     calibrated = geometry.fitted_arm(seed)
-    training, other = choose_motion(nominal, quick, seed), fourier([seed, 1001])
+    training, other = trajectory_b(quick, seed), fourier([seed, 1001])
     data, unseen = record(truth, training, [seed, 0]), record(truth, other, [seed, 1])
+    again = record(truth, training, [seed, 2])
     metrics: dict[str, Any] = {"counts": counts(), "models": {}}
     for number, kind in MODELS.items():
         found = identify(calibrated, kind, data)
@@ -323,7 +211,8 @@ def run(out: Path, quick: bool = False, seed: int = 0) -> dict[str, Any]:
     best = fits["calibrated"]
     metrics |= {
         "essential": essential(best),
-        "computed_torque": {name: computed_torque(found, unseen) for name, found in fits.items()},
+        "computed_torque": {name: computed_torque(found, unseen) for name, found in fits.items()}
+        | {"calibrated, B again": computed_torque(best, again)},
         "tracking_mrad": tracking(truth, fits, other),
         "cad_against_calibrated_percent": side_by_side(fits["cad"], best),
         "published": published(best),
@@ -367,7 +256,7 @@ def torques(found: Fit, data: Data) -> Figure:
 
 
 def main() -> None:
-    options = study_options.read(__doc__, quick="fewer candidate motions")
+    options = study_options.read(__doc__, quick="a design of little effort")
     study_tables.show(study_tables.dynamics(run(options.out, options.quick, options.seed)))
 
 

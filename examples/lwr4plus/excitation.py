@@ -27,17 +27,16 @@ from __future__ import annotations
 
 import sys
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Any
 
-import dynamics
 import excitation_figures as figures
 import numpy as np
 import study_options
 import study_tables
-from dynamics import PAYLOAD, TABLE_4
 from excitation_moves import moves, waypoint_spline
+from simulated_arm import PAYLOAD, TABLE_4, Data, collected, model, nominal_base, record, true_chain, true_parameters
 
 from calib import files
 from calib.api.motions import ExcitationDesign
@@ -51,7 +50,7 @@ from calib.estimation.triangles import combine
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit
 from calib.geometry.weighing import calibrated_chain
-from calib.procedure.excitation.design import search_motion
+from calib.procedure.excitation.design import Designed, search_motion
 from calib.procedure.excitation.inputs import ExcitationInputs, IdentifiableColumns, excited_model
 from calib.procedure.excitation.limits import read_motion_limits
 from calib.procedure.excitation.settings import ExcitationSettings
@@ -66,6 +65,8 @@ from trajectories.design.objectives import condition_numbers
 
 PERIODS = (10.0, 15.0, 20.0, 25.0, 30.0)  # the paper's T0, section 4.3 [s]
 PERIOD, SECONDS, RATE = 25.0, 50.0, 1000.0  # of a trajectory and of a log [s]; of the controller [Hz]
+STARTS, EVALUATIONS = 6, 250  # of a design
+FRONT = 6  # motions on the Pareto front of B
 SPEEDS = (0.3, 0.45, 0.6, 0.9)  # of the plain moves, shares of the limits
 NOISE = np.repeat([0.003, 0.015], 7)  # of the limits, on joint and motor torques: D's weights (the truth's)
 RUNS = ((PAYLOAD,), ())  # of the same motion: loaded, then empty
@@ -78,7 +79,7 @@ LIMITS = {
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """The arm as it is known: its geometry, and the standard parameters (136,) of `dynamics.model`."""
+    """The arm as it is known: its geometry, and the standard parameters (136,) of `model`."""
 
     chain: Chain
     values: np.ndarray
@@ -86,8 +87,8 @@ class Arm:
     @cached_property
     def observed(self) -> tuple[IdentificationModel, Base]:
         """Model 2, sharp, and its base columns: chosen on the CAD geometry, regrouped on this one."""
-        own = dynamics.model(self.chain, BOTH, v0=0.01)
-        return own, bases.regroup(dynamics.nominal_base(BOTH), own)
+        own = model(self.chain, BOTH, v0=0.01)
+        return own, bases.regroup(nominal_base(BOTH), own)
 
     @cached_property
     def without_payload(self) -> np.ndarray:
@@ -100,14 +101,14 @@ class Arm:
 
     def torque(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the larger of the motor torques' moduli with and without the payload (N, n)."""
-        Y = dynamics.model(self.chain, MOTOR, v0=0.01).regressor(q, v, a)
+        Y = model(self.chain, MOTOR, v0=0.01).regressor(q, v, a)
         return np.abs(np.stack([Y @ self.values, Y @ self.without_payload])).max(axis=0)
 
 
 @cache
 def truth() -> Arm:
-    chain = dynamics.true_chain()
-    return Arm(chain, dynamics.true_parameters(chain))
+    chain = true_chain()
+    return Arm(chain, true_parameters(chain))
 
 
 def estimate(seed: int) -> Arm:
@@ -119,11 +120,9 @@ def estimate(seed: int) -> Arm:
     measured = measure(lwr4plus_cell(), random_joints(nominal, 60, [seed, 1]), [seed, 2])
     chain = calibrated_chain(fit(install(nominal, [measured]), [measured])).chain
     bodies = np.arange(17 * (nominal.n + 1)) < 10 * (nominal.n + 1)
-    slow = moves(
-        nominal, Arm(nominal, dynamics.true_parameters(nominal) * bodies).torque, SPEEDS[0], seed, RATE, SECONDS
-    )
+    slow = moves(nominal, Arm(nominal, true_parameters(nominal) * bodies).torque, SPEEDS[0], seed, RATE, SECONDS)
     own, base = Arm(chain, np.zeros(0)).observed
-    rows = dynamics.collected(own, base, dynamics.record(truth().chain, slow, [seed, 3]))
+    rows = collected(own, base, record(truth().chain, slow, [seed, 3]))
     return Arm(chain, base.to_standard(wls(rows, settled_std(rows)).estimate.values))
 
 
@@ -134,7 +133,10 @@ def table_4(base: Base) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Plan:
-    """A trajectory to design: A, B or D, by the condition of 102 or 44 columns, by which knowledge."""
+    """A trajectory to design: A, B or D, by the condition of 102 or 44 columns, by which knowledge.
+
+    With `front` motions to choose from, between that condition and joint 6's torque.
+    """
 
     which: str
     columns: int = 102
@@ -142,6 +144,7 @@ class Plan:
     harmonics: int = 5
     seed: int = 0
     period: float = PERIOD
+    front: int = 0
 
     @property
     def name(self) -> str:
@@ -150,10 +153,10 @@ class Plan:
         return base + longer + {"truth": ", known truth", "cad": ", CAD geometry"}.get(self.knowledge, "")
 
 
-def designed(plan: Plan, arm: Arm, starts: int, evaluations: int) -> Reference:
-    """Return one period of a designed trajectory, verified between its samples."""
-    model, base = arm.observed
-    excited = excited_model(model, RUNS, arm.values, friction=True, base=base)
+def designed(plan: Plan, arm: Arm, starts: int, evaluations: int) -> tuple[Reference, list[dict[str, Any]]]:
+    """Return one period of a designed trajectory, verified between its samples, and what its front is worth."""
+    whole, base = arm.observed
+    excited = excited_model(whole, RUNS, arm.values, friction=True, base=base)
     columns = table_4(base) if plan.columns == len(TABLE_4) else np.arange(base.b)
     sigmas = np.tile(NOISE * np.tile(arm.effort, 2), len(RUNS)) if plan.which == "D" else None
     given = ExcitationInputs(
@@ -161,11 +164,20 @@ def designed(plan: Plan, arm: Arm, starts: int, evaluations: int) -> Reference:
         IdentifiableColumns(None, sigmas, base.names, chosen=columns), None,
     )  # fmt: skip
     settings = ExcitationSettings(
-        goals=GOALS[plan.which], period=plan.period, harmonics=plan.harmonics, rate=RATE,
+        goals=GOALS[plan.which], period=plan.period, harmonics=plan.harmonics, rate=RATE, front=plan.front,
         samples=80 + 8 * plan.harmonics, starts=starts, evaluations=evaluations, seed=plan.seed, outlook=False,
     )  # fmt: skip
-    found = ExcitationDesign(**vars(search_motion(given, settings)))
-    return Reference(*(series[:-1] for series in found.sampled()))  # periods follow each other
+    found = search_motion(given, settings)
+    return _period(found), [] if found.front is None else [
+        {"cond": motion["cond"]["44"]["raw"], "share": motion["torque_share"][5],
+         "best": bool(found.front.best[k]), "designed": k == found.front.designed}
+        for k, motion in enumerate(exact(_period(replace(found, found=run))) for run in found.front.found)
+    ]  # fmt: skip
+
+
+def _period(found: Designed) -> Reference:
+    """Return one period at the controller's rate without its end: periods follow each other."""
+    return Reference(*(series[:-1] for series in ExcitationDesign(**vars(found)).sampled()))
 
 
 def repeated(period: Reference, seconds: float = SECONDS) -> Reference:
@@ -190,16 +202,16 @@ def exact(motion: Reference) -> dict[str, Any]:
     }
 
 
-def logged(motion: Reference, seed: list[int]) -> dynamics.Data:
+def logged(motion: Reference, seed: list[int]) -> Data:
     """Return the logs of the true arm on a motion of 50 s, without and with payload."""
-    return dynamics.record(truth().chain, motion, seed)
+    return record(truth().chain, motion, seed)
 
 
-def fitted(arm: Arm, data: dynamics.Data) -> dict[str, Any]:
+def fitted(arm: Arm, data: Data) -> dict[str, Any]:
     """Filter, decimate and fit; what is said of the 44 with all 102 columns fitted, and fitted alone."""
     own, base = arm.observed
     true = (truth().observed[1].transform @ truth().values)[table_4(base)]
-    whole = dynamics.collected(own, base, data)
+    whole = collected(own, base, data)
     result: dict[str, Any] = {"truth": true.tolist(), "rows": int(whole.rows[0])}
     for name, rows in (("102 fitted", whole), ("44 fitted", whole.select(table_4(base)))):
         std = settled_std(rows)
@@ -237,16 +249,16 @@ class Task:
 @one_blas_thread()  # as the API does
 def done(task: Task) -> tuple[Reference, dict[str, Any]]:
     """Return the result of one task: motion, logs, identification and errors."""
-    arm, plan = task.arm, task.what
+    arm, plan, front = task.arm, task.what, list[dict[str, Any]]()
     if isinstance(plan, Plan):
         effort = task.evaluations * (2 if plan.which == "D" else 1)
         known = {"truth": truth(), "estimate": arm, "cad": Arm(lwr4plus.nominal_chain(), arm.values)}[plan.knowledge]
-        motion = designed(plan, known, task.starts, effort)
+        motion, front = designed(plan, known, task.starts, effort)
     elif plan is None:
         motion, _ = waypoint_spline(arm.chain, arm.torque, task.seed, RATE, PERIOD)
     else:
         motion = moves(arm.chain, arm.torque, plan, task.seed, RATE, SECONDS)
-    return motion, exact(motion) | fitted(arm, logged(repeated(motion), [task.seed, 4]))
+    return motion, exact(motion) | fitted(arm, logged(repeated(motion), [task.seed, 4])) | {"front": front}
 
 
 def study(
@@ -259,7 +271,10 @@ def study(
     for k in range(seed, seed + seeds):
         kinds = [("B", 44)] if quick else [("A", 102), ("B", 102), ("A", 44), ("B", 44)]
         for knowledge in ("estimate",) if quick or k > seed else ("estimate", "truth"):
-            wanted += [(Plan(which, columns, knowledge, seed=k), k) for which, columns in kinds]
+            chosen = ("B", 44, "estimate", seed)
+            wanted += [
+                (Plan(*kind, knowledge, seed=k, front=FRONT * ((*kind, knowledge, k) == chosen)), k) for kind in kinds
+            ]
         wanted += [(speed, k) for speed in ((0.45, 0.9) if quick else SPEEDS)] + [(None, k)]
     if not quick:
         wanted.append((Plan("D", 44, harmonics=12, seed=seed), seed))
@@ -334,8 +349,8 @@ def main() -> None:
         __doc__,
         quick="B of 44 columns and a few baselines, one seed",
         seeds=(3, "of designs, waypoints and noise"),
-        starts=(4, "of each design"),
-        evaluations=(250, "of each start; twice as many for D"),
+        starts=(STARTS, "of each design"),
+        evaluations=(EVALUATIONS, "of each start; twice as many for D"),
         workers=(2, "local processes"),
     )
     seeds = 1 if given.quick else given.seeds
@@ -353,6 +368,7 @@ def main() -> None:
     save(figures.paths(truth().chain, drawn), given.out / "plot_paths.png")
     save(figures.estimates(found["geometries"]), given.out / "plot_estimates.png")
     save(figures.speeds(found["motions"], SPEEDS), given.out / "plot_speeds.png")
+    save(figures.front(found["motions"]), given.out / "plot_front.png")
     study_tables.show(study_tables.excitation(found))
 
 

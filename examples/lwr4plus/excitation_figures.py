@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from dynamics import TABLE_4
 from matplotlib.figure import Figure
+from simulated_arm import TABLE_4
 
 from calib.procedure.report.style import AFTER, BEFORE, INK, MARK, PAGE_WIDTH, QUIET, log_axis, sheet, styled
 from calib.robot.chain import Chain
@@ -78,4 +78,23 @@ def speeds(rows: dict[str, list[dict[str, Any]]], shares: tuple[float, ...]) -> 
         log_axis(right.yaxis, 0.5, 15.0)
         right.annotate("dotted: trajectory B", (shares[0], 2.5), fontsize=7)
         left.legend(fontsize=7, loc="lower left")
+    return figure
+
+
+def front(rows: dict[str, list[dict[str, Any]]]) -> Figure:
+    """Draw the Pareto front of joint 6's torque and the condition number, the designs A and B, and the paper's goal."""
+    chosen = rows["B, 44 columns"][0]["front"]
+    best = sorted((one["share"], one["cond"]) for one in chosen if one["best"])
+    with styled():
+        figure, (axis,) = sheet(width=PAGE_WIDTH, height=2.8)
+        axis.plot(*zip(*best), "o-", color=AFTER, markersize=4, label="Pareto front, ε-constraint")
+        own = [(one["share"], one["cond"]) for one in chosen if one["designed"]]
+        axis.plot(*zip(*own), "s", color=MARK, markersize=7, label="B of seed 0, chosen")
+        for name, mark, colour in (("A", "^", BEFORE), ("B", "s", QUIET)):
+            seeds = [(one["torque_share"][5], one["cond"]["44"]["raw"]) for one in rows.get(f"{name}, 44 columns", [])]
+            if seeds:
+                axis.plot(*zip(*seeds), mark, color=colour, markersize=4, label=f"{name}, 44 columns, all seeds")
+        axis.plot([0.1], [35.0], "x", color=INK, label="asked by the paper: at most 35, at least 0.1")
+        axis.set(xlabel="mean torque of joint 6 / limit", ylabel="cond of 44 columns")
+        axis.legend(fontsize=7)
     return figure

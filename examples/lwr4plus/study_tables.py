@@ -192,6 +192,11 @@ def excitation(found: dict[str, Any]) -> Tables:
         for name, row in rows.items() if "102 fitted" in row
         for whole, alone in [(row["102 fitted"], row["44 fitted"])]
     ]  # fmt: skip
+    front = [
+        ("B, chosen" if one["designed"] else "front" if one["best"] else "dominated", f"{one['share']:.3f}",
+         f"{one['cond']:.1f}")
+        for one in sorted(found["motions"]["B, 44 columns"][0]["front"], key=lambda one: one["share"])
+    ]  # fmt: skip
     places = [
         (name, f"{row['median_rsd']:.3f}", f"{row['median_error']:.3f}", f"{row['error_in_sigma']:.2f}")
         for name, row in found["geometries"].items()
@@ -204,6 +209,7 @@ def excitation(found: dict[str, Any]) -> Tables:
         "excitation-designs": table(
             "motion | cond of 102 | cond of 44 | normalised | mean share τ6, τ7 | largest torque / limit", designs
         ),
+        "excitation-front": table("motion | mean share τ6 | cond of 44", front),
         "excitation-rsd": table(
             "motion | RSD [%] | wrist [%] | over B's | error [σ] | size, separation / B's | 44 alone: RSD [%] "
             "| over B's | error [σ]",

@@ -114,7 +114,9 @@ def test_a_predicate_is_kept_where_the_gradient_leads_into_it():
     assert run.merit > merit_of(space, start, "O1")[0]
 
 
-@pytest.mark.parametrize("method", ["polish", "local", "multistart", pytest.param("tabu", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "method", ["polish", "local", "multistart", "mlsl", pytest.param("tabu", marks=pytest.mark.slow)]
+)
 def test_methods_keep_constraints_repeat_by_seed_and_beat_random_sets(method):
     space = replace(SPACE, constraints=(LOW,), feasible=outside_the_wedge)
     runs = [

@@ -27,7 +27,7 @@ from trajectories.places import Clearance, Workspace
 BASE, CHI, CHAIN = arm.lwr()
 EFFORT = np.array([joint.effort for joint in CHAIN.joints])
 VELOCITY = np.array([joint.velocity for joint in CHAIN.joints])
-SLACK = TorqueSlack((5, 6), CHI, EFFORT)
+SLACK = TorqueSlack((5, 6), CHI, EFFORT, BASE.torque_gradient)
 
 
 def limits(radius: float = 0.3, lowest: float = -0.2) -> tuple:

@@ -37,7 +37,7 @@ OBJECTIVES = [
     Excitation("smallest", "normalised", sharpness=8.0, existing=PAST.T @ PAST),
     Excitation("trace", existing=PAST.T @ PAST),
     Excitation("trace", sigmas=np.linspace(0.2, 2.0, 7), columns=np.arange(3, 40), task=PAST.T[3:40] @ PAST[:, 3:40]),
-    TorqueSlack((5, 6), CHI, LIMITS),
+    TorqueSlack((5, 6), CHI, LIMITS, BASE.torque_gradient),
     FrictionCoverage(np.full(7, 0.2), np.full(7, 1.0), wanted=0.4),
     Duration(),
 ]
@@ -156,7 +156,7 @@ def test_the_slack_is_what_the_paper_minimises_up_to_the_stated_smoothing():
     motion = FAMILY.basis(np.linspace(0, 6, 60, endpoint=False)).motion(drawn())
     Y = BASE.regressor(motion.q, motion.v, motion.a)
     exact = np.mean(1 - np.abs((Y @ CHI)[:, 5:]) / LIMITS[5:])
-    slack = TorqueSlack((5, 6), CHI, LIMITS).evaluate(motion, Y).value
+    slack = TorqueSlack((5, 6), CHI, LIMITS, BASE.torque_gradient).evaluate(motion, Y).value
     assert exact <= slack <= exact + 1e-3
 
 

@@ -24,6 +24,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 
 from trajectories.basis import SampledMotion
+from trajectories.constraints import TorqueProduct
 from trajectories.errors import BadInput, NotExciting
 
 Index = Literal["cond", "logdet", "smallest", "trace"]
@@ -31,13 +32,13 @@ Scaling = Literal["raw", "normalised"]
 
 
 class Value(NamedTuple):
-    """An objective's value and gradients: in the regressor (N, n, b), q, v, a, jerk (4, N, n), and duration [1/s].
+    """An objective's value and gradients: in torques (N, n), q, v, a, jerk (4, N, n), and duration [1/s].
 
-    ``exact`` is the objective without smoothing, ``by_information`` ∂F/∂M (b, b) of the information's own.
+    ``exact`` is the objective without smoothing, ``by_information`` ∂F/∂M (c, c) of the information's own.
     """
 
     value: float
-    by_regressor: np.ndarray | None = None
+    by_torque: np.ndarray | None = None
     by_motion: np.ndarray | None = None
     by_duration: float = 0.0
     exact: float = np.nan
@@ -45,24 +46,23 @@ class Value(NamedTuple):
 
 
 class Observed(NamedTuple):
-    """A weighted observation matrix W (n N, b), joint after joint, and M = Wᵀ W + M_existing (b, b)."""
+    """A weighted observation matrix W (n N, c), joint after joint, and M = Wᵀ W + M_existing (c, c).
+
+    Its columns are those of a regressor (N, n, b) that an objective is of.
+    """
 
     W: np.ndarray
     M: np.ndarray
-    joints: int
+    shape: tuple[int, ...]
     sigmas: np.ndarray | None
+    columns: np.ndarray | slice
 
     def by_regressor(self, by_information: np.ndarray) -> np.ndarray:
-        """Return ∂F/∂regressor (N, n, b) = 2 W S over the sigmas, with S = ∂F/∂M (b, b), symmetric."""
-        b = len(by_information)
-        slope = (2 * by_information @ self.W.T).reshape(b, self.joints, -1).transpose(2, 1, 0)
-        return slope if self.sigmas is None else slope / self.sigmas[:, None]
-
-
-def observed(regressor: np.ndarray, sigmas: np.ndarray | None, existing: np.ndarray | None) -> Observed:
-    """Return the observation matrix of a regressor (N, n, b) and its information."""
-    W = _stacked(regressor if sigmas is None else regressor / sigmas[:, None])
-    return Observed(W, information(W, existing), regressor.shape[1], sigmas)
+        """Return ∂F/∂regressor (N, n, b) = 2 W S over the sigmas, with S = ∂F/∂M (c, c), symmetric."""
+        count, n, b = self.shape
+        slope = np.zeros((b, n, count))
+        slope[self.columns] = (2 * by_information @ self.W.T).reshape(len(by_information), n, count)
+        return (slope if self.sigmas is None else slope / self.sigmas[:, None]).transpose(2, 1, 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,19 +99,20 @@ class Excitation:
         return self.index + (f" {self.scaling}" if isinstance(self.scaling, str) else " scaled")
 
     def evaluate(self, motion: SampledMotion, regressor: np.ndarray) -> Value:
-        """Return the index and its gradients with respect to the regressor and to the information."""
-        seen = observed(regressor, self.sigmas, self.existing)
-        found = self.seen(seen)
-        return found._replace(by_regressor=seen.by_regressor(found.by_information))
+        """Return the index and its gradient with respect to the information."""
+        return self.seen(self.observed(regressor))
+
+    def observed(self, regressor: np.ndarray) -> Observed:
+        """Return the observation matrix of a regressor (N, n, b), of the objective's columns, and its information."""
+        columns = slice(None) if self.columns is None else self.columns
+        Y = regressor.transpose(2, 1, 0)[columns].transpose(2, 1, 0)
+        W = _stacked(Y if self.sigmas is None else Y / self.sigmas[:, None])
+        existing = None if self.existing is None else self.existing[columns][:, columns]
+        return Observed(W, information(W, existing), regressor.shape, self.sigmas, columns)
 
     def seen(self, matrix: Observed) -> Value:
-        """Return the index of another observation matrix with the same sigmas and existing information."""
-        M = matrix.M
-        if self.columns is None:
-            value, by_m, exact = self.of_information(M)
-        else:
-            part, by_m = np.ix_(self.columns, self.columns), np.zeros(M.shape)
-            value, by_m[part], exact = self.of_information(M[part])
+        """Return the index of another observation matrix with the same columns, sigmas and existing information."""
+        value, by_m, exact = self.of_information(matrix.M)
         return Value(value, exact=exact, by_information=by_m)
 
     def of_information(self, M: np.ndarray) -> tuple[float, np.ndarray, float]:
@@ -173,12 +174,14 @@ class TorqueSlack:
         joints: which.
         parameters: (b,) χ, of the regressor's columns.
         limits: (n,) τ_max [N m or N].
+        torque_product: (q, v, a, χ, G (N, n)) -> slopes of Σ G · Y χ.
         label: name; default: by the joints.
     """
 
     joints: tuple[int, ...]
     parameters: np.ndarray
     limits: np.ndarray
+    torque_product: TorqueProduct
     smoothing: float = 1e-3
     label: str = ""
 
@@ -193,7 +196,7 @@ class TorqueSlack:
         by_torque = np.zeros(regressor.shape[:2])
         by_torque[:, chosen] = -ratio / size / self.limits[chosen] / ratio.size
         value = 1.0 - float((size - self.smoothing).mean())
-        return Value(value, by_torque[:, :, None] * self.parameters, exact=value)
+        return Value(value, by_torque, exact=value)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,8 @@
 """Search for exciting motions: sequential quadratic programming from several feasible starts, gradients exact.
 
 A start is a random motion inside the joint limits (`trajectories.design.starts`); if it breaks another constraint it is
-repaired (the squared excess is minimised), then searched from (`trajectories.design.search`).
+repaired (the squared excess is minimised), then searched from (`trajectories.design.search`). After each round of
+stages only the best go on (successive halving, Jamieson & Talwalkar 2016).
 """
 
 import time
@@ -9,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from itertools import takewhile
-from typing import get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 
@@ -17,7 +18,20 @@ from trajectories.design.problem import ExcitationProblem, exact_values, stretch
 from trajectories.design.search import STAGES, Method, SearchResult, Stage, Stuck, one_start
 from trajectories.errors import BadInput, NotExciting, NothingFeasible, require
 
-KEPT = 1 / 3  # of the starts, which the last stages are for (our choice)
+
+class Round(NamedTuple):
+    """Stages that a share of the starts goes through, those with the best motions so far."""
+
+    stages: tuple[Stage, ...]
+    share: float
+
+    def count(self, starts: int) -> int:
+        """Return the number of starts that go through this round."""
+        return max(1, round(self.share * starts))
+
+
+ROUNDS = (Round(STAGES[:1], 1.0), Round(STAGES[1:2], 1 / 2), Round(STAGES[2:], 1 / 6))
+"""Our choice."""
 
 
 def design(
@@ -51,40 +65,45 @@ def design(
     began = time.perf_counter()
     tasks: list[int | np.ndarray] = [*guesses, *range(starts)]
     require(tasks, "no starts: ask for at least one, or give an initial guess")
-    search, polished = _Starts(problem, evaluations, method, seed, map, report, len(tasks)), list[SearchResult]()
+    search = _Starts(problem, evaluations, method, seed, map, report, sum(one.count(len(tasks)) for one in ROUNDS))
     try:
-        search.run(tasks, STAGES[:2])
-        if not search.interrupted:
-            polished = search.run(search.promising(), STAGES[2:])
+        ranked = tasks
+        for one in ROUNDS:
+            ranked = search.run(ranked[: one.count(len(tasks))], one.stages)
     except KeyboardInterrupt:
-        if not search.found:
+        if not any(search.found):
             raise
         search.interrupted = True
-    if not search.found:
+    if not any(search.found):
         raise _nothing(problem, search.stuck, len(tasks))
-    best = min(polished or search.found, key=lambda one: one.merit)
-    share = sum(one.feasible * one.evaluations for one in search.found) / search.spent
+    best = min(next(filter(None, reversed(search.found))), key=lambda one: one.merit)
     return replace(
-        best, evaluations=search.spent, feasible=share, seconds=time.perf_counter() - began,
+        best, evaluations=search.spent, feasible=search.kept / search.spent, seconds=time.perf_counter() - began,
         interrupted=search.interrupted,
     )  # fmt: skip
 
 
 class _Starts:
-    """Searches from several starts, in rounds."""
+    """Searches from several starts, in rounds.
+
+    Attributes:
+        found: motions of each round; `stuck`: searches without one.
+        spent: evaluations, of which `kept` kept all constraints.
+    """
 
     def __init__(
         self, problem: ExcitationProblem, evaluations: int, method: Method, seed: int, map: Callable,
-        report: Callable[[int, int, str], None] | None, starts: int,
+        report: Callable[[int, int, str], None] | None, total: int,
     ):  # fmt: skip
         self.problem, self.arguments, self.map, self.report = problem, (evaluations, method, seed), map, report
-        self.found, self.stuck = list[SearchResult](), list[Stuck]()
-        self.done, self.total = 0, starts + _kept(starts)
-        self.spent, self.interrupted = 0, False
+        self.found, self.stuck = list[list[SearchResult]](), list[Stuck]()
+        self.done, self.total = 0, total
+        self.spent, self.kept, self.interrupted = 0, 0.0, False
 
-    def run(self, tasks: list[int | np.ndarray], stages: tuple[Stage, ...]) -> list[SearchResult]:
-        """Run the given stages of the search for each task; return the results."""
-        fresh = list[SearchResult]()
+    def run(self, tasks: list[int | np.ndarray], stages: tuple[Stage, ...]) -> list[int | np.ndarray]:
+        """Run the given stages of the search for each task; return the variables, infeasible ones last."""
+        fresh, stuck = list[SearchResult](), list[Stuck]()
+        self.found.append(fresh)
         # a map in other processes may still hand back what it has
         wanted = takewhile(lambda _: not self.interrupted, tasks)
         for run in self.map(partial(one_start, self.problem, *self.arguments, stages=stages), wanted):
@@ -92,26 +111,16 @@ class _Starts:
             self.done += 1
             if isinstance(run, SearchResult):
                 fresh.append(run)
-                self.found.append(run)
+                self.kept += run.feasible * run.evaluations
                 self.interrupted |= run.interrupted
             else:
-                self.stuck.append(run)
+                stuck.append(run)
             if self.report:
-                best = min((one.merit for one in self.found), default=np.inf)
-                words = f"best so far {best:.4g}" if self.found else "nothing feasible yet"
-                self.report(self.done, self.total, words)
-        return fresh
-
-    def promising(self) -> list[int | np.ndarray]:
-        """Return the variables of the best motions so far; infeasible ones last, by constraint violation."""
-        ranked = sorted(self.found, key=lambda one: one.merit) + sorted(self.stuck, key=lambda one: one.excess)
-        chosen = ranked[: _kept(len(ranked))]
-        return [np.append(one.x, one.factor) if self.problem.free_period else one.x for one in chosen]
-
-
-def _kept(starts: int) -> int:
-    """Return the number of starts to search to the end."""
-    return max(1, round(KEPT * starts))
+                best = min((one.merit for one in fresh), default=np.inf)
+                self.report(self.done, self.total, f"best so far {best:.4g}" if fresh else "nothing feasible yet")
+        self.stuck += stuck
+        ranked = sorted(fresh, key=lambda one: one.merit) + sorted(stuck, key=lambda one: one.excess)
+        return [np.append(one.x, one.factor) if self.problem.free_period else one.x for one in ranked]
 
 
 def _nothing(problem: ExcitationProblem, stuck: list[Stuck], starts: int) -> NothingFeasible:

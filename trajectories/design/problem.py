@@ -13,17 +13,10 @@ import numpy as np
 
 from trajectories.basis import Basis, Family, SampledMotion, sample_times
 from trajectories.constraints import MotionConstraint, Product, Regressor, Smoothed, smoothed
-from trajectories.design.objectives import (
-    Excitation,
-    FrictionCoverage,
-    Objective,
-    Observed,
-    TorqueSlack,
-    Value,
-    observed,
-)
+from trajectories.design.objectives import Excitation, FrictionCoverage, Objective, Observed, TorqueSlack, Value
 from trajectories.errors import BadInput, require
 
+_Matrix = tuple[int, int, int]
 INSTANTS = 2000  # over a period at which a motion is looked at between its samples (our choice)
 
 
@@ -169,8 +162,8 @@ class Evaluation:
         return self._by_variables(empty, np.zeros(count))[count:]
 
     @cached_property
-    def _found(self) -> tuple[list[Value], dict[tuple[int, int], Observed]]:
-        seen: dict[tuple[int, int], Observed] = {}
+    def _found(self) -> tuple[list[Value], dict[_Matrix, Observed]]:
+        seen: dict[_Matrix, Observed] = {}
         wanted = (_sharpened(one, self.sharpness) for one in _terms(self.problem))
         return [_value(one, self.sampled, self.regressor, seen) for one in wanted], seen
 
@@ -236,18 +229,18 @@ def critical_times(
     return found[:: -(-len(found) // max_extra) or 1]
 
 
-def _value(one: Objective, motion: SampledMotion, Y: np.ndarray, seen: dict[tuple[int, int], Observed]) -> Value:
+def _value(one: Objective, motion: SampledMotion, Y: np.ndarray, seen: dict[_Matrix, Observed]) -> Value:
     """Evaluate an objective; indices of one observation matrix share it."""
     if not isinstance(one, Excitation):
         return one.evaluate(motion, Y)
     key = _matrix(one)
     if key not in seen:
-        seen[key] = observed(Y, one.sigmas, one.existing)
+        seen[key] = one.observed(Y)
     return one.seen(seen[key])
 
 
-def _matrix(one: Excitation) -> tuple[int, int]:
-    return id(one.sigmas), id(one.existing)
+def _matrix(one: Excitation) -> _Matrix:
+    return id(one.sigmas), id(one.existing), id(one.columns)
 
 
 def _summed(problem: ExcitationProblem, values: list[float]) -> tuple[float, np.ndarray]:
@@ -264,11 +257,11 @@ def _slope(
     Y: np.ndarray,
     found: list[Value],
     shares: np.ndarray,
-    seen: dict[tuple[int, int], Observed],
+    seen: dict[_Matrix, Observed],
 ) -> np.ndarray:
     """Return the gradients (4, N, n) of Σ shares · objectives in q, v, a, jerk, by one derivative product."""
     result, by_regressor = np.zeros((4, *motion.q.shape)), None
-    by_information: dict[tuple[int, int], np.ndarray] = {}
+    by_information: dict[_Matrix, np.ndarray] = {}
     for one, objective, share in zip(found, _terms(problem), shares):
         if share == 0.0:
             continue
@@ -277,8 +270,9 @@ def _slope(
         if isinstance(objective, Excitation):
             key = _matrix(objective)
             by_information[key] = by_information.get(key, 0.0) + share * one.by_information
-        elif one.by_regressor is not None:
-            by_regressor = share * one.by_regressor + (0.0 if by_regressor is None else by_regressor)
+        elif isinstance(objective, TorqueSlack) and one.by_torque is not None:
+            state = (motion.q, motion.v, motion.a)
+            result[:3] += objective.torque_product(*state, objective.parameters, share * one.by_torque)
     for key, S in by_information.items():
         slope = seen[key].by_regressor(S)
         by_regressor = slope if by_regressor is None else by_regressor + slope

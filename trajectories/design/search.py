@@ -143,7 +143,7 @@ def one_start(
             if number:
                 run, y = run.continued(run.reached(y), *_at_stage(problem, stage, extra))
             most = max(2, round(evaluations * stage.share))
-            for again in range(max_retries, -1, -1):
+            for again in range(0 if stage.rough else max_retries, -1, -1):
                 run.sharpness = stage.sharpness
                 y = run.solve(run.inside(y), most, method, stage.tolerance)
                 y = run.repaired(y, repair_evaluations)  # SLSQP travels outside, and may have ended there

@@ -33,7 +33,7 @@ OURS = (
     calibrated.ROBOT, MODEL, folders.ESTIMATE, folders.COVARIANCE, information.INFORMATION, INSTRUMENTAL,
     folders.METRICS, "drive_gains.csv",
     "torques_1.csv", calibrated.COVARIANCE, geometry_tables.EFFECTS, geometry_tables.SENSITIVITY,
-    geometry_tables.GEOMETRIES, "plot_torque_[0-9]*.png",
+    geometry_tables.GEOMETRIES, geometry_tables.TORQUE_COVARIANCE, "plot_torque_[0-9]*.png",
     *(f"plot_{name}.png" for name in ("residuals", "friction", "geometries", "geometry_effects")),
 )  # fmt: skip
 """Files of an earlier identification that a new one replaces."""

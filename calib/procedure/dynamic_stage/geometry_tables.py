@@ -4,7 +4,7 @@ Files in addition to those of every identification (``calib identify --out``)::
 
     estimate.csv          sigma and rsd are totals; sigma_torque is the part of the torques' noise, sigma_geometry that
                           of the geometry, empty where the robot came without a covariance (no folder of a fit)
-    covariance.csv        total: Sigma_torque + S Sigma_geometry S'
+    covariance.csv        total: Sigma_torque + S Sigma_geometry S'; covariance_torque.csv is Sigma_torque
     sensitivity.csv       S: change of each parameter per m or rad of each element of the chain, and per rad of tilt of
                           gravity about the base's x and y axes (gravity.rx, gravity.ry)
     geometry_effects.csv  the elements ranked by what one sigma of theirs does: the parameter that moves most, by how
@@ -22,11 +22,13 @@ from typing import NamedTuple
 import numpy as np
 
 from calib import files
+from calib.folders import write_covariance
 from calib.identification.geometry_uncertainty import NOTHING, TILTS, GeometryComparison, GeometryUncertainty
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.records import Number
 
 EFFECTS, SENSITIVITY, GEOMETRIES = "geometry_effects.csv", "sensitivity.csv", "geometries.csv"
+TORQUE_COVARIANCE = "covariance_torque.csv"
 MIN_SHIFT = float(np.sqrt((1.0 + NOTHING) ** 2 - 1.0))  # a shift, in σ_torque, that raises a σ by more than `NOTHING`
 
 
@@ -108,6 +110,7 @@ def write(outcome: IdentificationOutcome, folder: Path) -> None:
     header = [f"{name} [{unit}]" for name, unit in zip(carried.elements, carried.units)]
     files.write_table(folder / SENSITIVITY, ("name", *header), rows)
     files.write_table(folder / EFFECTS, GeometricEffect._fields, effects(carried))
+    write_covariance(folder / TORQUE_COVARIANCE, carried.names, carried.torque)
     if outcome.geometries is not None:
         table = _geometries(outcome.geometries, _essential_names(outcome))
         files.write_table(folder / GEOMETRIES, TwoGeometries._fields, table)

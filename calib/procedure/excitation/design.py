@@ -160,7 +160,7 @@ def torque_slack(joints: tuple[int, ...], given: ExcitationInputs, where: str) -
     values = values if given.model.friction else values + exact.base.transform @ _typical_friction(given)
     rows = tuple(exact.limited[:, list(joints)].ravel().tolist())
     label = f"torque slack of joints {', '.join(str(j + 1) for j in joints)}"
-    return TorqueSlack(rows, values, exact.of_rows(limits), label=label)
+    return TorqueSlack(rows, values, exact.of_rows(limits), given.model.smooth.torque_gradient, label=label)
 
 
 def _typical_friction(given: ExcitationInputs) -> np.ndarray:
@@ -511,10 +511,14 @@ def _front(
     evaluations: int,
     report: Callable[[int, int, str], None],
 ) -> Front:
-    """Return trade-offs by the ε-constraint: the first torque goal (default: wrist) from idle to its best value."""
+    """Return trade-offs by the ε-constraint: the first torque goal (default: wrist) from idle to its best value.
+
+    Against it stands the condition number among the goals; default the normalised one, or the aim.
+    """
     slack = next((one.objective for one in goals if isinstance(one.objective, TorqueSlack)), None)
     slack = slack or torque_slack(wrist(given.chain.n), given, "front")
-    bare, index = replace(problem, goals=()), problem.objectives[-1][0]  # normalised condition number, or the aim
+    stated = (one.objective for one in goals if isinstance(one.objective, Excitation))
+    bare, index = replace(problem, goals=()), next(stated, problem.objectives[-1][0])
     ends = proposed_goals(bare, [index, slack], starts=1, evaluations=300, guesses=(found.x,))
     known = [run for _, run in ends]
     return sweep(problem, index, slack, count, known, found, evaluations=evaluations, report=report)

@@ -10,7 +10,7 @@ import numpy as np
 from calib.config import Tables
 from calib.dynamics import base as base_parameters
 from calib.dynamics import drives
-from calib.dynamics.base import Base, columns_at_rest, information, standard_name
+from calib.dynamics.base import Base, BaseModel, columns_at_rest, information, standard_name
 from calib.dynamics.bodies import STANDARD, Bodies, bodies_of, standard_parameters, with_payload
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.load_cases import LoadCases
@@ -24,6 +24,7 @@ from calib.identification.identify_options import FileSettings
 from calib.identification.model_file import from_table, read_table, refuse_currents, refuse_other_arm
 from calib.identification.settings import IdentificationSettings, make_model
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
+from calib.procedure.dynamic_stage.geometry_tables import TORQUE_COVARIANCE
 from calib.procedure.dynamic_stage.inputs import read_motion
 from calib.procedure.excitation import coefficients
 from calib.procedure.excitation.limits import MotionLimits, check_bodies, read_motion_limits
@@ -332,7 +333,7 @@ def _identified(chain: Chain, folder: Path, texts: Sequence[str]) -> ExcitedMode
         name = model.names[int(np.argmin(np.isfinite(parameters)))]
         raise UsageError(f"{folder}: parameter {name} of the model is not finite")
     made = excited_model(model, loads, parameters, any(one.shape == "sign" for one in model.columns), notes)
-    covariance = _covariance(folder, made.exact.names)
+    covariance = _covariance(folder / COVARIANCE, made.exact)
     if covariance is None:
         notes.append(f"{folder}/covariance.csv has other columns than the design: no torque margin for uncertainty")
     return replace(made, covariance=covariance, notes=tuple(notes))
@@ -377,13 +378,11 @@ def excited_model(
     )
 
 
-def _covariance(folder: Path, names: Sequence[str]) -> np.ndarray | None:
-    """Return the covariance of the named columns; None if the file has other columns."""
-    known, covariance = read_covariance(folder) if (folder / COVARIANCE).is_file() else ((), np.empty((0, 0)))
-    if not set(names) <= set(known):
-        return None
-    index = [known.index(name) for name in names]
-    return covariance[np.ix_(index, index)]
+def _covariance(path: Path, model: BaseModel) -> np.ndarray | None:
+    """Return the covariance of a model's columns; None if the file has other columns."""
+    known, covariance = read_covariance(path) if path.is_file() else ((), np.empty((0, 0)))
+    index = model.among(known)
+    return None if index is None else covariance[np.ix_(index, index)]
 
 
 def _read_locked(texts: Sequence[str], chain: Chain, limits: BoxLimit) -> dict[int, float | None]:
@@ -502,24 +501,28 @@ def read_prior(
 
 
 def _known(folder: Path, model: ExcitedModel, geometry: GeometrySpread | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the information (b, b) of an identification, and the square root of its torque error density (rows,)."""
-    density, covariance = IdentificationFolder(folder).metrics().error_density, model.covariance
+    """Return the information (b, b) of an identification, and the square root of its torque error density (rows,).
+
+    Args:
+        geometry: where it is given, its part is not in the information.
+    """
+    density, path = IdentificationFolder(folder).metrics().error_density, folder / COVARIANCE
+    path = path if geometry is None else folder / TORQUE_COVARIANCE
+    covariance = _covariance(path, model.exact)
     if density is None or len(density) != model.exact.model.rows:
         raise UsageError(f"{folder}/metrics.json has no error_density of the torque rows; identify again")
     if covariance is None:
         raise UsageError(
-            f"{folder}/covariance.csv is missing or lacks columns of the design; if the model has payloads, state each "
-            "run's load (--load none --load tool)"
+            f"{path} is missing or lacks columns of the design; if the model has payloads, state each run's load "
+            "(--load none --load tool)"
         )
-    if geometry is not None:
-        covariance = covariance - geometry.before @ geometry.before.T
     spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     # what a constraint holds has no spread and gains nothing: as if known to a millionth (our choice)
     spread = np.where(spread > 0.0, spread, np.maximum(1e-6 * np.abs(cast(np.ndarray, model.values)), 1e-12))
     unit = covariance / np.outer(spread, spread)
     np.fill_diagonal(unit, 1.0 + 1e-9)
     if not np.linalg.eigvalsh(unit)[0] > 0.0:
-        raise UsageError(f"{folder}/covariance.csv is not positive definite, so it is damaged; identify again")
+        raise UsageError(f"{path} is not positive definite, so it is damaged; identify again")
     return np.linalg.inv(unit) / np.outer(spread, spread), np.tile(np.sqrt(density), len(model.exact.loads))
 
 

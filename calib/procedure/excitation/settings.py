@@ -79,7 +79,7 @@ class ExcitationSettings:
         evaluations: largest number of evaluations per start
         solver: slsqp (SciPy); mma, ccsaq or auglag (NLopt)
         seed: of all random numbers; the same seed gives the same motion
-        front: number of trade-offs between normalised condition number and first torque goal; 0: none
+        front: number of trade-offs between condition number (the goals', or normalised) and first torque goal; 0: none
         start: joint values with commas [rad or m]; adds an approach from there
         repeat: number of periods to run one after the other
         slower: factor of a slow rehearsal, written next to the motion; 1: none
@@ -101,7 +101,7 @@ class ExcitationSettings:
     columns: tuple[str, ...] = ()
     rate: Rate = 1000.0
     samples: Annotated[int, Whole(10, 100_000)] = 200
-    starts: Starts = 4
+    starts: Starts = 6
     evaluations: Evaluations = 1500
     solver: Annotated[Solver, OneOf(get_args(Solver))] = "slsqp"
     seed: Seed = 0

@@ -65,7 +65,7 @@ class SelectionSettings:
         kind: quantity that will be measured
         tools: x,y,z of a target in the tip's frame [m], repeated for several targets; default the tip itself
         index: observability index to maximise (O1 to O5), or cond to minimise
-        method: search method: detmax, polish, local, multistart or tabu
+        method: search method: detmax, polish, local, multistart, mlsl (NLopt's, global) or tabu
         candidates: number of poses to choose from
         sigmas: measurement σ of a position [m] and an orientation [rad], e.g. 1e-4,1e-4; default equal ones
         seed: reproduces everything random

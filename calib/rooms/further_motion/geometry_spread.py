@@ -7,7 +7,7 @@ import numpy as np
 
 from calib.data import csv_table
 from calib.dynamics.load_cases import LoadCases
-from calib.procedure.dynamic_stage.geometry_tables import SENSITIVITY
+from calib.procedure.dynamic_stage.geometry_tables import SENSITIVITY, TORQUE_COVARIANCE
 from calib.procedure.excitation.inputs import ExcitedModel, bodies_with
 from calib.robot import calibrated
 from calib.robot.calibrated import CalibratedChain
@@ -48,8 +48,10 @@ def geometry_spread(
         covariance = robot.covariance
     else:
         covariance = calibrated.read(path).covariance if path.suffix == ".toml" else None
-    if covariance is None or values is None or not (stored is None or stored.is_file()):
+    if covariance is None or values is None:
         return None
+    if after is not None and not all((after / name).is_file() for name in (SENSITIVITY, TORQUE_COVARIANCE)):
+        return None  # an earlier version's
     sizes, axes = np.linalg.eigh(covariance)
     errors = (axes * np.sqrt(np.maximum(sizes, 0.0)))[:, sizes > 1e-12 * sizes[-1]]
     own = exact.model.bodies
@@ -62,8 +64,8 @@ def geometry_spread(
     before = np.zeros((len(exact.names), errors.shape[1]))
     if stored is not None:
         names, *columns = csv_table.read_table(stored).cells  # an element each, then two tilts
-        rows = dict(zip(names.tolist(), np.column_stack(columns[: len(errors)]) @ errors))
-        if not set(exact.names) <= set(rows):
+        index = exact.among(names.tolist())
+        if index is None:
             return None
-        before = np.array([rows[name] for name in exact.names])
+        before = (np.column_stack(columns[: len(errors)]) @ errors)[index]
     return GeometrySpread(tuple((moved(one), moved(-one)) for one in errors.T), before)

@@ -73,7 +73,7 @@ def extend(session: Session, say: Say) -> list[str]:
     if designed.found.interrupted:
         raise KeyboardInterrupt
     motion_folder.write_design(designed, session.path(f"6-excitation/{round_name}"))
-    return [*_gains(designed, helped, weak), *notes]
+    return [*_gains(designed, helped, designed.inputs.columns.aimed_names if weak else ()), *notes]
 
 
 def _short_joints(session: Session) -> list[_Short]:

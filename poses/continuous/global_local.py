@@ -1,0 +1,86 @@
+"""Multi-level single linkage over all joint values (NLopt's MLSL), then the local search from the best set.
+
+MLSL (Rinnooy Kan & Timmer 1987; Sobol points as in Kucherenko & Sytsko 2005) starts a local search at a sampled point
+only if no better point lies near it, so that no optimum is searched twice. NLopt's knows bounds but no constraints:
+their violation is charged quadratically. The best set is brought back onto the constraints; poses that break them even
+so, or a predicate, are those of the start. Half of the effort is for MLSL, the rest for `poses.continuous.local`.
+"""
+
+import time
+from contextlib import suppress
+from dataclasses import replace
+
+import nlopt
+import numpy as np
+
+from poses.continuous.local import FEASIBLE, SHARPNESS, Improved, improved, merit_of, restored
+from poses.indices import Index
+from poses.space import SearchSpace, constraint_gradients, constraint_values, is_feasible
+
+CHARGE = 100.0  # of the merit, per squared unit of a violated constraint (our choice)
+POINTS = 4  # sampled between local searches (our choice)
+LOCAL = 60  # most evaluations of a local search, by NLopt's CCSAQ (our choice)
+
+
+def mlsl_search(
+    space: SearchSpace,
+    start: np.ndarray,
+    index: Index = "O1",
+    existing: np.ndarray | None = None,
+    *,
+    evaluations: int = 5000,
+    seconds: float = np.inf,
+) -> Improved:
+    """Return a set of poses by MLSL and a local search from the best set that it found.
+
+    Args:
+        space: limits, constraints, predicate, Jacobian.
+        start: (m, n) feasible poses, where MLSL begins [rad or m]; its other points are Sobol's.
+        index: what to improve.
+        existing: (k, rows, p) Jacobians of poses already measured.
+        evaluations: most of the index, of both parts together.
+        seconds: of processor time, of both parts together.
+    """
+    began, spent, best, found, interrupted = time.process_time(), 0, -np.inf, start, False
+    solver, local = (nlopt.opt(one, start.size) for one in (nlopt.G_MLSL_LDS, nlopt.LD_CCSAQ))
+
+    def charged(x: np.ndarray, slope: np.ndarray) -> float:
+        nonlocal spent, best, found, interrupted
+        spent += 1
+        try:
+            value, gradient = _charged(space, x.reshape(start.shape), index, existing)
+        except KeyboardInterrupt:  # NLopt hides an exception of its callbacks behind one of its own
+            interrupted, value, gradient = True, -np.inf, np.zeros(start.shape)
+        if interrupted or time.process_time() - began > seconds / 2:
+            solver.force_stop()
+        if slope.size:
+            slope[:] = -gradient.ravel()
+        if value > best:
+            best, found = value, x.reshape(start.shape).copy()
+        return -value
+
+    local.set_ftol_rel(1e-4)
+    local.set_maxeval(LOCAL)
+    solver.set_local_optimizer(local)
+    solver.set_population(POINTS)
+    solver.set_min_objective(charged)
+    solver.set_lower_bounds(np.tile(space.lower, len(start)))
+    solver.set_upper_bounds(np.tile(space.upper, len(start)))
+    solver.set_maxeval(max(1, evaluations // 2))
+    with suppress(nlopt.ForcedStop, nlopt.RoundoffLimited):  # the best set stands
+        solver.optimize(start.ravel())
+    found = restored(space, found)
+    bad = ~is_feasible(space, found, FEASIBLE)
+    found[bad] = start[bad]
+    left = 0.0 if interrupted else seconds - (time.process_time() - began)
+    run = improved(space, found, index, existing, evaluations=max(1, evaluations - spent), seconds=left)
+    return replace(run, evaluations=spent + run.evaluations, interrupted=interrupted or run.interrupted)
+
+
+def _charged(space: SearchSpace, q: np.ndarray, index: Index, existing: np.ndarray | None) -> tuple[float, np.ndarray]:
+    """Return the smoothed merit of poses less the charge for violated constraints, and its gradient by q (m, n)."""
+    value, gradient = merit_of(space, q, index, existing, SHARPNESS[0])
+    broken = np.maximum(constraint_values(space, q), 0.0)
+    by_q = np.einsum("mk,mkn->mn", broken, constraint_gradients(space, q))
+    value = (value if np.isfinite(value) else -1e6) - CHARGE * float((broken**2).sum())
+    return value, gradient - 2.0 * CHARGE * by_q
