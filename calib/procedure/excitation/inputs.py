@@ -179,11 +179,15 @@ def read_inputs(
         raise UsageError(
             f"drives '{settings.drives}': {model or 'the options file'} states the drive terms; leave it out"
         )
-    chain, source = load_rigid(robot, None, base, tip)
+    found, source = load_rigid(robot, None, base, tip)
+    chain, nominal = found.chain, found.nominal if found.moved else None
     known = read_motion_limits(limits, chain, source, predicted=model is not None)
+    if settings.within:
+        orders = _designed(Path(settings.within), chain)[:3]
+        known = known.narrowed([(one.min(axis=0), one.max(axis=0)) for one in orders])
     if settings.noise is not None and (after is not None or known.noise is not None):
         raise UsageError(f"noise: {after or '[noise] of the limits file'} states the torque errors; leave --noise out")
-    dynamics = read_model(chain, model, settings.drives, known, options, settings.loads)
+    dynamics = read_model(chain, model, settings.drives, known, options, settings.loads, nominal)
     dynamics = replace(dynamics, notes=(*dynamics.notes, *_unheld(dynamics, known)))
     noise = None if known.noise is None or after is not None else known.noise[dynamics.exact.joint_of_row]
     locked = _read_locked(settings.lock, chain, known.positions)
@@ -201,6 +205,7 @@ def read_model(
     limits: MotionLimits,
     options: IdentificationSettings | None = None,
     loads: Sequence[str] = (),
+    nominal: Chain | None = None,
 ) -> ExcitedModel:
     """Return the model to excite: from an identification's folder, or from the robot's inertias and the given friction.
 
@@ -209,6 +214,7 @@ def read_model(
         sets: drive terms of motor torques, where there are neither folder nor options.
         options: of the identification that will follow, where there is no folder.
         loads: see `ExcitationSettings`.
+        nominal: the arm before calibration, on which base columns are chosen as by the identification; None: `chain`.
 
     Raises:
         UsageError: for an unknown payload.
@@ -218,7 +224,7 @@ def read_model(
             raise UsageError(
                 f"identification {folder}: already states rows, drives and payloads; leave the options out"
             )
-        return _identified(chain, folder, loads)
+        return _identified(chain, folder, loads, nominal)
     notes = []
     if options is not None and not _designable(options.torque_rows):
         notes = [f"designed for motor torques: a motion cannot be designed for rows = '{options.torque_rows.name}'"]
@@ -247,7 +253,7 @@ def read_model(
         notes += said
         if not known:
             notes.append("friction is unknown (no model, no [friction]): torques are predicted without it")
-    return excited_model(model, cases, values, bool(known), notes)
+    return excited_model(model, cases, values, bool(known), notes, nominal_base(model, cases, nominal))
 
 
 def _unheld(model: ExcitedModel, limits: MotionLimits) -> list[str]:
@@ -310,7 +316,7 @@ def _differentiable(model: IdentificationModel) -> tuple[IdentificationModel, li
     return replace(model, terms=tuple(one for one in model.columns if one.form.slopes)), notes
 
 
-def _identified(chain: Chain, folder: Path, texts: Sequence[str]) -> ExcitedModel:
+def _identified(chain: Chain, folder: Path, texts: Sequence[str], nominal: Chain | None) -> ExcitedModel:
     """Return the model of an identification's folder with the payloads of the loads, and its covariance."""
     refuse_currents(folder, "an excitation within torque limits")
     refuse_other_arm(folder, chain)
@@ -331,7 +337,8 @@ def _identified(chain: Chain, folder: Path, texts: Sequence[str]) -> ExcitedMode
     if not np.isfinite(parameters).all():
         name = model.names[int(np.argmin(np.isfinite(parameters)))]
         raise UsageError(f"{folder}: parameter {name} of the model is not finite")
-    made = excited_model(model, loads, parameters, any(one.shape == "sign" for one in model.columns), notes)
+    friction = any(one.shape == "sign" for one in model.columns)
+    made = excited_model(model, loads, parameters, friction, notes, nominal_base(model, loads, nominal))
     covariance = _covariance(folder, made.exact.names)
     if covariance is None:
         notes.append(f"{folder}/covariance.csv has other columns than the design: no torque margin for uncertainty")
@@ -344,6 +351,18 @@ def bodies_with(chain: Chain, gravity: np.ndarray, payloads: Sequence[str]) -> B
     for label in payloads:
         bodies = with_payload(bodies, np.asarray(chain.tail), label, on=chain.n - 1)
     return bodies
+
+
+def moved_to(chain: Chain, model: IdentificationModel) -> IdentificationModel:
+    """Return a model, payloads included, on another geometry of its arm."""
+    payloads = [label for label, c in zip(model.bodies.labels, model.bodies.coordinates) if c < 0]
+    return replace(model, bodies=bodies_with(chain, model.bodies.gravity, payloads))
+
+
+def nominal_base(model: IdentificationModel, loads: Loads, nominal: Chain | None) -> Base:
+    """Return the base columns of a model, chosen on the nominal arm (None: on its own) as by the identification."""
+    there = None if nominal is None else moved_to(nominal, model)
+    return base_parameters.find(model, loads=loads, nominal=there)
 
 
 def excited_model(
@@ -528,7 +547,7 @@ def _designed(folder: Path, chain: Chain) -> tuple[np.ndarray, np.ndarray, np.nd
     found = coefficients.read(folder)
     if found.joint_names != tuple(chain.joint_names):
         raise UsageError(
-            f"existing {folder}: the motion has joints {', '.join(found.joint_names)}; {chain.name} has "
+            f"{folder}: the motion has joints {', '.join(found.joint_names)}; {chain.name} has "
             f"{', '.join(chain.joint_names)}"
         )
     count = max(1000, round(50 * found.period))

@@ -29,7 +29,7 @@ waypoints keeps what is stated only. Besides, per joint or ``all``::
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -219,6 +219,17 @@ class MotionLimits:
         free = np.full(len(self.torque), np.inf)
         boxes = (one for one in self.constraints if isinstance(one, BoxLimit) and one.order == 0)
         return next(boxes, BoxLimit(0, -free, free))
+
+    def narrowed(self, ranges: Sequence[tuple[np.ndarray, np.ndarray]]) -> "MotionLimits":
+        """Return the limits narrowed to the least and largest values (n,) of a motion's q, v and a; none at rest."""
+        boxes = {one.order: one for one in self.constraints if isinstance(one, BoxLimit)}
+        free = np.full(len(self.torque), np.inf)
+        for order, (low, high) in enumerate(ranges):
+            one, moves = boxes.get(order, BoxLimit(order, -free, free)), low < high
+            lower, upper = np.where(moves, low, -np.inf), np.where(moves, high, np.inf)
+            boxes[order] = replace(one, lower=np.maximum(one.lower, lower), upper=np.minimum(one.upper, upper))
+        others = (one for one in self.constraints if not isinstance(one, BoxLimit))
+        return replace(self, constraints=(*boxes.values(), *others))
 
     def broken(self, motion: SampledMotion) -> Iterator[tuple[MotionConstraint, str, int]]:
         """Yield (constraint, message, index of the worst of N states) for each violated constraint on positions."""

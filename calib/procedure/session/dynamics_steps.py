@@ -87,7 +87,8 @@ def excite(session: Session, say: Say) -> list[str]:
             rate=section.rate, starts=section.starts if first else 1,
             evaluations=section.evaluations if first else max(20, section.evaluations // 3),
             seed=session.settings.seed + (0 if first else VALIDATION_SEED), repeat=section.repeats, outlook=first,
-            goals=section.goals, hard=section.hard, front=section.front if first else 0,
+            goals=section.goals if first else (), hard=section.hard if first else (),
+            front=section.front if first else 0, within="" if first else str(session.path("6-excitation/training")),
         )  # fmt: skip
         designed = design.excite(
             session.fit.path, settings, limits=limits, options=options_of(session).settings,

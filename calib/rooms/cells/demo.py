@@ -34,7 +34,7 @@ from calib.rooms.viewer import viewer
 Say = Callable[[str], None]
 FIT, VALIDATION, AGAIN = 40, 20, 3
 DRIFT = 10e-6  # how far the simulated instrument wanders over a series [m]
-MOTION = {"period": 10.0, "starts": 2, "evaluations": 150, "repeats": 2, "torques": "both"}  # little effort, for time
+MOTION = {"period": 10.0, "starts": 2, "evaluations": 150, "repeats": 2, "torques": "motor"}  # little effort, for time
 SIMULATED = "simulated cell: {note}; nothing was measured on a robot"
 LOGS = (("training", 2, 240.0), ("validation", 3, 480.0))  # numbers of their noise, how long the arm ran before [s]
 
