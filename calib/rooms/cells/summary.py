@@ -1,0 +1,137 @@
+"""What the demonstration tells of itself: a line with one number for each step, how far it is, and five files.
+
+In letters that every terminal has, at most 60 of them a line.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+
+from calib.data.csv_table import read_table
+from calib.errors import command_line
+from calib.folders import CERTIFICATE, read_estimate
+from calib.procedure.export.delivery import prediction
+from calib.procedure.kinematic_stage.folder import URDF
+from calib.procedure.session.folder import SETTINGS, WAYS, Say, Session
+from calib.procedure.session.geometry_steps import chain_of
+from calib.procedure.session.steps import STEPS
+from calib.rooms.viewer import viewer
+
+PICTURE = "demo.png"
+SECONDS = {  # of processor time, about, by which the share done is told
+    "select": 1.0, "fit": 1.0, "validate": 0.1, "excite": 3.0, "record": 1.2, "identify": 3.0, "predict": 1.6,
+    "export": 0.3, "certificate": 2.0,
+}  # fmt: skip
+
+
+def row(name: str, number: float, words: str) -> str:
+    """Return a line of the summary: whose number, the number with three digits, what it is."""
+    return f"{name:<11} {number:>6.3g} {words}"
+
+
+def position_errors(session: Session) -> tuple[float, float]:
+    """Return the rms errors of nominal robot and robot.urdf on unseen poses [mm]."""
+    metrics = session.validation.metrics()
+    (rows,) = metrics.validation.values()
+    before, after = (errors.main for errors in (rows.nominal, rows.judged(metrics.deliverable)))
+    return (before.rms, after.rms) if before and after else (float("nan"),) * 2
+
+
+def torque_error(session: Session) -> float:
+    """Return the share of the torque that is unexplained on the unseen motion [%]."""
+    (score,) = session.identification.unseen.read().proofs.values()
+    return score.raw.relative_error_percent.total
+
+
+def _exported(session: Session) -> tuple[float, str]:
+    known, out = prediction(session.path(session.export)), session.path(session.export)
+    if known is None:
+        return len(list(out.iterdir())), "files for other programs"
+    return known.exported, "% of torque unexplained by the robot exported"
+
+
+def _minutes(session: Session) -> float:
+    """Return how long the run through the poses takes [min], the time to settle included."""
+    return read_table(session.path(f"2-poses/{WAYS}")).cells[0][-1] / 60.0
+
+
+NUMBERS: Mapping[str, Callable[[Session], tuple[float, str]]] = {
+    "describe": lambda s: (chain_of(s).n, f"joints: {s.settings.name}, simulated; its true errors are hidden"),
+    "select": lambda s: (s.settings.poses.fit, "poses chosen to measure"),
+    "measure": lambda s: (_minutes(s), "min at the robot to measure them"),
+    "fit": lambda s: (len(read_estimate(s.fit.path)), "parameters of its geometry, each with sigma"),
+    "validate": lambda s: (
+        position_errors(s)[1], f"mm error of robot.urdf, unseen poses: {s.validation.metrics().verdict}"
+    ),
+    "excite": lambda s: (s.settings.dynamics.period, "s of motion designed for its dynamics"),
+    "record": lambda s: (s.settings.dynamics.repeats, "periods of it logged, with torques"),
+    "identify": lambda s: (len(read_estimate(s.identification.path)), "parameters of its dynamics, each with sigma"),
+    "predict": lambda s: (
+        torque_error(s), f"% of torque unexplained, unseen motion: {s.identification.unseen.read().verdict}"
+    ),
+    "export": _exported,
+}  # fmt: skip
+"""Number of each step and what it is, read from the session's folders."""
+
+
+@dataclass
+class Telling:
+    """Tells of a session as it goes on.
+
+    Attributes:
+        say, show: lines that stay, and words that pass.
+        verbose: whether all that the session says is told besides.
+    """
+
+    session: Session
+    say: Say
+    show: Say
+    verbose: bool = False
+    began: float = field(default_factory=time.perf_counter)
+    _step: str = ""
+    _entered: float = 0.0
+
+    def said(self, *lines: str) -> None:
+        """Tell what the session says: the line of a step that is done and, if verbose, all its words."""
+        for words in lines:
+            step = words.partition(":")[0].rpartition(" ")[2]
+            if words[:1].isdigit() and step in NUMBERS:
+                self.say(row(step, *NUMBERS[step](self.session)))
+            if self.verbose:
+                self.say(f"    - {words.strip()}")
+
+    def progress(self, words: str) -> None:
+        """Show the stage, the share done and the time left; `words`: a stage's purpose, or what it does."""
+        now, purposes = time.perf_counter(), {step.purpose: step.name for step in STEPS}
+        if words in purposes:
+            self._step, self._entered = purposes[words], now
+        names = [step.name for step in STEPS if not step.stage or getattr(self.session, _STAGES[step.stage])]
+        before = sum(SECONDS.get(name, 0.0) for name in names[: names.index(self._step)])
+        pace = (self._entered - self.began) / before if before else 1.0
+        total, own = sum(SECONDS.get(name, 0.0) for name in names), SECONDS.get(self._step, 0.0)
+        done = before + min((now - self._entered) / pace, 0.95 * own)
+        stage = next(step.purpose for step in STEPS if step.name == self._step)
+        self.show(f"{stage}: {done / total:.0%} done, {(total - done) * pace:.0f} s left")
+
+
+_STAGES = {"geometry": "geometric", "dynamics": "dynamic"}
+
+
+def reasons(session: Session) -> Iterator[str]:
+    """Yield what a verdict other than pass means, and the commands that explain its reasons."""
+    found = {"geometry": session.validation.metrics()}
+    if session.dynamic:
+        found["dynamics"] = session.identification.unseen.read()
+    for stage, one in found.items():
+        if one.verdict != "pass":
+            yield f"{stage}: {one.verdict}; why: {command_line('explain', one.code)}"
+    if "marginal" in (one.verdict for one in found.values()):
+        yield "marginal: better than nominal, but a check found what the"
+        yield "model does not explain; use it after reading the reasons."
+
+
+def paths(session: Session) -> list[str]:
+    """Return the five files to look at."""
+    found = {"certificate": CERTIFICATE, "robot": f"{session.export}/{URDF}"}
+    found |= {"picture": PICTURE, "replay": viewer.FILE} if session.plots else {"truth": "truth.txt", "fit": "4-fit"}
+    return [f"{name:<11} {session.path(file)}" for name, file in {**found, "session": SETTINGS}.items()]
