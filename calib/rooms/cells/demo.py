@@ -32,7 +32,7 @@ from calib.rooms.cells.virtual_cells import virtual_cell
 FIT, VALIDATION, AGAIN = 40, 20, 3
 DRIFT = 10e-6  # how far the simulated instrument wanders over a series [m]
 ROBOT, HARD = "tx40", "lwr4plus"  # by default; where effects that no model holds are as large as those that some do
-MOTION = {"period": 10.0, "starts": 1, "evaluations": 150, "repeats": 2}  # little effort, for time
+MOTION = {"period": 10.0, "rate": 500.0, "starts": 1, "evaluations": 150, "repeats": 2}  # little effort, for time
 SIMULATED = "simulated cell: {note}; nothing was measured on a robot"
 LOGS = (("training", 2, 240.0), ("validation", 3, 480.0))  # numbers of their noise, how long the arm ran before [s]
 

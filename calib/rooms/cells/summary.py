@@ -88,15 +88,18 @@ class Telling:
     show: Say
     verbose: bool = False
     began: float = field(default_factory=time.perf_counter)
+    _told: set[str] = field(default_factory=set)
     _step: str = ""
     _entered: float = 0.0
 
     def said(self, *lines: str) -> None:
-        """Tell what the session says: the line of a step that is done and, if verbose, all its words."""
+        """Tell what the session says: of a step that is done its line, once, and if verbose all its words."""
         for words in lines:
             step = words.partition(":")[0].rpartition(" ")[2]
             if words[:1].isdigit() and step in NUMBERS:
-                self.say(row(step, *NUMBERS[step](self.session)))
+                told = row(step, *NUMBERS[step](self.session))
+                self.say(*({told} - self._told))
+                self._told.add(told)
             if self.verbose:
                 self.say(f"    - {words.strip()}")
 
