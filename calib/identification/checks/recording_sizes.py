@@ -8,8 +8,8 @@ A clock that runs s times too slow makes accelerations s² times too small, so t
 while masses, which gravity identifies, stay as they are. How large inertias are compared with masses, lengths alone say
 nearly: for rods between the joints their ratio is known up to 17 % on every recording at hand that identifies it
 (Panda, LWR4+, TX40, 11 of a UR10e), whatever the masses and the unit of the torques are. All these have six joints or
-more; arms of two, whose last link has no known length, are not looked at: one gave 45. A simulated TX40 gave 0.46: where
-the description has masses these are what inertias are compared with, if they are nearer (0.9 to 1.2 on these recordings).
+more; arms of two, whose last link has no known length, are not looked at: one gave 45. A simulated TX40 gave 0.46; so
+where the description has masses, inertias are compared with these if they are nearer (0.9 to 1.2 on these recordings).
 """
 
 from collections.abc import Callable, Sequence
