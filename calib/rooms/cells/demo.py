@@ -145,7 +145,7 @@ def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, 
         notes.append(arm.note)
         truth |= {"torque_percent": torques.identified, "within_two_sigma": within, "base_parameters": count}
         lines += [row("truth", torques.identified, "% true torque error on a random motion")]
-        lines += [row("truth", 100.0 * within, "% of parameters within two sigma of the truth")]
+        lines += [row("truth", 100.0 * within, "% of parameters are within two sigma")]
     files.write(session.path("truth.txt"), "\n".join([*notes, *lines]) + "\n")
     files.write_json(session.path("truth.json"), truth)
     say(*lines)

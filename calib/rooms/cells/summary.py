@@ -6,6 +6,7 @@ In letters that every terminal has, at most 60 of them a line.
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from shutil import get_terminal_size
 
 from calib.data.csv_table import read_table
 from calib.errors import command_line
@@ -47,7 +48,7 @@ def _exported(session: Session) -> tuple[float, str]:
     known, out = prediction(session.path(session.export)), session.path(session.export)
     if known is None:
         return len(list(out.iterdir())), "files for other programs"
-    return known.exported, "% of torque unexplained by the robot exported"
+    return known.exported, "% unexplained by the exported robot"
 
 
 def _minutes(session: Session) -> float:
@@ -56,18 +57,18 @@ def _minutes(session: Session) -> float:
 
 
 NUMBERS: Mapping[str, Callable[[Session], tuple[float, str]]] = {
-    "describe": lambda s: (chain_of(s).n, f"joints: {s.settings.name}, simulated; its true errors are hidden"),
+    "describe": lambda s: (chain_of(s).n, f"joints: {s.settings.name}, simulated, errors hidden"),
     "select": lambda s: (s.settings.poses.fit, "poses chosen to measure"),
     "measure": lambda s: (_minutes(s), "min at the robot to measure them"),
-    "fit": lambda s: (len(read_estimate(s.fit.path)), "parameters of its geometry, each with sigma"),
+    "fit": lambda s: (len(read_estimate(s.fit.path)), "parameters of its geometry, with sigma"),
     "validate": lambda s: (
-        position_errors(s)[1], f"mm error of robot.urdf, unseen poses: {s.validation.metrics().verdict}"
+        position_errors(s)[1], f"mm error left on unseen poses: {s.validation.metrics().verdict}"
     ),
     "excite": lambda s: (s.settings.dynamics.period, "s of motion designed for its dynamics"),
     "record": lambda s: (s.settings.dynamics.repeats, "periods of it logged, with torques"),
-    "identify": lambda s: (len(read_estimate(s.identification.path)), "parameters of its dynamics, each with sigma"),
+    "identify": lambda s: (len(read_estimate(s.identification.path)), "parameters of its dynamics, with sigma"),
     "predict": lambda s: (
-        torque_error(s), f"% of torque unexplained, unseen motion: {s.identification.unseen.read().verdict}"
+        torque_error(s), f"% of unseen torque unexplained: {s.identification.unseen.read().verdict}"
     ),
     "export": _exported,
 }  # fmt: skip
@@ -114,7 +115,8 @@ class Telling:
         total, own = sum(SECONDS.get(name, 0.0) for name in names), SECONDS.get(self._step, 0.0)
         done = before + min((now - self._entered) / pace, 0.95 * own)
         stage = next(step.purpose for step in STEPS if step.name == self._step)
-        self.show(f"{stage}: {done / total:.0%} done, {(total - done) * pace:.0f} s left")
+        words = f"{done / total:.0%} done, {(total - done) * pace:.0f} s left: {stage}"
+        self.show(words[: get_terminal_size().columns - 3])  # the spinner and the cursor need the rest
 
 
 _STAGES = {"geometry": "geometric", "dynamics": "dynamic"}
