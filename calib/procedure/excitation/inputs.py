@@ -10,7 +10,7 @@ import numpy as np
 from calib.config import Tables
 from calib.dynamics import base as base_parameters
 from calib.dynamics import drives
-from calib.dynamics.base import Base, columns_at_rest, information, standard_name
+from calib.dynamics.base import columns_at_rest, information, standard_name
 from calib.dynamics.bodies import STANDARD, Bodies, bodies_of, standard_parameters, with_payload
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.load_cases import LoadCases
@@ -214,7 +214,7 @@ def read_model(
         sets: drive terms of motor torques, where there are neither folder nor options.
         options: of the identification that will follow, where there is no folder.
         loads: see `ExcitationSettings`.
-        nominal: the arm before calibration, on which base columns are chosen as by the identification; None: `chain`.
+        nominal: see `excited_model`.
 
     Raises:
         UsageError: for an unknown payload.
@@ -253,7 +253,7 @@ def read_model(
         notes += said
         if not known:
             notes.append("friction is unknown (no model, no [friction]): torques are predicted without it")
-    return excited_model(model, cases, values, bool(known), notes, nominal_base(model, cases, nominal))
+    return excited_model(model, cases, values, bool(known), notes, nominal)
 
 
 def _unheld(model: ExcitedModel, limits: MotionLimits) -> list[str]:
@@ -337,8 +337,7 @@ def _identified(chain: Chain, folder: Path, texts: Sequence[str], nominal: Chain
     if not np.isfinite(parameters).all():
         name = model.names[int(np.argmin(np.isfinite(parameters)))]
         raise UsageError(f"{folder}: parameter {name} of the model is not finite")
-    friction = any(one.shape == "sign" for one in model.columns)
-    made = excited_model(model, loads, parameters, friction, notes, nominal_base(model, loads, nominal))
+    made = excited_model(model, loads, parameters, any(one.shape == "sign" for one in model.columns), notes, nominal)
     covariance = _covariance(folder, made.exact.names)
     if covariance is None:
         notes.append(f"{folder}/covariance.csv has other columns than the design: no torque margin for uncertainty")
@@ -359,19 +358,13 @@ def moved_to(chain: Chain, model: IdentificationModel) -> IdentificationModel:
     return replace(model, bodies=bodies_with(chain, model.bodies.gravity, payloads))
 
 
-def nominal_base(model: IdentificationModel, loads: Loads, nominal: Chain | None) -> Base:
-    """Return the base columns of a model, chosen on the nominal arm (None: on its own) as by the identification."""
-    there = None if nominal is None else moved_to(nominal, model)
-    return base_parameters.find(model, loads=loads, nominal=there)
-
-
 def excited_model(
     model: IdentificationModel,
     loads: Loads,
     values: np.ndarray | None,
     friction: bool,
     notes: Sequence[str] = (),
-    base: Base | None = None,
+    nominal: Chain | None = None,
 ) -> ExcitedModel:
     """Return the base model to excite, with a smoothed Coulomb sign for the search, from an identification model.
 
@@ -379,13 +372,14 @@ def excited_model(
         loads: payload labels of each run.
         values: (p,) of the model's parameters; None: unknown.
         friction: whether friction is among the values.
-        base: base columns; default those of the model under these loads.
+        nominal: the arm that base columns are chosen on, as by the identification; None: the model's own.
     """
     smoothed = (
         replace(one, settings=(max(SMOOTH, one.settings[0]),)) if one.shape == "sign" else one for one in model.terms
     )
     smooth = replace(model, terms=tuple(smoothed))
-    found = base_parameters.find(model, loads=loads) if base is None else base
+    there = None if nominal is None else moved_to(nominal, model)
+    found = base_parameters.find(model, loads=loads, nominal=there)
     chosen = None if values is None else found.transform @ values
     own = {model.names[k].removeprefix(name) for k in found.kept for name in STANDARD}
     lost = [label for label, c in zip(model.bodies.labels, model.bodies.coordinates) if c < 0 and label not in own]

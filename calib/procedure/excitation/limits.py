@@ -221,15 +221,9 @@ class MotionLimits:
         return next(boxes, BoxLimit(0, -free, free))
 
     def narrowed(self, ranges: Sequence[tuple[np.ndarray, np.ndarray]]) -> "MotionLimits":
-        """Return the limits narrowed to the least and largest values (n,) of a motion's q, v and a; none at rest."""
-        boxes = {one.order: one for one in self.constraints if isinstance(one, BoxLimit)}
-        free = np.full(len(self.torque), np.inf)
-        for order, (low, high) in enumerate(ranges):
-            one, moves = boxes.get(order, BoxLimit(order, -free, free)), low < high
-            lower, upper = np.where(moves, low, -np.inf), np.where(moves, high, np.inf)
-            boxes[order] = replace(one, lower=np.maximum(one.lower, lower), upper=np.minimum(one.upper, upper))
-        others = (one for one in self.constraints if not isinstance(one, BoxLimit))
-        return replace(self, constraints=(*boxes.values(), *others))
+        """Return the limits with those of a motion: least and largest q, v and a (n,), of joints that move."""
+        free = (np.where(low < high, [low, high], [[-np.inf], [np.inf]]) for low, high in ranges)
+        return replace(self, constraints=(*self.constraints, *(BoxLimit(k, *both) for k, both in enumerate(free))))
 
     def broken(self, motion: SampledMotion) -> Iterator[tuple[MotionConstraint, str, int]]:
         """Yield (constraint, message, index of the worst of N states) for each violated constraint on positions."""
