@@ -79,7 +79,7 @@ def run(
     cell = virtual_cell(robot, seed)
     if dynamics and cell.nominal.inertias is None:
         known = ", ".join(name for name in library.names() if load(name).inertias is not None)
-        say(f"geometry only: the library has masses for {known} alone")
+        say(f"geometry only: masses are known of {known}")
         dynamics = False
     motion = MOTION | {"torques": "both" if sensed(robot) else "motor"} if dynamics else {}
     begin = partial(

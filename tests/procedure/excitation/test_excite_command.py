@@ -135,7 +135,7 @@ def test_motions_before_count(earlier, tmp_path):
 
 def test_a_motion_to_validate_on_stays_within_the_earlier_one(earlier):
     """And is another motion: joint by joint its positions are not those of the first."""
-    found = design.excite("lwr4plus", replace(SHORT, period=12.0, within=str(earlier), seed=5))
+    found = design.excite("lwr4plus", replace(SHORT, period=12.0, evaluations=10, within=str(earlier), seed=5))
     first = coefficients.read(earlier)
     known = first.orders(np.linspace(0.0, first.period, 1000))
     motion = dense_motion(found.family, found.found.x, np.linspace(0.0, found.period, 1000))
