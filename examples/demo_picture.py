@@ -23,7 +23,6 @@ README = Path(__file__).parents[1] / "README.md"
 SENTENCES = (  # of the README: where a figure stands, and its form
     "unseen poses: {nominal_mm:.2f} mm before, {calibrated_mm:.2f} mm after",
     "unseen motion: {unexplained_percent:.1f} % of torque unexplained",
-    "{processor_seconds:.0f} s of processor time once compiled; {memory_mb:.0f} MB",
     "demo {within_two_sigma_percent:.0f} % within 2σ",
 )
 FIELD = re.compile(r"\{(\w+):(\S+)\}")

@@ -10,6 +10,7 @@ from calib.procedure.report.charts import Chart, Panel, line, picture, text
 from calib.procedure.report.geometry_figures import error_histogram
 from calib.procedure.report.style import AFTER, BEFORE, BROWN, INK, QUIET
 from calib.procedure.session.folder import Session
+from calib.procedure.session.geometry_steps import chain_of
 from calib.rooms.cells.summary import PICTURE, position_errors, torque_error
 from calib.rooms.viewer import scene
 
@@ -31,24 +32,23 @@ def _seen_from(points: np.ndarray) -> np.ndarray:
 
 def _cell(session: Session) -> Panel:
     """Return the arm at one of its poses, and the errors at all poses before and after, enlarged."""
-    shown = scene.read(session.folder)
-    (measured,), chain = shown.measured, shown.chain
-    scale, arm = measured.arrow_scale(chain), _seen_from(scene.strips(chain, measured.q)[0])
-    pose = arm[int(np.argmax(arm[:, -1, 1] + np.abs(arm[:, -1, 0])))]
-    layers = [line(*pose.T, colour=QUIET, width=5.0), line(*pose.T, "o", colour=INK, size=4.0)]
+    (measured,), chain = scene.read(session.folder).measured, chain_of(session)
+    scale, arm = measured.arrow_scale(chain), _seen_from(scene.skeleton(chain, measured.q))
+    x, y = arm[int(np.argmax(arm[:, -1, 1] + np.abs(arm[:, -1, 0])))].T
+    layers = [line(x, y, colour=QUIET, width=5.0), line(x, y, "o", colour=INK, size=4.0)]
     for found, colour in ((measured.nominal, BEFORE), (measured.calibrated, AFTER)):
         ends = measured.seen + scale * (found - measured.seen)
         strokes = np.stack([_seen_from(measured.seen), _seen_from(ends), np.full((len(ends), 2), np.nan)], axis=1)
-        layers.append(line(*strokes.reshape(-1, 2).T, colour=colour, width=1.4))
+        layers.append(line(strokes[..., 0].ravel(), strokes[..., 1].ravel(), colour=colour, width=1.4))
     return Panel(layers, f"{len(measured.q)} poses, errors × {scale:g}", "[m]", "[m]", equal=True, ticks=5)
 
 
 def _errors(session: Session) -> Panel:
     """Return the histogram of the errors of nominal robot and robot.urdf on unseen poses."""
     (rows,) = (one for one in fit_report.read(session.validation.report).sets if one.unseen)
-    sizes = (np.array(one["position"]) for one in (rows.nominal, rows.urdf_alone or rows.calibrated))
+    one, two = (np.array(sizes["position"]) for sizes in (rows.nominal, rows.urdf_alone or rows.calibrated))
     before, after = position_errors(session)
-    return replace(error_histogram(*sizes).panels[0], title=f"unseen poses: {before:.2f} → {after:.2f} mm")
+    return replace(error_histogram(one, two).panels[0], title=f"unseen poses: {before:.2f} → {after:.2f} mm")
 
 
 def _torque(session: Session) -> Panel:
@@ -66,6 +66,5 @@ def _torque(session: Session) -> Panel:
     ):  # fmt: skip
         layers.append(line(t, values[:, j], colour=colour, width=width))
         layers.append(text(name, t[0] + at * (t[-1] - t[0]), above, (0, 0), colour))
-    ends = {"xlim": (t[0], t[-1]), "ylim": (1.1 * low, 1.1 * above)}
-    title = f"{torque_error(session):.1f} % of torque unexplained"
-    return Panel(layers, title, "unseen motion [s]", f"{unseen.rows[j]} [{unseen.units[j]}]", **ends)
+    title, y = f"{torque_error(session):.1f} % of torque unexplained", f"{unseen.rows[j]} [{unseen.units[j]}]"
+    return Panel(layers, title, "unseen motion [s]", y, xlim=(t[0], t[-1]), ylim=(1.1 * low, 1.1 * above))

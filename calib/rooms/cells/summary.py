@@ -8,11 +8,15 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from shutil import get_terminal_size
 
+import numpy as np
+
 from calib.data.csv_table import read_table
 from calib.errors import command_line
 from calib.folders import CERTIFICATE, read_estimate
+from calib.procedure.dynamic_stage.metrics import UnseenReport
 from calib.procedure.export.delivery import prediction
 from calib.procedure.kinematic_stage.folder import URDF
+from calib.procedure.kinematic_stage.metrics import ValidationMetrics
 from calib.procedure.session.folder import SETTINGS, WAYS, Say, Session
 from calib.procedure.session.geometry_steps import chain_of
 from calib.procedure.session.steps import STEPS
@@ -35,7 +39,7 @@ def position_errors(session: Session) -> tuple[float, float]:
     metrics = session.validation.metrics()
     (rows,) = metrics.validation.values()
     before, after = (errors.main for errors in (rows.nominal, rows.judged(metrics.deliverable)))
-    return (before.rms, after.rms) if before and after else (float("nan"),) * 2
+    return (before.rms, after.rms) if before and after else (np.nan, np.nan)
 
 
 def torque_error(session: Session) -> float:
@@ -124,13 +128,12 @@ _STAGES = {"geometry": "geometric", "dynamics": "dynamic"}
 
 def reasons(session: Session) -> Iterator[str]:
     """Yield what a verdict other than pass means, and the commands that explain its reasons."""
-    found = {"geometry": session.validation.metrics()}
-    if session.dynamic:
-        found["dynamics"] = session.identification.unseen.read()
-    for stage, one in found.items():
+    found: list[ValidationMetrics | UnseenReport] = [session.validation.metrics()]
+    found += [session.identification.unseen.read()] if session.dynamic else []
+    for stage, one in zip(("geometry", "dynamics"), found):
         if one.verdict != "pass":
             yield f"{stage}: {one.verdict}; why: {command_line('explain', one.code)}"
-    if "marginal" in (one.verdict for one in found.values()):
+    if "marginal" in (one.verdict for one in found):
         yield "marginal: better than nominal, but a check found what the"
         yield "model does not explain; use it after reading the reasons."
 
