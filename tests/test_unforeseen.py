@@ -42,11 +42,8 @@ def test_whatever_happens_is_one_line_and_a_code(error, code, words, monkeypatch
     assert len(reports) == (code == 4)
     if reports:
         text = reports[0].read_text()
-        assert (
-            text.startswith(f"Send this to {bug_reports.TRACKER}.\ncalib formats mdh\nPython ")
-            and "in describe" in text
-            and "numpy " in text
-        )
+        assert text.startswith(f"calib formats mdh\nfor {bug_reports.TRACKER}\nPython ")
+        assert "in describe" in text and "numpy " in text
 
 
 def test_reports_readme_and_project_name_one_tracker() -> None:
