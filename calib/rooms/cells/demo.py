@@ -25,7 +25,7 @@ from calib.robot.library import load
 from calib.rooms.cells.camera_cell import CameraCell, limits_of, seen_by_camera, take_pictures
 from calib.rooms.cells.cell import Cell, measure, planned_poses, wandering, write_log, write_measured
 from calib.rooms.cells.summary import Telling, row
-from calib.rooms.cells.truth import position_errors, share_within, torque_errors, true_base
+from calib.rooms.cells.truth import TRUTH, position_errors, share_within, torque_errors, true_base
 from calib.rooms.cells.virtual_arm import REST, MovingArm, moving_arm, play, record, sensed
 from calib.rooms.cells.virtual_cells import virtual_cell
 
@@ -133,7 +133,7 @@ def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, 
         row("truth", bare, "mm true error of robot.urdf"),
     ]
     truth: dict[str, object] = {"position_mm": {"nominal": before, "calibrated": after, "urdf_alone": bare}}
-    notes = [cell.note]
+    notes = [cell.note, f"errors over {TRUTH} poses of the whole joint range, rms"]
     if session.dynamic:
         arm = arm_of(session, cell)
         chain, dynamics = read_dynamics(session.identification.path)
@@ -148,7 +148,8 @@ def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, 
         lines += [row("truth", 100.0 * within, "% of parameters are within two sigma")]
     files.write(session.path("truth.txt"), "\n".join([*notes, *lines]) + "\n")
     files.write_json(session.path("truth.json"), truth)
-    say(*lines)
+    for line in lines:
+        say(line)
     return before, after
 
 

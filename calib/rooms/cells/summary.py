@@ -79,6 +79,9 @@ NUMBERS: Mapping[str, Callable[[Session], tuple[float, str]]] = {
 """Number of each step and what it is, read from the session's folders."""
 
 
+_STAGES = {"geometry": "geometric", "dynamics": "dynamic"}  # of steps -> what a session has to be
+
+
 @dataclass
 class Telling:
     """Tells of a session as it goes on.
@@ -123,9 +126,6 @@ class Telling:
         self.show(words[: get_terminal_size().columns - 3])  # the spinner and the cursor need the rest
 
 
-_STAGES = {"geometry": "geometric", "dynamics": "dynamic"}
-
-
 def reasons(session: Session) -> Iterator[str]:
     """Yield what a verdict other than pass means, and the commands that explain its reasons."""
     found: list[ValidationMetrics | UnseenReport] = [session.validation.metrics()]
@@ -140,6 +140,9 @@ def reasons(session: Session) -> Iterator[str]:
 
 def paths(session: Session) -> list[str]:
     """Return the five files to look at."""
-    found = {"certificate": CERTIFICATE, "robot": f"{session.export}/{URDF}"}
-    found |= {"picture": PICTURE, "replay": viewer.FILE} if session.plots else {"truth": "truth.txt", "fit": "4-fit"}
-    return [f"{name:<11} {session.path(file)}" for name, file in {**found, "session": SETTINGS}.items()]
+    found = {
+        "session": SETTINGS, "certificate": CERTIFICATE, "robot": f"{session.export}/{URDF}", "picture": PICTURE,
+        "replay": viewer.FILE, "truth": "truth.txt", "fit": "4-fit",
+    }  # fmt: skip
+    there = [f"{name:<11} {path}" for name, file in found.items() if (path := session.path(file)).exists()]
+    return [*there[1:5], there[0]]
