@@ -134,8 +134,8 @@ def reasons(session: Session) -> Iterator[str]:
         if one.verdict != "pass":
             yield f"{stage}: {one.verdict}; why: {command_line('explain', one.code)}"
     if "marginal" in (one.verdict for one in found):
-        yield "marginal: better than nominal, but a check found what the"
-        yield "model does not explain; use it after reading the reasons."
+        yield "marginal: better than nominal, but a check has a doubt;"
+        yield "read the reasons before you use it."
 
 
 def paths(session: Session) -> list[str]:

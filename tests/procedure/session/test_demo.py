@@ -48,7 +48,7 @@ def test_the_hard_arm_says_what_marginal_means(tmp_path: Path, capsys: pytest.Ca
     out = tmp_path / "d"
     assert run("demo", "--hard", "--geometry-only", "--out", out) == 0
     said = capsys.readouterr().out
-    assert "geometry: marginal; why: calib explain rigid-misfit" in said and "use it after reading" in said
+    assert "geometry: marginal; why: calib explain rigid-misfit" in said and "read the reasons before" in said
     assert errors(out)["calibrated"] < errors(out)["nominal"] / 8
     found = json.loads((out / "5-validation/metrics.json").read_text())["validation"]["validation_measured.csv"]
     assert found["calibrated"]["position_mm"]["rms"] == pytest.approx(errors(out)["calibrated"], rel=0.25)  # 20 poses
