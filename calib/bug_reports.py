@@ -18,6 +18,8 @@ from calib.errors import CalibError, brief
 
 CODE = 4
 """Exit code of an internal error."""
+# where a report goes; README says the same and, once there is a public address, Issues of [project.urls]
+TRACKER = "the issue tracker of the repository you cloned (git remote -v)"
 PACKAGES = ("armature-calib", "numpy", "scipy", "numba", "pin", "pydantic", "typer", "matplotlib", "clarabel")
 
 
@@ -30,19 +32,19 @@ def report(error: BaseException, command: Sequence[str], folder: Path | None = N
         folder: where the file is to go; by default the current one, or the system's for temporary files.
     """
     name = f"calib-bug-{datetime.now():%Y%m%d-%H%M%S}-{id(error) % 9973}.txt"
-    content = "\n".join([f"calib {shlex.join(command)}", *_versions(), "", *traceback.format_exception(error)])
+    content = "\n".join([f"calib {shlex.join(command)}", *_head(), "", *traceback.format_exception(error)])
     said = f"internal error: {type(error).__name__}: {brief(error)}"
     for place in (Path() if folder is None else folder, Path(tempfile.gettempdir())):
         try:
             path = files.write(place / name, content)
         except CalibError:
             continue
-        return f"{said}; a bug report was written: {path}. Please check the input, too."
+        return f"{said}; a bug report was written: {path}. Check the input, then send it to {TRACKER}."
     return f"{said}; `calib --debug` shows the place. Please check the input, too."
 
 
-def _versions() -> list[str]:
-    found = [f"Python {platform.python_version()}, {platform.platform()}"]
+def _head() -> list[str]:
+    found = [f"for {TRACKER}", f"Python {platform.python_version()}, {platform.platform()}"]
     for name in PACKAGES:
         try:
             found.append(f"{name} {metadata.version(name)}")

@@ -16,9 +16,9 @@ RESULTS = (
     "robot.toml", "robot.urdf", "robot_for_corrections.urdf", "robot.xml", "joint_corrections.csv",
     "joint_corrections.txt", "report.json", "certificate.html", "residuals.csv", "trajectory.csv", "run.csv",
     "motion.csv", "approach.csv", "trajectory.yaml", "trajectory.json", "geometries.csv", "geometry_effects.csv",
-    "sensitivity.csv", "covariance_torque.csv", "drift.csv", "parameters.json", "drives.csv",
-    "joint_offsets.csv", "joint_origins.yaml", "ur_kinematics.yaml", "poses.csv", "validation_poses.csv", "selection.json", "summary.txt", "checked.txt",
-    "cuts.json",
+    "sensitivity.csv", "covariance_torque.csv", "drift.csv", "parameters.json", "drives.csv", "joint_offsets.csv",
+    "joint_origins.yaml", "ur_kinematics.yaml", "poses.csv", "validation_poses.csv", "selection.json", "summary.txt",
+    "checked.txt", "cuts.json",
     "simulated.txt", "session.toml", "state.json", "session.rrd",
 )  # fmt: skip
 

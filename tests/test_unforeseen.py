@@ -1,10 +1,13 @@
 """Internal errors: one message, a code of their own, and a file for whoever mends them."""
 
+import tomllib
 from pathlib import Path
 
 import pytest
 
-from calib import cli
+from calib import bug_reports, cli
+
+ROOT = Path(__file__).parents[1]
 
 
 def failing(error: BaseException):
@@ -39,7 +42,15 @@ def test_whatever_happens_is_one_line_and_a_code(error, code, words, monkeypatch
     assert len(reports) == (code == 4)
     if reports:
         text = reports[0].read_text()
-        assert text.startswith("calib formats mdh\nPython ") and "in describe" in text and "numpy " in text
+        assert text.startswith(f"calib formats mdh\nfor {bug_reports.TRACKER}\nPython ")
+        assert "in describe" in text and "numpy " in text
+
+
+def test_reports_readme_and_project_name_one_tracker() -> None:
+    urls = tomllib.loads((ROOT / "pyproject.toml").read_text()).get("project", {}).get("urls", {})
+    assert urls.get("Issues", bug_reports.TRACKER) == bug_reports.TRACKER
+    assert bug_reports.TRACKER in " ".join((ROOT / "README.md").read_text().replace("`", "").split())
+    assert bug_reports.TRACKER in bug_reports.report(ValueError("x"), ["fit"])
 
 
 def test_a_report_goes_elsewhere_where_the_folder_cannot_be_written(monkeypatch, capsys, tmp_path) -> None:
@@ -47,8 +58,6 @@ def test_a_report_goes_elsewhere_where_the_folder_cannot_be_written(monkeypatch,
     other.mkdir()
     gone = tmp_path / "gone"
     gone.write_text("a file, not a folder")
-    from calib import bug_reports
-
     monkeypatch.setattr("tempfile.tempdir", str(other))
     words = bug_reports.report(ValueError("x"), ["fit"], gone)
     assert str(other) in words and len(list(other.iterdir())) == 1

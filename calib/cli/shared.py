@@ -146,7 +146,8 @@ def progress(console: Any = None) -> Iterator[Any]:
     """Show the progress on a console, by default stderr, if it is a terminal."""
     from rich.markup import escape
 
-    with (console or make_console(stderr=True)).status("") as status:
+    console = console or make_console(stderr=True)
+    with console.status("", spinner="dots" if console.encoding.startswith("utf") else "line") as status:
         yield lambda words: status.update(escape(str(words)))
 
 

@@ -153,8 +153,9 @@ def random_samples(
 
 
 def find(
-    model: RegressorModel, samples: States | None = None, loads: Loads | None = None, tolerance: float = 1e-6
-) -> Base:
+    model: RegressorModel, samples: States | None = None, loads: Loads | None = None, tolerance: float = 1e-6,
+    nominal: RegressorModel | None = None,
+) -> Base:  # fmt: skip
     """Return the base parameters of a model: independent columns of its regressor.
 
     Args:
@@ -163,8 +164,11 @@ def find(
         loads: the load cases stacked, each as `carried` of the regressor; default with all payloads and without, if
             the model has any.
         tolerance: minimum part of a column of unit norm that is independent of the columns before.
+        nominal: the same model on the geometry that columns are chosen on; None: `model`.
     """
     samples = random_samples(model) if samples is None else samples
+    if nominal is not None:
+        return regroup(find(nominal, samples, loads, tolerance), model, samples, loads)
     cases = model.load_cases() if loads is None else loads
     factor = r_factor(model, samples, cases)
     split = _clean(split_columns(factor, [np.array([k]) for k in model.preference()], tolerance))

@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.dynamics import drives, rigid_body
-from calib.dynamics.base import BaseModel
 from calib.dynamics.bodies import Bodies
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
@@ -95,27 +94,6 @@ def of_standard(model: IdentificationModel, values: np.ndarray) -> PathDynamics:
     return PathDynamics(
         without.regressor, values[~rubbing], *_valued(model, values), model.bodies, np.array(values[:first])
     )
-
-
-def of_base(model: BaseModel, values: np.ndarray) -> PathDynamics:
-    """Return the path dynamics of base parameters (b,), with the base regressor.
-
-    Raises:
-        CalibError: if friction is regrouped with masses or offsets, so that they cannot be distinguished.
-    """
-    values = shaped(values, (model.base.b,), "base parameters")
-    _require_torques(model.model)
-    rubbing = _is_friction(model.model)
-    kept, dropped = rubbing[model.base.kept], rubbing[model.base.split.dropped]
-    mixed = np.abs(model.base.split.coefficients) * (kept[:, None] != dropped)
-    max_mixed = 1e-6  # of a column, beyond which friction counts as regrouped with something else
-    if mixed.max(initial=0.0) > max_mixed:
-        name = model.names[int(mixed.max(axis=1).argmax())]
-        raise CalibError(f"base parameter {name} mixes friction with other effects: path torques cannot be computed")
-    standard = model.base.to_standard(values)
-    bodies = standard[: model.model.inertial]
-    terms, amounts = _valued(model.model, standard)
-    return PathDynamics(model.regressor, np.where(kept, 0.0, values), terms, amounts, model.model.bodies, bodies)
 
 
 def _require_torques(model: IdentificationModel) -> None:

@@ -207,8 +207,7 @@ def find_base(
 ) -> Base:
     """Return the base columns of a model, selected over states and payloads on the nominal geometry if one is given."""
     loads = tuple(dict.fromkeys(tuple(sorted(case.carried)) for case in cases))
-    found = bases.find(model if nominal is None else nominal, states, loads)
-    return found if nominal is None else bases.regroup(found, model, states, loads)
+    return bases.find(model, states, loads, nominal=nominal)
 
 
 def _known_masses(chain: Chain) -> np.ndarray | None:

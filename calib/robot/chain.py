@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -214,18 +214,6 @@ class Chain:
             replace(element, value=float(value)) for element, value in zip(self.elements, values, strict=True)
         )
         return replace(self, elements=elements)
-
-    def element_index(self, names: Iterable[str]) -> np.ndarray:
-        """Return the indices of elements by name.
-
-        Raises:
-            RobotError: for a name the chain does not have.
-        """
-        table = {name: k for k, name in enumerate(self.names)}
-        try:
-            return np.array([table[name] for name in names], dtype=int)
-        except KeyError as error:
-            raise RobotError(f"robot '{self.name}' has no element {error}; it has {', '.join(self.names)}") from None
 
     def stretched_length(self) -> float:
         """Return the largest length of the stretched arm [m]: the sum of its constant offsets."""

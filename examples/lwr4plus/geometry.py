@@ -61,7 +61,7 @@ def study_chain(table: np.ndarray) -> Chain:
 
 def base_columns(chain: Chain) -> np.ndarray:
     """Return the positions of the paper's 32 base parameters."""
-    return chain.element_index([name for name in chain.names if name not in DROPPED])
+    return np.array([k for k, name in enumerate(chain.names) if name not in DROPPED])
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from calib.dynamics import base, drives
 from calib.dynamics.base import BaseModel
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
-from calib.dynamics.path_dynamics import PathDynamics, of_base, of_standard
+from calib.dynamics.path_dynamics import PathDynamics, of_standard
 from calib.robot import description, library
 from calib.robot.chain import Chain, random_joints
 from calib.rooms.cells.known_robots import truth
@@ -83,7 +83,7 @@ def identified(model: IdentificationModel, values: np.ndarray, seed: int) -> tup
     factor = np.linalg.qr(W, mode="r")
     fitted = np.linalg.lstsq(W, (tau / sigma).ravel(), rcond=None)[0]
     spread = np.linalg.inv(factor)
-    return of_base(found, fitted), found, spread @ spread.T
+    return of_standard(model, found.base.to_standard(fitted)), found, spread @ spread.T
 
 
 def guarded(

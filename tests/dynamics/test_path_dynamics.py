@@ -9,7 +9,7 @@ from pinocchio_model import model as pinocchio_model
 from calib.dynamics import base, drives
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
-from calib.dynamics.path_dynamics import of_base, of_standard
+from calib.dynamics.path_dynamics import of_standard
 from calib.dynamics.torque_rows import BOTH, DRIVE, MOTOR
 from calib.errors import CalibError
 from calib.robot.library import load
@@ -43,7 +43,7 @@ def test_the_three_terms_are_pinocchios(chain, seen):
     model, values = driven(chain)
     if seen == "base":
         found = base.find(model)
-        dynamics = of_base(base.BaseModel(model, found), found.transform @ values)
+        dynamics = of_standard(model, found.to_standard(found.transform @ values))
     else:
         dynamics = of_standard(model, values)
     states = arms.states(chain.n, 12)

@@ -11,6 +11,8 @@ from calib.data.recordings.checks import check_recording
 from calib.data.recordings.recording import Recording, earlier
 from calib.data.schema import Joints
 from calib.data.signals.motion import FilterOptions, make_motion
+from calib.dynamics.bodies import bodies_of, standard_parameters
+from calib.dynamics.rigid_body import inverse_dynamics
 from calib.errors import Finding, MeasurementError, finding
 from calib.identification.checks.recording_sizes import compare_sizes, signs_of
 from calib.identification.identify import identify
@@ -20,6 +22,7 @@ from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.plausibility import described, findings, impossible, wrong_joints
 from calib.procedure.findings import Verdict, level_of, settle
 from calib.robot.library import load
+from calib.rooms.cells.known_robots import random_fourier
 
 NAMES = ("joint1", "joint2", "joint3")
 ARM = replace(planted.arm(), joints=tuple(replace(joint, effort=60.0) for joint in planted.arm().joints))
@@ -364,3 +367,16 @@ def test_a_description_that_cannot_be_allows_no_pass():
     assert Verdict.of("good", wrong).level == "marginal"
     assert "a negative mass (M = -1 kg)" in wrong[0].values["bodies"][0]
     assert Verdict.of("good", settle(wrong, ["description"])).level == "pass"
+
+
+@pytest.mark.parametrize("clock, level", [(1.0, None), (0.5, "fail"), (3.0, "fail")])
+def test_a_description_with_masses_tells_the_clock_where_lengths_do_not(clock: float, level: str | None) -> None:
+    """BIRDy's TX40 has half the inertia that rods of its lengths would have."""
+    arm = load("tx40")
+    speed = np.array([joint.velocity for joint in arm.joints])
+    motion = random_fourier(0.7 * arm.lower, 0.7 * arm.upper, 0.7 * speed, 10.0, 250.0, acceleration=20.0)
+    torque = inverse_dynamics(bodies_of(arm), standard_parameters(arm), motion.q, motion.v, motion.a)
+    torque += 0.02 * torque.std(axis=0) * np.random.default_rng(0).normal(size=torque.shape)
+    log = Recording(clock * motion.t, motion.q, torque, "torque", arm.joint_names, file="log")
+    told = coded(findings([compare_sizes(case_of(log), arm)], arm.joint_names), "clock-off")
+    assert [level_of(one) for one in told] == ([level] if level else [])

@@ -182,7 +182,7 @@ def assess(
     relative = inputs.unit != TORQUE
     amperes = [finding("torques-relative", unit=without_gains(inputs.unit))] if relative else []
     replays, failure = {}, ""
-    for track in () if relative else offered("track"):
+    for track in offered("track") if inputs.replayed and not relative else ():
         replays, failure = track(inputs, dynamics, found.predictions, findings.controller)
     if any(one.inertia_added.any() for one in replays.values()):
         use = lines_of([finding("prediction-not-simulation")])

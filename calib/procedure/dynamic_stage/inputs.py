@@ -54,6 +54,7 @@ class IdentificationInputs:
         options: content of the options file, updated by the command's options.
         notes: remarks for the user on the interpretation of the files.
         currents: drive gains that convert currents to torques.
+        replayed: whether tracking with the model as feedforward is simulated.
     """
 
     robot: Any
@@ -63,6 +64,7 @@ class IdentificationInputs:
     options: IdentifyOptions
     notes: tuple[str, ...]
     currents: FoundGains
+    replayed: bool = True
 
     @property
     def unit(self) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from calib.config import Tables
 from calib.dynamics import base as base_parameters
 from calib.dynamics import drives
-from calib.dynamics.base import Base, BaseModel, columns_at_rest, information, standard_name
+from calib.dynamics.base import BaseModel, columns_at_rest, information, standard_name
 from calib.dynamics.bodies import STANDARD, Bodies, bodies_of, standard_parameters, with_payload
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.load_cases import LoadCases
@@ -180,11 +180,15 @@ def read_inputs(
         raise UsageError(
             f"drives '{settings.drives}': {model or 'the options file'} states the drive terms; leave it out"
         )
-    chain, source = load_rigid(robot, None, base, tip)
+    found, source = load_rigid(robot, None, base, tip)
+    chain, nominal = found.chain, found.nominal if found.moved else None
     known = read_motion_limits(limits, chain, source, predicted=model is not None)
+    if settings.within:
+        orders = _designed(Path(settings.within), chain)[:3]
+        known = known.narrowed([(one.min(axis=0), one.max(axis=0)) for one in orders])
     if settings.noise is not None and (after is not None or known.noise is not None):
         raise UsageError(f"noise: {after or '[noise] of the limits file'} states the torque errors; leave --noise out")
-    dynamics = read_model(chain, model, settings.drives, known, options, settings.loads)
+    dynamics = read_model(chain, model, settings.drives, known, options, settings.loads, nominal)
     dynamics = replace(dynamics, notes=(*dynamics.notes, *_unheld(dynamics, known)))
     noise = None if known.noise is None or after is not None else known.noise[dynamics.exact.joint_of_row]
     locked = _read_locked(settings.lock, chain, known.positions)
@@ -202,6 +206,7 @@ def read_model(
     limits: MotionLimits,
     options: IdentificationSettings | None = None,
     loads: Sequence[str] = (),
+    nominal: Chain | None = None,
 ) -> ExcitedModel:
     """Return the model to excite: from an identification's folder, or from the robot's inertias and the given friction.
 
@@ -210,6 +215,7 @@ def read_model(
         sets: drive terms of motor torques, where there are neither folder nor options.
         options: of the identification that will follow, where there is no folder.
         loads: see `ExcitationSettings`.
+        nominal: see `excited_model`.
 
     Raises:
         UsageError: for an unknown payload.
@@ -219,7 +225,7 @@ def read_model(
             raise UsageError(
                 f"identification {folder}: already states rows, drives and payloads; leave the options out"
             )
-        return _identified(chain, folder, loads)
+        return _identified(chain, folder, loads, nominal)
     notes = []
     if options is not None and not _designable(options.torque_rows):
         notes = [f"designed for motor torques: a motion cannot be designed for rows = '{options.torque_rows.name}'"]
@@ -248,7 +254,7 @@ def read_model(
         notes += said
         if not known:
             notes.append("friction is unknown (no model, no [friction]): torques are predicted without it")
-    return excited_model(model, cases, values, bool(known), notes)
+    return excited_model(model, cases, values, bool(known), notes, nominal)
 
 
 def _unheld(model: ExcitedModel, limits: MotionLimits) -> list[str]:
@@ -311,7 +317,7 @@ def _differentiable(model: IdentificationModel) -> tuple[IdentificationModel, li
     return replace(model, terms=tuple(one for one in model.columns if one.form.slopes)), notes
 
 
-def _identified(chain: Chain, folder: Path, texts: Sequence[str]) -> ExcitedModel:
+def _identified(chain: Chain, folder: Path, texts: Sequence[str], nominal: Chain | None) -> ExcitedModel:
     """Return the model of an identification's folder with the payloads of the loads, and its covariance."""
     refuse_currents(folder, "an excitation within torque limits")
     refuse_other_arm(folder, chain)
@@ -332,7 +338,7 @@ def _identified(chain: Chain, folder: Path, texts: Sequence[str]) -> ExcitedMode
     if not np.isfinite(parameters).all():
         name = model.names[int(np.argmin(np.isfinite(parameters)))]
         raise UsageError(f"{folder}: parameter {name} of the model is not finite")
-    made = excited_model(model, loads, parameters, any(one.shape == "sign" for one in model.columns), notes)
+    made = excited_model(model, loads, parameters, any(one.shape == "sign" for one in model.columns), notes, nominal)
     covariance = _covariance(folder / COVARIANCE, made.exact)
     if covariance is None:
         notes.append(f"{folder}/covariance.csv has other columns than the design: no torque margin for uncertainty")
@@ -347,13 +353,19 @@ def bodies_with(chain: Chain, gravity: np.ndarray, payloads: Sequence[str]) -> B
     return bodies
 
 
+def moved_to(chain: Chain, model: IdentificationModel) -> IdentificationModel:
+    """Return a model, payloads included, on another geometry of its arm."""
+    payloads = [label for label, c in zip(model.bodies.labels, model.bodies.coordinates) if c < 0]
+    return replace(model, bodies=bodies_with(chain, model.bodies.gravity, payloads))
+
+
 def excited_model(
     model: IdentificationModel,
     loads: Loads,
     values: np.ndarray | None,
     friction: bool,
     notes: Sequence[str] = (),
-    base: Base | None = None,
+    nominal: Chain | None = None,
 ) -> ExcitedModel:
     """Return the base model to excite, with a smoothed Coulomb sign for the search, from an identification model.
 
@@ -361,13 +373,14 @@ def excited_model(
         loads: payload labels of each run.
         values: (p,) of the model's parameters; None: unknown.
         friction: whether friction is among the values.
-        base: base columns; default those of the model under these loads.
+        nominal: the arm that base columns are chosen on, as by the identification; None: the model's own.
     """
     smoothed = (
         replace(one, settings=(max(SMOOTH, one.settings[0]),)) if one.shape == "sign" else one for one in model.terms
     )
     smooth = replace(model, terms=tuple(smoothed))
-    found = base_parameters.find(model, loads=loads) if base is None else base
+    there = None if nominal is None else moved_to(nominal, model)
+    found = base_parameters.find(model, loads=loads, nominal=there)
     chosen = None if values is None else found.transform @ values
     own = {model.names[k].removeprefix(name) for k in found.kept for name in STANDARD}
     lost = [label for label, c in zip(model.bodies.labels, model.bodies.coordinates) if c < 0 and label not in own]
@@ -531,7 +544,7 @@ def _designed(folder: Path, chain: Chain) -> tuple[np.ndarray, np.ndarray, np.nd
     found = coefficients.read(folder)
     if found.joint_names != tuple(chain.joint_names):
         raise UsageError(
-            f"existing {folder}: the motion has joints {', '.join(found.joint_names)}; {chain.name} has "
+            f"{folder}: the motion has joints {', '.join(found.joint_names)}; {chain.name} has "
             f"{', '.join(chain.joint_names)}"
         )
     count = max(1000, round(50 * found.period))

@@ -29,7 +29,7 @@ waypoints keeps what is stated only. Besides, per joint or ``all``::
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -219,6 +219,11 @@ class MotionLimits:
         free = np.full(len(self.torque), np.inf)
         boxes = (one for one in self.constraints if isinstance(one, BoxLimit) and one.order == 0)
         return next(boxes, BoxLimit(0, -free, free))
+
+    def narrowed(self, ranges: Sequence[tuple[np.ndarray, np.ndarray]]) -> "MotionLimits":
+        """Return the limits with those of a motion: least and largest q, v and a (n,), of joints that move."""
+        free = (np.where(low < high, [low, high], [[-np.inf], [np.inf]]) for low, high in ranges)
+        return replace(self, constraints=(*self.constraints, *(BoxLimit(k, *both) for k, both in enumerate(free))))
 
     def broken(self, motion: SampledMotion) -> Iterator[tuple[MotionConstraint, str, int]]:
         """Yield (constraint, message, index of the worst of N states) for each violated constraint on positions."""

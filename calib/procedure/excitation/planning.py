@@ -203,7 +203,8 @@ def plan(
     require(not (settings.shorten and settings.lines), words, UsageError)
     if settings.payloads and model is None:
         raise UsageError(f"payloads {', '.join(settings.payloads)}: need an identified model; name it (--model)")
-    chain, source = load_rigid(robot, waypoints if isinstance(waypoints, Path) else None, base, tip)
+    found, source = load_rigid(robot, waypoints if isinstance(waypoints, Path) else None, base, tip)
+    chain = found.chain
     known = read_motion_limits(limits, chain, source, given_way=True, predicted=model is not None)
     law, notes, uncertain = _law(chain, model, settings.payloads, drives, known)
     lower, upper, free = known.positions.lower, known.positions.upper, 1.0 - (known.margin or 0.0)

@@ -84,6 +84,8 @@ class ExcitationSettings:
         repeat: number of periods to run one after the other
         slower: factor of a slow rehearsal, written next to the motion; 1: none
         existing: a recording (log.npz@0:9.4 cuts) or folder of an earlier design, to complement; repeatable
+        within: folder of an earlier design, whose positions, speeds and accelerations are not exceeded: for a motion
+            to validate on
         lock: a joint that does not move: joint4, or joint4=0.5 [rad or m]; repeatable
         noise: expected torque residual as a share of the torque limits; only for predicted sigmas; default 0.01, or
             that of each joint in the limits file ([noise])
@@ -110,6 +112,7 @@ class ExcitationSettings:
     repeat: Annotated[int, Whole(1, 10_000)] = 1
     slower: Slower = 1.0
     existing: tuple[str, ...] = ()
+    within: Text = ""
     lock: tuple[str, ...] = ()
     noise: Annotated[float, Real(above=0.0, most=1.0)] | None = None
     outlook: Flag = True

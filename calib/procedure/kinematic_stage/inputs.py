@@ -189,19 +189,18 @@ def load_robot(
 
 def load_rigid(
     robot: str | Path | CalibratedChain, measured: Path | None = None, base: str | None = None, tip: str | None = None
-) -> tuple[Chain, Path]:
-    """Return the chain for dynamics and motion planning (without joint corrections), and its file.
+) -> tuple[CalibratedChain, Path]:
+    """Return the robot whose chain dynamics and motion planning use, and its file.
 
-    That is the best one without joint corrections: neither torques nor a robot's controller know of these, and the
-    geometry they belong to is worse than this one where they are left out.
+    That chain is the best one without joint corrections: neither torques nor a robot's controller know of these, and
+    the geometry they belong to is worse than this one where they are left out.
     """
     if isinstance(robot, CalibratedChain):
-        return robot.chain, Path(robot.source or robot.chain.name)
+        return robot, Path(robot.source or robot.chain.name)
     chain, source = load_robot(robot, measured, FitOptions(), base, tip)
     if measured is not None and tip is None and source.suffix == ".urdf":
         _check_whole(chain, source, measured, base)
-    found = CalibratedChain(chain) if source.suffix == ".urdf" else calibrated.read(source)
-    return (chain if found.corrections is None else found.chain), source
+    return CalibratedChain(chain) if source.suffix == ".urdf" else calibrated.read(source), source
 
 
 def _check_whole(chain: Chain, source: Path, measured: Path, base: str | None) -> None:

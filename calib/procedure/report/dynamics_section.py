@@ -159,7 +159,7 @@ def certificate_section(
     blocks += [*pictures("parameters"), page.table("Identified parameters", PARAMETERS, found.estimate, note)]
     if metrics.loop:
         blocks.append(page.Text("Closed loop", _loop_sentences(metrics.loop)))
-    blocks += tracking_blocks(metrics.tracking, metrics.tracking_failure)
+    blocks += tracking_blocks(unseen.tracking, unseen.tracking_failure)
     warnings = list(dict.fromkeys((*metrics.warnings, *unseen.warnings)))
     blocks += [page.Text("What was exported", exported), page.Text("Notes on the dynamics", warnings, "note")]
     return page.Section("Dynamics", blocks, unseen.verdict, unseen.reason, _key_figures(unseen, tolerance))

@@ -6,7 +6,6 @@ The same functions as `calib excite` and `calib identify`; only the files are th
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import NoReturn
 
 import numpy as np
@@ -87,7 +86,8 @@ def excite(session: Session, say: Say) -> list[str]:
             rate=section.rate, starts=section.starts if first else 1,
             evaluations=section.evaluations if first else max(20, section.evaluations // 3),
             seed=session.settings.seed + (0 if first else VALIDATION_SEED), repeat=section.repeats, outlook=first,
-            goals=section.goals, hard=section.hard, front=section.front if first else 0,
+            goals=section.goals if first else (), hard=section.hard if first else (),
+            front=section.front if first else 0, within="" if first else str(session.path("6-excitation/training")),
         )  # fmt: skip
         designed = design.excite(
             session.fit.path, settings, limits=limits, options=options_of(session).settings,
@@ -285,7 +285,7 @@ def identify(session: Session, say: Say) -> list[str]:
     if session.plots:
         from calib.procedure.report.dynamics_figures import write as draw
     given = _gathered(session, _divided(session)[0], (), say)
-    outcome = identifying.run(given, progress=say)
+    outcome = identifying.run(replace(given, replayed=False), progress=say)  # `predict` replays unseen motion
     outcome = replace(outcome, verdict=UNJUDGED)
     say("writing")
     identification_outputs.write_folder(outcome, session.identification.path, draw, owned=True)
@@ -328,16 +328,14 @@ def predict(session: Session, say: Say) -> list[str]:
 
 def _as_delivered(session: Session, found: Assessment) -> Verdict:
     """Return the verdict on the exported robot; a model that cannot be exported gets the verdict prediction only."""
-    from calib.procedure.export.delivery import Export, deliver
-    from calib.procedure.export.delivery import prediction as prediction_of_export
+    from calib.procedure.export.delivery import Export
 
     verdict, known = found.verdict, None
-    with TemporaryDirectory() as folder:
-        try:
-            deliver(Export(session.robot_file, identified=session.identification.path), Path(folder))
-            known = prediction_of_export(Path(folder))
-        except CalibError as error:
-            verdict = verdict.for_prediction(f"the dynamics cannot be exported: {error}")
+    exported = Export(session.robot_file, identified=session.identification.path)
+    try:
+        known = exported.with_masses and exported.prediction
+    except CalibError as error:
+        verdict = verdict.for_prediction(f"the dynamics cannot be exported: {error}")
     worst = max((one.raw.total for one in found.proofs.values()), default=0.0)
     left, what = (worst, "identified model") if known is None else (known.exported, "exported robot")
     tolerance = session.settings.dynamics.tolerance_percent

@@ -3,7 +3,6 @@
 import resource
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -13,35 +12,34 @@ import numpy as np
 from calib import files
 from calib.data.poses import IMAGES
 from calib.errors import SessionError, UsageError, command_line, require
-from calib.folders import CERTIFICATE, read_estimate
+from calib.folders import read_estimate
 from calib.geometry import installation
 from calib.identification.model_file import read_dynamics
-from calib.procedure.kinematic_stage.folder import URDF
 from calib.procedure.session import dynamics_steps, steps
 from calib.procedure.session.commands import asks, new_session
 from calib.procedure.session.dynamics_steps import next_round
-from calib.procedure.session.folder import MARK, ROUND, SETTINGS, Session, locked, open_session
+from calib.procedure.session.folder import MARK, ROUND, Say, Session, locked, open_session
 from calib.records import read_lines
 from calib.robot import calibrated, library
 from calib.robot.library import load
 from calib.rooms.cells.camera_cell import CameraCell, limits_of, seen_by_camera, take_pictures
 from calib.rooms.cells.cell import Cell, measure, planned_poses, wandering, write_log, write_measured
+from calib.rooms.cells.summary import Telling, row
 from calib.rooms.cells.truth import TRUTH, position_errors, share_within, torque_errors, true_base
-from calib.rooms.cells.virtual_arm import REST, MovingArm, moving_arm, play, record
+from calib.rooms.cells.virtual_arm import REST, MovingArm, moving_arm, play, record, sensed
 from calib.rooms.cells.virtual_cells import virtual_cell
-from calib.rooms.viewer import viewer
 
-Say = Callable[[str], None]
 FIT, VALIDATION, AGAIN = 40, 20, 3
 DRIFT = 10e-6  # how far the simulated instrument wanders over a series [m]
-MOTION = {"period": 10.0, "starts": 2, "evaluations": 150, "repeats": 2, "torques": "both"}  # little effort, for time
+ROBOT, HARD = "tx40", "lwr4plus"  # by default; where effects that no model holds are as large as those that some do
+MOTION = {"period": 10.0, "rate": 500.0, "starts": 1, "evaluations": 150, "repeats": 2}  # little effort, for time
 SIMULATED = "simulated cell: {note}; nothing was measured on a robot"
 LOGS = (("training", 2, 240.0), ("validation", 3, 480.0))  # numbers of their noise, how long the arm ran before [s]
 
 
 @dataclass(frozen=True)
 class DemoResult:
-    """Result of the demonstration: the session, its verdict ("" where it stopped), files to look at, and duration.
+    """Result of the demonstration: the session, its verdict ("" where it stopped), and duration.
 
     Attributes:
         asks: what to do now, where it stopped for an engineer.
@@ -51,7 +49,6 @@ class DemoResult:
 
     session: Session
     verdict: str
-    results: tuple[tuple[str, str], ...]
     seconds: float
     asks: tuple[str, ...] = ()
     nominal: float = float("nan")
@@ -61,7 +58,7 @@ class DemoResult:
 
 def run(
     folder: Path, robot: str, seed: int, say: Say, progress: Say, *, dynamics: bool = True, guided: bool = False,
-    plots: bool = True, instrument: str = "cmm",
+    plots: bool = True, instrument: str = "cmm", verbose: bool = False,
 ) -> DemoResult:  # fmt: skip
     """Return the result of a session on a simulated robot, compared with its hidden truth.
 
@@ -74,6 +71,7 @@ def run(
         guided: stop where an engineer would; `simulate_next` then plays his part.
         plots: whether figures are drawn.
         instrument: ``cmm``, or ``camera``, which takes rendered images.
+        verbose: say all that the session says, too.
     """
     if instrument not in ("cmm", "camera"):
         raise UsageError(f"--instrument {instrument}: expected cmm or camera")
@@ -81,12 +79,9 @@ def run(
     cell = virtual_cell(robot, seed)
     if dynamics and cell.nominal.inertias is None:
         known = ", ".join(name for name in library.names() if load(name).inertias is not None)
-        say(
-            f"geometry only: the library has no masses for {robot}, so its motion cannot be simulated "
-            f"(known for {known})"
-        )
+        say(f"geometry only: masses are known of {known}")
         dynamics = False
-    motion = MOTION if dynamics else {}
+    motion = MOTION | {"torques": "both" if sensed(robot) else "motor"} if dynamics else {}
     begin = partial(
         new_session, folder, robot, instrument, poses=FIT, validation=VALIDATION, seed=seed, dynamics=dynamics, **motion
     )
@@ -98,20 +93,26 @@ def run(
     else:
         begin()
     session = open_session(folder, plots)
-    say(f"the cell: {cell.note}")
+    told = Telling(session, say, progress, verbose)
+    told.said(f"the cell: {cell.note}")
     with locked(session):
-        waiting = steps.run_next(session, say, progress, "calib demo")
+        waiting = steps.run_next(session, say if guided else told.said, told.progress, "calib demo")
         while waiting is not None and waiting.kind == steps.WAITING and not guided:
-            _bring_for(session, waiting.step.name, say, progress)
-            waiting = steps.run_next(session, say, progress, "calib demo")
+            _bring_for(session, waiting.step.name, told.said, told.progress)
+            waiting = steps.run_next(session, told.said, told.progress, "calib demo")
     if waiting is not None:
         require(guided, f"the demonstration stopped at {waiting.step.name}: {waiting.words}", SessionError)
-        return DemoResult(session, "", (), time.perf_counter() - started, _stopped(session, waiting))
+        return DemoResult(session, "", time.perf_counter() - started, _stopped(session, waiting))
     before, after = _compare_with_truth(session, cell, say)
-    seconds = time.perf_counter() - started
+    if plots:
+        from calib.rooms.cells.picture import draw
+
+        draw(session)
     unit = 2.0**20 if sys.platform == "darwin" else 2.0**10  # the system counts in bytes on macOS, in kB on Linux
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
-    return DemoResult(session, session.verdicts().level, _results(session), seconds, (), before, after, memory)
+    return DemoResult(
+        session, session.verdicts().level, time.perf_counter() - started, (), before, after, memory
+    )  # fmt: skip
 
 
 def _stopped(session: Session, waiting: steps.State) -> tuple[str, ...]:
@@ -123,32 +124,16 @@ def _stopped(session: Session, waiting: steps.State) -> tuple[str, ...]:
     )
 
 
-def _results(session: Session) -> tuple[tuple[str, str], ...]:
-    """Return name and path of each result file."""
-    found = [
-        ("certificate", CERTIFICATE),
-        ("plots" if session.plots else "fit", "4-fit"),
-        ("calibrated URDF", f"{session.export}/{URDF}"),
-    ]
-    if session.dynamic:
-        found += [("motions", "6-excitation"), ("dynamics", "8-dynamics")]
-    if session.path(viewer.FILE).exists():
-        found.append(("to play", viewer.FILE))
-    return (*found, ("the session", SETTINGS))
-
-
 def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, float]:
-    """Return the tool errors [mm] of nominal and calibrated arm against the truth; print and write all errors."""
+    """Return the tool errors [mm] of nominal and calibrated arm against the truth; say and write all errors."""
     found = installation.read(session.fit.path)
     before, after, bare = position_errors(cell, found, calibrated.read(session.fit.path).chain)
     lines = [
-        f"hidden truth, over {TRUTH} poses of the whole joint range: tool error {before:.3f} mm rms with the "
-        f"nominal arm, {after:.3f} mm with the calibrated one"
+        row("truth", before, "mm true error of the nominal robot"),
+        row("truth", bare, "mm true error of robot.urdf"),
     ]
     truth: dict[str, object] = {"position_mm": {"nominal": before, "calibrated": after, "urdf_alone": bare}}
-    if bare > after:
-        lines[0] += f" ({bare:.3f} mm with its URDF alone, without the joint corrections)"
-    notes = [cell.note]
+    notes = [cell.note, f"errors over {TRUTH} poses of the whole joint range, rms"]
     if session.dynamic:
         arm = arm_of(session, cell)
         chain, dynamics = read_dynamics(session.identification.path)
@@ -159,11 +144,8 @@ def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, 
         within, count = share_within(true, read_estimate(session.identification.path))
         notes.append(arm.note)
         truth |= {"torque_percent": torques.identified, "within_two_sigma": within, "base_parameters": count}
-        lines.append(
-            "hidden truth, on unseen motion: noise-free torques are predicted with an error of "
-            f"{torques.identified:.2f} % ({torques.nominal:.1f} % of the link torques with nominal masses and the "
-            f"true friction); of {count} base parameters {within:.0%} are within two sigmas of the truth"
-        )
+        lines += [row("truth", torques.identified, "% true torque error on a random motion")]
+        lines += [row("truth", 100.0 * within, "% of parameters are within two sigma")]
     files.write(session.path("truth.txt"), "\n".join([*notes, *lines]) + "\n")
     files.write_json(session.path("truth.json"), truth)
     for line in lines:

@@ -129,6 +129,6 @@ def true_base(
     bare = [replace(model, bodies=bodies_of(chain), terms=terms) for chain in (cell.nominal, arm.chain)]
     lower, upper = arm.chain.sampling_limits()
     samples = bases.random_samples(bare[0], seed=seed, lower=lower, upper=upper)
-    base = bases.regroup(bases.find(bare[0], samples), bare[1], samples)
+    base = bases.find(bare[1], samples, nominal=bare[0])
     plain = (base.standard[k] for k in base.kept)  # what is regrouped on one geometry need not be on another
     return dict(zip(plain, base.transform @ np.array([known[name] for name in bare[1].names])))

@@ -47,6 +47,7 @@ class MovingArm:
         effort: (n,) limits that the noise of the torques is a share of [N m or N].
         note: what the truth is made of.
         unmodelled: torques that no parameter of an identification holds.
+        sensors: whether torque sensors behind the gears are recorded, too.
     """
 
     chain: Chain
@@ -57,6 +58,7 @@ class MovingArm:
     effort: np.ndarray
     note: str
     unmodelled: TorqueErrors
+    sensors: bool
 
     def true_torque(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the noise-free motor torques (N, n) [N m or N] of a warm arm along a finely sampled motion."""
@@ -98,15 +100,23 @@ def moving_arm(cell: Cell, robot: str, seed: int = 0, unmodelled: TorqueErrors =
     told = np.concatenate([standard_parameters(nominal), (values * share).ravel()])
     inertia = plant.inertia_diagonal(random_joints(chain, 200, 0))
     omega = 2 * np.pi * BANDWIDTH
+    sensors = sensed(robot)
+    noise = f"{SIGMA_MOTOR:.1%} (motors) and {SIGMA_LINK:.1%} (sensors)" if sensors else f"{SIGMA_MOTOR:.1%}"
     note = (
         f"masses off their nominal by {2 * MASS:.0%}, centres by {1e3 * SHIFT:g} mm (1 sigma); {source}; torque noise "
-        f"{SIGMA_MOTOR:.1%} (motors) and {SIGMA_LINK:.1%} (sensors) of the limits{unmodelled.note}"
+        f"{noise} of the limits{unmodelled.note}"
     )
     return MovingArm(
         chain, plant, IdentificationModel(plant.bodies, plant.terms, LINK),
         Plant(bodies_of(nominal), tuple(terms), told),
         replace(pd(omega**2 * inertia, 2 * DAMPING * omega * inertia), cutoff=CUTOFF), effort, note, unmodelled,
+        sensors,
     )  # fmt: skip
+
+
+def sensed(robot: str) -> bool:
+    """Return whether a robot of the library has joint torque sensors: friction behind its gears is known."""
+    return library.path(f"{robot}_truth").exists() and "Fvl" in known_robots.truth(robot)["drives"]
 
 
 def play(t: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray, repeats: int) -> Reference:
@@ -128,7 +138,7 @@ def play(t: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray, repeats: in
 def record(
     arm: MovingArm, reference: Reference, seed: int | np.random.Generator = 0, running: float = np.inf
 ) -> Recording:
-    """Return a simulated recording of a motion: encoders, motor torques and torque sensors.
+    """Return a simulated recording of a motion: encoders, motor torques and, where the arm has any, torque sensors.
 
     Args:
         arm: what moves.
@@ -146,9 +156,9 @@ def record(
     beyond = _unmodelled(arm, reference.q, reference.v, reference.a, running + reference.t)
     run = simulate(arm.plant, controller, reference, sensing, rng, push=-beyond)
     noise = [sigma * arm.effort * rng.normal(size=run.q.shape) for sigma in (SIGMA_LINK, SIGMA_MOTOR)]
-    sensed = _held(arm.link_torque(run.q, run.v, run.a)) + noise[0]
+    link = _held(arm.link_torque(run.q, run.v, run.a)) + noise[0] if arm.sensors else None
     motor = _held(run.torque) + noise[1]
-    return Recording(run.t, run.measured, motor, "torque", arm.chain.joint_names, tau_link=sensed)
+    return Recording(run.t, run.measured, motor, "torque", arm.chain.joint_names, tau_link=link)
 
 
 def _held(torque: np.ndarray) -> np.ndarray:

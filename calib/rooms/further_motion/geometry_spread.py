@@ -8,7 +8,7 @@ import numpy as np
 from calib.data import csv_table
 from calib.dynamics.load_cases import LoadCases
 from calib.procedure.dynamic_stage.geometry_tables import SENSITIVITY, TORQUE_COVARIANCE
-from calib.procedure.excitation.inputs import ExcitedModel, bodies_with
+from calib.procedure.excitation.inputs import ExcitedModel, moved_to
 from calib.robot import calibrated
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
@@ -54,12 +54,9 @@ def geometry_spread(
         return None  # an earlier version's
     sizes, axes = np.linalg.eigh(covariance)
     errors = (axes * np.sqrt(np.maximum(sizes, 0.0)))[:, sizes > 1e-12 * sizes[-1]]
-    own = exact.model.bodies
-    payloads = [label for label, c in zip(own.labels, own.coordinates) if c < 0]
 
     def moved(step: np.ndarray) -> LoadCases:
-        bodies = bodies_with(chain.with_values(np.asarray(chain.values) + step), own.gravity, payloads)
-        return replace(exact, model=replace(exact.model, bodies=bodies))
+        return replace(exact, model=moved_to(chain.with_values(np.asarray(chain.values) + step), exact.model))
 
     before = np.zeros((len(exact.names), errors.shape[1]))
     if stored is not None:

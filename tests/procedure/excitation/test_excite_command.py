@@ -27,7 +27,9 @@ from calib.procedure.excitation.limits import Points, read_motion_limits
 from calib.procedure.excitation.planning import plan
 from calib.procedure.excitation.prediction import foretell
 from calib.procedure.excitation.settings import ExcitationSettings
+from calib.robot.calibrated import CalibratedChain
 from calib.robot.kinematics import forward
+from calib.robot.library import load
 from trajectories.basis import SampledMotion
 from trajectories.design.objectives import condition_numbers
 from trajectories.design.search import StartSearch
@@ -129,6 +131,29 @@ def test_motions_before_count(earlier, tmp_path):
     assert found is not None
     ratio = np.diag(found.information) / np.diag(second.inputs.prior.information)
     assert 0.9 < np.median(ratio) < 1.02
+
+
+def test_a_motion_to_validate_on_stays_within_the_earlier_one(earlier):
+    """And is another motion: joint by joint its positions are not those of the first."""
+    found = design.excite("lwr4plus", replace(SHORT, period=12.0, evaluations=10, within=str(earlier), seed=5))
+    first = coefficients.read(earlier)
+    known = first.orders(np.linspace(0.0, first.period, 1000))
+    motion = dense_motion(found.family, found.found.x, np.linspace(0.0, found.period, 1000))
+    for own, whole in zip((motion.q, motion.v, motion.a), known):
+        assert (own.max(axis=0) <= whole.max(axis=0) + 1e-6).all() and (
+            own.min(axis=0) >= whole.min(axis=0) - 1e-6
+        ).all()
+    assert max(abs(np.corrcoef(a, b)[0, 1]) for a, b in zip(known[0].T, motion.q.T)) < 0.9
+
+
+def test_a_calibrated_arm_is_excited_for_the_columns_that_will_be_identified():
+    """Its tilted axes raise the exact rank by columns that no motion tells from others."""
+    nominal = load("tx40")
+    values = nominal.values + 5e-4 * np.random.default_rng(0).standard_normal(len(nominal.values))
+    moved = CalibratedChain(nominal.with_values(values), nominal=nominal)
+    names = [read_inputs(arm, SHORT).columns.names for arm in (CalibratedChain(nominal), moved)]
+    assert [name.removesuffix("R") for name in names[1]] == [name.removesuffix("R") for name in names[0]]
+    assert len(read_inputs(replace(moved, nominal=None), SHORT).columns.names) > len(names[0])
 
 
 @pytest.mark.slow

@@ -211,7 +211,7 @@ def another(table: np.ndarray, header: list[str]) -> np.ndarray:
         (scaled("tau_joint4", -1.0), "training_log.csv: torque of joint4 .* reverse the sign of the column of joint4"),
         (numbers(counted_from_the_horizontal), r"if joint3, joint2 are combined \(-\)"),
         (scaled("tau_joint", 1e-2), "times those of the nominal masses"),
-        (scaled("tau_joint", 12.0), "are they in mNm"),
+        (scaled("tau_joint", 11.0), "are they in mNm"),
         (numbers(another), "does not contain the motion designed in this session"),
         (numbers(lambda table, header: table[:1000]), "shorter than one period"),
         (reheaded(lambda header: [name.replace("q_joint4", "x4") for name in header]), "joint"),
