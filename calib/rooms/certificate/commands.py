@@ -1,7 +1,6 @@
 """Command that writes the certificate of a result again, and figures as SVG: certificate."""
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
@@ -12,19 +11,17 @@ from calib.procedure.session.answers import CertificateSection
 app = typer.Typer()
 
 
-@command(app)
-def certificate(
-    folder: Annotated[Path, typer.Argument(help="of a fit, an identification, or a finished session")],
-    details: CertificateSection,
-    svg: Path | None = None,
-    plots: bool = True,
-) -> None:
+@command(app, "Files and studies")
+def certificate(folder: Path, details: CertificateSection, svg: Path | None = None, plots: bool = True) -> None:
     """Write a result's certificate and report again.
 
     For a fit or an identification, stating serial numbers, operator …. Of a session, session.toml has these details,
     under [certificate]; here only --svg applies.
 
+    Example: calib certificate fit --robot-serial 4711 --operator "A. Weber"
+
     Args:
+        folder: of a fit, an identification, or a finished session
         svg: folder for all figures of the report as SVG
     """
     from calib.folders import PAGES, SESSION
