@@ -200,7 +200,7 @@ class TorqueCurves:
     """Measured and predicted torques of one recording, (rows, K) each, thinned for drawing; times [s].
 
     Attributes:
-        band: both are low-passed to this [Hz]; NaN: they are as recorded (until schema 2).
+        band: both are low-passed to this [Hz]; NaN: they are as recorded, as earlier versions kept them.
         error_sigma: standard error of the relative error of the torques as recorded [%].
     """
 
