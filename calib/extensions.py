@@ -26,7 +26,10 @@ A room is a package of `calib.rooms` with a table ``OFFERS``: what it adds, and 
     fit_notes              functions: a fit → findings on it; image_coverage, reprojection: figures of its images
     image_words            what is said of images as they arrive
     recordings             functions: a session's folder → the name of the recording written there
-    steps, endings         of a session: steps after the certificate; functions: a complete session → lines to print
+    steps, endings         of a session: steps after the export; functions: a complete session → lines to print
+    fit_pages, model_pages functions that write the certificate of a fit (report, figures, folder) and of an
+                           identification (outcome, folder, whether with figures) into its folder
+    notebook               function: a result → HTML
     geometry_spread        function: see `calib.procedure.excitation.inputs.GeometrySpread`
 
 A room that is deleted takes its commands, methods and robots along; the rest works without.

@@ -23,6 +23,8 @@ METRICS, SESSION = "metrics.json", "session.toml"
 """Files that identify results and sessions; the metrics are written last and mark a folder as complete."""
 REPORT, CERTIFICATE = "report.json", "certificate.html"
 """The certificate, and the data for it and its figures."""
+PAGES = (CERTIFICATE, "certificate.pdf", "report.html")
+"""The certificate as a page and as a document, and the report with all tables and figures."""
 OFFSETS, PARAMETERS = "joint_offsets.csv", "parameters.json"
 """Files that identify an export, of a geometry and of dynamics."""
 

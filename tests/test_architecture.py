@@ -47,7 +47,8 @@ HOMES = {
     "clarabel": ["calib.estimation."],
     "cvxpy": [],  # the tests' independent solver
     "matplotlib": ["calib.procedure.", "calib.api.", "calib.rooms."],
-    "jinja2": ["calib.procedure.", "calib.rooms.studies."],
+    "jinja2": ["calib.procedure.report.templates"],
+    "typst": ["calib.rooms.certificate.rendering"],
     "pyarrow": ["calib.rooms.studies.store"],
     "dask": ["calib.workers.cluster"],
     "distributed": ["calib.workers.cluster"],

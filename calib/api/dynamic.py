@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -87,9 +88,9 @@ class DynamicsModel(Drawn, Judged, identify.IdentificationOutcome):
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write the result folder, as `calib identify --out` does."""
-        from calib.procedure.report import dynamics_figures
+        from calib.procedure.report import outputs
 
-        return folder.write_folder(self, Path(out), dynamics_figures.write if plots else None)
+        return folder.write_folder(self, Path(out), partial(outputs.write_model, plots=plots))
 
     def charts(self) -> dict[str, Chart]:
         """Return what the figures show: measured and predicted torques, autocorrelations, friction."""

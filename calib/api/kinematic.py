@@ -31,7 +31,7 @@ from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
     from calib.procedure.report.charts import Chart
-    from calib.procedure.report.page import Page, Section
+    from calib.procedure.report.page import Section
 
 Measured = str | Path | PoseMeasurements
 Several = Measured | Sequence[Measured | Sequence[Measured]]
@@ -172,12 +172,12 @@ class GeometryFit(Drawn, Judged, fit.Outcome):
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write the result folder, as `calib fit --out` does: robot.toml, URDF, estimate, residuals, certificate."""
-        from calib.procedure.report import certificate
+        from calib.procedure.report import outputs
 
-        return folder.write_folder(self, Path(out), partial(certificate.write_fit, plots=plots))
+        return folder.write_folder(self, Path(out), partial(outputs.write_fit, plots=plots))
 
     def charts(self) -> dict[str, Chart]:
-        """Return what the figures of the certificate show, by name."""
+        """Return what the figures of the report show, by name."""
         from calib.procedure.report import geometry_figures
         from calib.procedure.report.fit_report import collect
 
@@ -198,13 +198,6 @@ class GeometryFit(Drawn, Judged, fit.Outcome):
         from calib.procedure.report import geometry_section
 
         return geometry_section.outcome_section(folder.metrics(self))
-
-    def page(self) -> Page:
-        """Return the certificate of this fit, without figures."""
-        from calib.procedure.report import certificate
-        from calib.procedure.report.fit_report import collect
-
-        return certificate.of_fit(collect(self), {}, self.inputs)
 
     def __repr__(self) -> str:
         return f"<GeometryFit of {self.robot.chain.name}: model {self.selection.chosen}, {self.verdict.level}>"

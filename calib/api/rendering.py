@@ -1,4 +1,4 @@
-"""Results as text and HTML: console text for ``print(result)``, and the certificate as a page for notebooks.
+"""Results as text and HTML: console text for ``print(result)``, and a page for notebooks, which a room makes.
 
 What the verbs take in several forms: one or many, a file that may be missing, a result or its folder.
 """
@@ -16,13 +16,14 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, ClassVar, Self, overload
 
 from calib.errors import UsageError, one_of, refused_as
+from calib.extensions import offered
 from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from calib.procedure.report.charts import Chart
-    from calib.procedure.report.page import Page, Section
+    from calib.procedure.report.page import Section
 
 Progress = Callable[[str], None]
 
@@ -124,16 +125,9 @@ class Judged(Shown, ABC):
     def __str__(self) -> str:
         return as_text(self.renderables())
 
-    def page(self) -> Page:
-        """Return the section as a page with a title."""
-        from calib.procedure.report import certificate
-
-        return certificate.certificate(repr(self).strip("<>"), "", (), [self.section()])
-
-    def _repr_html_(self) -> str:
-        from calib.procedure.report import certificate
-
-        return certificate.render(self.page())
+    def _repr_html_(self) -> str | None:
+        """Return the result as a page, as notebooks show it."""
+        return next((page(self) for page in offered("notebook")), None)
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, str]:
         """Return the page in a frame of its own, so that its style does not become the notebook's."""

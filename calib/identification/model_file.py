@@ -34,7 +34,8 @@ findings behind them, ``noticed`` (code, values; `calib explain CODE`), ``verdic
 rows per second), ``seed``, ``schema`` (3; files without one are of earlier versions and are
 read, too). No number: null.
 
-Figures: ``plot_torque_N.png`` of every file in the order given, training first (measured, predicted, residual);
+Figures: ``plot_torque_N.png`` of every file in the order given, training first (measured, predicted, residual,
+low-passed to the identification band);
 ``plot_residuals.png`` (autocorrelation; dashed: white noise), ``plot_friction.png`` (over velocity), and, where the
 geometry's uncertainty is known, what it adds to sigma.
 """

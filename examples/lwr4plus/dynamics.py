@@ -3,7 +3,7 @@
 Kolyubin, Shiriaev & Jubien (2019), Int. J. Adv. Manuf. Technol. 101, 243-259, sections 4 and 6.2, on a simulated arm:
 the calibrated column of their Table 2, a 3.28 kg payload, joint torque sensors, 1 kHz, 10 Hz Butterworth, decimation to
 2 Hz. *Calibrated* is the geometry fitted to 17 measured poses. The motion is Trajectory B of 44 columns, as
-`excitation.py` designs it; torques are predicted on it again, and on a random Fourier series of 25 s and five harmonics.
+`excitation.py` designs it; torques are predicted on it again and on a random Fourier series of 25 s and five harmonics.
 
 What is by construction: see `simulated_arm.py`. The counts, and which inertial parameters turn out essential, do not
 depend on that. How many are essential depends on the noise and the rule: the paper supervised its rule by hand; here an

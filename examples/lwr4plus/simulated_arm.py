@@ -1,6 +1,6 @@
 """The simulated LWR4+ of the dynamic study: its models, its truth, and its logs with and without the payload.
 
-Geometry: the calibrated column of Table 2 of Kolyubin, Shiriaev & Jubien (2019). By construction, so no evidence about a
+Geometry: the calibrated column of Table 2 of Kolyubin, Shiriaev & Jubien (2019). By construction, no evidence about a
 real arm: motor inertias and total friction are the published ones of another unit (Jubien, Gautier & Janot 2014); their
 split between the sides, offsets and noise are chosen with Table 4 in view; the truth obeys the model.
 """

@@ -2,8 +2,8 @@
 
     python examples/survey/motions.py random designed logdet torque [--conditions …] [--data-sets 8]
 
-where logdet is a folder of ``calib excite tx40 --out logdet --goal logdet --period 10 --harmonics 12 --drives "Ia Fv Fc"
---rate 5000 --limits examples/survey/limits.toml``, and torque one of ``--goal torque``.
+where logdet is a folder of ``calib excite tx40 --out logdet --goal logdet --period 10 --harmonics 12 --drives "Ia Fv
+Fc" --rate 5000 --limits examples/survey/limits.toml``, and torque one of ``--goal torque``.
 
 `random` and `designed` are the motions of `calib study`. Prints, for each motion, the condition number of W raw and
 normalised, and of ols and wls the median errors [%] of β and of noise-free torques along another motion, and the torque

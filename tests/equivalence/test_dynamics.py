@@ -107,7 +107,7 @@ def by_session(session: Session) -> Judgement:
     assert set(found["warnings"]) <= {*notes, *own["warnings"]}  # said by one of the two steps
     numbers = {key: found[key] for key in ("fit", "validation")} | {key: own[key] for key in MODEL}
     numbers["tracking"] = timeless(found["tracking"])
-    section = dynamics_section.certificate_section(printed, {})
+    section = dynamics_section.report_section(printed, {})
     assert (section.verdict, section.reason) == (found["verdict"], found["reason"])
     return Judgement(found["verdict"], found["reason"], numbers, frozenset(found["warnings"]))
 

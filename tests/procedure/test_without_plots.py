@@ -24,7 +24,7 @@ def test_a_fit_without_plots_has_its_certificate_and_all_else(cell, calib):
     assert calib(*arguments, "--out", "with")[0] == calib(*arguments, "--out", "without", "--no-plots")[0] == 0
     drawn, bare = names(cell.folder / "with"), names(cell.folder / "without")
     assert len(drawn - bare) >= 6 and all(name.startswith("plot_") for name in drawn - bare) and bare < drawn
-    page = (cell.folder / "without/certificate.html").read_text(encoding="utf-8")
+    page = (cell.folder / "without/report.html").read_text(encoding="utf-8")
     assert "<img" not in page and "Ladder of models" in page
     for name in ("metrics.json", "estimate.csv", "report.json"):
         assert (cell.folder / "with" / name).read_text() == (cell.folder / "without" / name).read_text()

@@ -31,7 +31,7 @@ from calib.units import headings, per_ampere
 INSTRUMENTAL = "instrumental.csv"
 OURS = (
     calibrated.ROBOT, MODEL, folders.ESTIMATE, folders.COVARIANCE, information.INFORMATION, INSTRUMENTAL,
-    folders.METRICS, "drive_gains.csv",
+    folders.METRICS, "drive_gains.csv", folders.REPORT, *folders.PAGES,
     "torques_1.csv", calibrated.COVARIANCE, geometry_tables.EFFECTS, geometry_tables.SENSITIVITY,
     geometry_tables.GEOMETRIES, geometry_tables.TORQUE_COVARIANCE, "plot_torque_[0-9]*.png",
     *(f"plot_{name}.png" for name in ("residuals", "friction", "geometries", "geometry_effects")),
@@ -69,8 +69,13 @@ class IdentificationFolder:
 
     @property
     def unseen(self) -> UnseenFolder:
-        """Folder of the model's results on unseen motion."""
+        """Folder of the model's results on unseen motion, in a session."""
         return UnseenFolder(self.path / "unseen")
+
+    @property
+    def judged(self) -> UnseenReport:
+        """Report of the model on unseen motion: a session's, else that of `calib identify`, in the folder itself."""
+        return (self.unseen if self.unseen.report.is_file() else UnseenFolder(self.path)).read()
 
     def dynamics(self) -> Dynamics:
         """Return the identified model, read from the folder."""
@@ -109,6 +114,10 @@ class UnseenFolder:
         for number, case in enumerate(inputs.unseen, 1):
             predicted, expected = found.predictions[case.name], found.intervals.get(case.name)
             _write_torques(inputs, case, predicted, expected, self.path / f"torques_{number}.csv")
+        self.write_report(inputs, found)
+
+    def write_report(self, inputs: IdentificationInputs, found: Assessment) -> None:
+        """Write the report alone."""
         files.write_json(self.report, UnseenReport.of(inputs, found))
 
     def read(self) -> UnseenReport:

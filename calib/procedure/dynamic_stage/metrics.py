@@ -22,15 +22,16 @@ from calib.identification.gains import GainRecord
 from calib.identification.identify import Identification
 from calib.identification.loop import LoopMetrics, Replay
 from calib.identification.methods.registry import METHODS
-from calib.identification.prediction import Score
+from calib.identification.prediction import Score, relative_error_sigma
 from calib.identification.rows import Case
 from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.identify import Assessment, IdentificationOutcome, ModelFindings
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
-from calib.records import Array, Number
+from calib.records import Array, Number, Unbounded
+from calib.units import TORQUE
 
 SCHEMA, UNSEEN_SCHEMA = 3, 2  # of metrics.json, and of unseen/report.json
-MAX_POINTS = 400  # samples per curve of the certificate (our choice)
+MAX_POINTS = 600  # samples per curve of the certificate (our choice)
 
 
 @dataclass(frozen=True)
@@ -196,19 +197,28 @@ def _error_density(found: Identification, cases: Sequence[Case]) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class TorqueCurves:
-    """Measured and predicted torques of one recording, (rows, K) each, thinned for drawing; times [s]."""
+    """Measured and predicted torques of one recording, (rows, K) each, thinned for drawing; times [s].
+
+    Attributes:
+        band: both are low-passed to this [Hz]; NaN: they are as recorded, as earlier versions kept them.
+        error_sigma: standard error of the relative error of the torques as recorded [%].
+    """
 
     name: str
     t: Array
     measured: Array
     predicted: Array
+    band: Number = np.nan
+    error_sigma: Number = np.nan
 
     @classmethod
     def of(cls, case: Case, predicted: np.ndarray) -> TorqueCurves:
         """Return the curves of a case and its prediction (N, rows)."""
-        picked = np.unique(np.linspace(0, len(case.target) - 1, MAX_POINTS).astype(int))
-        shown = (np.asarray(x)[picked].T for x in (case.target, predicted))
-        return cls(case.name, np.round(case.motion.t[picked], 4), *(_five_digits(x) for x in shown))
+        motion, measured = case.motion, np.asarray(case.target)
+        picked = np.unique(np.linspace(0, len(measured) - 1, MAX_POINTS).astype(int))
+        low, other = (_five_digits(motion.in_band(one)[picked].T) for one in (measured, predicted))
+        sigma = relative_error_sigma(measured[picked].T, predicted[picked].T)
+        return cls(case.name, np.round(motion.t[picked], 4), low, other, motion.band, sigma)
 
 
 def _five_digits(values: np.ndarray) -> np.ndarray:
@@ -217,11 +227,20 @@ def _five_digits(values: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class UnseenReport(JudgedMetrics):
-    """A model on unseen motion, as ``unseen/report.json`` stores it; see `calib.procedure.dynamic_stage.identify`."""
+    """A model on unseen motion, as ``unseen/report.json`` stores it; see `calib.procedure.dynamic_stage.identify`.
+
+    Attributes:
+        robot: its name; empty in files of earlier versions.
+        units: of the torque rows.
+        curves: of the recordings that are judged.
+        limits: (rows,) torques that the robot's description allows; infinite without one.
+    """
 
     units: tuple[str, ...]
     fit: Mapping[str, Score]
     curves: tuple[TorqueCurves, ...]
+    limits: Unbounded | None = None
+    robot: str = ""
     schema: int = UNSEEN_SCHEMA
 
     @classmethod
@@ -229,9 +248,12 @@ class UnseenReport(JudgedMetrics):
         """Return the report of an assessment."""
         rows = inputs.options.settings.torque_rows.titles(inputs.chain.joint_names)
         curves = (TorqueCurves.of(case, found.predictions[case.name]) for case in (inputs.unseen or inputs.cases))
+        known = inputs.options.settings.torque_rows.projection is None and inputs.unit == TORQUE
+        limits = np.resize([joint.effort if known else np.inf for joint in inputs.chain.joints], len(rows))
         return cls(
-            **_judged(found), rows=tuple(rows), units=tuple(inputs.row_units), fit=found.fit, curves=tuple(curves)
-        )
+            **_judged(found), rows=tuple(rows), units=tuple(inputs.row_units), fit=found.fit, curves=tuple(curves),
+            limits=limits, robot=inputs.chain.name,
+        )  # fmt: skip
 
     @property
     def proofs(self) -> dict[str, Score]:

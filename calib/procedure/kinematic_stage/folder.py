@@ -13,7 +13,7 @@ import numpy as np
 
 from calib import files, folders
 from calib.errors import UsageError, refused_as
-from calib.folders import CERTIFICATE, COVARIANCE, ESTIMATE, METRICS, REPORT, InFolder
+from calib.folders import COVARIANCE, ESTIMATE, METRICS, PAGES, REPORT, InFolder
 from calib.geometry import installation
 from calib.geometry.error_model import ErrorModel
 from calib.geometry.first_guess import install
@@ -41,7 +41,7 @@ FIGURES = (
 OURS = (
     calibrated.ROBOT, URDF, CORRECTED_URDF,
     ESTIMATE, COVARIANCE, calibrated.COVARIANCE, RESIDUALS, TERMS,
-    FORMULA, REPORT, CERTIFICATE, METRICS, *(f"plot_{name}.png" for name in FIGURES),
+    FORMULA, REPORT, *PAGES, METRICS, *(f"plot_{name}.png" for name in FIGURES),
 )  # fmt: skip
 """Files of an earlier fit that a new one replaces."""
 

@@ -98,11 +98,11 @@ def text(
 
 
 @layer
-def dots(axes: Axes, x: Any, y: Any, values: Any, most: float, unit: str = "") -> None:
-    """Draw points (k,) coloured by their values (k,) up to `most`, with a colour bar if `unit` is given."""
+def dots(axes: Axes, x: Any, y: Any, values: Any, least: float, most: float, unit: str = "") -> None:
+    """Draw points (k,) coloured by their values (k,) from `least` to `most`, with a colour bar if `unit` is given."""
     order = np.argsort(values)  # the largest on top
     x, y, values = (np.asarray(each)[order] for each in (x, y, values))
-    drawn = axes.scatter(x, y, SIZE, values, cmap="cividis_r", vmin=0.0, vmax=most, edgecolors=QUIET, linewidths=0.25)
+    drawn = axes.scatter(x, y, SIZE, values, cmap="cividis_r", vmin=least, vmax=most, edgecolors=QUIET, linewidths=0.25)
     if unit:
         _scale(axes, drawn, unit, extend="max" if values[-1] > most else "neither")
 
@@ -258,7 +258,12 @@ def figures(charts: Mapping[str, Chart]) -> dict[str, Figure]:
 
 def picture(chart: Chart, caption: str) -> Picture:
     """Return a chart with a caption as a picture for a page, from the cache if it was drawn before."""
-    return Picture(_drawn(pickle.dumps(chart)), caption, chart.width > style.HALF_WIDTH)
+    return Picture(_drawn(pickle.dumps(chart)), caption, chart.width > style.HALF_WIDTH, chart)
+
+
+def vector(chart: Chart, caption: str) -> Picture:
+    """Return a chart with a caption as a picture of lines and outlines (SVG), for print."""
+    return Picture(style.svg(figure(chart)), caption, chart.width > style.HALF_WIDTH)
 
 
 @lru_cache(maxsize=32)
@@ -269,4 +274,4 @@ def _drawn(chart: bytes) -> bytes:
 def save_all(charts: Mapping[str, Chart], folder: Path) -> None:
     """Write charts into a folder, as ``plot_<name>.png``."""
     for name, chart in charts.items():
-        files.write(folder / f"plot_{name}.png", picture(chart, "").png)
+        files.write(folder / f"plot_{name}.png", picture(chart, "").image)

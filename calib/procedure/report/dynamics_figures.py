@@ -25,6 +25,7 @@ from calib.units import small
 
 MAX_HALF_PAGE_ROWS = 8  # torque rows whose figures fit half a page
 MAX_ELEMENTS = 15  # elements in the ranked figure
+MAX_LABELS = 40  # parameters along an axis: more cannot be read on A4
 T = TypeVar("T")
 
 
@@ -32,7 +33,7 @@ def write(outcome: IdentificationOutcome, folder: Path) -> None:
     """Write ``plot_torque_<n>.png`` of every file, ``plot_residuals.png``, ``plot_friction.png`` and more."""
     save_all(figures(outcome), folder)
     for name, drawn in from_folder(folder).items():
-        files.write(folder / f"plot_{name}.png", drawn.png)
+        files.write(folder / f"plot_{name}.png", drawn.image)
 
 
 def figures(outcome: IdentificationOutcome) -> dict[str, Chart]:
@@ -49,8 +50,9 @@ def file_torques(case: Case, predicted: np.ndarray, outcome: IdentificationOutco
     found = {**outcome.fit, **outcome.validation}[case.name].raw
     title = f"{case.name} ({kind}): {found.total:.3g} % of the torque unexplained"
     labels, units = _rows(outcome), outcome.inputs.row_units
-    target = np.asarray(case.target)
-    return torques(case.motion.t, target, predicted, labels, units, title, found.joints)
+    motion = case.motion
+    measured, predicted = (motion.in_band(np.asarray(one)) for one in (case.target, predicted))
+    return torques(motion.t, measured, predicted, labels, units, title, found.joints, motion.band)
 
 
 def _autocorrelations(outcome: IdentificationOutcome) -> Chart:
@@ -95,7 +97,7 @@ def _rows(outcome: IdentificationOutcome) -> tuple[str, ...]:
 
 def torques(
     t: np.ndarray, measured: np.ndarray, predicted: np.ndarray, rows: Sequence[str], units: Sequence[str], title: str,
-    errors: Sequence[float] | np.ndarray = (),
+    errors: Sequence[float] | np.ndarray = (), band: float = np.nan,
 ) -> Chart:  # fmt: skip
     """Return the chart of measured torques, predicted torques and residuals over time.
 
@@ -105,17 +107,19 @@ def torques(
         rows, units: names of the torque rows, and their units.
         title: of the whole.
         errors: relative error of each row [%]; none where it is not known.
+        band: to which the torques are low-passed [Hz]; NaN: they are as recorded.
     """
+    below = "time [s]" + (f"; torques low-passed at {band:.3g} Hz" if np.isfinite(band) else "")
     columns = 2 if len(rows) > MAX_HALF_PAGE_ROWS else 1
     panels = []
     for j, (row, unit) in enumerate(zip(rows, units)):
         left = f": {errors[j]:.3g} % left" if j < len(errors) and np.isfinite(errors[j]) else ""
         lines = [
-            line(t, measured[:, j], "-", BEFORE, 1.4, label="measured"),
+            line(t, measured[:, j], "-", BEFORE, 2.4, label="measured"),
             line(t, predicted[:, j], "-", AFTER, 0.7, label="predicted"),
             line(t, measured[:, j] - predicted[:, j], "-", QUIET, 0.5, label="measured - predicted"),
         ]
-        panels.append(Panel(lines, f"{row} [{unit}]{left}", "time [s]", xlim=(t[0], t[-1])))
+        panels.append(Panel(lines, f"{row} [{unit}]{left}", below, xlim=(t[0], t[-1])))
     return Chart(panels, 0.7 + 0.95 * -(-len(rows) // columns), columns, title=title, shared="x")
 
 
@@ -169,24 +173,25 @@ def from_folder(folder: Path) -> dict[str, Picture]:
 
 
 def _geometries(rows: Sequence[TwoGeometries]) -> Chart:
-    """Return the chart of each parameter's value on both geometries, and of the differences in sigmas."""
+    """Return the chart of parameters' values on both geometries, and of the differences in sigmas: the largest ones."""
     table = np.array([(row.nominal, row.sigma_nominal, row.calibrated, row.sigma_calibrated) for row in rows])
-    nominal, s_nominal, own, s_own = table.T
-    x, percent = np.arange(len(rows)), 100.0 / np.abs(own)
-    size = np.divide(nominal - own, s_own, out=np.zeros(len(rows)), where=s_own > 0.0)
+    size = np.divide(table[:, 0] - table[:, 2], table[:, 3], out=np.zeros(len(rows)), where=table[:, 3] > 0.0)
+    title = f"{int((np.abs(size) > 2.0).sum())} of {len(rows)} parameters change by two sigmas with the geometry"
+    chosen = np.sort(np.argsort(-np.abs(size), kind="stable")[:MAX_LABELS])
+    which = f"the {len(chosen)} of {len(rows)} that change most" if len(chosen) < len(rows) else ""
+    (nominal, s_nominal, own, s_own), size = table[chosen].T, size[chosen]
+    x, percent = np.arange(len(chosen)), 100.0 / np.abs(own)
     above = [
         line(x + shift, percent * (values - own), "o", colour, 1.0, 2.5, label=label, spread=2.0 * percent * sigma)
         for values, sigma, colour, shift, label in (
             (nominal, s_nominal, BEFORE, -0.15, "nominal (CAD) geometry"), (own, s_own, AFTER, 0.15, "calibrated"),
         )
     ]  # fmt: skip
-    moved = np.abs(size) > 2.0
-    shown = bars(size, [MARK if one else QUIET for one in moved], upright=True)
+    shown = bars(size, [MARK if abs(one) > 2.0 else QUIET for one in size], upright=True)
     panels = [
-        Panel(above, y="from calibrated [%]", xnames=[""] * len(rows), grid="y", symlog=1.0),
-        Panel([shown], y="difference [σ]", xnames=[row.name for row in rows], grid="y", symlog=2.0),
+        Panel(above, y="from calibrated [%]", xnames=[""] * len(chosen), grid="y", symlog=1.0),
+        Panel([shown], x=which, y="difference [σ]", xnames=[rows[k].name for k in chosen], grid="y", symlog=2.0),
     ]
-    title = f"{int(moved.sum())} of {len(rows)} parameters change by two sigmas with the geometry"
     return Chart(panels, 4.2, title=title)
 
 
@@ -260,7 +265,7 @@ def _torques(unseen: UnseenReport) -> list[Picture]:
         raw = {**unseen.fit, **unseen.validation}[curves.name].raw
         sides = curves.measured.T, curves.predicted.T
         title = f"{curves.name}: {percent(raw.total)} of the torque unexplained"
-        chart = torques(curves.t, *sides, unseen.rows, unseen.units, title, raw.joints)
+        chart = torques(curves.t, *sides, unseen.rows, unseen.units, title, raw.joints, curves.band)
         result.append(picture(chart, f"Torques on {curves.name}, {seen}: measured, predicted, and the residual."))
     return result
 
@@ -269,8 +274,11 @@ def _significance(found: DynamicReport) -> Picture:
     """Return the picture of each parameter's distance from zero in sigmas; values below two are not significant."""
     known = [row for row in found.estimate if row.sigma]
     share = np.array([max(abs(row.value) / max(row.sigma or 0.0, 1e-300), 0.1) for row in known])
-    shown = bars(share, [AFTER if one > 2 else QUIET for one in share], upright=True, base=0.1)
     title = f"{int((share > 2).sum())} of {len(known)} parameters differ from zero by two sigmas"
-    limits, names = (0.1, 2.0 * float(share.max(initial=2.0))), [row.name for row in known]
-    chart = Chart([Panel([shown, level(2.0)], title, y="|value| / σ", ylim=limits, log="y", xnames=names)], 2.3)
+    chosen = np.sort(np.argsort(share, kind="stable")[:MAX_LABELS])
+    which = f"the {len(chosen)} of {len(known)} nearest to zero" if len(chosen) < len(known) else ""
+    share, names = share[chosen], [known[k].name for k in chosen]
+    shown = bars(share, [AFTER if one > 2 else QUIET for one in share], upright=True, base=0.1)
+    limits = 0.1, 2.0 * float(share.max(initial=2.0))
+    chart = Chart([Panel([shown, level(2.0)], title, which, "|value| / σ", ylim=limits, log="y", xnames=names)], 2.3)
     return picture(chart, "Distance of each parameter from zero, in its σ; grey: not significant.")

@@ -1,4 +1,4 @@
-"""The dynamics section of reports, for the console output of an identification and for certificates."""
+"""The dynamics section of reports, for the console output of an identification and for its report."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,13 +20,14 @@ from calib.identification.loop import (
     LoopMetrics,
     Replay,
 )
-from calib.identification.prediction import Score, relative_error_sigma
+from calib.identification.prediction import Score
 from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.metrics import ModelMetrics, UnseenReport
 from calib.procedure.dynamic_stage.metrics import metrics as record_of
+from calib.procedure.findings import lines_of
 from calib.procedure.report import page
 from calib.records import read_rows
 from calib.robot.chain import Chain
@@ -37,6 +38,7 @@ WORDS = 46  # letters of what a parameter holds that are printed
 SHOWN = 8  # geometric errors listed
 WHITE = 0.10  # share of autocorrelations beyond the bound below which a residual may be called white (0.05 if it is)
 ERROR_NOTE = (
+    "Of limit: of the torque that the robot's description allows. "
     "Error: 100 ‖τ - τ̂‖ / ‖τ‖ of the torque as recorded; in band: both low-passed to the band of the motion; moving, "
     "standing: as recorded, where the joint moves or stands. Torque above that band (noise, ripple) is explained "
     "by no model of q, v, a. ACF outside: share of the residual's autocorrelations beyond the 95 % bounds of "
@@ -105,7 +107,7 @@ def read(folder: Path) -> DynamicReport:
             place.metrics(),
             read_estimate(folder, IdentifiedParameter),
             read_rows(geometry_tables.GeometricEffect, effects) if effects.exists() else (),
-            place.unseen.read(),
+            place.judged,
         )
     except (OSError, ValueError) as error:
         raise UsageError(f"{folder}: {error}; identify again: calib redo … identify") from error
@@ -129,22 +131,24 @@ def read_lines(inputs: IdentificationInputs) -> list[str]:
 
 
 def outcome_section(outcome: IdentificationOutcome) -> page.Section:
-    """Return the console's section on an identification: that of its certificate, without figures and parameters."""
+    """Return the console's section on an identification: that of its report, without figures and parameters."""
     effects = () if outcome.carried is None else geometry_tables.effects(outcome.carried)
-    return certificate_section(
+    return report_section(
         DynamicReport(record_of(outcome), (), tuple(effects), UnseenReport.of(outcome.inputs, outcome)), {}
     )
 
 
-def certificate_section(
-    found: DynamicReport, drawn: Mapping[str, page.Pictures], exported: Sequence[str] = (), tolerance: float = 0.0
-) -> page.Section:
-    """Return the section of a certificate: errors on unseen motion, torques, excitation, and parameters.
+def report_section(
+    found: DynamicReport, drawn: Mapping[str, page.Pictures], exported: Sequence[str] = (), tolerance: float = 0.0,
+    delivered: float | None = None,
+) -> page.Section:  # fmt: skip
+    """Return the section of a report: errors on unseen motion, torques, excitation, and parameters.
 
     Args:
         drawn: figures by name (`draw_dynamics`); those that are not there are left out.
         exported: what the export had to say.
         tolerance: largest error of the torque on unseen motion that is good enough [%]; 0: none.
+        delivered: error of the exported robot there [%]; None where it is not known.
     """
     metrics, unseen = found.metrics, found.unseen
     pictures = lambda name: [drawn[name]] if name in drawn else []  # noqa: E731
@@ -160,9 +164,15 @@ def certificate_section(
     if metrics.loop:
         blocks.append(page.Text("Closed loop", _loop_sentences(metrics.loop)))
     blocks += tracking_blocks(unseen.tracking, unseen.tracking_failure)
-    warnings = list(dict.fromkeys((*metrics.warnings, *unseen.warnings)))
-    blocks += [page.Text("What was exported", exported), page.Text("Notes on the dynamics", warnings, "note")]
-    return page.Section("Dynamics", blocks, unseen.verdict, unseen.reason, _key_figures(unseen, tolerance))
+    blocks += [page.Text("What was exported", exported), page.Text("Notes on the dynamics", warnings_of(found), "note")]
+    return page.Section("Dynamics", blocks, unseen.verdict, unseen.reason, _key_figures(unseen, tolerance, delivered))
+
+
+def warnings_of(found: DynamicReport) -> list[str]:
+    """Return what was noticed by identification and validation, each once, and nothing that validation refuted."""
+    early = [one for one in found.metrics.noticed if one.code == "no-unseen-motion" and found.unseen.proofs]
+    lines = dict.fromkeys((*found.metrics.warnings, *found.unseen.warnings))
+    return [line for line in lines if line not in lines_of(early)]
 
 
 def proof_of(unseen: UnseenReport) -> tuple[str, Score, str]:
@@ -173,22 +183,28 @@ def proof_of(unseen: UnseenReport) -> tuple[str, Score, str]:
     return name, found, where
 
 
-def _key_figures(unseen: UnseenReport, tolerance: float = 0.0) -> list[page.KeyFigure]:
+def _key_figures(unseen: UnseenReport, tolerance: float, delivered: float | None) -> list[page.KeyFigure]:
     """Return the torque errors that decide the verdict: those of the worst unseen recording."""
     name, proof, _ = proof_of(unseen)
     count = len(unseen.proofs)
     basis = {0: "the training motion", 1: "1 unseen motion"}.get(count, f"worst of {count} unseen motions")
-    raw, band = proof.raw, proof.filtered
-    curves = next((one for one in unseen.curves if one.name == name), None)
-    sigma = np.nan if curves is None else relative_error_sigma(curves.measured, curves.predicted)
+    sigma = next((one.error_sigma for one in unseen.curves if one.name == name), np.nan)
     spread = f"± {sigma:.2g} %" if np.isfinite(sigma) else ""
-    shares = ((x, row) for x, row in zip(band.joints, unseen.rows) if np.isfinite(x))
+    shares = ((x, row) for x, row in zip(proof.filtered.joints, unseen.rows) if np.isfinite(x))
     worst, row = max(shares, default=(np.nan, "torque"))
-    allowed = f"{tolerance:g} %" if tolerance else ""
+    left = proof.raw.total if delivered is None else delivered
+    asked = {"allowed": f"{tolerance:g} %" if tolerance else "none", "met": page.met(left, tolerance)}
+    error, in_band = "torque unexplained", "torque unexplained in the motion's band"
+    figures = [page.KeyFigure(error, "", percent(proof.raw.total), spread, basis, **asked)]
+    if delivered is not None:
+        figures = [
+            page.KeyFigure(f"{error} (exported robot)", "", percent(delivered), "", basis, **asked),
+            page.KeyFigure(f"{error} (identified model)", "", percent(proof.raw.total), spread, basis),
+        ]
     return [
-        page.KeyFigure("torque unexplained", "", percent(raw.total), spread, basis, allowed),
-        page.KeyFigure("torque unexplained in the motion's band", "", percent(band.total), "", basis),
-        page.KeyFigure(f"torque unexplained in the motion's band, worst joint: {row}", "", percent(worst), "", basis),
+        *figures,
+        page.KeyFigure(in_band, "", percent(proof.filtered.total), "", basis),
+        page.KeyFigure(f"{in_band}, worst joint: {row}", "", percent(worst), "", basis),
     ]
 
 
@@ -208,18 +224,27 @@ def _error_table(unseen: UnseenReport) -> page.Table:
     for name, one in unseen.validation.items():
         sets[f"{name} ({'unseen' if one.evidence else 'repeat: no evidence'})"] = one
     groups = {label: _error_rows(one, unseen) for label, one in sets.items()}
-    header = ("torque", "error", "in band", "moving", "standing", "torque above band", "rms", "ACF outside")
+    header = (
+        "torque", "rms error", "of limit", "error", "in band", "moving", "standing", "torque above band", "ACF outside",
+    )  # fmt: skip
     return page.grouped("Torque errors", header, groups, ERROR_NOTE, _of_all)
 
 
 def _error_rows(one: Score, unseen: UnseenReport) -> Iterator[Sequence[str]]:
     parts = one.raw, one.filtered, one.moving, one.standing
-    yield "all", *(percent(part.total) for part in parts), "", "", ""
-    for j, (row, unit, rms, white) in enumerate(zip(unseen.rows, unseen.units, one.raw.rms, one.whiteness)):
+    yield "all", "", "", *(percent(part.total) for part in parts), "", ""
+    for j, (row, white) in enumerate(zip(unseen.rows, one.whiteness)):
         yield (
-            row, *(percent(part.joints[j]) for part in parts), percent(one.above_band_percent[j]),
-            f"{rms:.3g} {unit}" if np.isfinite(rms) else "", "" if white is None else f"{100 * white.outside:.0f} %",
+            row, *rms_words(one, unseen, j), *(percent(part.joints[j]) for part in parts),
+            percent(one.above_band_percent[j]), "" if white is None else f"{100 * white.outside:.0f} %",
         )  # fmt: skip
+
+
+def rms_words(one: Score, unseen: UnseenReport, row: int) -> tuple[str, str]:
+    """Return the rms error of a torque row in its unit, and in per cent of its limit; "–" where that is not known."""
+    rms, limit = one.raw.rms[row], np.inf if unseen.limits is None else unseen.limits[row]
+    share = percent(100.0 * rms / limit) if np.isfinite(limit) else "–"
+    return (f"{rms:.3g} {unseen.units[row]}", share) if np.isfinite(rms) else ("–", "–")
 
 
 def _of_all(row: Sequence[str]) -> bool:

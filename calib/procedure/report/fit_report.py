@@ -1,4 +1,4 @@
-"""The data of a fit's certificate: plain numbers in ``report.json``, from which the certificate can be rebuilt."""
+"""The data of a fit's report and certificate, plain numbers in ``report.json``, from which both can be made again."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from calib.geometry.observation import layout, predict, prepare
 from calib.procedure.kinematic_stage.comparison import Comparison
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.folder import metrics
+from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import FitMetrics, ImageCoverage, ValidationMetrics
 from calib.procedure.kinematic_stage.tables import estimate_table
 from calib.records import read_json
@@ -26,6 +27,7 @@ from calib.transforms import invert
 SCHEMA = 2
 READ = (1, SCHEMA)  # 1 kept the findings here, too
 NATURES = ("position", "orientation", "distance")
+FileRow = tuple[str, str, str, str]  # name, what it is, bytes, SHA-256
 
 
 class FittedParameter(NamedTuple):
@@ -66,7 +68,8 @@ class RowErrors:
         poses: how many robot poses.
         nominal, calibrated, urdf_alone: by nature, the errors of that arm [m, rad].
         expected: radius within which 95 % of the calibrated arm's errors are to be [m]; empty where none is known.
-        q: (rows, n) joints, and points (rows, 3) in the arm's base, where there is one error per row.
+        q: (rows, n) joints, points (rows, 3) in the arm's base, and numbers of the file's rows, where there is one
+            error per row.
     """
 
     name: str
@@ -78,6 +81,11 @@ class RowErrors:
     points: tuple[tuple[float, ...], ...] = ()
     expected: tuple[float, ...] = ()
     urdf_alone: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    rows: tuple[int, ...] = ()
+
+    def judged(self, deliverable: str) -> Mapping[str, tuple[float, ...]]:
+        """Return the errors of the deliverable on which the verdict is based, by nature."""
+        return self.calibrated if deliverable != "urdf" or not self.urdf_alone else self.urdf_alone
 
 
 @dataclass(frozen=True)
@@ -96,6 +104,8 @@ class Report:
         sets: errors per set of rows.
         noise: what the stated sigmas alone give, rms by nature [m, rad]; None where none were stated.
         images: what each camera's images show of it; empty without any.
+        files: what was read, see `file_row`.
+        source: path of the robot's description.
     """
 
     schema: int
@@ -114,6 +124,8 @@ class Report:
     sets: tuple[RowErrors, ...]
     noise: Mapping[str, float | None]
     images: tuple[ImageCoverage, ...] = ()
+    files: tuple[FileRow, ...] = ()
+    source: str = ""
 
     def with_unseen(self, found: ValidationMetrics, sets: Sequence[RowErrors]) -> Report:
         """Return the report, extended by unseen rows (`rows_of`) and updated verdict, reason and warnings."""
@@ -148,7 +160,28 @@ def collect(outcome: Outcome) -> Report:
         sets=tuple(sets),
         noise=_noise(outcome.fit.blocks),
         images=tuple(each for coverage in offered("image_coverage") for each in coverage(fit)),
+        files=_files(outcome.inputs),
+        source=str(outcome.inputs.source),
     )
+
+
+def file_row(name: str, role: str, path: Path) -> FileRow:
+    """Return the entry of a file in the certificate: name, content, bytes, SHA-256."""
+    return name, role, str(path.stat().st_size), files.fingerprint(path)
+
+
+def unseen_role(role: str, seen: bool, judged: str) -> str:
+    """Return the role of a validation file, and whether the file was unseen by `judged` (fit or identification)."""
+    return f"{role}, {'NOT unseen' if seen else 'unseen'} by {judged}"
+
+
+def _files(inputs: Inputs) -> tuple[FileRow, ...]:
+    """Return the entries of the robot's description and of the files for fit and validation."""
+    found = {inputs.source: "nominal robot", **{Path(block.file): "measured" for block in inputs.fit if block.file}}
+    for unseen in inputs.unseen.values():
+        if not unseen.held_out and unseen.block.file:
+            found.setdefault(Path(unseen.block.file), unseen_role("measured", unseen.seen, "the fit"))
+    return tuple(file_row(path.name, role, path) for path, role in found.items() if path.is_file())
 
 
 def rows_of(name: str, comparison: Comparison, unseen: bool) -> RowErrors:
@@ -162,7 +195,8 @@ def rows_of(name: str, comparison: Comparison, unseen: bool) -> RowErrors:
     if len(comparison.errors[1].main) != len(q):
         return rows
     expected = () if comparison.intervals is None else _plain(comparison.intervals.radius)
-    return replace(rows, q=_plain(q), points=_plain(_points(comparison)), expected=expected)
+    numbers = tuple(int(row) for block in comparison.blocks for row in block.rows)
+    return replace(rows, q=_plain(q), points=_plain(_points(comparison)), expected=expected, rows=numbers)
 
 
 def _points(comparison: Comparison) -> np.ndarray:

@@ -41,11 +41,11 @@ def error_histogram(
         [
             *(histogram(count, edges, colour) for count, colour in zip(counts, (BEFORE, AFTER))),
             level(rms[0], BROWN, upright=True, words="nominal"),
-            level(rms[1], AFTER, upright=True, words="calibrated"),
-            *([level(seen, INK, ":", upright=True, words="instrument", height=0.89)] if noise else []),
+            level(rms[1], AFTER, upright=True, words="calibrated", height=0.9),
+            *([level(seen, INK, ":", upright=True, words="instrument", height=0.82)] if noise else []),
         ],
         f"{rms[0]:.3g} {unit} rms before, {rms[1]:.3g} {unit} after", f"{nature} error [{unit}]", "poses",
-        xlim=(edges[0], edges[-1]), ylim=(0.0, 1.2 * max(1, *map(max, counts))), log="x" if apart else "",
+        xlim=(edges[0], edges[-1]), ylim=(0.0, 1.3 * max(1, *map(max, counts))), log="x" if apart else "",
     )  # fmt: skip
     return Chart([panel], 2.4, width=HALF_WIDTH)
 
@@ -86,8 +86,9 @@ def residuals_by_joint(
 
 
 def error_map(
-    points: np.ndarray, sizes: np.ndarray, words: str = "at most {} remain", expected: np.ndarray | None = None
-) -> Chart:
+    points: np.ndarray, sizes: np.ndarray, words: str = "at most {} remain", expected: np.ndarray | None = None,
+    least: float = 0.0,
+) -> Chart:  # fmt: skip
     """Return the maps of remaining errors in the workspace (from above and from the side) and of expected errors.
 
     Args:
@@ -95,6 +96,7 @@ def error_map(
         sizes: (m,) errors that remain [m].
         words: of the title, around the largest.
         expected: (m,) radius within which 95 % of such errors are to be [m]; None or empty where it is not known.
+        least: where the colours begin [m].
     """
     top = 1e3 * float(np.max(sizes, initial=1e-9))
     both = [sizes] if expected is None or not len(expected) else [sizes, expected]
@@ -107,7 +109,7 @@ def error_map(
     panels = [
         Panel(
             [
-                dots(points[:, 0], points[:, j], 1e3 * np.asarray(values), most, "[mm]" if j == 2 else ""),
+                dots(points[:, 0], points[:, j], 1e3 * np.asarray(values), 1e3 * least, most, "[mm]" if j == 2 else ""),
                 line([0.0], [0.0], "+", INK, size=9.0), text("base", 0.0, 0.0, (0, -5), across="center", along="top"),
             ],
             title, "x [m]", f"{'xyz'[j]} [m]", grid="both", equal=True, ticks=6,
@@ -119,7 +121,7 @@ def error_map(
 
 def predicted_map(points: np.ndarray, sigma: np.ndarray) -> Chart:
     """Return the map of the tool position's predicted σ (m,) [m] at points (m, 3) [m] of the workspace."""
-    return error_map(points, sigma, words="predicted σ up to {}")
+    return error_map(points, sigma, words="predicted σ up to {}", least=float(np.min(sigma)))
 
 
 def image_coverage(size: tuple[int, int], count: np.ndarray, rms: np.ndarray) -> Chart:

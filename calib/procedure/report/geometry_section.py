@@ -1,4 +1,4 @@
-"""The geometry section of reports, for the console output of a fit and for its certificate."""
+"""The geometry section of reports, for the console output of a fit and for its report."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
@@ -13,7 +13,7 @@ from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics
 from calib.procedure.kinematic_stage.validation import ARM
 from calib.procedure.report import page
-from calib.procedure.report.fit_report import Report
+from calib.procedure.report.fit_report import Report, RowErrors
 from calib.units import ERRORS, SMALL
 
 KINDS = {f"{nature}_{unit}": (nature, unit) for nature, (_, unit) in ERRORS.items()}
@@ -75,7 +75,7 @@ def read_lines(inputs: Inputs) -> list[str]:
 
 def outcome_section(metrics: FitMetrics) -> page.Section:
     """Return the console's section on a fit: ladder, errors, repeated poses, findings, verdict."""
-    blocks: list[page.Block] = [_ladder_table(metrics), _error_table(metrics)]
+    blocks: list[page.Block] = [_ladder_table(metrics), error_table(_sets(metrics), metrics.deliverable)]
     sizes = [f"{label}: {_rms_words(found)}" for label, found in _sets(metrics)]
     blocks.append(page.Text("", [f"model {metrics.model}, {parameter_words(metrics)}", *sizes]))
     if metrics.advice and not any(metrics.advice in line for line in metrics.warnings):
@@ -85,14 +85,14 @@ def outcome_section(metrics: FitMetrics) -> page.Section:
     return page.Section("Geometry", blocks, metrics.verdict, metrics.reason)
 
 
-def certificate_section(report: Report, drawn: Mapping[str, page.Picture]) -> page.Section:
-    """Return the section of a certificate: errors, ladder, parameters, identifiability, figures, outliers.
+def report_section(report: Report, drawn: Mapping[str, page.Picture]) -> page.Section:
+    """Return the section of a report: errors, ladder, parameters, identifiability, figures, outliers.
 
     Args:
         drawn: figures by name (`geometry_figures.draw`); those that are not there are left out.
     """
     metrics = report.metrics
-    blocks: list[page.Block] = [_error_table(metrics), *iso9283_tables(metrics)]
+    blocks: list[page.Block] = [error_table(_sets(metrics), metrics.deliverable), *iso9283_tables(metrics)]
     blocks.append(_pictures("Before and after", drawn, ("position", "orientation", "distance")))
     blocks.append(_pictures("What remains", drawn, ("joints", "map")))
     blocks.append(_pictures("Image coverage", drawn, [name for name in drawn if name.startswith("coverage")]))
@@ -113,15 +113,11 @@ def _key_figures(report: Report) -> list[page.KeyFigure]:
 
     Of the worst unseen rows; without any, those of cross-validation, where it judged; else of the fit's rows.
     """
-    metrics, proofs = report.metrics, report.metrics.proofs
-    if not proofs and (folds := _left_out(metrics)):
+    metrics = report.metrics
+    if not metrics.proofs and (folds := _left_out(metrics)):
         return [folds]
-    left = {name: rows.judged(metrics.deliverable).main for name, rows in proofs.items()}
-    worst = {found.rms: name for name, found in left.items() if found}
-    name = worst[max(worst)] if worst else next(iter(proofs), "fit")
-    proof = proofs.get(name, metrics.fit)
-    own = next((rows for rows in report.sets if rows.name == name), None)
-    basis = f"{proof.poses} {'unseen' if proofs else 'fitted'} poses"
+    proof, own = deciding(report)
+    basis = f"{proof.poses} {'unseen' if metrics.proofs else 'fitted'} poses"
     arms = (
         {"calibrated": ""}
         if proof.urdf_alone is None
@@ -137,15 +133,25 @@ def _key_figures(report: Report) -> list[page.KeyFigure]:
         sizes = None if own is None else (own.urdf_alone if arm == "urdf_alone" else own.calibrated).get(label)
         sigma = np.nan if sizes is None else ERRORS[label][0] * rms_sigma(np.array(sizes))
         spread = f"± {sigma:.2g} {unit}" if np.isfinite(sigma) else ""
-        judged = metrics.tolerance_mm and before is proof.nominal.main
-        allowed = f"{metrics.tolerance_mm:g} mm" if judged else ""
-        kinds = {"rms": (before.rms, after.rms, spread, basis, allowed)}
+        main = before is proof.nominal.main
+        judged = (metrics.tolerance_mm or 0.0) if main else 0.0
+        allowed = f"{judged:g} mm" if judged else "none" if main else ""
+        kinds = {"rms": (before.rms, after.rms, spread, basis, allowed, page.met(after.rms, judged))}
         if arm == next(iter(arms)):
-            kinds["largest"] = before.max, after.max, "", basis, ""
+            kinds["largest"] = before.max, after.max, "", basis, "", ""
         for kind, (one, two, *rest) in kinds.items():
-            what = f"{label} {words}".strip()
-            result.append(page.KeyFigure(f"{what}, {kind}", _size(one, unit), _size(two, unit), *rest))
+            what = f"{label}, {kind}" + (f" ({words})" if words else "")
+            result.append(page.KeyFigure(what, _size(one, unit), _size(two, unit), *rest))
     return result
+
+
+def deciding(report: Report) -> tuple[ComparedRows, RowErrors | None]:
+    """Return the worst unseen rows, and the errors of each; without unseen ones the fit's rows."""
+    metrics, proofs = report.metrics, report.metrics.proofs
+    left = {name: rows.judged(metrics.deliverable).main for name, rows in proofs.items()}
+    worst = {found.rms: name for name, found in left.items() if found}
+    name = worst[max(worst)] if worst else next(iter(proofs), "fit")
+    return proofs.get(name, metrics.fit), next((rows for rows in report.sets if rows.name == name), None)
 
 
 def _left_out(metrics: FitMetrics) -> page.KeyFigure | None:
@@ -155,10 +161,11 @@ def _left_out(metrics: FitMetrics) -> page.KeyFigure | None:
         return None
     before = nominal.rms if found.nominal_cross_validated is None else 1e3 * found.nominal_cross_validated
     label = "position" if metrics.fit.nominal.position_mm else "distance"
-    allowed = f"{metrics.tolerance_mm:g} mm" if metrics.tolerance_mm else ""
+    allowed = f"{metrics.tolerance_mm:g} mm" if metrics.tolerance_mm else "none"
     alone = metrics.fit.judged(metrics.deliverable) is metrics.fit.urdf_alone
-    after = _size(1e3 * ((alone and found.rigid_cross_validated) or found.cross_validated), "mm")
-    return page.KeyFigure(f"{label}, rms", _size(before, "mm"), after, "", "cross-validated rows", allowed)
+    after = 1e3 * ((alone and found.rigid_cross_validated) or found.cross_validated)
+    met, sizes = page.met(after, metrics.tolerance_mm or 0.0), (_size(before, "mm"), _size(after, "mm"))
+    return page.KeyFigure(f"{label}, rms", *sizes, "", "cross-validated rows", allowed, met)
 
 
 def _size(value: float, unit: str) -> str:
@@ -179,16 +186,15 @@ def _sets(metrics: FitMetrics) -> list[tuple[str, ComparedRows]]:
     return [(f"fitted: {metrics.fit.poses} poses", metrics.fit), *unseen]
 
 
-def _error_table(metrics: FitMetrics) -> page.Table:
-    """Return the table of errors of both arms, fitted and unseen: mean, rms, 95 % quantile and maximum."""
-    sets = _sets(metrics)
+def error_table(sets: Sequence[tuple[str, ComparedRows]], deliverable: str) -> page.Table:
+    """Return the table of errors of all arms on sets of rows, with the one that is judged in bold."""
     notes = ["Distances of pairs do not depend on the placement of instrument and tool."]
     notes += [ALONE_NOTE] * any(found.urdf_alone for _, found in sets)
     header = ("error", "arm", "mean", "rms", "95 %", "max")
     groups = {label: list(_error_rows(found)) for label, found in sets}
-    calibrated = lambda row: row[1:2] == ("calibrated",)  # noqa: E731
+    judged = lambda row: row[1:2] in (("calibrated",), (ARM[deliverable or "corrections"],))  # noqa: E731
     title = "Errors of the nominal and the calibrated arm"
-    return page.grouped(title, header, groups, " ".join(notes), calibrated, texts=2)
+    return page.grouped(title, header, groups, " ".join(notes), judged, texts=2)
 
 
 def _error_rows(found: ComparedRows) -> Iterator[tuple[str, ...]]:
@@ -196,11 +202,12 @@ def _error_rows(found: ComparedRows) -> Iterator[tuple[str, ...]]:
     kinds: dict[str, Mapping[str, ErrorStatistics | None]] = {
         f"{words} [{unit}]": {arm: _errors(found, arm, key) for arm in ARMS} for key, (words, unit) in KINDS.items()
     }
+    names = ARMS | ({"calibrated": ARM["corrections"]} if found.urdf_alone else {})
     for words, arms in (*kinds.items(), ("distance of pairs [mm]", found.pair_distance_mm)):
         for arm in ARMS:
             if numbers := arms.get(arm):
                 sizes = numbers.mean, numbers.rms, numbers.p95, numbers.max
-                yield words if arm == "nominal" else "", ARMS[arm], *(f"{size:.4f}" for size in sizes)
+                yield words if arm == "nominal" else "", names[arm], *(f"{size:.4f}" for size in sizes)
 
 
 def _ladder_table(metrics: FitMetrics) -> page.Table:
@@ -293,13 +300,13 @@ def _repeated_sentences(metrics: FitMetrics) -> list[str]:
     return [f"{name}: {iso9283_sentence(found.iso9283)}" for name, found in sets.items() if found.iso9283]
 
 
-def iso9283_tables(metrics: FitMetrics) -> list[page.Table]:
+def iso9283_tables(metrics: FitMetrics, most: int = MAX_POSES) -> list[page.Table]:
     """Return the tables of accuracy and repeatability after ISO 9283, one per set of rows with repeated poses."""
     result = []
     for name, found in {"fitted": metrics.fit, **metrics.validation}.items():
         if iso := found.iso9283:
             title = f"Accuracy and repeatability, {name} ({iso9283_sentence(iso)})"
-            result.append(page.table(title, REPEATED, [*enumerate(iso.each, 1)], ISO_NOTE, most=MAX_POSES))
+            result.append(page.table(title, REPEATED, [*enumerate(iso.each, 1)], ISO_NOTE, most=most))
     return result
 
 

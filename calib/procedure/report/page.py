@@ -1,6 +1,6 @@
-"""Elements of a report as values (tables, texts, pictures, sections, pages), and their printing by rich.
+"""Elements of a report as values (tables, texts, pictures, sections), and their printing by rich.
 
-A certificate shows the same values as HTML; this module does not depend on robots.
+Report and certificate show the same values as HTML and PDF; this module does not depend on robots.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -96,11 +96,12 @@ class Text:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure as PNG; a wide one uses the full width of the page."""
+    """A figure as PNG or SVG; a wide one uses the full width of the page; `chart` is what it was drawn from."""
 
-    png: bytes
+    image: bytes
     caption: str
     wide: bool = False
+    chart: Any = None
 
 
 @dataclass(frozen=True)
@@ -128,6 +129,7 @@ class KeyFigure:
         spread: its standard error.
         basis: on how many poses or motions, unseen or not.
         allowed: the tolerance; empty where none was given.
+        met: whether it is met, in a word.
     """
 
     quantity: str
@@ -136,6 +138,12 @@ class KeyFigure:
     spread: str = ""
     basis: str = ""
     allowed: str = ""
+    met: str = ""
+
+
+def met(value: float, tolerance: float) -> str:
+    """Return whether a value is within a tolerance, in a word; empty without a tolerance (0)."""
+    return "" if not tolerance else "yes" if value <= tolerance else "NO"
 
 
 @dataclass(frozen=True)
@@ -147,37 +155,6 @@ class Section:
     verdict: str = ""
     reason: str = ""
     figures: Sequence[KeyFigure] = ()
-
-
-@dataclass(frozen=True)
-class Page:
-    """A certificate: a self-contained first sheet, followed by sections.
-
-    Attributes:
-        title, subtitle: its head.
-        issued: by what and when it was made, in a line.
-        setup: label and value of what was calibrated, with what, when.
-        sections: judged ones are summed up on the first sheet.
-        marks: name, what it is, and the beginning of its SHA-256 of each file that the first sheet lists.
-    """
-
-    title: str
-    subtitle: str
-    issued: str
-    setup: Sequence[tuple[str, str]]
-    sections: Sequence[Section]
-    marks: Sequence[tuple[str, str, str]] = ()
-
-    @property
-    def tight(self) -> bool:
-        """Whether the first sheet needs a small font."""
-        lines = sum(max(60, len(value)) for _, value in self.setup)
-        return sum(len(section.reason) for section in self.judged) + lines > 1400
-
-    @property
-    def judged(self) -> list[Section]:
-        """The sections that have a verdict."""
-        return [section for section in self.sections if section.verdict]
 
 
 def relative_sigma(percent: float | None) -> str:

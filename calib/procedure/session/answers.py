@@ -1,16 +1,67 @@
 """Answers to `calib new`, given as options or at a terminal. This module imports little: `calib` starts fast."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from datetime import date
 from pathlib import Path
 from typing import Annotated, Any
+from unicodedata import category
 
 from calib.config import strict
-from calib.config_types import Expect, OneOf, Real, Text, Typed
+from calib.config_types import Checked, Expect, OneOf, Real, Text, Typed
 
 CAMERA = ("mounting", "lens", "board", "carried", "stands")
 CELL = ("instrument_at", "cone", "facing", "box", "obstacles", *CAMERA)
 Held = Annotated[float, Real(least=-3.0, most=3.0, unit="m", quantity="length")]
 Torques = Annotated[str, OneOf(("motor", "link", "both"))]
+Tolerance = Annotated[float, Real(least=0.0, quantity="1")]
+MAX_LETTERS = 200  # of one entry of a certificate
+
+
+def _entry(value: Any) -> Any:
+    """Check an entry of a certificate (a text, number or date), and return it as a text of one line."""
+    if not isinstance(value, str | int | float | date) or isinstance(value, bool):
+        return value
+    line = " ".join("".join(" " if category(one) in ("Cc", "Cs") else one for one in str(value)).split())
+    if len(line) > MAX_LETTERS:
+        raise ValueError(f"expected at most {MAX_LETTERS} letters, found {len(line)}")
+    return line
+
+
+StatedEntry = Annotated[Text, Checked(_entry)]
+
+
+@strict
+@dataclass(frozen=True)
+class CertificateSection:
+    """Section ``[certificate]``: what the certificate states besides results; empty: a line to fill in by hand.
+
+    Attributes:
+        certificate_number: certificate number
+        robot_make: robot make and type
+        robot_serial: robot serial number
+        controller: controller
+        controller_software: controller software
+        instrument_serial: instrument serial number
+        instrument_calibrated: instrument calibrated on
+        temperature: temperature
+        flange_load: payload at the flange
+        operator: operator
+        place: place
+        measured_on: date of measurement
+    """
+
+    certificate_number: StatedEntry = ""
+    robot_make: StatedEntry = ""
+    robot_serial: StatedEntry = ""
+    controller: StatedEntry = ""
+    controller_software: StatedEntry = ""
+    instrument_serial: StatedEntry = ""
+    instrument_calibrated: StatedEntry = ""
+    temperature: StatedEntry = ""
+    flange_load: StatedEntry = ""
+    operator: StatedEntry = ""
+    place: StatedEntry = ""
+    measured_on: StatedEntry = ""
 
 
 @strict
@@ -38,6 +89,10 @@ class Answers:
         dynamics: identify the dynamics, too (default), or fit the geometry only.
         torques: which torques the log contains.
         payloads: label=kg of a payload for additional recordings; repeatable.
+        tolerance_mm: largest accepted rms of the position on unseen poses [mm]; 0: none.
+        tolerance_percent: largest accepted torque error of the exported robot on unseen motion [%]; 0: none.
+        details: ask for the certificate's details: number, serial numbers, operator ….
+        certificate: these details.
     """
 
     robot: Text | None = None
@@ -57,6 +112,10 @@ class Answers:
     dynamics: Annotated[bool, Typed("--dynamics/--geometry-only")] | None = None
     torques: Torques | None = None
     payloads: tuple[str, ...] = ()
+    tolerance_mm: Tolerance | None = None
+    tolerance_percent: Tolerance | None = None
+    details: Annotated[bool, Typed("--details/--no-details")] | None = None
+    certificate: CertificateSection = field(default_factory=CertificateSection)
 
     @property
     def cell(self) -> dict[str, Any]:

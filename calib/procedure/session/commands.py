@@ -18,7 +18,7 @@ from calib.data.csv_table import read_table
 from calib.data.poses import IMAGES
 from calib.errors import UsageError, command_line, require
 from calib.extensions import needed, offered
-from calib.folders import CERTIFICATE, SESSION
+from calib.folders import CERTIFICATE, PAGES, SESSION
 from calib.geometry.observability import targets_of
 from calib.procedure.excitation.coefficients import RUN, SAMPLES
 from calib.procedure.excitation.limits import read_motion_limits
@@ -153,6 +153,8 @@ def new_session(
     base: str = "",
     tip: str = "",
     seed: int = 0,
+    tolerance_mm: float = 0.0,
+    certificate: Mapping[str, Any] | None = None,
     **motion: Any,
 ) -> Path:
     """Create the folder of a guided session for a robot, like `calib new`.
@@ -167,6 +169,8 @@ def new_session(
         limits: TOML file that both poses and motions keep (``calib formats limits``), or its tables.
         dynamics: identify the dynamics, too.
         seed: of everything random.
+        tolerance_mm: largest accepted rms on unseen poses [mm]; 0: none.
+        certificate: keys of ``[certificate]``: what the certificate states besides results.
         motion: other keys of ``[dynamics]`` (``calib formats session``): torques, payloads, period …
 
     Returns:
@@ -182,11 +186,11 @@ def new_session(
     chain = load(robot, base or None, tip or None)
     copied, named = _limits(limits, chain, source, dynamics)
     table = {
-        "name": chain.name, "created": "", "seed": seed, "fit": {},
+        "name": chain.name, "created": "", "seed": seed, "fit": {"tolerance_mm": tolerance_mm},
         "robot": {"file": source.name, "given": str(robot), "base": base, "tip": tip},
         "instrument": asdict(device) | ({} if tool is None else {"tool": [*map(float, tool)]}),
         "poses": {"fit": poses, "validation": validation, "constraints": named},
-        "dynamics": {"wanted": dynamics, "limits": named, **motion},
+        "dynamics": {"wanted": dynamics, "limits": named, **motion}, "certificate": dict(certificate or {}),
     }  # fmt: skip
     create(Path(folder), source, parse(SessionSettings, table, SESSION), copied | meshes_beside(source))
     return Path(folder)
@@ -238,7 +242,8 @@ def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", 
 
 def _ending(session: Session) -> tuple[str, ...]:
     """Return the closing lines of a complete session: the verdict, where certificate and robot are."""
-    page, robot = session.path(CERTIFICATE), session.path(f"{session.export}/{URDF}")
+    first, *others = PAGES
+    page, robot = f"{session.path(first)} ({', '.join(others)})", session.path(f"{session.export}/{URDF}")
     found, further = session.verdicts(), [line for ending in offered("endings") for line in ending(session)]
     use = " (for inspection only, do not use)" if found.level == "fail" else ""
     made = f"robot: {robot}{use}" if robot.exists() else "no robot was exported"

@@ -16,7 +16,8 @@ session.toml     what is to be calibrated, with what, how; written by `calib new
 8-dynamics/      the identified model; unseen/ holds it against the validation motion
 8-masses/        the identification whose masses the fit's gravity torques are made of, where it has compliance
 9-export/        the calibrated robot in the forms other programs read; README.txt says which file is for whom
-certificate.html
+certificate.html, certificate.pdf, report.html
+                 the certificate, at most four pages A4, and the report with all tables and figures
 verdict.json     the verdict of the session, of each stage, and of each exported file
                  Without dynamics there are no 6 to 8, and the export is 6-export. Where nothing is measured there are
                  no 2 to 5: 1-robot/as_given holds the geometry that dynamics are identified on.

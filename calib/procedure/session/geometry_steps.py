@@ -39,8 +39,9 @@ from calib.procedure.measuring.prediction import beside
 from calib.procedure.measuring.prediction import read as read_prediction
 from calib.procedure.measuring.prediction import write as write_prediction
 from calib.procedure.measuring.run import same_turn, write_run
-from calib.procedure.report import certificate, fit_report
+from calib.procedure.report import fit_report
 from calib.procedure.report.geometry_section import error_words, outlier_sentences, parameter_words
+from calib.procedure.report.outputs import write_fit
 from calib.procedure.session.folder import (
     MASSES,
     POSES,
@@ -101,7 +102,7 @@ def _choose(session: Session, chain: Chain, say: Say) -> list[str]:
         from calib.procedure.report.geometry_figures import predicted_map
 
         chart = predicted_map(outlook.points, outlook.spread)
-        files.write(session.path(PREDICTED), picture(chart, "").png)
+        files.write(session.path(PREDICTED), picture(chart, "").image)
     record = {"words": words, **selection.record(chosen), "seed": settings.seed}
     files.write_json(session.path(SELECTION), record)
     notes = [f"{len(q)} poses for the fit: {words}"]
@@ -293,7 +294,7 @@ def fit(session: Session, say: Say) -> list[str]:
     selection = read_prediction(poses) if session.settings.poses.plan and beside(poses).exists() else None
     outcome = fitting.run(_gathered(session), _options_of(session), _fit_settings(session), say, selection)
     outcome = replace(outcome, assessment=replace(outcome.assessment, verdict=UNJUDGED, deliverables={}))
-    draw = partial(certificate.write_fit, plots=session.plots, page=False)
+    draw = partial(write_fit, plots=session.plots, pages=False)
     outputs.write_folder(outcome, session.fit.path, draw, owned=True)
     metrics = session.fit.metrics()
     words = f"model {metrics.model}: {error_words(metrics)}; {parameter_words(metrics)}"

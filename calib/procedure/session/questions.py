@@ -1,7 +1,7 @@
 """Questions of `calib new`: known instruments, questions at a terminal, and checks of the answers."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from calib.data.poses import BOARD, IMAGES, IN_HAND, TO_HAND
 from calib.errors import UsageError, one_of, refused_as, require
 from calib.extensions import needed
 from calib.procedure.measuring.constraints_file import AXES, ConstraintsFile
-from calib.procedure.session.answers import CAMERA, CELL, Answers
+from calib.procedure.session.answers import CAMERA, CELL, Answers, CertificateSection
 from calib.procedure.session.settings import NOTHING, InstrumentSection
 from calib.robot.library import resolve
 from calib.transforms import pose, to_xyz_rpy
@@ -56,14 +56,18 @@ class Question:
 
     name: str
     default: str
+    of: type = Answers
 
     @property
     def words(self) -> str:
         """Text of the question, from the help of the option."""
-        return f"{self.name.replace('_', ' ')} ({described(Answers)[self.name]})"
+        about = described(self.of)[self.name]
+        return f"{self.name.replace('_', ' ')} ({about})" if self.of is Answers else f"{about} (Enter: by hand, later)"
 
     def open(self, given: Answers) -> bool:
         """Return whether the question still needs an answer, given the earlier answers."""
+        if self.of is CertificateSection:
+            return bool(given.details) and not getattr(given.certificate, self.name)
         if getattr(given, self.name) not in (None, ()) or (self.name in CELL and given.limits is not None):
             return False
         camera, nothing = _measures(given) == IMAGES, _measures(given) == NOTHING
@@ -80,16 +84,21 @@ class Question:
                 return camera and (given.mounting or "").lower() not in UNSAID
             case "dynamics":
                 return not nothing
-            case "torques" | "payloads":
+            case "torques" | "payloads" | "tolerance_percent":
                 return given.dynamics is not False
+            case "tolerance_mm":
+                return not nothing
         return True
 
 
 DEFAULTS = {
     "robot": "", "instrument": "tracker", "tool": "0.05,0,0.05", "limits": "none", "facing": "z", "dynamics": "yes",
-    "torques": "motor", "payloads": "none",
+    "torques": "motor", "payloads": "none", "tolerance_mm": "0", "tolerance_percent": "0", "details": "yes",
 }  # fmt: skip
-QUESTIONS = tuple(Question(one.name, DEFAULTS.get(one.name, "unknown")) for one in fields(Answers))
+QUESTIONS = (
+    *(Question(one.name, DEFAULTS.get(one.name, "unknown")) for one in fields(Answers) if one.name != "certificate"),
+    *(Question(one.name, "", CertificateSection) for one in fields(CertificateSection)),
+)
 
 
 def with_answer(given: Answers, question: Question, text: str) -> Answers:
@@ -99,9 +108,13 @@ def with_answer(given: Answers, question: Question, text: str) -> Answers:
         UsageError: for an invalid answer, with the valid form.
     """
     name, empty = question.name, text.lower() in ("", "none", "-")
+    if question.of is CertificateSection:
+        entry = getattr(parse(CertificateSection, {name: text}, ""), name)
+        return replace(given, certificate=replace(given.certificate, **{name: entry}))
+    said = {"y": True, "n": False}.get(text[:1].lower(), text)
     values: dict[str, Any] = {
         "tool": text.split(","), "limits": None if empty else text, "payloads": [] if empty else text.split(),
-        "obstacles": [text], "dynamics": {"y": True, "n": False}.get(text[:1].lower(), text),
+        "obstacles": [text], "dynamics": said, "details": said,
     }  # fmt: skip
     found = replace(given, **{name: getattr(parse(Answers, {name: values.get(name, text)}, ""), name)})
     if name == "robot":
@@ -136,7 +149,8 @@ def checked(given: Answers) -> dict[str, Any]:
         require(not given.cell, words, UsageError)
     else:
         result["limits"] = cell_tables(**given.cell) or None
-    others = {"tool": given.tool, "torques": given.torques, "payloads": dict(map(_payload, given.payloads))}
+    others = {"payloads": dict(map(_payload, given.payloads)), "certificate": asdict(given.certificate)}
+    others |= {name: getattr(given, name) for name in ("tool", "torques", "tolerance_mm", "tolerance_percent")}
     return result | {name: value for name, value in others.items() if value}
 
 

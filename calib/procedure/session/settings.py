@@ -52,7 +52,7 @@ from calib.procedure.kinematic_stage.settings import (  # fmt: skip
     Method,
     Stations,
 )
-from calib.procedure.session.answers import Torques
+from calib.procedure.session.answers import CertificateSection, Torques
 
 SCHEMA = 2
 READ = (1, SCHEMA)  # a session of schema 1 knows no dynamics; it goes on as geometry alone
@@ -233,6 +233,7 @@ class SessionSettings:
 
     Attributes:
         seed: of pose selection, cross-validation and all other random choices
+        certificate: stated on the certificate besides results; what is empty is a line to fill in by hand
     """
 
     name: Text
@@ -243,6 +244,7 @@ class SessionSettings:
     poses: PosesSection
     fit: FitSection
     dynamics: DynamicsSection
+    certificate: CertificateSection = field(default_factory=CertificateSection)
     schema: Annotated[int, Whole(1)] = SCHEMA
 
 

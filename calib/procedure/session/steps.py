@@ -19,17 +19,15 @@ from typing import Any
 from calib.errors import SessionError
 from calib.extensions import offered
 from calib.files import fingerprint
-from calib.folders import CERTIFICATE
 from calib.procedure.excitation.coefficients import NAME as MOTION
 from calib.procedure.findings import Warned
-from calib.procedure.report.certificate import versions
-from calib.procedure.session import certificate, dynamics_steps, geometry_steps
+from calib.procedure.report.templates import versions
+from calib.procedure.session import dynamics_steps, geometry_steps
 from calib.procedure.session.folder import (
     AS_GIVEN,
     BROUGHT,
     CUTS,
     EXPORT,
-    MARK,
     MASSES,
     MOTION_CHECKED,
     POSES,
@@ -168,12 +166,6 @@ STEPS = (
         "robot:file fit/robot.toml 4-fit/robot.urdf 5-validation/metrics.json 8-dynamics/dynamics.json "
         "8-dynamics/estimate.csv 8-dynamics/covariance.csv 8-dynamics/unseen/report.json",
         f"6-export/* 9-export/* {VERDICT}", "robot",
-    ),
-    SessionStep(
-        "certificate", "print the certificate", certificate.certify,
-        f"{VERDICT} 4-fit/report.json 5-validation/metrics.json export/robot.urdf {SELECTION}? {POSES_CHECKED} "
-        f"{MOTION_CHECKED} 8-dynamics/metrics.json 8-dynamics/estimate.csv 8-dynamics/unseen/report.json {MARK}?",
-        CERTIFICATE, "name created instrument poses fit dynamics.torques,payloads,tolerance_percent",
     ),
 )  # fmt: skip
 

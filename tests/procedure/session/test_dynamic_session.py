@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pypdf import PdfReader
 from sessions import begin, copy_of, edit, go_on, kinds
 
 from calib import cli
@@ -130,11 +131,16 @@ def test_it_ends_in_one_certificate_of_both(whole: Session) -> None:
     origins = re.compile("(?m)^    <origin .*")
     joints = [origins.findall(whole.path(f"{place}/robot.urdf").read_text()) for place in ("4-fit", "9-export")]
     assert joints[0] == joints[1] and "dynamics" not in given, "the calibrated geometry"
-    page = whole.path("certificate.html").read_text()
+    page = whole.path("report.html").read_text()
     titles = {"Torque errors", "Excitation", "Identified parameters", "Geometry", "What was exported"}
     assert all(words in page for words in titles | {"ZZ2R", "7-recorded/training_log.csv"})
     found = json.loads(whole.path("8-dynamics/unseen/report.json").read_text())
     own = found["validation"]["validation_log.csv"]
+    document = PdfReader(whole.path("certificate.pdf"))
+    text = " ".join(" ".join(one.extract_text() for one in document.pages).split())
+    assert len(document.pages) == 4 and "low-passed at" in text
+    for row, rms, limit in zip(found["rows"], own["raw"]["rms"], found["limits"], strict=True):
+        assert f"{row} {rms:.3g} N m {100.0 * rms / limit:.3g} %" in text, "in N·m and of the limit"
     assert "<inertia " in whole.path("9-export/robot.urdf").read_text()
     assert own["evidence"] and whole.verdicts().level == "marginal"  # errors that no model holds remain
 

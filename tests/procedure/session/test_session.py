@@ -14,10 +14,11 @@ from sessions import edit, go_on, kinds, quiet
 from calib import cli
 from calib.errors import CalibError, MeasurementError, SessionError
 from calib.procedure.findings import UNJUDGED
-from calib.procedure.session import certificate, commands, steps
+from calib.procedure.session import commands, steps
 from calib.procedure.session.folder import Session, locked, open_session, read_state
 from calib.robot.formats.urdf_tree import with_comment
 from calib.robot.library import load
+from calib.rooms.certificate.session import listed
 
 
 def words(session: Session, name: str) -> str:
@@ -88,8 +89,10 @@ def test_what_a_person_replaced_is_kept_and_said(finished: Session) -> None:
     urdf.write_text(urdf.read_text() + "<!-- checked -->\n")
     assert kinds(finished)["export"] == steps.DONE
     assert "replaced manually: 6-export/robot.urdf" in words(finished, "export")
-    roles = {name: role for name, role, _, _ in certificate.listed(finished)}
-    assert roles["6-export/robot.urdf"] == "edited by hand" and roles["6-export/robot.toml"] == "calibrated robot"
+    roles = {name: role for name, role, _, _ in listed(finished)}
+    assert roles["6-export/robot.urdf"] == "edited by hand" and roles["6-export/robot.toml"].startswith(
+        "calibrated robot, verdict"
+    )
     assert go_on(finished) is None
     assert "checked" in urdf.read_text()
 
@@ -135,7 +138,8 @@ def _killed_at(session: Session, name: str) -> int:
 
     if not (child := os.fork()):
         try:
-            steps.STEPS = tuple(replace(step, make=killed) if step.name == name else step for step in steps.STEPS)
+            there = steps._steps_of(session)
+            steps._steps_of = lambda _: tuple(replace(one, make=killed) if one.name == name else one for one in there)
             cli.run(["next", "--no-plots", str(session.folder)])
         finally:
             os._exit(1)
@@ -225,14 +229,14 @@ def test_a_failed_robots_files_say_so_until_it_does_not_fail(finished: Session, 
     marginal = (place / "README.txt").read_text()
     assert marginal.startswith("verdict marginal: geometry: ") and "remain with rigid geometry alone" in marginal
     assert marginal.splitlines()[0] in before.decode()
-    assert "none given: pass means" in finished.path("certificate.html").read_text(), "no tolerance"
+    assert "none given: pass means" in finished.path("report.html").read_text(), "no tolerance"
     edit(settings, "tolerance_mm = 0.0", "tolerance_mm = 0.001")
     assert cli.run(["next", "--no-plots", str(finished.folder)]) == 1
     said = capsys.readouterr().out.strip().split("\n")[-4:]
     assert said[0].startswith("verdict fail: geometry: ") and "(for inspection only, do not use)" in said[2]
     found = json.loads(finished.path("5-validation/metrics.json").read_text())
     assert (found["verdict"], found["code"]) == ("fail", "above-tolerance")
-    assert "0.001 mm rms on unseen poses" in finished.path("certificate.html").read_text()
+    assert "0.001 mm rms on unseen poses" in finished.path("report.html").read_text()
     head = (place / "robot.urdf").read_text().split("<robot", 1)[0]
     assert "<!-- verdict fail: geometry: " in head and "do not use -->" in head
     assert (place / "README.txt").read_text().startswith("verdict fail: geometry: ")

@@ -1,4 +1,4 @@
-"""The certificate is one file, says what it has to, and the figures are what the numbers are."""
+"""Report and certificate of a session are files that load nothing, say what they have to, and the figures are right."""
 
 import base64
 import hashlib
@@ -14,13 +14,15 @@ import pytest
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
-from sessions import go_on
+from pypdf import PdfReader
+from sessions import edit, go_on
 from without_figures import run
 
 from calib.errors import CalibError
 from calib.geometry.model_choice.ladder import ModelStep
-from calib.procedure.report import certificate, charts, fit_report, geometry_figures, style
+from calib.procedure.report import charts, fit_report, geometry_figures, style
 from calib.procedure.session.folder import Session
+from calib.rooms.certificate import rendering, results
 
 
 class References(HTMLParser):
@@ -41,6 +43,11 @@ class References(HTMLParser):
 
 @pytest.fixture(scope="module")
 def page(finished_folder: Path) -> str:
+    return (finished_folder / "report.html").read_text()
+
+
+@pytest.fixture(scope="module")
+def first(finished_folder: Path) -> str:
     return (finished_folder / "certificate.html").read_text()
 
 
@@ -49,12 +56,13 @@ def text(page: str) -> str:
     return " ".join(" ".join(References(page).text).split())
 
 
-def test_it_loads_nothing_from_anywhere(page: str) -> None:
-    found = References(page)
-    assert all(reference.startswith(("#", "data:")) for reference in found.loaded)
-    assert not {"script", "link", "iframe", "object", "base"} & set(found.tags)
-    assert "@import" not in page and not re.search(r"url\((?!#)", page)
-    assert len(page) < 1_500_000
+def test_they_load_nothing_from_anywhere(page: str, first: str) -> None:
+    for one in (page, first):
+        found = References(one)
+        assert all(reference.startswith(("#", "data:")) for reference in found.loaded)
+        assert not {"script", "link", "iframe", "object", "base"} & set(found.tags)
+        assert "@import" not in one and not re.search(r"url\((?!#)", one)
+        assert len(one) < 1_500_000
 
 
 def test_it_says_what_a_professional_signs(text: str, finished_folder: Path) -> None:
@@ -67,12 +75,39 @@ def test_it_says_what_a_professional_signs(text: str, finished_folder: Path) -> 
     assert len(digest) == len(set(digest)) >= 6
 
 
-def test_a_simulated_session_says_that_it_is_and_another_does_not(page: str, finished: Session) -> None:
-    assert "<h1>Simulated calibration of" in page and "SIMULATED: optical CMM" in page
-    assert "simulated cell: " in page and "nothing was measured on a robot" in page
+def test_a_simulated_session_says_that_it_is_and_another_does_not(page: str, first: str, finished: Session) -> None:
+    assert (
+        all(">Simulated calibration of" in one for one in (page, first))
+        and "SIMULATED: nothing was measured on a robot; optical CMM" in page
+    )
+    assert "simulated cell: " in page and "SIMULATED: nothing was measured on a robot" in first
     finished.path("simulated.txt").unlink()
     assert go_on(finished) is None
-    assert "imulated" not in finished.path("certificate.html").read_text()
+    assert all("imulated" not in finished.path(name).read_text() for name in ("certificate.html", "report.html"))
+
+
+def test_the_certificate_states_the_numbers_of_the_data_on_four_pages(finished: Session) -> None:
+    edit(finished.path("session.toml"), 'robot_serial = ""', 'robot_serial = "SN 4711"')
+    edit(finished.path("session.toml"), "tolerance_mm = 0.0", "tolerance_mm = 0.3")
+    assert go_on(finished, plots=True) is None
+    document = PdfReader(finished.path("certificate.pdf"))
+    assert len(document.pages) <= 4
+    text = " ".join(" ".join(one.extract_text() for one in document.pages).split())
+    rows = json.loads(finished.path("5-validation/metrics.json").read_text())["validation"]["validation.csv"]
+    before, after = (rows[arm]["position_mm"] for arm in ("nominal", "calibrated"))
+    met = "yes" if after["rms"] <= 0.3 else "NO"
+    assert re.search(rf"position, rms {before['rms']:.3g} mm {after['rms']:.3g} mm ± [\d.]+ mm .* 0.3 mm {met} ", text)
+    assert all(f"{one[name]:.4f}" in text for one in (before, after) for name in ("mean", "rms", "p95", "max"))
+    errors = fit_report.read(finished.path("5-validation/report.json")).sets[-1]
+    worst = int(np.argmax(errors.calibrated["position"]))
+    joints = ", ".join(f"{angle:.1f} deg" for angle in np.degrees(errors.q[worst]))
+    assert (
+        f"row {errors.rows[worst]} of validation.csv: {after['max']:.3g} mm" in text and f"joints at {joints};" in text
+    )
+    assert "robot serial number SN 4711" in text and "ISO 9283" in text and "NOT checked" in text
+    shown = finished.path("certificate.html").read_text()
+    assert "SN 4711" in shown and shown.count('<span class="blank">') == 11 and str(finished.folder) not in shown + text
+    assert shown.count("data:image/svg+xml;base64,") == 3
 
 
 def test_what_was_noticed_on_arrival_stands_on_it(text: str, finished_folder: Path) -> None:
@@ -102,7 +137,7 @@ def test_numbers_of_the_report_are_those_of_the_fit(finished_folder: Path) -> No
 def test_a_fits_own_certificate_names_its_files(finished_folder: Path, tmp_path: Path) -> None:
     given = ("1-robot/robot.toml", "3-measured/measured.csv")
     assert not run("fit", *(finished_folder / name for name in given), "--model", "geometry", "--out", tmp_path / "fit")
-    page = (tmp_path / "fit/certificate.html").read_text()
+    page = (tmp_path / "fit/report.html").read_text()
     assert not (finished_folder / "4-fit/certificate.html").exists(), "a session has one certificate"
     for name in given:
         digest = hashlib.sha256((finished_folder / name).read_bytes()).hexdigest()
@@ -111,8 +146,8 @@ def test_a_fits_own_certificate_names_its_files(finished_folder: Path, tmp_path:
 
 def test_hostile_names_do_not_become_markup(finished_folder: Path) -> None:
     found = replace(fit_report.read(finished_folder / "4-fit/report.json"), robot="<script>alert(1)</script>")
-    written = certificate.render(certificate.of_fit(found, {}))
-    assert "<script>" not in written and "&lt;script&gt;" in written
+    for one in results.of_fit(found, {}):
+        assert "<script>" not in rendering.html(one) and "&lt;script&gt;" in rendering.html(one)
 
 
 def test_another_versions_report_is_refused(finished_folder: Path, tmp_path: Path) -> None:
@@ -204,7 +239,7 @@ def test_what_the_data_do_not_give_is_left_out(finished_folder: Path) -> None:
 
 
 def test_what_was_not_checked_and_what_was_predicted_is_repeated(finished: Session) -> None:
-    page = (finished.folder / "certificate.html").read_text()
+    page = (finished.folder / "report.html").read_text()
     assert "poses NOT checked for" in page and "obstacles (not known)" in page and "self-collision (capsules" in page
     notes = json.loads((finished.folder / "state.json").read_text())["steps"]["fit"]["notes"]
     assert any(note.startswith("estimated σ / predicted σ") for note in notes)

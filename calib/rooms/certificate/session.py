@@ -1,5 +1,6 @@
-"""The certificate of a session: the results of geometry and dynamics, read from the session's folders, on one page."""
+"""The certificate of a session: the results of geometry and dynamics, read from the session's folders."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -7,17 +8,32 @@ from calib import files
 from calib.data.poses import CORNERS, JOINTS
 from calib.errors import command_line
 from calib.extensions import offered
-from calib.folders import CERTIFICATE
+from calib.folders import CERTIFICATE, PAGES
 from calib.procedure.excitation.coefficients import SAMPLES
+from calib.procedure.export.delivery import prediction
 from calib.procedure.kinematic_stage.folder import SCHEMA, URDF
 from calib.procedure.kinematic_stage.metrics import FitMetrics
-from calib.procedure.report import certificate, fit_report
-from calib.procedure.report.certificate import FileRow
-from calib.procedure.report.fit_report import RowErrors
-from calib.procedure.report.page import Section, Text
-from calib.procedure.session.folder import CHECKED, MARK, SELECTION, Say, Session, read_state
+from calib.procedure.report import fit_report
+from calib.procedure.report.fit_report import FileRow, RowErrors, file_row, unseen_role
+from calib.procedure.report.page import Text
+from calib.procedure.report.templates import versions
+from calib.procedure.session.folder import (
+    CHECKED,
+    MARK,
+    MOTION_CHECKED,
+    POSES_CHECKED,
+    SELECTION,
+    VERDICT,
+    Say,
+    Session,
+    read_state,
+)
 from calib.procedure.session.geometry_steps import chain_of
+from calib.procedure.session.steps import SessionStep
 from calib.records import read_json, read_lines
+from calib.rooms.certificate import dynamics, geometry, rendering
+from calib.rooms.certificate.record import EDITED, Certificate, Entry, Page, Stage, records
+from calib.rooms.certificate.results import tolerance
 
 ROLES = {
     "1-robot": "nominal robot", "3-measured": "measured", "4-fit": "fit", "6-excitation": "motion to record",
@@ -30,45 +46,69 @@ TORQUES = {
 
 
 def certify(session: Session, say: Say) -> list[str]:
-    """Write the certificate of a session as HTML, and return its notes."""
-    from calib.procedure.report import dynamics_section, geometry_section
-
+    """Write certificate and report of a session, and return its notes."""
     say("drawing" if session.plots else "writing")
-    judged, whole = [], None
-    if session.geometric:
-        whole, drawn = _whole_report(session), {}
-        if session.plots:
-            from calib.procedure.report.geometry_figures import draw
-
-            drawn = draw(whole)
-        section = geometry_section.certificate_section(whole, drawn)
-        judged = [_with_arrival(section, _arrival_notes(session, "3-measured", "validate"))]
-    if session.dynamic:
-        dynamics = dynamics_section.read(session.identification.path)
-        exported = read_state(session).notes("export")
-        drawn = {}
-        if session.plots:
-            from calib.procedure.report.dynamics_figures import draw_dynamics
-
-            motions = session.path("6-excitation") if session.settings.dynamics.plan else None
-            drawn = draw_dynamics(dynamics, session.identification.path, motions, chain_of(session).joints)
-        tolerance = session.settings.dynamics.tolerance_percent
-        section = dynamics_section.certificate_section(dynamics, drawn, exported, tolerance)
-        own = session.verdicts().stages["dynamics"]
-        section = replace(section, verdict=own.level, reason=own.reason)
-        judged.append(_with_arrival(section, _arrival_notes(session, "7-recorded", "predict")))
+    one, whole = pages(session)
+    judged = [section for section in whole.sections if section.verdict]
     notes = [f"{section.title.lower()} {section.verdict}: {section.reason}" for section in judged]
-    simulated = session.path(MARK).exists()
-    page = certificate.certificate(
-        f"{'Simulated calibration' if simulated else 'Calibration'} of {session.settings.name}",
-        f"{'SIMULATED: ' if simulated else ''}{session.settings.instrument.name}, {session.settings.created[:10]}",
-        _setup(session, whole),
-        judged,
-        listed(session),
-    )
-    files.write(session.path(CERTIFICATE), certificate.render(page))
+    written = rendering.write(session.folder, one, whole)
     recordings = [write(session.folder) for write in offered("recordings") if session.plots]
-    return [*notes, CERTIFICATE, *recordings]
+    return [*notes, CERTIFICATE, *written, *recordings]
+
+
+def pages(session: Session) -> tuple[Certificate, Page]:
+    """Return certificate and report of a session."""
+    whole = _whole_report(session) if session.geometric else None
+    stages = [*([_geometry(session, whole)] if whole else []), *([_dynamics(session)] if session.dynamic else [])]
+    simulated, settings, rows = read_lines(session.path(MARK)), session.settings, listed(session)
+    title = f"{'Simulated calibration' if simulated else 'Calibration'} of {settings.name}"
+    subtitle = f"{settings.instrument.name}, {settings.created[:10]}"
+    setup = [*(Entry("simulated", line) for line in simulated), *_setup(session, whole and whole.metrics)]
+    alert = f"SIMULATED: {simulated[0].rpartition('; ')[2]}" if simulated else ""
+    return records(title, subtitle, setup, stages, [*_unchecked(session)], rows, settings.certificate, alert)
+
+
+def _geometry(session: Session, whole: fit_report.Report) -> Stage:
+    drawn = {}
+    if session.plots:
+        from calib.procedure.report.geometry_figures import draw
+
+        drawn = draw(whole)
+    found = geometry.stage(whole, drawn)
+    return _with_arrival(found, _arrival_notes(session, "3-measured", "validate"))
+
+
+def _dynamics(session: Session) -> Stage:
+    from calib.procedure.report import dynamics_section
+
+    found, drawn = dynamics_section.read(session.identification.path), {}
+    if session.plots:
+        from calib.procedure.report.dynamics_figures import draw_dynamics
+
+        motions = session.path("6-excitation") if session.settings.dynamics.plan else None
+        drawn = draw_dynamics(found, session.identification.path, motions, chain_of(session).joints)
+    allowed, exported = session.settings.dynamics.tolerance_percent, read_state(session).notes("export")
+    known = prediction(session.path(session.export))
+    section = dynamics_section.report_section(found, drawn, exported, allowed, known and known.exported)
+    own = session.verdicts().stages["dynamics"]
+    section = replace(section, verdict=own.level, reason=own.reason)
+    stage = dynamics.stage(found, section, session.plots, allowed)
+    return _with_arrival(stage, _arrival_notes(session, "7-recorded", "predict"))
+
+
+def _unchecked(session: Session) -> Iterator[str]:
+    """Yield what the whole session does not show."""
+    unchecked = _session_plan(session).unchecked if session.geometric else ()
+    if unchecked:
+        yield f"when poses were chosen: {', '.join(unchecked)}"
+    if not session.geometric:
+        yield "geometry: not measured, taken as described"
+    if not session.dynamic:
+        yield "dynamics: not identified"
+    if session.geometric and not session.brought("drift"):
+        yield "drift: no poses were measured once more at the end"
+    if session.geometric and not session.settings.certificate.instrument_calibrated:
+        yield "calibration of the instrument: its date was not stated"
 
 
 def _whole_report(session: Session) -> fit_report.Report:
@@ -92,30 +132,31 @@ def _arrival_notes(session: Session, place: str, unseen: str) -> list[str]:
     return [line for line in (*lines, *(note for note in said if names and note.startswith(names))) if line.strip()]
 
 
-def _with_arrival(section: Section, lines: list[str]) -> Section:
-    """Return a section with the missing notes on its input files appended."""
-    said = {line for block in section.blocks if isinstance(block, Text) for line in block.lines}
+def _with_arrival(stage: Stage, lines: list[str]) -> Stage:
+    """Return a stage whose section of the report has the missing notes on its input files, too."""
+    blocks = stage.section.blocks
+    said = {line for block in blocks if isinstance(block, Text) for line in block.lines}
     fresh = [line for line in dict.fromkeys(lines) if line not in said]
-    return replace(section, blocks=[*section.blocks, Text("Notes on the files when they were read", fresh)])
+    notes = Text("Notes on the files when they were read", fresh)
+    return replace(stage, section=replace(stage.section, blocks=[*blocks, notes]))
 
 
-def _setup(session: Session, found: fit_report.Report | None) -> list[tuple[str, str]]:
-    """Return the rows (label, value) of the certificate's table "Setup", for the stages that the session has."""
+def _setup(session: Session, found: FitMetrics | None) -> list[Entry]:
+    """Return what was calibrated, with what and how, for the stages that the session has."""
     settings, chain = session.settings, chain_of(session)
     described = settings.robot.given if found else f"{settings.robot.given}, taken as calibrated"
-    rows = [*(("simulated", line) for line in read_lines(session.path(MARK)))]
-    rows += [
+    rows = [
         ("robot", f"{chain.name}, {chain.base} to {chain.tip}, {chain.n} joints"), ("description", described),
         ("session made", settings.created.replace("T", " ")),
     ]  # fmt: skip
     if found:
         plan = _session_plan(session)
         rows += [
-            ("instrument", _instrument(session, found.metrics)),
+            ("instrument", _instrument(session, found)),
             ("measurements", _named(session.brought("measured", "validation"))),
             ("pose plan", plan.words), ("poses kept", ", ".join(plan.checked)),
-            ("poses NOT checked for", ", ".join(plan.unchecked)), ("model", found.metrics.model),
-            ("tolerance", certificate.tolerance(settings.fit.tolerance_mm, found.metrics)),
+            ("poses NOT checked for", ", ".join(plan.unchecked)), ("model", found.model),
+            ("tolerance", tolerance(settings.fit.tolerance_mm, found)),
         ]  # fmt: skip
     if session.dynamic:
         section = settings.dynamics
@@ -127,9 +168,9 @@ def _setup(session: Session, found: fit_report.Report | None) -> list[tuple[str,
         ]  # fmt: skip
     rows += [
         ("seed", str(settings.seed)), ("command", command_line("next", session.folder.name)),
-        ("toolkit", certificate.versions()),
+        ("toolkit", versions()),
     ]  # fmt: skip
-    return [(label, value) for label, value in rows if value.strip()]
+    return [Entry(label, value) for label, value in rows if value.strip()]
 
 
 def _instrument(session: Session, found: FitMetrics) -> str:
@@ -191,6 +232,7 @@ def listed(session: Session) -> list[FileRow]:
             filed += sorted(session.path("6-excitation").glob(f"*/{SAMPLES}"))
         filed += [*session.identification.tables, session.identification.model]
     filed += [*(session.fit.tables if session.geometric else ()), *exported[1:]]
+    judged_files = read_json(session.path(VERDICT)).get("files", {}) if session.path(VERDICT).exists() else {}
     made = {name: mark for step in read_state(session).steps.values() for name, mark in step.outputs.items()}
     judged = session.validation.metrics().validation if session.geometric else {}
     rows, seen = [], [name for name, found in judged.items() if not found.unseen]
@@ -200,8 +242,19 @@ def listed(session: Session) -> list[FileRow]:
         if name.parts[-1].lower().startswith("validation") or name.parts[1].lower().startswith("validation"):
             which = "the fit" if name.parts[0] == "3-measured" else "the identification"
             known = name.parts[0] == "3-measured" and name.parts[1] in seen
-            role = certificate.unseen_role(role, known, which)
+            role = unseen_role(role, known, which)
+        if name.parts[0] == session.export and name.name in judged_files:
+            role = f"{role}, verdict {judged_files[name.name]['verdict']}"
         if name.parts[0] in ("4-fit", "8-dynamics", session.export) and made.get(str(name)) != files.fingerprint(path):
-            role = certificate.EDITED
-        rows.append(certificate.file_row(str(name), role, path))
+            role = EDITED
+        rows.append(file_row(str(name), role, path))
     return rows
+
+
+STEP = SessionStep(
+    "certificate", "print the certificate", certify,
+    f"{VERDICT} 4-fit/report.json 5-validation/metrics.json export/robot.urdf {SELECTION}? {POSES_CHECKED} "
+    f"{MOTION_CHECKED} 8-dynamics/metrics.json 8-dynamics/estimate.csv 8-dynamics/unseen/report.json {MARK}?",
+    " ".join(PAGES),
+    "name created instrument poses fit dynamics.torques,payloads,tolerance_percent certificate",
+)  # fmt: skip

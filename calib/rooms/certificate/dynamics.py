@@ -1,0 +1,105 @@
+"""The certificate's page on the dynamics: torque errors in N·m and of the limits, torques, uncertainty."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from calib.procedure.findings import sentence
+from calib.procedure.report.dynamics_section import DynamicReport, percent, proof_of, rms_words, warnings_of
+from calib.procedure.report.page import Picture, Pictures, Section, Table, Text
+from calib.rooms.certificate.record import Stage
+
+UNCERTAINTY = ("torque-interval-coverage", "outside-training-range")
+MAX_ROWS = 14  # torques in the table
+MAX_CURVES = 4  # torques drawn
+NOTE = (
+    "rms error: of the torque as recorded; of limit: of the torque that the robot's description allows; in band: both "
+    "torques low-passed to the band of the motion; 95 % interval: half width (median), and share of errors within it."
+)
+
+
+def stage(found: DynamicReport, section: Section, plots: bool, tolerance: float = 0.0) -> Stage:
+    """Return the stage of an identification.
+
+    Args:
+        section: of the report, with verdict and key figures.
+        plots: whether there are to be figures.
+        tolerance: largest error of the torque on unseen motion that is good enough [%]; 0: none.
+    """
+    order = _worst_first(found)
+    curves = Pictures("Torques", list(_curves(found, order)) if plots else [])
+    blocks = [_torque_table(found, order), curves, Text("Uncertainty", list(_uncertainty(found)))]
+    return Stage(section, blocks, [*_unchecked(found, tolerance)], _findings(found))
+
+
+def _unchecked(found: DynamicReport, tolerance: float) -> Iterator[str]:
+    """Yield what the recordings of an identification do not show."""
+    if not found.unseen.proofs:
+        yield "torque errors on unseen motion: none was recorded"
+    if not tolerance:
+        yield "a tolerance of the torque: none was asked for; pass means below 10 %"
+
+
+def _findings(found: DynamicReport) -> list[str]:
+    """Return what was noticed, without what stands under uncertainty."""
+    said = _noticed(found)
+    return [line for line in warnings_of(found) if not any(line.startswith(one) for one in said)]
+
+
+def _noticed(found: DynamicReport) -> list[str]:
+    return [sentence(one) for one in found.unseen.noticed if one.code in UNCERTAINTY]
+
+
+def _worst_first(found: DynamicReport) -> np.ndarray:
+    """Return the torque rows by their error, as a share of the limit if all limits are known, else of the largest."""
+    unseen, (_, proof, _) = found.unseen, proof_of(found.unseen)
+    rms = np.nan_to_num(proof.raw.rms)
+    limits = np.full(len(rms), np.inf) if unseen.limits is None else unseen.limits
+    return np.argsort(-(rms / limits if np.isfinite(limits).all() else rms), kind="stable")
+
+
+def _torque_table(found: DynamicReport, order: np.ndarray) -> Table:
+    unseen, (name, proof, where) = found.unseen, proof_of(found.unseen)
+    held = proof.interval95
+    inside = "–" if held is None else f"{held.coverage_percent:.1f} %"
+    rows = [["all torques", "", "", percent(proof.raw.total), percent(proof.filtered.total), "", inside]]
+    for j in np.sort(order[:MAX_ROWS]):
+        half = "–" if held is None else f"± {held.median[j]:.3g} {unseen.units[j]}"
+        inside = "–" if held is None else f"{held.joints_percent[j]:.0f} %"
+        errors = [percent(float(one.joints[j])) for one in (proof.raw, proof.filtered)]
+        rows.append([unseen.rows[j], *rms_words(proof, unseen, j), *errors, half, inside])
+    left = len(order) - MAX_ROWS
+    note = NOTE + (f" The {MAX_ROWS} largest of {len(order)}; all: see report.html." if left > 0 else "")
+    header = ("torque", "rms error", "of limit", "unexplained", "in band", "95 % interval", "within it")
+    return Table(f"Torque errors on {where} ({name})", header, rows, note, frozenset({0}), range(1, 7))
+
+
+def _curves(found: DynamicReport, order: np.ndarray) -> Iterator[Picture]:
+    """Yield the picture of measured and predicted torques with the largest errors."""
+    from calib.procedure.report.charts import vector
+    from calib.procedure.report.dynamics_figures import torques
+
+    unseen, (name, proof, _) = found.unseen, proof_of(found.unseen)
+    curves = next((one for one in unseen.curves if one.name == name), None)
+    if curves is None:
+        return
+    shown = np.sort(order[:MAX_CURVES])
+    rows, units = ([names[j] for j in shown] for names in (unseen.rows, unseen.units))
+    measured, predicted = curves.measured[shown].T, curves.predicted[shown].T
+    chart = torques(curves.t, measured, predicted, rows, units, name, proof.raw.joints[shown], curves.band)
+    which = (
+        f"The {len(shown)} of {len(order)} torques with the largest errors" if len(order) > len(shown) else "Torques"
+    )
+    low = f", low-passed at {curves.band:.3g} Hz" if np.isfinite(curves.band) else ""
+    yield vector(chart, f"{which}: measured, predicted, and the difference{low}. All: see report.html.")
+
+
+def _uncertainty(found: DynamicReport) -> Iterator[str]:
+    metrics = found.metrics
+    yield from _noticed(found)
+    yield (
+        f"{metrics.parameters.base} base parameters, {metrics.parameters.essential} of them essential; their values "
+        "and standard deviations: see report.html and estimate.csv"
+    )
+    if metrics.geometry is not None:
+        yield metrics.geometry.summary

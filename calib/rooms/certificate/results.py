@@ -1,0 +1,117 @@
+"""Certificate and report of a fit or an identification outside sessions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from calib.errors import UsageError, command_line, require
+from calib.folders import SESSION
+from calib.procedure.kinematic_stage.fit import Outcome
+from calib.procedure.kinematic_stage.folder import FitFolder
+from calib.procedure.kinematic_stage.metrics import FitMetrics
+from calib.procedure.kinematic_stage.validation import ARM
+from calib.procedure.report import fit_report
+from calib.procedure.report.fit_report import Report
+from calib.procedure.report.page import Picture
+from calib.procedure.report.templates import versions
+from calib.procedure.session.answers import CertificateSection
+from calib.rooms.certificate import geometry, rendering
+from calib.rooms.certificate.record import NO_DETAILS, Certificate, Entry, Page, records, report
+
+if TYPE_CHECKING:
+    from calib.api.rendering import Judged
+    from calib.procedure.dynamic_stage.identify import IdentificationOutcome
+
+
+def write_fit(found: Report, drawn: Mapping[str, Picture], folder: Path) -> None:
+    """Write certificate and report of a fit into its folder.
+
+    Args:
+        drawn: the report's figures by name; without any, the certificate has none either.
+    """
+    rendering.write(folder, *of_fit(found, drawn))
+
+
+def read(folder: Path, plots: bool, details: CertificateSection) -> tuple[Certificate, Page]:
+    """Return certificate and report of the fit or identification in a folder.
+
+    Raises:
+        UsageError: where there is none, or it is a session's, which has a certificate of its own.
+    """
+    from calib.procedure.dynamic_stage.folder import IdentificationFolder
+
+    redo = command_line("redo", folder.parent, "certificate")
+    words = f"{folder} belongs to a session, which has the certificate: {redo}"
+    require(not (folder.absolute().parent / SESSION).exists(), words, UsageError)
+    if IdentificationFolder(folder).model.exists():
+        return of_model(folder, plots, details)
+    require(FitFolder(folder).report.exists(), f"{folder} is neither of a fit nor of an identification", UsageError)
+    found, drawn = fit_report.read(FitFolder(folder).report), {}
+    if plots:
+        from calib.procedure.report.geometry_figures import draw
+
+        drawn = draw(found)
+    return of_fit(found, drawn, details)
+
+
+def of_fit(
+    found: Report, drawn: Mapping[str, Picture], details: CertificateSection = NO_DETAILS
+) -> tuple[Certificate, Page]:
+    """Return certificate and report of a fit."""
+    metrics, title = found.metrics, f"Calibration of {found.robot}"
+    measured = ", ".join(name for name, role, *_ in found.files if role != "nominal robot")
+    setup = [
+        Entry("robot", f"{found.robot}, {found.base} to {found.tip}, {len(found.joints)} joints"),
+        Entry("description", found.source), Entry("measurements", measured), Entry("model", metrics.model),
+        Entry("tolerance", tolerance(metrics.tolerance_mm, metrics)), Entry("seed", str(metrics.seed)),
+        Entry("toolkit", versions()),
+    ]  # fmt: skip
+    stages, unchecked = [geometry.stage(found, drawn)], ["dynamics: not identified"]
+    return records(title, "Geometry", setup, stages, unchecked, found.files, details)
+
+
+def tolerance(millimetres: float | None, found: FitMetrics) -> str:
+    """Return a text on the condition for verdict pass, and on the deliverable to which it applies."""
+    of = f"; judged: {ARM[found.deliverable]}" if len(found.deliverables) > 1 else ""
+    if not millimetres:
+        return f"none given: pass means better than the nominal robot on unseen poses, or no improvement possible{of}"
+    return f"{millimetres:g} mm rms on unseen poses{of}"
+
+
+def write_model(outcome: IdentificationOutcome, folder: Path, plots: bool) -> None:
+    """Write certificate and report of an identification into its folder, where the numbers are already."""
+    from calib.procedure.dynamic_stage.folder import UnseenFolder
+
+    UnseenFolder(folder).write_report(outcome.inputs, outcome)
+    rendering.write(folder, *of_model(folder, plots))
+
+
+def of_model(folder: Path, plots: bool = True, details: CertificateSection = NO_DETAILS) -> tuple[Certificate, Page]:
+    """Return certificate and report of an identification, read from its folder."""
+    from calib.procedure.report import dynamics_section
+    from calib.rooms.certificate import dynamics
+
+    found, drawn = dynamics_section.read(folder), {}
+    if plots:
+        from calib.procedure.report.dynamics_figures import draw_dynamics
+
+        drawn = draw_dynamics(found, folder, None, ())
+    unseen, metrics = found.unseen, found.metrics
+    setup = [
+        Entry("robot", unseen.robot), Entry("recordings", ", ".join((*unseen.fit, *unseen.validation))),
+        Entry("torques", f"{len(unseen.rows)} rows"), Entry("method", metrics.method),
+        Entry("friction", metrics.friction), Entry("seed", str(metrics.seed)), Entry("toolkit", versions()),
+    ]  # fmt: skip
+    stages = [dynamics.stage(found, dynamics_section.report_section(found, drawn), plots)]
+    unchecked = ["geometry: taken as described"]
+    return records(f"Calibration of {unseen.robot}", "Dynamics", setup, stages, unchecked, details=details)
+
+
+def notebook(result: Judged) -> str:
+    """Return a result as a page for a notebook: the first page of a fit's certificate, else its section of a report."""
+    if isinstance(result, Outcome):
+        return rendering.html(replace(of_fit(fit_report.collect(result), {})[0], sections=()))
+    return rendering.html(report(repr(result).strip("<>"), "", (), [result.section()]))
