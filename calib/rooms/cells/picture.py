@@ -21,7 +21,7 @@ HEIGHT = 2.5  # [in]
 def draw(session: Session) -> None:
     """Draw the picture of a finished session into its folder."""
     panels = [_cell(session), _errors(session), *([_torque(session)] if session.dynamic else [])]
-    files.write(session.path(PICTURE), picture(Chart(panels, HEIGHT, len(panels)), "").png)
+    files.write(session.path(PICTURE), picture(Chart(panels, HEIGHT, len(panels)), "").image)
 
 
 def _seen_from(points: np.ndarray) -> np.ndarray:

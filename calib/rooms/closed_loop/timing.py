@@ -8,6 +8,7 @@ not known move nothing, wrong gains do. A reference that follows the measured po
 """
 
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -82,7 +83,7 @@ class _Law:
         self.controller = controller
         self.t = np.arange(len(case.motion)) / rate
         place = np.arange(len(self.t)) * every
-        parts = (reference.at(place)[0], case.motion.q, motor_torques(case))
+        parts = (reference.at(place)[0], case.motion.q, cast(np.ndarray, motor_torques(case)))
         self.asked, self.measured, self.torque = (CubicSpline(self.t, low_pass(x, rate, band)) for x in parts)
         self.ahead = np.zeros((len(self.t), n))
         if controller.ahead is not None:

@@ -145,10 +145,16 @@ class ParallelModel:
         if self.identical_legs:
             size, starts = self.legs[0][2].stop, self.known.robot.starts
             first[: size * len(self.legs)] %= size
-            motors = {one.joint: k for k, one in enumerate(self.terms, self._bodies) if one.name.startswith("Ia")}
+            inertias = [(one.joint, k) for k, one in enumerate(self.terms, self._bodies) if one.name.startswith("Ia")]
+            motors = {joint: k for joint, k in inertias if joint is not None}
             for joint, k in motors.items():
                 first[k] = motors.get(joint % int(starts[1]), k)
         return first
+
+    @cached_property
+    def _kept(self) -> np.ndarray:
+        """Which parameters of `single` stand for those here (p,)."""
+        return np.unique(self._first)
 
     @cached_property
     def owners(self) -> np.ndarray:
@@ -169,16 +175,16 @@ class ParallelModel:
         return result
 
     def _chosen(self, every: Sequence[Any]) -> tuple[Any, ...]:
-        return tuple(every[k] for k in np.unique(self._first))
+        return tuple(every[k] for k in self._kept)
 
     @property
     def _bodies(self) -> int:
         """Number of the bodies' parameters in `single`."""
         return 10 * len(self.labels)
 
-    @cached_property
+    @property
     def inertial(self) -> int:
-        return int(np.sum(np.unique(self._first) < self._bodies))
+        return int(np.searchsorted(self._kept, self._bodies))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -197,8 +203,12 @@ class ParallelModel:
     def p(self) -> int:
         return len(self.names)
 
-    @cached_property
+    @property
     def columns(self) -> tuple[DriveTerm, ...]:
+        return self._columns
+
+    @cached_property
+    def _columns(self) -> tuple[DriveTerm, ...]:
         return self._chosen((*[None] * self._bodies, *self.terms))[self.inertial :]
 
     @property
