@@ -125,10 +125,11 @@ def one_start(
 
     Args:
         evaluations: most, if all of `STAGES` are gone through.
-        stages: those to go through; a given start is not led away by a coarse one.
+        stages: those to go through; a given start is not led away by a coarse one: it goes through the first other.
     """
     began, random = time.perf_counter(), isinstance(start, int | np.integer)
-    chosen = stages if random else tuple(stage for stage in stages if not stage.coarse)
+    fine = [tuple(stage for stage in some if not stage.coarse) for some in (stages, STAGES)]
+    chosen = stages if random else fine[0] or fine[1][:1]
     extra = problem.extra
     run = StartSearch(*_at_stage(problem, chosen[0], extra))
     if random:

@@ -182,7 +182,7 @@ class State:
     words: str
 
 
-def _steps_of(session: Session) -> tuple[SessionStep, ...]:
+def steps_of(session: Session) -> tuple[SessionStep, ...]:
     """Return the steps of a session, without those of stages that the settings exclude."""
     left_out = {"dynamics": not session.dynamic, "geometry": not session.geometric, "need": not session.needs}
     return tuple(step for step in (*STEPS, *offered("steps")) if not left_out.get(step.stage))
@@ -194,7 +194,7 @@ def find(session: Session, name: str) -> SessionStep:
     Raises:
         SessionError: with the names there are.
     """
-    there = _steps_of(session)
+    there = steps_of(session)
     for number, step in enumerate(there, 1):
         if name in (step.name, str(number)):
             return step
@@ -208,7 +208,7 @@ def find(session: Session, name: str) -> SessionStep:
 def states(session: Session) -> list[State]:
     """Return the status of every step."""
     recorded, result, current = read_state(session), [], True
-    for step in _steps_of(session):
+    for step in steps_of(session):
         words = (
             "was completed, but an earlier step has to be repeated first"
             if step.name in recorded.steps
@@ -295,7 +295,7 @@ def run_next(session: Session, say: Say, progress: Say, command: str = "calib ne
 
 
 def _run(session: Session, step: SessionStep, say: Say, progress: Say, command: str) -> None:
-    number = _steps_of(session).index(step) + 1
+    number = steps_of(session).index(step) + 1
     recorded = read_state(session).without(step.name)
     session.write_state(replace(recorded, running=step.name))
     inputs, started = _inputs(session, step), time.perf_counter()
@@ -324,6 +324,6 @@ def _run(session: Session, step: SessionStep, say: Say, progress: Say, command: 
 
 def forget(session: Session, step: SessionStep) -> None:
     """Mark a step and all steps after it to be run again, but not a design that people have carried out."""
-    there = _steps_of(session)
+    there = steps_of(session)
     again = (later for later in there[there.index(step) :] if later is step or not session.brought(*later.kept[0]))
     session.write_state(read_state(session).without(*(later.name for later in again)))

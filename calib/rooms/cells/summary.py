@@ -19,7 +19,7 @@ from calib.procedure.kinematic_stage.folder import URDF
 from calib.procedure.kinematic_stage.metrics import ValidationMetrics
 from calib.procedure.session.folder import SETTINGS, WAYS, Say, Session
 from calib.procedure.session.geometry_steps import chain_of
-from calib.procedure.session.steps import STEPS
+from calib.procedure.session.steps import steps_of
 from calib.rooms.viewer import viewer
 
 PICTURE = "demo.png"
@@ -79,9 +79,6 @@ NUMBERS: Mapping[str, Callable[[Session], tuple[float, str]]] = {
 """Number of each step and what it is, read from the session's folders."""
 
 
-_STAGES = {"geometry": "geometric", "dynamics": "dynamic"}  # of steps -> what a session has to be
-
-
 @dataclass
 class Telling:
     """Tells of a session as it goes on.
@@ -113,15 +110,16 @@ class Telling:
 
     def progress(self, words: str) -> None:
         """Show the stage, the share done and the time left; `words`: a stage's purpose, or what it does."""
-        now, purposes = time.perf_counter(), {step.purpose: step.name for step in STEPS}
+        now, steps = time.perf_counter(), steps_of(self.session)
+        purposes = {step.purpose: step.name for step in steps}
         if words in purposes:
             self._step, self._entered = purposes[words], now
-        names = [step.name for step in STEPS if not step.stage or getattr(self.session, _STAGES[step.stage])]
+        names = list(purposes.values())
         before = sum(SECONDS.get(name, 0.0) for name in names[: names.index(self._step)])
         pace = (self._entered - self.began) / before if before else 1.0
         total, own = sum(SECONDS.get(name, 0.0) for name in names), SECONDS.get(self._step, 0.0)
         done = before + min((now - self._entered) / pace, 0.95 * own)
-        stage = next(step.purpose for step in STEPS if step.name == self._step)
+        stage = steps[names.index(self._step)].purpose
         words = f"{done / total:.0%} done, {(total - done) * pace:.0f} s left: {stage}"
         self.show(words[: get_terminal_size().columns - 3])  # the spinner and the cursor need the rest
 

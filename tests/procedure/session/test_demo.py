@@ -70,15 +70,15 @@ def test_hard_names_the_robot(tmp_path: Path, capsys: pytest.CaptureFixture) -> 
 
 def test_progress_tells_stage_share_and_time_left() -> None:
     shown: list[str] = []
-    session: Any = SimpleNamespace(geometric=True, dynamic=True)
+    session: Any = SimpleNamespace(geometric=True, dynamic=True, needs=False)
     told = Telling(session, print, shown.append)
-    for step in steps.STEPS:
+    for step in steps.steps_of(session):
         told.progress(step.purpose)
         told.progress("some words of its own")
     shares = [int(re.findall(r"^(\d+)% done, \d+ s left: ", words)[0]) for words in shown]
     assert shares == sorted(shares) and shares[0] == 0 and 70 < shares[-1] < 100
-    assert all(step.purpose in words for step, words in zip(steps.STEPS, shown[::2]))
-    assert set(SECONDS) < {step.name for step in steps.STEPS}
+    assert all(step.purpose in words for step, words in zip(steps.steps_of(session), shown[::2], strict=True))
+    assert set(SECONDS) < {step.name for step in steps.steps_of(session)}
 
 
 def test_only_arms_with_torque_sensors_log_them() -> None:

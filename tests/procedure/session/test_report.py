@@ -93,7 +93,7 @@ def test_the_certificate_states_the_numbers_of_the_data_on_four_pages(finished: 
     document = PdfReader(finished.path("certificate.pdf"))
     assert len(document.pages) <= 4
     text = " ".join(" ".join(one.extract_text() for one in document.pages).split())
-    rows = json.loads(finished.path("5-validation/metrics.json").read_text())["validation"]["validation.csv"]
+    rows = json.loads(finished.path("5-validation/metrics.json").read_text())["validation"]["validation_measured.csv"]
     before, after = (rows[arm]["position_mm"] for arm in ("nominal", "calibrated"))
     met = "yes" if after["rms"] <= 0.3 else "NO"
     assert re.search(rf"position, rms {before['rms']:.3g} mm {after['rms']:.3g} mm ± [\d.]+ mm .* 0.3 mm {met} ", text)
@@ -102,7 +102,8 @@ def test_the_certificate_states_the_numbers_of_the_data_on_four_pages(finished: 
     worst = int(np.argmax(errors.calibrated["position"]))
     joints = ", ".join(f"{angle:.1f} deg" for angle in np.degrees(errors.q[worst]))
     assert (
-        f"row {errors.rows[worst]} of validation.csv: {after['max']:.3g} mm" in text and f"joints at {joints};" in text
+        f"row {errors.rows[worst]} of validation_measured.csv: {after['max']:.3g} mm" in text
+        and f"joints at {joints};" in text
     )
     assert "robot serial number SN 4711" in text and "ISO 9283" in text and "NOT checked" in text
     shown = finished.path("certificate.html").read_text()

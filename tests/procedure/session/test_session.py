@@ -138,8 +138,8 @@ def _killed_at(session: Session, name: str) -> int:
 
     if not (child := os.fork()):
         try:
-            there = steps._steps_of(session)
-            steps._steps_of = lambda _: tuple(replace(one, make=killed) if one.name == name else one for one in there)
+            there = steps.steps_of(session)
+            steps.steps_of = lambda _: tuple(replace(one, make=killed) if one.name == name else one for one in there)
             cli.run(["next", "--no-plots", str(session.folder)])
         finally:
             os._exit(1)
