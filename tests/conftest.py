@@ -33,18 +33,18 @@ settings.load_profile("fixed")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    words = "note the findings that tests make the sources say; a run of the slow tests compares with the catalogue"
-    parser.addoption("--findings", action="store_true", help=words)
+    words = "note the findings that tests make the sources say, or compare what was noted with the catalogue"
+    parser.addoption("--findings", choices=("note", "compare"), help=words)
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    if config.getoption("findings"):
+    if config.getoption("findings") == "note":
         produced.note()
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    if session.config.getoption("findings") and session.config.option.markexpr == "not slow":
-        session.config.cache.set(produced.KEY, sorted(produced.CODES))
+    if session.config.getoption("findings") == "note":
+        produced.keep(session.config)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -52,10 +52,6 @@ def _one_blas_thread() -> Iterator[None]:
     """Limit BLAS for tests that call what stands behind the API, as the API does."""
     with one_blas_thread():
         yield
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    items.sort(key=lambda item: item.name == "test_every_entry_is_produced")  # by all tests before it
 
 
 def pytest_collection_finish() -> None:

@@ -3,12 +3,13 @@
 import sys
 from pathlib import Path
 
+import pytest
+
 import calib
 from calib.errors import Finding
 
 SOURCES = str(Path(calib.__file__).parent)
 CODES: set[str] = set()
-KEY = "calib/findings"  # of the codes of the quick tests, in pytest's cache
 
 
 def note() -> None:
@@ -26,3 +27,14 @@ def note() -> None:
             CODES.add(self.code)
 
     Finding.__init__ = noted
+
+
+def keep(config: pytest.Config) -> None:
+    """Write what this process has noted into pytest's cache: a file for the quick tests and one for the slow, each."""
+    worker = getattr(config, "workerinput", {}).get("workerid", "main")
+    (config.cache.mkdir("findings") / f"{config.option.markexpr}, {worker}").write_text(" ".join(sorted(CODES)))
+
+
+def kept(config: pytest.Config) -> set[str]:
+    """Return the codes that all processes have noted."""
+    return {code for path in config.cache.mkdir("findings").iterdir() for code in path.read_text().split()}
