@@ -13,6 +13,7 @@ from typing import Any, Concatenate, ParamSpec
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator, NullLocator
 
 from calib import files
@@ -21,6 +22,7 @@ from calib.procedure.report.page import Picture
 from calib.procedure.report.style import AFTER, INK, MARK, PAGE_WIDTH, QUIET, log_axis
 
 SIZE = 16.0  # of a coloured dot [pt²]
+HALO = [withStroke(linewidth=2.0, foreground="white")]  # around labels, so that a line behind them does not hide them
 
 
 P = ParamSpec("P")
@@ -84,7 +86,7 @@ def level(
         words, (at, height) if upright else (0.0, at),
         xycoords=("data", "axes fraction") if upright else ("axes fraction", "data"),
         xytext=(3 if right else -3, 0 if upright else 1), textcoords="offset points", color=colour,
-        va="top" if upright else "bottom", ha="left" if right else "right",
+        va="top" if upright else "bottom", ha="left" if right else "right", path_effects=HALO,
     )  # fmt: skip
 
 

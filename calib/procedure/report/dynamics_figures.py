@@ -113,7 +113,7 @@ def torques(
     columns = 2 if len(rows) > MAX_HALF_PAGE_ROWS else 1
     panels = []
     for j, (row, unit) in enumerate(zip(rows, units)):
-        left = f": {errors[j]:.3g} % left" if j < len(errors) and np.isfinite(errors[j]) else ""
+        left = f": {errors[j]:.3g} % unexplained" if j < len(errors) and np.isfinite(errors[j]) else ""
         lines = [
             line(t, measured[:, j], "-", BEFORE, 2.4, label="measured"),
             line(t, predicted[:, j], "-", AFTER, 0.7, label="predicted"),

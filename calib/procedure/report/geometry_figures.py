@@ -110,7 +110,7 @@ def error_map(
         Panel(
             [
                 dots(points[:, 0], points[:, j], 1e3 * np.asarray(values), 1e3 * least, most, "[mm]" if j == 2 else ""),
-                line([0.0], [0.0], "+", INK, size=9.0), text("base", 0.0, 0.0, (0, -5), across="center", along="top"),
+                line([0.0], [0.0], "+", INK, size=9.0), text("base", 0.0, 0.0, (-5, 4), across="right"),
             ],
             title, "x [m]", f"{'xyz'[j]} [m]", grid="both", equal=True, ticks=6,
         )

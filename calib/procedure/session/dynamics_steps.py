@@ -95,7 +95,7 @@ def excite(session: Session, say: Say) -> list[str]:
         )  # fmt: skip
         if designed.found.interrupted:  # a session is resumed, not gone on with half a search
             raise KeyboardInterrupt
-        motion_folder.write_design(designed, session.path("6-excitation") / name, draw)
+        motion_folder.write_design(designed, session.path("6-excitation") / name, draw if first else None)
         cond = designed.condition
         notes.append(
             f"{name}: {designed.period:g} s, condition number {cond.raw:.3g} raw, {cond.normalised:.3g} "

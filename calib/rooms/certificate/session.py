@@ -41,7 +41,8 @@ ROLES = {
     "9-export": "calibrated robot",
 }  # fmt: skip
 TORQUES = {
-    "motor": "motors'", "link": "of sensors behind the gears", "both": "motors' and of sensors behind the gears",
+    "motor": "of the motors", "link": "of sensors behind the gears",
+    "both": "of the motors and of sensors behind the gears",
 }  # fmt: skip
 
 

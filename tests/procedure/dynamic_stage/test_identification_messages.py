@@ -80,7 +80,7 @@ def test_figures_have_units_at_their_axes():
         inputs=inputs,
     )  # fmt: skip
     figure = charts.figure(dynamics_figures.file_torques(one, np.asarray(one.target), outcome))
-    units = [f"{joint.name} [{unit}]: 5 % left" for joint, unit in zip(joints, ("N", "N m", "N m"))]
+    units = [f"{joint.name} [{unit}]: 5 % unexplained" for joint, unit in zip(joints, ("N", "N m", "N m"))]
     assert [axis.get_title(loc="left") for axis in figure.axes] == units
     assert not any(axis.get_legend() for axis in figure.axes), "a legend inside would cover the curve"
     gains = DriveGains(np.ones(3), np.zeros((3, 3)), (), np.zeros(0), np.ones(3), "", (2,))
