@@ -338,8 +338,8 @@ def _shared(block: PoseMeasurements, fit: Sequence[PoseMeasurements], notes: lis
         if block.station not in stations:
             block = replace(block, station=stations[0])
             notes.append(
-                f"{block.file} is predicted with the fit's station '{stations[0]}'; if the instrument stood elsewhere, "
-                "refit its frames (--refit-frames)"
+                f"{Path(block.file).name} is predicted with the fit's station '{stations[0]}'; if the instrument stood "
+                "elsewhere, refit its frames (--refit-frames)"
             )
     known = {name for other in fit for name in other.tool_names}
     if not set(block.tool_names) <= known:

@@ -203,7 +203,7 @@ def _effects(rows: Sequence[GeometricEffect]) -> Chart:
         *(text(row.parameter, one, k, (3, 0), along="center") for k, (row, one) in enumerate(zip(rows, size))),
     ]  # fmt: skip
     labels = [f"{row.element} ({small(row.sigma or 0.0, row.unit, digits=2)})" for row in rows]
-    title = f"{int((size > MIN_SHIFT).sum())} of {len(rows)} geometric errors shift parameters noticeably"
+    title = f"{int((size > MIN_SHIFT).sum())} of {len(rows)} geometric errors matter"
     limits = 0.0, 1.25 * float(size.max(initial=MIN_SHIFT))
     panel = Panel(layers, title, "shift [σ of torque noise]", xlim=limits, ynames=labels)
     return Chart([panel], 0.7 + 0.19 * len(rows), width=HALF_WIDTH)
@@ -243,8 +243,8 @@ def _judged(unseen: UnseenReport) -> list[Picture]:
     _, proof, where = proof_of(unseen)
     fitted, left = (np.nan_to_num(one.raw.joints) for one in (next(iter(unseen.fit.values())), proof))
     shown = [
-        bars(fitted, BEFORE, shift=-0.19, thick=0.36, label="training motion"),
-        bars(left, AFTER, shift=0.19, thick=0.36, label="unseen motion"),
+        bars(fitted, BEFORE, shift=-0.19, thick=0.36, label="training"),
+        bars(left, AFTER, shift=0.19, thick=0.36, label="unseen"),
     ]
     title = f"at most {max(left, default=0.0):.3g} % unexplained"
     panel = Panel(shown, x="torque unexplained [%]", ynames=unseen.rows, grid="x")
