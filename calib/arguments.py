@@ -3,7 +3,9 @@
 Loads nothing heavy: the command line builds default settings before it knows what it is asked for.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import cache, wraps
 from inspect import Signature, isgenerator, signature
 from numbers import Integral, Real
@@ -22,7 +24,8 @@ _TABLE = "found a DataFrame: write it by frame.to_csv('table.csv', index=False) 
 def checked(given: C) -> C:
     """Return a function or settings class that raises an error for arguments of a type other than annotated.
 
-    A function runs with one thread of BLAS, `calib.workers.threads`. Settings are read as an option file's table is,
+    A function runs with one thread of BLAS, `calib.workers.threads`; one that takes `progress` shows it in notebooks,
+    in a line below the cell until it returns. Settings are read as an option file's table is,
     see `calib.config.parse`; without arguments nothing is loaded for that.
 
     Numbers may be numpy's, and any sequence or array stands for a tuple; text is neither number nor sequence.
@@ -75,11 +78,26 @@ def _checked(function: Callable[..., Any]) -> Any:
         from calib.workers.threads import limited_steps, one_blas_thread
 
         _refuse_other_types(function.__name__, *expected(), args, kwargs)
-        with one_blas_thread(), quiet():
-            result = function(*args, **kwargs)
+        with one_blas_thread(), quiet(), _reporter(expected()[0], kwargs) as progress:
+            result = function(*args, **kwargs | progress)
         return limited_steps(result) if isgenerator(result) else result
 
     return call
+
+
+@contextmanager
+def _reporter(wanted: Signature, given: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yield a notebook's reporter as an argument for a function that takes one and was given none; otherwise {}."""
+    notebook = sys.modules.get("IPython")
+    wants = "progress" in wanted.parameters and given.get("progress") is None
+    if not wants or notebook is None or not hasattr(notebook.get_ipython(), "kernel"):
+        yield {}
+        return
+    line = notebook.display.display({"text/plain": ""}, raw=True, display_id=True)
+    try:
+        yield {"progress": lambda words: line.update({"text/plain": words}, raw=True)}
+    finally:
+        line.update({}, raw=True)
 
 
 def _refuse_other_types(name: str, wanted: Signature, hints: dict[str, Any], args: tuple, kwargs: dict) -> None:

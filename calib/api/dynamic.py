@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from calib.api.rendering import Drawn, Judged, Progress, data_frame, listed, optional, progress_shown
+from calib.api.rendering import Drawn, Judged, Progress, data_frame, listed, optional
 from calib.arguments import checked
 from calib.data.recordings.recording import Recording
 from calib.errors import UsageError, require
@@ -177,7 +177,6 @@ def identify_dynamics(
         "settings and options were both given, but contain the same keys: give only one of them",
         UsageError,
     )
-    progress = progress_shown(progress)
     chosen = options if isinstance(options, IdentifyOptions) else read_options(optional(options))
     chosen = chosen if settings is None else options_of(settings)
     designed = [] if excitation is None else [coefficients.read(Path(excitation))]

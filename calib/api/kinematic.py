@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 import numpy as np
 
 from calib import files
-from calib.api.rendering import Drawn, Judged, Progress, data_frame, listed, optional, progress_shown
+from calib.api.rendering import Drawn, Judged, Progress, data_frame, listed, optional
 from calib.arguments import checked
 from calib.config import Tables
 from calib.data.poses.fit_options import FitOptions, read_options
@@ -237,7 +237,7 @@ def select_poses(
     from calib.workers import workers as opened
 
     stage_of(robot, "choosing poses")
-    say, lost = progress_shown(progress) or (lambda words: None), []
+    say, lost = progress or (lambda words: None), []
     with as_ours(), opened(workers) as crew:
         chosen = selection.choose(
             robot, count, settings, constraints=optional(constraints), existing=optional(existing), base=base, tip=tip,
@@ -279,7 +279,6 @@ def fit_geometry(
         Unidentifiable: where no parameter is identifiable.
         NotConverged: where the fit did not come to an end.
     """
-    progress = progress_shown(progress)
     chosen = options if isinstance(options, FitOptions) else read_options(optional(options))
     expected = poses.prediction if isinstance(poses, PoseSelection) else poses and prediction.read(Path(poses))
     if (stage := stage_of(robot, "fit", base, tip)) is not None:

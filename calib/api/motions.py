@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from calib.api.dynamic import DynamicsModel
-from calib.api.rendering import Drawn, Progress, optional, progress_shown, saved
+from calib.api.rendering import Drawn, Progress, optional, saved
 from calib.arguments import checked
 from calib.config import Tables
 from calib.data.poses.pose_lists import Targets
@@ -146,7 +146,6 @@ def design_excitation(
     """
     from calib.workers import workers as opened
 
-    progress = progress_shown(progress)
     lost, stage = [], stage_of(robot, "excite", base, tip)
     with as_ours(), ExitStack() as stack:
         place = None if model is None else stack.enter_context(saved(model))
@@ -193,7 +192,6 @@ def plan_motion(
     Raises:
         UsageError: for waypoints that cannot be reached, and limits that cannot be kept.
     """
-    progress = progress_shown(progress)
     stage = stage_of(robot, "plan", base, tip)
     with as_ours(), ExitStack() as stack:
         place = None if model is None else stack.enter_context(saved(model))

@@ -6,7 +6,6 @@ What the verbs take in several forms: one or many, a file that may be missing, a
 from __future__ import annotations
 
 import io
-import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -38,15 +37,6 @@ def listed(given: object | Sequence[object]) -> list:
 def optional(given: Any) -> Any:
     """Return a text as a path, and any other value unchanged."""
     return Path(given) if isinstance(given, str) else given
-
-
-def progress_shown(progress: Progress | None) -> Progress | None:
-    """Return the given progress reporter; without one, in a notebook, a line below the cell; otherwise None."""
-    notebook = sys.modules.get("IPython")
-    if progress is not None or notebook is None or not hasattr(notebook.get_ipython(), "kernel"):
-        return progress
-    line = notebook.display.display({"text/plain": ""}, raw=True, display_id=True)
-    return lambda words: line.update({"text/plain": words}, raw=True)
 
 
 @contextmanager

@@ -9,7 +9,7 @@ import numpy as np
 
 from calib import files
 from calib.api.kinematic import GeometryFit
-from calib.api.rendering import Progress, Shown, progress_shown, saved
+from calib.api.rendering import Progress, Shown, saved
 from calib.arguments import checked
 from calib.data.poses.pose_lists import Targets, read_targets
 from calib.errors import CalibError
@@ -88,6 +88,6 @@ def compensate(
         targets = read_targets(targets, joints_of(chain))
     commands = joint_commands.computed(
         found, Targets.of(targets), frame=frame, tool=tool, dof=dof, start=start, tolerance=tolerance, seed=seed,
-        progress=progress_shown(progress),
+        progress=progress,
     )  # fmt: skip
     return JointCommands(**vars(commands))
