@@ -57,6 +57,7 @@ def main() -> None:
     given = read.parse_args()
     good = given.html or run_pages(given.pages, given.record, given.slow)
     command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-j", str(WORKERS), "-b", "html", HERE, HTML]
+    command += [] if given.html else ["--fresh-env"]  # notebooks run, too, where only the code has changed
     good = subprocess.run(command).returncode == 0 and good
     print(f"{HTML / 'index.html'}" if good else "the documentation has errors")
     sys.exit(0 if good else 1)

@@ -184,11 +184,34 @@ def _plain(text: str) -> str:
 
 
 def _keys(name: str) -> str:
+    said = example_words(name)
     rows = [
-        (_literal(key), _plain(held), _literal(default), _plain(words))
+        (_literal(key), _plain(held), _literal(default), _plain(words or said.get(key, "")))
         for key, held, default, words in formats.keys(name)
     ]
     return _rst_table(("Key", "Allowed", "Default", "Meaning"), rows)
+
+
+_EXAMPLE_LINE = re.compile(r"    (?:\[\[([\w.]+)\]\]|\[(\w+).*?\]|(?:# )?(\w+) = .*?(?=$| +#)| )? *(?:# (.*))?")
+
+
+def example_words(name: str) -> dict[str, str]:
+    """Return what the comments in the example of a kind of TOML file say of its keys, by place (``loop.kp``)."""
+    texts = [import_module(module).__doc__ or "" for module in formats.TOPICS[name][1].split()]
+    texts += [_indented(example())] if name == "session" else []
+    table, key, found = "", "", example_words("constraints") if name == "limits" else {}  # whose tables it takes, too
+    for line in "\n".join(texts).splitlines():
+        if not (parts := _EXAMPLE_LINE.fullmatch(line)) or not line.strip():
+            table, key = "", ""
+            continue
+        tables, one, name, words = parts.groups()  # of [payload.tool] the second part is a name that the user gives
+        if tables or one:
+            table = key = tables or one
+        elif name:
+            key = f"{table}.{name}".lstrip(".")
+        if words:
+            found[key] = f"{found.get(key, '')} {words}".strip()
+    return found
 
 
 def _pose_columns() -> str:

@@ -30,6 +30,8 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
     prior = "auto"                   # auto, none, cad: regularise what is not identified towards CAD values;
                                      # auto: where there are none, to rods between the joints
     folds = 6                        # time blocks of the cross-validation
+    samples = 20000                  # largest number of rows per torque; beyond it every second, third … row
+    deflections = true               # joint corrections of the fit (compliance, gears, encoders) move the links
     accept = []                      # findings that are meant so, by the name that their line prints
 
     [filter]                         # default: from the data
@@ -53,19 +55,21 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
     names = { torque = "tau_m" }     # our name = the file's
     units = { q = "deg" }            # of columns that state none
     [[coupling]]                     # a motor that turns with the sum of two joints: Iam Fvm Fcm
-    joints = [5, 6]
-    label = "6"
+    joints = [5, 6]                  # the two joints, from 1
+    label = "6"                      # ends the names of its parameters
     [[term]]                         # any other torque term, e.g. a counterbalance
-    name = "Ks2"
+    name = "Ks2"                     # of the parameter
     shape = "sine"                   # see calib.dynamics.shapes
-    joint = 2
-    settings = [1.0, inf]            # order 1 is gravity's own shape: only wide and fast motion distinguishes them
+    joint = 2                        # from 1
+    side = "motor"                   # or link, of a joint torque sensor
+    settings = [1.0, inf]            # of the shape; a sine's order 1 is gravity's own shape: only wide and fast motion
+                                     # distinguishes them
     [payload.tool]                   # a body at the flange
     mass = 2.805                     # known mass [kg]
     com = [0.0, 0.0, 0.05]           # known centre of mass in the tip's frame [m]
     [gain_identification]            # torque = gain x current, from runs without and with a payload of known mass
     unloaded = "run.npz"             # recordings of the command line, or other files
-    loaded = "run_load.npz"
+    loaded = "run_load.npz"          # the same motion with the payload
     [loop]                           # the closed loop they came from: see calib.identification.loop
     controller = "identify"
     [constraints]                    # what parameters must satisfy, for the methods pc-*
@@ -74,9 +78,11 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
     bodies = false                   # of bodies that can exist (pseudo-inertias), in place of M(q) over postures
     bounds = { Fv1 = [0.5, 5.0], ZZ1R = [0.0, inf] }   # [lower, upper]; both alike fix a parameter
     [[constraints.sum]]              # a weighted sum of parameters: equal, or least and most
-    weights = { Fv5 = 1.0, Fv6 = -1.0 }
-    equal = 0.0
-    name = "wrist joints alike"
+    weights = { Fv5 = 1.0, Fv6 = -1.0 }  # name of a parameter -> its weight
+    equal = 0.0                      # what the sum is
+    # least = 0.0                    # or the least that it may be
+    # most = 1.0                     # and the most
+    name = "wrist joints alike"      # of the constraint, for messages
     [[constraints.curved]]           # a twice differentiable function of parameters, h >= 0; numbers, + - * / **, sqrt,
     h = "XX2R * ZZ2R >= XZ2R**2"     # exp, log, sin, cos, tanh; in Python also a function with its derivatives `slope`
     [files."run_load.npz"]           # for this file only: payload, gains, reference; keys of filter and recording

@@ -9,12 +9,12 @@ Gains are what the joints feel, torque per position error on the joint side::
 
     [loop]
     controller = "pd"                # pd, cascade, or identify: gains read from the logs (ARX, see below)
-    kp = [12000.0, 4500.0]           # pd: [N m/rad], one per joint or one for all; kd [N m s/rad], ki [N m/(rad s)]
-    kd = [90.0, 28.0]
-    ki = 0.0
-    position = [40.0, 40.0]          # cascade P-PI: P [1/s], velocity K [N m s/rad], reset Ti [s] (none: P-P)
-    velocity = [90.0, 28.0]
-    reset = 0.05
+    kp = [12000.0, 4500.0]           # pd: [N m/rad], one per joint or one for all
+    kd = [90.0, 28.0]                # pd: [N m s/rad]
+    ki = 0.0                         # pd: [N m/(rad s)]
+    position = [40.0, 40.0]          # cascade P-PI: gain P of the position loop [1/s]
+    velocity = [90.0, 28.0]          # cascade: gain K of the velocity loop [N m s/rad]
+    reset = 0.05                     # cascade: reset time Ti of the velocity loop [s]; none: P-P
     share = 1.0                      # of the reference's velocity that the velocity loop sees
     rate = 5000.0                    # of the controller [Hz], whole multiple of the log's or not; default: the log's,
                                      # or the least multiple of it that is 1 kHz or more

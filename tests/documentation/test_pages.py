@@ -84,6 +84,7 @@ def test_no_block_of_code_escapes() -> None:
     assert sum(len(blocks.read(page.read_text(encoding="utf-8"))) for page in PAGES) > 20
 
 
+@pytest.mark.slow
 def test_what_the_concepts_name_exists() -> None:
     for page in (DOCS / "concepts").glob("*.md"):
         for name in re.findall(r"`((?:calib|poses|trajectories)(?:\.\w+)+)`", page.read_text(encoding="utf-8")):
@@ -94,6 +95,7 @@ def test_what_the_concepts_name_exists() -> None:
                 assert hasattr(import_module(".".join(parts[:-1])), parts[-1]), (page.name, name)
 
 
+@pytest.mark.slow
 def test_the_reference_has_all_that_is_declared() -> None:
     import reference
 
@@ -111,6 +113,8 @@ def test_the_reference_has_all_that_is_declared() -> None:
         found = json.loads(formats.json_schema(topic))
         keys = [key for key in found["properties"] if key != "files"]
         assert all(re.search(rf"``{key}[.`]", shown) for key in keys) if topic != "session" else "[poses]" in shown
+        said = reference.example_words(topic)
+        assert [key for key, _, _, words in formats.keys(topic) if not (words or said.get(key))] == [], "no meaning"
 
 
 def test_notebooks_are_kept_without_outputs() -> None:

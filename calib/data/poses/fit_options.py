@@ -24,7 +24,8 @@ TOML; every key is optional, and an unknown key is refused. Lengths in m, angles
     [columns]                        # our name = the file's; y and z go with x
     x = "X_leica"
     [units]                          # of columns whose header states none: our name, or joints, position, distance,
-    joints = "deg"                   # orientation, sigma, sigma_rotation
+                                     # orientation, sigma, sigma_rotation
+    joints = "deg"
     [sigma]                          # standard deviations: a number, or one per axis
     position = [1e-5, 1e-5, 2e-5]
     orientation = 1e-4

@@ -10,18 +10,19 @@ waypoints keeps what is stated only. Besides, per joint or ``all``::
     share = 0.9                      # of the limits, those of the robot included
     [acceleration]                   # default: where no torque limit counts, 2/s times the speed limit; none of plans
     all = 8.0
-    [jerk]
+    [jerk]                           # moduli; default: no limit
     all = 100.0
     [torque]                         # default the robot's effort limits
     margin = 0.1                     # a share of the limits that stays free
     deviations = 2.0                 # standard deviations of the predicted torque, where the model has a covariance
-    [friction]                       # where there is no identified model: Fv [N m s/rad], Fc [N m], per joint
-    Fv = [14.4, 15.3, 6.55, 11.0, 4.29, 2.26, 1.6]
-    Fc = [11.9, 11.5, 8.98, 8.35, 8.31, 4.72, 6.04]
-    [noise]                          # standard deviation of a torque's error that no parameter explains, where there is
-    q1 = 2.5                         # no identified model [N m or N]; default 1 % of the torque limit; weighs the rows
+    [friction]                       # where there is no identified model
+    Fv = [14.4, 15.3, 6.55, 11.0, 4.29, 2.26, 1.6]  # viscous, per joint [N m s/rad]
+    Fc = [11.9, 11.5, 8.98, 8.35, 8.31, 4.72, 6.04]  # Coulomb, per joint [N m]
+    [noise]                          # standard deviation of a torque's error that no parameter explains [N m or N],
+                                     # where there is no identified model; weighs the rows; default 1 % of the limit
+    q1 = 2.5
     [[point]]                        # a named point, which keeps [target]'s height and axis_distance
-    name = "elbow"
+    name = "elbow"                   # for messages
     joint = 4                        # of the link behind this joint, or 0: of the tip
     xyz = [0.0, 0.0, 0.0]            # in the frame behind the joint
     [frequency]

@@ -17,17 +17,18 @@ TOML; every table is optional, a key that is none of these is refused. Lengths i
     reach = 1.2                      # largest distance from the base's origin
     facing = [0, 0, 1]               # the direction it faces, in its own frame (default z), "-x" …; a list of several
     [instrument]                     # camera or tracker
-    xyz = [2.0, 0.0, 1.0]            # where it stands, and how: rpy (or matrix)
-    rpy = [0, 0, "180 deg"]
+    xyz = [2.0, 0.0, 1.0]            # where it stands
+    rpy = [0, 0, "180 deg"]          # how it is turned: roll, pitch, yaw
+    # matrix = [[1, 0, 0, 2], …]     # in place of xyz and rpy: three or four rows of 4 numbers
     roll = ["-20 deg", "20 deg"]     # of the target, seen from the instrument's frame: R = Rz(yaw) Ry(pitch) Rx(roll)
-    pitch = ["-20 deg", "20 deg"]
+    pitch = ["-20 deg", "20 deg"]    # the same of its pitch
     sight = "40 deg"                 # half angle of the cone, around facing, in which the target sees the instrument
     range = [0.5, 20.0]              # least and largest distance of the target
     [camera]                         # in place of an instrument; places may be rough, a centimetre and some degrees do
     # what is "unknown" of the first five keys is said; the poses are then not held against the camera's view
     mounting = "in hand"             # the arm carries the camera; to hand: the board
     lens = "camera.yaml"             # beside the file; ROS camera_info
-    board = "board.toml"
+    board = "board.toml"             # as calib board writes it
     carried = {xyz = [0.04, 0.0, 0.06], rpy = [0, 0, 0]}       # what the arm carries, in the tip's frame
     stands = {xyz = [0.5, 0.1, 0.0], rpy = ["180 deg", 0, 0]}  # the other, in the base; cameras look along z
     tilt = "50 deg"                  # largest angle between the line of sight and the board's normal
@@ -38,11 +39,13 @@ TOML; every table is optional, a key that is none of these is refused. Lengths i
     radius = 0.06                    # of the capsules; by default 5 % of the stretched arm, 0.05 or more
     floor = 0.0                      # height of the floor; by default of what the arm stands on
     box = [[-1, 1], [-1, 1], [0, 2]] # x, y and z that no part of the arm leaves
-    [[obstacle]]                     # box (size: 3), sphere (1: radius) or cylinder (2: radius, length)
-    name = "table"
-    kind = "box"
-    size = [1.0, 1.0, 0.1]
-    xyz = [0.8, 0.0, -0.05]
+    [[obstacle]]                     # any number of these
+    name = "table"                   # for messages
+    kind = "box"                     # box, sphere or cylinder
+    size = [1.0, 1.0, 0.1]           # of a box its three edges; of a sphere the radius; of a cylinder radius and length
+    xyz = [0.8, 0.0, -0.05]          # its centre
+    rpy = [0, 0, 0]                  # how it is turned: roll, pitch, yaw
+    # matrix = [[1, 0, 0, 2], …]     # in place of xyz and rpy: three or four rows of 4 numbers
 """
 
 from collections.abc import Mapping

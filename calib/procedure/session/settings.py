@@ -82,6 +82,7 @@ class RobotSection:
     """Section ``[robot]``: the robot and its file.
 
     Attributes:
+        file: description of the robot, beside session.toml
         given: name or file as given to calib new
         base: URDF: first link of the arm; empty: the root
         tip: URDF: last link of the arm; empty: end of the longest chain
@@ -99,6 +100,7 @@ class InstrumentSection:
     """Section ``[instrument]``: the instrument, and its sigmas.
 
     Attributes:
+        name: what it is called
         measures: pose (position and orientation), position or pixels; nothing: the geometry is not fitted
         sigma_position: standard deviation of one measurement, per axis [m]; 0: estimated from the residuals
         sigma_orientation: standard deviation of one measurement, per axis [rad]; 0: estimated from the residuals
@@ -232,6 +234,9 @@ class SessionSettings:
     """The content of ``session.toml``, by sections.
 
     Attributes:
+        name: of the robot, for titles
+        created: when it was made, UTC
+        schema: version of this file's form
         seed: of pose selection, cross-validation and all other random choices
         certificate: stated on the certificate besides results; what is empty is a line to fill in by hand
     """

@@ -2,8 +2,8 @@
 
 TOML; SI units. Every combination of robot, motion, rate, noise, decimation, cutoff and mismatch is a condition::
 
-    name = "small"
-    about = "what it is for"
+    name = "small"                   # of the study, and of its folder's conditions
+    about = "what it is for"         # a sentence for lists
     robot = ["tx40", "rv2sq"]        # those two: their true inertias, friction and controller are known
     motion = "designed"              # by calib excite; default random: the best of 20 random Fourier series
     rate = [200, 50]                 # of the log [Hz]; default 0: the toolbox's, 1000 (tx40) and 140 (rv2sq)
@@ -26,7 +26,7 @@ TOML; SI units. Every combination of robot, motion, rate, noise, decimation, cut
     guesses = 25                     # of these, the same for every data set: such methods run once from each; default 1
     resimulated = 3                  # data sets whose estimate is simulated once more, for the survey's position error
     [[noise]]                        # at least one
-    name = "1"
+    name = "1"                       # ends the names of conditions
     sigma_q = "1e-4 deg"             # of every encoder, in the loop
     sigma_tau = 0.05                 # of the logged torque [N m]
 
