@@ -40,7 +40,7 @@ from calib.robot.tables import dumps
 
 
 def asks(session: Session, state: State) -> tuple[str, str]:
-    """Return two lines: the task at the robot, and the file to provide, with the file's format."""
+    """Return the task at the robot, a line for each part of it, and the file to provide, with the file's format."""
     step, again = state.step.name, command_line("next", session.folder)
     if state.kind == WAITING and step in ("record", "predict"):
         task, file = _to_record(session, step)
@@ -71,8 +71,11 @@ def _to_measure(session: Session, step: str) -> tuple[str, str]:
     if images:
         spread = "" if sets else ", with the board near, far and tilted"
         return (
-            f"Drive {where}{spread}; at each let the arm settle for a second, take an image of the board (fixed focus, "
-            "zoom and exposure; images neither rotated nor scaled), and log the joint angles read back.",
+            _numbered(
+                f"Drive {where}{spread}; at each let the arm settle for a second.",
+                "Take an image of the board (fixed focus, zoom and exposure; images neither rotated nor scaled).",
+                "Log the joint angles read back.",
+            ),
             f"{' and '.join(file.removesuffix('.csv') for file in files)}: images, joints.csv (image, {joints[0]} "
             f"[deg] … {joints[-1]} [deg]; one row per image), board.toml (calib board makes boards), and camera.yaml "
             "if the lens is known (calib formats images)",
@@ -80,11 +83,17 @@ def _to_measure(session: Session, step: str) -> tuple[str, str]:
     columns = ", ".join((*(f"{joint} [deg]" for joint in joints), *(f"{axis} [mm]" for axis in "xyz")))
     turned = ", qx, qy, qz, qw" if device.measures == "pose" else ""
     return (
-        f"Drive {where}, let the arm settle, measure the target's {device.measures} with the {device.name} and log "
-        "the joint angles read back. At the end, measure the first three again to check for drift (optional, into "
-        "drift.csv).",
+        _numbered(
+            f"Drive {where}; at each let the arm settle.",
+            f"Measure the target's {device.measures} with the {device.name} and log the joint angles read back.",
+            "At the end, measure the first three again to check for drift (optional, into drift.csv).",
+        ),
         f"{' and '.join(files)}, one row per pose: {columns}{turned} (calib formats measurements)",
     )
+
+
+def _numbered(*parts: str) -> str:
+    return "\n".join(f"{number} {part}" for number, part in enumerate(parts, 1))
 
 
 def _to_record(session: Session, step: str) -> tuple[str, str]:
@@ -96,11 +105,13 @@ def _to_record(session: Session, step: str) -> tuple[str, str]:
     motions = " and, into a separate file, ".join(str(session.path(f"6-excitation/{name}/{file}")) for name in names)
     unseen = " (never used for training)" if "validation" in names else ""
     loads = ", ".join(f"'{label}' ({mass:g} kg)" for label, mass in section.payloads.items())
-    again = f" Then repeat it with {loads} on the flange, and put the label into the file's name." if loads else ""
-    task = (
+    again = f"Then repeat it with {loads} on the flange, and put the label into the file's name."
+    task = _numbered(
+        "Rehearse: play the motion at a low override to check for collisions.",
         f"Play {motions}{unseen}, the motion {section.repeats} times each, at {section.rate:g} Hz, from rest at its "
-        "first row. Before that, play it at a low override to check for collisions. Log joint positions and torques "
-        f"all the time.{again if step == 'record' else ''}"
+        "first row.",
+        "Log joint positions and torques all the time.",
+        *([again] if loads and step == "record" else []),
     )
     if not section.plan:
         task = "Record two motions of all joints: one for training, and a different one for validation."
