@@ -257,10 +257,9 @@ def finding_list() -> str:
 
 
 def _finding(name: str, one: findings.Entry) -> str:
-    limits = [f"{level} where {value} > {limit:g}" for value, by in one.limits.items() for level, limit in by.items()]
     rows = [
         ("Says", cell(one.says)),
-        ("Level", cell("; ".join(limits) or one.level)),
+        ("Level", cell(findings.levels(one))),
         ("Means", cell(one.means)),
         ("Do", cell(one.advice)),
         ("Accept", code(f'accept = ["{one.accept}"]') if one.accept else ""),

@@ -182,6 +182,17 @@ def glossary() -> Mapping[str, str]:
     return tomllib.loads(Path(__file__).with_name("glossary.toml").read_text(encoding="utf-8"))
 
 
+def levels(entry: Entry) -> str:
+    """Return in words what level a finding has, and from which values on; a limit below zero is exceeded always."""
+    rules = [
+        f"{level} where {value} > {limit:g}" if limit >= 0.0 else f"{level} always"
+        for value, steps in entry.limits.items()
+        for level, limit in steps.items()
+        if limit >= 0.0 or len(entry.limits) == 1
+    ]
+    return "; ".join(rules) or entry.level
+
+
 def explain(code: str) -> str:
     """Return the explanation of a finding's code (sentence, limits, advice) or of a term of the glossary.
 
@@ -194,11 +205,8 @@ def explain(code: str) -> str:
     if (entry := catalogue().get(code)) is None:
         near = suggestion(code, [*catalogue(), *glossary()])
         raise UsageError(f"no finding or term is called '{code}'{near}; `calib explain` lists all")
-    rules = [
-        f"{level} where {value} > {limit:g}" for value, steps in entry.limits.items() for level, limit in steps.items()
-    ]
     accept = f'accept = ["{entry.accept}"] in the options file lets the verdict pass' if entry.accept else ""
-    parts = (entry.says, "; ".join(rules) or f"level: {entry.level}", entry.means, f"{entry.advice}", accept)
+    parts = (entry.says, f"level: {levels(entry)}", entry.means, f"{entry.advice}", accept)
     return "\n".join([code, *(f"  {part}" for part in parts if part)])
 
 
