@@ -125,10 +125,10 @@ def one_start(
 
     Args:
         evaluations: most, if all of `STAGES` are gone through.
-        stages: those to go through; a given start is not led away by a coarse one.
+        stages: those to go through, a given start with the whole family in all of them.
     """
     began, random = time.perf_counter(), isinstance(start, int | np.integer)
-    chosen = stages if random else tuple(stage for stage in stages if not stage.coarse)
+    chosen = tuple(stage if random else stage._replace(coarse=False) for stage in stages)
     extra = problem.extra
     run = StartSearch(*_at_stage(problem, chosen[0], extra))
     if random:
