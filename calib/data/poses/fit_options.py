@@ -110,6 +110,7 @@ class FileOptions:
         columns: the toolkit's name of a column → the file's name.
         units: the toolkit's name of a column, or a family of columns → its unit.
         where: column → texts; only rows with one of these texts are used.
+        planned: CSV of the poses that were to be measured, for a file without joints.
     """
 
     kind: Annotated[str, OneOf(tuple(KINDS))] = ""
@@ -127,6 +128,7 @@ class FileOptions:
     socket_distance: Annotated[float, Real(above=0, most=10.0, unit="m")] | None = None
     socket_pairs: Annotated[tuple[tuple[Label, Label], ...], Expect('pairs of socket labels, [["0", "1"]]')] = ()
     check_limits: Flag = True
+    planned: Annotated[str, Hidden()] = ""
     camera: CameraOptions = field(default_factory=CameraOptions)
 
 

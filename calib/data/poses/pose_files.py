@@ -193,9 +193,9 @@ def _turned(turn: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 
 def read_measurements(
-    path: str | Path, joints: Joints | Sequence[str], options: FileOptions | None = None
+    source: str | Path | Table, joints: Joints | Sequence[str], options: FileOptions | None = None
 ) -> list[PoseMeasurements]:
-    """Return the measurements in the file at `path` for a robot with these joints.
+    """Return the measurements in a file, or in a table read from one, for a robot with these joints.
 
     Args:
         joints: the robot's n joints, or their names (of revolute joints without limits).
@@ -208,8 +208,8 @@ def read_measurements(
         MeasurementError: for whatever cannot be what it claims to be, with row and column.
     """
     robot, options = Joints.of(joints), options or FileOptions()
-    form = options.format or ("robodk" if robodk.recognises(read_header(path)[0]) else "csv")
-    table, notes = None, ()
+    table, path, notes = (source, source.file, ()) if isinstance(source, Table) else (None, source, ())
+    form = options.format or ("robodk" if table is None and robodk.recognises(read_header(path)[0]) else "csv")
     if form in robodk.FORMS:
         table, options, notes = robodk.FORMS[form](path, len(robot.names), options)
     sheet = _select_rows(Sheet(table or read_table(path), options))
