@@ -174,7 +174,7 @@ def _similar(between: np.ndarray, triangle: np.ndarray, bound: float, rng: np.ra
 
 
 def _moved(triangle: np.ndarray, targets: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the points (k, m, 3) after the rotations and shifts that lay a triangle (3, 3) on each target (k, 3, 3)."""
+    """Return the points (k, m, 3) after the motions that lay a triangle (3, 3) on each target (k, 3, 3)."""
     centre, middle = triangle.mean(axis=0), targets.mean(axis=1)
     u, _, vt = np.linalg.svd(np.einsum("kia,ib->kab", targets - middle[:, None], triangle - centre))
     sign = np.ones((len(targets), 3))
