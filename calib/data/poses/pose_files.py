@@ -212,10 +212,14 @@ def read_measurements(
     form = options.format or ("robodk" if table is None and robodk.recognises(read_header(path)[0]) else "csv")
     if form in robodk.FORMS:
         table, options, notes = robodk.FORMS[form](path, len(robot.names), options)
-    sheet = _select_rows(Sheet(table or read_table(path), options))
+    table = table or read_table(path)
+    if table.notes:  # names that were understood need no map
+        maps = {ours: theirs for ours, theirs in options.columns.items() if theirs in table or ours not in table}
+        options = replace(options, columns=maps)
+    sheet = _select_rows(Sheet(table, options))
     layout = find_layout(sheet, robot.names)
     q, _ = sheet.joints(robot.names)
-    notes = (*notes, *layout.notes, *plausible.check_joints(q, sheet, layout.joints, robot))
+    notes = (*sheet.table.notes, *notes, *layout.notes, *plausible.check_joints(q, sheet, layout.joints, robot))
     block = (_read_targets if layout.positions else read_groups)(sheet, layout, q)
     ignored = tuple(name for name in sheet.table.header if name not in layout.used)
     station = options.station or Path(path).stem

@@ -96,6 +96,7 @@ def join(joints: Table, points: Table, by: str = "", chain: Chain | None = None)
         pose, notes = ordered(chain, q, points, {} if by == "geometry" else {f"joined by {by}": pose})
     else:
         notes = (f"{counts}, joined by {by}", *notes)
+    notes = (*joints.notes, *points.notes, *notes)
     return merged(joints, points, pose, notes, [name for name in keys if name])
 
 
@@ -221,15 +222,24 @@ def _labels(joints: Table) -> list[str]:
 
 def _same_names(joints: Table, points: Table, one: str, other: str) -> np.ndarray:
     """Return the row of joints (m,) with each point's name, -1 without one."""
-    places = {_plain(text): k for k, text in enumerate(joints.texts(one))}
-    if len(places) < len(joints):
-        refuse_data(joints.file, "has a name twice: each pose needs a name of its own", one)
-    return np.array([places.get(_plain(text), -1) for text in points.texts(other)])
+    theirs, ours = points.texts(other), joints.texts(one)
+    for plain in (_plain, _number):
+        places = {plain(text): k for k, text in enumerate(ours)}
+        if len(places) < len(joints):
+            refuse_data(joints.file, "has a name twice: each pose needs a name of its own", one)
+        if (pose := np.array([places.get(plain(text), -1) for text in theirs])).max() >= 0:
+            break
+    return pose
 
 
 def _plain(text: str) -> str:
     """Return a name in comparable form: small letters and digits, without zeros in front: ``P_007`` is ``p7``."""
     return re.sub(r"(?<!\d)0+(?=\d)", "", re.sub(r"[^a-z0-9]", "", text.lower()))
+
+
+def _number(text: str) -> str:
+    """Return the last number in a name, or the name where it has none."""
+    return (re.findall(r"\d+", text) or [text])[-1].lstrip("0")
 
 
 def _at_times(joints: Table, points: Table, one: str, other: str) -> tuple[Table, np.ndarray, tuple[str, ...]]:

@@ -81,7 +81,7 @@ class Placements(GeometryFit):
         yield str(self.verdict)
         yield from (str(each) for each in self.placed if each.name.startswith(first))
         left = 1e3 * self.fit.errors[1].rms
-        yield f"{poses} poses, {left:.3g} mm rms residual; σ follows from it, errors of the arm included where they are random"
+        yield f"{poses} poses, {left:.3g} mm rms residual; σ follows from it, the arm's random errors included"
         yield from self.warnings
         if poses < USUAL_POSES:
             yield f"{poses} poses are few: measure {USUAL_POSES}, with the wrist turned by 90° and more between them"
