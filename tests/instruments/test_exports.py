@@ -1,4 +1,4 @@
-"""Exports of instruments, written from their published descriptions, are read; tables of the toolkit stay as they are."""
+"""Exports of instruments, written from their published descriptions, are read; our own tables stay as they are."""
 
 import numpy as np
 import pytest
@@ -37,7 +37,7 @@ EXPORTS = {
     + commas(lines("P{};{:.9f};{:.9f};{:.9f}", 1 / 0.0254)),
     "CMM": "Part: A7\nUnit: mm\n\nID\tActual X\tActual Y\tActual Z\n" + lines("{}\t{:.9f}\t{:.9f}\t{:.9f}", 1e3),
     "names, no header": lines("P{},{:.9f},{:.9f},{:.9f}"),
-    "units below": "Point X Y Z\n- mm mm mm\n".replace("- ", '"" ') + lines("P{} {:.9f} {:.9f} {:.9f}", 1e3),
+    "units below": "Point;X;Y;Z\n;mm;mm;mm\n" + lines("P{};{:.9f};{:.9f};{:.9f}", 1e3),
 }
 
 

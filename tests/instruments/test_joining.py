@@ -142,7 +142,7 @@ def test_an_interrupted_run_goes_on_in_a_second_file(planned, arm, q):
 def test_few_points_need_names(planned, arm, q):
     points = seen(arm, q)[30:33]
     path = write(planned.path("3-measured/rest.csv"), POINT, points)
-    with pytest.raises(MeasurementError, match="3 points are too few.*column 'pose'"):
+    with pytest.raises(MeasurementError, match=r"3 points are too few.*column 'pose'"):
         arrive(planned, print)
     write(path, ["pose", *POINT], ([31 + k, *point] for k, point in enumerate(points)))
     ((_, block),) = read_measured(planned, chain_of(planned), [path])

@@ -35,7 +35,7 @@ from calib.errors import MeasurementError, UsageError, counted, finding, listing
 from calib.geometry.first_guess import check_scale
 from calib.procedure.findings import lines_of
 from calib.robot.chain import Chain
-from calib.rooms.instruments.order import MAX_MISFIT, MIN_POINTS, find_order
+from calib.rooms.instruments.order import MAX_MISFIT, MIN_FOUND, MIN_POINTS, find_order
 from calib.units import TIMES
 
 WAYS = ("name", "time", "row", "geometry")
@@ -123,11 +123,17 @@ def ordered(
     check_scale(spread, chain)  # says which unit explains points that spread too far
     found = find_order(chain, q, position[seen], {how: pose[seen] for how, pose in stated.items()})
     if found is None:
+        order, advice = "any order", ""
+        if len(seen) < MIN_FOUND:
+            order, advice = (
+                "their order",
+                f" With {MIN_FOUND} points or more any order is found; else name them (a column 'pose')",
+            )
         limit = 1e3 * MAX_MISFIT * chain.stretched_length()
         refuse_data(
             points.file,
-            f"its {len(seen)} points are not those of these {len(q)} poses in any order (within {limit:.0f} mm of the "
-            "nominal arm): is it this robot and this list, and did instrument and target stay in place?",
+            f"its {len(seen)} points are not those of these {len(q)} poses in {order} (within {limit:.0f} mm of the "
+            f"nominal arm): is it this robot and this list, and did instrument and target stay in place?{advice}",
         )
     pose = np.full(len(position), -1)
     pose[seen] = found.pose

@@ -10,8 +10,9 @@ errors do not count), then S and t by least squares.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment, minimize
@@ -25,8 +26,11 @@ from calib.robot.kinematics import forward
 
 MAX_MISFIT = 0.02  # of the arm's length: what nominal errors leave in the right order, at most (our choice)
 MIN_POINTS = 6  # below which an order is not checked: placing instrument and target takes all they say (our choice)
+MIN_FOUND = 12  # below which no order is looked for: of 10 points in 40 poses, one in twelve was wrong
 AMBIGUOUS = 3.0  # another pose is possible if its point is nearer than so many rms residuals (our choice)
 STARTS, TRIPLES, KEPT = 6, 12, 8  # tools to start from, measured triples, placements that are refined (our choice)
+TOOLS = [np.array(tool) for tool in product((-0.1, 0.0, 0.1), repeat=3)]  # tried where these fail [m] (our choice)
+SCORED = 15  # points that a placement is scored by (our choice)
 MAX_TRIPLES = 20_000  # of poses that are compared with one triple of points (our choice)
 
 
@@ -61,11 +65,18 @@ def find_order(chain: Chain, q: np.ndarray, points: np.ndarray, stated: dict[str
     """
     arm, limit = forward(chain, q), MAX_MISFIT * chain.stretched_length()
     for how, pose in stated.items():
+        known = np.flatnonzero(pose >= 0)
+        predicted = _predicted(chain, q, points, pose, known) if len(known) >= MIN_POINTS else None
+        if predicted is None or np.median(np.linalg.norm(predicted[pose[known]] - points[known], axis=1)) > limit:
+            continue
         found = _refined(chain, q, points, pose, limit, prefer=pose)
         if found is not None and np.mean(found.pose[pose >= 0] == pose[pose >= 0]) > 0.5:
             return Order(found.pose, found.error, how=how)
-    tried = [_refined(chain, q, points, pose, limit) for pose in _by_distances(arm, points)]
-    good = [each for each in tried if each is not None]
+    good = list[Order]()
+    for tools in (_tools(arm, points), TOOLS):
+        if not good and len(points) >= MIN_FOUND:
+            tried = [_refined(chain, q, points, pose, limit) for pose in _by_distances(arm, points, tools)]
+            good = [each for each in tried if each is not None]
     if not good:
         return None
     best = max(good, key=lambda each: (int((each.pose >= 0).sum()), -each.rms))
@@ -122,10 +133,11 @@ def _assigned(cost: np.ndarray, bound: float, prefer: np.ndarray | None) -> np.n
     return pose
 
 
-def _by_distances(arm: np.ndarray, points: np.ndarray) -> Iterator[np.ndarray]:
+def _by_distances(arm: np.ndarray, points: np.ndarray, tools: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
     """Yield orders to start from, by distances between points: the best of many triples of poses."""
-    rng, scored = np.random.default_rng(0), list[tuple[float, np.ndarray]]()
-    for tool in _tools(arm, points):
+    rng, scored = np.random.default_rng(0), list[tuple[float, np.ndarray, np.ndarray]]()
+    few = rng.permutation(len(points))[:SCORED]
+    for tool in tools:
         predicted = arm[:, :3, 3] + arm[:, :3, :3] @ tool
         between, bound = squareform(pdist(predicted)), 0.06 * float(np.linalg.norm(np.std(points, axis=0)))
         for triple in _wide_triples(points, rng):
@@ -133,8 +145,8 @@ def _by_distances(arm: np.ndarray, points: np.ndarray) -> Iterator[np.ndarray]:
             if not len(poses):
                 continue
             placed = _moved(points[triple], predicted[poses], points)
-            cost = np.array([cdist(each, predicted).min(axis=1) for each in placed])
-            score = np.median(np.minimum(cost, 5.0 * bound), axis=1)
+            near = cdist(placed[:, few].reshape(-1, 3), predicted).min(axis=1).reshape(len(placed), -1)
+            score = np.median(near, axis=1)
             scored += [(float(score[k]), placed[k], predicted) for k in np.argsort(score)[:KEPT]]
     scored.sort(key=lambda one: one[0])
     for _, placed, predicted in scored[:KEPT]:

@@ -20,7 +20,7 @@ from calib.procedure.findings import lines_of
 from calib.procedure.robot_kinds import joints_of
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
-from calib.rooms.instruments.joining import NAMES, column_of, merged, ordered
+from calib.rooms.instruments.joining import MIN_POINTS, NAMES, column_of, merged, ordered
 
 SIGMA_JOINT = 1e-4  # between a commanded and a reached joint position [rad or m] (our choice)
 STEP = 1e-6  # of the differences that propagate it [rad or m]
@@ -61,8 +61,11 @@ def read_planned(path: Path, chain: Chain, options: FileOptions) -> list[PoseMea
 
 def _stated(points: Table, count: int) -> dict[str, np.ndarray]:
     """Return the orders that the file itself may state, in words → (m,) index of the pose."""
-    numbers = np.arange(len(points))
-    stated = {"in the order of the list": np.where(numbers < count, numbers, -1)}
+    numbers, stated = np.arange(len(points)), dict[str, np.ndarray]()
+    starts = range(max(count - len(points), 0) + 1) if len(points) >= MIN_POINTS else ()
+    for start in starts:  # a run that was interrupted goes on somewhere
+        how = f"in the order of the list{f' from pose {start + 1} on' if start else ''}"
+        stated[how] = np.where(numbers + start < count, numbers + start, -1)
     if name := column_of(points, NAMES):
         found = [re.findall(r"\d+", text)[-1:] for text in points.texts(name)]
         named = np.array([int(digits[0]) - 1 if digits else -1 for digits in found])
