@@ -67,7 +67,7 @@ def test_points_are_joined_by_name_and_missing_ones_named(tmp_path, joints, arm,
 
 def test_37_of_40_points_in_another_order_are_found_by_the_geometry(tmp_path, joints, arm, q):
     points = write(tmp_path / "p.csv", POINT, seen(arm, q)[SHUFFLED])
-    with pytest.raises(UsageError, match="40 rows of joints, 37 points cannot be joined.*give --robot"):
+    with pytest.raises(UsageError, match=r"40 rows of joints, 37 points cannot be joined.*give --robot"):
         calib.join(joints, points)
     found = calib.join(joints, points, robot="lwr4plus")
     np.testing.assert_allclose(

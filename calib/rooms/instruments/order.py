@@ -30,6 +30,7 @@ MIN_FOUND = 12  # below which no order is looked for: of 10 points in 40 poses, 
 AMBIGUOUS = 3.0  # another pose is possible if its point is nearer than so many rms residuals (our choice)
 STARTS, TRIPLES, KEPT = 6, 12, 8  # tools to start from, measured triples, placements that are refined (our choice)
 TOOLS = [np.array(tool) for tool in product((-0.1, 0.0, 0.1), repeat=3)]  # tried where these fail [m] (our choice)
+MAX_ROUNDS = 10  # of an assignment and a placement (our choice)
 SCORED = 15  # points that a placement is scored by (our choice)
 MAX_TRIPLES = 20_000  # of poses that are compared with one triple of points (our choice)
 
@@ -74,9 +75,11 @@ def find_order(chain: Chain, q: np.ndarray, points: np.ndarray, stated: dict[str
             return Order(found.pose, found.error, how=how)
     good = list[Order]()
     for tools in (_tools(arm, points), TOOLS):
-        if not good and len(points) >= MIN_FOUND:
-            tried = [_refined(chain, q, points, pose, limit) for pose in _by_distances(arm, points, tools)]
-            good = [each for each in tried if each is not None]
+        for pose in _by_distances(arm, points, tools) if not good and len(points) >= MIN_FOUND else ():
+            if (found := _refined(chain, q, points, pose, limit)) is not None:
+                good.append(found)
+                if np.mean(found.pose >= 0) > 0.9:
+                    break
     if not good:
         return None
     best = max(good, key=lambda each: (int((each.pose >= 0).sum()), -each.rms))
@@ -87,7 +90,7 @@ def _refined(
     chain: Chain, q: np.ndarray, points: np.ndarray, pose: np.ndarray, limit: float, prefer: np.ndarray | None = None
 ) -> Order | None:
     """Return the order that a first order leads to, None if most of the points then belong to no pose."""
-    for _ in range(20):
+    for _ in range(MAX_ROUNDS):
         known = np.flatnonzero(pose >= 0)
         if len(known) < MIN_POINTS or (predicted := _predicted(chain, q, points, pose, known)) is None:
             return None

@@ -24,6 +24,7 @@ from calib.rooms.placements.settings import DEFAULT_PLACEMENT, PlacementSettings
 from calib.transforms import invert
 from calib.units import DEG
 
+Arm = str | Path | CalibratedChain
 USUAL_POSES = 12  # of a quick calibration (our choice)
 
 
@@ -106,47 +107,43 @@ def _stated(value: float, sigma: float, digits: int) -> str:
     return f"{value:.{digits}f} " + ("(not identifiable)" if np.isnan(sigma) else f"± {sigma:.2g}")
 
 
-def _placements(
-    robot: str | Path | CalibratedChain,
+def tool(
+    robot: Arm,
     measured: Several,
-    settings: PlacementSettings,
+    settings: PlacementSettings = DEFAULT_PLACEMENT,
     *,
     options: FitOptions | str | Path | None = None,
     base: str | None = None,
     tip: str | None = None,
     progress: Progress | None = None,
 ) -> Placements:
+    """Calibrate the tool (TCP): the target's placement in the arm's tip, from a dozen measured poses.
+
+    Args:
+        robot, base, tip: the arm, as of `calib.load`; its geometry is left as it is.
+        measured: CSV files, folders of images, or what `read_poses` returned, as of `fit_geometry`.
+        settings: tolerance, share held out.
+        options, progress: as of `fit_geometry`.
+
+    Returns:
+        The fit: ``placed`` has the frames with σ, ``verdict`` the verdict.
+    """
     asked = FitSettings(model="frames", holdout=settings.holdout, tolerance=settings.tolerance)
     found = fit_geometry(robot, measured, asked, options=options, base=base, tip=tip, progress=progress)
     return Placements(**vars(found))
 
 
-def tool(
-    robot: str | Path | CalibratedChain, measured: Several, settings: PlacementSettings = DEFAULT_PLACEMENT, **more: Any
-) -> Placements:
-    """Calibrate the tool (TCP): the target's placement in the arm's tip, from a dozen measured poses.
+def base(robot: Arm, measured: Several, settings: PlacementSettings = DEFAULT_PLACEMENT, **more: Any) -> Placements:
+    """Calibrate the base: the arm's placement in the instrument's frame, from a dozen measured poses.
 
-    Args:
-        robot: the arm, as of `calib.load`; its geometry is left as it is.
-        measured: CSV files, folders of images, or what `read_poses` returned, as of `fit_geometry`.
-        settings: tolerance, share held out.
-        more: ``options``, ``base``, ``tip``, ``progress``, as of `fit_geometry`.
-
-    Returns:
-        The fit: ``placed`` has the frames with σ, ``verdict`` the verdict.
+    It is the fit of `tool`, with the same arguments (robot, measured, settings, and more by their names).
     """
-    return _placements(robot, measured, settings, **more)
+    return tool(robot, measured, settings, **more)
 
 
-def base(
-    robot: str | Path | CalibratedChain, measured: Several, settings: PlacementSettings = DEFAULT_PLACEMENT, **more: Any
-) -> Placements:
-    """Calibrate the base: the arm's placement in the instrument's frame, from a dozen measured poses; see `tool`."""
-    return _placements(robot, measured, settings, **more)
+def hand_eye(robot: Arm, measured: Several, settings: PlacementSettings = DEFAULT_PLACEMENT, **more: Any) -> Placements:
+    """Calibrate camera and board, one carried by the arm and the other beside it, from a dozen images.
 
-
-def hand_eye(
-    robot: str | Path | CalibratedChain, measured: Several, settings: PlacementSettings = DEFAULT_PLACEMENT, **more: Any
-) -> Placements:
-    """Calibrate hand and eye: camera and board in the arm's tip and base, from a dozen images; see `tool`."""
-    return _placements(robot, measured, settings, **more)
+    It is the fit of `tool`, with the same arguments (robot, measured, settings, and more by their names).
+    """
+    return tool(robot, measured, settings, **more)
