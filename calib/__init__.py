@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from calib.robot.calibrated import CalibratedChain
     from calib.rooms.compensation.api import JointCommands, compensate
     from calib.rooms.fleet.fleet import run_sessions
-    from calib.rooms.instruments.api import join
+    from calib.rooms.instruments.joining import join
     from calib.rooms.placements.api import base, hand_eye, tool
 
 # what `import calib` offers, and where it lives: loaded when first asked for, so that `calib --help` starts at once
@@ -48,7 +48,7 @@ _HOMES = {
     "rooms.fleet.fleet": ("run_sessions",),
     "robot.calibrated": ("CalibratedChain",),
     "rooms.compensation.api": ("compensate", "JointCommands"),
-    "rooms.instruments.api": ("join",),
+    "rooms.instruments.joining": ("join",),
     "rooms.placements.api": ("tool", "base", "hand_eye"),
     "procedure.kinematic_stage.settings": ("SelectionSettings", "FitSettings"),
     "procedure.excitation.settings": ("ExcitationSettings", "PlanSettings"),

@@ -10,6 +10,7 @@ from sessions import begin
 import calib
 from calib.cli import run
 from calib.data.csv_table import read_table
+from calib.data.poses.measurements import Positions
 from calib.errors import MeasurementError, UsageError
 from calib.procedure.session.folder import Session
 from calib.procedure.session.geometry_steps import arrive, chain_of, read_measured
@@ -61,6 +62,7 @@ def test_points_are_joined_by_name_and_missing_ones_named(tmp_path, joints, arm,
     missing = ", ".join(f"P{k + 1}" for k in range(40) if k not in SHUFFLED)
     assert found.notes[-1] == f"without a point: 3 of 40 poses: {missing}"
     (block,) = calib.read_poses(out, "lwr4plus")
+    assert isinstance(block, Positions)
     np.testing.assert_allclose(block.q, q[found.poses], atol=1e-9)
     np.testing.assert_allclose(1e3 * block.position, points[found.poses], rtol=1e-9)
 

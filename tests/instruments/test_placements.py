@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 import calib
 from calib.cli import run
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.measurements import PoseMeasurements, Poses
 from calib.robot.chain import random_joints
 from calib.robot.kinematics import forward
 from calib.robot.library import load
@@ -18,12 +18,12 @@ STATION = pose(Rotation.from_euler("xyz", [0.3, -0.2, 1.1]), [1.2, -2.0, 0.7])
 TOOL = pose(Rotation.from_euler("xyz", [0.1, 0.4, -0.6]), [0.02, -0.03, 0.11])
 
 
-def measured(seed: int, count: int = 12, noise: float = 1e-4) -> PoseMeasurements:
+def measured(seed: int, count: int = 12, noise: float = 1e-4) -> Poses:
     rng, q = np.random.default_rng(seed), random_joints(ARM, count, seed)
     targets = STATION @ forward(ARM, q) @ TOOL
     turns = Rotation.from_rotvec(noise * rng.normal(size=(count, 3))) * Rotation.from_matrix(targets[:, :3, :3])
     position = targets[:, :3, 3] + noise * rng.normal(size=(count, 3))
-    return PoseMeasurements.of(q, position, turns.as_quat(), joint_names=ARM.joint_names)
+    return Poses(q, ARM.joint_names, position, turns.as_quat())
 
 
 def test_frames_are_recovered_within_their_sigma():

@@ -133,9 +133,9 @@ def unmeasured(
     plan: ArrayLike, measured: Sequence[PoseMeasurements], near: float = MAX_JOINT_DIFFERENCE
 ) -> tuple[str, ...]:
     """Return a note on the planned poses (m, n) [rad or m] that are in none of the blocks; empty if all are."""
-    plan, q = np.asarray(plan), np.concatenate([block.q for block in measured])
-    remain = np.flatnonzero(~_matched(q, plan, near)) + 1
-    words = f"{len(remain)} of {len(plan)} planned poses remain to be measured: {listing(remain, 10)}"
+    found = [_matched(block.q, np.asarray(plan), near) for block in measured]
+    remain = np.flatnonzero(~np.any(found, axis=0)) + 1 if found else ()
+    words = f"{len(remain)} of {len(np.asarray(plan))} planned poses remain to be measured: {listing(remain, 10)}"
     return (f"{words} (in a further file, then calib next again)",) if len(remain) else ()
 
 

@@ -26,7 +26,7 @@ def join(
 
     Several readings of one pose are averaged; missing poses, and readings that contradict each other, are named.
 
-    Example: calib join joints.csv points.csv --out measured.csv
+    Example: calib join joints.csv points.csv --out m.csv
 
     Args:
         joints: CSV of joint values, one row per pose, or a log over time
@@ -37,11 +37,10 @@ def join(
     """
     from calib.errors import one_of
     from calib.files import results
-    from calib.rooms.instruments import api
-    from calib.rooms.instruments.joining import WAYS
+    from calib.rooms.instruments import joining
 
-    one_of(by or WAYS[0], WAYS, "--by")
+    one_of(by or "row", joining.WAYS, "--by")
     with results([(out, (".csv",))], [joints, points, robot], overwrite):
-        joined = api.join(joints, points, by=by, robot=robot, base=base, tip=tip)
+        joined = joining.join(joints, points, by=by, robot=robot, base=base, tip=tip)
         joined.write(out)
     say(*joined.notes, f"{len(joined.poses)} measured poses written to {out}")

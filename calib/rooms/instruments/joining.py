@@ -28,13 +28,16 @@ import numpy as np
 from scipy.spatial.distance import pdist
 
 from calib import files
-from calib.data.csv_table import Table
+from calib.arguments import checked
+from calib.data.csv_table import Table, read_table
 from calib.data.poses.columns import POSITION, SIGMA, Sheet
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import MeasurementError, UsageError, counted, finding, listing, refuse_data, require
 from calib.geometry.first_guess import check_scale
 from calib.procedure.findings import lines_of
+from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
+from calib.robot.library import load_calibrated
 from calib.rooms.instruments.order import MAX_MISFIT, MIN_FOUND, MIN_POINTS, find_order
 from calib.units import TIMES
 
@@ -69,16 +72,35 @@ class Joined:
         return files.write_table(path, header, zip(*(cells.tolist() for cells in self.table.cells)), self.notes)
 
 
-def join(joints: Table, points: Table, by: str = "", chain: Chain | None = None) -> Joined:
-    """Return joints and points joined.
+@checked
+def join(
+    joints: str | Path,
+    points: str | Path,
+    *,
+    by: str = "",
+    robot: str | Path | CalibratedChain | None = None,
+    base: str | None = None,
+    tip: str | None = None,
+) -> Joined:
+    """Join a controller's joint values and an instrument's points to one table of measured poses.
 
     Args:
-        by: one of `WAYS`; empty: the first of them that both tables have columns or rows for.
-        chain: the nominal arm, for ``geometry``; it checks the other ways, too.
+        joints: CSV file of joint values, one row per pose, or a log over time.
+        points: CSV file of measured points.
+        by: ``name``, ``time``, ``row`` or ``geometry``; empty: the first of them that both files have columns for.
+        robot, base, tip: the nominal robot, as of `calib.load`, whose geometry checks the order, or finds it.
+
+    Returns:
+        The table, the index of each row's pose, and notes; ``write(path)`` writes the CSV that `fit_geometry` takes.
 
     Raises:
-        MeasurementError: where the tables do not go together, with what is missing.
+        MeasurementError: where the files do not go together.
     """
+    arm = load_calibrated(robot, base, tip) if isinstance(robot, str | Path) else robot
+    return _joined(read_table(joints), read_table(points), by, arm and arm.complete)
+
+
+def _joined(joints: Table, points: Table, by: str, chain: Chain | None) -> Joined:
     named, timed = ([column_of(table, known) for table in (joints, points)] for known in (NAMES, CLOCKS))
     possible = {"name": all(named), "time": all(timed), "row": len(joints) == len(points), "geometry": bool(chain)}
     by = by or next((way for way, holds in possible.items() if holds), "")

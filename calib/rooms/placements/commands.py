@@ -25,7 +25,7 @@ def tool(
 ) -> None:  # fmt: skip
     """Calibrate the tool (TCP) of ROBOT from a dozen measured poses, the arm left as it is.
 
-    Example: calib tool robot.urdf measured.csv --tolerance 0.5
+    Example: calib tool robot.urdf m.csv --tolerance 0.5
     """
     _place("tool", ("tool",), robot, measured, settings, out, options=options, base=base, tip=tip)
 
