@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from calib.robot.calibrated import CalibratedChain
     from calib.rooms.compensation.api import JointCommands, compensate
     from calib.rooms.fleet.fleet import run_sessions
+    from calib.rooms.instruments.joining import join
+    from calib.rooms.placements.api import base, hand_eye, tool
 
 # what `import calib` offers, and where it lives: loaded when first asked for, so that `calib --help` starts at once
 _HOMES = {
@@ -46,6 +48,8 @@ _HOMES = {
     "rooms.fleet.fleet": ("run_sessions",),
     "robot.calibrated": ("CalibratedChain",),
     "rooms.compensation.api": ("compensate", "JointCommands"),
+    "rooms.instruments.joining": ("join",),
+    "rooms.placements.api": ("tool", "base", "hand_eye"),
     "procedure.kinematic_stage.settings": ("SelectionSettings", "FitSettings"),
     "procedure.excitation.settings": ("ExcitationSettings", "PlanSettings"),
     "identification.identify_options": ("IdentifySettings",),
@@ -53,7 +57,8 @@ _HOMES = {
 }
 
 __all__ = [  # noqa: RUF022 (in the order of use)
-    "load", "read_poses", "read_recording", "select_poses", "fit_geometry", "design_excitation", "plan_motion",
+    "load", "read_poses", "read_recording", "join", "select_poses", "fit_geometry", "tool", "base", "hand_eye",
+    "design_excitation", "plan_motion",
     "identify_dynamics", "methods", "validate", "export", "compensate", "new_session", "run_sessions",
     "CalibratedChain", "PoseSelection", "GeometryFit", "ExcitationDesign", "MotionPlan", "DynamicsModel",
     "JointCommands", "SelectionSettings", "FitSettings", "ExcitationSettings", "PlanSettings", "IdentifySettings",

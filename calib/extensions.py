@@ -18,6 +18,8 @@ A room is a package of `calib.rooms` with a table ``OFFERS``: what it adds, and 
     drive_gains            function: robot, cases of currents, settings, known parameters, reference joint → gains of
                            a robot that is not a serial arm (`calib.identification.gains.DriveGains`)
     image_folders          a module: `read_images` reads a folder of images as a block of measurements
+    exports                functions: path → the file as a stream of our text, None where it is our table already
+    planned_poses          function: file of points, nominal arm, options → blocks with the joints of planned poses
     camera_guess           a module: lenses of images completed, images as poses
     optics                 of kinds of measurement that are not the core's: their instruments' parameters
                            (`calib.geometry.installation.NoOptics`); loading it registers guesses and residuals

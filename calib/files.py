@@ -297,8 +297,10 @@ def _not_finite(value: Any, place: str) -> Iterator[str]:
         yield place
 
 
-def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> Path:
-    """Write a CSV table; floats have 12 significant digits, cells of None and NaN are empty.
+def write_table(
+    path: str | Path, header: Sequence[str], rows: Iterable[Sequence[Any]], notes: Sequence[str] = ()
+) -> Path:
+    """Write a CSV table below comment lines `notes`; floats have 12 significant digits, None and NaN are empty.
 
     Cells with commas, quotes or line breaks are quoted, those of the header too: names come from people's files. So is
     a whole header that would be taken for one with other separators, or for a comment. A text that a spreadsheet would
@@ -307,7 +309,7 @@ def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence
     text = _headed(header)
     lines = csv.writer(text, lineterminator="\n")
     lines.writerows([_cell(cell) for cell in row] for row in rows)
-    return write(path, text.getvalue())
+    return write(path, remarks(notes) + text.getvalue())
 
 
 def write_numbers(

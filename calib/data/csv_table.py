@@ -13,7 +13,7 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain, islice
 from pathlib import Path
@@ -22,6 +22,7 @@ from typing import IO, NoReturn
 import numpy as np
 
 from calib.errors import MeasurementError, refuse_data, require, suggestion
+from calib.extensions import offered
 from calib.files import check_regular
 from calib.records import frozen, plain_text
 from calib.units import ANGLES, LENGTHS, plain_number
@@ -43,6 +44,7 @@ class Table:
         units: what stood in brackets behind each name; "" where nothing did.
         cells: one array per column: floats (NaN where a cell is empty) where every cell is a number, else texts.
         rows: (m,) number of each row in the file; data rows count from 1.
+        notes: how a file of another program was read.
     """
 
     file: str
@@ -50,6 +52,7 @@ class Table:
     units: tuple[str, ...]
     cells: tuple[np.ndarray, ...]
     rows: np.ndarray
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -118,7 +121,7 @@ class Table:
 
     def where(self, keep: np.ndarray) -> Table:
         """Return the table of the rows selected by the mask `keep` (m,)."""
-        return Table(self.file, self.header, self.units, tuple(cells[keep] for cells in self.cells), self.rows[keep])
+        return replace(self, cells=tuple(cells[keep] for cells in self.cells), rows=self.rows[keep])
 
 
 def read_table(path: str | Path, header: Sequence[str] | None = None, doubles: bool = False) -> Table:
@@ -138,12 +141,12 @@ def read_table(path: str | Path, header: Sequence[str] | None = None, doubles: b
             name = next(name for i, name in enumerate(names) if name in names[:i])
             places = " and ".join(str(i + 1) for i, other in enumerate(names) if other == name)
             refuse_data(path, f"occurs more than once in the header (columns {places})", name)
-        cells = _read_columns(lines, separator, names, path)
+        cells, notes = _read_columns(lines, separator, names, path), getattr(lines, "notes", ())
     require(len(cells[0]), "has a header but no data rows", MeasurementError, path)
     rows = frozen(np.arange(1, len(cells[0]) + 1), int)
     if header is None and names[-1] == f"column {len(names)}" and not _filled(cells[-1]):
         names, units, cells = names[:-1], units[:-1], cells[:-1]  # each line ends with a separator
-    return Table(str(path), names, units, cells, rows)
+    return Table(str(path), names, units, cells, rows, notes)
 
 
 def read_header(path: str | Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -166,7 +169,9 @@ def _opened(path: str | Path, headed: bool) -> Iterator[tuple[IO[str], str, list
         opened = open(path, encoding="utf-8-sig", newline="")  # noqa: SIM115 (closed below)
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise MeasurementError(f"cannot be read: {getattr(error, 'strerror', None) or error}", path) from error
-    with opened as file:
+    with opened as own:
+        exports = (export for room in offered("exports") if headed and (export := room(path)) is not None)
+        file = next(exports, own)
         yield file, *_first_line(file, path, headed)
 
 

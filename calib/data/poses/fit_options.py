@@ -11,6 +11,7 @@ TOML; every key is optional, and an unknown key is refused. Lengths in m, angles
     station = "tracker A"            # one name for the instrument placement; by default each file has its own
     tool = "ball"                    # the tool's (reflector's) name
     check_limits = true              # refuse joint values outside the robot's limits
+    planned = "poses.csv"            # of a file without joints: the poses driven, in this order or found by geometry
     socket_distance = 0.05           # between two sockets of the same fixture position
     socket_pairs = [["0", "1"]]      # which sockets that joins, where there are more than two
     model = "auto"                   # or frames, offsets, geometry, stiffness, bending, coupling, harmonics, wobble
@@ -111,6 +112,7 @@ class FileOptions:
         columns: the toolkit's name of a column → the file's name.
         units: the toolkit's name of a column, or a family of columns → its unit.
         where: column → texts; only rows with one of these texts are used.
+        planned: CSV of the poses that were to be measured, for a file without joints.
     """
 
     kind: Annotated[str, OneOf(tuple(KINDS))] = ""
@@ -128,6 +130,7 @@ class FileOptions:
     socket_distance: Annotated[float, Real(above=0, most=10.0, unit="m")] | None = None
     socket_pairs: Annotated[tuple[tuple[Label, Label], ...], Expect('pairs of socket labels, [["0", "1"]]')] = ()
     check_limits: Flag = True
+    planned: Name = ""
     camera: CameraOptions = field(default_factory=CameraOptions)
 
 

@@ -193,9 +193,9 @@ def _turned(turn: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 
 def read_measurements(
-    path: str | Path, joints: Joints | Sequence[str], options: FileOptions | None = None
+    source: str | Path | Table, joints: Joints | Sequence[str], options: FileOptions | None = None
 ) -> list[PoseMeasurements]:
-    """Return the measurements in the file at `path` for a robot with these joints.
+    """Return the measurements in a file, or in a table read from one, for a robot with these joints.
 
     Args:
         joints: the robot's n joints, or their names (of revolute joints without limits).
@@ -208,14 +208,18 @@ def read_measurements(
         MeasurementError: for whatever cannot be what it claims to be, with row and column.
     """
     robot, options = Joints.of(joints), options or FileOptions()
-    form = options.format or ("robodk" if robodk.recognises(read_header(path)[0]) else "csv")
-    table, notes = None, ()
+    table, path, notes = (source, source.file, ()) if isinstance(source, Table) else (None, source, ())
+    form = options.format or ("robodk" if table is None and robodk.recognises(read_header(path)[0]) else "csv")
     if form in robodk.FORMS:
         table, options, notes = robodk.FORMS[form](path, len(robot.names), options)
-    sheet = _select_rows(Sheet(table or read_table(path), options))
+    table = table or read_table(path)
+    if table.notes:  # names that were understood need no map
+        maps = {ours: theirs for ours, theirs in options.columns.items() if theirs in table or ours not in table}
+        options = replace(options, columns=maps)
+    sheet = _select_rows(Sheet(table, options))
     layout = find_layout(sheet, robot.names)
     q, _ = sheet.joints(robot.names)
-    notes = (*notes, *layout.notes, *plausible.check_joints(q, sheet, layout.joints, robot))
+    notes = (*sheet.table.notes, *notes, *layout.notes, *plausible.check_joints(q, sheet, layout.joints, robot))
     block = (_read_targets if layout.positions else read_groups)(sheet, layout, q)
     ignored = tuple(name for name in sheet.table.header if name not in layout.used)
     station = options.station or Path(path).stem

@@ -115,7 +115,7 @@ def check_against(plan: ArrayLike, measured: PoseMeasurements, near: float = MAX
     A planned and a measured pose are the same if no joint differs by more than `near`.
 
     Returns:
-        Notes: planned poses that were not measured, rows that nobody planned.
+        Notes: rows that nobody planned.
 
     Raises:
         MeasurementError: where most rows were not planned, with the cause if degrees, swapped or reversed joint
@@ -125,13 +125,18 @@ def check_against(plan: ArrayLike, measured: PoseMeasurements, near: float = MAX
     q, rows = _distinct(measured)
     if (matched := _matched(plan, q, near)).mean() < 0.5:
         raise _explain(plan, q, rows, measured, near)
-    notes = []
-    if not (hit := _matched(q, plan, near)).all():
-        missing = np.flatnonzero(~hit) + 1
-        notes.append(f"{len(missing)} of {len(plan)} planned poses were not measured: {listing(missing, 10)}")
-    if not matched.all():
-        notes.append(f"{int((~matched).sum())} rows were not planned: {listing(rows[~matched], 10)}")
-    return tuple(notes)
+    strange = rows[~matched]
+    return (f"{len(strange)} rows were not planned: {listing(strange, 10)}",) if len(strange) else ()
+
+
+def unmeasured(
+    plan: ArrayLike, measured: Sequence[PoseMeasurements], near: float = MAX_JOINT_DIFFERENCE
+) -> tuple[str, ...]:
+    """Return a note on the planned poses (m, n) [rad or m] that are in none of the blocks; empty if all are."""
+    found = [_matched(block.q, np.asarray(plan), near) for block in measured]
+    remain = np.flatnonzero(~np.any(found, axis=0)) + 1 if found else ()
+    words = f"{len(remain)} of {len(np.asarray(plan))} planned poses remain to be measured: {listing(remain, 10)}"
+    return (f"{words} (in a further file, then calib next again)",) if len(remain) else ()
 
 
 def _distinct(measured: PoseMeasurements) -> tuple[np.ndarray, np.ndarray]:

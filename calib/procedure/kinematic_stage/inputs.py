@@ -12,7 +12,7 @@ from calib.data.poses.measurements import PoseMeasurements, take
 from calib.data.poses.plausible import check_block
 from calib.data.poses.pose_files import joint_columns, read_measurements
 from calib.errors import CalibError, MeasurementError, UsageError, require
-from calib.extensions import needed
+from calib.extensions import needed, offered
 from calib.geometry.first_guess import check_orientations, check_scale
 from calib.geometry.repeatability import repeated, repeated_rows
 from calib.procedure.kinematic_stage.settings import FitSettings
@@ -234,7 +234,8 @@ def read_file(
     elif is_image_folder(path):
         blocks = [needed("image_folders").read_images(path, joints, own)]
     else:
-        blocks = read_measurements(path, joints, own)
+        rooms = offered("planned_poses") if own.planned else ()
+        blocks = [block for room in rooms for block in room(path, chain, own)] or read_measurements(path, joints, own)
     blocks = [needed("camera_guess").complete_camera(chain, b, like) if b.kind == IMAGES else b for b in blocks]
     for block in blocks:
         check_scale(block, chain)  # unseen files, too: the fit looks at its own only

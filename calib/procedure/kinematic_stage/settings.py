@@ -12,6 +12,7 @@ DELIVERABLES = ("urdf", "corrections")  # what a verdict is about: robot.urdf al
 Place = Annotated[float, Real(least=-100.0, most=100.0, unit="m", quantity="length")]  # of a target in the tip's frame
 Point = Annotated[tuple[Place, Place, Place], Expect("x,y,z [m]")]
 Sigma = Annotated[float, Real(above=0.0, least=MIN_SIGMA, most=10.0, unit="m or rad", quantity="1")]
+Tolerance = Annotated[float, Real(above=0.0, quantity="length"), Typed(unit="mm")] | None
 Stations = Annotated[str, OneOf(("each", "one"))]
 Deliverable = Annotated[str, OneOf(DELIVERABLES)]
 Index = Annotated[str, OneOf("poses.indices:Index")]
@@ -47,7 +48,7 @@ class FitSettings:
     tools: Stations = "one"
     holdout: Holdout = 0.0
     refit_frames: Flag = False
-    tolerance: Annotated[float, Real(above=0.0, quantity="length"), Typed(unit="mm")] | None = None
+    tolerance: Tolerance = None
     deliverable: Deliverable = DELIVERABLES[0]
     seed: Seed = 0
     masses: Text = ""

@@ -18,7 +18,14 @@ from calib import files
 from calib.data.poses import IMAGES
 from calib.data.poses.fit_options import FileOptions, FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
-from calib.data.poses.pose_lists import MAX_JOINT_DIFFERENCE, check_against, filled_in, read_poses, write_poses
+from calib.data.poses.pose_lists import (
+    MAX_JOINT_DIFFERENCE,
+    check_against,
+    filled_in,
+    read_poses,
+    unmeasured,
+    write_poses,
+)
 from calib.data.schema import Joints
 from calib.errors import CalibError, Finding, UsageError, finding
 from calib.extensions import needed
@@ -27,7 +34,7 @@ from calib.geometry.observability import SIGMA_ORIENTATION, observation, targets
 from calib.geometry.repeatability import drift_of, noise_of_difference
 from calib.geometry.weighing import Settings
 from calib.identification.model_file import MODEL
-from calib.procedure.findings import UNJUDGED, lines_of
+from calib.procedure.findings import UNJUDGED, Warned, lines_of
 from calib.procedure.kinematic_stage import fit as fitting
 from calib.procedure.kinematic_stage import folder as outputs
 from calib.procedure.kinematic_stage import inputs, selection
@@ -139,9 +146,9 @@ def chain_of(session: Session) -> Chain:
     return inputs.load_robot(session.robot_file, None, _options_of(session), **session.links)[0]
 
 
-def _options_of(session: Session) -> FitOptions:
-    """Return the fit options; files without a sigma get the sigma of the instrument."""
-    instrument = session.settings.instrument
+def _options_of(session: Session, paths: Sequence[Path] = ()) -> FitOptions:
+    """Return the fit options; files without a sigma get the instrument's, those (`paths`) without joints the plan's."""
+    instrument, unseen = session.settings.instrument, session.brought("validation")
     options = read_options(session.named(session.settings.fit.options))
     position, turn = instrument.sigma_position, instrument.sigma_orientation
 
@@ -153,7 +160,11 @@ def _options_of(session: Session) -> FitOptions:
             sigma = replace(sigma, orientation=(turn,) * 3)
         return replace(each, sigma=sigma)
 
-    return replace(options, sigma=stated(options).sigma, files={n: stated(each) for n, each in options.files.items()})
+    lists = {path: session.path(f"2-poses/{UNSEEN if path in unseen else POSES}") for path in paths}
+    there = {path: plan for path, plan in lists.items() if session.settings.poses.plan and plan.exists()}
+    own = {path.name: replace(options.for_file(path), planned=str(plan)) for path, plan in there.items()}
+    files = {name: stated(each) for name, each in {**own, **options.files, **own}.items()}
+    return replace(options, sigma=stated(options).sigma, files=files)
 
 
 def describe(session: Session, say: Say) -> list[str]:
@@ -205,7 +216,7 @@ def read_measured(
     Raises:
         MeasurementError: for implausible values, with row and column.
     """
-    options = _options_of(session)
+    options = _options_of(session, paths)
     return [(path.name, block) for path in paths for block in inputs.read_file(path, chain, options, like)]
 
 
@@ -227,8 +238,8 @@ def _notes_on(session: Session, chain: Chain, blocks: Sequence[tuple[str, PoseMe
         found += block.notes
         if planned is not None:
             found += [*check_against(planned, block), *lines_of(readback(planned, block))]
-        notes += [f"{name}: {note}" for note in found]
-    return notes
+        notes += [(Warned if isinstance(note, Warned) else str)(f"{name}: {note}") for note in found]
+    return notes if planned is None else [*notes, *unmeasured(planned, [block for _, block in blocks])]
 
 
 def readback(plan: np.ndarray, measured: PoseMeasurements) -> list[Finding]:
@@ -279,11 +290,11 @@ def _fit_settings(session: Session) -> FitSettings:
 
 def _gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
     """Return the inputs of the fit: robot, measurements, and the given validation files."""
-    chain, links = chain_of(session), session.links
+    chain, links, measured = chain_of(session), session.links, session.brought("measured")
     if session.robot_file.suffix == ".urdf":  # whatever joints the files' columns name
         links = {"base": chain.base, "tip": chain.tip}
     return inputs.gather(
-        session.robot_file, session.brought("measured"), validate, options=_options_of(session),
+        session.robot_file, measured, validate, options=_options_of(session, [*measured, *validate]),
         settings=_fit_settings(session), **links,
     )  # fmt: skip
 

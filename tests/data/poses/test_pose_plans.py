@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calib.data.poses.measurements import Planes
-from calib.data.poses.pose_lists import check_against, read_poses, write_poses
+from calib.data.poses.pose_lists import check_against, read_poses, unmeasured, write_poses
 from calib.data.schema import Joints
 from calib.errors import CalibError, MeasurementError
 
@@ -52,13 +52,16 @@ def test_as_planned_in_any_order(plan):
 
 def test_missing_and_extra_poses_are_named(plan):
     q = np.vstack([plan[5:], plan[:1] + 0.5])
-    notes = check_against(plan, measured(q))
-    assert notes == ("5 of 40 planned poses were not measured: 1, 2, 3, 4, 5", "1 rows were not planned: 36")
+    assert check_against(plan, measured(q)) == ("1 rows were not planned: 36",)
+    (remain,) = unmeasured(plan, [measured(q)])
+    assert remain.startswith("5 of 40 planned poses remain to be measured: 1, 2, 3, 4, 5")
+    assert not unmeasured(plan, [measured(q), measured(plan[4::-1])])
 
 
 def test_several_targets_of_one_row_count_once(plan):
-    notes = check_against(plan, measured(np.repeat(plan[:-1], 3, axis=0), np.repeat(np.arange(1, 40), 3)))
-    assert notes == ("1 of 40 planned poses were not measured: 40",)
+    found = measured(np.repeat(plan[:-1], 3, axis=0), np.repeat(np.arange(1, 40), 3))
+    assert check_against(plan, found) == ()
+    assert unmeasured(plan, [found])[0].startswith("1 of 40 planned poses remain to be measured: 40 (")
 
 
 @pytest.mark.parametrize(

@@ -65,7 +65,7 @@ def test_a_changed_measurement_makes_stale_what_rests_on_it(finished: Session) -
     assert "measured.csv has changed" in words(finished, "measure")
     assert go_on(finished) is None
     assert json.loads(finished.path("4-fit/metrics.json").read_text())["fit"]["poses"] == 19
-    assert "1 of 20 planned poses were not measured: 20" in finished.path("3-measured/checked.txt").read_text()
+    assert "1 of 20 planned poses remain to be measured: 20" in finished.path("3-measured/checked.txt").read_text()
 
 
 def test_a_changed_setting_makes_stale_only_what_reads_it(finished: Session) -> None:

@@ -1,0 +1,10 @@
+"""Files of measuring instruments: as they come, and joined with the joints of a robot's controller."""
+
+OFFERS = {
+    "commands": "commands:app", "exports": "exports:translated", "planned_poses": "planned:read_planned",
+    "topics": ":TOPICS",
+}  # fmt: skip
+TOPICS = {
+    "join": ("joints and points in separate files, for calib join", "calib.rooms.instruments.joining"),
+    "instruments": ("text exports of trackers, CMMs and motion capture", "calib.rooms.instruments.exports"),
+}

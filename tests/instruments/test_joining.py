@@ -1,0 +1,157 @@
+"""Joints and points in files of their own are joined by name, time, row or geometry; a session takes points alone."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sessions import begin
+
+import calib
+from calib.cli import run
+from calib.data.csv_table import read_table
+from calib.data.poses.measurements import Positions
+from calib.errors import MeasurementError, UsageError
+from calib.procedure.session.folder import Session
+from calib.procedure.session.geometry_steps import arrive, chain_of, read_measured
+from calib.robot.chain import Chain, random_joints
+from calib.robot.kinematics import forward
+from calib.robot.library import load
+
+SHUFFLED = np.random.default_rng(4).permutation(40)[:37]
+JOINTS = [f"joint{k} [rad]" for k in range(1, 8)]
+POINT = ["x [mm]", "y [mm]", "z [mm]"]
+
+
+def write(path: Path, header: list[str], rows: object) -> Path:
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([header, *rows])  # type: ignore[misc]
+    return path
+
+
+def seen(chain: Chain, q: np.ndarray, noise: float = 1.5) -> np.ndarray:
+    """Return what an instrument sees of a target 0.12 m from the tip [mm], with errors of an uncalibrated arm."""
+    arm = forward(chain, q)
+    target = arm[:, :3, 3] + arm[:, :3, :3] @ [0.06, -0.04, 0.1]
+    turn = np.array([[0.0, -0.6, 0.8], [1.0, 0.0, 0.0], [0.0, 0.8, 0.6]])
+    return 1e3 * (target @ turn.T + [1.0, -3.0, 0.4]) + noise * np.random.default_rng(1).normal(size=(len(q), 3))
+
+
+@pytest.fixture(scope="module")
+def arm() -> Chain:
+    return load("lwr4plus")
+
+
+@pytest.fixture(scope="module")
+def q(arm: Chain) -> np.ndarray:
+    return random_joints(arm, 40, 5)
+
+
+@pytest.fixture
+def joints(tmp_path: Path, q: np.ndarray) -> Path:
+    return write(tmp_path / "joints.csv", ["pose", *JOINTS], ([f"P{k + 1}", *row] for k, row in enumerate(q)))
+
+
+def test_points_are_joined_by_name_and_missing_ones_named(tmp_path, joints, arm, q):
+    points = seen(arm, q)
+    named = write(tmp_path / "p.csv", ["Point Name", *POINT], ([f"p_{k + 1:03d}", *points[k]] for k in SHUFFLED))
+    out = tmp_path / "measured.csv"
+    assert run(["join", str(joints), str(named), "--out", str(out)]) == 0
+    found = calib.join(joints, named)
+    assert found.poses.tolist() == sorted(SHUFFLED.tolist())
+    missing = ", ".join(f"P{k + 1}" for k in range(40) if k not in SHUFFLED)
+    assert found.notes[-1] == f"without a point: 3 of 40 poses: {missing}"
+    (block,) = calib.read_poses(out, "lwr4plus")
+    assert isinstance(block, Positions)
+    np.testing.assert_allclose(block.q, q[found.poses], atol=1e-9)
+    np.testing.assert_allclose(1e3 * block.position, points[found.poses], rtol=1e-9)
+
+
+def test_37_of_40_points_in_another_order_are_found_by_the_geometry(tmp_path, joints, arm, q):
+    points = write(tmp_path / "p.csv", POINT, seen(arm, q)[SHUFFLED])
+    with pytest.raises(UsageError, match=r"40 rows of joints, 37 points cannot be joined.*give --robot"):
+        calib.join(joints, points)
+    found = calib.join(joints, points, robot="lwr4plus")
+    np.testing.assert_allclose(
+        np.column_stack([found.table.numbers(axis, "length") for axis in "xyz"]), 1e-3 * seen(arm, q)[found.poses]
+    )
+
+
+def test_a_wrong_order_of_rows_is_noticed_and_points_of_another_arm_are_refused(tmp_path, joints, arm, q):
+    points = seen(arm, q)
+    points[[3, 7]] = points[[7, 3]]
+    found = calib.join(joints, write(tmp_path / "p.csv", POINT, points), by="row", robot="lwr4plus")
+    np.testing.assert_allclose(found.table.numbers("x", "length")[3], 1e-3 * points[7, 0])
+    other = write(tmp_path / "o.csv", POINT, seen(arm, random_joints(arm, 40, 9)))
+    with pytest.raises(MeasurementError, match="not those of these 40 poses in any order"):
+        calib.join(joints, other, robot="lwr4plus")
+
+
+def test_readings_5_mm_apart_are_named_and_near_ones_averaged_with_their_scatter(tmp_path, joints, arm, q):
+    points, rng = seen(arm, q), np.random.default_rng(2)
+    rows = [[f"P{k + 1}", *(points[k] + 0.02 * rng.normal(size=3))] for k in range(40) for _ in range(2)]
+    rows[8][1] += 5.0
+    found = calib.join(joints, write(tmp_path / "p.csv", ["Name", *POINT], rows))
+    assert 4 not in found.poses and len(found.poses) == 39
+    assert any("between readings of pose P5 (rows 9, 10), which is left out" in note for note in found.notes)
+    sigma = found.table.numbers("sigma_x", "length")
+    assert sigma == pytest.approx(0.02e-3 / np.sqrt(2.0), rel=0.3)
+
+
+def test_points_join_a_log_by_time_where_the_arm_stands(tmp_path, arm, q):
+    times = np.arange(0.0, 80.0, 0.1)
+    at = np.interp(times, np.repeat(2.0 * np.arange(40), 2) + np.tile([0.0, 1.5], 40), np.arange(80) // 2)
+    values = (
+        q[np.floor(at).astype(int)] + (at % 1.0)[:, None] * np.diff(q, axis=0, append=q[-1:])[np.floor(at).astype(int)]
+    )
+    log = write(tmp_path / "log.csv", ["time [s]", *JOINTS], np.column_stack([times, values]))
+    taken = 2.0 * np.arange(40) + 0.75
+    taken[6] += 1.0  # while it moves
+    points = write(tmp_path / "p.csv", ["t [ms]", *POINT], np.column_stack([1e3 * taken, seen(arm, q)]))
+    found = calib.join(log, points)
+    assert len(found.poses) == 39 and any("while the arm moved: rows 7" in note for note in found.notes)
+    np.testing.assert_allclose(found.table.numbers("joint3", "angle"), np.delete(q, 6, axis=0)[:, 2], atol=1e-9)
+    late = write(tmp_path / "late.csv", ["t [s]", *POINT], np.column_stack([taken + 9e4, seen(arm, q)]))
+    with pytest.raises(MeasurementError, match="are both times of the same clock"):
+        calib.join(log, late)
+
+
+@pytest.fixture
+def planned(tmp_path: Path, q: np.ndarray) -> Session:
+    session = begin(tmp_path / "cell", "lwr4plus", "tracker", 40, 0, dynamics=False)
+    write(session.path("2-poses/poses.csv"), JOINTS, q)
+    return session
+
+
+def test_a_session_takes_points_alone_with_the_planned_joints(planned, arm, q):
+    path = write(planned.path("3-measured/points.csv"), POINT, seen(arm, q)[SHUFFLED])
+    notes = arrive(planned, print)
+    assert any("those of the planned poses are used, σ 0.1" in note for note in notes)
+    missing = ", ".join(str(k + 1) for k in range(40) if k not in SHUFFLED)
+    assert any(note.startswith(f"3 of 40 planned poses remain to be measured: {missing} (") for note in notes)
+    ((_, block),) = read_measured(planned, chain_of(planned), [path])
+    np.testing.assert_allclose(block.q, q[sorted(SHUFFLED)], atol=1e-12)
+
+
+def test_an_interrupted_run_goes_on_in_a_second_file(planned, arm, q):
+    points = seen(arm, q)
+    write(planned.path("3-measured/a.csv"), POINT, points[:25])
+    assert any("15 of 40 planned poses remain" in note for note in arrive(planned, print))
+    write(planned.path("3-measured/b.csv"), POINT, points[:24:-1])
+    assert not any("remain" in note for note in arrive(planned, print))
+
+
+def test_few_points_need_names(planned, arm, q):
+    points = seen(arm, q)[30:33]
+    path = write(planned.path("3-measured/rest.csv"), POINT, points)
+    with pytest.raises(MeasurementError, match=r"3 points are too few.*column 'pose'"):
+        arrive(planned, print)
+    write(path, ["pose", *POINT], ([31 + k, *point] for k, point in enumerate(points)))
+    ((_, block),) = read_measured(planned, chain_of(planned), [path])
+    np.testing.assert_allclose(block.q, q[30:33])
+
+
+def test_a_written_join_is_read_back(tmp_path, joints, arm, q):
+    found = calib.join(joints, write(tmp_path / "p.csv", POINT, seen(arm, q)))
+    table = read_table(found.write(tmp_path / "m.csv"))
+    assert table.header == ("pose", *(name[:6] for name in JOINTS), "x", "y", "z") and len(table) == 40
