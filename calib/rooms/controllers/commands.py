@@ -1,0 +1,53 @@
+"""Command for programs of poses: program."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calib.cli.shared import command, say
+from calib.rooms.controllers.program import CSV, ProgramSettings
+
+app = typer.Typer()
+
+
+@command(app, "Geometry")
+def program(
+    poses: Annotated[Path | None, typer.Argument()] = None,
+    controller: Annotated[str, typer.Option("--for", metavar="NAME")] = "",
+    out: Path | None = None,
+    settings: ProgramSettings = ProgramSettings(),
+    overwrite: bool = False,
+    listed: Annotated[bool, typer.Option("--list")] = False,
+) -> None:
+    """Write a program that drives the poses of a list, and waits at each for the measurement.
+
+    A program that was edited by hand is read back with --for csv.
+
+    Example: calib program poses.csv --for krl
+
+    Args:
+        poses: CSV of poses to drive, or a program of such poses
+        controller: the robot's controller; csv: the poses as a table; --list shows all
+        out: file of the program; by default beside the poses
+        listed: list controllers, with what each can be told of a calibration
+    """
+    from calib.errors import UsageError, require
+    from calib.rooms.controllers.program import write_program
+    from calib.rooms.controllers.table import controllers
+
+    if listed:
+        for name, each in controllers().items():
+            say(
+                f"{name}: {each.title}, {', '.join(place.format(name='NAME') for place in each.files.values())}",
+                result=True,
+            )
+            say(
+                f"    takes: {each.takes}", f"    closed: {each.closed}", f"    checked by: {each.checked}", result=True
+            )
+        return
+    known = ", ".join((*controllers(), CSV))
+    require(poses is not None and controller, f"give a list of poses and its controller: --for {known}", UsageError)
+    assert poses is not None
+    target = out or poses.with_suffix(".csv" if controller == CSV else "")
+    say(*(f"written to {path}" for path in write_program(poses, target, controller, settings, overwrite)))

@@ -1,0 +1,140 @@
+"""Programs of poses for robot controllers: `calib program POSES.csv --for NAME`.
+
+A program moves joint by joint to each pose, waits until the arm has settled, reads its joints, and then waits for the
+operator's key, or raises a digital output for the instrument (``--output``). The pose's number is shown. The joints that
+were read are in the file that ``calib program --list`` names for each controller; they are better than the planned ones,
+since the program's are rounded and the arm stops near them only.
+
+A program that was edited by hand is read again, ``calib program EDITED.src --for csv``, and so are the joints that a KUKA
+keeps in its ``.dat`` file. `calib compensate FIT PROGRAM` corrects the targets inside a program.
+
+No program was run on a real controller. Run it first at low override, beam and cables off, one pose at a time.
+"""
+
+import re
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any
+
+import jinja2
+import numpy as np
+
+from calib import files
+from calib.config import strict
+from calib.config_types import Real, Whole
+from calib.data.csv_table import read_table
+from calib.data.poses.columns import OURS
+from calib.data.poses.pose_lists import joint_columns, read_poses
+from calib.errors import UsageError, require
+from calib.procedure.report.templates import read
+from calib.rooms.controllers.table import Controller, controller_named
+from calib.rooms.controllers.targets import is_program, number, read_program
+from calib.units import ANGLES
+
+CSV = "csv"  # in place of a controller: the poses of a program as a table
+
+
+@strict
+@dataclass(frozen=True)
+class ProgramSettings:
+    """How a program of poses moves and waits.
+
+    Attributes:
+        settle: seconds to wait at each pose before it is measured
+        speed: of joint moves, percent of the fastest
+        output: digital output that is raised for the instrument for half a second; 0: the operator presses a key
+    """
+
+    settle: Annotated[float, Real(least=0.0, most=600.0, words="seconds from 0 to 600")] = 2.0
+    speed: Annotated[int, Whole(1, 100)] = 10
+    output: Annotated[int, Whole(0, 4096)] = 0
+
+
+def joints_in(path: Path) -> tuple[np.ndarray, list[str]]:
+    """Return joint values (m, n) [rad] of a CSV of poses or of a program, and the joints' names.
+
+    In a CSV, the joints are the columns whose header states an angle (``joint1 [deg]``).
+
+    Raises:
+        UsageError: for sliding joints, and where no column is a joint.
+    """
+    if is_program(path):
+        found = read_program(path)
+        require(found.of("joints"), f"{path}: its targets are poses of the tool, not joints", UsageError)
+        q = found.joints()
+        return q, [f"q{k + 1}" for k in range(q.shape[1])]
+    table = read_table(path)
+    names = [name for name, unit in zip(table.header, table.units) if unit.lower() in ANGLES and name not in OURS]
+    words = f"{path}: no column of joint angles, as 'joint1 [deg]'; found {', '.join(table.header)}"
+    require(names, words, UsageError)
+    return read_poses(path, names), names
+
+
+def write_program(
+    path: Path, out: Path, name: str, settings: ProgramSettings | None = None, overwrite: bool = False
+) -> list[Path]:
+    """Write the poses of a CSV file, or of a program, as a program; return its files.
+
+    Args:
+        path: CSV of poses (``joint1 [deg]``), or a program whose targets are joints.
+        out: its name, without the suffix, is the program's; the suffixes are the controller's.
+        name: of a controller, or ``csv``: the poses as a table.
+        settings: how it moves and waits.
+        overwrite: replace files that no earlier run left.
+
+    Raises:
+        UsageError: for an unknown controller, a name that it does not take, or another number of axes.
+    """
+    q, names = joints_in(path)
+    if name == CSV:
+        header, factors = joint_columns(names, ["revolute"] * len(names))
+        with files.results([(out, (".csv",))], [path], overwrite):
+            return [files.write_numbers(out, header, q * factors)]
+    controller, stem = controller_named(name), out.stem
+    if not re.fullmatch(controller.names, stem):
+        raise UsageError(f"{out}: '{stem}' is no name for a program of {controller.title}: {_words(controller.names)}")
+    if controller.axes and q.shape[1] not in controller.axes:
+        allowed = " or ".join(map(str, controller.axes))
+        raise UsageError(f"{path}: {q.shape[1]} joints ({', '.join(names)}); {controller.title} takes {allowed}")
+    texts = rendered(controller, q, names, stem, settings or ProgramSettings())
+    targets = {out.with_name(place.format(name=stem)): content for place, content in texts.items()}
+    with files.results([(target, ()) for target in targets], [path], overwrite):
+        return [files.write(target, content) for target, content in targets.items()]
+
+
+def rendered(
+    controller: Controller, q: np.ndarray, names: list[str], stem: str, settings: ProgramSettings
+) -> dict[str, str]:
+    """Return the texts of a program of poses (m, n) [rad], by the pattern of the file's name."""
+    poses = [[number(value, controller.decimals) for value in row] for row in controller.shown(q)]
+    values: dict[str, Any] = {"name": stem, "poses": poses, "joints": names, "head": _head(controller, names)}
+    values |= {key: getattr(settings, key) for key in ("settle", "speed", "output")}
+    return {place: _template(file).render(values) for file, place in controller.files.items()}
+
+
+def _head(controller: Controller, names: list[str]) -> list[str]:
+    """Return what stands at a program's head: what is not checked, and whose joints these are."""
+    way = {1: "+", -1: "-"}
+    coupled = [
+        f"axis {axis} = {names[axis - 1]} {way[sign]} {names[other - 1]}" for axis, other, sign in controller.coupled
+    ]
+    return [
+        f"Not run on a real controller; checked by {controller.checked}.",
+        "Simulate first, then run at low override, one pose at a time.",
+        f"Joints: {', '.join(names)}" + "".join(f"; {each}" for each in coupled) + ".",
+        *([f"Joints read at each pose: {controller.keeps}."] if controller.keeps else []),
+    ]
+
+
+def _words(pattern: str) -> str:
+    longest = re.search(r"\{0,(\d+)\}", pattern)
+    return "letters, digits and _, a letter first" + (f", at most {int(longest[1]) + 1}" if longest else "")
+
+
+@cache
+def _template(file: str) -> jinja2.Template:
+    environment = jinja2.Environment(
+        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, undefined=jinja2.StrictUndefined
+    )
+    return environment.from_string(read(__package__, f"templates/{file}"))
