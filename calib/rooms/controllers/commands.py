@@ -32,8 +32,9 @@ def program(
         out: file of the program; by default beside the poses
         listed: list controllers, with what each can be told of a calibration
     """
+    from calib import files
     from calib.errors import UsageError, require
-    from calib.rooms.controllers.program import write_program
+    from calib.rooms.controllers.program import program_files
     from calib.rooms.controllers.table import controllers
 
     if listed:
@@ -50,4 +51,6 @@ def program(
     require(poses is not None and controller, f"give a list of poses and its controller: --for {known}", UsageError)
     assert poses is not None
     target = out or poses.with_suffix(".csv" if controller == CSV else "")
-    say(*(f"written to {path}" for path in write_program(poses, target, controller, settings, overwrite)))
+    texts = program_files(poses, target, controller, settings)
+    with files.results([(path, ()) for path in texts], [poses], overwrite):
+        say(*(f"written to {files.write(path, text)}" for path, text in texts.items()))

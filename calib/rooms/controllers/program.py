@@ -1,12 +1,12 @@
 """Programs of poses for robot controllers: `calib program POSES.csv --for NAME`.
 
 A program moves joint by joint to each pose, waits until the arm has settled, reads its joints, and then waits for the
-operator's key, or raises a digital output for the instrument (``--output``). The pose's number is shown. The joints that
-were read are in the file that ``calib program --list`` names for each controller; they are better than the planned ones,
-since the program's are rounded and the arm stops near them only.
+operator's key, or raises a digital output for the instrument (``--output``). The pose's number is shown. The joints
+that were read are where the program's head says; they are better than the planned ones, since those of the program are
+rounded, and the arm stops only near them.
 
-A program that was edited by hand is read again, ``calib program EDITED.src --for csv``, and so are the joints that a KUKA
-keeps in its ``.dat`` file. `calib compensate FIT PROGRAM` corrects the targets inside a program.
+A program that was edited by hand is read again, ``calib program EDITED.src --for csv``, and so are the joints that a
+KUKA keeps in its ``.dat`` file. `calib compensate FIT PROGRAM` corrects the targets inside a program.
 
 No program was run on a real controller. Run it first at low override, beam and cables off, one pose at a time.
 """
@@ -28,7 +28,7 @@ from calib.data.poses.columns import OURS
 from calib.data.poses.pose_lists import joint_columns, read_poses
 from calib.errors import UsageError, require
 from calib.procedure.report.templates import read
-from calib.rooms.controllers.table import Controller, controller_named
+from calib.rooms.controllers.table import HERE, Controller, controller_named
 from calib.rooms.controllers.targets import is_program, number, read_program
 from calib.units import ANGLES
 
@@ -71,17 +71,14 @@ def joints_in(path: Path) -> tuple[np.ndarray, list[str]]:
     return read_poses(path, names), names
 
 
-def write_program(
-    path: Path, out: Path, name: str, settings: ProgramSettings | None = None, overwrite: bool = False
-) -> list[Path]:
-    """Write the poses of a CSV file, or of a program, as a program; return its files.
+def program_files(path: Path, out: Path, name: str, settings: ProgramSettings | None = None) -> dict[Path, str]:
+    """Return the files of a program of the poses in a CSV file or in another program: path → text.
 
     Args:
         path: CSV of poses (``joint1 [deg]``), or a program whose targets are joints.
         out: its name, without the suffix, is the program's; the suffixes are the controller's.
         name: of a controller, or ``csv``: the poses as a table.
         settings: how it moves and waits.
-        overwrite: replace files that no earlier run left.
 
     Raises:
         UsageError: for an unknown controller, a name that it does not take, or another number of axes.
@@ -89,8 +86,8 @@ def write_program(
     q, names = joints_in(path)
     if name == CSV:
         header, factors = joint_columns(names, ["revolute"] * len(names))
-        with files.results([(out, (".csv",))], [path], overwrite):
-            return [files.write_numbers(out, header, q * factors)]
+        rows = [",".join(f"{value:.12g}" for value in row) for row in q * factors]
+        return {out: "\n".join([",".join(header), *rows, ""])}
     controller, stem = controller_named(name), out.stem
     if not re.fullmatch(controller.names, stem):
         raise UsageError(f"{out}: '{stem}' is no name for a program of {controller.title}: {_words(controller.names)}")
@@ -98,9 +95,12 @@ def write_program(
         allowed = " or ".join(map(str, controller.axes))
         raise UsageError(f"{path}: {q.shape[1]} joints ({', '.join(names)}); {controller.title} takes {allowed}")
     texts = rendered(controller, q, names, stem, settings or ProgramSettings())
-    targets = {out.with_name(place.format(name=stem)): content for place, content in texts.items()}
-    with files.results([(target, ()) for target in targets], [path], overwrite):
-        return [files.write(target, content) for target, content in targets.items()]
+    return {out.with_name(place.format(name=stem)): content for place, content in texts.items()}
+
+
+def write_program(path: Path, out: Path, name: str) -> list[Path]:
+    """Write the program of a session's planned poses; return its files."""
+    return [files.write(target, content) for target, content in program_files(path, out, name).items()]
 
 
 def rendered(
@@ -137,4 +137,4 @@ def _template(file: str) -> jinja2.Template:
     environment = jinja2.Environment(
         trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, undefined=jinja2.StrictUndefined
     )
-    return environment.from_string(read(__package__, f"templates/{file}"))
+    return environment.from_string(read(HERE, f"templates/{file}"))

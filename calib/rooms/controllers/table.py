@@ -1,8 +1,8 @@
 """Robot controllers, as ``controllers.toml`` declares them: their joints, their programs, what they can be told.
 
-A controller shows  s_i = sign_i · (q_i + Σ way · q_j)  for a description's joints q: signs and coupled axes (a FANUC's J3
-counts from the horizontal). Descriptions are ROS-Industrial's or the maker's; where a description counts a joint from
-another zero, its programs would be wrong: play them in the controller's simulation first.
+A controller shows  s_i = sign_i · (q_i + Σ way · q_j)  for a description's joints q: signs and coupled axes (a
+FANUC's J3 counts from the horizontal). Descriptions are ROS-Industrial's or the maker's; where a description counts a joint
+from another zero, its programs would be wrong: play them in the controller's simulation first.
 """
 
 import tomllib
@@ -17,6 +17,8 @@ from calib.config import parse, strict
 from calib.errors import UsageError, one_of
 from calib.procedure.report.templates import read
 from calib.units import ANGLES, LENGTHS
+
+HERE = "calib.rooms.controllers"  # where table and templates are
 
 
 @strict
@@ -57,11 +59,7 @@ class Controller:
         return q @ self.matrix(q.shape[-1]).T / ANGLES[self.unit]
 
     def described(self, shown: np.ndarray) -> np.ndarray:
-        """Return the joints (…, n) [rad] of a description from those that the controller shows, in its unit."""
-        return self.untwisted(shown * ANGLES[self.unit])
-
-    def untwisted(self, shown: np.ndarray) -> np.ndarray:
-        """Return a description's joints (…, n) from those that the controller shows, units as given."""
+        """Return the joints (…, n) of a description from those that the controller shows, in the same unit."""
         return shown @ np.linalg.inv(self.matrix(shown.shape[-1])).T
 
     @property
@@ -73,7 +71,7 @@ class Controller:
 @cache
 def controllers() -> dict[str, Controller]:
     """Return all controllers by name."""
-    table = tomllib.loads(read(__package__, "controllers.toml"))
+    table = tomllib.loads(read(HERE, "controllers.toml"))
     return {
         name: parse(
             Controller, (table[entry["like"]] if "like" in entry else {}) | _own(entry), f"controllers.toml: {name}"
@@ -108,3 +106,13 @@ def controller_of(path: Path, name: str = "") -> Controller:
             return each
     known = ", ".join(suffix for each in controllers().values() for suffix in each.suffixes)
     raise UsageError(f"{path}: no program of a known controller: expected a suffix of {known}")
+
+
+def as_described(name: str, shown: np.ndarray) -> np.ndarray:
+    """Return a description's joints, or their speeds (…, n), from those that a controller shows, in the same unit."""
+    return controller_named(name).described(shown)
+
+
+def motors_as_described(name: str, shown: np.ndarray) -> np.ndarray:
+    """Return motors' torques or currents (…, n) with the description's signs; coupled axes do not change a motor."""
+    return shown * np.array(controller_named(name).signs or 1.0)

@@ -1,7 +1,7 @@
 """Targets in a controller's program: read with their places in the text, and written back, all else byte for byte.
 
-Joint targets and poses of the tool are recognised by the patterns of ``controllers.toml``, not in comments. Relative moves,
-targets that a program computes, and targets with some axes left out are not touched.
+Joint targets and poses of the tool are recognised by the patterns of ``controllers.toml``, not in comments. Relative
+moves, targets that a program computes, and targets with some axes left out are not touched.
 """
 
 import re
@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from calib.errors import MeasurementError, UsageError
 from calib.rooms.controllers.table import Controller, controller_of
 from calib.transforms import pose as pose_of
-from calib.units import DEG
+from calib.units import ANGLES, DEG
 
 NUMBER = r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)"
 ENCODING = "latin-1"  # one letter for each byte, whatever the program is in
@@ -58,7 +58,7 @@ class Program:
     def joints(self) -> np.ndarray:
         """Return the joint targets (m, n) as joints of a description [rad]."""
         shown = [self.targets[k].values for k in self.of("joints")]
-        return self.controller.described(np.array(shown))
+        return self.controller.described(np.array(shown) * ANGLES[self.controller.unit])
 
     def poses(self) -> np.ndarray:
         """Return the pose targets (m, 4, 4) [m]."""
