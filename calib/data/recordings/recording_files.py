@@ -201,7 +201,10 @@ def _described(recording: Recording, controller: str) -> Recording:
     """Return a recording of the description's joints from one of joints as a controller shows them."""
     if not controller:
         return recording
-    parts = {"as_described": ("q", "v", "q_link", "q_ref"), "motors_as_described": ("effort", "tau_motor", "tau_ff")}
+    parts = {
+        "as_described": ("q", "v", "q_link", "q_ref"),
+        "motors_as_described": ("effort", "tau_link", "tau_motor", "tau_ff"),
+    }
     series = {name: (how, getattr(recording, name)) for how, names in parts.items() for name in names}
     changed = {name: needed(how)(controller, own) for name, (how, own) in series.items() if own is not None}
     return replace(recording, **changed)

@@ -13,10 +13,11 @@ app = typer.Typer()
 
 @command(app, "Geometry")
 def program(
+    settings: ProgramSettings,
     poses: Annotated[Path | None, typer.Argument()] = None,
     controller: Annotated[str, typer.Option("--for", metavar="NAME")] = "",
+    source: Annotated[str, typer.Option("--from", metavar="NAME")] = "",
     out: Path | None = None,
-    settings: ProgramSettings = ProgramSettings(),
     overwrite: bool = False,
     listed: Annotated[bool, typer.Option("--list")] = False,
 ) -> None:
@@ -29,6 +30,7 @@ def program(
     Args:
         poses: CSV of poses to drive, or a program of such poses
         controller: the robot's controller; csv: the poses as a table; --list shows all
+        source: the controller of a program that is read, if its suffix does not say it
         out: file of the program; by default beside the poses
         listed: list controllers, with what each can be told of a calibration
     """
@@ -51,6 +53,6 @@ def program(
     require(poses is not None and controller, f"give a list of poses and its controller: --for {known}", UsageError)
     assert poses is not None
     target = out or poses.with_suffix(".csv" if controller == CSV else "")
-    texts = program_files(poses, target, controller, settings)
+    texts = program_files(poses, target, controller, settings, source)
     with files.results([(path, ()) for path in texts], [poses], overwrite):
         say(*(f"written to {files.write(path, text)}" for path, text in texts.items()))

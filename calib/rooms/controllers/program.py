@@ -43,24 +43,28 @@ class ProgramSettings:
     Attributes:
         settle: seconds to wait at each pose before it is measured
         speed: of joint moves, percent of the fastest
-        output: digital output that is raised for the instrument for half a second; 0: the operator presses a key
+        output: number of the digital output that is raised for the instrument for half a second (ABB: signal do1 …);
+            without it the operator presses a key
     """
 
     settle: Annotated[float, Real(least=0.0, most=600.0, words="seconds from 0 to 600")] = 2.0
     speed: Annotated[int, Whole(1, 100)] = 10
-    output: Annotated[int, Whole(0, 4096)] = 0
+    output: Annotated[int, Whole(0, 4096)] | None = None
 
 
-def joints_in(path: Path) -> tuple[np.ndarray, list[str]]:
+def joints_in(path: Path, source: str = "") -> tuple[np.ndarray, list[str]]:
     """Return joint values (m, n) [rad] of a CSV of poses or of a program, and the joints' names.
 
     In a CSV, the joints are the columns whose header states an angle (``joint1 [deg]``).
 
+    Args:
+        source: the controller of a program, where its suffix does not say it.
+
     Raises:
         UsageError: for sliding joints, and where no column is a joint.
     """
-    if is_program(path):
-        found = read_program(path)
+    if source or is_program(path):
+        found = read_program(path, source)
         require(found.of("joints"), f"{path}: its targets are poses of the tool, not joints", UsageError)
         q = found.joints()
         return q, [f"q{k + 1}" for k in range(q.shape[1])]
@@ -71,7 +75,9 @@ def joints_in(path: Path) -> tuple[np.ndarray, list[str]]:
     return read_poses(path, names), names
 
 
-def program_files(path: Path, out: Path, name: str, settings: ProgramSettings | None = None) -> dict[Path, str]:
+def program_files(
+    path: Path, out: Path, name: str, settings: ProgramSettings | None = None, source: str = ""
+) -> dict[Path, str]:
     """Return the files of a program of the poses in a CSV file or in another program: path → text.
 
     Args:
@@ -79,11 +85,13 @@ def program_files(path: Path, out: Path, name: str, settings: ProgramSettings | 
         out: its name, without the suffix, is the program's; the suffixes are the controller's.
         name: of a controller, or ``csv``: the poses as a table.
         settings: how it moves and waits.
+        source: see `joints_in`.
 
     Raises:
-        UsageError: for an unknown controller, a name that it does not take, or another number of axes.
+        UsageError: for an unknown controller, a name that it does not take, another number of axes, and an output where
+            it has none.
     """
-    q, names = joints_in(path)
+    settings, (q, names) = settings or ProgramSettings(), joints_in(path, source)
     if name == CSV:
         header, factors = joint_columns(names, ["revolute"] * len(names))
         rows = [",".join(f"{value:.12g}" for value in row) for row in q * factors]
@@ -94,7 +102,9 @@ def program_files(path: Path, out: Path, name: str, settings: ProgramSettings | 
     if controller.axes and q.shape[1] not in controller.axes:
         allowed = " or ".join(map(str, controller.axes))
         raise UsageError(f"{path}: {q.shape[1]} joints ({', '.join(names)}); {controller.title} takes {allowed}")
-    texts = rendered(controller, q, names, stem, settings or ProgramSettings())
+    if settings.output is not None and not controller.outputs:
+        raise UsageError(f"--output: {controller.title} raises no output; the operator presses a key")
+    texts = rendered(controller, q, names, stem, settings)
     return {out.with_name(place.format(name=stem)): content for place, content in texts.items()}
 
 

@@ -1,8 +1,8 @@
 """Robot controllers, as ``controllers.toml`` declares them: their joints, their programs, what they can be told.
 
 A controller shows  s_i = sign_i · (q_i + Σ way · q_j)  for a description's joints q: signs and coupled axes (a
-FANUC's J3 counts from the horizontal). Descriptions are ROS-Industrial's or the maker's; where a description counts a joint
-from another zero, its programs would be wrong: play them in the controller's simulation first.
+FANUC's J3 counts from the horizontal). Descriptions are ROS-Industrial's or the maker's; where a description counts a
+joint from another zero, its programs would be wrong: play them in the controller's simulation first.
 """
 
 import tomllib
@@ -36,6 +36,7 @@ class Controller:
     closed: str
     checked: str
     keeps: str = ""
+    outputs: bool = True
     axes: tuple[int, ...] = ()
     suffixes: tuple[str, ...] = ()
     signs: tuple[int, ...] = ()

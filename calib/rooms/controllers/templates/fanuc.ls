@@ -9,7 +9,7 @@
 {% set _ = lines.append("J P[" ~ loop.index ~ "] " ~ speed ~ "% FINE") %}
 {% set _ = lines.append("  WAIT " ~ "%6.2f"|format(settle) ~ "(sec)") %}
 {% set _ = lines.append("  PR[" ~ loop.index ~ "]=JPOS") %}
-{% set _ = lines.append("  DO[" ~ output ~ "]=PULSE,0.5sec" if output else "  PAUSE") %}
+{% set _ = lines.append("  DO[" ~ output ~ "]=PULSE,0.5sec" if output is not none else "  PAUSE") %}
 {% endfor %}
 /PROG  {{ name|upper }}
 /ATTR
