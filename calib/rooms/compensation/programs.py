@@ -49,7 +49,8 @@ class CompensatedProgram:
 
     def lines(self) -> list[str]:
         """Return the lines for the user."""
-        shown = [line for one in self.commands for line in lines(one) if not line.startswith("not reached")]
+        met = [one for one in self.commands if one.reached.any()]
+        shown = [line for one in met for line in lines(one) if not line.startswith("not reached")]
         kept = ["not reached, left as it was: " + words for words in self.lost]
         return [*dict.fromkeys(shown), *kept]
 
