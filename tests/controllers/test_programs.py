@@ -14,7 +14,8 @@ from calib.data.recordings.recording_options import RecordingOptions
 from calib.errors import MeasurementError, UsageError
 from calib.procedure.session import geometry_steps
 from calib.procedure.session.folder import open_session
-from calib.rooms.controllers.program import CSV, ProgramSettings, joints_in, program_files
+from calib.rooms.controllers.program import joints_in, program_files
+from calib.rooms.controllers.program_settings import CSV, ProgramSettings
 from calib.rooms.controllers.table import controller_named, controllers
 from calib.rooms.controllers.targets import read_program
 

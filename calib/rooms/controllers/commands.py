@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from calib.cli.shared import command, say
-from calib.rooms.controllers.program import CSV, ProgramSettings
+from calib.rooms.controllers.program_settings import CSV, ProgramSettings
 
 app = typer.Typer()
 

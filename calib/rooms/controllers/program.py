@@ -12,44 +12,23 @@ No program was run on a real controller. Run it first at low override, beam and 
 """
 
 import re
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import jinja2
 import numpy as np
 
 from calib import files
-from calib.config import strict
-from calib.config_types import Real, Whole
 from calib.data.csv_table import read_table
 from calib.data.poses.columns import OURS
 from calib.data.poses.pose_lists import joint_columns, read_poses
 from calib.errors import UsageError, require
 from calib.procedure.report.templates import read
+from calib.rooms.controllers.program_settings import CSV, ProgramSettings
 from calib.rooms.controllers.table import HERE, Controller, controller_named
 from calib.rooms.controllers.targets import is_program, number, read_program
 from calib.units import ANGLES
-
-CSV = "csv"  # in place of a controller: the poses of a program as a table
-
-
-@strict
-@dataclass(frozen=True)
-class ProgramSettings:
-    """How a program of poses moves and waits.
-
-    Attributes:
-        settle: seconds to wait at each pose before it is measured
-        speed: of joint moves, percent of the fastest
-        output: number of the digital output that is raised for the instrument for half a second (ABB: signal do1 …);
-            without it the operator presses a key
-    """
-
-    settle: Annotated[float, Real(least=0.0, most=600.0, words="seconds from 0 to 600")] = 2.0
-    speed: Annotated[int, Whole(1, 100)] = 10
-    output: Annotated[int, Whole(0, 4096)] | None = None
 
 
 def joints_in(path: Path, source: str = "") -> tuple[np.ndarray, list[str]]:

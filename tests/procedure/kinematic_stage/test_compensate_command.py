@@ -355,7 +355,7 @@ def test_targets_inside_a_program_are_rewritten(cell, fitted, here, calib):
     text = PROGRAM.format(*values, more="")
     (here / "part.src").write_text(text)
     near = ",".join(map(str, q[0]))
-    code, out, err = calib("compensate", fitted, "part.src", "--out", "sent.src", "--start", near)
+    code, _, err = calib("compensate", fitted, "part.src", "--out", "sent.src", "--start", near)
     assert code == 0, err
     found, before = read_program(here / "sent.src"), read_program(here / "part.src")
     assert found.rewritten([np.array(each.values) for each in before.targets]) == text.encode(), "nothing else changed"
