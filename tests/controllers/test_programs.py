@@ -123,6 +123,7 @@ def test_other_bytes_stay_when_targets_are_rewritten(tmp_path):
     np.testing.assert_allclose(turned[:3], [[-1, 0, 0, 0.5005], [0, 1, 0, 0], [0, 0, -1, 0.4]], atol=1e-15)
 
 
+@pytest.mark.slow
 def test_a_session_writes_the_program_beside_the_poses(tmp_path):
     session = begin(tmp_path / "cell", "tx40", "tracker", poses=12, validation=4)
     edit(tmp_path / "cell/session.toml", 'controller = ""', 'controller = "krl"')
