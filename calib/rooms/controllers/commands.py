@@ -1,4 +1,4 @@
-"""Command for programs of poses: program."""
+"""Commands for controllers: program, deliver."""
 
 from pathlib import Path
 from typing import Annotated
@@ -56,3 +56,32 @@ def program(
     texts = program_files(poses, target, controller, settings, source)
     with files.results([(path, ()) for path in texts], [poses], overwrite):
         say(*(f"written to {files.write(path, text)}" for path, text in texts.items()))
+
+
+@command(app, "Geometry")
+def deliver(
+    folder: Annotated[Path, typer.Argument(metavar="FIT")],
+    controller: Annotated[str, typer.Option("--for", metavar="NAME")],
+    out: Path | None = None,
+    overwrite: bool = False,
+) -> None:
+    """State a calibration in a controller's words: tool and base frames, mastering offsets, what it cannot take.
+
+    Example: calib deliver fit --for krl
+
+    Args:
+        folder: the folder of a fit, or of a session with a fit
+        controller: the robot's controller: calib program --list
+        out: text file; by default it is printed
+    """
+    from calib import files
+    from calib.procedure.export.geometry import results
+    from calib.rooms.controllers.delivery import delivery_text
+    from calib.rooms.controllers.table import controller_named
+
+    text = delivery_text(folder, controller_named(controller))
+    if out is None:
+        say(text, result=True)
+        return
+    with files.results([(out, (".txt",))], results(folder), overwrite):
+        say(f"written to {files.write(out, text)}")

@@ -35,6 +35,8 @@ class Controller:
     takes: str
     closed: str
     checked: str
+    tool_frame: str = ""
+    base_frame: str = ""
     keeps: str = ""
     outputs: bool = True
     axes: tuple[int, ...] = ()

@@ -90,7 +90,7 @@ def pose_values(controller: Controller, poses: np.ndarray) -> np.ndarray:
     elif turn == "vector":
         angles = rotation.as_rotvec()
     else:
-        angles = rotation.as_euler(_order(turn), degrees=True)
+        angles = rotation.as_euler(_order(turn), degrees=not turn.endswith("rad"))
     return np.concatenate([poses[:, :3, 3] / controller.metres, angles], axis=1)
 
 
@@ -101,7 +101,7 @@ def _rotation(turn: str, values: np.ndarray) -> Rotation:
 
 
 def _order(turn: str) -> str:
-    axes, how = turn.split()
+    axes, how = turn.split()[:2]
     return axes.upper() if how == "moving" else axes
 
 
