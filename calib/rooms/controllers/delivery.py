@@ -1,8 +1,8 @@
 """A calibration in a controller's words: `calib deliver FIT --for NAME`.
 
-A controller that keeps its nominal geometry takes the tool's and the instrument's frames with which the nominal arm meets
-the measurements best. One whose axes are mastered anew takes joint offsets with the frames that belong to them: from a
-fit with ``--model offsets``, since offsets of a richer model are not the best ones by themselves.
+A controller that keeps its nominal geometry takes the tool's and the instrument's frames with which the nominal arm
+meets the measurements best. One whose axes are mastered anew takes joint offsets with the frames that belong to them:
+from a fit with ``--model offsets``, since offsets of a richer model are not the best ones by themselves.
 """
 
 from collections.abc import Iterator
@@ -33,7 +33,7 @@ def delivery_text(folder: Path, controller: Controller) -> str:
     """
     fit = folder / IN_SESSION if FitFolder(folder / IN_SESSION).robot.is_file() else folder
     robot, (cell, nominal) = read(fit), read_arms(fit)
-    lines = [f"{controller.title}: calibration of {robot.chain.name}", f"verdict: {verdicts(fit)}", ""]
+    lines = [f"{controller.title}: calibration of {robot.chain.name}", str(verdicts(fit)), ""]
     lines += [f"It takes: {controller.takes}.", f"It does not: {controller.closed}.", ""]
     if len(nominal.tools):
         lines += [
@@ -41,7 +41,9 @@ def delivery_text(folder: Path, controller: Controller) -> str:
             *_frames(nominal, controller),
             "",
         ]
-    if FitFolder(fit).metrics().model == "offsets":
+    if not controller.mastered:
+        lines.append("Its axes are not mastered by their users.")
+    elif FitFolder(fit).metrics().model == "offsets":
         lines += [
             "Mastering, with frames that belong to it:",
             *_mastering(robot, controller),
@@ -49,6 +51,7 @@ def delivery_text(folder: Path, controller: Controller) -> str:
         ]
     else:
         lines.append("Mastering offsets: fit with --model offsets, and deliver that fit.")
+    lines += ["", "A tool's angles are nominal where only its position was measured."]
     return "\n".join([*lines, ""])
 
 
@@ -71,4 +74,5 @@ def _mastering(robot: CalibratedChain, controller: Controller) -> Iterator[str]:
     chain, before = robot.chain, nominal_of(robot)
     moved = [(chain.elements[k].value - before.elements[k].value) / chain.elements[k].ratio for k in chain.moving]
     for axis, value in enumerate(controller.shown(np.array(moved)), 1):
-        yield f"  axis {axis} stands at what it shows {value:+.5f} {controller.unit}"
+        kept = "" if value else " (kept at nominal)"
+        yield f"  axis {axis}: true angle = shown angle {value:+.5f} {controller.unit}{kept}"

@@ -39,6 +39,7 @@ class Controller:
     base_frame: str = ""
     keeps: str = ""
     outputs: bool = True
+    mastered: bool = True
     axes: tuple[int, ...] = ()
     suffixes: tuple[str, ...] = ()
     signs: tuple[int, ...] = ()
