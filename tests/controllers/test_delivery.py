@@ -12,7 +12,8 @@ from calib.robot.kinematics import forward
 from calib.robot.library import load
 from calib.rooms.cells.cell import SimulatedInstrument, measure, write_measured
 from calib.rooms.cells.virtual_cells import perturbed_cell
-from calib.rooms.controllers.table import as_described, controllers
+from calib.rooms.controllers.delivery import delivery_text
+from calib.rooms.controllers.table import as_described, controller_named, controllers
 from calib.transforms import from_xyz_rpy, invert, pose
 
 NUMBER = r"(-?\d+\.\d+)"
@@ -30,22 +31,20 @@ def fit(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray, np.
     return folder / "fit", seen.q, seen.position
 
 
-def test_the_frames_of_the_nominal_arm_fit_as_its_metrics_say(fit, calib):
+def test_the_frames_of_the_nominal_arm_fit_as_its_metrics_say(fit):
     folder, q, seen = fit
-    code, out, _ = calib("deliver", folder, "--for", "ros2")
-    assert code == 0 and "Its axes are not mastered" in out and "Mastering, " not in out
-    found = [
-        from_xyz_rpy(v[:3], v[3:])
-        for v in np.array(re.findall(" ".join(["xyz", *[NUMBER] * 3]) + ", rpy " + " ".join([NUMBER] * 3), out), float)
-    ]
+    out = delivery_text(folder, controller_named("ros2"))
+    assert "Its axes are not mastered" in out and "Mastering, " not in out
+    form = " ".join(["xyz", *[NUMBER] * 3]) + ", rpy " + " ".join([NUMBER] * 3)
+    found = [from_xyz_rpy(v[:3], v[3:]) for v in np.array(re.findall(form, out), float)]
     points = (invert(found[1]) @ forward(load("ur5"), q) @ found[0])[:, :3, 3]
     rms = 1e3 * np.sqrt(np.mean(np.sum((points - seen) ** 2, axis=1)))
     assert rms == pytest.approx(FitFolder(folder).metrics().fit.nominal.main.rms, rel=1e-4)
 
 
-def test_offsets_and_the_frames_beside_them_fit_better(fit, calib):
+def test_offsets_and_the_frames_beside_them_fit_better(fit):
     folder, q, seen = fit
-    _, out, _ = calib("deliver", folder, "--for", "krl")
+    out = delivery_text(folder, controller_named("krl"))
     mastered = out.partition("Mastering, ")[2]
     offsets = np.radians(np.array(re.findall(r"shown angle ([-+]\d+\.\d+) deg", mastered), float))
     names = "".join(rf"{name} {NUMBER}[,}}]" for name in "XYZABC")
@@ -57,13 +56,15 @@ def test_offsets_and_the_frames_beside_them_fit_better(fit, calib):
     assert rms == pytest.approx(whole.calibrated.main.rms, rel=1e-3) and rms < 0.9 * whole.nominal.main.rms
 
 
-def test_every_controller_says_what_it_takes_and_what_is_closed(fit, calib):
-    for name in controllers():
-        code, out, err = calib("deliver", fit[0], "--for", name)
-        assert code == 0 and "It takes: " in out and "It does not: " in out, err
+def test_every_controller_says_what_it_takes_and_what_is_closed(fit):
+    for name, each in controllers().items():
+        out = delivery_text(fit[0], each)
+        assert "It takes: " in out and "It does not: " in out and "instrument seen: " in out, name
 
 
 def test_signs_and_coupled_axes_are_undone():
     shown = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
-    np.testing.assert_allclose(as_described("fanuc", shown), shown + [0, 0, 0.2, 0, 0, 0], atol=1e-15)
-    np.testing.assert_allclose(as_described("rapid-parallelogram", shown), shown - [0, 0, 0.2, 0, 0, 0], atol=1e-15)
+    np.testing.assert_allclose(as_described("fanuc", shown), shown + np.array([0, 0, 0.2, 0, 0, 0]), atol=1e-15)
+    np.testing.assert_allclose(
+        as_described("rapid-parallelogram", shown), shown - np.array([0, 0, 0.2, 0, 0, 0]), atol=1e-15
+    )
