@@ -123,6 +123,16 @@ def test_other_bytes_stay_when_targets_are_rewritten(tmp_path):
     np.testing.assert_allclose(turned[:3], [[-1, 0, 0, 0.5005], [0, 1, 0, 0], [0, 0, -1, 0.4]], atol=1e-15)
 
 
+def test_a_yaskawa_gets_pulses(tmp_path):
+    with pytest.raises(UsageError, match="pulses per degree of each of 6 axes"):
+        written(tmp_path, "yaskawa")
+    pulses = (1341.4, 1341.4, 1341.4, 1000.0, -1000.0, 622.0)
+    text = written(tmp_path, "yaskawa", pulses=pulses)[".jbi"].read_text()
+    rows = [line.partition("=")[2] for line in text.split("\n") if line.startswith("C0")]
+    np.testing.assert_allclose(np.array([row.split(",") for row in rows], int), np.degrees(Q) * pulses, atol=0.5)
+    assert text.count("MOVJ C0") == text.count("PAUSE") == len(Q) and f"///NPOS {len(Q)},0" in text
+
+
 @pytest.mark.slow
 def test_a_session_writes_the_program_beside_the_poses(tmp_path):
     session = begin(tmp_path / "cell", "tx40", "tracker", poses=12, validation=4)

@@ -83,6 +83,8 @@ def program_files(
         raise UsageError(f"{path}: {q.shape[1]} joints ({', '.join(names)}); {controller.title} takes {allowed}")
     if settings.output is not None and not controller.outputs:
         raise UsageError(f"--output: {controller.title} raises no output; the operator presses a key")
+    if controller.pulses and (len(settings.pulses) != q.shape[1] or not all(settings.pulses)):
+        raise UsageError(f"--pulse: {controller.title} needs the pulses per degree of each of {q.shape[1]} axes")
     texts = rendered(controller, q, names, stem, settings)
     return {out.with_name(place.format(name=stem)): content for place, content in texts.items()}
 
@@ -96,7 +98,8 @@ def rendered(
     controller: Controller, q: np.ndarray, names: list[str], stem: str, settings: ProgramSettings
 ) -> dict[str, str]:
     """Return the texts of a program of poses (m, n) [rad], by the pattern of the file's name."""
-    poses = [[number(value, controller.decimals) for value in row] for row in controller.shown(q)]
+    shown = controller.shown(q) * (np.array(settings.pulses) if controller.pulses else 1.0)
+    poses = [[number(value, controller.decimals) for value in row] for row in shown]
     values: dict[str, Any] = {"name": stem, "poses": poses, "joints": names, "head": _head(controller, names)}
     values |= {key: getattr(settings, key) for key in ("settle", "speed", "output")}
     return {place: _template(file).render(values) for file, place in controller.files.items()}

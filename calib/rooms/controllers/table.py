@@ -40,6 +40,7 @@ class Controller:
     keeps: str = ""
     outputs: bool = True
     mastered: bool = True
+    pulses: bool = False
     axes: tuple[int, ...] = ()
     suffixes: tuple[str, ...] = ()
     signs: tuple[int, ...] = ()
