@@ -133,6 +133,27 @@ def test_a_yaskawa_gets_pulses(tmp_path):
     assert text.count("MOVJ C0") == text.count("PAUSE") == len(Q) and f"///NPOS {len(Q)},0" in text
 
 
+@pytest.mark.parametrize(("name", "cycle"), [("ur", 0.008), ("krl", 0.004), ("rapid", 0.004)])
+def test_a_motion_becomes_setpoints_at_the_controllers_cycle(tmp_path, name, cycle):
+    t = np.arange(201) / 100.0
+
+    def q(t: np.ndarray) -> np.ndarray:
+        return 0.5 * np.sin(t[:, None] * np.arange(1, 7))
+
+    head = ["t [s]", *(f"q_joint{k + 1} [rad]" for k in range(6)), "v_joint1 [rad/s]"]
+    with (tmp_path / "motion.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([head, *np.column_stack([t, q(t), t]).tolist()])
+    (text,) = program_files(tmp_path / "motion.csv", tmp_path / "move", name).values()
+    lines = [line for line in text.split("\n") if line[:1].isdigit() or "servoj([" in line]
+    found = [line.partition("[")[2].partition("]")[0] if name == "ur" else line for line in lines]
+    values = np.array([row.split(",") for row in found], float)
+    values = values if name == "ur" else np.radians(values[:, 1:7])
+    np.testing.assert_allclose(values, q(cycle * np.arange(len(values))), atol=2e-5)
+    assert len(values) == round(2.0 / cycle) + 1
+    with pytest.raises(UsageError, match="takes no stream"):
+        program_files(tmp_path / "motion.csv", tmp_path / "move", "fanuc")
+
+
 @pytest.mark.slow
 def test_a_session_writes_the_program_beside_the_poses(tmp_path):
     session = begin(tmp_path / "cell", "tx40", "tracker", poses=12, validation=4)

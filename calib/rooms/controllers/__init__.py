@@ -10,6 +10,7 @@ OFFERS = {
 TOPICS = {
     "programs": (
         "programs for robot controllers, of calib program",
-        "calib.rooms.controllers.program calib.rooms.controllers.targets calib.rooms.controllers.table",
+        "calib.rooms.controllers.program calib.rooms.controllers.motion "
+        "calib.rooms.controllers.targets calib.rooms.controllers.table",
     )
 }

@@ -28,7 +28,7 @@ def program(
     Example: calib program poses.csv --for krl
 
     Args:
-        poses: CSV of poses to drive, or a program of such poses
+        poses: CSV of poses to drive, a designed motion (UR, KUKA RSI, ABB EGM), or a program of poses
         controller: the robot's controller; csv: the poses as a table; --list shows all
         source: the controller of a program that is read, if its suffix does not say it
         out: file of the program; by default beside the poses

@@ -14,7 +14,6 @@ No program was run on a real controller. Run it first at low override, beam and 
 import re
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import jinja2
 import numpy as np
@@ -25,6 +24,7 @@ from calib.data.poses.columns import OURS
 from calib.data.poses.pose_lists import joint_columns, read_poses
 from calib.errors import UsageError, require
 from calib.procedure.report.templates import read
+from calib.rooms.controllers.motion import is_motion, setpoints, stream_values
 from calib.rooms.controllers.program_settings import CSV, ProgramSettings
 from calib.rooms.controllers.table import HERE, Controller, controller_named
 from calib.rooms.controllers.targets import is_program, number, read_program
@@ -60,7 +60,7 @@ def program_files(
     """Return the files of a program of the poses in a CSV file or in another program: path → text.
 
     Args:
-        path: CSV of poses (``joint1 [deg]``), or a program whose targets are joints.
+        path: CSV of poses (``joint1 [deg]``) or of a motion (``t [s]``), or a program whose targets are joints.
         out: its name, without the suffix, is the program's; the suffixes are the controller's.
         name: of a controller, or ``csv``: the poses as a table.
         settings: how it moves and waits.
@@ -70,14 +70,16 @@ def program_files(
         UsageError: for an unknown controller, a name that it does not take, another number of axes, and an output where
             it has none.
     """
-    settings, (q, names) = settings or ProgramSettings(), joints_in(path, source)
+    settings, moving = settings or ProgramSettings(), not (source or is_program(path)) and is_motion(path)
     if name == CSV:
+        q, names = joints_in(path, source)
         header, factors = joint_columns(names, ["revolute"] * len(names))
         rows = [",".join(f"{value:.12g}" for value in row) for row in q * factors]
         return {out: "\n".join([",".join(header), *rows, ""])}
     controller, stem = controller_named(name), out.stem
     if not re.fullmatch(controller.names, stem):
         raise UsageError(f"{out}: '{stem}' is no name for a program of {controller.title}: {_words(controller.names)}")
+    q, names = setpoints(path, controller) if moving else joints_in(path, source)
     if controller.axes and q.shape[1] not in controller.axes:
         allowed = " or ".join(map(str, controller.axes))
         raise UsageError(f"{path}: {q.shape[1]} joints ({', '.join(names)}); {controller.title} takes {allowed}")
@@ -85,8 +87,10 @@ def program_files(
         raise UsageError(f"--output: {controller.title} raises no output; the operator presses a key")
     if controller.pulses and (len(settings.pulses) != q.shape[1] or not all(settings.pulses)):
         raise UsageError(f"--pulse: {controller.title} needs the pulses per degree of each of {q.shape[1]} axes")
-    texts = rendered(controller, q, names, stem, settings)
-    return {out.with_name(place.format(name=stem)): content for place, content in texts.items()}
+    values = stream_values(controller, q) if moving else {"poses": _poses(controller, q, settings)}
+    values |= {"name": stem, "joints": names, "head": _head(controller, names, moving), **vars(settings)}
+    texts = controller.stream if moving else controller.files
+    return {out.with_name(place.format(name=stem)): _template(file).render(values) for file, place in texts.items()}
 
 
 def write_program(path: Path, out: Path, name: str) -> list[Path]:
@@ -94,18 +98,13 @@ def write_program(path: Path, out: Path, name: str) -> list[Path]:
     return [files.write(target, content) for target, content in program_files(path, out, name).items()]
 
 
-def rendered(
-    controller: Controller, q: np.ndarray, names: list[str], stem: str, settings: ProgramSettings
-) -> dict[str, str]:
-    """Return the texts of a program of poses (m, n) [rad], by the pattern of the file's name."""
+def _poses(controller: Controller, q: np.ndarray, settings: ProgramSettings) -> list[list[str]]:
+    """Return poses (m, n) [rad] as a controller's programs have them."""
     shown = controller.shown(q) * (np.array(settings.pulses) if controller.pulses else 1.0)
-    poses = [[number(value, controller.decimals) for value in row] for row in shown]
-    values: dict[str, Any] = {"name": stem, "poses": poses, "joints": names, "head": _head(controller, names)}
-    values |= {key: getattr(settings, key) for key in ("settle", "speed", "output")}
-    return {place: _template(file).render(values) for file, place in controller.files.items()}
+    return [[number(value, controller.decimals) for value in row] for row in shown]
 
 
-def _head(controller: Controller, names: list[str]) -> list[str]:
+def _head(controller: Controller, names: list[str], moving: bool) -> list[str]:
     """Return what stands at a program's head: what is not checked, and whose joints these are."""
     way = {1: "+", -1: "-"}
     coupled = [
@@ -113,9 +112,11 @@ def _head(controller: Controller, names: list[str]) -> list[str]:
     ]
     return [
         f"Not run on a real controller; checked by {controller.checked}.",
-        "Simulate first, then run at low override, one pose at a time.",
+        "Simulate first, then run at low override."
+        if moving
+        else "Simulate first; run at low override, one pose at a time.",
         f"Joints: {', '.join(names)}" + "".join(f"; {each}" for each in coupled) + ".",
-        *([f"Joints read at each pose: {controller.keeps}."] if controller.keeps else []),
+        *([f"Joints read at each pose: {controller.keeps}."] if controller.keeps and not moving else []),
     ]
 
 

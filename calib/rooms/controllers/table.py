@@ -7,7 +7,7 @@ joint from another zero, its programs would be wrong: play them in the controlle
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 
@@ -37,6 +37,8 @@ class Controller:
     checked: str
     tool_frame: str = ""
     base_frame: str = ""
+    stream: Mapping[str, str] = field(default_factory=dict)
+    cycle: float = 0.0
     keeps: str = ""
     outputs: bool = True
     mastered: bool = True
