@@ -111,10 +111,8 @@ def _head(controller: Controller, names: list[str], moving: bool) -> list[str]:
         f"axis {axis} = {names[axis - 1]} {way[sign]} {names[other - 1]}" for axis, other, sign in controller.coupled
     ]
     return [
-        f"Not run on a real controller; checked by {controller.checked}.",
-        "Simulate first, then run at low override."
-        if moving
-        else "Simulate first; run at low override, one pose at a time.",
+        "Not run on a real controller" + ("." if moving else f"; checked by {controller.checked}."),
+        "Simulate first, then run at low override" + ("." if moving else ", one pose at a time."),
         f"Joints: {', '.join(names)}" + "".join(f"; {each}" for each in coupled) + ".",
         *([f"Joints read at each pose: {controller.keeps}."] if controller.keeps and not moving else []),
     ]

@@ -49,6 +49,7 @@ class Controller:
     coupled: tuple[tuple[int, int, int], ...] = ()
     joints: str = ""
     pose: str = ""
+    moves: str = ""
     turn: str = ""
     length: str = "m"
     comment: str = ""

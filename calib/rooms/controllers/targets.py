@@ -55,6 +55,11 @@ class Program:
         """Return the indices of the targets of a kind."""
         return [k for k, each in enumerate(self.targets) if each.kind == kind]
 
+    @property
+    def moves(self) -> int:
+        """Number of motion statements, comments aside."""
+        return len(_matches(self.text, self.controller.moves, self.controller.comment))
+
     def joints(self) -> np.ndarray:
         """Return the joint targets (m, n) as joints of a description [rad]."""
         shown = [self.targets[k].values for k in self.of("joints")]
@@ -134,13 +139,18 @@ def read_program(path: Path, controller: str = "") -> Program:
     return Program(path, kind, text, tuple(sorted(found, key=lambda each: each.spans[0])))
 
 
-def _found(text: str, name: str, controller: Controller) -> list[Target]:
-    pattern, targets = getattr(controller, name), []
-    for match in re.finditer(pattern.replace("NUM", NUMBER), text) if pattern else ():
-        begin = text.rfind("\n", 0, match.start()) + 1
-        if controller.comment and controller.comment in text[begin : match.start()]:
-            continue
+def _matches(text: str, pattern: str, comment: str) -> list[re.Match[str]]:
+    """Return what matches a pattern outside comments."""
+    found = re.finditer(pattern.replace("NUM", NUMBER), text) if pattern else ()
+    return [
+        one for one in found if not comment or comment not in text[text.rfind("\n", 0, one.start()) + 1 : one.start()]
+    ]
+
+
+def _found(text: str, kind: str, controller: Controller) -> list[Target]:
+    targets = []
+    for match in _matches(text, getattr(controller, kind), controller.comment):
         places = range(1, len(match.groups()) + 1)
         spans, values = tuple(map(match.span, places)), tuple(float(match[k]) for k in places)
-        targets.append(Target(text.count("\n", 0, match.start()) + 1, spans, values, name))
+        targets.append(Target(text.count("\n", 0, match.start()) + 1, spans, values, kind))
     return targets

@@ -368,12 +368,13 @@ def test_targets_inside_a_program_are_rewritten(cell, fitted, here, calib):
 
 def test_a_target_of_a_program_that_is_not_reached_is_named_with_its_line(cell, fitted, here, calib):
     q = np.degrees(drawn(cell, 20, 5)[0])
-    text = PROGRAM.format(*q, 9e3, 0, 0, 0, 0, 0, more="PTP {A1 400, A2 0, A3 0, A4 0, A5 0, A6 0}\n")
+    text = PROGRAM.format(*q, 9e3, 0, 0, 0, 0, 0, more="PTP {A1 400, A2 0, A3 0, A4 0, A5 0, A6 0}\nPTP_REL {A1 5}\n")
     (here / "part.src").write_text(text)
     code, _, err = calib("compensate", fitted, "part.src", "--out", "sent.src")
     assert code == 2 and "--start" in err and "the first in line 4" in err
     near = ("--start", "0,-1,1,0,1,0", "--partial")
     code, out, err = calib("compensate", fitted, "part.src", "--out", "sent.src", *near)
+    assert "warning: 4 moves, 3 targets" in out
     assert code == 0 and "1 of 3 targets written" in out and "left as it was: line 4: " in out, err
     assert (here / "sent.src").read_text().split("\n")[3:] == text.split("\n")[3:]
     (here / "joints.src").write_text("\n".join(line for line in text.split("\n") if "LIN" not in line))
