@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from sessions import begin, edit
 
+from calib.data.poses.fit_options import FileOptions
+from calib.data.poses.pose_files import read_measurements
 from calib.data.recordings.recording_files import read_recording
 from calib.data.recordings.recording_options import RecordingOptions
 from calib.errors import MeasurementError, UsageError
@@ -175,3 +177,18 @@ def test_a_log_of_a_fanuc_is_read_as_the_descriptions_joints(tmp_path):
     found = read_recording(tmp_path / "log.csv", options=RecordingOptions(controller="fanuc"))
     np.testing.assert_allclose(found.q, q, atol=1e-9)
     np.testing.assert_allclose(found.effort, q, atol=1e-9)
+
+
+@pytest.mark.parametrize("joint", ["q", "J"])
+def test_measured_poses_of_a_fanuc_are_read_as_the_descriptions_joints(tmp_path, joint):
+    """From our columns, and from RoboDK's."""
+    shown = controller_named("fanuc").shown(Q)
+    unit = " [deg]" if joint == "q" else ""
+    head = [*(f"{joint}{k + 1}{unit}" for k in range(6)), *(("x [mm]", "y [mm]", "z [mm]") if unit else "XYZ")]
+    with (tmp_path / "m.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([head, *np.column_stack([shown, 900.0 * np.sin(Q[:, :3])]).tolist()])
+    names = [f"q{k + 1}" for k in range(6)]
+    (found,) = read_measurements(tmp_path / "m.csv", names, FileOptions(controller="fanuc"))
+    np.testing.assert_allclose(found.q, Q, atol=1e-9)
+    with pytest.raises(UsageError, match="controller 'fanuk' is not one of"):
+        read_measurements(tmp_path / "m.csv", names, FileOptions(controller="fanuk"))
