@@ -28,7 +28,7 @@ from calib.rooms.controllers.motion import is_motion, setpoints, stream_values
 from calib.rooms.controllers.program_settings import CSV, ProgramSettings
 from calib.rooms.controllers.table import HERE, Controller, controller_named
 from calib.rooms.controllers.targets import is_program, number, read_program
-from calib.units import ANGLES
+from calib.units import ANGLES, LENGTHS
 
 
 def joints_in(path: Path, source: str = "") -> tuple[np.ndarray, list[str]]:
@@ -48,7 +48,10 @@ def joints_in(path: Path, source: str = "") -> tuple[np.ndarray, list[str]]:
         q = found.joints()
         return q, [f"q{k + 1}" for k in range(q.shape[1])]
     table = read_table(path)
-    names = [name for name, unit in zip(table.header, table.units) if unit.lower() in ANGLES and name not in OURS]
+    named = [(name, unit.lower()) for name, unit in zip(table.header, table.units) if name not in OURS]
+    sliding = [name for name, unit in named if unit in LENGTHS]
+    require(not sliding, f"{path}: programs have turning joints only; {', '.join(sliding)} slides", UsageError)
+    names = [name for name, unit in named if unit in ANGLES]
     words = f"{path}: no column of joint angles, as 'joint1 [deg]'; found {', '.join(table.header)}"
     require(names, words, UsageError)
     return read_poses(path, names), names
