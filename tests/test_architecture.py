@@ -47,7 +47,7 @@ HOMES = {
     "clarabel": ["calib.estimation."],
     "cvxpy": [],  # the tests' independent solver
     "matplotlib": ["calib.procedure.", "calib.api.", "calib.rooms."],
-    "jinja2": ["calib.procedure.report.templates"],
+    "jinja2": ["calib.procedure.report.templates", "calib.rooms.controllers.program"],
     "typst": ["calib.rooms.certificate.rendering"],
     "pyarrow": ["calib.rooms.studies.store"],
     "dask": ["calib.workers.cluster"],

@@ -12,6 +12,7 @@ from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.measurements import KINDS
 from calib.data.schema import BOUNDS, Column
 from calib.errors import MeasurementError, one_of, suggestion
+from calib.extensions import needed
 
 SUFFIXES = ("", "_meas", "_measured")
 POSITION = Column(("x", "y", "z"), "length", "position", BOUNDS.max_length, "mm")
@@ -78,7 +79,9 @@ class Sheet:
     def joints(self, joints: Sequence[str]) -> tuple[np.ndarray, tuple[str, ...]]:
         """Return joint values (m, n) [rad or m] and the file's names of their columns."""
         names = self.find_joints(joints)
-        return self.numbers(names, Column(tuple(joints), "joint", "joints")), names
+        q = self.numbers(names, Column(tuple(joints), "joint", "joints"))
+        name = self.options.controller
+        return needed("as_described")(name, q) if name else q, names
 
     def check_names(self, joints: Sequence[str]) -> None:
         """Refuse options that name a column unknown to both the toolkit and the file."""

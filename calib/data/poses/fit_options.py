@@ -8,6 +8,8 @@ TOML; every key is optional, and an unknown key is refused. Lengths in m, angles
                                      # after the other, "zyx moving" (KUKA's A B C) about axes that turn along, or
                                      # "vector", a rotation vector (UR); wpr is xyz fixed, xyz is xyz moving
     groups = ["tool_position"]       # columns that, with the socket (plane), name one group
+    controller = "fanuc"             # joints are as this controller shows them (signs, axes that count from the
+                                     # horizontal): calib program --list
     station = "tracker A"            # one name for the instrument placement; by default each file has its own
     tool = "ball"                    # the tool's (reflector's) name
     check_limits = true              # refuse joint values outside the robot's limits
@@ -116,6 +118,7 @@ class FileOptions:
     """
 
     kind: Annotated[str, OneOf(tuple(KINDS))] = ""
+    controller: Name = ""
     format: Annotated[str, OneOf(FORMATS)] = ""
     euler: Annotated[str, OneOf(EULER)] = ""
     columns: Mapping[str, Name] = field(default_factory=dict)

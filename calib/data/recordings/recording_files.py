@@ -30,6 +30,7 @@ from calib.data.recordings.recording_options import (
 )
 from calib.data.schema import Joints
 from calib.errors import MeasurementError, refuse_data, suggestion
+from calib.extensions import needed
 from calib.files import check_regular
 
 
@@ -184,7 +185,7 @@ def read_recording(
     options = options or RecordingOptions()
     for name, unit in options.units.items():
         check_units(name, [unit] * len(joints.names if joints else ()), joints, file)
-    recording = _reader(Path(file), (start, stop))(Path(file), joints, options)
+    recording = _described(_reader(Path(file), (start, stop))(Path(file), joints, options), options.controller)
     if (start, stop) != (None, None):
         recording = recording.cut(start, stop)
     if joints is not None and recording.n != len(joints.names):
@@ -194,6 +195,19 @@ def read_recording(
         )
         refuse_data(recording.file, message)
     return check_recording(earlier(recording, options.lag), joints)
+
+
+def _described(recording: Recording, controller: str) -> Recording:
+    """Return a recording of the description's joints from one of joints as a controller shows them."""
+    if not controller:
+        return recording
+    parts = {
+        "as_described": ("q", "v", "q_link", "q_ref"),
+        "motors_as_described": ("effort", "tau_link", "tau_motor", "tau_ff"),
+    }
+    series = {name: (how, getattr(recording, name)) for how, names in parts.items() for name in names}
+    changed = {name: needed(how)(controller, own) for name, (how, own) in series.items() if own is not None}
+    return replace(recording, **changed)
 
 
 def _reader(path: Path, ends: Ends) -> Reader:

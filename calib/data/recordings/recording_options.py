@@ -89,6 +89,7 @@ class RecordingOptions:
         rate: sampling rate of a file without stamps [Hz].
         topic: name of the topic to read, for a ROS bag with several topics of joint states.
         use_range: use only the rows of the file's `use_range` if the path has no cut.
+        controller: joints are as this controller shows them (`calib program --list`); torques take its signs only.
         lag: delay of torques and currents relative to the positions in the same row [s].
         rows: name of the torques to be explained, for messages.
         motors, sensors: whether these need the motors' torques, the torques of sensors after the gears; if they need
@@ -100,6 +101,7 @@ class RecordingOptions:
     units: Annotated[Mapping[str, Text], Checked(_known)] = field(default_factory=dict)
     rate: Positive | None = None
     topic: Name = ""
+    controller: Name = ""
     use_range: Flag = True
     lag: Annotated[float, Real(least=-MAX_LAG, most=MAX_LAG, unit="s")] = 0.0
     rows: Annotated[str, Hidden()] = "motor"

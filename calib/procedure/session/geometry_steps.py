@@ -99,7 +99,9 @@ def _choose(session: Session, chain: Chain, say: Say) -> list[str]:
     unseen = _unseen(session, robot_file, chain, section.validation)
     sets = {POSES: q, UNSEEN: unseen} if section.validation else {POSES: q}
     for name, joints in sets.items():
-        write_poses(session.path(f"2-poses/{name}"), joints, chain.joint_names, joint_kinds(chain))
+        path = write_poses(session.path(f"2-poses/{name}"), joints, chain.joint_names, joint_kinds(chain))
+        if settings.robot.controller:
+            needed("write_program")(path, path.with_suffix(""), settings.robot.controller)
     write_run(session.path(f"2-poses/{WAYS}"), chosen.run, chain)
     if chosen.prediction is not None:
         write_prediction(chosen.prediction, session.path(f"2-poses/{POSES}"))

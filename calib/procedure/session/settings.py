@@ -86,12 +86,14 @@ class RobotSection:
         given: name or file as given to calib new
         base: URDF: first link of the arm; empty: the root
         tip: URDF: last link of the arm; empty: end of the longest chain
+        controller: whose program of the poses is written beside them, as krl; see `calib program --list`
     """
 
     file: Annotated[Name, Checked(_beside)]
     given: Text = ""
     base: Text = ""
     tip: Text = ""
+    controller: Text = ""
 
 
 @strict

@@ -4,6 +4,6 @@ OFFERS = {"commands": "commands:app", "topics": ":TOPICS"}
 TOPICS = {
     "targets": (
         "targets of calib compensate, and the commands it writes",
-        "calib.data.poses.pose_lists calib.rooms.compensation.joint_commands",
+        "calib.data.poses.pose_lists calib.rooms.compensation.joint_commands calib.rooms.compensation.programs",
     )
 }

@@ -23,6 +23,8 @@ from calib.robot.library import load
 from calib.rooms.cells.cell import Cell, SimulatedInstrument, measure, true_poses
 from calib.rooms.cells.virtual_cells import perturbed_cell
 from calib.rooms.compensation import joint_commands
+from calib.rooms.controllers.table import controller_named
+from calib.rooms.controllers.targets import pose_values, read_program
 from calib.transforms import from_quaternion, from_xyz_rpy, rotation_vector, to_quaternion
 
 SIGMA = 20e-6
@@ -335,3 +337,47 @@ def test_commands_for_measured_poses_are_the_joints_they_were_measured_at(
     assert rms["compensated"] < goal
     assert rms["compensated"] < 0.5 * rms["nominal"]
     assert rms["compensated"] == pytest.approx(1e3 * fitted.unseen, rel=0.1)
+
+
+PROGRAM = """DEF part()
+; PTP {{A1 1, A2 2, A3 3, A4 4, A5 5, A6 6}}
+PTP {{A1 {0:.6f}, A2 {1:.6f}, A3 {2:.6f}, A4 {3:.6f}, A5 {4:.6f}, A6 {5:.6f}}} C_PTP
+LIN {{X {6:.6f}, Y {7:.6f}, Z {8:.6f}, A {9:.6f}, B {10:.6f}, C {11:.6f}, S 2, T 35}} C_DIS
+{more}END
+"""
+
+
+def test_targets_inside_a_program_are_rewritten(cell, fitted, here, calib):
+    """A joint target becomes the command that meets it, a pose the one that the nominal robot has there."""
+    q = drawn(cell, 20, 5)[:1]
+    pose = forward(cell.nominal, q)
+    values = [*np.degrees(q[0]), *pose_values(controller_named("krl"), pose)[0]]
+    text = PROGRAM.format(*values, more="")
+    (here / "part.src").write_text(text)
+    near = ",".join(map(str, q[0]))
+    code, _, err = calib("compensate", fitted, "part.src", "--out", "sent.src", "--start", near)
+    assert code == 0, err
+    found, before = read_program(here / "sent.src"), read_program(here / "part.src")
+    assert found.rewritten([np.array(each.values) for each in before.targets]) == text.encode(), "nothing else changed"
+    position, turn = off(forward(cell.nominal, found.joints()), found.poses())
+    assert position < 3e-8 and turn < 1e-7, "both mean the same joints"
+    write(here / "t.csv", Q, q)
+    commanded(calib, fitted)
+    np.testing.assert_allclose(found.joints(), numbers(commands(), Q), atol=2e-8)
+
+
+def test_a_target_of_a_program_that_is_not_reached_is_named_with_its_line(cell, fitted, here, calib):
+    q = np.degrees(drawn(cell, 20, 5)[0])
+    text = PROGRAM.format(*q, 9e3, 0, 0, 0, 0, 0, more="PTP {A1 400, A2 0, A3 0, A4 0, A5 0, A6 0}\nPTP_REL {A1 5}\n")
+    (here / "part.src").write_text(text)
+    code, _, err = calib("compensate", fitted, "part.src", "--out", "sent.src")
+    assert code == 2 and "--start" in err and "the first in line 4" in err
+    near = ("--start", "0,-1,1,0,1,0", "--partial")
+    code, out, err = calib("compensate", fitted, "part.src", "--out", "sent.src", *near)
+    assert "warning: 4 moves, 3 targets" in out
+    assert code == 0 and "1 of 3 targets written" in out and "left as it was: line 4: " in out, err
+    assert (here / "sent.src").read_text().split("\n")[3:] == text.split("\n")[3:]
+    (here / "joints.src").write_text("\n".join(line for line in text.split("\n") if "LIN" not in line))
+    code, _, err = calib("compensate", fitted, "joints.src", "--out", "no.src")
+    assert code == 2 and "line 4: the target itself is outside the limits" in err
+    assert not (here / "no.src").exists()

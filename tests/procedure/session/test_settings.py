@@ -50,6 +50,7 @@ def test_a_session_of_the_version_before_typed_settings_opens(old: Path) -> None
     assert (found.poses.fit, found.instrument.tool) == (16, (0.3, 0.05, 0.02))
     assert found.seed == 1 and found.fit.tolerance_mm == 0.0 and found.dynamics.payloads == {"loaded": 3.28}
     then = tomllib.loads(OLD)
+    then["robot"] |= {"controller": ""}
     then["fit"] |= {"deliverable": "urdf", "holdout": 0.0, "rounds": 3}
     then["dynamics"] |= {"holdout": 0.0, "goals": [], "hard": [], "front": 0, "sigma_percent": 0.0}
     then["certificate"] = dict.fromkeys(vars(CertificateSection()), "")

@@ -1,0 +1,16 @@
+"""Robot controllers: programs of poses for them, targets inside their programs, their logs; what each can be told."""
+
+OFFERS = {
+    "commands": "commands:app",
+    "topics": ":TOPICS",
+    "write_program": "program:write_program",
+    "as_described": "table:as_described",
+    "motors_as_described": "table:motors_as_described",
+}
+TOPICS = {
+    "programs": (
+        "programs for robot controllers, of calib program",
+        "calib.rooms.controllers.program calib.rooms.controllers.motion "
+        "calib.rooms.controllers.targets calib.rooms.controllers.table",
+    )
+}

@@ -1,0 +1,87 @@
+"""Commands for controllers: program, deliver."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calib.cli.shared import command, say
+from calib.rooms.controllers.program_settings import CSV, ProgramSettings
+
+app = typer.Typer()
+
+
+@command(app, "Geometry")
+def program(
+    settings: ProgramSettings,
+    poses: Annotated[Path | None, typer.Argument()] = None,
+    controller: Annotated[str, typer.Option("--for", metavar="NAME")] = "",
+    source: Annotated[str, typer.Option("--from", metavar="NAME")] = "",
+    out: Path | None = None,
+    overwrite: bool = False,
+    listed: Annotated[bool, typer.Option("--list")] = False,
+) -> None:
+    """Write a program that drives the poses of a list, and waits at each for the measurement.
+
+    A program that was edited by hand is read back with --for csv.
+
+    Example: calib program poses.csv --for krl
+
+    Args:
+        poses: CSV of poses to drive, a designed motion (UR, KUKA RSI, ABB EGM), or a program of poses
+        controller: the robot's controller; csv: the poses as a table; --list shows all
+        source: the controller of a program that is read, if its suffix does not say it
+        out: file of the program; by default beside the poses
+        listed: list controllers, with what each can be told of a calibration
+    """
+    from calib import files
+    from calib.errors import UsageError, require
+    from calib.rooms.controllers.program import program_files
+    from calib.rooms.controllers.table import controllers
+
+    if listed:
+        for name, each in controllers().items():
+            say(
+                f"{name}: {each.title}, {', '.join(place.format(name='NAME') for place in each.files.values())}",
+                result=True,
+            )
+            say(
+                f"    takes: {each.takes}", f"    closed: {each.closed}", f"    checked by: {each.checked}", result=True
+            )
+        return
+    known = ", ".join((*controllers(), CSV))
+    require(poses is not None and controller, f"give a list of poses and its controller: --for {known}", UsageError)
+    assert poses is not None
+    target = out or poses.with_suffix(".csv" if controller == CSV else "")
+    texts = program_files(poses, target, controller, settings, source)
+    with files.results([(path, ()) for path in texts], [poses], overwrite):
+        say(*(f"written to {files.write(path, text)}" for path, text in texts.items()))
+
+
+@command(app, "Geometry")
+def deliver(
+    folder: Annotated[Path, typer.Argument(metavar="FIT")],
+    controller: Annotated[str, typer.Option("--for", metavar="NAME")],
+    out: Path | None = None,
+    overwrite: bool = False,
+) -> None:
+    """State a calibration in a controller's words: tool and base frames, mastering offsets, what it cannot take.
+
+    Example: calib deliver fit --for krl
+
+    Args:
+        folder: the folder of a fit, or of a session with a fit
+        controller: the robot's controller: calib program --list
+        out: text file; by default it is printed
+    """
+    from calib import files
+    from calib.procedure.export.geometry import results
+    from calib.rooms.controllers.delivery import delivery_text
+    from calib.rooms.controllers.table import controller_named
+
+    text = delivery_text(folder, controller_named(controller))
+    if out is None:
+        say(text, result=True)
+        return
+    with files.results([(out, (".txt",))], results(folder), overwrite):
+        say(f"written to {files.write(out, text)}")
