@@ -57,7 +57,7 @@ def commands() -> str:
     """Return the page of all commands, by their groups."""
     tree, groups = cli.command_tree(), dict[str, list[Any]]()
     printed = tree.get_help(tree.context_class(tree, info_name="calib"))  # in the order of calib --help
-    for name in re.findall(r"^  ([\w-]+)  ", printed, flags=re.M):
+    for name in re.findall(r"^  (\w[\w-]*)  ", printed, flags=re.M):
         one = tree.commands[name]
         groups.setdefault(str(one.rich_help_panel or "All commands"), []).append(one)
     parts = ["# Commands\n\n`calib COMMAND --help` prints the same.", exit_codes()]

@@ -29,6 +29,7 @@ from calib.data.poses.robodk import recognises
 
 HEAD = 1 << 16  # letters of a file in which its numbers begin (our choice)
 ROWS = 3  # of numbers, alike, that make a table (or as many as there are)
+BEGIN = 60  # lines, without comments, in which the numbers begin (our choice)
 STACK = 7  # rows above the numbers that may name columns
 COMMENTS = ("#", "//", "%", "!")
 UNITS = {
@@ -114,7 +115,7 @@ def _grid(lines: Sequence[str]) -> Grid | None:
     kept = [(i, line) for i, line in enumerate(lines) if line.strip() and not line.lstrip().startswith(COMMENTS)]
     best, most = None, 2
     for separator in "\t;|, ":
-        cells = [(i, _split(line, separator)) for i, line in kept[:200]]
+        cells = [(i, _split(line, separator)) for i, line in kept[:BEGIN]]
         for mark in ".," if separator != "," else ".":
             counts = [sum(bool(_NUMBER[mark].fullmatch(cell)) for cell in row) for _, row in cells]
             for k, (i, row) in enumerate(cells):
