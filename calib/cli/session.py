@@ -83,13 +83,8 @@ def formats(topic: Annotated[str | None, typer.Argument(autocompletion=topics)] 
     Example: calib formats measurements
 
     Args:
-<<<<<<< HEAD
         topic: measurements, instruments, join, images, targets, programs, options, identify-options, identified,
             exports, constraints, mdh, parallel, robot, session, limits, waypoints, excitation, study or recordings
-=======
-        topic: measurements, images, targets, options, identify-options, identified, exports, constraints, mdh,
-            parallel, robot, session, limits, waypoints, excitation, study, recordings, join or instruments
->>>>>>> instr
         schema: the JSON schema of a TOML file, for editors that complete its keys
     """
     from calib.procedure import formats as documents
