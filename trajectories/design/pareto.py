@@ -8,7 +8,7 @@ import numpy as np
 from trajectories.design.objectives import Objective
 from trajectories.design.optimise import design
 from trajectories.design.problem import AttainmentGoal, ExcitationProblem, exact_values, stretched
-from trajectories.design.search import SearchResult, one_start
+from trajectories.design.search import STAGES, SearchResult, one_start
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +80,7 @@ def sweep(
         spot, best = replace(problem, goals=goals), None
         for k in {int(np.argmin(kept)), int(np.argmin(np.abs(table[:, 1] - level)))}:
             guess = np.append(known[k].x, known[k].factor) if problem.free_period else known[k].x
-            run = one_start(spot, evaluations, "slsqp", 0, guess)
+            run = one_start(spot, evaluations, "slsqp", 0, guess, STAGES[1:])
             if isinstance(run, SearchResult) and run.merit < (np.inf if best is None else best.merit):
                 best = run
         if best is not None:

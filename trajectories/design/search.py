@@ -125,11 +125,10 @@ def one_start(
 
     Args:
         evaluations: most, if all of `STAGES` are gone through.
-        stages: those to go through; a given start is not led away by a coarse one: it goes through the first other.
+        stages: those to go through, a given start with the whole family in all of them.
     """
     began, random = time.perf_counter(), isinstance(start, int | np.integer)
-    fine = [tuple(stage for stage in some if not stage.coarse) for some in (stages, STAGES)]
-    chosen = stages if random else fine[0] or fine[1][:1]
+    chosen = tuple(stage if random else stage._replace(coarse=False) for stage in stages)
     extra = problem.extra
     run = StartSearch(*_at_stage(problem, chosen[0], extra))
     if random:

@@ -170,20 +170,24 @@ def _candidates(
     doubted = replace(problem, factor=problem.factor / doubt)
     min_cad_weight = 20.0  # of γ with a CAD
     usual = [g for g in WEIGHTS if g >= min_cad_weight] if references.cad else WEIGHTS[4::3]
+    values = None
     for gamma in usual if weight is None else [weight]:
-        values = solve(doubted, gamma)
+        values = solve(doubted, gamma, values)
         yield _evidence(doubted, gamma, values), gamma, doubted, values, references
 
 
-def solve(problem: BodyCost, gamma: float) -> np.ndarray:
-    """Return argmin of the cost (p,) by Newton's method, starting at the references and staying inside the cone.
+def solve(problem: BodyCost, gamma: float, start: np.ndarray | None = None) -> np.ndarray:
+    """Return argmin of the cost (p,) by Newton's method, staying inside the cone.
 
-    From far off a weak barrier makes Newton's steps short, so all priors are as strong as the data at first and let
-    go by factors of ten, as interior-point methods do.
+    It starts at the optimum for another weight, or at the references. From far off a weak barrier makes Newton's steps
+    short, so from there all priors are as strong as the data at first and let go by factors of ten, as interior-point
+    methods do.
 
     Raises:
         NotConverged: with the last parameters.
     """
+    if start is not None:
+        return _descend(problem, gamma, start)
     values = _reference(problem)
     rest = problem.factor[:, :-1] @ values - problem.factor[:, -1]
     for power in range(max(int(np.ceil(np.log10(1.0 + float(rest @ rest)))), 0), -1, -1):
