@@ -156,7 +156,7 @@ class Plan:
 def designed(plan: Plan, arm: Arm, starts: int, evaluations: int) -> tuple[Reference, list[dict[str, Any]]]:
     """Return one period of a designed trajectory, verified between its samples, and what its front is worth."""
     whole, base = arm.observed
-    excited = excited_model(whole, RUNS, arm.values, friction=True, base=base)
+    excited = excited_model(whole, RUNS, arm.values, friction=True, nominal=lwr4plus.nominal_chain())
     columns = table_4(base) if plan.columns == len(TABLE_4) else np.arange(base.b)
     sigmas = np.tile(NOISE * np.tile(arm.effort, 2), len(RUNS)) if plan.which == "D" else None
     given = ExcitationInputs(
