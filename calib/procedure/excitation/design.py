@@ -37,7 +37,7 @@ from trajectories.design.objectives import (
 )
 from trajectories.design.optimise import design
 from trajectories.design.pareto import Front, proposed_goals, sweep
-from trajectories.design.problem import AttainmentGoal, ExcitationProblem, exact_values
+from trajectories.design.problem import AttainmentGoal, ExcitationProblem, exact_values, merit
 from trajectories.design.search import SearchResult
 from trajectories.design.verify import Verification, dense_motion, ensured
 from trajectories.errors import NothingFeasible
@@ -332,6 +332,7 @@ def search_motion(
     if settings.front and not found.interrupted:
         with suppress(KeyboardInterrupt):  # the motion is there: what comes besides may be cut short
             front = _front(problem, given, found, goals, settings.front, settings.evaluations, report)
+            front, found, proof = _nearest_goals(front, problem, goals, given, (found, proof), checked)
     with finishing():
         played = play(problem.family, found, given, settings)
         condition_found = _condition_of(given, problem.family, found, settings.repeat)
@@ -500,6 +501,30 @@ def _constraints(
         for one in (dynamics.smooth, dynamics.exact)
     ]  # fmt: skip
     return (*limits.constraints, torque[0]), (*limits.constraints, torque[1]), notes
+
+
+def _nearest_goals(
+    front: Front,
+    problem: ExcitationProblem,
+    goals: list[AttainmentGoal],
+    given: ExcitationInputs,
+    designed: tuple[SearchResult, Verification],
+    checked: tuple[MotionConstraint, ...],
+) -> tuple[Front, SearchResult, Verification]:
+    """Return the front, and of its motions and the designed one that which comes nearest to the goals, verified."""
+
+    def missed(run: SearchResult) -> float:
+        return merit(problem, np.array(_reached(problem, goals, run, given)))
+
+    if not goals:
+        return front, *designed
+    best = int(np.argmin([missed(run) for run in front.found]))
+    moved = replace(designed[0], x=front.found[best].x, factor=front.found[best].factor)
+    with suppress(NothingFeasible):
+        moved, proof = ensured(problem, moved, checked)
+        if missed(moved) < missed(designed[0]):
+            return replace(front, designed=best), moved, proof
+    return front, *designed
 
 
 def _front(
