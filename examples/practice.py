@@ -154,7 +154,7 @@ def platform(folder: str) -> None:
     for name, carried in (("empty", ()), ("load", ("plate",)), ("other", ("plate",))):
         angle = order * t[:, None] + rng.uniform(0, 6, (4, 1, 3))
         size = np.array([0.02, 0.02, 0.12])
-        plan = PlatformRegressor(model, np.arange(model.p), values, 10.0, carried)
+        plan = PlatformRegressor(model, np.arange(model.p), values, carried)
         motion = plan.motion(*((size * part).sum(axis=0) for part in (
             np.sin(angle), order * np.cos(angle), -(order**2) * np.sin(angle)
         )))  # fmt: skip
