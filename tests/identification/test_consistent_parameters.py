@@ -156,6 +156,14 @@ def problem_of(data: Information) -> BodyCost:
     return make_problem(data, next(find_prior_bodies(data.chain, data.dynamics.model)))
 
 
+def test_the_optimum_is_the_same_from_that_of_another_weight():
+    _, model, _, information = planted(3)
+    problem = make_problem(information, next(find_prior_bodies(arm(None), model)))
+    cold = solve.solve(problem, 1e3)
+    warm = solve.solve(problem, 1e3, solve.solve(problem, 10.0))
+    assert np.abs(warm - cold).max() < 1e-6 * np.abs(cold).max()
+
+
 def test_slope_and_curvature_are_those_of_the_cost():
     _, _, _, data = planted(6, noise=1.0)
     problem = problem_of(data)

@@ -61,7 +61,7 @@ def find_prior_bodies(chain: Chain, model: IdentificationModel) -> Iterator[Prio
         return
     for total in TOTALS:
         bodies = rods(chain, model, total)
-        words = f"the robot's description has no masses: rods between the joints, {total:.3g} kg in all by evidence"
+        words = f"rods between the joints (the description has no masses), {total:.3g} kg in all by evidence"
         yield PriorBodies(bodies, ~carried, False, words)
 
 

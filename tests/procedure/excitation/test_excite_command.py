@@ -467,6 +467,16 @@ def test_a_goal_out_of_reach_is_named():
 
 
 @pytest.mark.slow
+def test_a_front_serves_the_goals():
+    """With a coarse family to begin with; what is designed is as near to the goals as any motion of the front."""
+    goals = ("normalised=6", "wrist=0.1")
+    settings = replace(SHORT, goals=goals, period=20.0, harmonics=12, evaluations=60, front=3, outlook=False)
+    found = design.excite("tx40", settings)
+    missed = (found.front.values - [6.0, 0.9]) / [6.0, 0.9]
+    assert missed[found.front.designed].max() < missed.max(axis=1).min() + 0.02 and found.proof.feasible
+
+
+@pytest.mark.slow
 def test_a_torque_goal_works_before_friction_is_known():
     """Typical friction stands in for what nobody knows yet, so that condition numbers do not pay for a goal in vain."""
     settings = replace(SHORT, starts=2, evaluations=300, outlook=False)
