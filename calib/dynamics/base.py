@@ -111,16 +111,6 @@ class BaseModel:
     def units(self) -> tuple[str, ...]:
         return self.base.units
 
-    def among(self, names: Sequence[str]) -> list[int] | None:
-        """Return where each base parameter stands among others' names; None if one does not.
-
-        What is regrouped into it, and so the R of its name, may differ by another geometry or by joint corrections.
-        """
-        standard = self.model.names
-        place = {standard_name(name, standard): k for k, name in enumerate(names)}
-        own = [standard[k] for k in self.base.kept]
-        return [place[name] for name in own] if set(own) <= set(place) else None
-
     def regressor(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the base regressor (N, rows, b) at q, v, a (N, n), with all payloads."""
         full = self.model.regressor(q, v, a)
@@ -235,6 +225,16 @@ def expressions(base: Base) -> tuple[str, ...]:
 def standard_name(name: str, standard: Collection[str]) -> str:
     """Return the standard parameter of a base parameter's name in a file: ``ZZ1`` for ``ZZ1R``."""
     return name[:-1] if name.endswith("R") and name not in standard and name[:-1] in standard else name
+
+
+def places(own: Sequence[str], names: Sequence[str], standard: Collection[str]) -> list[int] | None:
+    """Return where each base parameter of `own` stands among others' names; None if one does not.
+
+    What is regrouped into it, and so the R of its name, may differ by another geometry or by joint corrections.
+    """
+    there = {standard_name(name, standard): k for k, name in enumerate(names)}
+    wanted = [standard_name(name, standard) for name in own]
+    return [there[name] for name in wanted] if set(wanted) <= set(there) else None
 
 
 def _updated(triangle: np.ndarray, columns: np.ndarray) -> np.ndarray:

@@ -71,6 +71,7 @@ def test_waypoints_limits_and_poses_in_memory_are_those_of_files(tmp_path):
         calib.plan_motion("ur5", way, limits={"velocity": {"q9": 1.0}})
 
 
+@pytest.mark.slow
 def test_constraints_and_poses_measured_before_are_values_too(tmp_path):
     (tmp_path / "c.toml").write_text("[joints]\nq1 = [-1.0, 1.0]\n")
     (tmp_path / "p.csv").write_text("\n".join(["q1,q2,q3,q4,q5,q6", *(",".join(map(str, q)) for q in Q[:20])]))

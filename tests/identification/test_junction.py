@@ -54,7 +54,9 @@ def test_fit_and_identification_in_one_process_equal_the_way_through_files(model
 
     kept = calibrated.read(identified.write_folder(through, tmp_path / "model"))
     np.testing.assert_allclose(kept.covariance, robot.covariance, **close)
-    assert kept.corrections is None and np.array_equal(kept.chain.values, robot.chain.values)
+    assert (kept.corrections is None) == (robot.corrections is None) and np.array_equal(
+        kept.chain.values, robot.chain.values
+    )
 
 
 def test_a_calibrated_robot_reads_back_as_it_was_written(tmp_path):

@@ -70,6 +70,7 @@ def test_one_rigid_body_is_read_as_a_pose_and_markers_as_several_targets(tmp_pat
         "t,q_a,q_b,tau_a\n0,1,2,3\n1,1,2,3\n",
         "1,2,3\n4,5,6\n",
         "a,b\n1,5,2,5\n",
+        "joint,unit,reading,command,sigma\njoint1,rad,0,0,\njoint2,rad,1,2,3\njoint3,rad,1,2,3\n",
     ],
 )
 def test_our_tables_are_left_alone(tmp_path, text):

@@ -49,6 +49,7 @@ def test_columns_are_sums_over_the_legs(rows):
     assert len(model.columns) == model.p - model.inertial and model.columns[0].name == "Ia11"
 
 
+@pytest.mark.slow
 def test_identical_legs_have_smaller_sigma_and_are_tested(tmp_path):
     """Truth within 4 σ, no finding, and the same file for other commands; a leg that is 20 % off is named."""
     alike, apart = identified(identical_legs=True, prior="none"), identified(prior="none")

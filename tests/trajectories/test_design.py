@@ -239,6 +239,7 @@ def test_a_motion_that_breaks_its_limits_is_searched_again():
     assert proof.feasible and again.evaluations > found.evaluations
 
 
+@pytest.mark.slow
 def test_a_wall_thinner_than_a_step_is_not_jumped_over():
     """Joint 1 must stay on one side of 0.3 rad, which samples 0.6 s apart do not see."""
     wall = Clearance(

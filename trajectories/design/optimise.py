@@ -30,7 +30,7 @@ class Round(NamedTuple):
         return max(1, round(self.share * starts))
 
 
-ROUNDS = (Round(STAGES[:1], 1.0), Round(STAGES[1:2], 1 / 2), Round(STAGES[2:], 1 / 6))
+ROUNDS = (Round(STAGES[:2], 1.0), Round(STAGES[2:], 1 / 3))
 """Our choice."""
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from calib.config import Tables
 from calib.dynamics import base as base_parameters
 from calib.dynamics import drives
-from calib.dynamics.base import BaseModel, columns_at_rest, information, standard_name
+from calib.dynamics.base import columns_at_rest, information, places, standard_name
 from calib.dynamics.bodies import STANDARD, Bodies, bodies_of, standard_parameters, with_payload
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.load_cases import LoadCases
@@ -391,10 +391,10 @@ def excited_model(
     )
 
 
-def _covariance(path: Path, model: BaseModel) -> np.ndarray | None:
+def _covariance(path: Path, model: LoadCases) -> np.ndarray | None:
     """Return the covariance of a model's columns; None if the file has other columns."""
     known, covariance = read_covariance(path) if path.is_file() else ((), np.empty((0, 0)))
-    index = model.among(known)
+    index = places(model.names, known, model.model.names)
     return None if index is None else covariance[np.ix_(index, index)]
 
 

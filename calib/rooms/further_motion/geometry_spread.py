@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.data import csv_table
+from calib.dynamics.base import places
 from calib.dynamics.load_cases import LoadCases
 from calib.procedure.dynamic_stage.geometry_tables import SENSITIVITY, TORQUE_COVARIANCE
 from calib.procedure.excitation.inputs import ExcitedModel, moved_to
@@ -61,7 +62,7 @@ def geometry_spread(
     before = np.zeros((len(exact.names), errors.shape[1]))
     if stored is not None:
         names, *columns = csv_table.read_table(stored).cells  # an element each, then two tilts
-        index = exact.among(names.tolist())
+        index = places(exact.names, names.tolist(), exact.model.names)
         if index is None:
             return None
         before = (np.column_stack(columns[: len(errors)]) @ errors)[index]

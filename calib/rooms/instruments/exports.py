@@ -74,7 +74,7 @@ def presets() -> dict[str, dict[str, str]]:
 
 
 def translated(path: str | Path) -> Export | None:
-    """Return the file at `path` as a table of the toolkit; None where it is one already, or no table at all."""
+    """Return the file at `path` as a table of the toolkit; None where it is one already, or no table of positions."""
     with open(path, "rb") as file:
         begin = file.read(HEAD)
         utf16 = begin[:2] in (b"\xff\xfe", b"\xfe\xff")
@@ -91,7 +91,7 @@ def translated(path: str | Path) -> Export | None:
         length = UNITS.get(stated[1].lower(), "") if stated else ""
         plain = not known and grid.mark == "." and not utf16 and not said
         begins = next((i for i, line in enumerate(lines) if line.strip() and not line.startswith("#")), 0)
-        if not names or (plain and begins == grid.first - 1):
+        if not (recognises(names) or _is_ours(names)) or (plain and begins == grid.first - 1):
             return None
         text = (begin + file.read()).decode("utf-16" if utf16 else "utf-8-sig", errors="replace")
     units = [length if not unit and re.fullmatch(r"[xyz]\d*", name) else unit for name, unit in zip(names, units)]

@@ -341,7 +341,7 @@ def test_bad_input_is_refused_with_exit_code_2(cell, calib, extra, options, word
 @pytest.mark.parametrize(
     ("extra", "changed", "words"),
     [
-        ("[torque]\nall = 0.05", {"lock": ("joint2=1.57",)}, r"breaks the torque limit .*that of \[torque\]"),
+        ("[torque]\nall = 5.0", {"lock": ("joint2=1.57",)}, r"breaks the torque limit .*that of \[torque\]"),
         ("", {"hard": ("wrist=0.9",)}, "hard goal wrist=0.9 was not reached"),
     ],
 )
@@ -399,6 +399,7 @@ def test_collision_distances_are_kept_with_a_slope(tmp_path):
 PAYLOAD = {"rows": "both", "payload": {"load": {"mass": 3.28, "com": [0.0, 0.0, 0.05]}}}
 
 
+@pytest.mark.slow
 def test_the_design_is_for_the_model_that_will_be_identified():
     """Both torque rows, runs without and with the payload: 102 columns, and both loads keep the torque limits."""
     options = parse_options(PAYLOAD).settings
@@ -437,6 +438,7 @@ def test_stated_noise_weighs_rows_and_predicts():
         read_inputs("lwr4plus", replace(SHORT, noise=0.02), limits={"noise": {"all": 1.0}})
 
 
+@pytest.mark.slow
 def test_designs_for_predicted_sigmas_predict_smaller_ones():
     """Of torques on the typical task, and of the parameters relative to their values."""
     found = {goal: design.excite("lwr4plus", replace(SHORT, goals=goal)) for goal in ((), ("torque",), ("parameters",))}

@@ -158,10 +158,10 @@ def test_a_session_with_images_goes_to_its_certificate(cell, tmp_path):
     said: list[str] = []
     stop = go_on(tmp_path / "s", said.append, SILENT, "test", plots=False)
     asked = " ".join(stop.lines)
-    assert "take an image of the board" in asked and "joints.csv (image, joint1 [deg]" in asked
+    assert "take an image of the board" in asked.lower() and "joints.csv (image, joint1 [deg]" in asked
     assert "board.toml" in asked and "3-measured/validation" in asked
     session, names = open_session(tmp_path / "s"), cell.cell.nominal.joint_names
-    for seed, (plan, name) in enumerate((("poses", "measured"), ("validation", "validation"))):
+    for seed, (plan, name) in enumerate((("poses", "measured"), ("validation_poses", "validation_measured"))):
         q = read_poses(session.path(f"2-poses/{plan}.csv"), names)
         shots(cell, q, seed, session.path(f"3-measured/{name}"))
     stop = go_on(tmp_path / "s", said.append, SILENT, "test", plots=False)
@@ -170,7 +170,7 @@ def test_a_session_with_images_goes_to_its_certificate(cell, tmp_path):
     assert "the board sets the scale (30 mm per square)" in told
     assert stop.verdict == "pass"
     found = json.loads(session.path("5-validation/metrics.json").read_text())
-    unseen = found["validation"]["validation"]
+    unseen = found["validation"]["validation_measured"]
     assert unseen["reprojection_px"]["calibrated"] < 0.2 < unseen["reprojection_px"]["nominal"]
     assert go_on(tmp_path / "s", said.append, SILENT, "test", plots=False).verdict == "pass"
 

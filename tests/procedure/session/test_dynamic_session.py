@@ -71,6 +71,7 @@ PLAIN = re.compile(  # columns that have no unit, or have it in a column of thei
 )
 
 
+@pytest.mark.slow
 def test_no_column_of_a_session_lacks_its_unit(whole: Session) -> None:
     """Joints above all: those of what is to be driven, of what was, of motions and of torques."""
     seen = 0
