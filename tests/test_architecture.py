@@ -4,6 +4,7 @@ import ast
 import re
 import subprocess
 import sys
+import tomllib
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -178,3 +179,15 @@ def test_the_command_line_starts_light(loaded):
     """`calib --help` loads neither Pinocchio nor matplotlib nor the optimisers."""
     heavy = {"pinocchio", "matplotlib", "scipy", "numpy", "nlopt", "cvxpy", "jinja2", "numba"}
     assert "calib.cli" in loaded["command line"] and heavy & loaded["command line"] == set()
+
+
+def test_every_file_of_the_packages_is_installed():
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
+    installed = {
+        path
+        for name, patterns in declared.items()
+        for one in patterns
+        for path in ROOT.joinpath(*name.split(".")).glob(one)
+    }
+    there = {path for package in PACKAGES for path in (ROOT / package).rglob("*") if path.is_file()}
+    assert {path for path in there if path.suffix != ".py" and "__pycache__" not in path.parts} == installed
