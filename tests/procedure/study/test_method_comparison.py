@@ -88,7 +88,10 @@ def test_without_unseen_motion_there_is_no_ranking(robot: Path, tmp_path: Path):
         compare_methods(gather(robot, [recorded(tmp_path)[0]]))
 
 
-def test_the_command_writes_what_it_shows(robot: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_the_command_writes_what_it_shows(
+    robot: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("COLUMNS", "160")
     train, other = recorded(tmp_path)
     words = ["compare", str(robot), str(train), "--validate", str(other), "--methods", "wls,ols"]
     assert run([*words, "--out", str(tmp_path / "methods.csv")]) == 0
