@@ -42,8 +42,8 @@ def _unchecked(found: DynamicReport, tolerance: float) -> Iterator[str]:
 
 def _findings(found: DynamicReport) -> list[str]:
     """Return what was noticed, without what stands under uncertainty."""
-    said = _noticed(found)
-    return [line for line in warnings_of(found) if not any(line.startswith(one) for one in said)]
+    said = tuple(_noticed(found))
+    return [line for line in warnings_of(found) if not line.startswith(said)]
 
 
 def _noticed(found: DynamicReport) -> list[str]:

@@ -58,8 +58,8 @@ def _unchecked(report: Report) -> Iterator[str]:
 
 def _findings(metrics: FitMetrics) -> list[str]:
     """Return what was noticed, worst first, without what stands under uncertainty."""
-    said = set(_noticed(metrics))
-    return [line for line in metrics.warnings if not any(line.startswith(one) for one in said)]
+    said = tuple(_noticed(metrics))
+    return [line for line in metrics.warnings if not line.startswith(said)]
 
 
 def _noticed(metrics: FitMetrics) -> list[str]:
