@@ -85,6 +85,8 @@ def test_a_wrong_order_of_rows_is_noticed_and_points_of_another_arm_are_refused(
     other = write(tmp_path / "o.csv", POINT, seen(arm, random_joints(arm, 40, 9)))
     with pytest.raises(MeasurementError, match="not those of these 40 poses in any order"):
         calib.join(joints, other, robot="lwr4plus")
+    with pytest.raises(UsageError, match="by 'rows' is not one of name, time, row, geometry"):
+        calib.join(joints, other, by="rows")
 
 
 def test_readings_5_mm_apart_are_named_and_near_ones_averaged_with_their_scatter(tmp_path, joints, arm, q):

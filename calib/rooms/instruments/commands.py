@@ -35,11 +35,9 @@ def join(
         by: how rows are matched. Default: the first that both files have columns for
         robot: its nominal geometry checks the order, or finds it (--by geometry)
     """
-    from calib.errors import one_of
     from calib.files import results
     from calib.rooms.instruments import joining
 
-    one_of(by or "row", joining.WAYS, "--by")
     with results([(out, (".csv",))], [joints, points, robot], overwrite):
         joined = joining.join(joints, points, by=by, robot=robot, base=base, tip=tip)
         joined.write(out)

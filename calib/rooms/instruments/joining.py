@@ -32,7 +32,7 @@ from calib.arguments import checked
 from calib.data.csv_table import Table, read_table
 from calib.data.poses.columns import POSITION, SIGMA, Sheet
 from calib.data.poses.measurements import PoseMeasurements
-from calib.errors import MeasurementError, UsageError, counted, finding, listing, refuse_data, require
+from calib.errors import MeasurementError, UsageError, counted, finding, listing, one_of, refuse_data, require
 from calib.geometry.first_guess import check_scale
 from calib.procedure.findings import lines_of
 from calib.robot.calibrated import CalibratedChain
@@ -94,8 +94,10 @@ def join(
         The table, the index of each row's pose, and notes; ``write(path)`` writes the CSV that `fit_geometry` takes.
 
     Raises:
+        UsageError: for another `by`, or one that the files have no columns for.
         MeasurementError: where the files do not go together.
     """
+    one_of(by or "row", WAYS, "by", UsageError)
     arm = load_calibrated(robot, base, tip) if isinstance(robot, str | Path) else robot
     return _joined(read_table(joints), read_table(points), by, arm and arm.complete)
 
