@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from calib.errors import MeasurementError, UsageError
 from calib.rooms.controllers.table import Controller, controller_of
 from calib.transforms import pose as pose_of
-from calib.units import ANGLES, DEG
+from calib.units import ANGLES
 
 NUMBER = r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)"
 ENCODING = "latin-1"  # one letter for each byte, whatever the program is in
@@ -95,19 +95,24 @@ def pose_values(controller: Controller, poses: np.ndarray) -> np.ndarray:
     elif turn == "vector":
         angles = rotation.as_rotvec()
     else:
-        angles = rotation.as_euler(_order(turn), degrees=not turn.endswith("rad"))
+        order, degrees = _order(turn)
+        angles = rotation.as_euler(order, degrees)
     return np.concatenate([poses[:, :3, 3] / controller.metres, angles], axis=1)
 
 
 def _rotation(turn: str, values: np.ndarray) -> Rotation:
     if turn == "wxyz":
         return Rotation.from_quat(values[:, [1, 2, 3, 0]])
-    return Rotation.from_rotvec(values) if turn == "vector" else Rotation.from_euler(_order(turn), values * DEG)
+    if turn == "vector":
+        return Rotation.from_rotvec(values)
+    order, degrees = _order(turn)
+    return Rotation.from_euler(order, values, degrees)
 
 
-def _order(turn: str) -> str:
-    axes, how = turn.split()[:2]
-    return axes.upper() if how == "moving" else axes
+def _order(turn: str) -> tuple[str, bool]:
+    """Return the axes of a pose's angles as SciPy names them, and whether the angles are in degrees."""
+    axes, how, *unit = turn.split()
+    return axes.upper() if how == "moving" else axes, unit != ["rad"]
 
 
 def is_program(path: Path) -> bool:
