@@ -1,8 +1,7 @@
 """Search for exciting motions: sequential quadratic programming from several feasible starts, gradients exact.
 
 A start is a random motion inside the joint limits (`trajectories.design.starts`); if it breaks another constraint it is
-repaired (the squared excess is minimised), then searched from (`trajectories.design.search`). After each round of
-stages only the best go on (successive halving, Jamieson & Talwalkar 2016).
+repaired (the squared excess is minimised), then searched from (`trajectories.design.search`).
 """
 
 import time
@@ -10,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from itertools import takewhile
-from typing import NamedTuple, get_args
+from typing import get_args
 
 import numpy as np
 
@@ -18,20 +17,7 @@ from trajectories.design.problem import ExcitationProblem, exact_values, stretch
 from trajectories.design.search import STAGES, Method, SearchResult, Stage, Stuck, one_start
 from trajectories.errors import BadInput, NotExciting, NothingFeasible, require
 
-
-class Round(NamedTuple):
-    """Stages that a share of the starts goes through, those with the best motions so far."""
-
-    stages: tuple[Stage, ...]
-    share: float
-
-    def count(self, starts: int) -> int:
-        """Return the number of starts that go through this round."""
-        return max(1, round(self.share * starts))
-
-
-ROUNDS = (Round(STAGES[:2], 1.0), Round(STAGES[2:], 1 / 3))
-"""Our choice."""
+KEPT = 1 / 3  # of the starts, which the last stages are for (our choice)
 
 
 def design(
@@ -65,45 +51,40 @@ def design(
     began = time.perf_counter()
     tasks: list[int | np.ndarray] = [*guesses, *range(starts)]
     require(tasks, "no starts: ask for at least one, or give an initial guess")
-    search = _Starts(problem, evaluations, method, seed, map, report, sum(one.count(len(tasks)) for one in ROUNDS))
+    search, polished = _Starts(problem, evaluations, method, seed, map, report, len(tasks)), list[SearchResult]()
     try:
-        ranked = tasks
-        for one in ROUNDS:
-            ranked = search.run(ranked[: one.count(len(tasks))], one.stages)
+        search.run(tasks, STAGES[:2])
+        if not search.interrupted:
+            polished = search.run(search.promising(), STAGES[2:])
     except KeyboardInterrupt:
-        if not any(search.found):
+        if not search.found:
             raise
         search.interrupted = True
-    if not any(search.found):
+    if not search.found:
         raise _nothing(problem, search.stuck, len(tasks))
-    best = min(next(filter(None, reversed(search.found))), key=lambda one: one.merit)
+    best = min(polished or search.found, key=lambda one: one.merit)
+    share = sum(one.feasible * one.evaluations for one in search.found) / search.spent
     return replace(
-        best, evaluations=search.spent, feasible=search.kept / search.spent, seconds=time.perf_counter() - began,
+        best, evaluations=search.spent, feasible=share, seconds=time.perf_counter() - began,
         interrupted=search.interrupted,
     )  # fmt: skip
 
 
 class _Starts:
-    """Searches from several starts, in rounds.
-
-    Attributes:
-        found: motions of each round; `stuck`: searches without one.
-        spent: evaluations, of which `kept` kept all constraints.
-    """
+    """Searches from several starts, in rounds."""
 
     def __init__(
         self, problem: ExcitationProblem, evaluations: int, method: Method, seed: int, map: Callable,
-        report: Callable[[int, int, str], None] | None, total: int,
+        report: Callable[[int, int, str], None] | None, starts: int,
     ):  # fmt: skip
         self.problem, self.arguments, self.map, self.report = problem, (evaluations, method, seed), map, report
-        self.found, self.stuck = list[list[SearchResult]](), list[Stuck]()
-        self.done, self.total = 0, total
-        self.spent, self.kept, self.interrupted = 0, 0.0, False
+        self.found, self.stuck = list[SearchResult](), list[Stuck]()
+        self.done, self.total = 0, starts + _kept(starts)
+        self.spent, self.interrupted = 0, False
 
-    def run(self, tasks: list[int | np.ndarray], stages: tuple[Stage, ...]) -> list[int | np.ndarray]:
-        """Run the given stages of the search for each task; return the variables, infeasible ones last."""
-        fresh, stuck = list[SearchResult](), list[Stuck]()
-        self.found.append(fresh)
+    def run(self, tasks: list[int | np.ndarray], stages: tuple[Stage, ...]) -> list[SearchResult]:
+        """Run the given stages of the search for each task; return the results."""
+        fresh = list[SearchResult]()
         # a map in other processes may still hand back what it has
         wanted = takewhile(lambda _: not self.interrupted, tasks)
         for run in self.map(partial(one_start, self.problem, *self.arguments, stages=stages), wanted):
@@ -111,16 +92,26 @@ class _Starts:
             self.done += 1
             if isinstance(run, SearchResult):
                 fresh.append(run)
-                self.kept += run.feasible * run.evaluations
+                self.found.append(run)
                 self.interrupted |= run.interrupted
             else:
-                stuck.append(run)
+                self.stuck.append(run)
             if self.report:
-                best = min((one.merit for one in fresh), default=np.inf)
-                self.report(self.done, self.total, f"best so far {best:.4g}" if fresh else "nothing feasible yet")
-        self.stuck += stuck
-        ranked = sorted(fresh, key=lambda one: one.merit) + sorted(stuck, key=lambda one: one.excess)
-        return [np.append(one.x, one.factor) if self.problem.free_period else one.x for one in ranked]
+                best = min((one.merit for one in self.found), default=np.inf)
+                words = f"best so far {best:.4g}" if self.found else "nothing feasible yet"
+                self.report(self.done, self.total, words)
+        return fresh
+
+    def promising(self) -> list[int | np.ndarray]:
+        """Return the variables of the best motions so far; infeasible ones last, by constraint violation."""
+        ranked = sorted(self.found, key=lambda one: one.merit) + sorted(self.stuck, key=lambda one: one.excess)
+        chosen = ranked[: _kept(len(ranked))]
+        return [np.append(one.x, one.factor) if self.problem.free_period else one.x for one in chosen]
+
+
+def _kept(starts: int) -> int:
+    """Return the number of starts to search to the end."""
+    return max(1, round(KEPT * starts))
 
 
 def _nothing(problem: ExcitationProblem, stuck: list[Stuck], starts: int) -> NothingFeasible:

@@ -103,7 +103,7 @@ class ExcitationSettings:
     columns: tuple[str, ...] = ()
     rate: Rate = 1000.0
     samples: Annotated[int, Whole(10, 100_000)] = 200
-    starts: Starts = 6
+    starts: Starts = 4
     evaluations: Evaluations = 1500
     solver: Annotated[Solver, OneOf(get_args(Solver))] = "slsqp"
     seed: Seed = 0
