@@ -165,7 +165,7 @@ def _options_of(session: Session, paths: Sequence[Path] = ()) -> FitOptions:
     lists = {path: session.path(f"2-poses/{UNSEEN if path in unseen else POSES}") for path in paths}
     there = {path: plan for path, plan in lists.items() if session.settings.poses.plan and plan.exists()}
     own = {path.name: replace(options.for_file(path), planned=str(plan)) for path, plan in there.items()}
-    files = {name: stated(each) for name, each in {**own, **options.files, **own}.items()}
+    files = {name: stated(each) for name, each in {**options.files, **own}.items()}
     return replace(options, sigma=stated(options).sigma, files=files)
 
 
