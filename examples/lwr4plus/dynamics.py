@@ -3,13 +3,14 @@
 Kolyubin, Shiriaev & Jubien (2019), Int. J. Adv. Manuf. Technol. 101, 243-259, sections 4 and 6.2, on a simulated arm:
 the calibrated column of their Table 2, a 3.28 kg payload, joint torque sensors, 1 kHz, 10 Hz Butterworth, decimation to
 2 Hz. *Calibrated* is the geometry fitted to 17 measured poses. The motion is Trajectory B of 44 columns, as
-`excitation.py` designs it; torques are predicted on it again and on a random Fourier series of 25 s and five harmonics.
+`excitation.py` designed it (``trajectory.toml``); torques are predicted on it again and on a random Fourier series of
+25 s and five harmonics.
 
 What is by construction: see `simulated_arm.py`. The counts, and which inertial parameters turn out essential, do not
 depend on that. How many are essential depends on the noise and the rule: the paper supervised its rule by hand; here an
 F-test, then whatever has an RSD above 10 % goes, and the paper's own ratio of RSDs is shown beside it.
 
-    python examples/lwr4plus/dynamics.py --out lwr4plus-dynamics [--quick] [--seed 0]
+    python examples/lwr4plus/dynamics.py --out lwr4plus-dynamics [--seed 0]
 """
 
 from __future__ import annotations
@@ -18,11 +19,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import excitation
 import geometry
 import numpy as np
 import study_options
 import study_tables
+from excitation import RATE
 from matplotlib.figure import Figure
 from simulated_arm import TABLE_4, Data, collected, controller, model, nominal_base, record, true_chain, true_parameters
 
@@ -34,6 +35,7 @@ from calib.dynamics.torque_rows import BOTH, MODELS, MOTOR, TorqueRows
 from calib.estimation.essential import Elimination, Rule, eliminate
 from calib.estimation.linear import LinearFit, settled_std, wls
 from calib.identification.rows import observe
+from calib.procedure.excitation import coefficients
 from calib.procedure.report.style import AFTER, INK, PAGE_WIDTH, QUIET, save, sheet, styled
 from calib.robot.chain import Chain
 from calib.rooms.cells import lwr4plus
@@ -41,7 +43,6 @@ from calib.rooms.cells.known_robots import random_fourier
 from calib.rooms.closed_loop.controllers import Reference
 from calib.rooms.closed_loop.simulation import Plant, feed_forward, tracking_error
 
-RATE = excitation.RATE
 REACH = 0.8 * np.deg2rad([170.0, 120.0, 170.0, 120.0, 170.0, 90.0, 170.0])
 SPEED = 0.8 * np.deg2rad([110.0, 110.0, 128.0, 128.0, 204.0, 184.0, 184.0])
 PAPER_JOINT_6 = 0.5  # [N m], within which Fig. 8's joint 6 stays "along most of the validation trajectory"
@@ -69,10 +70,11 @@ def counts() -> dict[str, int]:
     return found
 
 
-def trajectory_b(quick: bool, seed: int) -> Reference:
-    """Return one period of Trajectory B, 44 columns, designed with the current estimate of the arm."""
-    effort = (1, 60) if quick else (excitation.STARTS, excitation.EVALUATIONS)
-    return excitation.designed(excitation.Plan("B", 44, seed=seed), excitation.estimate(seed), *effort)[0]
+def trajectory_b() -> Reference:
+    """Return one period of Trajectory B, 44 columns, as kept of `excitation.py`'s first seed."""
+    found = coefficients.read(Path(__file__).parent)
+    t = np.arange(round(found.period * RATE)) / RATE
+    return Reference(t, *found.orders(t))
 
 
 def fourier(seed: list[int]) -> Reference:
@@ -192,11 +194,11 @@ def published(found: Fit) -> dict[str, dict[str, float]]:
     }
 
 
-def run(out: Path, quick: bool = False, seed: int = 0) -> dict[str, Any]:
+def run(out: Path, seed: int = 0) -> dict[str, Any]:
     """Run the study; write and return the metrics."""
     nominal, truth = lwr4plus.nominal_chain(), true_chain()
     calibrated = geometry.fitted_arm(seed)
-    training, other = trajectory_b(quick, seed), fourier([seed, 1001])
+    training, other = trajectory_b(), fourier([seed, 1001])
     data, unseen = record(truth, training, [seed, 0]), record(truth, other, [seed, 1])
     again = record(truth, training, [seed, 2])
     metrics: dict[str, Any] = {"counts": counts(), "models": {}}
@@ -256,8 +258,8 @@ def torques(found: Fit, data: Data) -> Figure:
 
 
 def main() -> None:
-    options = study_options.read(__doc__, quick="a design of little effort")
-    study_tables.show(study_tables.dynamics(run(options.out, options.quick, options.seed)))
+    options = study_options.read(__doc__)
+    study_tables.show(study_tables.dynamics(run(options.out, options.seed)))
 
 
 if __name__ == "__main__":

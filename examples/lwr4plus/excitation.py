@@ -29,6 +29,7 @@ import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from pathlib import Path
 from typing import Any
 
 import excitation_figures as figures
@@ -50,12 +51,14 @@ from calib.estimation.triangles import combine
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit
 from calib.geometry.weighing import calibrated_chain
+from calib.procedure.excitation import coefficients
 from calib.procedure.excitation.design import Designed, search_motion
 from calib.procedure.excitation.inputs import ExcitationInputs, IdentifiableColumns, excited_model
 from calib.procedure.excitation.limits import read_motion_limits
 from calib.procedure.excitation.settings import ExcitationSettings
 from calib.procedure.report.style import save
 from calib.robot.chain import Chain, random_joints
+from calib.robot.tables import dumps
 from calib.rooms.cells import lwr4plus
 from calib.rooms.cells.cell import measure
 from calib.rooms.cells.virtual_cells import lwr4plus_cell
@@ -178,6 +181,15 @@ def designed(plan: Plan, arm: Arm, starts: int, evaluations: int) -> tuple[Refer
 def _period(found: Designed) -> Reference:
     """Return one period at the controller's rate without its end: periods follow each other."""
     return Reference(*(series[:-1] for series in ExcitationDesign(**vars(found)).sampled()))
+
+
+def keep(period: Reference, folder: Path) -> Path:
+    """Write one period of a Fourier series as ``trajectory.toml``, which `dynamics.py` plays."""
+    lines = np.fft.rfft(period.q, axis=0)[: Plan("B").harmonics + 1] / len(period.q)
+    own = tuple(np.concatenate([[c[0].real], -2.0 * c[1:].imag, 2.0 * c[1:].real]) for c in lines.T)
+    names, kinds = zip(*((joint.name, joint.kind) for joint in lwr4plus.nominal_chain().joints))
+    motion = coefficients.Periodic(names, kinds, len(period.q) / RATE, RATE, 1, "fourier", own)
+    return files.write(folder / coefficients.NAME, dumps(coefficients.table(motion, "lwr4plus", ())))
 
 
 def repeated(period: Reference, seconds: float = SECONDS) -> Reference:
@@ -369,6 +381,7 @@ def main() -> None:
     save(figures.estimates(found["geometries"]), given.out / "plot_estimates.png")
     save(figures.speeds(found["motions"], SPEEDS), given.out / "plot_speeds.png")
     save(figures.front(found["motions"]), given.out / "plot_front.png")
+    keep(motions["B, 44 columns"], given.out)
     study_tables.show(study_tables.excitation(found))
 
 

@@ -22,11 +22,12 @@ from pathlib import Path
 import study_tables
 
 from calib import files
+from calib.procedure.excitation import coefficients
 
 HERE = Path(__file__).parent
 PARTS: dict[str, tuple[list[str], list[str]]] = {  # options of the whole part, and of the quick one
     "geometry": ([], ["--quick"]),
-    "dynamics": ([], ["--quick"]),
+    "dynamics": ([], []),
     "consistency": (["--runs", "40"], ["--runs", "0"]),
     "excitation": ([], ["--quick"]),
     "planning": ([], ["--paths", "3"]),
@@ -97,6 +98,8 @@ def main() -> None:
         for picture in (path for name in given.only for path in (given.out / name).glob("*.png")):
             FIGURES.mkdir(exist_ok=True)
             shutil.copy(picture, FIGURES / picture.name)
+        for motion in (path for name in given.only for path in (given.out / name).glob(coefficients.NAME)):
+            shutil.copy(motion, HERE / motion.name)
 
 
 if __name__ == "__main__":

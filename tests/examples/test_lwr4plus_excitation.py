@@ -28,7 +28,9 @@ def test_the_designed_motion_attains_the_papers_goals_and_what_halving_is_agains
             one["102 fitted"]["error_in_sigma"] < 2.0 < one["44 fitted"]["error_in_sigma"]
         )  # 58 left out, all in the truth
         assert np.array(one["102 fitted"]["rsd"]).shape == (44,)
-    assert {path.name for path in tmp_path.glob("*.png")} == {"plot_paths.png", "plot_estimates.png", "plot_speeds.png"}
+    assert {path.name for path in tmp_path.glob("*.png")} == {
+        "plot_paths.png", "plot_estimates.png", "plot_speeds.png", "plot_front.png",
+    }  # fmt: skip
 
 
 @pytest.mark.slow

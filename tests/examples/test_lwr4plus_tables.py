@@ -80,6 +80,14 @@ def test_a_fresh_run_makes_the_readmes_tables(fresh, name: str, options: tuple[s
                 assert numbers(cell) == expected, (key, row)
 
 
+def test_the_kept_trajectory_b_is_the_readmes() -> None:
+    import dynamics
+    import excitation
+
+    _, least, most = numbers(rows(README["excitation-designs"])["B, 44 columns"][1])
+    assert least - 0.1 <= excitation.exact(dynamics.trajectory_b())["cond"]["44"]["raw"] <= most + 0.1
+
+
 @pytest.mark.slow
 def test_a_fresh_design_and_fresh_logs_lie_in_the_readmes_ranges(fresh) -> None:
     found = fresh("excitation", "--quick")
