@@ -256,13 +256,14 @@ def assert_gone(pids: list[int]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("run", "kill"), [("map", os.killpg), pytest.param("completed", os.kill, marks=pytest.mark.slow)]
+    ("run", "hit"), [("map", "group"), pytest.param("completed", "parent", marks=pytest.mark.slow), ("map", "workers")]
 )
-def test_after_ctrl_c_tasks_under_way_hand_back_what_they_have(tmp_path: Path, run: str, kill) -> None:
-    """Whether the terminal's group gets it, or this process alone; no further task begins."""
+def test_after_ctrl_c_tasks_under_way_hand_back_what_they_have(tmp_path: Path, run: str, hit: str) -> None:
+    """Whether the terminal's group gets it, this process alone, or its workers before it; no further task begins."""
     running = script(tmp_path, run)
     pids = pids_in(tmp_path)
-    kill(running.pid, signal.SIGINT)
+    for pid in pids if hit == "workers" else [running.pid]:
+        (os.killpg if hit == "group" else os.kill)(pid, signal.SIGINT)
     out, err = running.communicate(timeout=SECONDS)
     assert out.count("so far") == 2 and "KeyboardInterrupt" in err and running.returncode != 0
     assert len(list(tmp_path.glob("*.pid"))) == 2

@@ -215,7 +215,7 @@ class Processes:
         for pipe in connection.wait(list(self.working), timeout):
             process = self.working[pipe]
             try:
-                answer = process.pipe.recv_bytes()
+                answer, interrupted = process.pipe.recv()
             except (EOFError, OSError):
                 yield process.number, None, self._died(process)
                 continue
@@ -227,6 +227,8 @@ class Processes:
             self.idle.append(self.working.pop(pipe))
             if not starting:
                 yield process.number, *pickle.loads(answer)
+                if interrupted and not self.stopping:
+                    raise KeyboardInterrupt  # a terminal's, which has not reached this process yet
 
     def _died(self, process: _Process) -> Exception:
         del self.working[process.pipe]
@@ -278,20 +280,27 @@ class Processes:
 
 def _serve(pipe: connection.Connection) -> None:
     """Answer calls in a worker process until the pipe is closed. Ctrl-C has an effect only during a task."""
-    hear = partial(signal.signal, signal.SIGINT, signal.default_int_handler)
+    heard = list[int]()
+
+    def interrupt(number: int, frame: Any) -> None:
+        heard.append(number)
+        raise KeyboardInterrupt
+
+    hear = partial(signal.signal, signal.SIGINT, interrupt)
     hush = partial(signal.signal, signal.SIGINT, signal.SIG_IGN)
     Thread(target=_end_with_parent, daemon=True).start()
     sys.unraisablehook = _unheard
     hush()
     signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
     with suppress(EOFError, OSError, KeyboardInterrupt):  # the last where one more came before `hush`
-        pipe.send_bytes(b"ready")
+        pipe.send((b"ready", False))
         while True:
             try:
                 answer = run_call(pipe.recv_bytes(), hear, pickle.dumps, hush)
             finally:
                 hush()
-            pipe.send_bytes(answer)
+            pipe.send((answer, bool(heard)))
+            heard.clear()
 
 
 def _unheard(unraisable: Any) -> None:

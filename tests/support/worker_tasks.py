@@ -77,8 +77,8 @@ def pid_a_little_later(x: int) -> int:
 
 def until_told(folder: Path) -> str:
     """Wait like a search that hands back the best so far after Ctrl-C."""
-    (folder / f"{os.getpid()}.pid").touch()
     try:
+        (folder / f"{os.getpid()}.pid").touch()
         time.sleep(2 * SECONDS)
     except KeyboardInterrupt:
         return "so far"
@@ -94,8 +94,8 @@ class SlowlySaid(KeyboardInterrupt):
 
 
 def slow_to_say(folder: Path) -> None:
-    (folder / f"{os.getpid()}.pid").touch()
     try:
+        (folder / f"{os.getpid()}.pid").touch()
         time.sleep(2 * SECONDS)
     except KeyboardInterrupt:
         raise SlowlySaid from None
