@@ -1,0 +1,29 @@
+"""Settings of the comparison of two calibrations."""
+
+from dataclasses import dataclass
+
+from calib.arguments import checked
+from calib.config_types import Flag, Seed
+from calib.procedure.kinematic_stage.settings import Tolerance
+
+
+@checked
+@dataclass(frozen=True)
+class DiffSettings:
+    """Settings of a comparison of two calibrations.
+
+    Attributes:
+        tolerance: largest rms error [m; on the command line mm] of the robot today with the earlier parameters; above
+            it the verdict is fail. Default: that of the later fit or session, else of the earlier one
+        same_base: robot and instrument stood in the same places at both visits: a change of the base placement counts
+        same_tool: the same target on the same mount: a change of the tool placement counts
+        seed: of the random poses
+    """
+
+    tolerance: Tolerance = None
+    same_base: Flag = False
+    same_tool: Flag = False
+    seed: Seed = 0
+
+
+DEFAULT_DIFF = DiffSettings()
