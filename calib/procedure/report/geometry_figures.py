@@ -144,12 +144,13 @@ def image_coverage(size: tuple[int, int], count: np.ndarray, rms: np.ndarray) ->
     return Chart(panels, 0.8 + 0.5 * (PAGE_WIDTH - 2.0) * high / wide, 2)
 
 
-def parameter_changes(rows: Sequence[FittedParameter], most: int = 48) -> Chart:
+def parameter_changes(rows: Sequence[FittedParameter], most: int = 48, of: str = "calibrated - nominal") -> Chart:
     """Return the chart of calibrated minus nominal values with bars of two sigmas; lengths in mm, angles in mrad.
 
     Args:
         rows: fitted parameters; those in other units are left out.
         most: parameters per panel, those furthest from nominal by their sigma.
+        of: of what the difference is, in words.
     """
     panels, longest = [], 5
     for base, unit, what in (("m", "mm", "lengths"), ("rad", "mrad", "angles")):
@@ -164,7 +165,7 @@ def parameter_changes(rows: Sequence[FittedParameter], most: int = 48) -> Chart:
         shown = bars(value, [AFTER if one else PALE for one in clear], spread=spread)
         words = f"{int(clear.sum())} of {len(chosen)} {what} clearly changed"
         labels = [own[k].name for k in chosen]
-        panels.append(Panel([shown], words, f"calibrated - nominal [{unit}], bars ±2σ", ynames=labels, grid="x"))
+        panels.append(Panel([shown], words, f"{of} [{unit}], bars ±2σ", ynames=labels, grid="x"))
         longest = max(longest, len(chosen))
     return Chart(panels, 0.65 + 0.155 * longest, max(1, len(panels)))
 

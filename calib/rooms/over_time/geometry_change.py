@@ -24,6 +24,7 @@ from calib.errors import UsageError, require
 from calib.geometry.installation import Installation, NoOptics, see
 from calib.geometry.model_choice.cross_validation import project_out
 from calib.geometry.observation import layout_counts, target_jacobian
+from calib.procedure.findings import limit
 from calib.procedure.kinematic_stage.inputs import gravity_of
 from calib.robot.calibrated import evaluate
 from calib.robot.chain import random_joints
@@ -35,6 +36,7 @@ LEVER = 0.1  # that weighs a target's turn against its way [m/rad]: a tool's usu
 MAX_POSES = 300  # of each fit, and at random
 SHOWN = 1e-7  # of the largest singular value: below it, no pose shows a combination
 SPAN = 1e-5  # sine of an angle below which two combinations are one
+CHANCE = 0.01  # probability below which a χ² is no chance, as 2.6 σ
 AS_WELL = 4.0  # χ² by which a second explanation may be worse: 2 σ
 
 
@@ -116,6 +118,11 @@ class GeometryChange:
         return float(norm.isf(max(self.probability, 1e-300) / 2.0))
 
     @property
+    def changed(self) -> bool:
+        """Whether the test says that something moved."""
+        return self.sigmas > limit("arm-changed", "sigmas", "marginal")
+
+    @property
     def unexplained(self) -> float:
         """χ² that is left where only the first parameter changed."""
         return max(self.chi2 - self.parameters[0].explained, 0.0) if self.parameters else self.chi2
@@ -123,12 +130,14 @@ class GeometryChange:
     @property
     def alone(self) -> bool:
         """Whether the change of the first parameter alone explains the whole difference."""
-        return chi2.sf(self.unexplained, max(self.freedom - 1, 1)) > 0.01
+        return bool(chi2.sf(self.unexplained, max(self.freedom - 1, 1)) > CHANCE)
 
     @property
     def rivals(self) -> tuple[str, ...]:
         """The parameters whose change explains the difference about as well as that of the first one."""
-        return tuple(each.name for each in self.parameters[1:] if each.explained > self.parameters[0].explained - AS_WELL)
+        return tuple(
+            each.name for each in self.parameters[1:] if each.explained > self.parameters[0].explained - AS_WELL
+        )
 
 
 @dataclass(frozen=True, eq=False)
