@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from calib.rooms.compensation.api import JointCommands, compensate
     from calib.rooms.fleet.fleet import run_sessions
     from calib.rooms.instruments.joining import join
+    from calib.rooms.over_time.robot_change import diff
     from calib.rooms.placements.api import base, hand_eye, tool
 
 # what `import calib` offers, and where it lives: loaded when first asked for, so that `calib --help` starts at once
@@ -49,6 +50,7 @@ _HOMES = {
     "robot.calibrated": ("CalibratedChain",),
     "rooms.compensation.api": ("compensate", "JointCommands"),
     "rooms.instruments.joining": ("join",),
+    "rooms.over_time.robot_change": ("diff",),
     "rooms.placements.api": ("tool", "base", "hand_eye"),
     "procedure.kinematic_stage.settings": ("SelectionSettings", "FitSettings"),
     "procedure.excitation.settings": ("ExcitationSettings", "PlanSettings"),
@@ -57,7 +59,7 @@ _HOMES = {
 }
 
 __all__ = [  # noqa: RUF022 (in the order of use)
-    "load", "read_poses", "read_recording", "join", "select_poses", "fit_geometry", "tool", "base", "hand_eye",
+    "load", "read_poses", "read_recording", "join", "select_poses", "fit_geometry", "diff", "tool", "base", "hand_eye",
     "design_excitation", "plan_motion",
     "identify_dynamics", "methods", "validate", "export", "compensate", "new_session", "run_sessions",
     "CalibratedChain", "PoseSelection", "GeometryFit", "ExcitationDesign", "MotionPlan", "DynamicsModel",

@@ -136,7 +136,7 @@ def _read(name: str | Path, path: Path) -> Calibration:
 
 
 def _nominal(name: str | Path, like: Chain) -> Calibration:
-    """Return the robot of a description, between the links of a calibrated one, as a calibration without uncertainty."""
+    """Return the robot of a description, between a calibrated one's links, as a calibration without covariance."""
     links = {"base": like.base, "tip": like.tip} if str(name).endswith(".urdf") else {}
     robot = CalibratedChain(load_calibrated(name, **links).chain)
     return Calibration(str(name), robot, Installation(robot.chain), np.zeros(0, dtype=int), np.zeros((0, 0)))

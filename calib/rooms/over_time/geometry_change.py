@@ -7,9 +7,9 @@ of V from J = U S Vᵀ are the combinations that poses can show. In them
     z = V δ,  C = V Σ Vᵀ,  χ² = zᵀ C⁻¹ z
 
 has as many degrees of freedom as combinations were fitted. If parameter k alone changed, by the size x, then z = x v_k
-with v_k the column of V: x = v_kᵀ C⁻¹ z / v_kᵀ C⁻¹ v_k, σ² = 1 / v_kᵀ C⁻¹ v_k, and χ² falls by (x/σ)² (Baarda 1968, data
-snooping). A combination that only one of two fits has fitted is taken out by conditioning: that fit is as if it had
-kept it at nominal, too.
+with v_k the column of V: x = v_kᵀ C⁻¹ z / v_kᵀ C⁻¹ v_k, σ² = 1 / v_kᵀ C⁻¹ v_k, and χ² falls by (x/σ)² (Baarda 1968,
+data snooping). A combination that only one of two fits has fitted is taken out by conditioning: that fit is as if
+it had kept it at nominal, too.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from calib.transforms import invert, rotation_vector
 LEVER = 0.1  # that weighs a target's turn against its way [m/rad]: a tool's usual length (our choice)
 MAX_POSES = 300  # of each fit, and at random
 SHOWN = 1e-7  # of the largest singular value: below it, no pose shows a combination
+PARALLEL = 1e-2  # share of a parameter's motion that base and tool do not take up; below it, no pose shows it alone
 SPAN = 1e-5  # sine of an angle below which two combinations are one
 CHANCE = 0.01  # probability below which a χ² is no chance, as 2.6 σ
 AS_WELL = 4.0  # χ² by which a second explanation may be worse: 2 σ
@@ -209,11 +210,11 @@ def compare(before: Calibration, after: Calibration, settings: DiffSettings) -> 
     z, combinations, covariance, extra = _tested(pair, seen)
     solved = np.linalg.solve(covariance, np.column_stack([z, combinations]))
     along, across = combinations.T @ solved[:, 0], np.einsum("zk,zk->k", combinations, solved[:, 1:])
-    total, sizes = sum(pair.covariances), np.linalg.norm(seen.rows, axis=1)
+    total, sizes = sum(pair.covariances), np.linalg.norm(combinations, axis=0)
     found, steps = [], np.zeros((chain.n, len(pair.change)))
     for k, (element, one, two) in enumerate(zip(chain.elements, chain.values, after.chain.values)):
         steps[min(element.owner, chain.n - 1), k] = pair.change[k]
-        known = across[k] > 0.0 and sizes[k] > SHOWN * sizes.max()
+        known = sizes[k] > PARALLEL * sizes.max()
         alone = (along[k] / across[k], across[k] ** -0.5, along[k] ** 2 / across[k]) if known else (np.nan, np.nan, 0.0)
         found.append(ParameterChange(element.name, element.unit, one, two, float(np.sqrt(total[k, k])), *alone))
     found.sort(key=lambda each: -each.explained)
@@ -236,7 +237,7 @@ def corrected_motion(before: Calibration, after: Calibration, settings: DiffSett
 
 
 def frame_changes(before: Calibration, after: Calibration) -> dict[str, np.ndarray]:
-    """Return the motions (6,) [m, rad] of ``base`` and ``tool`` from one fit to the other; empty for a nominal robot."""
+    """Return the motions (6,) [m, rad] of ``base`` and ``tool`` between two fits; empty for a nominal robot."""
     if before.nominal or after.nominal:
         return {}
     one, two = ((each.cell.stations[s], each.cell.tools[t]) for each, s, t in _places(before, after))

@@ -85,7 +85,8 @@ class RobotChange(Drawn, Judged):
         by_joint = [Column("joint", "{0[0]}", number=False), Column("rms mm", lambda one: f"{1e3 * one[1]:.3g}")]
         shown = [one for one in found.parameters if one.sigma or one.explained][:MOST]
         blocks: list[Block] = [
-            Text("Notes", lines_of(self.noticed), "note"), table("Motion of the tool", motions, found.motions),
+            Text("Motion", self._motion()), Text("Notes", lines_of(self.noticed), "note"),
+            table("Motion of the tool", motions, found.motions),
             table("Changed parameters, those first that explain most", parameters, shown, f"All in {TABLE}."),
             table("Motion of the tool by what describes one joint", by_joint, found.by_joint),
         ]  # fmt: skip
@@ -95,6 +96,18 @@ class RobotChange(Drawn, Judged):
             met(self.today, self.tolerance or 0.0),
         )  # fmt: skip
         return Section("Change", blocks, self.verdict.level, self.verdict.reason, [figure])
+
+    def _motion(self) -> list[str]:
+        """Return sentences on the target's motion: how far, where most, and by which joint."""
+        found = self.geometry
+        joint, most = max(found.by_joint, key=lambda one: one[1])
+        lines = [
+            f"{one.where} ({len(one.q)}): the tool moved by {1e3 * np.median(one.position):.3g} mm (median), "
+            f"{1e3 * one.position.max():.3g} mm (worst, at {_joints(one, self.before.chain.joints)}), "
+            f"and turned by {1e3 * np.median(one.orientation):.3g} and {1e3 * one.orientation.max():.3g} mrad"
+            for one in found.motions
+        ]
+        return [*lines, f"most of it comes from {joint}: {1e3 * most:.3g} mm rms"] if found.changed else lines
 
     def charts(self) -> dict[str, Chart]:
         """Return what the figures show: the tool's motion over the workspace, and the parameters' changes."""
@@ -170,7 +183,8 @@ def _plus_minus(value: float, sigma: float, unit: str) -> str:
 def _joints(motion: ToolMotion, joints: Any) -> str:
     """Return the joint values of the worst pose."""
     worst = motion.q[motion.position.argmax()]
-    return ", ".join(f"{JOINT[one.kind][0] * value:.0f}" for one, value in zip(joints, worst))
+    shown = (JOINT[one.kind] for one in joints)
+    return ", ".join(f"{factor * value:.0f} {unit}" for (factor, unit), value in zip(shown, worst))
 
 
 def _today(after: Calibration, found: GeometryChange) -> float:
@@ -195,9 +209,7 @@ def diff(
         RobotError: where they are of different robots.
     """
     with saved(before) as first, saved(after) as second:
-        one, two = read_pair(
-            first if isinstance(before, GeometryFit) else before, second if isinstance(after, GeometryFit) else after
-        )
+        one, two = read_pair(first, second)
     found = geometry_change.compare(one, two, settings)
     tolerance = settings.tolerance or two.tolerance or one.tolerance
     noticed = settle(_findings(one, two, found, settings, tolerance))
@@ -222,8 +234,8 @@ def _findings(
         result.append(finding("outgrown", times=today / tolerance, today=today, tolerance=tolerance, **names))
     beyond = moved.rms / max(left, 1e-12)
     result.append(finding(
-        "arm-changed", sigmas=found.sigmas, beyond=0.0 if tolerance else beyond, chi2=found.chi2, freedom=found.freedom,
-        probability=found.probability, moved=moved.rms, expected=moved.expected, left=left if beyond <= 1.0 else None,
+        "arm-changed", sigmas=found.sigmas, beyond=0.0 if tolerance else beyond, probability=found.probability,
+        left=left if beyond <= 1.0 else None,
     ))  # fmt: skip
     if found.changed and found.parameters:
         first = found.parameters[0]
