@@ -215,7 +215,7 @@ def diff(
     noticed = settle(_findings(one, two, found, settings, tolerance))
     moved = found.motions[0]
     figures = (
-        f"the tool moved by {1e3 * moved.rms:.3g} mm rms at the poses of the fits, by σ {1e3 * moved.expected:.2g} mm; "
+        f"the tool moved by {1e3 * moved.rms:.3g} mm rms (σ lets expect {1e3 * moved.expected:.2g} mm), "
         f"χ² {found.chi2:.3g} on {found.freedom}"
     )
     if tolerance:
@@ -231,7 +231,7 @@ def _findings(
     names = {"before": one.name, "after": two.name}
     if tolerance:
         today = _today(two, found)
-        result.append(finding("outgrown", times=today / tolerance, today=today, tolerance=tolerance, **names))
+        result.append(finding("outgrown", times=today / tolerance, today=today, after=two.name))
     beyond = moved.rms / max(left, 1e-12)
     result.append(finding(
         "arm-changed", sigmas=found.sigmas, beyond=0.0 if tolerance else beyond, probability=found.probability,
