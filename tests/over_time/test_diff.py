@@ -46,8 +46,8 @@ def test_a_planted_joint_offset_is_found_and_named(fits):
     assert "joint_3.offset alone explains it" in str(found)
 
 
-def test_base_and_tool_count_only_where_told(fits, tmp_path):
-    """A base that moved is no change of the arm, unless the instrument stood still."""
+def test_base_and_tool_count_only_where_told(fits):
+    """A base that moved is no change of the arm, unless instrument and target were left as they were."""
     moved = fits / "moved"
     if not moved.exists():
         table = np.genfromtxt(fits / "second.csv", delimiter=",", skip_header=1)
@@ -61,7 +61,9 @@ def test_base_and_tool_count_only_where_told(fits, tmp_path):
         )
         settings = calib.FitSettings(model="geometry", holdout=0.2)
         calib.fit_geometry(UR5 / "model.urdf", fits / "moved.csv", settings).save(moved, plots=False)
-    free, held = (calib.diff(fits / "first", moved, DiffSettings(same_base=each)) for each in (False, True))
+    free, held = (
+        calib.diff(fits / "first", moved, DiffSettings(same_base=each, same_tool=each)) for each in (False, True)
+    )
     assert free.verdict == "pass" and free.geometry.motions[0].rms < 1e-4
     assert held.verdict == "marginal" and held.geometry.motions[0].rms == pytest.approx(np.hypot(0.2, 0.1), rel=1e-3)
 
