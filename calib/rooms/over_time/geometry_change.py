@@ -210,7 +210,7 @@ def compare(before: Calibration, after: Calibration, settings: DiffSettings) -> 
     z, combinations, covariance, extra = _tested(pair, seen)
     solved = np.linalg.solve(covariance, np.column_stack([z, combinations]))
     along, across = combinations.T @ solved[:, 0], np.einsum("zk,zk->k", combinations, solved[:, 1:])
-    total, sizes = sum(pair.covariances), np.linalg.norm(combinations, axis=0)
+    total, sizes = np.add(*pair.covariances), np.linalg.norm(combinations, axis=0)
     found, steps = [], np.zeros((chain.n, len(pair.change)))
     for k, (element, one, two) in enumerate(zip(chain.elements, chain.values, after.chain.values)):
         steps[min(element.owner, chain.n - 1), k] = pair.change[k]
@@ -309,7 +309,7 @@ def _tested(pair: _Pair, seen: _Seen) -> tuple[np.ndarray, np.ndarray, np.ndarra
             covariances[place] = covariances[place] - gain @ beyond.T @ covariances[place]
     together, beyond = _span(np.hstack(fitted)), np.hstack(extra)
     kept = _span(together - beyond @ (beyond.T @ together))
-    return kept.T @ change, kept.T @ shown, kept.T @ sum(covariances) @ kept, (extra[0].shape[1], extra[1].shape[1])
+    return kept.T @ change, kept.T @ shown, kept.T @ np.add(*covariances) @ kept, (extra[0].shape[1], extra[1].shape[1])
 
 
 def _span(columns: np.ndarray) -> np.ndarray:
