@@ -127,7 +127,7 @@ def _read(name: str | Path, path: Path) -> Calibration:
     unseen = [rows for rows in judged.validation.values() if rows.unseen]
     free, covariance = tables.read_covariance(folder.path, cell)
     robot = calibrated.read(folder.path)
-    asked = session.settings.geometry.tolerance_mm if session else metrics.tolerance_mm
+    asked = session.settings.fit.tolerance_mm if session else metrics.tolerance_mm
     serial = session.settings.certificate.robot_serial if session else ""
     return Calibration(
         str(name), robot, cell, free, covariance, folder.learnt_joints(robot.chain.joints), metrics,
