@@ -26,7 +26,7 @@ from calib.errors import UsageError, require
 from calib.procedure.report.templates import read
 from calib.rooms.controllers.motion import is_motion, setpoints, stream_values
 from calib.rooms.controllers.program_settings import CSV, ProgramSettings
-from calib.rooms.controllers.table import HERE, Controller, controller_named
+from calib.rooms.controllers.table import HERE, Controller, check_controller, controller_named
 from calib.rooms.controllers.targets import is_program, number, read_program
 from calib.units import ANGLES, LENGTHS
 
@@ -83,9 +83,7 @@ def program_files(
     if not re.fullmatch(controller.names, stem):
         raise UsageError(f"{out}: '{stem}' is no name for a program of {controller.title}: {_words(controller.names)}")
     q, names = setpoints(path, controller) if moving else joints_in(path, source)
-    if controller.axes and q.shape[1] not in controller.axes:
-        allowed = " or ".join(map(str, controller.axes))
-        raise UsageError(f"{path}: {q.shape[1]} joints ({', '.join(names)}); {controller.title} takes {allowed}")
+    check_controller(name, q.shape[1], ", ".join(names))
     if settings.output is not None and not controller.outputs:
         raise UsageError(f"--output: {controller.title} raises no output; the operator presses a key")
     if controller.pulses and (len(settings.pulses) != q.shape[1] or not all(settings.pulses)):

@@ -101,6 +101,19 @@ def controller_named(name: str) -> Controller:
     return controllers()[one_of(name, controllers(), "controller", UsageError)]
 
 
+def check_controller(name: str, axes: int, names: str = "") -> Controller:
+    """Return a controller by its name; `names` are the joints' for the message.
+
+    Raises:
+        UsageError: for an unknown name, and where it takes no arm of so many axes.
+    """
+    found = controller_named(name)
+    if found.axes and axes not in found.axes:
+        allowed = " or ".join(map(str, found.axes))
+        raise UsageError(f"{axes} joints{names and f' ({names})'}; {found.title} takes {allowed}")
+    return found
+
+
 def controller_of(path: Path, name: str = "") -> Controller:
     """Return the controller whose program stands at `path`: by name, or by the file's suffix.
 
