@@ -75,7 +75,6 @@ class Answers:
         robot: a .urdf, an MDH .toml, a library name, or the folder of an earlier fit.
         instrument: cmm, tracker, tracker6d, mocap, camera, camera-poses, other-pose, other-position, none.
         tool: x,y,z: approximate position of the target in the tip's frame [m].
-        program: controller in whose language the poses are written, too: ur, krl … (calib program --list); or none.
         limits: TOML file that describes the cell: instrument or [camera], obstacles, speeds; none: asked in questions.
         mounting: in hand (the arm holds the camera), to hand (the arm holds the board), or unknown.
         lens: camera_info YAML with approximate values of the camera's lens; or unknown.
@@ -92,6 +91,7 @@ class Answers:
         payloads: label=kg of a payload for additional recordings; repeatable.
         tolerance_mm: largest accepted rms of the position on unseen poses [mm]; 0: none.
         tolerance_percent: largest accepted torque error of the exported robot on unseen motion [%]; 0: none.
+        program: controller in whose language the poses are written, too: ur, krl … (calib program --list); or none.
         details: ask for the certificate's details: number, serial numbers, operator ….
         certificate: these details.
     """
@@ -99,7 +99,6 @@ class Answers:
     robot: Text | None = None
     instrument: Text | None = None
     tool: Annotated[tuple[Held, Held, Held], Expect("x,y,z in metres, at most 3 m from the flange")] | None = None
-    program: Text | None = None
     limits: Path | None = None
     mounting: Text | None = None
     lens: Text | None = None
@@ -116,6 +115,7 @@ class Answers:
     payloads: tuple[str, ...] = ()
     tolerance_mm: Tolerance | None = None
     tolerance_percent: Tolerance | None = None
+    program: Text | None = None
     details: Annotated[bool, Typed("--details/--no-details")] | None = None
     certificate: CertificateSection = field(default_factory=CertificateSection)
 
