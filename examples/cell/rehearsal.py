@@ -138,10 +138,12 @@ def csv_part(q: np.ndarray) -> str:
 
 
 def csv_targets(path: Path) -> np.ndarray:
-    """Return the joints [rad] in the table that `calib compensate` wrote, in degrees."""
+    """Return the joints [rad] in the table that `calib compensate` wrote; a target that is not reached is NaN."""
     with path.open() as file:
-        rows = [row for row in csv.DictReader(line for line in file if not line.startswith("#"))]
-    return np.radians([[float(row[f"joint{k + 1} [deg]"]) for k in range(7)] for row in rows])
+        rows = [*csv.reader(line for line in file if not line.startswith("#"))]
+    joints = [k for k, name in enumerate(rows[0]) if name.startswith("joint")]
+    unit = np.pi / 180 if "[deg]" in rows[0][joints[0]] else 1.0
+    return unit * np.array([[float(row[k] or "nan") for k in joints] for row in rows[1:]])
 
 
 @dataclass(frozen=True)
@@ -194,7 +196,9 @@ def played(name: str, folder: Path) -> tuple[str, ...]:
     calib("compensate", "cell", arm.part, "--frame", "nominal", "--partial", "--out", sent, folder=folder)
     wanted = forward(cell.nominal, seen)
     verdict = json.loads((session / "verdict.json").read_text())
-    true, moved = true_poses(cell, seen), true_poses(cell, arm.sent(folder / sent))
+    commands = arm.sent(folder / sent)
+    commands = np.where(np.isnan(commands), seen, commands)
+    true, moved = true_poses(cell, seen), true_poses(cell, commands)
     delivered = urdf_poses(session / "6-export/robot.urdf", seen)
     errors = (misfit(wanted, true), misfit(delivered, true), misfit(wanted, moved))
     return (name, arm.controller, verdict["verdict"], *(f"{each:.2f}" for each in errors), arm.checked)
