@@ -80,10 +80,8 @@ def posreg(q: np.ndarray, path: Path) -> None:
 
 def ros_node(program: Path) -> np.ndarray:
     """Return the joints [rad] in the list POSES of a Python node."""
-    found = {
-        each.targets[0].id: each.value for each in ast.parse(program.read_text()).body if isinstance(each, ast.Assign)
-    }
-    return np.array(ast.literal_eval(found["POSES"]))
+    parts = [each for each in ast.parse(program.read_text()).body if isinstance(each, ast.Assign)]
+    return np.array(next(ast.literal_eval(one.value) for one in parts if ast.unparse(one.targets[0]) == "POSES"))
 
 
 def node_csv(q: np.ndarray, path: Path) -> None:
@@ -206,10 +204,10 @@ def played(name: str, folder: Path) -> tuple[str, ...]:
 
 def urdf_poses(path: Path, q: np.ndarray) -> np.ndarray:
     """Return the last joint's poses (m, 4, 4) [m] of a URDF, by Pinocchio."""
-    model = pinocchio.buildModelFromUrdf(str(path))
+    model = pinocchio.buildModelFromUrdf(str(path))  # pyright: ignore[reportAttributeAccessIssue]
     data, found = model.createData(), []
     for row in q:
-        pinocchio.forwardKinematics(model, data, row)
+        pinocchio.forwardKinematics(model, data, row)  # pyright: ignore[reportAttributeAccessIssue]
         found.append(data.oMi[model.njoints - 1].homogeneous)
     return np.array(found)
 

@@ -90,7 +90,8 @@ def _to_measure(session: Session, step: str) -> tuple[str, str]:
             f"Measure the target's {device.measures} with the {device.name} and log the joint angles read back.",
             "At the end, measure the first three again to check for drift (optional, into drift.csv).",
         ),
-        f"{' and '.join(files)}, one row per pose: {columns}{turned} (calib formats measurements), or joints and points apart, by calib join",
+        f"{' and '.join(files)}, one row per pose: {columns}{turned} (calib formats measurements), "
+        "or joints and points apart, by calib join",
     )
 
 

@@ -92,8 +92,8 @@ class Question:
 
 
 DEFAULTS = {
-    "robot": "", "instrument": "tracker", "tool": "0.05,0,0.05", "program": "none", "limits": "none", "facing": "z", "dynamics": "yes",
-    "torques": "motor", "payloads": "none", "tolerance_mm": "0", "tolerance_percent": "0", "details": "yes",
+    "robot": "", "instrument": "tracker", "tool": "0.05,0,0.05", "program": "none", "limits": "none", "facing": "z",
+    "dynamics": "yes", "torques": "motor", "payloads": "none", "tolerance_mm": "0", "tolerance_percent": "0", "details": "yes",
 }  # fmt: skip
 QUESTIONS = (
     *(Question(one.name, DEFAULTS.get(one.name, "unknown")) for one in fields(Answers) if one.name != "certificate"),
@@ -150,7 +150,9 @@ def checked(given: Answers) -> dict[str, Any]:
     else:
         result["limits"] = cell_tables(**given.cell) or None
     others = {"payloads": dict(map(_payload, given.payloads)), "certificate": asdict(given.certificate)}
-    others |= {name: getattr(given, name) for name in ("tool", "program", "torques", "tolerance_mm", "tolerance_percent")}
+    others |= {
+        name: getattr(given, name) for name in ("tool", "program", "torques", "tolerance_mm", "tolerance_percent")
+    }
     return result | {name: value for name, value in others.items() if value and value != NONE}
 
 
