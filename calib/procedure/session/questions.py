@@ -93,7 +93,8 @@ class Question:
 
 DEFAULTS = {
     "robot": "", "instrument": "tracker", "tool": "0.05,0,0.05", "program": "none", "limits": "none", "facing": "z",
-    "dynamics": "yes", "torques": "motor", "payloads": "none", "tolerance_mm": "0", "tolerance_percent": "0", "details": "yes",
+    "dynamics": "yes", "torques": "motor", "payloads": "none", "tolerance_mm": "0", "tolerance_percent": "0",
+    "details": "yes",
 }  # fmt: skip
 QUESTIONS = (
     *(Question(one.name, DEFAULTS.get(one.name, "unknown")) for one in fields(Answers) if one.name != "certificate"),
