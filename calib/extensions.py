@@ -31,6 +31,7 @@ A room is a package of `calib.rooms` with a table ``OFFERS``: what it adds, and 
     steps, endings         of a session: steps after the export; functions: a complete session → lines to print
     fit_pages, model_pages functions that write the certificate of a fit (report, figures, folder) and of an
                            identification (outcome, folder, whether with figures) into its folder
+    check_controller       function: controller's name, number of joints; raises where it takes no such arm
     write_program          function: CSV of poses, path, controller's name → files of its program
     as_described           function: controller's name, joints as it shows them → the description's joints;
     motors_as_described    the same of motors' torques and currents

@@ -16,9 +16,9 @@ from calib.data.recordings.recording_options import RecordingOptions
 from calib.errors import MeasurementError, UsageError
 from calib.procedure.session import geometry_steps
 from calib.procedure.session.folder import open_session
-from calib.rooms.controllers.program import joints_in, program_files
+from calib.rooms.controllers.program import joints_in, joints_table, program_files
 from calib.rooms.controllers.program_settings import CSV, ProgramSettings
-from calib.rooms.controllers.table import controller_named, controllers
+from calib.rooms.controllers.table import check_controller, controller_named, controllers
 from calib.rooms.controllers.targets import read_program
 
 Q = np.radians(np.random.default_rng(3).uniform(-170.0, 170.0, (7, 6)))
@@ -195,3 +195,26 @@ def test_measured_poses_of_a_fanuc_are_read_as_the_descriptions_joints(tmp_path,
     np.testing.assert_allclose(found.q, Q, atol=1e-9)
     with pytest.raises(UsageError, match="controller 'fanuk' is not one of"):
         read_measurements(tmp_path / "m.csv", names, FileOptions(controller="fanuk"))
+
+
+def test_joints_that_a_fanuc_kept_have_their_poses_numbers_and_are_those_of_the_description(tmp_path):
+    # As backups hold POSREG.VA: register 2 was not read, 3 is a pose of the tool.
+    (tmp_path / "POSREG.VA").write_text(
+        "[*POSREG*]$POSREG  Storage: CMOS  Access: RW  : ARRAY[1,4] OF Position Reg\n"
+        "    [1,1] =   'a'   Group: 1\n  J1 =    10.000 deg   J2 =    20.000 deg   J3 =    30.000 deg \n"
+        "  J4 =      .000 deg   J5 =    50.000 deg   J6 =   -60.000 deg \n\n    [1,2] =   '' Uninitialized\n"
+        "    [1,3] =   '' \n  Group: 1   Config: N U T, 0, 0, 0\n  X:  1.000   Y: 2.000   Z: 3.000\n"
+        "    [1,4] =   ''   Group: 1\n  J1 =     1.000 deg   J2 =     2.000 deg   J3 =     3.000 deg \n"
+        "  J4 =     4.000 deg   J5 =     5.000 deg   J6 =     6.000 deg \n"
+    )
+    table = joints_table(tmp_path / "POSREG.VA")
+    assert table.header == ("pose", "q1", "q2", "q3", "q4", "q5", "q6") and table.cells[0].tolist() == [1, 4]
+    assert table.cells[3] == pytest.approx([50.0, 5.0]), "J3 counts from the horizontal"
+
+
+def test_a_session_refuses_a_controller_that_does_not_take_its_arm(tmp_path):
+    for name, words in (("krl", "takes 6"), ("kr", "is not one of"), ("yaskawa", "takes 6")):
+        with pytest.raises(UsageError, match=words):
+            check_controller(name, 7)
+    with pytest.raises(UsageError, match="pulses per degree"):
+        check_controller("yaskawa", 6)

@@ -91,6 +91,7 @@ class Answers:
         payloads: label=kg of a payload for additional recordings; repeatable.
         tolerance_mm: largest accepted rms of the position on unseen poses [mm]; 0: none.
         tolerance_percent: largest accepted torque error of the exported robot on unseen motion [%]; 0: none.
+        program: controller in whose language the poses are written, too: ur, krl … (calib program --list); or none.
         details: ask for the certificate's details: number, serial numbers, operator ….
         certificate: these details.
     """
@@ -114,6 +115,7 @@ class Answers:
     payloads: tuple[str, ...] = ()
     tolerance_mm: Tolerance | None = None
     tolerance_percent: Tolerance | None = None
+    program: Text | None = None
     details: Annotated[bool, Typed("--details/--no-details")] | None = None
     certificate: CertificateSection = field(default_factory=CertificateSection)
 

@@ -62,7 +62,9 @@ def _to_measure(session: Session, step: str) -> tuple[str, str]:
     for path in (session.path(f"2-poses/{name}") for name in lists if settings.poses.plan):
         if path.exists():
             noun, unseen = "" if sets else "poses ", " (never fitted)" if sets else ""
-            sets.append(f"the {len(read_table(path))} {noun}of {path}{unseen}")
+            programs = ", ".join(map(str, sorted({*path.parent.glob(f"{path.stem}.*")} - {path})))
+            played = f" (program: {programs})" if settings.robot.controller else ""
+            sets.append(f"the {len(read_table(path))} {noun}of {path}{played}{unseen}")
     if sets and lists[0] == POSES and not images and (ways := session.path(f"2-poses/{WAYS}")).exists():
         sets[0] += f" in their order (ways: {ways}; calib view {session.folder} rehearses them)"
     where = " and, into a separate file, ".join(sets) or "poses all over the workspace"
@@ -88,7 +90,8 @@ def _to_measure(session: Session, step: str) -> tuple[str, str]:
             f"Measure the target's {device.measures} with the {device.name} and log the joint angles read back.",
             "At the end, measure the first three again to check for drift (optional, into drift.csv).",
         ),
-        f"{' and '.join(files)}, one row per pose: {columns}{turned} (calib formats measurements)",
+        f"{' and '.join(files)}, one row per pose: {columns}{turned} (calib formats measurements), "
+        "or joints and points apart, by calib join",
     )
 
 
@@ -164,6 +167,7 @@ def new_session(
     base: str = "",
     tip: str = "",
     seed: int = 0,
+    program: str = "",
     tolerance_mm: float = 0.0,
     certificate: Mapping[str, Any] | None = None,
     **motion: Any,
@@ -180,6 +184,7 @@ def new_session(
         limits: TOML file that both poses and motions keep (``calib formats limits``), or its tables.
         dynamics: identify the dynamics, too.
         seed: of everything random.
+        program: controller in whose language the poses are written, too (`calib program --list`).
         tolerance_mm: largest accepted rms on unseen poses [mm]; 0: none.
         certificate: keys of ``[certificate]``: what the certificate states besides results.
         motion: other keys of ``[dynamics]`` (``calib formats session``): torques, payloads, period …
@@ -195,10 +200,12 @@ def new_session(
     words = "neither geometry nor dynamics were requested: choose an instrument, or identify the dynamics"
     require(dynamics or device.measures != NOTHING, words, UsageError)
     chain = load(robot, base or None, tip or None)
+    if program:
+        needed("check_controller")(program, chain.n)
     copied, named = _limits(limits, chain, source, dynamics)
     table = {
         "name": chain.name, "created": "", "seed": seed, "fit": {"tolerance_mm": tolerance_mm},
-        "robot": {"file": source.name, "given": str(robot), "base": base, "tip": tip},
+        "robot": {"file": source.name, "given": str(robot), "base": base, "tip": tip, "controller": program},
         "instrument": asdict(device) | ({} if tool is None else {"tool": [*map(float, tool)]}),
         "poses": {"fit": poses, "validation": validation, "constraints": named},
         "dynamics": {"wanted": dynamics, "limits": named, **motion}, "certificate": dict(certificate or {}),

@@ -86,14 +86,15 @@ class Question:
                 return not nothing
             case "torques" | "payloads" | "tolerance_percent":
                 return given.dynamics is not False
-            case "tolerance_mm":
+            case "tolerance_mm" | "program":
                 return not nothing
         return True
 
 
 DEFAULTS = {
-    "robot": "", "instrument": "tracker", "tool": "0.05,0,0.05", "limits": "none", "facing": "z", "dynamics": "yes",
-    "torques": "motor", "payloads": "none", "tolerance_mm": "0", "tolerance_percent": "0", "details": "yes",
+    "robot": "", "instrument": "tracker", "tool": "0.05,0,0.05", "program": "none", "limits": "none", "facing": "z",
+    "dynamics": "yes", "torques": "motor", "payloads": "none", "tolerance_mm": "0", "tolerance_percent": "0",
+    "details": "yes",
 }  # fmt: skip
 QUESTIONS = (
     *(Question(one.name, DEFAULTS.get(one.name, "unknown")) for one in fields(Answers) if one.name != "certificate"),
@@ -150,8 +151,10 @@ def checked(given: Answers) -> dict[str, Any]:
     else:
         result["limits"] = cell_tables(**given.cell) or None
     others = {"payloads": dict(map(_payload, given.payloads)), "certificate": asdict(given.certificate)}
-    others |= {name: getattr(given, name) for name in ("tool", "torques", "tolerance_mm", "tolerance_percent")}
-    return result | {name: value for name, value in others.items() if value}
+    others |= {
+        name: getattr(given, name) for name in ("tool", "program", "torques", "tolerance_mm", "tolerance_percent")
+    }
+    return result | {name: value for name, value in others.items() if value and value != NONE}
 
 
 def _payload(text: str) -> tuple[str, float]:

@@ -19,14 +19,14 @@ import jinja2
 import numpy as np
 
 from calib import files
-from calib.data.csv_table import read_table
+from calib.data.csv_table import Table, read_table
 from calib.data.poses.columns import OURS
-from calib.data.poses.pose_lists import joint_columns, read_poses
+from calib.data.poses.pose_lists import read_poses
 from calib.errors import UsageError, require
 from calib.procedure.report.templates import read
 from calib.rooms.controllers.motion import is_motion, setpoints, stream_values
 from calib.rooms.controllers.program_settings import CSV, ProgramSettings
-from calib.rooms.controllers.table import HERE, Controller, controller_named
+from calib.rooms.controllers.table import HERE, Controller, check_controller, controller_named
 from calib.rooms.controllers.targets import is_program, number, read_program
 from calib.units import ANGLES, LENGTHS
 
@@ -57,6 +57,20 @@ def joints_in(path: Path, source: str = "") -> tuple[np.ndarray, list[str]]:
     return read_poses(path, names), names
 
 
+def joints_table(path: Path, source: str = "") -> Table:
+    """Return the joints of `joints_in` as a table [deg], with a column ``pose`` where the program numbers all of them.
+
+    So do the joints that a controller kept: a UR's log, a KUKA's ``.dat``, a FANUC's ``POSREG.VA``.
+    """
+    q, names = joints_in(path, source)
+    found = read_program(path, source) if source or is_program(path) else None
+    numbers = np.array([found.targets[k].number for k in found.of("joints")] if found else [0])
+    numbered = {"pose": numbers} if numbers.all() else {}
+    rows = np.arange(1, len(q) + 1)
+    cells = (*numbered.values(), *(q / ANGLES["deg"]).T)
+    return Table(str(path), (*numbered, *names), (*("" for _ in numbered), *("deg" for _ in names)), cells, rows)
+
+
 def program_files(
     path: Path, out: Path, name: str, settings: ProgramSettings | None = None, source: str = ""
 ) -> dict[Path, str]:
@@ -75,21 +89,17 @@ def program_files(
     """
     settings, moving = settings or ProgramSettings(), not (source or is_program(path)) and is_motion(path)
     if name == CSV:
-        q, names = joints_in(path, source)
-        header, factors = joint_columns(names, ["revolute"] * len(names))
-        rows = [",".join(f"{value:.12g}" for value in row) for row in q * factors]
+        table = joints_table(path, source)
+        header = [f"{name} [{unit}]" if unit else name for name, unit in zip(table.header, table.units)]
+        rows = [",".join(f"{value:.12g}" for value in row) for row in zip(*table.cells)]
         return {out: "\n".join([",".join(header), *rows, ""])}
     controller, stem = controller_named(name), out.stem
     if not re.fullmatch(controller.names, stem):
         raise UsageError(f"{out}: '{stem}' is no name for a program of {controller.title}: {_words(controller.names)}")
     q, names = setpoints(path, controller) if moving else joints_in(path, source)
-    if controller.axes and q.shape[1] not in controller.axes:
-        allowed = " or ".join(map(str, controller.axes))
-        raise UsageError(f"{path}: {q.shape[1]} joints ({', '.join(names)}); {controller.title} takes {allowed}")
+    check_controller(name, q.shape[1], settings.pulses)
     if settings.output is not None and not controller.outputs:
         raise UsageError(f"--output: {controller.title} raises no output; the operator presses a key")
-    if controller.pulses and (len(settings.pulses) != q.shape[1] or not all(settings.pulses)):
-        raise UsageError(f"--pulse: {controller.title} needs the pulses per degree of each of {q.shape[1]} axes")
     values = stream_values(controller, q) if moving else {"poses": _poses(controller, q, settings)}
     values |= {"name": stem, "joints": names, "head": _head(controller, names, moving), **vars(settings)}
     texts = controller.stream if moving else controller.files

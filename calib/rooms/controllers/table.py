@@ -6,7 +6,7 @@ joint from another zero, its programs would be wrong: play them in the controlle
 """
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.config import parse, strict
-from calib.errors import UsageError, one_of
+from calib.errors import UsageError, one_of, require
 from calib.procedure.report.templates import read
 from calib.units import ANGLES, LENGTHS
 
@@ -49,6 +49,7 @@ class Controller:
     coupled: tuple[tuple[int, int, int], ...] = ()
     joints: str = ""
     pose: str = ""
+    numbered: str = ""
     moves: str = ""
     turn: str = ""
     length: str = "m"
@@ -99,6 +100,15 @@ def controller_named(name: str) -> Controller:
         UsageError: for an unknown name, with the known ones.
     """
     return controllers()[one_of(name, controllers(), "controller", UsageError)]
+
+
+def check_controller(name: str, axes: int, pulses: Sequence[float] = ()) -> None:
+    """Refuse an unknown name, a controller that takes no arm of so many axes, and one whose pulses are not given."""
+    found = controller_named(name)
+    allowed = " or ".join(map(str, found.axes))
+    require(not allowed or axes in found.axes, f"{axes} joints; {found.title} takes {allowed}", UsageError)
+    words = f"{found.title} needs the pulses per degree of each of {axes} axes: calib program --pulse"
+    require(not found.pulses or (len(pulses) == axes and all(pulses)), words, UsageError)
 
 
 def controller_of(path: Path, name: str = "") -> Controller:

@@ -21,6 +21,9 @@ NUMBER = r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)"
 ENCODING = "latin-1"  # one letter for each byte, whatever the program is in
 
 
+NEAR = 200  # letters before a target in which its number stands (our choice)
+
+
 @dataclass(frozen=True)
 class Target:
     """One target in a program.
@@ -30,12 +33,14 @@ class Target:
         spans: begin and end of each of its numbers in the text.
         values: these numbers, in the controller's units.
         kind: ``joints`` or ``pose``.
+        number: of the pose, where the text before it says one; else 0.
     """
 
     line: int
     spans: tuple[tuple[int, int], ...]
     values: tuple[float, ...]
     kind: str
+    number: int = 0
 
 
 @dataclass(frozen=True)
@@ -157,5 +162,7 @@ def _found(text: str, kind: str, controller: Controller) -> list[Target]:
     for match in _matches(text, getattr(controller, kind), controller.comment):
         places = range(1, len(match.groups()) + 1)
         spans, values = tuple(map(match.span, places)), tuple(float(match[k]) for k in places)
-        targets.append(Target(text.count("\n", 0, match.start()) + 1, spans, values, kind))
+        numbered = re.search(rf"(?:{controller.numbered})$", text[max(match.start() - NEAR, 0) : match.start(1)])
+        number = int(next(filter(None, numbered.groups()))) if controller.numbered and numbered else 0
+        targets.append(Target(text.count("\n", 0, match.start()) + 1, spans, values, kind, number))
     return targets

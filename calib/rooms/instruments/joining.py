@@ -1,7 +1,8 @@
 """Join joint values and measured points, each in a file of its own, to one table of measured poses.
 
 ==================  ===================================================================================================
-joints              ``joints.csv``: one row per pose, or a log over time: a column per joint
+joints              ``joints.csv``: one row per pose, or a log over time: a column per joint; or what a program of
+                    `calib program` left at the controller (`calib formats programs`)
 points              ``points.csv``: ``x y z``, with or without an orientation, sigmas, ``tool``
 by name             a column ``name``, ``point``, ``pose``, ``id``, ``label`` or ``target`` in both; ``P_007`` is ``p7``
 by time             a column ``t``, ``time`` or ``timestamp`` in both (a number, or ISO 8601), of the same clock; points
@@ -38,6 +39,8 @@ from calib.procedure.findings import lines_of
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
 from calib.robot.library import load_calibrated
+from calib.rooms.controllers.program import joints_table
+from calib.rooms.controllers.targets import is_program
 from calib.rooms.instruments.order import MAX_MISFIT, MIN_FOUND, MIN_POINTS, find_order
 from calib.units import TIMES
 
@@ -85,7 +88,8 @@ def join(
     """Join a controller's joint values and an instrument's points to one table of measured poses.
 
     Args:
-        joints: CSV file of joint values, one row per pose, or a log over time.
+        joints: CSV file of joint values, one row per pose, or a log over time; or the file in which a controller kept
+            the joints of `calib program`.
         points: CSV file of measured points.
         by: ``name``, ``time``, ``row`` or ``geometry``; empty: the first of them that both files have columns for.
         robot, base, tip: the nominal robot, as of `calib.load`, whose geometry checks the order, or finds it.
@@ -99,7 +103,8 @@ def join(
     """
     one_of(by or "row", WAYS, "by", UsageError)
     arm = load_calibrated(robot, base, tip) if isinstance(robot, str | Path) else robot
-    return _joined(read_table(joints), read_table(points), by, arm and arm.complete)
+    own = joints_table(Path(joints)) if is_program(Path(joints)) else read_table(joints)
+    return _joined(own, read_table(points), by, arm and arm.complete)
 
 
 def _joined(joints: Table, points: Table, by: str, chain: Chain | None) -> Joined:

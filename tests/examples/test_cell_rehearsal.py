@@ -1,0 +1,31 @@
+"""Three arms go from `calib new` to a delivered correction by commands alone, on files as an engineer gets them."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLE = Path(__file__).parents[2] / "examples/cell"
+
+
+def rows(text: str) -> dict[str, list[str]]:
+    """Return the rows of a table in Markdown by their first cell."""
+    cells = ([cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:2] == "| ")
+    return {name: others for name, *others in cells}
+
+
+@pytest.mark.slow
+def test_each_arm_is_corrected_and_the_readme_states_what_a_fresh_run_finds(tmp_path):
+    ran = subprocess.run(
+        [sys.executable, str(EXAMPLE / "rehearsal.py"), "--out", str(tmp_path / "r")],
+        check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    found, stated = rows(ran.stdout), rows((EXAMPLE / "README.md").read_text())
+    assert found.keys() == stated.keys() and len(found) == 5
+    for name in ("ur5", "lrmate200id", "lwr4plus"):
+        controller, verdict, *errors, checked = found[name]
+        assert [controller, verdict, checked] == [*stated[name][:2], stated[name][-1]]
+        assert [float(one) for one in errors] == pytest.approx([float(one) for one in stated[name][2:-1]], rel=0.1)
+        nominal, urdf, sent = map(float, errors)
+        assert urdf < 0.5 * nominal and sent < 0.5 * nominal
