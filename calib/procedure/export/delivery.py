@@ -63,7 +63,7 @@ from calib.robot.calibrated import ROBOT, CalibratedChain, nominal_of
 from calib.robot.chain import Joint
 from calib.robot.description import impossible_bodies
 from calib.robot.formats import urdf_write
-from calib.robot.formats.urdf_tree import text, with_comment
+from calib.robot.formats.urdf_tree import is_urdf, text, with_comment
 
 README, UR_KINEMATICS, MJCF, DRIVES = "README.txt", "ur_kinematics.yaml", "robot.xml", "drives.csv"
 GEOMETRY, DYNAMICS = "geometry", "dynamics"
@@ -108,7 +108,7 @@ class Export:
     @property
     def urdf(self) -> Path | None:
         """Path of the source if it is a URDF; else None."""
-        return self.source if self.source is not None and self.source.suffix == ".urdf" else None
+        return self.source if self.source is not None and is_urdf(self.source) else None
 
     @cached_property
     def with_masses(self) -> tuple[str, list[str]]:
