@@ -60,9 +60,9 @@ def test_a_changed_file_is_read_again(arm):
 
 def test_packages_elsewhere_are_named_by_the_environment(arm, tmp_path, monkeypatch):
     (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "clone").rename(tmp_path / "elsewhere/arm_parts")
-    (tmp_path / "elsewhere/arm_parts/package.xml").unlink()
-    with pytest.raises(RobotError, match=r"no package 'arm_parts' .* ROS_PACKAGE_PATH=/folder/that/holds/arm_parts"):
+    (tmp_path / "clone").rename(tmp_path / "elsewhere/far_parts")
+    arm.write_text(ARM.replace("arm_parts", "far_parts"))
+    with pytest.raises(RobotError, match=r"no package 'far_parts' .* ROS_PACKAGE_PATH=/folder/that/holds/far_parts"):
         calib.load(arm)
     monkeypatch.setenv("ROS_PACKAGE_PATH", str(tmp_path / "elsewhere"))
     assert calib.load(arm).chain.n == 2

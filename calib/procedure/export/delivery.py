@@ -143,6 +143,7 @@ def _geometric_urdf(export: Export, path: Path, name: str) -> list[str]:
     if export.urdf is not None:
         content, read_by = geometry.edited_urdf(export.robot, export.urdf, for_corrections=name != URDF)
         made = f"joint origins of {export.urdf} are calibrated; base link, flange and all else are unchanged"
+        made += "" if export.urdf.suffix == ".urdf" else f" (a URDF: {export.urdf.name} itself is not rewritten)"
     else:
         content = ((export.fit or Path()) / name).read_bytes()
         chain = export.robot.chain if name == URDF else export.robot.complete

@@ -2,8 +2,5 @@
 
 OFFERS = {"descriptions": "reading:", "topics": ":TOPICS"}
 TOPICS = {
-    "descriptions": (
-        "robots as xacro and MJCF",
-        "calib.rooms.descriptions.xacro_files calib.rooms.descriptions.mjcf",
-    )
+    "descriptions": ("robots as xacro and MJCF", "calib.rooms.descriptions.xacro_files calib.rooms.descriptions.mjcf")
 }

@@ -156,7 +156,9 @@ class _Tree:
                 refuse_robot(self.where, f"equality '{name}' closes a loop; see calib formats parallel for such robots")
             offset, ratio, *higher = model.eq_data[k, :5]
             if any(higher):
-                refuse_robot(self.where, f"equality '{name}' of '{self.joints[one]}' is no straight line; edit polycoef")
+                refuse_robot(
+                    self.where, f"equality '{name}' of '{self.joints[one]}' is no straight line; edit polycoef"
+                )
             start, lead = (model.qpos0[model.jnt_qposadr[joint]] for joint in (one, two))
             shift = repr(float(start + offset - ratio * lead))
             found[one] = {"joint": self.joints[two], "multiplier": repr(float(ratio)), "offset": shift}
