@@ -13,6 +13,8 @@ A room is a package of `calib.rooms` with a table ``OFFERS``: what it adds, and 
     return_masses          function: session → notes; hands identified masses to its fit
     track                  function: inputs, dynamics, predictions, controller → replays with the model fed forward
     robots                 functions: what a person names → `calib.procedure.robot_kinds.Mechanism`, or None
+    descriptions           a module: `takes` tells by its name whether a file is another program's description of a
+                           robot, `urdf` returns it as the text of a URDF
     library                folder of the robots that go by a name
     stages                 their verbs: tables of kind → verb → `calib.procedure.robot_kinds.Stage`
     drive_gains            function: robot, cases of currents, settings, known parameters, reference joint → gains of

@@ -8,6 +8,7 @@ touch in nearly every posture (`calib.robot.capsules.inseparable`, listed in `Co
 obstacle that a link never leaves is refused.
 """
 
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -23,9 +24,11 @@ from calib.robot.capsules import SAMPLES, TARGET_RADIUS, Obstacle, Wall, closing
 from calib.robot.chain import Chain, random_joints
 from calib.robot.formats import urdf
 from calib.robot.formats.simulators import configurations, driven_joints
-from calib.robot.formats.urdf_tree import Node, numbers, origin, parse, text
+from calib.robot.formats.urdf_tree import Node, is_urdf, numbers, origin, parse, text
 from calib.robot.kinematics import sweep
 from calib.transforms import pose
+
+PACKAGE_PATH = "ROS_PACKAGE_PATH"
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,8 +288,14 @@ def find_mesh(name: str, folders: Sequence[Path]) -> Path | None:
     if name.startswith("package://"):
         inner = name.removeprefix("package://")
         variants = [inner, inner.partition("/")[2]]
-    found = (folder / variant for folder in folders for variant in variants)
+    found = (folder / variant for folder in (*folders, *package_folders()) for variant in variants)
     return next((path for path in found if path.is_file()), None)
+
+
+def package_folders() -> list[Path]:
+    """Return the folders that hold ROS packages: of ``ROS_PACKAGE_PATH``, and of the installed ROS."""
+    places = [Path(one) for one in os.environ.get(PACKAGE_PATH, "").split(os.pathsep) if one]
+    return places + [Path(one, "share") for one in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if one]
 
 
 def meshes_beside(path: Path) -> dict[str, Path | str]:
@@ -294,7 +303,7 @@ def meshes_beside(path: Path) -> dict[str, Path | str]:
 
     Names from the root, or that lead out of their folder, are left out: a copy of the URDF finds them, or nothing does.
     """
-    if path.suffix != ".urdf":
+    if not is_urdf(path):
         return {}
     folders, found = list(path.resolve().parents), dict[str, Path | str]()
     for _, _, node in urdf_meshes(path, "collision"):

@@ -207,8 +207,8 @@ def test_loading(tmp_path, monkeypatch):
         ("ur5x", r"no robot 'ur5x' \(did you mean 'ur5'\?\); give a path .* iiwa14, lwr4plus"),
         ("absent.urdf", r"no file absent\.urdf; give a path of a \.urdf"),
         ("empty", r"folder empty has no robot\.toml; give .*one of the library"),
-        ("arm.urdf.xacro", r"neither \.urdf nor \.toml; expand it first"),
-        ("arm.step", r"arm\.step is neither \.urdf nor \.toml; give"),
+        ("arm.urdf.xacro", r"arm\.urdf\.xacro: xacro: syntax error"),
+        ("arm.step", r"arm\.step is no robot file; give"),
     ],
 )
 def test_what_is_no_robot(robot, message, tmp_path, monkeypatch):

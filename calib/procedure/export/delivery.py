@@ -63,7 +63,7 @@ from calib.robot.calibrated import ROBOT, CalibratedChain, nominal_of
 from calib.robot.chain import Joint
 from calib.robot.description import impossible_bodies
 from calib.robot.formats import urdf_write
-from calib.robot.formats.urdf_tree import text, with_comment
+from calib.robot.formats.urdf_tree import is_urdf, text, with_comment
 
 README, UR_KINEMATICS, MJCF, DRIVES = "README.txt", "ur_kinematics.yaml", "robot.xml", "drives.csv"
 GEOMETRY, DYNAMICS = "geometry", "dynamics"
@@ -108,7 +108,7 @@ class Export:
     @property
     def urdf(self) -> Path | None:
         """Path of the source if it is a URDF; else None."""
-        return self.source if self.source is not None and self.source.suffix == ".urdf" else None
+        return self.source if self.source is not None and is_urdf(self.source) else None
 
     @cached_property
     def with_masses(self) -> tuple[str, list[str]]:
@@ -143,6 +143,7 @@ def _geometric_urdf(export: Export, path: Path, name: str) -> list[str]:
     if export.urdf is not None:
         content, read_by = geometry.edited_urdf(export.robot, export.urdf, for_corrections=name != URDF)
         made = f"joint origins of {export.urdf} are calibrated; base link, flange and all else are unchanged"
+        made += "" if export.urdf.suffix == ".urdf" else f" (a URDF: {export.urdf.name} itself is not rewritten)"
     else:
         content = ((export.fit or Path()) / name).read_bytes()
         chain = export.robot.chain if name == URDF else export.robot.complete

@@ -30,6 +30,7 @@ from calib.robot import calibrated
 from calib.robot.calibrated import CorrectedChain
 from calib.robot.chain import Joint
 from calib.robot.formats import urdf_write
+from calib.robot.formats.urdf_tree import is_urdf
 
 T = TypeVar("T")
 URDF, CORRECTED_URDF = "robot.urdf", "robot_for_corrections.urdf"
@@ -171,7 +172,7 @@ def _write_all(outcome: Outcome, folder: Path) -> None:
         urdfs[CORRECTED_URDF] = robot.corrections.chain
         _write_corrections(robot.corrections, folder)
     for name, geometry in urdfs.items():
-        if outcome.inputs.source.suffix == ".urdf":
+        if is_urdf(outcome.inputs.source):
             urdf_write.edit_file(outcome.inputs.source, folder / name, chain, geometry)
         else:
             files.write(folder / name, urdf_write.write_new(geometry))

@@ -21,8 +21,8 @@ from calib.robot import calibrated, description
 from calib.robot.calibrated import CalibratedChain, Deflection
 from calib.robot.chain import Chain
 from calib.robot.description import remarks
+from calib.robot.formats.urdf_tree import is_urdf, text
 from calib.robot.formats.urdf_tree import read as read_tree
-from calib.robot.formats.urdf_tree import text
 from calib.robot.library import load, resolve
 
 
@@ -172,7 +172,7 @@ def load_robot(
     if isinstance(robot, CalibratedChain):
         return robot.complete, Path(robot.source or robot.chain.name)
     source = resolve(robot)
-    if source.suffix != ".urdf":
+    if not is_urdf(source):
         if base is None and tip is None and not options.beta:
             return description.read(source, propose_beta=False), source
         return load(robot, base, tip), source
@@ -198,9 +198,9 @@ def load_rigid(
     if isinstance(robot, CalibratedChain):
         return robot, Path(robot.source or robot.chain.name)
     chain, source = load_robot(robot, measured, FitOptions(), base, tip)
-    if measured is not None and tip is None and source.suffix == ".urdf":
+    if measured is not None and tip is None and is_urdf(source):
         _check_whole(chain, source, measured, base)
-    return CalibratedChain(chain) if source.suffix == ".urdf" else calibrated.read(source), source
+    return CalibratedChain(chain) if is_urdf(source) else calibrated.read(source), source
 
 
 def _check_whole(chain: Chain, source: Path, measured: Path, base: str | None) -> None:

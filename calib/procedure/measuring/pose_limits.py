@@ -24,7 +24,7 @@ from calib.procedure.measuring.constraints_file import CameraTable, CollisionTab
 from calib.procedure.measuring.sight import SeenOnly, Sight, sight_of
 from calib.robot.capsules import Obstacle, Wall, signed_distance
 from calib.robot.description import MAX_TURN, remarks
-from calib.robot.formats.urdf_tree import text
+from calib.robot.formats.urdf_tree import is_urdf, text
 from calib.robot.tables import placement
 from poses import constraints
 from poses.space import PoseConstraint, SearchSpace
@@ -336,7 +336,7 @@ def _model(
 
     chain, notes = cell.chain, ()
     around: dict[str, Any] = {"walls": walls, "targets": cell.tools[:, :3, 3], "margin": table.margin, "within": within}
-    if source is not None and source.suffix == ".urdf" and "<collision" in text(source)[0]:
+    if source is not None and is_urdf(source) and "<collision" in text(source)[0]:
         try:
             model = collision.from_urdf(source, chain.base, chain.tip, floor, obstacles, **around)
             if model.missing:

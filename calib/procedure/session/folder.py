@@ -51,6 +51,7 @@ from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFol
 from calib.procedure.session.settings import NOTHING, SCHEMA, SessionSettings, check_schema, read_settings, written
 from calib.records import plain
 from calib.robot.calibrated import ROBOT
+from calib.robot.formats.urdf_tree import converter, text
 
 Say = Callable[[str], None]
 FOLDERS = ("1-robot", "2-poses", "3-measured", "4-fit", "5-validation")
@@ -213,14 +214,15 @@ def create(folder: Path, robot_file: Path, settings: SessionSettings, copied: Ma
 
     Args:
         folder: new, or empty.
-        robot_file: the description, copied into ``1-robot``.
+        robot_file: the description, copied into ``1-robot``, there a URDF where it is xacro or MJCF.
         settings: what ``session.toml`` is to say; the robot's file and the date are filled in here.
         copied: other files to copy, or texts to write, by their names in the folder.
 
     Raises:
         SessionError: if the folder is not empty, or cannot be written.
     """
-    target = f"1-robot/robot{robot_file.suffix}"
+    own = text(robot_file)[0] if converter(robot_file) else robot_file
+    target = f"1-robot/robot{robot_file.suffix if own is robot_file else '.urdf'}"
     created = datetime.now().astimezone().isoformat(timespec="seconds")
     settings = replace(settings, created=created, robot=replace(settings.robot, file=target))
     wanted, measured = settings.dynamics.wanted, settings.instrument.measures != NOTHING
@@ -228,7 +230,7 @@ def create(folder: Path, robot_file: Path, settings: SessionSettings, copied: Ma
     def fill(staging: Path) -> None:
         for name in (*(FOLDERS if measured else FOLDERS[:1]), *(DYNAMIC if wanted else ()), EXPORT[wanted]):
             (staging / name).mkdir()
-        for name, source in {**copied, target: robot_file, SETTINGS: written(settings)}.items():
+        for name, source in {**copied, target: own, SETTINGS: written(settings)}.items():
             files.write(staging / name, source.read_bytes() if isinstance(source, Path) else source)
         if folder.exists():
             folder.rmdir()

@@ -64,6 +64,7 @@ from calib.procedure.session.folder import (
 )
 from calib.robot import calibrated
 from calib.robot.chain import Chain, joint_kinds
+from calib.robot.formats.urdf_tree import is_urdf
 from calib.robot.library import load_calibrated
 from calib.units import JOINT
 from poses.candidates import draw_candidates
@@ -293,7 +294,7 @@ def _fit_settings(session: Session) -> FitSettings:
 def _gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
     """Return the inputs of the fit: robot, measurements, and the given validation files."""
     chain, links, measured = chain_of(session), session.links, session.brought("measured")
-    if session.robot_file.suffix == ".urdf":  # whatever joints the files' columns name
+    if is_urdf(session.robot_file):  # whatever joints the files' columns name
         links = {"base": chain.base, "tip": chain.tip}
     return inputs.gather(
         session.robot_file, measured, validate, options=_options_of(session, [*measured, *validate]),

@@ -15,14 +15,17 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 from xml.parsers import expat
 
 import numpy as np
 
 from calib.errors import RobotError, listing, refuse_robot, refused_as, require, suggestion
+from calib.extensions import offered
 from calib.robot.chain import MIN_LIMIT, Joint
 from calib.transforms import from_xyz_rpy
 
+XACRO = "this is a xacro file; name it so (robot.urdf.xacro)"
 _DECLARED = re.compile(rb"""^\s*<\?xml[^>]*?encoding\s*=\s*["']([A-Za-z0-9._-]+)["']""")
 
 _ATTRIBUTE = re.compile(rb"""\s+([^\s=/>]+)\s*=\s*("[^"]*"|'[^']*')""")
@@ -48,12 +51,24 @@ class Node:
         return next(self.all(tag), None)
 
 
+def converter(path: str | Path) -> Any:
+    """Return the module of a room that converts this file to a URDF (``descriptions``); None where there is none."""
+    return next((room for room in offered("descriptions") if room.takes(str(path))), None)
+
+
+def is_urdf(path: Path) -> bool:
+    """Return whether `text` returns a URDF for this file, read or converted."""
+    return path.suffix == ".urdf" or converter(path) is not None
+
+
 def text(path: str | Path) -> tuple[str, str]:
-    """Return a file's text with unchanged line ends, and its declared encoding (default UTF-8).
+    """Return a URDF's text with unchanged line ends, and its declared encoding (default UTF-8); converted if need be.
 
     Raises:
-        RobotError: where it cannot be read or decoded.
+        RobotError: where it cannot be read, decoded or converted.
     """
+    if (room := converter(path)) is not None:
+        return room.urdf(str(path)), "utf-8"
     with refused_as(RobotError, OSError, f"cannot read {path}: {{}}"):
         data = Path(path).read_bytes()
     declared = _DECLARED.match(data)
@@ -146,7 +161,6 @@ MOVING = ("revolute", "continuous", "prismatic")
 KINDS = (*MOVING, "fixed", "floating", "planar")
 UNLIMITED = 1e9
 TURN = 2 * np.pi + 1e-3  # [rad]
-XACRO = "expand it first: xacro file.xacro > robot.urdf"
 
 
 @dataclass(frozen=True)
@@ -262,7 +276,7 @@ def read(source: str, where: str) -> UrdfTree:
     if root.tag != "robot":
         refuse_robot(f"{where}, line {root.line}", f"the root element is <{root.tag}>, a URDF has <robot>")
     if macro := next((node for node in root.children if _is_macro(node)), None):
-        refuse_robot(f"{where}, line {macro.line}", f"found <{macro.tag}>: this is a xacro file; {XACRO}")
+        refuse_robot(f"{where}, line {macro.line}", f"found <{macro.tag}>: {XACRO}")
     bodies: dict[str, np.ndarray | None] = {}
     for node in root.all("link"):
         name = _fresh(node, bodies, where)
@@ -432,7 +446,7 @@ def numbers(node: Node, key: str, place: str, default: str = "", count: int = 3,
         values = np.empty(0)
     if len(values) != count or np.isnan(values).any() or not (infinite or np.isfinite(values).all()):
         expected = "a number" if count == 1 else f"{count} finite numbers"
-        hint = f"; this is a xacro file, {XACRO}" if found and "${" in found else ""
+        hint = f"; {XACRO}" if found and "${" in found else ""
         refuse_robot(place, f'{key}="{found}" of <{node.tag}> in line {node.line} is not {expected}{hint}')
     return values
 

@@ -9,6 +9,7 @@ from calib.robot import calibrated, description
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
 from calib.robot.formats import urdf
+from calib.robot.formats.urdf_tree import converter, is_urdf
 
 
 def names() -> tuple[str, ...]:
@@ -30,7 +31,8 @@ def load(
     """Return the chain of a robot given by name or path.
 
     Args:
-        robot: a library name, the path of a ``.urdf`` or ``.toml`` file, or a folder that holds ``robot.toml``.
+        robot: a library name, the path of a ``.urdf``, ``.urdf.xacro``, MJCF or ``.toml`` file, or a folder that holds
+            ``robot.toml``.
         base, tip: links of a URDF between which the arm runs.
         joint_names: the joints a measurement file names (URDF).
 
@@ -38,7 +40,7 @@ def load(
         RobotError: where nothing of this kind is found, with the library's names and the nearest one.
     """
     path = resolve(robot)
-    if path.suffix == ".urdf":
+    if is_urdf(path):
         return urdf.read(path, base, tip, joint_names)
     return _check_ends(path, description.read(path), base, tip)
 
@@ -53,7 +55,7 @@ def _check_ends(path: Path, chain: Chain, base: str | None, tip: str | None) -> 
 def load_calibrated(robot: str | Path, base: str | None = None, tip: str | None = None) -> CalibratedChain:
     """Return the calibrated robot of a name or path, with covariance and corrections; arguments as in `load`."""
     path = resolve(robot)
-    if path.suffix == ".urdf":
+    if is_urdf(path):
         return CalibratedChain(load(path, base, tip), source=str(robot))
     found = calibrated.read(path)
     _check_ends(path, found.complete, base, tip)
@@ -64,18 +66,19 @@ def resolve(robot: str | Path) -> Path:
     """Return the file of a robot given by name or path; the working folder takes precedence over the library."""
     place, listed = Path(robot), names()
     require(str(robot).strip(), f"the robot's name is empty; the library has {', '.join(listed)}", RobotError)
-    known = f"a path of a .urdf or .toml file, a folder with robot.toml, or one of the library: {', '.join(listed)}"
+    known = (
+        "a path of a .urdf, .urdf.xacro, MJCF (.xml) or .toml file, a folder with robot.toml, or one of the library: "
+        f"{', '.join(listed)}"
+    )
     if place.is_dir():
         if (place / calibrated.ROBOT).is_file():
             return place / calibrated.ROBOT
         require(str(robot) in listed, f"folder {place} has no robot.toml; give {known}", RobotError)
-    elif place.is_file():
-        if place.suffix in (".urdf", ".toml"):
-            return place
-        advice = "expand it first: xacro file.xacro > robot.urdf" if place.suffix == ".xacro" else f"give {known}"
-        raise RobotError(f"{place} is neither .urdf nor .toml; {advice}")
+    elif place.is_file() or converter(place):
+        require(place.suffix == ".toml" or is_urdf(place), f"{place} is no robot file; give {known}", RobotError)
+        return place
     if str(robot) in listed:
         return path(str(robot))
-    a_path = place.suffix in (".urdf", ".toml") or len(place.parts) > 1
+    a_path = place.suffix in (".urdf", ".toml", ".xacro", ".xml") or len(place.parts) > 1
     what = f"no file {place}" if a_path else f"no robot '{robot}'{suggestion(str(robot), listed)}"
     raise RobotError(f"{what}; give {known}")

@@ -28,7 +28,7 @@ from calib.records import Frozen
 from calib.robot import calibrated, library
 from calib.robot.chain import Chain, Joint, joint_kinds
 from calib.robot.collision import find_mesh, urdf_meshes
-from calib.robot.formats.urdf_tree import numbers, origin
+from calib.robot.formats.urdf_tree import is_urdf, numbers, origin
 from calib.robot.kinematics import forward, joint_frames
 from calib.robot.library import load, resolve
 from calib.transforms import invert
@@ -255,7 +255,7 @@ def _kinds(chain: Chain | Drawn) -> list[str]:
 
 def _meshes(chain: Chain | Drawn | None, source: Path | None) -> tuple[list[Visual], list[str]]:
     """Return the meshes of the moving links, and a note on missing meshes."""
-    if not isinstance(chain, Chain) or source is None or source.suffix != ".urdf" or not chain.links:
+    if not isinstance(chain, Chain) or source is None or not is_urdf(source) or not chain.links:
         return [], []
     found, missing = visuals(source)
     known = [one for one in found if one.link in (chain.base, *chain.links)]

@@ -139,6 +139,13 @@ def test_masses_that_are_not_the_descriptions_are_said(tmp_path, change, factor,
     assert any(catalogue()[code].says.split("{")[0] in line for line in identified.notes_of(identified.read(found)))
 
 
+def test_an_estimate_far_from_every_robot_is_said_with_what_costs_most(tmp_path):
+    """The torques of bodies with negative masses."""
+    write_identification(tmp_path, SOURCE.replace("AXIS", "revolute"), factor=-1.0)
+    line = next(line for line in identified.notes_of(identified.read(tmp_path)) if "nearest" in line)
+    assert "limit" in line and "mostly by" in line
+
+
 def test_all_else_of_the_source_stays(tmp_path):
     source = SOURCE.replace("AXIS", "revolute")
     (tmp_path / "source.urdf").write_text(source)

@@ -1,0 +1,175 @@
+"""MJCF files (MuJoCo) of serial arms, read by MuJoCo's own compiler: ``pip install 'armature-calib[mujoco]'``.
+
+What becomes a URDF, wherever one is taken: bodies as links, hinge and slide joints with axes, places, reference
+positions and ranges, masses and inertias, damping and dry friction, effort limits of motors, sites as links without
+mass. Joints that an equality ties to another one follow it. The root link is ``world``; the tip is a site that alone
+ends the arm, or the last body (--tip names another).
+
+Not taken: meshes and other shapes (links are capsules where collisions matter), armature (torques are identified with a
+motor inertia of their own), gravity other than along -z. Refused: free and ball joints, loops closed by equalities,
+tendons that tie joints of the arm.
+"""
+
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib.errors import RobotError, refuse_robot
+from calib.robot.formats.urdf_tree import UNLIMITED
+from calib.robot.formats.urdf_write import add_joint, numbers_text, xml_text
+from calib.transforms import from_quaternion, invert, pose
+
+WORLD = "world"
+
+
+def convert(path: str) -> str:
+    """Return the URDF text of an MJCF file; an ``.xml`` file that is a URDF already comes back unchanged.
+
+    Raises:
+        RobotError: where MuJoCo is missing or cannot read it, or for what is no serial arm.
+    """
+    text = Path(path).read_text(encoding="utf-8", errors="replace")
+    if "<robot" in text and "<mujoco" not in text.partition("<robot")[0]:
+        return text
+    try:
+        mujoco: Any = import_module("mujoco")
+    except ImportError:
+        words = "an MJCF file is read by MuJoCo: pip install mujoco (or 'armature-calib[mujoco]')"
+        raise RobotError(f"{path}: {words}") from None
+    try:
+        spec = mujoco.MjSpec.from_file(path)
+        model = _compiled(spec)
+    except Exception as error:  # ValueError of the compiler, whatever its reader raises
+        raise RobotError(f"{path}: MuJoCo cannot read it: {' '.join(str(error).split())}") from None
+    return _Tree(model, mujoco, path, spec.modelname).text()
+
+
+def _compiled(spec: Any) -> Any:
+    """Return the model without meshes and pictures, whose files need not be there where masses are stated."""
+    try:
+        return spec.compile()
+    except ValueError as error:
+        if not any(words in str(error) for words in ("opening file", "open file", "resource")):
+            raise
+    for shape in [one for one in spec.geoms if one.meshname]:
+        spec.delete(shape)
+    unused = (spec.meshes, spec.materials, spec.textures, spec.hfields, spec.skins, spec.keys, spec.pairs, spec.sensors)
+    for each in [one for kind in unused for one in kind]:
+        spec.delete(each)
+    return spec.compile()
+
+
+class _Tree:
+    """URDF of a compiled model, body by body."""
+
+    def __init__(self, model: Any, mujoco: Any, where: str, name: str) -> None:
+        self.model, self.mj, self.where = model, mujoco, where
+        self.bodies = [WORLD, *(model.body(k).name or f"body_{k}" for k in range(1, model.nbody))]
+        self.joints = [model.joint(k).name or f"joint_{k}" for k in range(model.njnt)]
+        self.root = ET.Element("robot", name=name or Path(where).stem)
+        self.efforts, self.leaders = self._efforts(), self._leaders()
+
+    def text(self) -> str:
+        ET.SubElement(self.root, "link", name=WORLD)
+        for k in range(1, self.model.nbody):
+            self._add_body(k)
+        taken = {*self.bodies}
+        for k in range(self.model.nsite):
+            name = self.model.site(k).name
+            if name:
+                name = f"{name}_site" if name in taken else name
+                placed = _pose(self.model.site_pos[k], self.model.site_quat[k])
+                ET.SubElement(self.root, "link", name=name)
+                add_joint(self.root, f"{name}_fixed", "fixed", self.bodies[self.model.site_bodyid[k]], name, placed)
+        return xml_text(self.root)
+
+    def _add_body(self, k: int) -> None:
+        """Add a body's joints, in the order in which MuJoCo moves them, and its link, whose frame is the body's.
+
+        With several joints: T = T_body · Π Trans(pos) exp(axis (q - ref)) Trans(-pos) (MuJoCo documentation,
+        "Computation", kinematic tree); a link without mass stands behind each but the last.
+        """
+        model, name = self.model, self.bodies[k]
+        parent, placed = self.bodies[model.body_parentid[k]], _pose(model.body_pos[k], model.body_quat[k])
+        first, count = int(model.body_jntadr[k]), int(model.body_jntnum[k])
+        for j in range(first, first + count):
+            shift = pose(position=model.jnt_pos[j])
+            last = j == first + count - 1 and not model.jnt_pos[j].any()
+            child = name if last else f"{name}_{self.joints[j]}"
+            if not last:
+                ET.SubElement(self.root, "link", name=child)
+            self._add_joint(j, parent, child, placed @ shift)
+            parent, placed = child, invert(shift)
+        if parent != name:
+            add_joint(self.root, f"{name}_fixed", "fixed", parent, name, placed)
+        link, turn = ET.SubElement(self.root, "link", name=name), _pose(model.body_ipos[k], model.body_iquat[k])
+        inertial = ET.SubElement(link, "inertial")
+        ET.SubElement(inertial, "origin", xyz=numbers_text(turn[:3, 3]), rpy="0 0 0")
+        ET.SubElement(inertial, "mass", value=repr(float(model.body_mass[k])))
+        moments = (turn[:3, :3] * model.body_inertia[k]) @ turn[:3, :3].T
+        ET.SubElement(inertial, "inertia", {
+            f"i{'xyz'[a]}{'xyz'[b]}": repr(float(moments[a, b])) for a in range(3) for b in range(a, 3)
+        })  # fmt: skip
+
+    def _add_joint(self, j: int, parent: str, child: str, placed: np.ndarray) -> None:
+        model, name, kinds = self.model, self.joints[j], self.mj.mjtJoint
+        kind = kinds(int(model.jnt_type[j]))
+        if kind not in (kinds.mjJNT_HINGE, kinds.mjJNT_SLIDE):
+            found = "free" if kind == kinds.mjJNT_FREE else "ball"
+            advice = "an arm has hinges and slides; give the robot's own file, not a scene with it"
+            refuse_robot(self.where, f"body '{self.bodies[model.jnt_bodyid[j]]}' has a {found} joint; {advice}")
+        slides, axis, ref = kind == kinds.mjJNT_SLIDE, model.jnt_axis[j], model.qpos0[model.jnt_qposadr[j]]
+        back = pose(position=-ref * axis) if slides else pose(Rotation.from_rotvec(-ref * axis))
+        limited = bool(model.jnt_limited[j])
+        kind = "prismatic" if slides else "revolute" if limited else "continuous"
+        joint, dof = add_joint(self.root, name, kind, parent, child, placed @ back), model.jnt_dofadr[j]
+        ET.SubElement(joint, "axis", xyz=numbers_text(axis))
+        limits = {"effort": repr(self.efforts.get(j, UNLIMITED)), "velocity": repr(UNLIMITED)}
+        if limited or slides:
+            low, high = model.jnt_range[j] if limited else (-UNLIMITED, UNLIMITED)
+            limits |= {"lower": repr(float(low)), "upper": repr(float(high))}
+        ET.SubElement(joint, "limit", limits)
+        damping, friction = (repr(float(one[dof])) for one in (model.dof_damping, model.dof_frictionloss))
+        ET.SubElement(joint, "dynamics", damping=damping, friction=friction)
+        if j in self.leaders:
+            ET.SubElement(joint, "mimic", self.leaders[j])
+
+    def _efforts(self) -> dict[int, float]:
+        """Return the largest force or torque of each joint's actuators with a limit [N m or N]."""
+        model, found = self.model, {}
+        for k in range(model.nu):
+            if model.actuator_trntype[k] == int(self.mj.mjtTrn.mjTRN_JOINT) and model.actuator_forcelimited[k]:
+                most = np.abs(model.actuator_forcerange[k]).max() * abs(model.actuator_gear[k, 0])
+                found[int(model.actuator_trnid[k, 0])] = float(most)
+        return found
+
+    def _leaders(self) -> dict[int, dict[str, str]]:
+        """Return the <mimic> of each joint that an equality ties to another; refuse what closes a loop."""
+        model, kinds, found = self.model, self.mj.mjtEq, {}
+        for k in range(model.neq):
+            name = model.equality(k).name or f"number {k + 1}"
+            one, two = (int(each) for each in (model.eq_obj1id[k], model.eq_obj2id[k]))
+            if model.eq_type[k] != int(kinds.mjEQ_JOINT) or two < 0:
+                refuse_robot(self.where, f"equality '{name}' closes a loop; describe such a robot as a parallel one")
+            offset, ratio, *higher = model.eq_data[k, :5]
+            if any(higher):
+                refuse_robot(
+                    self.where, f"equality '{name}' of '{self.joints[one]}' is no straight line; edit polycoef"
+                )
+            start, lead = (model.qpos0[model.jnt_qposadr[joint]] for joint in (one, two))
+            shift = repr(float(start + offset - ratio * lead))
+            found[one] = {"joint": self.joints[two], "multiplier": repr(float(ratio)), "offset": shift}
+        tied = {*found, *(self.joints.index(each["joint"]) for each in found.values())}
+        for k in range(model.nwrap):
+            if model.wrap_type[k] != int(self.mj.mjtWrap.mjWRAP_JOINT) or int(model.wrap_objid[k]) not in tied:
+                refuse_robot(self.where, "a tendon moves it, which a serial arm does not have; take it out of the file")
+        return found
+
+
+def _pose(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
+    """Return the pose (4, 4) of MuJoCo's position and quaternion w x y z."""
+    return from_quaternion(position, np.roll(quaternion, -1))
