@@ -4,9 +4,9 @@ Arguments follow the file as they do on the command line of xacro, all in quotes
 
     calib fit "ur.urdf.xacro ur_type:=ur5e name:=ur5e" measured.csv --out fit
 
-``$(find NAME)`` and ``package://NAME`` need no ROS: a package is a folder of that name, or one whose ``package.xml`` has
-the name, among the folders above the file and those beside them, in the installed ROS (``AMENT_PREFIX_PATH``), or in
-the folders of the environment variable ``ROS_PACKAGE_PATH``, separated by colons.
+``$(find NAME)`` and ``package://NAME`` need no ROS: a package is a folder of that name, or one whose ``package.xml``
+has the name, among the folders above the file and those beside them, in the installed ROS (``AMENT_PREFIX_PATH``), or
+in the folders of the environment variable ``ROS_PACKAGE_PATH``, separated by colons.
 
 A calibrated robot is exported as a URDF: the expanded file with its joint origins edited; the xacro itself is never
 rewritten.
