@@ -8,14 +8,15 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from html import unescape
 from pathlib import Path
 from typing import Any
 
 import pytest
-from sessions import begin, go_on
+from sessions import begin, edit, go_on
 from starlette.testclient import TestClient
 
-from calib.procedure.session import commands, steps
+from calib.procedure.session import commands
 from calib.procedure.session.folder import Session, open_session
 from calib.rooms.cells import demo
 from calib.rooms.cells.virtual_cells import virtual_cell
@@ -52,13 +53,14 @@ def bring(client: TestClient, kind: str, name: str, content: bytes = b"x\n1\n") 
 
 
 def test_the_page_says_what_calib_next_says(session: Session, client: TestClient) -> None:
-    plan = session.path("2-poses/poses.csv")
-    shown = client.get("/").text
-    assert "read the robot" in shown and not plan.exists()
-    (session.folder / "state.json").unlink(missing_ok=True)
-    state = steps.State(steps.find(session, "measure"), steps.WAITING, "")
-    task, file = commands.asks(session, state)
-    assert "Measure the target" in task and "Bring " in file
+    assert "read the robot" in client.get("/").text
+    edit(session.path("session.toml"), "plan = true", "plan = false")
+    waits = go_on(session)
+    assert waits is not None
+    task, file = commands.asks(session, waits)
+    shown = re.sub("<.*?>", "", unescape(client.get("/").text))
+    lines = [line.partition(" ")[2] for line in task.splitlines()]
+    assert len(lines) == 3 and all(line in shown for line in (*lines, file))
 
 
 def test_files_come_under_the_names_that_the_session_reads(session: Session, client: TestClient) -> None:

@@ -43,7 +43,7 @@ def serve(folder: Path, host: str = LOCAL, port: Annotated[int, typer.Option(min
     with refused_as(UsageError, OSError, f"cannot listen on {host}, port {port} ({{}}); try another --port"):
         listening = socket.create_server((host, port))
     work = Work(folder)
-    shown = socket.gethostname() if host == "0.0.0.0" else host
+    shown = _own_address() if host == "0.0.0.0" else host
     address = f"http://{shown}:{listening.getsockname()[1]}/{f'?token={token}' if token else ''}"
     say(f"{folder}: {address} (Ctrl-C stops)", result=True)
     try:
@@ -53,3 +53,15 @@ def serve(folder: Path, host: str = LOCAL, port: Annotated[int, typer.Option(min
         pass
     finally:
         work.stop()
+
+
+def _own_address() -> str:
+    """Return this computer's address towards other networks, or its name where it has none; nothing is sent."""
+    import socket
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as route:
+        try:
+            route.connect(("192.0.2.1", 9))  # an address of documentation (RFC 5737)
+            return route.getsockname()[0]
+        except OSError:
+            return socket.gethostname()
