@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sessions import begin, edit, go_on
+from sessions import begin, go_on
 from starlette.testclient import TestClient
 
-from calib.procedure.session import commands
+from calib.procedure.session import commands, steps
 from calib.procedure.session.folder import Session, open_session
 from calib.rooms.cells import demo
 from calib.rooms.cells.virtual_cells import virtual_cell
@@ -52,11 +52,10 @@ def bring(client: TestClient, kind: str, name: str, content: bytes = b"x\n1\n") 
     return client.post(f"/bring/{kind}", files={"file": (name, content)}, follow_redirects=False)
 
 
-def test_the_page_says_what_calib_next_says(session: Session, client: TestClient) -> None:
+def test_the_page_says_what_calib_next_says(session: Session, client: TestClient, monkeypatch) -> None:
     assert "read the robot" in client.get("/").text
-    edit(session.path("session.toml"), "plan = true", "plan = false")
-    waits = go_on(session)
-    assert waits is not None
+    waits = steps.State(steps.find(session, "measure"), steps.WAITING, "a file of measured poses")
+    monkeypatch.setattr(steps, "states", lambda _: [waits])
     task, file = commands.asks(session, waits)
     shown = re.sub("<.*?>", "", unescape(client.get("/").text))
     lines = [line.partition(" ")[2] for line in task.splitlines()]

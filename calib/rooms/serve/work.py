@@ -114,7 +114,7 @@ class Work:
         self._waiting.clear()
         if self._process is not None and self._process.is_alive():
             with suppress(ProcessLookupError):
-                os.kill(self._process.pid, signal.SIGINT)
+                os.kill(int(self._process.pid), signal.SIGINT)
             self._process.join(10.0)
             self._process.kill()
 
