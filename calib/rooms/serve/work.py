@@ -63,7 +63,8 @@ class Work:
         self.folder, self.current, self.last = folder, None, None
         self.checks: dict[str, Job] = {}
         self._waiting: deque[Job] = deque()
-        self._lock, self._process = Lock(), None
+        self._lock = Lock()
+        self._process: Any = None
         self.current: Job | None
         self.last: Job | None
 
@@ -114,7 +115,7 @@ class Work:
         self._waiting.clear()
         if self._process is not None and self._process.is_alive():
             with suppress(ProcessLookupError):
-                os.kill(int(self._process.pid), signal.SIGINT)
+                os.kill(self._process.pid, signal.SIGINT)
             self._process.join(10.0)
             self._process.kill()
 
