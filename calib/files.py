@@ -151,6 +151,12 @@ def clear_leftovers(path: Path) -> None:
                 left.unlink(missing_ok=True)
 
 
+def in_use(path: Path) -> bool:
+    """Return whether a temporary file or folder (`staged_name`) belongs to a running process."""
+    found = re.fullmatch(r"\..*\.(\d+)\.[^.]+\.part", path.name)
+    return found is not None and _alive(int(found[1]))
+
+
 def _alive(process: int) -> bool:
     try:
         os.kill(process, 0)

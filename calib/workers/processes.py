@@ -288,7 +288,7 @@ def _serve(pipe: connection.Connection) -> None:
 
     hear = partial(signal.signal, signal.SIGINT, interrupt)
     hush = partial(signal.signal, signal.SIGINT, signal.SIG_IGN)
-    Thread(target=_end_with_parent, daemon=True).start()
+    Thread(target=end_with_parent, daemon=True).start()
     sys.unraisablehook = _unheard
     hush()
     signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
@@ -309,7 +309,8 @@ def _unheard(unraisable: Any) -> None:
         sys.__unraisablehook__(unraisable)
 
 
-def _end_with_parent() -> None:
+def end_with_parent() -> None:
+    """Wait for the parent process, and end this process with it."""
     if parent := parent_process():
         parent.join()
         os._exit(1)

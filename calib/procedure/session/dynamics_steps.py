@@ -116,7 +116,7 @@ def record(session: Session, say: Say) -> list[str]:
         rounds = [
             name for name in designed_motions(session) if name.startswith(ROUND) and path in _logs_of(session, name)
         ]
-        found, said = _check_recording(session, path, ["training", *rounds][-1])
+        found, said = check_recording(session, path, ["training", *rounds][-1])
         cuts[path.name] = found
         notes += said
     files.write_json(session.path(CUTS), cuts)
@@ -124,7 +124,7 @@ def record(session: Session, say: Say) -> list[str]:
     return notes
 
 
-def _check_recording(session: Session, path: Path, name: str) -> tuple[list[float] | None, list[str]]:
+def check_recording(session: Session, path: Path, name: str) -> tuple[list[float] | None, list[str]]:
     """Return start and end of the designed motion in a recording [s] (None: use the whole recording), and notes.
 
     Raises:
@@ -312,7 +312,7 @@ def predict(session: Session, say: Say) -> list[str]:
     unseen = session.brought("unseen")
     notes, aside = [], {}
     for path in unseen:
-        aside[path.name], said = _check_recording(session, path, "validation")
+        aside[path.name], said = check_recording(session, path, "validation")
         notes += said
     say("predicting unseen motion")
     given = _gathered(session, training, [*held, *_cut_paths(unseen, aside)], say)

@@ -205,7 +205,7 @@ def arrive(session: Session, say: Say) -> list[str]:
     """Check the measured files for the fit, and return notes."""
     chain, sigma = chain_of(session), session.settings.instrument.sigma_position
     blocks, again = (read_measured(session, chain, session.brought(kind)) for kind in ("measured", "drift"))
-    notes = _notes_on(session, chain, blocks, POSES)
+    notes = notes_on(session, chain, blocks, POSES)
     notes += lines_of(drift(chain, [block for _, block in blocks], [block for _, block in again], sigma))
     files.write(session.path(POSES_CHECKED), "\n".join(notes) + "\n")
     return notes
@@ -223,7 +223,7 @@ def read_measured(
     return [(path.name, block) for path in paths for block in inputs.read_file(path, chain, options, like)]
 
 
-def _notes_on(session: Session, chain: Chain, blocks: Sequence[tuple[str, PoseMeasurements]], plan: str) -> list[str]:
+def notes_on(session: Session, chain: Chain, blocks: Sequence[tuple[str, PoseMeasurements]], plan: str) -> list[str]:
     """Return the notes on measured blocks: rows, kind, ignored columns, poses missing from a list in ``2-poses``."""
     measures, notes, path = session.settings.instrument.measures, [], session.path(f"2-poses/{plan}")
     planned = None
@@ -322,7 +322,7 @@ def validate(session: Session, say: Say) -> list[str]:
     chain, unseen, fit, out = chain_of(session), session.brought("validation"), session.fit, session.validation
     before, report = fit.metrics(), fit_report.read(fit.report)
     like = _gathered(session).fit if any(path.is_dir() for path in unseen) else ()
-    notes = _notes_on(session, chain, read_measured(session, chain, unseen, like), UNSEEN)
+    notes = notes_on(session, chain, read_measured(session, chain, unseen, like), UNSEEN)
     say("comparing on unseen poses")
     given, options, wanted = _gathered(session, unseen), _options_of(session), _fit_settings(session)
     settings = Settings(wanted.loss or options.loss, options.loss_scale)
@@ -370,8 +370,10 @@ def _exported(session: Session, out: Path, say: Say) -> list[str]:
 
 
 def clear_staging(session: Session) -> None:
-    """Remove the temporary folders of a killed command."""
+    """Remove the temporary folders of a killed command; an upload that arrives meanwhile stays."""
     for path in session.folder.rglob(".*.part"):
+        if files.in_use(path):
+            continue
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
         else:

@@ -1,0 +1,163 @@
+"""The one worker of a served session: a process per run of `calib next` or check of files, one at a time.
+
+What a run says is kept here, so that every page, reloaded or in another tab, shows the same progress.
+"""
+
+import os
+import signal
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from pathlib import Path
+from threading import Lock, Thread
+from typing import Any
+
+from calib import bug_reports
+from calib.errors import command_line, complaint
+from calib.procedure.session.folder import POSES, UNSEEN, Session, open_session
+from calib.workers.processes import end_with_parent
+
+CHECK, NEXT, REDO = "check", "next", "redo"
+_spawned = get_context("spawn")  # a forked process has threads of libraries that are not there
+
+
+@dataclass
+class Job:
+    """A run or a check, and what it has said so far.
+
+    Attributes:
+        task: `CHECK`, `NEXT` or `REDO`.
+        subject: the kind of files to check, or the step to repeat.
+        lines, words: said to stay, and the last that passes.
+        problem: why it failed.
+        began: by `time.monotonic` [s].
+    """
+
+    task: str
+    subject: str = ""
+    lines: list[str] = field(default_factory=list)
+    words: str = ""
+    problem: str = ""
+    began: float = 0.0
+
+    @property
+    def seconds(self) -> int:
+        """Since it began [s]."""
+        return round(time.monotonic() - self.began)
+
+
+class Work:
+    """Runs jobs on a session's folder one after the other, each in a process of its own.
+
+    Attributes:
+        current: the running job, or None.
+        last: the last run.
+        checks: the last check of each kind of files.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.current, self.last = folder, None, None
+        self.checks: dict[str, Job] = {}
+        self._waiting: deque[Job] = deque()
+        self._lock = Lock()
+        self._process: Any = None
+        self.current: Job | None
+        self.last: Job | None
+
+    def ask(self, task: str, subject: str = "") -> bool:
+        """Queue a job and return True; return False where a run is under way, or this check is queued."""
+        with self._lock:
+            known = [*self._waiting, *([self.current] if self.current and task != CHECK else [])]
+            if any(
+                (task != CHECK and one.task != CHECK) or (one.task, one.subject) == (task, subject) for one in known
+            ):
+                return False
+            self._waiting.append(Job(task, subject))
+            if self.current is None:
+                self._begin()
+            return True
+
+    def _begin(self) -> None:
+        self.current = job = self._waiting.popleft()
+        job.began = time.monotonic()
+        heard, telling = _spawned.Pipe(duplex=False)
+        self._process = _spawned.Process(target=_run, args=(telling, self.folder, job.task, job.subject))
+        self._process.start()
+        telling.close()
+        Thread(target=self._listen, args=(job, heard, self._process), daemon=True).start()
+
+    def _listen(self, job: Job, heard: Connection, process: Any) -> None:
+        with suppress(EOFError, OSError):
+            while True:
+                kind, words = heard.recv()
+                if kind == "line":
+                    job.lines.append(words)
+                else:
+                    setattr(job, kind, words)
+        process.join()
+        if process.exitcode and not job.problem:
+            job.problem = "it was interrupted; nothing is lost, continue from here"
+        with self._lock:
+            if job.task == CHECK:
+                self.checks[job.subject] = job
+            else:
+                self.last = job
+            self.current = None
+            if self._waiting:
+                self._begin()
+
+    def stop(self) -> None:
+        """Interrupt the running job, as Ctrl-C does; the session can be resumed."""
+        self._waiting.clear()
+        if self._process is not None and self._process.is_alive():
+            with suppress(ProcessLookupError):
+                os.kill(self._process.pid, signal.SIGINT)
+            self._process.join(10.0)
+            self._process.kill()
+
+
+def _run(telling: Connection, folder: Path, task: str, subject: str) -> None:
+    """Do a job in its own process, and send what there is to say."""
+    from calib.procedure.session.commands import go_on
+
+    def tell(kind: str) -> Callable[[object], None]:
+        return lambda words: telling.send((kind, str(words)))
+
+    Thread(target=end_with_parent, daemon=True).start()
+    typed = command_line("serve", folder)
+    try:
+        if task == CHECK:
+            for line in checked(open_session(folder), subject):
+                tell("line")(line)
+        else:
+            go_on(folder, tell("line"), tell("words"), typed, subject if task == REDO else "")
+    except KeyboardInterrupt:
+        tell("problem")("it was interrupted; nothing is lost, continue from here")
+    except Exception as error:
+        foreseen = complaint(error)
+        tell("problem")(foreseen[0] if foreseen else bug_reports.report(error, [typed], folder))
+
+
+def checked(session: Session, kind: str) -> list[str]:
+    """Check the files that were brought of a kind as the session's step does, and return its notes.
+
+    Raises:
+        CalibError: for what the step would refuse.
+    """
+    from calib.procedure.session import dynamics_steps, geometry_steps
+
+    paths = session.brought(kind)
+    if kind in ("training", "unseen"):
+        if not session.fit.robot.exists():
+            return ["the logs are checked once the geometry is fitted"]
+        motion = "training" if kind == "training" else "validation"
+        return [note for path in paths for note in dynamics_steps.check_recording(session, path, motion)[1]]
+    chain = geometry_steps.chain_of(session)
+    blocks = geometry_steps.read_measured(session, chain, paths)
+    if kind == "drift":
+        return [f"{name}: {len(block)} rows" for name, block in blocks]
+    return geometry_steps.notes_on(session, chain, blocks, POSES if kind == "measured" else UNSEEN)
