@@ -13,7 +13,7 @@ LOCAL = "127.0.0.1"
 
 
 @command(app, "Start")
-def serve(folder: Path, host: str = LOCAL, port: Annotated[int, typer.Option(min=0, max=65535)] = 8000) -> None:
+def serve(folder: Path, host: str = LOCAL, port: Annotated[int, typer.Option(min=0)] = 8000) -> None:
     """Serve a session as a web page: what to do now, upload of files with their check, progress, results.
 
     It stops with Ctrl-C; the session goes on from there.
@@ -40,7 +40,8 @@ def serve(folder: Path, host: str = LOCAL, port: Annotated[int, typer.Option(min
 
     open_session(folder)
     token = "" if host in (LOCAL, "localhost") else secrets.token_urlsafe(16)
-    with refused_as(UsageError, OSError, f"cannot listen on {host}, port {port} ({{}}); try another --port"):
+    words = f"cannot listen on {host}, port {port} ({{}}); try another --port"
+    with refused_as(UsageError, (OSError, OverflowError), words):
         listening = socket.create_server((host, port))
     work = Work(folder)
     shown = _own_address() if host == "0.0.0.0" else host
