@@ -84,7 +84,8 @@ def formats(topic: Annotated[str | None, typer.Argument(autocompletion=topics)] 
 
     Args:
         topic: measurements, instruments, join, images, descriptions, targets, programs, options, identify-options,
-            identified, exports, constraints, mdh, parallel, robot, session, limits, waypoints, excitation, study or recordings
+            identified, exports, constraints, mdh, parallel, robot, session, limits, waypoints, excitation, study or
+            recordings
         schema: the JSON schema of a TOML file, for editors that complete its keys
     """
     from calib.procedure import formats as documents
