@@ -46,19 +46,20 @@ def test_a_planted_joint_offset_is_found_and_named(fits):
     assert "joint_3.offset alone explains it" in str(found)
 
 
+def test_a_tolerance_that_holds_near_the_fits_alone_is_marginal(fits):
+    found = calib.diff(fits / "first", fits / "crashed", DiffSettings(tolerance=3e-4))
+    assert found.today < 3e-4 < found.geometry.motions[1].rms
+    assert found.verdict == "marginal" and "near the poses of the fits" in str(found)
+
+
 def test_base_and_tool_count_only_where_told(fits):
     """A base that moved is no change of the arm, unless instrument and target were left as they were."""
     moved = fits / "moved"
     if not moved.exists():
         table = np.genfromtxt(fits / "second.csv", delimiter=",", skip_header=1)
         table[:, 6:] += (0.2, 0.0, 0.1)
-        np.savetxt(
-            fits / "moved.csv",
-            table,
-            delimiter=",",
-            header=(fits / "second.csv").read_text().split("\n")[0],
-            comments="",
-        )
+        header = (fits / "second.csv").read_text().split("\n")[0]
+        np.savetxt(fits / "moved.csv", table, delimiter=",", header=header, comments="")
         settings = calib.FitSettings(model="geometry", holdout=0.2)
         calib.fit_geometry(UR5 / "model.urdf", fits / "moved.csv", settings).save(moved, plots=False)
     free, held = (

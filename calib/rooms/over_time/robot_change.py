@@ -232,6 +232,9 @@ def _findings(
     if tolerance:
         today = _today(two, found)
         result.append(finding("outgrown", times=today / tolerance, today=today, after=two.name))
+        wide = found.motions[1]
+        times = np.sqrt(max(wide.rms**2 - wide.expected**2, 0.0)) / tolerance
+        result.append(finding("outgrown-elsewhere", times=times, moved=wide.rms, expected=wide.expected))
     beyond = moved.rms / max(left, 1e-12)
     result.append(finding(
         "arm-changed", sigmas=found.sigmas, beyond=0.0 if tolerance else beyond, probability=found.probability,
