@@ -21,10 +21,11 @@ from calib.procedure.session import commands, steps
 from calib.procedure.session.folder import BROUGHT, Session, open_session
 from calib.rooms.serve import uploads
 from calib.rooms.serve.work import CHECK, NEXT, REDO, Work
+from calib.rooms.viewer.viewer import FILE as RECORDING
 
 HERE = "calib.rooms.serve"
 DRIFT = "the first poses measured again at the end, to check for drift (optional)"
-PICTURES, RECORDING = (".png", ".svg"), "session.rrd"
+PICTURES = (".png", ".svg")
 OURS = "default-src 'none'; style-src 'unsafe-inline'; script-src 'self'; connect-src 'self'; img-src 'self' data:"
 POLICY = f"{OURS}; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
 SANDBOX = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox"  # of files, whoever wrote them
