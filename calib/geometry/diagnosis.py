@@ -1,7 +1,8 @@
 """Checks of measurements against the model: changed set-up, systematic residuals, changed columns, a scale factor.
 
-Changed columns (joint signs, exchanged joints, mirrored axes): the nominal arm, base and tool placement free, explains
-rows as measured and with each change; the errors of a sound arm are small compared with either.
+Changed columns (joint signs, exchanged joints, mirrored axes, angles of another convention): the nominal arm, base and
+tool placement free, explains rows as measured and with each change; the errors of a sound arm are small compared with
+either.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,9 +13,11 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
 from calib.column_changes import Change, Explanation, best_changes, coupling, couplings, exchange, reversal
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions, take
+from calib.data.poses.plausible import from_angles, to_angles
 from calib.errors import CalibError, Finding, finding
 from calib.geometry.accuracy import errors
 from calib.geometry.first_guess import install
@@ -190,6 +193,8 @@ def length_factor(fit: GeometricFit) -> Scale | None:
 
 
 SHORT = Settings(limit=20, passes=1)  # where base and tool settle at all they do so sooner
+# of the makers' angles; others are rare (our choice)
+CONVENTIONS = ("vector", "xyz fixed", "xyz moving", "zyx fixed", "zyx moving", "zyz moving", "zxz moving")
 FLIP = np.array([1.0, -1.0, 1.0])
 Blocks = Sequence[PoseMeasurements]
 
@@ -214,6 +219,11 @@ def wrong_columns(nominal: Installation, blocks: Blocks, mirrored: bool = False)
     table += [Change("joints-exchanged", _of_joints(exchange(n, *pair)), pair, max_left=surely) for pair in pairs]
     if mirrored and any(isinstance(block, Positions) for block in blocks):
         table.append(Change("left-handed", _mirrored, max_left=surely))
+    if read_as := {block.euler for block in blocks if isinstance(block, Poses)} - {""}:
+        others = (euler for euler in CONVENTIONS if euler not in read_as)
+        table += [
+            Change("angle-convention", partial(_read_as, euler), (), {"convention": euler}, surely) for euler in others
+        ]
     return best_changes(few, table, partial(_left, nominal), partial(_least, nominal), n)
 
 
@@ -229,6 +239,17 @@ def _mirrored(blocks: Blocks) -> Blocks:
             block = replace(block, position=np.asarray(block.position) * FLIP)
         if isinstance(block, Poses):
             block = replace(block, quaternion=np.asarray(block.quaternion) * [-1.0, 1.0, -1.0, 1.0])
+        found.append(block)
+    return found
+
+
+def _read_as(euler: str, blocks: Blocks) -> Blocks:
+    """Return blocks with the angles of orientations read by another convention."""
+    found = []
+    for block in blocks:
+        if isinstance(block, Poses) and block.euler:
+            angles = to_angles(Rotation.from_quat(block.quaternion), block.euler)
+            block = replace(block, quaternion=from_angles(angles, euler).as_quat(canonical=True), euler=euler)
         found.append(block)
     return found
 

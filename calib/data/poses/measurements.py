@@ -149,11 +149,13 @@ class Poses(Positions):
         quaternion: (m, 4) x y z w of unit norm.
         sigma_rotation: (m, 3) standard deviation of the orientation, about the station's axes [rad]; None where not
             stated.
+        euler: meaning of the three angles that `quaternion` was read from, as in the options; empty for other columns.
     """
 
     quaternion: np.ndarray
     _: KW_ONLY
     sigma_rotation: np.ndarray | None = None
+    euler: str = ""
 
     kind: ClassVar[str] = "pose"
     placing: ClassVar[int] = 0

@@ -125,11 +125,25 @@ def orientation(sheet: Sheet, names: Sequence[str]) -> np.ndarray:
         return unit_quaternions(values, sheet.table, names)
     if len(names) == 9:
         return _from_matrices(values.reshape(-1, 3, 3), sheet.table, names).as_quat(canonical=True)
-    if (euler := sheet.options.euler) == "vector":
-        return Rotation.from_rotvec(values).as_quat(canonical=True)
-    TURNS.check(values, sheet.table, names)
+    if sheet.options.euler != "vector":
+        TURNS.check(values, sheet.table, names)
+    return from_angles(values, sheet.options.euler).as_quat(canonical=True)
+
+
+def from_angles(values: np.ndarray, euler: str) -> Rotation:
+    """Return the rotations of three numbers each (m, 3) [rad], by what the options' ``euler`` says they mean."""
+    return Rotation.from_rotvec(values) if euler == "vector" else Rotation.from_euler(_axes(euler), values)
+
+
+def to_angles(turns: Rotation, euler: str) -> np.ndarray:
+    """Return the three numbers (m, 3) [rad] of rotations, the inverse of `from_angles`."""
+    return turns.as_rotvec() if euler == "vector" else turns.as_euler(_axes(euler))
+
+
+def _axes(euler: str) -> str:
+    """Return SciPy's letters of a convention: small ones for turns about fixed axes."""
     axes, _, how = {"wpr": "xyz fixed", "xyz": "xyz moving"}.get(euler, euler).partition(" ")
-    return Rotation.from_euler(axes if how == "fixed" else axes.upper(), values).as_quat(canonical=True)
+    return axes if how == "fixed" else axes.upper()
 
 
 def _from_matrices(matrices: np.ndarray, source: Rows, columns: Sequence[str]) -> Rotation:

@@ -279,7 +279,8 @@ def _read_targets(sheet: Sheet, layout: Layout, q: np.ndarray) -> Positions:
     block = Positions(q[index], layout.joints, position[index, target], **common)
     if layout.kind == Poses.kind:
         turns, about = plausible.orientation(sheet, layout.orientation), _sigma_rotation(sheet, layout)
-        block = Poses(q[index], layout.joints, block.position, turns, sigma_rotation=about, **common)
+        euler = sheet.options.euler if len(layout.orientation) == 3 else ""
+        block = Poses(q[index], layout.joints, block.position, turns, sigma_rotation=about, euler=euler, **common)
     if not layout.base:
         return block
     base = sheet.numbers(layout.base[:3], POSITION)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from calib.errors import Finding
 from calib.procedure.findings import catalogue, level_of, lines_of
@@ -86,6 +87,21 @@ def test_joints_that_turn_the_other_way_are_named(cell, calib, reversed_ones, mo
     assert odd[0] == "joint-sign" and "moved" not in odd
     assert noticed()["joint-sign"].values["joints"] == [cell.nominal.joint_names[j] for j in reversed_ones]
     assert model != "frames" or accepted(calib, out)[0] == 0
+
+
+@pytest.mark.slow
+def test_angles_of_another_convention_are_named(cell, calib):
+    """A controller's A B C turn about moving axes z y x; here they are stated as fixed ones."""
+    rows = cell.measure(COUNT)
+    for row in rows:
+        turns = Rotation.from_quat([row.pop(name) for name in ("qx", "qy", "qz", "qw")])
+        row |= dict(zip(("rx", "ry", "rz"), turns.as_euler("ZYX")))
+    Path("e.toml").write_text('euler = "zyx fixed"')
+    done, out, err = calib("fit", "ur5", cell.write("m.csv", rows), "--out", "o", "--options", "e.toml")
+    assert (done, *verdict()[:2]) == (1, "fail", "angle-convention"), err
+    stated = re.search(r'euler = "(\w+ \w+)"', out)
+    assert stated and Path("e.toml").write_text(stated[0])
+    assert calib("fit", "ur5", "m.csv", "--out", "o", "--options", "e.toml")[0] == 0
 
 
 @pytest.mark.parametrize("model", ["frames", pytest.param("geometry", marks=pytest.mark.slow)])
