@@ -1,6 +1,7 @@
 """Two calibrations of one robot: nothing moved, or what moved is found and named."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from recordings import DATA
 import calib
 from calib import cli
 from calib.errors import RobotError, UsageError
+from calib.rooms.over_time import robot_change
 from calib.rooms.over_time.settings import DiffSettings
 
 UR5 = DATA / "ur5_gts3800"
@@ -93,3 +95,17 @@ def test_what_cannot_be_compared_is_refused(fits, tmp_path):
         calib.diff(fits / "first", tmp_path)
     with pytest.raises(UsageError, match="neither ur5 nor panda is"):
         calib.diff("ur5", "panda")
+
+
+def test_what_makes_two_calibrations_hard_to_compare_is_said():
+    """Combinations that one alone has, a failed one, another serial number, several parameters changed."""
+    fit = SimpleNamespace(cell=SimpleNamespace(deflection=SimpleNamespace(terms=())), left=1e-4, judged=("fail", "bad"))
+    one, two = (SimpleNamespace(**vars(fit), name=name, serial=name) for name in ("a", "b"))
+    moved = SimpleNamespace(rms=1e-3, expected=1e-5)
+    first = SimpleNamespace(name="joint_3.offset", alone=1e-3, alone_sigma=1e-5, unit="rad")
+    found = SimpleNamespace(
+        motions=[moved, moved], sigmas=9.0, probability=1e-9, changed=True, parameters=[first], alone=False,
+        unexplained=50.0, rivals=[], extra=(1, 2), frames={},
+    )  # fmt: skip
+    codes = {each.code for each in robot_change._findings(one, two, found, DiffSettings(), None)}
+    assert {"combinations-left-out", "earlier-failed", "other-serial-number", "several-parameters-changed"} <= codes
