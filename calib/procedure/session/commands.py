@@ -63,7 +63,7 @@ def _to_measure(session: Session, step: str) -> tuple[str, str]:
         if path.exists():
             noun, unseen = "" if sets else "poses ", " (never fitted)" if sets else ""
             programs = ", ".join(map(str, sorted({*path.parent.glob(f"{path.stem}.*")} - {path})))
-            played = f" (program: {programs})" if settings.robot.controller else ""
+            played = f" (program: {programs})" if settings.robot.controller and programs else ""
             sets.append(f"the {len(read_table(path))} {noun}of {path}{played}{unseen}")
     if sets and lists[0] == POSES and not images and (ways := session.path(f"2-poses/{WAYS}")).exists():
         sets[0] += f" in their order (ways: {ways}; calib view {session.folder} rehearses them)"

@@ -1,4 +1,4 @@
-"""Descriptions of robots in the words of ROS and MuJoCo: xacro and MJCF in, MoveIt's limits in, a ROS 2 package out."""
+"""Descriptions of robots by ROS and MuJoCo: xacro and MJCF files, read as URDF."""
 
 OFFERS = {"descriptions": "reading:", "topics": ":TOPICS"}
 TOPICS = {

@@ -113,10 +113,8 @@ class RobotChange(Drawn, Judged):
         """Return what the figures show: the tool's motion over the workspace, and the parameters' changes."""
         from calib.procedure.report.geometry_figures import error_map, parameter_changes
 
-        motion, arm = (
-            self.geometry.motions[0],
-            {element.name: k for k, element in enumerate(self.before.chain.elements)},
-        )
+        motion = self.geometry.motions[0]
+        arm = {element.name: k for k, element in enumerate(self.before.chain.elements)}
         rows = [
             FittedParameter(one.name, one.unit, one.before, one.after, one.sigma, None, "arm")
             for one in sorted(self.geometry.parameters, key=lambda one: arm[one.name]) if one.sigma

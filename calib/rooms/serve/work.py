@@ -22,6 +22,7 @@ from calib.procedure.session.folder import POSES, UNSEEN, Session, open_session
 from calib.workers.processes import end_with_parent
 
 CHECK, NEXT, REDO = "check", "next", "redo"
+INTERRUPTED = "it was interrupted; nothing is lost, continue from here"
 _spawned = get_context("spawn")  # a forked process has threads of libraries that are not there
 
 
@@ -60,13 +61,13 @@ class Work:
     """
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.current, self.last = folder, None, None
+        self.folder = folder
+        self.current: Job | None = None
+        self.last: Job | None = None
         self.checks: dict[str, Job] = {}
         self._waiting: deque[Job] = deque()
         self._lock = Lock()
         self._process: Any = None
-        self.current: Job | None
-        self.last: Job | None
 
     def ask(self, task: str, subject: str = "") -> bool:
         """Queue a job and return True; return False where a run is under way, or this check is queued."""
@@ -100,7 +101,7 @@ class Work:
                     setattr(job, kind, words)
         process.join()
         if process.exitcode and not job.problem:
-            job.problem = "it was interrupted; nothing is lost, continue from here"
+            job.problem = INTERRUPTED
         with self._lock:
             if job.task == CHECK:
                 self.checks[job.subject] = job
@@ -136,7 +137,7 @@ def _run(telling: Connection, folder: Path, task: str, subject: str) -> None:
         else:
             go_on(folder, tell("line"), tell("words"), typed, subject if task == REDO else "")
     except KeyboardInterrupt:
-        tell("problem")("it was interrupted; nothing is lost, continue from here")
+        tell("problem")(INTERRUPTED)
     except Exception as error:
         foreseen = complaint(error)
         tell("problem")(foreseen[0] if foreseen else bug_reports.report(error, [typed], folder))
