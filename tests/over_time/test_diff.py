@@ -109,3 +109,15 @@ def test_what_makes_two_calibrations_hard_to_compare_is_said():
     )  # fmt: skip
     codes = {each.code for each in robot_change._findings(one, two, found, DiffSettings(), None)}
     assert {"combinations-left-out", "earlier-failed", "other-serial-number", "several-parameters-changed"} <= codes
+
+
+@pytest.mark.slow
+def test_joint_corrections_are_compared_apart(fits):
+    """A URDF does not contain them: geometry is compared without them, and the note says what moved with them."""
+    calib.fit_geometry(UR5 / "model.urdf", fits / "second.csv", calib.FitSettings(holdout=0.2)).save(
+        fits / "corrected", plots=False
+    )
+    found = calib.diff(fits / "first", fits / "corrected")
+    (note,) = (each for each in found.noticed if each.code == "corrections-not-compared")
+    assert note.values["names"] == (str(fits / "corrected"),) and found.after.cell.deflection.terms
+    assert note.values["moved"] > 2.0 * found.geometry.motions[0].rms
