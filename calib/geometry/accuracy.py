@@ -18,7 +18,7 @@ import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements, Positions, Sockets
 from calib.geometry.installation import Installation
-from calib.geometry.observation import observe, predict, prepare
+from calib.geometry.observation import observe, positions, prepare
 from calib.units import ERRORS
 
 NATURE = {
@@ -101,7 +101,7 @@ def errors(cell: Installation, measured: Sequence[PoseMeasurements]) -> Errors:
         for part in observe(cell, block, _NONE):
             found[NATURE[part.label]].append(part.sizes())
         if isinstance(block.measured, Sockets) and not block.measured.links:
-            found["distance"].append(_socket_spread(predict(cell, block).point, block.measured))
+            found["distance"].append(_socket_spread(positions(cell, block), block.measured))
     joined = {name: np.concatenate(sizes) if sizes else np.zeros(0) for name, sizes in found.items()}
     return Errors(**{name: sizes if len(sizes) else None for name, sizes in joined.items()})
 
@@ -141,7 +141,7 @@ def pair_errors(
         if not isinstance(block.measured, Positions) or len(block.measured) < 2:
             continue
         first, second = _pairs(len(block.measured), limit, generator)
-        point, seen = predict(cell, block).point.T, block.measured.position
+        point, seen = positions(cell, block).T, block.measured.position
         predicted = np.linalg.norm(point[first] - point[second], axis=1)
         result.append(np.abs(predicted - np.linalg.norm(seen[first] - seen[second], axis=1)))
     return np.concatenate(result)

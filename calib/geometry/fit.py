@@ -10,16 +10,17 @@ from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import Unidentifiable, refuse_data
 from calib.estimation.base_columns import ColumnSplit
 from calib.estimation.nonlinear import covariance, solve
-from calib.estimation.relevance import gram, relevance
+from calib.estimation.relevance import relevance
 from calib.geometry.first_guess import install
 from calib.geometry.installation import Installation
 from calib.geometry.observability import base_columns
-from calib.geometry.observation import Block, families, layout, observe, parameter_values, prepare, stack, step
+from calib.geometry.observation import Block, families, layout, observe, parameter_values, prepare, sample, step
 from calib.geometry.weighing import GeometricFit, Settings, Weigher
 from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain, element_length
 
 PLAUSIBLE = {"m": 0.01, "rad": 0.05}  # how far a real arm may be from its nominal (our choice)
+WARM_POSES = 2000  # of which the fit of many more begins (our choice)
 CRAWLS = 60  # linearisations after which a placement that has not settled does not tell itself (our choice)
 
 
@@ -136,9 +137,8 @@ def _shrunk_fit(
     min_width = 1e-6  # [m, rad]
     width_updates = 3  # updates of a regularised fit's widths
     for _ in range(width_updates):
-        residual, matrix = _whitened(found)
         moved = np.where(family >= 0, parameter_values(found.cell)[free] - nominal, 0.0)
-        widths = relevance(gram(residual + matrix @ moved, matrix), family, prior).ridge
+        widths = relevance(found.data().moved(moved).gram(), family, prior).ridge
         prior = np.where(family >= 0, np.clip(widths, min_width, plausible_deviation(cell, free)), np.inf)
         prior = np.minimum(prior, stated)
         found = fit_with_prior(cell, blocks, free, prior, settings=settings)
@@ -166,7 +166,7 @@ def fit_with_prior(
     """Return the fit of exactly the parameters `free`: min Σ ‖(y - f(x)) / σ‖² + Σ ((x - x_nominal) / σ_prior)².
 
     Sigmas that no file states are estimated, one per file and nature (position, orientation …), and the fit repeated
-    until they settle; so are the weights of a robust loss.
+    until they settle; so are the weights of a robust loss. Thousands of poses begin where a sample of them ends.
 
     Args:
         cell: where to start.
@@ -177,9 +177,11 @@ def fit_with_prior(
         nominal: mean of the prior; None for `cell`.
     """
     settings = settings or Settings()
-    weigher = Weigher(settings, nominal or cell, blocks, free, prior)
     state, solution = cell, None
-    weigher.update(state, first=True)
+    if few := sample(cell, blocks, max(WARM_POSES, 4 * len(free))):
+        state = fit_with_prior(cell, few, free, prior, settings=settings, nominal=nominal).cell
+    weigher = Weigher(settings, nominal or cell, blocks, free, prior)
+    weigher.update(state, first=not few)
     image_passes = 20  # at most, until the noise of images settles (our choice)
     for _ in range(image_passes if any(weigher.noises) and settings.passes > 1 else settings.passes):
         solution = solve(
@@ -190,7 +192,7 @@ def fit_with_prior(
         if settled is not None:
             return weigher.result(settled)
     assert solution is not None
-    weigher.sigmas, weigher.weights, weigher.noises = weigher.used
+    weigher.pieces = weigher.used
     return weigher.result(solution)
 
 
@@ -206,8 +208,7 @@ def _identifiable_columns(found: GeometricFit, plausible: np.ndarray) -> np.ndar
     Backward elimination: the worst identified parameter goes back to its nominal, which changes the covariance C of the
     others to C - c cᵀ / c_k (c its column), until all that remain are identified.
     """
-    _, matrix = _whitened(found)
-    factor = np.linalg.qr(matrix, mode="r")
+    factor = found.data().factor
     norms = np.linalg.norm(factor, axis=0)
     left = covariance(factor / norms, found.estimate.residual_std**2) / np.outer(norms, norms)
     kept = np.ones(len(plausible), dtype=bool)
@@ -218,13 +219,6 @@ def _identifiable_columns(found: GeometricFit, plausible: np.ndarray) -> np.ndar
             return np.flatnonzero(kept)
         kept[worst] = False
         left = left - np.outer(left[:, worst], left[worst]) / left[worst, worst]
-
-
-def _whitened(found: GeometricFit) -> tuple[np.ndarray, np.ndarray]:
-    """Return the whitened and weighted residual (rows,) and W (rows, f) of a fit, without its prior."""
-    return stack(
-        [piece.part for piece in found.pieces], [piece.sigma / np.sqrt(piece.weight) for piece in found.pieces]
-    )
 
 
 def polish_frames(

@@ -14,8 +14,9 @@ from scipy.spatial.transform import Rotation
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
 from calib.errors import Finding, Unidentifiable, UsageError, finding, one_of, require
 from calib.estimation.base_columns import ColumnSplit, split_columns
+from calib.estimation.nonlinear import MOST_ROWS
 from calib.geometry.installation import Installation, see
-from calib.geometry.observation import Block, families, layout, observe, prepare, target_jacobian
+from calib.geometry.observation import Block, families, layout, observe, prepare, target_jacobian, whitened
 from calib.geometry.weighing import GeometricFit
 from calib.robot.chain import Chain, random_joints
 from calib.robot.kinematics import element_jacobian, forward, joint_jacobian, twist_product
@@ -119,11 +120,14 @@ def _orientation_range(found: GeometricFit) -> float | None:
 def observation_matrix(cell: Installation, blocks: Sequence[Block], columns: np.ndarray) -> np.ndarray:
     """Return the observation matrix W (rows, c) of all blocks, scaled by stated sigmas; else by the arm's reach.
 
+    Of more than `MOST_ROWS` rows their R factor instead, whose columns have the same dependences.
+
     The reach (rms distance of targets from the arm's base) makes orientation rows comparable with position rows.
     """
     rows = []
     for block in blocks:
-        for part in observe(cell, block, columns):
+        scales = []
+        for part in observe(cell, block, columns[:0]):
             scale = part.sigma
             if part.label == "pixel":
                 scale = np.asarray(part.per_length)
@@ -133,7 +137,11 @@ def observation_matrix(cell: Installation, blocks: Sequence[Block], columns: np.
                 scale = scale / np.median(scale)
             else:
                 scale = scale / np.median(scale) / _reach(cell)
-            rows.append(part.whitened(scale)[1])
+            scales.append(np.broadcast_to(scale, part.value.shape))
+        for _, matrix in whitened(cell, block, columns, scales):
+            rows.append(matrix)
+            if sum(map(len, rows)) > MOST_ROWS:
+                rows = [np.linalg.qr(np.concatenate(rows), mode="r")]
     return np.concatenate(rows)
 
 

@@ -7,17 +7,18 @@ placement's own axes), six per tool (in the target's own axes), of images the le
 deflection coefficients (E).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from calib.data.poses.fit_options import FitOptions
-from calib.data.poses.measurements import PoseMeasurements, take
+from calib.data.poses.measurements import PoseMeasurements, Positions, take
 from calib.errors import UsageError, require
+from calib.estimation.nonlinear import Rows
 from calib.geometry.installation import FRAME_AXES, Installation, Seen, see
-from calib.geometry.residuals import Part, parts
+from calib.geometry.residuals import Part, joined, parts
 from calib.robot.calibrated import evaluate, extra_displacements, target_elements
 from calib.robot.kinematics import element_jacobian
 from calib.transforms import displace
@@ -153,7 +154,7 @@ class Block:
         measured: m rows.
         station: index of their station; -1 for kinds without an instrument, which refer to the arm's base.
         tool: (m,) index of each row's target among the installation's tools.
-        bases: (E, m) the deflection's bases, evaluated once.
+        bases: (E, m) the deflection's bases, evaluated once; None for a block that `pieces` divides.
         given: (K, m) displacements by the known deflections, or None.
     """
 
@@ -174,15 +175,35 @@ def prepare(cell: Installation, measured: Sequence[PoseMeasurements]) -> list[Bl
     for block in measured:
         station = _index(cell.station_names, block.station, "station") if block.has_instrument else -1
         tools = np.array([_index(cell.tool_names, name, "tool") for name in block.tool_names])
-        blocks.append(_ready(cell, block, station, tools[block.tool]))
+        bare = Block(block, station, tools[block.tool])
+        blocks.append(bare if _divided(block) else rows_of(cell, bare, np.arange(len(block))))
     return blocks
 
 
-def _ready(cell: Installation, measured: PoseMeasurements, station: int, tool: np.ndarray) -> Block:
+def rows_of(cell: Installation, block: Block, rows: np.ndarray) -> Block:
+    """Return some rows of a block, their deflection bases evaluated."""
+    measured = take(block.measured, rows)
     bases = evaluate(cell.deflection, measured.q, measured.torque) if cell.deflection.terms else None
     known = evaluate(cell.known, measured.q, measured.torque) if cell.known.terms else None
     given = extra_displacements(cell.chain, cell.known, measured.q, known)
-    return Block(measured, station, tool, bases, given)
+    return Block(measured, block.station, block.tool[rows], bases, given)
+
+
+PIECE = 2000  # rows observed at once: the Jacobian of so many has 50 MB at 500 parameters (our choice)
+
+
+def _divided(measured: PoseMeasurements) -> bool:
+    """Return whether a block is observed in pieces: it is long, and its rows do not depend on each other."""
+    return len(measured) > PIECE and isinstance(measured, Positions)
+
+
+def pieces(cell: Installation, block: Block) -> Iterator[Block]:
+    """Yield a long block of positions or poses in pieces of at most `PIECE` rows, in their order; others whole."""
+    if not _divided(block.measured):
+        yield block
+        return
+    for rows in np.array_split(np.arange(len(block.measured)), -(-len(block.measured) // PIECE)):
+        yield rows_of(cell, block, rows)
 
 
 def _index(names: tuple[str, ...], name: str, what: str) -> int:
@@ -190,17 +211,61 @@ def _index(names: tuple[str, ...], name: str, what: str) -> int:
     return names.index(name)
 
 
+def sample(cell: Installation, blocks: Sequence[Block], poses: int, seed: int = 0) -> list[Block]:
+    """Return random rows of long blocks, and the others whole; empty where that is not a quarter of all or less.
+
+    `poses`: rows of all blocks, about; a block keeps at least a tenth of that.
+    """
+    total = sum(len(block.measured) for block in blocks)
+    generator, result = np.random.default_rng(seed), []
+    for block in blocks:
+        m = len(block.measured)
+        count = max(poses * m // max(total, 1), poses // 10)
+        if _divided(block.measured) and count < m:
+            block = rows_of(cell, block, np.sort(generator.choice(m, count, replace=False)))
+        result.append(block)
+    return result if 4 * sum(len(block.measured) for block in result) <= total else []
+
+
+def positions(cell: Installation, block: Block) -> np.ndarray:
+    """Return the predicted target positions (3, m) [m] of a block's rows, in the instrument's frame."""
+    return np.concatenate([predict(cell, piece).point for piece in pieces(cell, block)], axis=1)
+
+
 def predict(cell: Installation, block: Block) -> Seen:
-    """Return the predicted targets of a block's rows, in the instrument's frame."""
+    """Return the predicted targets of a block's rows, or of a piece's, in the instrument's frame."""
     return see(cell, block.measured.q, block.station, block.tool, block.bases, block.given)
 
 
 def observe(cell: Installation, block: Block, free: np.ndarray) -> list[Part]:
     """Return the residual parts of a block with their Jacobian with respect to the parameters `free` (f,)."""
+    found = [_observe(cell, piece, free) for piece in pieces(cell, block)]
+    return found[0] if len(found) == 1 else [joined(each) for each in zip(*found)]
+
+
+def _observe(cell: Installation, block: Block, free: np.ndarray) -> list[Part]:
     seen = predict(cell, block)
     if len(cell.optics):
         seen = replace(seen, view=cell.optics.view(block.measured, free - sum(layout_counts(cell)[:3])))
     return parts(block.measured, seen, target_jacobian(cell, seen, free, block.station, block.tool, block.bases))
+
+
+def whitened(
+    cell: Installation, block: Block, free: np.ndarray, scales: Sequence[np.ndarray], noises: Sequence[Any] = ()
+) -> Iterator[Rows]:
+    """Yield residuals and Jacobians of a block piece by piece, whitened.
+
+    Args:
+        cell, block, free: as of `observe`.
+        scales: for each of its parts, the divisor (rows, m) of its residuals.
+        noises: for each of its parts, the noise that its rows share, or None.
+    """
+    done = 0
+    for piece in pieces(cell, block):
+        for k, part in enumerate(observe(cell, piece, free)):
+            part = replace(part, noise=noises[k]) if noises and noises[k] else part
+            yield part.whitened(scales[k][:, done : done + part.value.shape[1]])
+        done += len(piece.measured)
 
 
 def target_jacobian(
@@ -231,7 +296,8 @@ def target_jacobian(
         targets = target_elements(cell.chain, cell.deflection)[numbers]
         unique, inverse = np.unique(targets, return_inverse=True)
         moved = element_jacobian(cell.chain, seen.walked, seen.point, unique)
-        jacobian[in_terms] = moved[inverse] * bases[numbers][:, None, :]
+        for place, which, number in zip(in_terms, inverse, numbers):
+            np.multiply(moved[which], bases[number], out=jacobian[place])
     return jacobian
 
 
@@ -244,20 +310,6 @@ def _station_column(column: np.ndarray, placement: np.ndarray, seen: Seen, axis:
         lever = (seen.point - placement[:3, 3:4]).T
         column[:3] = np.cross(direction, lever).T
         column[3:] = direction[:, None]
-
-
-def stack(found: Sequence[Part], sigmas: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return all parts whitened and stacked: residual r (rows,) and a column-major W (rows, f).
-
-    Args:
-        found: parts of all blocks.
-        sigmas: one array per part, broadcastable to its value (rows, m).
-    """
-    edges = np.cumsum([0, *(part.height for part in found)])
-    residual, matrix = np.empty(edges[-1]), np.empty((len(found[0].jacobian), edges[-1]))
-    for part, sigma, start, stop in zip(found, sigmas, edges, edges[1:]):
-        part.fill(residual[start:stop], matrix[:, start:stop], sigma)
-    return residual, matrix.T
 
 
 def pose_sigmas(
@@ -279,7 +331,7 @@ def pose_sigmas(
     chunk = 500  # poses at once: the Jacobian has a column per parameter
     for first in range(0, len(at), chunk):
         part = np.arange(first, min(first + chunk, len(at)))
-        block = _ready(cell, take(at, part), station, np.broadcast_to(tool, len(at))[part])
+        block = rows_of(cell, Block(at, station, np.broadcast_to(tool, len(at))), part)
         jacobian = target_jacobian(cell, predict(cell, block), free, station, block.tool, block.bases)
         spread = (root.T @ jacobian.reshape(len(free), -1)).reshape(len(root), 2, 3, len(part))
         result.append(np.sqrt(np.sum(spread**2, axis=(0, 2))).T)

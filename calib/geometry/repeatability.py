@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
 from calib.errors import counted
 from calib.geometry.installation import Installation
-from calib.geometry.observation import Block, predict, prepare
+from calib.geometry.observation import Block, predict, prepare, rows_of
 from calib.records import stored
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
@@ -212,10 +212,10 @@ def _repeated_pose(
     turns = Rotation.from_quat(measured.quaternion[index]) if isinstance(measured, Poses) else None
     own: dict[str, Any] = {}
     for arm, cell, block in reversed(list(zip(ARMS, cells, blocks))):
-        seen, base = predict(cell, block), cell.stations[block.station][:3, :3]
-        own[f"{arm}_mm"] = _numbers(1e3 * base.T @ (points.mean(axis=0) - seen.point[:, index].mean(axis=1)))
+        seen, base = predict(cell, rows_of(cell, block, index)), cell.stations[block.station][:3, :3]
+        own[f"{arm}_mm"] = _numbers(1e3 * base.T @ (points.mean(axis=0) - seen.point.mean(axis=1)))
         if turns is not None:
-            middle, command = turns.mean(), Rotation.from_matrix(seen.rotation.transpose(2, 1, 0)[index]).mean()
+            middle, command = turns.mean(), Rotation.from_matrix(seen.rotation.transpose(2, 1, 0)).mean()
             own[f"{arm}_deg"] = _numbers(np.degrees(base.T @ (middle * command.inv()).as_rotvec()))
             spread_about = 3.0 * ((turns * middle.inv()).as_rotvec() @ base).std(axis=0, ddof=1)
             own["repeatability_deg"] = _numbers(np.degrees(spread_about))

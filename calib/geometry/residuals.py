@@ -8,7 +8,8 @@ the Jacobian is Kaufman's 1975, whose gradient is exact).
 
 from __future__ import annotations
 
-from dataclasses import KW_ONLY, dataclass
+from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import singledispatch
 from typing import Any
 
@@ -90,6 +91,20 @@ class Part:
     def alone(self, sigma: np.ndarray) -> np.ndarray:
         """Return the residuals (rows, m) without the common errors of rows."""
         return self.value
+
+
+def joined(pieces: Sequence[Part]) -> Part:
+    """Return the part of consecutive pieces of a block, each with its own rows counted from 0."""
+    edges = np.cumsum([0, *(len(each.index) for each in pieces)])
+    sigma = None if pieces[0].sigma is None else np.concatenate([np.asarray(each.sigma) for each in pieces], axis=1)
+    return replace(
+        pieces[0],
+        value=np.concatenate([each.value for each in pieces], axis=1),
+        jacobian=np.concatenate([each.jacobian for each in pieces], axis=2),
+        sigma=sigma,
+        nuisances=sum(each.nuisances for each in pieces),
+        index=np.concatenate([each.index + first for each, first in zip(pieces, edges)]),
+    )
 
 
 @singledispatch

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -11,9 +13,9 @@ from calib.errors import UsageError, one_of, refuse_data
 from calib.estimation import robust
 from calib.estimation.base_columns import ColumnSplit
 from calib.estimation.estimate import Estimate
-from calib.estimation.nonlinear import Solution, covariance
+from calib.estimation.nonlinear import Reduced, Rows, Solution, covariance, reduced
 from calib.geometry.installation import Installation
-from calib.geometry.observation import Block, layout, observe, parameter_values, stack
+from calib.geometry.observation import Block, layout, observe, parameter_values, whitened
 from calib.geometry.residuals import Part
 from calib.records import frozen
 from calib.robot.calibrated import CalibratedChain, CorrectedChain
@@ -26,7 +28,7 @@ class Piece:
 
     Attributes:
         block: index into `GeometricFit.blocks`.
-        part: residuals and Jacobian at the solution.
+        part: residuals at the solution.
         sigma: (rows, m) standard deviations used.
         weight: (m,) robust weights.
     """
@@ -65,6 +67,10 @@ class GeometricFit:
     blocks: list[Block]
     pieces: list[Piece]
     prior: np.ndarray | None = None
+
+    def data(self) -> Reduced:
+        """Return the whitened rows at the solution, reduced, without the prior."""
+        return reduced(lambda: _rows(self.cell, self.free, self.blocks, self.pieces))
 
     def outliers(self, threshold: float = 4.0) -> list[tuple[str, int, str, float, float]]:
         """Return the outlier rows, worst first: file, row, label, size in robust sigmas, size [m or rad].
@@ -168,6 +174,9 @@ class Settings:
         one_of(self.loss, ("auto", *robust.LOSSES), "loss", UsageError)
 
 
+_NONE = np.array([], dtype=int)
+
+
 class Weigher:
     """Sigmas and robust weights of every residual part, updated between passes of a fit."""
 
@@ -176,27 +185,19 @@ class Weigher:
     ):
         self.settings, self.nominal, self.blocks, self.free = settings, nominal, blocks, free
         self.prior = prior if prior is not None and np.isfinite(prior).any() else None
-        self.sigmas: list[np.ndarray] = []
-        self.weights: list[np.ndarray] = []
-        self.noises: list[Any] = []
-        self.used = self.sigmas, self.weights, self.noises
+        self.pieces: list[Piece] = []
+        self.used = self.pieces
 
-    def parts(self, state: Installation, free: np.ndarray | None = None) -> list[Part]:
-        """Return the residual parts of all blocks, with their Jacobian for `free`."""
-        chosen = self.free if free is None else free
-        found = [observe(state, block, chosen) for block in self.blocks]
-        self.owners = [number for number, own in enumerate(found) for _ in own]
-        return [part for own in found for part in own]
-
-    def noisy(self, found: list[Part]) -> list[Part]:
-        """Return the parts with their shared noise, which whitening takes into account."""
-        return [replace(part, noise=noise) if noise else part for part, noise in zip(found, self.noises)]
+    @property
+    def noises(self) -> list[Any]:
+        """Noise that the rows of each part share; None for a part without."""
+        return [piece.part.noise for piece in self.pieces]
 
     def update(self, state: Installation, first: bool) -> None:
         """Set sigmas and weights from the residuals at a state."""
-        found = self.parts(state, np.array([], dtype=int))
-        rows = sum(part.value.size for part in found)
-        unknown = len(self.free) + sum(part.nuisances for part in found)
+        owned = [(number, part) for number, block in enumerate(self.blocks) for part in observe(state, block, _NONE)]
+        rows = sum(part.value.size for _, part in owned)
+        unknown = len(self.free) + sum(part.nuisances for _, part in owned)
         if rows < unknown and self.prior is None:
             refuse_data(
                 self.blocks[0].measured.file,
@@ -204,52 +205,51 @@ class Weigher:
                 "model ('frames' or 'offsets')",
             )
         share = max(1.0 - unknown / rows, 0.05)
-        loss = "none" if self.settings.loss == "auto" else self.settings.loss
-        robustly = loss != "none"
-        self.sigmas = [_sigma(part, share, first and not robustly, robustly) for part in found]
-        known = len(self.free) // len(found), loss, self.settings.loss_scale, first and not robustly
-        self.noises = [part.common_noise(sigma, *known) for part, sigma in zip(found, self.sigmas)]
-        self.sigmas = [noise.factor * sigma if noise else sigma for noise, sigma in zip(self.noises, self.sigmas)]
-        self.weights = [
-            robust.weights(_size(part, sigma), loss, self.settings.loss_scale)
-            for part, sigma in zip(found, self.sigmas)
-        ]
+        loss, scale = "none" if self.settings.loss == "auto" else self.settings.loss, self.settings.loss_scale
+        robustly, self.pieces = loss != "none", []
+        for number, part in owned:
+            sigma = _sigma(part, share, first and not robustly, robustly)
+            noise = part.common_noise(sigma, len(self.free) // len(owned), loss, scale, first and not robustly)
+            sigma = noise.factor * sigma if noise else sigma
+            weight = robust.weights(_size(part, sigma), loss, scale)
+            self.pieces.append(Piece(number, replace(part, noise=noise) if noise else part, sigma, weight))
 
     def settle(self, solution: Solution) -> Solution | None:
         """Return the solution scaled to the sigmas of its residuals; None if new sigmas would change the estimate.
 
         A common factor on all sigmas changes only the scale, unless the fit has a prior.
         """
-        before, weights, noises = self.used = self.sigmas, self.weights, self.noises
+        before, noises = self.pieces, self.noises
+        self.used = before
         self.update(solution.state, first=False)
-        ratios = [float(np.mean(new / old)) for new, old in zip(self.sigmas, before)]
-        steady = all(np.abs(new - old).max(initial=0.0) < 0.02 for new, old in zip(self.weights, weights))
+        both = list(zip(self.pieces, before))
+        ratios = [float(np.mean(new.sigma / old.sigma)) for new, old in both]
+        steady = all(np.abs(new.weight - old.weight).max(initial=0.0) < 0.02 for new, old in both)
         common = ratios[0] if self.prior is None and not any(noises) else 1.0
         steady = steady and all(a is None or b is None or a.near(b) for a, b in zip(self.noises, noises))
         if not steady or any(abs(ratio / common - 1.0) > 0.02 for ratio in ratios):
             return None
         if self.prior is not None or any(noises):
-            self.sigmas, self.weights, self.noises = before, weights, noises
+            self.pieces = before
             return solution
         return replace(solution, factor=solution.factor / common, cost=solution.cost / common**2)
 
-    def linearise(self, state: Installation) -> tuple[np.ndarray, np.ndarray]:
-        found = self.noisy(self.parts(state))
-        scales = [sigma / np.sqrt(weight) for sigma, weight in zip(self.sigmas, self.weights)]
-        residual, matrix = stack(found, scales)
+    def linearise(self, state: Installation) -> Reduced:
+        """Return the whitened problem at a state, reduced, with the prior."""
+        known = list[Rows]()
         if self.prior is not None:
-            pull = (parameter_values(self.nominal) - parameter_values(state))[self.free] / self.prior
             held = np.isfinite(self.prior)
-            residual = np.concatenate([residual, pull[held]])
-            matrix = np.vstack([matrix, np.diag(1.0 / self.prior)[held]])
-        return residual, matrix
+            pull = (parameter_values(self.nominal) - parameter_values(state))[self.free] / self.prior
+            known.append((pull[held], np.diag(1.0 / self.prior)[held]))
+        return reduced(lambda: chain(_rows(state, self.free, self.blocks, self.pieces), known))
 
     def result(self, solution: Solution) -> GeometricFit:
         state = solution.state
-        found = self.noisy(self.parts(state))
+        parts = [part for block in self.blocks for part in observe(state, block, _NONE)]
+        pieces = [replace(one, part=replace(part, noise=one.part.noise)) for one, part in zip(self.pieces, parts)]
         table = layout(state)
-        rows = sum(part.value.size for part in found)
-        dof = rows - len(self.free) - sum(part.nuisances for part in found)
+        rows = sum(part.value.size for part in parts)
+        dof = rows - len(self.free) - sum(part.nuisances for part in parts)
         if self.prior is not None:
             dof = max(dof + int(np.isfinite(self.prior).sum()), 1)
         variance = solution.cost / max(dof, 1)
@@ -261,10 +261,17 @@ class Weigher:
             float(np.sqrt(variance)),
             dof,
         )
-        pieces = [Piece(*each) for each in zip(self.owners, found, self.sigmas, self.weights)]
         return GeometricFit(
             state, self.nominal, self.free, estimate, None, self.free, solution, self.blocks, pieces, self.prior
         )
+
+
+def _rows(cell: Installation, free: np.ndarray, blocks: list[Block], pieces: list[Piece]) -> Iterator[Rows]:
+    """Yield the residuals of all blocks and their Jacobians, whitened as in `pieces`."""
+    for number, block in enumerate(blocks):
+        own = [piece for piece in pieces if piece.block == number]
+        scales = [piece.sigma / np.sqrt(piece.weight) for piece in own]
+        yield from whitened(cell, block, free, scales, [piece.part.noise for piece in own])
 
 
 def _sigma(part: Part, share: float, start: bool, robustly: bool) -> np.ndarray:

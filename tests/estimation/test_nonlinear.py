@@ -7,7 +7,7 @@ import pytest
 import scipy.optimize
 from differences import check
 
-from calib.estimation.nonlinear import Status, covariance, damped_step, solve, triangle
+from calib.estimation.nonlinear import Reduced, Status, covariance, damped_step, reduced, solve, triangle
 
 Problem = tuple[Callable[[np.ndarray], np.ndarray], Callable[[np.ndarray], np.ndarray], np.ndarray]
 
@@ -70,9 +70,9 @@ PROBLEMS = {f.__name__: f for f in (rosenbrock, decay, kowalik_osborne)}
 KNOWN = {"rosenbrock": 0.0, "kowalik_osborne": 3.07505e-4}
 
 
-def stated(problem: Problem) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """Return the problem as `solve` wants it: r = 0 - f, W = df/dx."""
-    return lambda x: (-problem[0](x), problem[1](x))
+def stated(problem: Problem) -> Callable[[np.ndarray], Reduced]:
+    """Return the problem as `solve` wants it: r = 0 - f and W = df/dx, reduced."""
+    return lambda x: triangle(-problem[0](x), problem[1](x))
 
 
 def add(x: np.ndarray, dx: np.ndarray) -> np.ndarray:
@@ -126,7 +126,8 @@ def test_damping_zero_takes_worse_steps_and_levenberg_marquardt_does_not():
 def test_a_damped_step_solves_equation_12():
     rng = np.random.default_rng(0)
     matrix, residual = rng.normal(size=(30, 5)), rng.normal(size=30)
-    factor, target, cost = triangle(residual, matrix)
+    found = triangle(residual, matrix)
+    factor, target, cost = found.factor, found.target, found.cost
     assert cost == pytest.approx(residual @ residual)
     assert factor.T @ factor == pytest.approx(matrix.T @ matrix)
     square = matrix.T @ matrix
@@ -156,7 +157,7 @@ def test_what_damping_does_not_reach_is_not_called_converged():
 
 def test_a_wrong_jacobian_stalls():
     problem = decay()
-    found = solve(lambda x: (-problem[0](x), -problem[1](x)), add, problem[2])
+    found = solve(lambda x: triangle(-problem[0](x), -problem[1](x)), add, problem[2])
     assert found.status is Status.STALLED
     assert found.state == pytest.approx(problem[2])  # no uphill step was taken
 
@@ -174,7 +175,7 @@ def test_unknowns_may_live_on_a_manifold():
 
     def linearise(u):
         gap = (angles - np.arctan2(u[1], u[0]) + np.pi) % (2 * np.pi) - np.pi
-        return gap, np.ones((50, 1))
+        return triangle(gap, np.ones((50, 1)))
 
     def turn(u, dx):
         c, s = np.cos(dx[0]), np.sin(dx[0])
@@ -186,5 +187,24 @@ def test_unknowns_may_live_on_a_manifold():
 
 def test_the_covariance_is_the_inverse_information():
     matrix = np.random.default_rng(2).normal(size=(40, 6))
-    factor, _, _ = triangle(np.zeros(40), matrix)
+    factor = triangle(np.zeros(40), matrix).factor
     assert covariance(factor, 4.0) == pytest.approx(4.0 * np.linalg.inv(matrix.T @ matrix))
+
+
+@pytest.mark.parametrize("spread", [1.0, 1e-4, 1e-9])
+def test_many_rows_piece_by_piece_are_reduced_as_at_once(spread):
+    """Well-conditioned rows by WᵀW, others by QR: R and z solve the problem as QR of all rows does."""
+    rng = np.random.default_rng(2)
+    matrix, residual = rng.normal(size=(60_000, 6)), rng.normal(size=60_000)
+    matrix[:, 5] = matrix[:, 4] + spread * matrix[:, 5]
+    cuts = np.array_split(np.arange(60_000), 30)
+    found, whole = reduced(lambda: ((residual[own], matrix[own]) for own in cuts)), triangle(residual, matrix)
+    assert found.rows == 60_000 and found.cost == pytest.approx(whole.cost)
+    for one, other in ((found.gram(), whole.gram()), (found.moved(TRUTH).gram(), whole.moved(TRUTH).gram())):
+        assert one.square == pytest.approx(other.square) and one.cross == pytest.approx(other.cross, abs=1e-6)
+        assert one.total == pytest.approx(other.total)
+    steps = [damped_step(each.factor, each.target, 0.0) for each in (found, whole)]
+    assert steps[0] == pytest.approx(steps[1], rel=1e-5)
+
+
+TRUTH = np.arange(6.0)

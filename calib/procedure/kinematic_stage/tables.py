@@ -15,7 +15,7 @@ from calib.data.poses.measurements import PoseMeasurements, Positions
 from calib.errors import UsageError
 from calib.geometry.accuracy import NATURE
 from calib.geometry.installation import Installation
-from calib.geometry.observation import layout, observe, predict, prepare
+from calib.geometry.observation import layout, observe, positions, prepare
 from calib.geometry.residuals import inverse_right_jacobian
 from calib.geometry.weighing import GeometricFit
 from calib.procedure.kinematic_stage.comparison import INTERVAL, Comparison, interval_cells
@@ -205,6 +205,6 @@ def _places(found: Comparison, number: int) -> np.ndarray:
         return np.full((len(block), 9), np.nan)
     ready = [prepare(cell, [block])[0] for cell in found.cells]
     base = invert(found.cells[1].stations[ready[1].station])
-    ways = [1e3 * (predict(cell, one).point.T - block.position) for cell, one in zip(found.cells, ready)]
+    ways = [1e3 * (positions(cell, one).T - block.position) for cell, one in zip(found.cells, ready)]
     turn = base[:3, :3].T
     return np.hstack([block.position @ turn + base[:3, 3], *(way @ turn for way in ways)])

@@ -14,7 +14,7 @@ from calib.data.poses import IMAGES
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import UsageError
 from calib.extensions import offered
-from calib.geometry.observation import layout, predict, prepare
+from calib.geometry.observation import layout, positions, prepare
 from calib.procedure.kinematic_stage.comparison import Comparison
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.folder import metrics
@@ -203,7 +203,7 @@ def _points(comparison: Comparison) -> np.ndarray:
     """Return the target positions (rows, 3) [m] in the arm's base frame."""
     cell, points = comparison.cells[1], []
     for block in prepare(cell, comparison.blocks):
-        point = predict(cell, block).point.T
+        point = positions(cell, block).T
         base = cell.stations[block.station] if block.measured.has_instrument else cell.stations[0]
         back = invert(base)
         points.append(point @ back[:3, :3].T + back[:3, 3])

@@ -210,8 +210,8 @@ class _Comparison:
         max_simulations = 25  # simulations with tangents per round
         step_tolerance = 0.05  # standard deviations of the estimate
         return nonlinear.solve(
-            lambda x: self.whitened(x, std), lambda x, step: x + step, values, damping=first_damping,
-            tolerance=step_tolerance, limit=max_simulations,
+            lambda x: nonlinear.triangle(*self.whitened(x, std)), lambda x, step: x + step, values,
+            damping=first_damping, tolerance=step_tolerance, limit=max_simulations,
         )  # fmt: skip
 
     def spread(self, residual: np.ndarray, p: int) -> np.ndarray:
