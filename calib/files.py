@@ -17,6 +17,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import lru_cache
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -100,8 +101,8 @@ def _written(path: Path) -> dict[str, str]:
     return found if isinstance(found, dict) else {}
 
 
-def write(path: str | Path, content: str | bytes) -> Path:
-    """Write `content` to `path` by a temporary file in the same folder and a rename (see `together`).
+def write(path: str | Path, content: str | bytes | Iterable[str]) -> Path:
+    """Write `content`, whole or in parts, to `path` by a temporary file in its folder and a rename (see `together`).
 
     A killed process or a full disk leaves the old file as it was.
 
@@ -109,7 +110,8 @@ def write(path: str | Path, content: str | bytes) -> Path:
         CalibError: where the folder is missing, read-only or full; nothing is left behind.
     """
     path = Path(path)
-    data = content.encode() if isinstance(content, str) else content
+    whole = isinstance(content, (str, bytes))
+    parts = (part.encode() if isinstance(part, str) else part for part in ([content] if whole else content))
     temporary = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -117,7 +119,7 @@ def write(path: str | Path, content: str | bytes) -> Path:
         prefix, suffix = staged_name(path)
         handle, temporary = tempfile.mkstemp(suffix, prefix, path.parent)
         with os.fdopen(handle, "wb") as file:
-            file.write(data)
+            file.writelines(parts)
             file.flush()
             os.fsync(file.fileno())
         os.chmod(temporary, 0o666 & ~umask())
@@ -125,9 +127,11 @@ def write(path: str | Path, content: str | bytes) -> Path:
             staged.append((temporary, path))
         else:
             os.replace(temporary, path)
-    except OSError as error:
+    except BaseException as error:
         if temporary and os.path.exists(temporary):
             os.unlink(temporary)
+        if not isinstance(error, OSError):
+            raise
         reason = error.strerror or str(error)
         raise CalibError(f"cannot write {path}: {reason}; nothing was changed there") from error
     return path
@@ -312,10 +316,16 @@ def write_table(
     a whole header that would be taken for one with other separators, or for a comment. A text that a spreadsheet would
     take for a formula (``=1+1``) gets an apostrophe before it (`calib.records.shielded`).
     """
-    text = _headed(header)
-    lines = csv.writer(text, lineterminator="\n")
-    lines.writerows([_cell(cell) for cell in row] for row in rows)
-    return write(path, remarks(notes) + text.getvalue())
+
+    def parts(many: int = 1000) -> Iterator[str]:
+        yield remarks(notes) + _headed(header).getvalue()
+        left = iter(rows)
+        while some := list(islice(left, many)):
+            text = io.StringIO()
+            csv.writer(text, lineterminator="\n").writerows([_cell(cell) for cell in row] for row in some)
+            yield text.getvalue()
+
+    return write(path, parts())
 
 
 def write_numbers(

@@ -14,7 +14,17 @@ from calib.estimation.relevance import relevance
 from calib.geometry.first_guess import install
 from calib.geometry.installation import Installation
 from calib.geometry.observability import base_columns
-from calib.geometry.observation import Block, families, layout, observe, parameter_values, prepare, sample, step
+from calib.geometry.observation import (
+    Block,
+    families,
+    layout,
+    observe,
+    parameter_values,
+    prepare,
+    rows_of,
+    sampled,
+    step,
+)
 from calib.geometry.weighing import GeometricFit, Settings, Weigher
 from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain, element_length
@@ -178,8 +188,11 @@ def fit_with_prior(
     """
     settings = settings or Settings()
     state, solution = cell, None
-    if few := sample(cell, blocks, max(WARM_POSES, 4 * len(free))):
-        state = fit_with_prior(cell, few, free, prior, settings=settings, nominal=nominal).cell
+    rows = sampled([block.measured for block in blocks], max(WARM_POSES, 4 * len(free)))
+    few = 4 * sum(map(len, rows)) <= sum(len(block.measured) for block in blocks)
+    if few:
+        some = [rows_of(cell, block, own) for block, own in zip(blocks, rows)]
+        state = fit_with_prior(cell, some, free, prior, settings=settings, nominal=nominal).cell
     weigher = Weigher(settings, nominal or cell, blocks, free, prior)
     weigher.update(state, first=not few)
     image_passes = 20  # at most, until the noise of images settles (our choice)

@@ -211,20 +211,18 @@ def _index(names: tuple[str, ...], name: str, what: str) -> int:
     return names.index(name)
 
 
-def sample(cell: Installation, blocks: Sequence[Block], poses: int, seed: int = 0) -> list[Block]:
-    """Return random rows of long blocks, and the others whole; empty where that is not a quarter of all or less.
+def sampled(measured: Sequence[PoseMeasurements], poses: int, seed: int = 0) -> list[np.ndarray]:
+    """Return random rows of long blocks of positions or poses, all rows of the others.
 
-    `poses`: rows of all blocks, about; a block keeps at least a tenth of that.
+    `poses`: of all blocks, about; a block keeps at least a tenth of that.
     """
-    total = sum(len(block.measured) for block in blocks)
     generator, result = np.random.default_rng(seed), []
-    for block in blocks:
-        m = len(block.measured)
-        count = max(poses * m // max(total, 1), poses // 10)
-        if _divided(block.measured) and count < m:
-            block = rows_of(cell, block, np.sort(generator.choice(m, count, replace=False)))
-        result.append(block)
-    return result if 4 * sum(len(block.measured) for block in result) <= total else []
+    for block in measured:
+        count = max(poses * len(block) // max(sum(map(len, measured)), 1), poses // 10)
+        rows = np.arange(len(block))
+        few = _divided(block) and count < len(rows)
+        result.append(np.sort(generator.choice(rows, count, replace=False)) if few else rows)
+    return result
 
 
 def positions(cell: Installation, block: Block) -> np.ndarray:

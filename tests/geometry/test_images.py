@@ -91,7 +91,8 @@ def test_whitening_by_what_an_image_shares_is_that_of_the_full_covariance():
     block, start, candidates = started(cell, block)
     found = fit(start, [block], candidates[-20:])  # frames and lens
     piece = found.pieces[0]
-    part, noise = piece.part, piece.part.noise
+    noise = piece.part.noise
+    part = replace(observe(found.cell, found.blocks[0], found.free)[0], noise=noise)
     matrix = part.whitened(piece.sigma)[1]
     total = np.zeros((len(found.free),) * 2)
     for image in range(6):

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.data.poses.measurements import KINDS, Planes, PoseMeasurements, Sockets
 from calib.geometry.installation import Installation, see
-from calib.geometry.observation import observe, prepare, stack
+from calib.geometry.observation import observe, prepare
 from calib.geometry.weighing import GeometricFit
 from calib.robot.chain import Chain, random_joints
 from calib.robot.kinematics import joint_jacobian
@@ -162,7 +162,7 @@ def deviation(found: GeometricFit, exact: Sequence[PoseMeasurements]) -> tuple[f
         dxᵀ C⁻¹ dx, chi-squared with as many degrees of freedom as parameters; and ‖r - W dx‖ / ‖r‖.
     """
     parts = [part for block in prepare(found.cell, exact) for part in observe(found.cell, block, found.free)]
-    residual, matrix = stack(parts, [np.ones(1)] * len(parts))
+    residual, matrix = map(np.concatenate, zip(*(part.whitened(np.ones(1)) for part in parts)))
     scale = np.linalg.norm(matrix, axis=0)
     dx = np.linalg.lstsq(matrix / scale, residual, rcond=None)[0] / scale
     rest = np.linalg.norm(residual - matrix @ dx) / np.linalg.norm(residual)

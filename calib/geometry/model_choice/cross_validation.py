@@ -18,11 +18,12 @@ from calib.estimation.relevance import SETTLED, Condensed, Gram, Relevance, cond
 from calib.geometry.fit import plausible_deviation
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.folds import Folds
-from calib.geometry.observation import layout, observe, prepare
+from calib.geometry.observation import layout, observe, prepare, sampled
 from calib.geometry.weighing import GeometricFit
 from calib.robot.calibrated import Deflection, Term
 from calib.robot.chain import Chain
 
+JUDGED_POSES = 20_000  # poses that models are judged by (our choice)
 METRES = ("position", "consistency", "distance", "plane", "pixel")
 
 
@@ -152,7 +153,11 @@ def fold_statistics(
     """
     cell = replace(found.cell, deflection=Deflection(terms, np.zeros(len(terms)), reference))
     free = np.concatenate([found.free, layout(cell).index("deflection")])
-    rows_of = _Rows(cell, measured, free, found.used_sigmas(), found.row_weights(), found.used_noises())
+    chosen = sampled(measured, JUDGED_POSES)
+    measured = [take(block, rows) for block, rows in zip(measured, chosen)]
+    folds = replace(folds, members=tuple(members[rows] for members, rows in zip(folds.members, chosen)))
+    weights = [each[rows] for each, rows in zip(found.row_weights(), chosen)]
+    rows_of = _Rows(cell, measured, free, found.used_sigmas(), weights, found.used_noises())
     rigid, groups, sizes = len(found.free), term_groups(terms), term_sizes(terms)
     pooled = all(block.has_instrument for block in measured)
     each, held_out, rows = list[Gram](), list[Gram](), []

@@ -4,14 +4,15 @@ The fit moves a frame T by a step in its own axes, T · Trans(d) · Exp(w). In t
 rotation vector r, so that the covariance of (d, w) goes through  position = R d,  r' = J_r⁻¹(r) w.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
 from calib import files, folders
-from calib.data.poses.measurements import PoseMeasurements, Positions
+from calib.data.poses.measurements import Positions
 from calib.errors import UsageError
 from calib.geometry.accuracy import NATURE
 from calib.geometry.installation import Installation
@@ -119,43 +120,27 @@ COMPONENTS = {
 }
 
 
-def residuals(outcome: Outcome) -> tuple[list[list[object]], list[str]]:
+def residuals(outcome: Outcome) -> tuple[Iterator[Sequence[object]], list[str]]:
     """Return the residual (measured minus predicted) of every row: fitted, held out or validation; and the header.
 
     Unseen rows have the columns of `INTERVAL` as well, as ``errors.csv`` of a session: ``sigma``, the standard
     deviation that the fit expects of the calibrated arm's position error there, ``interval95`` within which 95 % of
     such errors are to be, ``extrapolated`` 1 where a joint stands outside the training range.
     """
-    named = {(each.file, each.row) for each in outcome.outliers}
-    weights = _weights(outcome)
-    rows: list[list[object]] = []
     sets, unseen = [("fit", outcome.fit)], outcome.inputs.unseen.items()
     sets += [("held out" if one.held_out else "validation", outcome.validation[name]) for name, one in unseen]
-    for label, comparison in sets:
-        rows += _residual_rows(label, comparison, named, weights if label == "fit" else {})
     joints = outcome.inputs.chain.joints
     header = ["set", "file", "row", "station", "tool", *(f"{joint.name} [{joint.unit}]" for joint in joints)]
     header += [name for names in COMPONENTS.values() for name in names]
+    rows = chain.from_iterable(_residual_rows(label, comparison, outcome) for label, comparison in sets)
     return rows, [*header, "size [mm]", "nominal size [mm]", "weight", "outlier", *INTERVAL]
 
 
-def _weights(outcome: Outcome) -> dict[tuple[str, int, str], float]:
-    """Return the robust weight by (file, row, tool): the smaller of the position weight and the orientation weight."""
-    fit, result = outcome.selection.fit, {}
-    for piece in fit.pieces:
-        for i, w in zip(piece.part.index, piece.weight):
-            key = _key(fit.blocks[piece.block].measured, int(i))
-            result[key] = min(float(w), result.get(key, np.inf))
-    return result
-
-
-def _key(measured: PoseMeasurements, i: int) -> tuple[str, int, str]:
-    return measured.file, int(measured.rows[i]), measured.tool_names[measured.tool[i]]
-
-
-def _residual_rows(label: str, comparison: Comparison, named: set, weights: dict) -> list[list[object]]:
+def _residual_rows(label: str, comparison: Comparison, outcome: Outcome) -> Iterator[Sequence[object]]:
     nominal, cell = comparison.cells
-    result, stated = [], iter(interval_cells(comparison))
+    named = {(each.file, each.row) for each in outcome.outliers if label == "fit"}
+    stated = iter(interval_cells(comparison))
+    weights = iter(outcome.selection.fit.row_weights() if label == "fit" else ())
     for before, block in zip(*(prepare(each, comparison.blocks) for each in comparison.cells)):
         measured, m = block.measured, len(block.measured)
         columns = {nature: np.full((len(names), m), np.nan) for nature, names in COMPONENTS.items()}
@@ -170,16 +155,15 @@ def _residual_rows(label: str, comparison: Comparison, named: set, weights: dict
         position, distance = columns["position"], columns["distance"]
         length = np.sqrt(np.nansum(position**2, axis=0))
         size = np.where(np.isnan(position).all(axis=0), np.abs(distance[0]), length)
-        numbers = np.column_stack([measured.q, *(values.T for values in columns.values()), size, first])
-        station = measured.station if measured.has_instrument else ""
-        for i, row in enumerate(numbers):
-            file, number, tool = key = _key(measured, i)
-            outlier = int((file, number) in named and label == "fit")
-            result.append([label, file, number, station, tool, *row, weights.get(key), outlier, *next(stated)])
-    return result
+        weight = next(weights, np.full(m, np.nan))
+        numbers = np.column_stack([measured.q, *(values.T for values in columns.values()), size, first, weight])
+        station, file = measured.station if measured.has_instrument else "", measured.file
+        for number, tool, row in zip(measured.rows.tolist(), measured.tool.tolist(), numbers):
+            outlier = int((file, number) in named)
+            yield [label, file, number, station, measured.tool_names[tool], *row.tolist(), outlier, *next(stated)]
 
 
-def write_errors(path: Path, chain: Chain, validation: Mapping[str, Comparison]) -> None:
+def write_errors(path: Path, arm: Chain, validation: Mapping[str, Comparison]) -> None:
     """Write the errors of both arms at every validation row, and the error vectors of measured positions.
 
     Then ``x y z`` is where the target was seen, ``to_nominal`` and ``to_calibrated`` lead from there to where each arm
@@ -194,7 +178,7 @@ def write_errors(path: Path, chain: Chain, validation: Mapping[str, Comparison])
             places = np.concatenate([_places(each, number) for number in range(len(each.blocks))])
             cells = np.column_stack([q, *(1e3 * size for size in sizes), places, interval_cells(each)])
             rows += [[name, number, *values] for number, values in zip(numbers, cells)]
-    joints = [f"{joint.name} [{joint.unit}]" for joint in chain.joints]
+    joints = [f"{joint.name} [{joint.unit}]" for joint in arm.joints]
     files.write_table(path, ["file", "row", *joints, "nominal [mm]", "calibrated [mm]", *PLACES, *INTERVAL], rows)
 
 

@@ -58,6 +58,9 @@ class _CorrelationMatrix:
     matrix: tuple[tuple[float, ...], ...]
 
 
+SHOWN = 2000  # rows that figures show at most
+
+
 @dataclass(frozen=True)
 class RowErrors:
     """Error sizes on one set of rows.
@@ -70,6 +73,7 @@ class RowErrors:
         expected: radius within which 95 % of the calibrated arm's errors are to be [m]; empty where none is known.
         q: (rows, n) joints, points (rows, 3) in the arm's base, and numbers of the file's rows, where there is one
             error per row.
+        worst: the row with the calibrated arm's largest error, where only a sample of the rows stands here.
     """
 
     name: str
@@ -82,6 +86,7 @@ class RowErrors:
     expected: tuple[float, ...] = ()
     urdf_alone: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     rows: tuple[int, ...] = ()
+    worst: RowErrors | None = None
 
     def judged(self, deliverable: str) -> Mapping[str, tuple[float, ...]]:
         """Return the errors of the deliverable on which the verdict is based, by nature."""
@@ -185,18 +190,41 @@ def _files(inputs: Inputs) -> tuple[FileRow, ...]:
 
 
 def rows_of(name: str, comparison: Comparison, unseen: bool) -> RowErrors:
-    """Return the errors of one set of rows, with joint values and target positions if each row has one error."""
+    """Return the errors of one set of rows, with joint values and target positions if each row has one error.
+
+    Of more than `SHOWN` such rows a random sample, and the worst.
+    """
+    q, sizes = np.concatenate([block.q for block in comparison.blocks]), comparison.errors[1].main
+    if len(sizes) != len(q):
+        return _row_errors(name, comparison, unseen, slice(None))
+    points = _points(comparison)
+    if len(q) <= SHOWN:
+        return _row_errors(name, comparison, unseen, slice(None), q, points)
+    chosen = np.sort(np.random.default_rng(0).choice(len(q), SHOWN, replace=False))
+    worst = _row_errors(name, comparison, unseen, np.array([np.argmax(sizes)]), q, points)
+    return replace(_row_errors(name, comparison, unseen, chosen, q, points), worst=worst)
+
+
+def _row_errors(
+    name: str,
+    comparison: Comparison,
+    unseen: bool,
+    chosen: slice | np.ndarray,
+    q: np.ndarray | None = None,
+    points: np.ndarray | None = None,
+) -> RowErrors:
     nominal, calibrated, alone = (
-        {nature: _plain(size) for nature in NATURES if (size := getattr(found, nature, None)) is not None}
+        {nature: _plain(size[chosen]) for nature in NATURES if (size := getattr(found, nature, None)) is not None}
         for found in (*comparison.errors, comparison.alone)
     )
-    q = np.concatenate([block.q for block in comparison.blocks])
     rows = RowErrors(name, unseen, comparison.poses, nominal, calibrated, urdf_alone=alone)
-    if len(comparison.errors[1].main) != len(q):
+    if q is None or points is None:
         return rows
-    expected = () if comparison.intervals is None else _plain(comparison.intervals.radius)
-    numbers = tuple(int(row) for block in comparison.blocks for row in block.rows)
-    return replace(rows, q=_plain(q), points=_plain(_points(comparison)), expected=expected, rows=numbers)
+    expected = () if comparison.intervals is None else _plain(comparison.intervals.radius[chosen])
+    numbers = np.concatenate([block.rows for block in comparison.blocks])[chosen]
+    return replace(
+        rows, q=_plain(q[chosen]), points=_plain(points[chosen]), expected=expected, rows=tuple(map(int, numbers))
+    )
 
 
 def _points(comparison: Comparison) -> np.ndarray:

@@ -81,7 +81,8 @@ def _figures(report: Report, own: RowErrors, label: str) -> Iterator[Picture]:
     if own.points and own.rows:
         nature = next(iter(left))
         points, sizes = np.array(own.points), np.array(left[nature])
-        worst, chart = points[np.argmax(sizes)], error_map(points, sizes)
+        worst = points[np.argmax(sizes)] if own.worst is None else own.worst.points[0]
+        chart = error_map(points, sizes)
         panels = [
             replace(panel, layers=[*panel.layers, text("worst", worst[0], worst[j], colour=MARK)])
             for j, panel in zip((1, 2), chart.panels)
@@ -91,7 +92,7 @@ def _figures(report: Report, own: RowErrors, label: str) -> Iterator[Picture]:
 
 def _worst(report: Report, own: RowErrors) -> Iterator[str]:
     """Yield a sentence on the pose with the largest error: its errors, joints, and place."""
-    deliverable, nature = report.metrics.deliverable, next(iter(own.nominal))
+    own, deliverable, nature = own.worst or own, report.metrics.deliverable, next(iter(own.nominal))
     factor, unit = ERRORS[nature]
     before, after = (factor * np.array(one[nature]) for one in (own.nominal, own.judged(deliverable)))
     worst = int(np.argmax(after))
