@@ -6,7 +6,7 @@ reason, where the folder is absent.
 
 import gc
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import loaded as processes
@@ -30,6 +30,19 @@ settings.register_profile(
 )
 settings.register_profile("search", deadline=None, max_examples=2000)
 settings.load_profile("fixed")
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Callable[..., Path]:
+    """Write text, or a header and rows, to a file."""
+
+    def _write(header: str, rows: Sequence[Sequence[object]] | str = "", name: str = "poses.csv") -> Path:
+        path = tmp_path / name
+        body = rows if isinstance(rows, str) else "\n".join(",".join(str(cell) for cell in row) for row in rows)
+        path.write_text(header + "\n" + body + "\n", encoding="utf-8")
+        return path
+
+    return _write
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

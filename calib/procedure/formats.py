@@ -10,10 +10,7 @@ from calib.errors import UsageError, one_of
 from calib.extensions import merged
 
 TOPICS: Mapping[str, tuple[str, str]] = {
-    "measurements": (
-        "CSV files of measured poses, positions, distances",
-        "calib.data.poses.pose_files calib.data.poses.robodk",
-    ),
+    "measurements": ("CSV files of measured poses, positions, distances", "calib.data.poses.pose_files"),
     "options": ("the TOML file of calib fit --options", "calib.data.poses.fit_options"),
     "identify-options": (
         "the TOML file of calib identify --options",

@@ -1,25 +1,12 @@
 """A small measurement file and a recording that are right, to be spoilt in one place per test."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from calib.data.recordings.recording import Recording
-
-
-@pytest.fixture
-def write(tmp_path: Path) -> Callable[..., Path]:
-    """Write text, or a header and rows, to a file."""
-
-    def _write(header: str, rows: Sequence[Sequence[object]] | str = "", name: str = "poses.csv") -> Path:
-        path = tmp_path / name
-        body = rows if isinstance(rows, str) else "\n".join(",".join(str(cell) for cell in row) for row in rows)
-        path.write_text(header + "\n" + body + "\n", encoding="utf-8")
-        return path
-
-    return _write
 
 
 @pytest.fixture

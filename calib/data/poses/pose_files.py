@@ -16,7 +16,7 @@ sockets, plane      ``socket`` (grouped together with ``tool_position``), ``plan
 tool                ``tool``: label of the reflector that a row saw
 ==================  ===================================================================================================
 
-All other columns are ignored and listed. Other forms: `calib.data.poses.robodk`.
+All other columns are ignored and listed. Other forms: calib formats robodk.
 
 A frame on the robot's base measured beside the target: what is relative to it does not care for the instrument.
 
@@ -36,7 +36,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.data.csv_table import Table, read_header, read_table
-from calib.data.poses import plausible, robodk
+from calib.data.poses import plausible
 from calib.data.poses.columns import (
     DISTANCE,
     OURS,
@@ -61,6 +61,7 @@ from calib.data.poses.measurements import (
     Sockets,
 )
 from calib.data.schema import Joints, refuse
+from calib.extensions import merged
 
 
 def read_groups(sheet: Sheet, layout: Layout, q: np.ndarray) -> GroupedMeasurements:
@@ -209,9 +210,11 @@ def read_measurements(
     """
     robot, options = Joints.of(joints), options or FileOptions()
     table, path, notes = (source, source.file, ()) if isinstance(source, Table) else (None, source, ())
-    form = options.format or ("robodk" if table is None and robodk.recognises(read_header(path)[0]) else "csv")
-    if form in robodk.FORMS:
-        table, options, notes = robodk.FORMS[form](path, len(robot.names), options)
+    forms = merged("pose_forms")
+    header = () if options.format or table is not None else read_header(path)[0]
+    form = options.format or next((name for name, (known, _) in forms.items() if known(header)), "csv")
+    if form in forms:
+        table, options, notes = forms[form][1](path, len(robot.names), options)
     table = table or read_table(path)
     if table.notes:  # names that were understood need no map
         maps = {ours: theirs for ours, theirs in options.columns.items() if theirs in table or ours not in table}

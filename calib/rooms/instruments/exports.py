@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.data.poses.columns import SUFFIXES
-from calib.data.poses.robodk import recognises
+from calib.rooms.instruments.robodk import recognises
 
 HEAD = 1 << 16  # letters of a file in which its numbers begin (our choice)
 ROWS = 3  # of numbers, alike, that make a table (or as many as there are)

@@ -14,13 +14,13 @@ from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.measurements import PoseMeasurements, Positions
 from calib.data.poses.pose_files import read_measurements
 from calib.data.poses.pose_lists import read_poses
-from calib.data.poses.robodk import recognises
 from calib.errors import finding
 from calib.procedure.findings import lines_of
 from calib.procedure.robot_kinds import joints_of
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 from calib.rooms.instruments.joining import MIN_POINTS, NAMES, column_of, merged, ordered
+from calib.rooms.instruments.robodk import recognises
 
 SIGMA_JOINT = 1e-4  # between a commanded and a reached joint position [rad or m] (our choice)
 STEP = 1e-6  # of the differences that propagate it [rad or m]

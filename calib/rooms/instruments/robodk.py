@@ -114,5 +114,8 @@ def _with_tools(table: Table, tcp: Sequence[str], options: FileOptions) -> tuple
     return table, (f"{len(labels)} different TCPs, read as different tools ({values})",)
 
 
-FORMS: dict[str, Callable[[str | Path, int, FileOptions], Read]] = {"robodk": read_robodk, "three_smr": read_three_smr}
-"""Readers by the options' ``format``; other files are standard tables."""
+FORMS: dict[str, tuple[Callable[[Sequence[str]], bool], Callable[[str | Path, int, FileOptions], Read]]] = {
+    "robodk": (recognises, read_robodk),
+    "three_smr": (lambda header: False, read_three_smr),
+}
+"""By the options' ``format``: whether a header is of that form, and the reader."""
