@@ -98,12 +98,13 @@ def best_changes(
             changed = change.make(data)
             if at_least is None or _share(at_least(changed), now) < change.max_left:
                 after = left(changed)
-                tried.append((_share(after, now), change, changed, after))
+                tried.append((_share(after, now), change, after))
         counts = sorted((one for one in tried if one[0] < one[1].max_left), key=lambda one: one[0])
         if not counts:
             break
-        share, best, data, now = counts[0]
-        near = [change for other, change, *_ in counts[1:] if other < MAX_APART * share]
+        share, best, now = counts[0]
+        data = best.make(data)
+        near = [change for other, change, _ in counts[1:] if other < MAX_APART * share]
         rival = near[0] if near and not made else None
         made.append(best)
         rest.remove(best)
