@@ -4,6 +4,7 @@ OFFERS = {
     "commands": "commands:app",
     "topics": ":TOPICS",
     "check_controller": "table:check_controller",
+    "ur_kinematics": "ur_kinematics:kinematics",
     "write_program": "program:write_program",
     "as_described": "table:as_described",
     "motors_as_described": "table:motors_as_described",
