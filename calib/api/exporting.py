@@ -5,6 +5,7 @@ Validation compares a result with measurements that it was not estimated from.
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, overload
 
@@ -13,6 +14,7 @@ from calib.api.kinematic import GeometryFit, Measured, Several
 from calib.api.rendering import listed, optional, saved
 from calib.arguments import checked
 from calib.errors import CalibWarning, RobotError, UsageError, refused_as, require
+from calib.extensions import needed
 from calib.procedure.dynamic_stage import identify as arm_identify
 from calib.procedure.export import delivery, geometry
 from calib.procedure.export.identified import is_identified
@@ -61,6 +63,8 @@ def export(
     *,
     urdf: str | Path | None = None,
     prior: str = "entropic",
+    ros2: str = "",
+    **package: Any,
 ) -> tuple[str, ...]:
     """Write a calibrated robot, with identified dynamics if available, for other programs.
 
@@ -74,6 +78,9 @@ def export(
         into: folder for the files.
         urdf: description of the nominal robot to edit, everything else in it kept; by default the fit's own source.
         prior: what masses that the torques do not identify are regularised towards, ``entropic`` or ``euclidean``.
+        ros2: name of a ROS 2 package that is written into the folder, in place of the other files
+            (``calib formats ros2``).
+        package: of that: ``moveit`` (files to copy), ``control`` (write a ros2_control), ``overwrite``.
 
     Returns:
         What was written and what to know of it, in words.
@@ -90,6 +97,9 @@ def export(
             wanted = delivery.Export(source, identified=place, prior=prior)
         else:
             wanted = delivery.Export(source or _source_of(place), place)
+        if ros2:
+            remark = delivery.verdicts(place).of("urdf", dynamics=True).remark
+            return needed("ros2_package")(replace(wanted, remark=remark), ros2, into, **package)
         delivery.check_into(wanted, into, place)
         lines = delivery.deliver(wanted, into)
         judged = delivery.mark(into, delivery.verdicts(place))
