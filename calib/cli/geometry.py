@@ -37,7 +37,7 @@ def select(
 
     Args:
         out: CSV file of the chosen joint values
-        constraints: TOML, see calib formats constraints
+        constraints: TOML, see calib formats constraints, or MoveIt's files: calib formats moveit
         run: CSV of the run: t, pose (0: via-point), joints; calib view rehearses it
         existing: CSV of poses measured before, included in the selection
     """
@@ -49,7 +49,7 @@ def select(
     from calib.procedure.measuring.constraints_file import beside
     from calib.procedure.robot_kinds import stage_of
 
-    named = beside(constraints).values() if constraints else ()
+    named = beside(constraints).values() if constraints and constraints.suffix == ".toml" else ()
     stage_of(robot, "choosing poses")
     load_robot(robot, existing, FitOptions(), base, tip)
     written = [*selection.targets(out, plots), *([(run, (".csv",))] if run else [])]

@@ -43,7 +43,11 @@ def moveit_files(path: Path) -> list[Path]:
     places = [path, path / "config"]
     found = [one / JOINT_LIMITS for one in places if (one / JOINT_LIMITS).is_file()][:1]
     pairs = sorted(file for one in places for file in one.glob(f"*{SRDF}"))
-    require(len(pairs) < 2, f"{path} has {len(pairs)} SRDF files: give one of them, as {pairs[:1]}", UsageError)
+    require(
+        len(pairs) < 2,
+        f"{path} has {len(pairs)} SRDF files: give one of them, as {', '.join(map(str, pairs[:1]))}",
+        UsageError,
+    )
     require(found or pairs, f"{path}: neither {JOINT_LIMITS} nor *{SRDF} in this folder or its config", UsageError)
     return [*found, *pairs]
 
