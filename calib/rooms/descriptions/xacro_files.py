@@ -29,7 +29,7 @@ from xml.etree import ElementTree as ET
 from calib.errors import RobotError, refuse_robot, suggestion
 from calib.robot.collision import PACKAGE_PATH, package_folders
 
-_ARGUMENTS = re.compile(r"(?<=\.xacro)\s+(?=\w+:=)")
+_ARGUMENTS = re.compile(r"(?:(?<=\.xacro)|(?<=\.conf))\s+(?=\w+:=)")
 MAX_ABOVE = 4  # folders above the file in which packages are looked for (our choice)
 
 
