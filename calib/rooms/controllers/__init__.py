@@ -2,6 +2,7 @@
 
 OFFERS = {
     "commands": "commands:app",
+    "exports": "logs:translated",
     "topics": ":TOPICS",
     "check_controller": "table:check_controller",
     "ur_kinematics": "ur_kinematics:kinematics",
@@ -14,5 +15,6 @@ TOPICS = {
         "programs for robot controllers, of calib program",
         "calib.rooms.controllers.program calib.rooms.controllers.motion "
         "calib.rooms.controllers.targets calib.rooms.controllers.table",
-    )
+    ),
+    "logs": ("logs of robot controllers, by brand", "calib.rooms.controllers.logs"),
 }
