@@ -2,8 +2,8 @@
 
 Positions, velocities and efforts are taken by joint name; efforts are torques (or currents, where the options say so:
 many drivers publish currents under that name). Stamps are those of the headers; where these are all zero, the times
-at which the messages were logged. Messages that lack one of the joints (a gripper's own) are left out. So ros2_control's
-joint_state_broadcaster and franka_ros are read; of franka_ros2 the ``measured_joint_state`` of
+at which the messages were logged. Messages that lack one of the joints (a gripper's own) are left out. So bags of
+ros2_control's joint_state_broadcaster and of franka_ros are read; of franka_ros2 the ``measured_joint_state`` of
 ``franka_msgs/FrankaRobotState``, too, where the bag holds the message's definition.
 
 Read by `rosbags` (pure Python, Apache-2.0; its wheels' C parts exist for Linux and macOS), which is

@@ -7,12 +7,11 @@ They are known by the names of their columns, and the notes say which was recogn
 * ABB: EGM as abb_libegm logs it: positions only, no torques
 * KUKA: Sunrise's DataRecorder; the name of the torques' columns has to be stated
 
-Sources stand in ``logs.toml``. ROS bags, of ros2_control and franka_ros too, are read by their joint states, and those of
-franka_ros2 by ``FrankaRobotState``. No
-published description of the text was found for KUKA's RSI monitor and KRC trace (``.r64`` and its exports) and FRI,
-ABB's Signal Analyzer and Test Signal Viewer, FANUC, Staubli and Yaskawa: none is invented, and the general rules read
-them, with names and units stated in the options. Joints are as the controller shows them: ``controller = "fanuc"`` in
-the options sets signs and coupled axes right.
+Sources stand in ``logs.toml``. ROS bags, of ros2_control and franka_ros too, are read by their joint states, those of
+franka_ros2 by ``FrankaRobotState``, too. No published description of the text was found for KUKA's RSI monitor and KRC
+trace (``.r64`` and its exports) and FRI, ABB's Signal Analyzer and Test Signal Viewer, FANUC, Staubli and Yaskawa:
+none is invented, and the general rules read them, with names and units stated in the options. Joints are as the
+controller shows them: ``controller = "fanuc"`` in the options sets signs and coupled axes right.
 """
 
 import io
