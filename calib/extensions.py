@@ -16,7 +16,7 @@ A room is a package of `calib.rooms` with a table ``OFFERS``: what it adds, and 
     descriptions           a module: `takes` tells by its name whether a file is another program's description of a
                            robot, `urdf` returns it as the text of a URDF
     limit_tables           functions: path, arm, its file → tables of `calib formats limits`, None for other files
-    ros2_package           function: see `calib.rooms.descriptions.package`
+    ros2_package           function: see `calib.rooms.descriptions.ros2_package`
     library                folder of the robots that go by a name
     stages                 their verbs: tables of kind → verb → `calib.procedure.robot_kinds.Stage`
     drive_gains            function: robot, cases of currents, settings, known parameters, reference joint → gains of

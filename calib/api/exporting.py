@@ -64,7 +64,9 @@ def export(
     urdf: str | Path | None = None,
     prior: str = "entropic",
     ros2: str = "",
-    **package: Any,
+    moveit: Sequence[str | Path] = (),
+    control: bool = False,
+    overwrite: bool = False,
 ) -> tuple[str, ...]:
     """Write a calibrated robot, with identified dynamics if available, for other programs.
 
@@ -80,7 +82,9 @@ def export(
         prior: what masses that the torques do not identify are regularised towards, ``entropic`` or ``euclidean``.
         ros2: name of a ROS 2 package that is written into the folder, in place of the other files
             (``calib formats ros2``).
-        package: of that: ``moveit`` (files to copy), ``control`` (write a ros2_control), ``overwrite``.
+        moveit: files of MoveIt to copy into that package, or a folder with them.
+        control: write a ros2_control for mock hardware into its URDF where there is none.
+        overwrite: replace files of that package that are there.
 
     Returns:
         What was written and what to know of it, in words.
@@ -91,6 +95,7 @@ def export(
     into = Path(into)
     with saved(result) as place:
         if (stage := stage_of(place, "export")) is not None:
+            require(not ros2, f"ros2 {ros2}: a package is written of serial arms only", UsageError)
             return stage.run(place, into, urdf=urdf, prior=prior)
         source = optional(urdf)
         if is_identified(place):
@@ -98,8 +103,9 @@ def export(
         else:
             wanted = delivery.Export(source or _source_of(place), place)
         if ros2:
-            remark = delivery.verdicts(place).of("urdf", dynamics=True).remark
-            return needed("ros2_package")(replace(wanted, remark=remark), ros2, into, **package)
+            wanted = replace(wanted, remark=delivery.verdicts(place).of("urdf", dynamics=True).remark)
+            own = {"moveit": [*map(Path, moveit)], "control": control, "overwrite": overwrite}
+            return needed("ros2_package")(wanted, ros2, into, **own)
         delivery.check_into(wanted, into, place)
         lines = delivery.deliver(wanted, into)
         judged = delivery.mark(into, delivery.verdicts(place))

@@ -168,11 +168,13 @@ def export(
         if ur_kinematics or offsets or (into and out):
             raise UsageError("--into writes all files into one folder; leave --out, --ur-kinematics and --offsets out")
         require(into or out, f"--ros2 {ros2}: give the folder for the package, --out", UsageError)
-        own = {"moveit": moveit or (), "control": ros2_control, "overwrite": overwrite} if ros2 else {}
         target = into or out or Path()
         with progress() as show:
             show("writing all formats, and reading each file back")
-            lines = export_all(folder, target, urdf=urdf, prior=prior, ros2=ros2, **own)
+            lines = export_all(
+                folder, target, urdf=urdf, prior=prior, ros2=ros2, moveit=moveit or (), control=ros2_control,
+                overwrite=overwrite,
+            )  # fmt: skip
         say_written(lines, target / ros2, delivery.verdicts(folder).level)
         return
     words = "nothing to write: give --urdf SOURCE.urdf --out FILE.urdf, --ur-kinematics, --offsets, --ros2 or --into"

@@ -351,8 +351,9 @@ def _model(
     from calib.robot import capsules, collision
 
     chain, notes = cell.chain, ()
+    known = links_of(chain, source) if table.ignored else ()
     for name in (name for pair in table.ignored for name in pair):
-        one_of(name, links_of(chain, source), "collision.ignored: link", RobotError)
+        one_of(name, known, "collision.ignored: link", RobotError)
     around: dict[str, Any] = {
         "walls": walls, "targets": cell.tools[:, :3, 3], "margin": table.margin, "within": within,
         "ignored": {frozenset(pair) for pair in table.ignored},
