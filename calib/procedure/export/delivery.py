@@ -200,7 +200,8 @@ def _drives(export: Export, path: Path) -> list[str]:
 
 def _joint_origins(export: Export, path: Path) -> list[str]:
     if export.urdf is not None:
-        files.write(path, geometry.joint_origins(text(export.urdf)[0], export.with_masses[0], str(export.urdf)))
+        for origins in offered("joint_origins"):
+            files.write(path, origins(text(export.urdf)[0], export.with_masses[0], str(export.urdf)))
     return []
 
 

@@ -5,6 +5,7 @@ OFFERS = {
     "exports": "logs:translated",
     "topics": ":TOPICS",
     "check_controller": "table:check_controller",
+    "joint_origins": "joint_origins:joint_origins",
     "ur_kinematics": "ur_kinematics:kinematics",
     "write_program": "program:write_program",
     "as_described": "table:as_described",

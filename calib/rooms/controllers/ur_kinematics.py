@@ -1,6 +1,6 @@
 """Universal Robots' own geometry: the kinematics file of ur_description, in UR's frames.
 
-A nested mapping in block style (`calib.procedure.export.geometry.block`).
+A nested mapping in block style (`calib.rooms.controllers.joint_origins.block`).
 """
 
 import hashlib
@@ -8,12 +8,13 @@ import hashlib
 import numpy as np
 
 from calib.errors import RobotError, refused_as
-from calib.procedure.export.geometry import NoSuchArm, block
+from calib.procedure.export.geometry import NoSuchArm
 from calib.robot.calibrated import CalibratedChain, nominal_of
 from calib.robot.chain import AXES, Chain
 from calib.robot.formats import urdf_write
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.kinematics import forward, joint_frames
+from calib.rooms.controllers.joint_origins import block
 from calib.transforms import invert, to_xyz_rpy
 
 ON_AXIS = 1e-3  # [m]
