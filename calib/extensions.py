@@ -15,6 +15,8 @@ A room is a package of `calib.rooms` with a table ``OFFERS``: what it adds, and 
     robots                 functions: what a person names → `calib.procedure.robot_kinds.Mechanism`, or None
     descriptions           a module: `takes` tells by its name whether a file is another program's description of a
                            robot, `urdf` returns it as the text of a URDF
+    limit_tables           functions: path, arm, its file → tables of `calib formats limits`, None for other files
+    ros2_package           function: see `calib.rooms.descriptions.ros2_package`
     library                folder of the robots that go by a name
     stages                 their verbs: tables of kind → verb → `calib.procedure.robot_kinds.Stage`
     drive_gains            function: robot, cases of currents, settings, known parameters, reference joint → gains of
@@ -37,6 +39,8 @@ A room is a package of `calib.rooms` with a table ``OFFERS``: what it adds, and 
                            identification (outcome, folder, whether with figures) into its folder
     check_controller       function: controller's name, number of joints; raises where it takes no such arm
     write_program          function: CSV of poses, path, controller's name → files of its program
+    joint_origins          function: texts of a nominal and a calibrated URDF, their name → YAML for tesseract
+    ur_kinematics          function: calibrated robot → YAML for ur_description, and a remark
     as_described           function: controller's name, joints as it shows them → the description's joints;
     motors_as_described    the same of motors' torques and currents
     notebook               function: a result → HTML

@@ -37,7 +37,7 @@ HOMES = {
         "calib.rooms.camera.pictures.board_print",
         "calib.rooms.cells.rendered_camera",
     ],
-    "ruamel": ["calib.rooms.camera.lens"],
+    "ruamel": ["calib.rooms.camera.lens", "calib.rooms.descriptions.moveit"],
     "mcap": ["calib.data.", "calib.rooms.camera."],
     "rosbags": ["calib.data.", "calib.rooms.camera."],
     "pandas": ["calib.api.rendering"],

@@ -5,6 +5,7 @@ Validation compares a result with measurements that it was not estimated from.
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, overload
 
@@ -13,6 +14,7 @@ from calib.api.kinematic import GeometryFit, Measured, Several
 from calib.api.rendering import listed, optional, saved
 from calib.arguments import checked
 from calib.errors import CalibWarning, RobotError, UsageError, refused_as, require
+from calib.extensions import needed
 from calib.procedure.dynamic_stage import identify as arm_identify
 from calib.procedure.export import delivery, geometry
 from calib.procedure.export.identified import is_identified
@@ -61,6 +63,10 @@ def export(
     *,
     urdf: str | Path | None = None,
     prior: str = "entropic",
+    ros2: str = "",
+    moveit: Sequence[str | Path] = (),
+    control: bool = False,
+    overwrite: bool = False,
 ) -> tuple[str, ...]:
     """Write a calibrated robot, with identified dynamics if available, for other programs.
 
@@ -74,6 +80,11 @@ def export(
         into: folder for the files.
         urdf: description of the nominal robot to edit, everything else in it kept; by default the fit's own source.
         prior: what masses that the torques do not identify are regularised towards, ``entropic`` or ``euclidean``.
+        ros2: name of a ROS 2 package that is written into the folder, in place of the other files
+            (``calib formats ros2``).
+        moveit: files of MoveIt to copy into that package, or a folder with them.
+        control: write a ros2_control for mock hardware into its URDF where there is none.
+        overwrite: replace files of that package that are there.
 
     Returns:
         What was written and what to know of it, in words.
@@ -84,12 +95,17 @@ def export(
     into = Path(into)
     with saved(result) as place:
         if (stage := stage_of(place, "export")) is not None:
+            require(not ros2, f"ros2 {ros2}: a package is written of serial arms only", UsageError)
             return stage.run(place, into, urdf=urdf, prior=prior)
         source = optional(urdf)
         if is_identified(place):
             wanted = delivery.Export(source, identified=place, prior=prior)
         else:
             wanted = delivery.Export(source or _source_of(place), place)
+        if ros2:
+            wanted = replace(wanted, remark=delivery.verdicts(place).of("urdf", dynamics=True).remark)
+            own = {"moveit": [*map(Path, moveit)], "control": control, "overwrite": overwrite}
+            return needed("ros2_package")(wanted, ros2, into, **own)
         delivery.check_into(wanted, into, place)
         lines = delivery.deliver(wanted, into)
         judged = delivery.mark(into, delivery.verdicts(place))

@@ -33,7 +33,7 @@ def excite(
     Args:
         out: folder for the motion, its figures and metrics.json
         model: folder of an identification: predicts the torques
-        limits: TOML: speeds, torques, workspace, collision, friction
+        limits: TOML: speeds, torques, workspace, collision, friction; or MoveIt's files: calib formats moveit
         options: TOML: options of the identification that will follow (rows, drives, couplings, payloads)
         after: folder of an identification, which the motion adds to: for its model, information and torque errors
     """
@@ -147,7 +147,7 @@ def plan(
         waypoints: CSV of joint values, or x y z, qx qy qz qw of the tip
         out: folder for the motion, its figures and metrics.json
         model: folder of an identification: the dynamics to plan with
-        limits: TOML: speeds, torques, workspace, collision, friction
+        limits: TOML: speeds, torques, workspace, collision, friction; or MoveIt's files: calib formats moveit
         drives: TOML: [drives] Ia, Fv, Fc, off, without --model
     """
     from calib.api.motions import plan_motion

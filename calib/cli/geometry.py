@@ -37,7 +37,7 @@ def select(
 
     Args:
         out: CSV file of the chosen joint values
-        constraints: TOML, see calib formats constraints
+        constraints: TOML, see calib formats constraints, or MoveIt's files: calib formats moveit
         run: CSV of the run: t, pose (0: via-point), joints; calib view rehearses it
         existing: CSV of poses measured before, included in the selection
     """
@@ -49,7 +49,7 @@ def select(
     from calib.procedure.measuring.constraints_file import beside
     from calib.procedure.robot_kinds import stage_of
 
-    named = beside(constraints).values() if constraints else ()
+    named = beside(constraints).values() if constraints and constraints.suffix == ".toml" else ()
     stage_of(robot, "choosing poses")
     load_robot(robot, existing, FitOptions(), base, tip)
     written = [*selection.targets(out, plots), *([(run, (".csv",))] if run else [])]
@@ -131,8 +131,13 @@ def export(
     for_corrections: bool = False,
     overwrite: bool = False,
     prior: str = "entropic",
+    ros2: str = "",
+    moveit: list[Path] | None = None,
+    ros2_control: bool = False,
 ) -> None:
     """Write the calibrated robot for other programs. With --into: in all forms, identified dynamics included.
+
+    With --ros2 NAME --out FOLDER: as a ROS 2 package with launch file and meshes.
 
     A result whose verdict is no pass is marked so, with the reason; with fail, for inspection only, the exit code is 1.
 
@@ -147,6 +152,9 @@ def export(
         into: folder for all formats, with identified dynamics: calib formats exports
         for_corrections: the URDF to use only together with joint_corrections.csv
         prior: with --into: distance from the prior for unidentified masses, entropic or euclidean
+        ros2: name of a ROS 2 package written into the folder --out: calib formats ros2
+        moveit: with --ros2: SRDF, joint_limits.yaml, or a folder with both, to copy; may be repeated
+        ros2_control: with --ros2: write a ros2_control (mock hardware) if the URDF has none
     """
     from calib.errors import UsageError, require
     from calib.files import results
@@ -154,17 +162,22 @@ def export(
     from calib.procedure.robot_kinds import stage_of
 
     stage_of(folder, "export" if into else "export to single files")
-    if into:
+    if into or ros2:
         from calib.api.exporting import export as export_all
 
-        if out or ur_kinematics or offsets:
+        if ur_kinematics or offsets or (into and out):
             raise UsageError("--into writes all files into one folder; leave --out, --ur-kinematics and --offsets out")
+        require(into or out, f"--ros2 {ros2}: give the folder for the package, --out", UsageError)
+        target = into or out or Path()
         with progress() as show:
             show("writing all formats, and reading each file back")
-            lines = export_all(folder, into, urdf=urdf, prior=prior)
-        say_written(lines, into, delivery.verdicts(folder).level)
+            lines = export_all(
+                folder, target, urdf=urdf, prior=prior, ros2=ros2, moveit=moveit or (), control=ros2_control,
+                overwrite=overwrite,
+            )  # fmt: skip
+        say_written(lines, target / ros2, delivery.verdicts(folder).level)
         return
-    words = "nothing to write: give --urdf SOURCE.urdf --out FILE.urdf, --ur-kinematics, --offsets or --into"
+    words = "nothing to write: give --urdf SOURCE.urdf --out FILE.urdf, --ur-kinematics, --offsets, --ros2 or --into"
     require((urdf is None) == (out is None) and (urdf or ur_kinematics or offsets), words, UsageError)
     form = delivery.CORRECTED_URDF if for_corrections else delivery.URDF
     asked = [(form, out, (".urdf",)), (delivery.UR_KINEMATICS, ur_kinematics, (".yaml", ".yml")),

@@ -10,7 +10,7 @@ the nearest point of a line is found by golden sections, inside as outside.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from typing import Any
@@ -368,6 +368,7 @@ def from_chain(
     targets: np.ndarray | Sequence[Sequence[float]] = (),
     margin: float = 0.0,
     within: bool = True,
+    ignored: Collection[frozenset[str]] = (),
     seed: int = 0,
 ) -> Capsules:
     """Return the collision model of an arm with capsules from each joint frame to the next.
@@ -383,6 +384,7 @@ def from_chain(
         targets: (T, 3) of what is measured, in the tip's frame [m].
         margin: the least distance that will be asked for [m]; pairs that never have it are left out.
         within: False: parts of the arm are not compared with each other.
+        ignored: pairs of links that are not compared.
         seed: of the random postures that show which pairs those are.
     """
     size = usual_radius(chain) if radius is None else radius
@@ -401,6 +403,7 @@ def from_chain(
     radii = np.array([*[size] * (len(moving) + 1), *[TARGET_RADIUS] * len(places)])
     there = np.flatnonzero(length > 1e-6)
     own = [(i, j) for i in there for j in there if bodies[j] > bodies[i] + 1 and within]
+    own = [(i, j) for i, j in own if frozenset((names[i], names[j])) not in ignored]
     planes = (*([] if floor is None else [Wall("floor", np.array([0.0, 0.0, 1.0]), floor)]), *walls)
     world = [(i, k) for k in range(len(planes) + len(obstacles)) for i in there if bodies[i]]
     found = Capsules(

@@ -9,7 +9,7 @@ obstacle that a link never leaves is refused.
 """
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -138,6 +138,7 @@ def from_urdf(
     targets: np.ndarray | Sequence[Sequence[float]] = (),
     margin: float = 0.0,
     within: bool = True,
+    ignored: Collection[frozenset[str]] = (),
     seed: int = 0,
 ) -> Collision:
     """Return the collision model of a URDF's collision shapes; joints outside the chain stay at zero.
@@ -152,6 +153,7 @@ def from_urdf(
         targets: (T, 3) of what is measured, in the tip's frame [m]: each a thin capsule from the tip.
         margin: the least distance that will be asked for [m]; pairs that never have it are left out.
         within: False: parts of the arm are not compared with each other.
+        ignored: pairs of links that are not compared.
         seed: of the random postures that show which pairs those are.
 
     Raises:
@@ -178,10 +180,12 @@ def from_urdf(
     planes = [*([] if floor is None else [Wall("floor", np.array([0.0, 0.0, 1.0]), floor)]), *walls]
     _surround(model, geometry, chain.base, planes, obstacles)
     carriers = [shape.parentJoint for shape in geometry.geometryObjects]
+    links = [model.frames[shape.parentFrame].name for shape in geometry.geometryObjects]
     for one in range(own):
         for two in range(one + 1, len(carriers)):
             i, j = sorted((carriers[one], carriers[two]))
-            if i != j and (two >= own or (within and model.parents[j] != i)):
+            compared = within and model.parents[j] != i and frozenset((links[one], links[two])) not in ignored
+            if i != j and (two >= own or compared):
                 geometry.addCollisionPair(pin.CollisionPair(one, two))
     found = Collision(_names(geometry), (), tuple(missing), model, geometry, chain, own)
     return _without_inseparable(found, margin, seed) if found.pairs else found

@@ -2,7 +2,9 @@
 
 Positions, velocities and efforts are taken by joint name; efforts are torques (or currents, where the options say so:
 many drivers publish currents under that name). Stamps are those of the headers; where these are all zero, the times
-at which the messages were logged. Messages that lack one of the joints (a gripper's own) are left out.
+at which the messages were logged. Messages that lack one of the joints (a gripper's own) are left out. So bags of
+ros2_control's joint_state_broadcaster and of franka_ros are read; of franka_ros2 the ``measured_joint_state`` of
+``franka_msgs/FrankaRobotState``, too, where the bag holds the message's definition.
 
 Read by `rosbags` (pure Python, Apache-2.0; its wheels' C parts exist for Linux and macOS), which is
 imported when a bag is read (75 ms). Memory grows with the joint states alone, time with their number.
@@ -21,13 +23,14 @@ from calib.data.schema import Joints
 from calib.errors import MeasurementError, refuse_data, refused_as, require, suggestion
 
 JOINT_STATE = ("sensor_msgs/msg/JointState", "sensor_msgs/JointState")
+FRANKA_STATE = "franka_msgs/msg/FrankaRobotState"  # of franka_ros2: a joint state, measured_joint_state, among others
 
 
 def read_bag(path: Path, joints: Joints | None, options: RecordingOptions) -> Recording:
     """Return the recording of a bag's joint states; only shapes are checked."""
     with opened(path) as reader:
         connections = connections_of(
-            reader, JOINT_STATE, options.topic, path, "joint states", "topic = '...'", "/joint_states"
+            reader, (*JOINT_STATE, FRANKA_STATE), options.topic, path, "joint states", "topic = '...'", "/joint_states"
         )  # fmt: skip
         names, parts, skipped = joint_states(reader, connections, joints, path)
     for ours, what in (("q", "positions"), ("effort", "efforts")):
@@ -90,6 +93,7 @@ def joint_states(
     skipped = 0
     for connection, logged, raw in reader.messages(connections=connections):
         message = reader.deserialize(raw, connection.msgtype)
+        message = getattr(message, "measured_joint_state", message)
         own = tuple(message.name)
         names = names or own
         if own not in order:

@@ -53,7 +53,7 @@ def read_log(path: Path, joints: Joints | None, options: RecordingOptions) -> Re
     }
     used = {place for columns in found.values() for place in columns}
     unused = [name for place, name in enumerate(table.header) if place not in used]
-    notes = [f"not read: {', '.join(unused)}"] if unused else []
+    notes = [*table.notes, *([f"not read: {', '.join(unused)}"] if unused else [])]
     for ours, columns in found.items():
         if stem_of(table.header[columns[0]])[0].startswith(MEASURED):
             notes.append(f"{ours} is read from {', '.join(_called(table, columns))}")
@@ -92,7 +92,7 @@ def _numbered_brackets(table: Table) -> Table:
         return table
     header = tuple(name + unit if unit.isdigit() else name for name, unit in zip(table.header, table.units))
     units = tuple("" if unit.isdigit() else unit for unit in table.units)
-    return Table(table.file, header, units, table.cells, table.rows)
+    return Table(table.file, header, units, table.cells, table.rows, table.notes)
 
 
 def _find(table: Table, options: RecordingOptions, joints: Sequence[str]) -> dict[str, list[int]]:

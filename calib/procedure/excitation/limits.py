@@ -41,7 +41,7 @@ from calib.config_types import Name, NotNegative, Numeric, Real, Spread, Whole, 
 from calib.errors import UsageError, require
 from calib.geometry.observability import targets_of
 from calib.procedure.measuring.constraints_file import DEFAULTS, ConstraintsFile, Point
-from calib.procedure.measuring.pose_limits import Limits, limits_of
+from calib.procedure.measuring.pose_limits import Limits, limits_of, tables_of
 from calib.robot.chain import Chain, Joint
 from calib.robot.description import impossible_bodies
 from calib.robot.kinematics import joint_frames, joint_jacobian, sweep
@@ -255,7 +255,7 @@ def read_motion_limits(
         UsageError: for an unknown key or a value that a key cannot have, and where nothing limits speeds, or
             accelerations and torques (`MotionBounds`).
     """
-    stated, where = read(LimitsFile, given, "limits")
+    stated, where = read(LimitsFile, *tables_of(given, chain, source, "limits"))
     torque_table = stated.torque
     without = ()
     if given_way:

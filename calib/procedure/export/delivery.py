@@ -43,6 +43,7 @@ import numpy as np
 
 from calib import files
 from calib.errors import UsageError
+from calib.extensions import offered
 from calib.folders import OFFSETS, PARAMETERS, check_target, write_staged
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.export import geometry, identified
@@ -167,9 +168,12 @@ def _offsets(export: Export, path: Path) -> list[str]:
 
 
 def _ur_kinematics(export: Export, path: Path) -> list[str]:
-    files.write(path, _remarked(geometry.ur_kinematics(export.robot).encode(), export.remark))
-    flange = geometry.flange_note(export.robot)
-    return [f"{path.name}: for kinematics_params_file of ur_description" + (f"; {flange}" if flange else "")]
+    notes = []
+    for kinematics in offered("ur_kinematics"):
+        content, flange = kinematics(export.robot)
+        files.write(path, _remarked(content.encode(), export.remark))
+        notes.append(f"{path.name}: for kinematics_params_file of ur_description" + (f"; {flange}" if flange else ""))
+    return notes
 
 
 def _mjcf(export: Export, path: Path) -> list[str]:
@@ -196,7 +200,8 @@ def _drives(export: Export, path: Path) -> list[str]:
 
 def _joint_origins(export: Export, path: Path) -> list[str]:
     if export.urdf is not None:
-        files.write(path, geometry.joint_origins(text(export.urdf)[0], export.with_masses[0], str(export.urdf)))
+        for origins in offered("joint_origins"):
+            files.write(path, origins(text(export.urdf)[0], export.with_masses[0], str(export.urdf)))
     return []
 
 

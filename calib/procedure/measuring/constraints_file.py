@@ -39,6 +39,7 @@ TOML; every table is optional, a key that is none of these is refused. Lengths i
     radius = 0.06                    # of the capsules; by default 5 % of the stretched arm, 0.05 or more
     floor = 0.0                      # height of the floor; by default of what the arm stands on
     box = [[-1, 1], [-1, 1], [0, 2]] # x, y and z that no part of the arm leaves
+    ignored = [["base", "tool0"]]     # pairs of links that are not compared, as an SRDF's disable_collisions
     [[obstacle]]                     # any number of these
     name = "table"                   # for messages
     kind = "box"                     # box, sphere or cylinder
@@ -159,6 +160,7 @@ class CollisionTable:
     radius: Annotated[float, Real(above=0, quantity="length")] | None = None
     floor: Metres | None = None
     box: Box | None = None
+    ignored: tuple[Annotated[tuple[Name, Name], Expect("pairs of links")], ...] = ()
 
 
 @strict

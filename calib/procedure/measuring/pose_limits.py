@@ -5,7 +5,7 @@ between the arm's own links, and the floor that the arm stands on: `Limits.check
 `Limits.unchecked` names what could not be, since nobody has stated it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -15,16 +15,18 @@ import numpy as np
 
 from calib.config import Tables, check_keys, read
 from calib.config_types import number
-from calib.errors import RobotError, UsageError, listing, refused_as, require
-from calib.extensions import needed
+from calib.errors import RobotError, UsageError, listing, one_of, refused_as, require
+from calib.extensions import needed, offered
 from calib.geometry.installation import Installation
 from calib.geometry.observability import Observation, Target, TargetJacobian
 from calib.procedure.measuring import constraints_file
 from calib.procedure.measuring.constraints_file import CameraTable, CollisionTable, ConstraintsFile, InstrumentTable
 from calib.procedure.measuring.sight import SeenOnly, Sight, sight_of
 from calib.robot.capsules import Obstacle, Wall, signed_distance
+from calib.robot.chain import Chain
 from calib.robot.description import MAX_TURN, remarks
 from calib.robot.formats.urdf_tree import is_urdf, text
+from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.tables import placement
 from poses import constraints
 from poses.space import PoseConstraint, SearchSpace
@@ -104,12 +106,26 @@ def read_limits(
     known = (*constraints_file.DEFAULTS, *constraints_file.CELL)
     if unknown := sorted(set(without) - {*known}):
         raise UsageError(f"without {unknown[0]}: expected one of {', '.join(known)}")
-    stated, where = read(ConstraintsFile, given, "constraints", constraints_file.MOTION)
+    stated, where = read(ConstraintsFile, *tables_of(given, cell.chain, source, "constraints"), constraints_file.MOTION)
     limits = limits_of(stated, cell, source, where, without)
     if stated.camera is None:
         return limits
     folder = given.parent if isinstance(given, Path) else Path()
     return _with_camera(limits, stated.camera, cell, where, folder, {*stated.without, *without})
+
+
+def tables_of(given: Tables | None, chain: Chain, source: Path | None, name: str) -> tuple[Tables | None, str]:
+    """Return limits as a file or tables, from other programs' files where a room reads them, and their name.
+
+    Args:
+        given: a file, a folder, or tables, which are named by `name`.
+        chain, source: the arm, and its file.
+    """
+    if isinstance(given, str | Path):
+        for room in offered("limit_tables"):
+            if (found := room(Path(given), chain, source)) is not None:
+                return found, str(given)
+    return given, name
 
 
 def _with_camera(
@@ -335,7 +351,13 @@ def _model(
     from calib.robot import capsules, collision
 
     chain, notes = cell.chain, ()
-    around: dict[str, Any] = {"walls": walls, "targets": cell.tools[:, :3, 3], "margin": table.margin, "within": within}
+    known = links_of(chain, source) if table.ignored else ()
+    for name in (name for pair in table.ignored for name in pair):
+        one_of(name, known, "collision.ignored: link", RobotError)
+    around: dict[str, Any] = {
+        "walls": walls, "targets": cell.tools[:, :3, 3], "margin": table.margin, "within": within,
+        "ignored": {frozenset(pair) for pair in table.ignored},
+    }  # fmt: skip
     if source is not None and is_urdf(source) and "<collision" in text(source)[0]:
         try:
             model = collision.from_urdf(source, chain.base, chain.tip, floor, obstacles, **around)
@@ -348,6 +370,13 @@ def _model(
             notes = (f"{error.args[0].partition(';')[0]}: capsules are used as link shapes",)
     radius = capsules.usual_radius(chain) if table.radius is None else table.radius
     return capsules.from_chain(chain, radius, floor, obstacles, **around), f"capsules of radius {radius:g} m", notes
+
+
+def links_of(chain: Chain, source: Path | None) -> Collection[str]:
+    """Return the names of a robot's links: of all in its URDF, else of the arm's capsules."""
+    if source is not None and is_urdf(source):
+        return read_tree(text(source)[0], str(source)).bodies
+    return (chain.base, *(chain.links or [f"{name}_link" for name in chain.joint_names]), chain.tip)
 
 
 def _walls(box: tuple[Any, ...] | None, where: str) -> list[Wall]:

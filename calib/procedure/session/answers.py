@@ -75,7 +75,8 @@ class Answers:
         robot: a .urdf, an MDH .toml, a library name, or the folder of an earlier fit.
         instrument: cmm, tracker, tracker6d, mocap, camera, camera-poses, other-pose, other-position, none.
         tool: x,y,z: approximate position of the target in the tip's frame [m].
-        limits: TOML file that describes the cell: instrument or [camera], obstacles, speeds; none: asked in questions.
+        limits: TOML file that describes the cell: instrument or [camera], obstacles, speeds; or
+            MoveIt's files (calib formats moveit); none: asked in questions.
         mounting: in hand (the arm holds the camera), to hand (the arm holds the board), or unknown.
         lens: camera_info YAML with approximate values of the camera's lens; or unknown.
         board: board.toml as `calib board` writes it; or unknown.

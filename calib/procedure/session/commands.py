@@ -23,8 +23,8 @@ from calib.geometry.observability import targets_of
 from calib.procedure.excitation.coefficients import RUN, SAMPLES
 from calib.procedure.excitation.limits import read_motion_limits
 from calib.procedure.kinematic_stage.folder import URDF
-from calib.procedure.measuring.constraints_file import ConstraintsFile, beside
-from calib.procedure.measuring.pose_limits import limits_of, read_limits
+from calib.procedure.measuring.constraints_file import UNKNOWN, beside
+from calib.procedure.measuring.pose_limits import read_limits, tables_of
 from calib.procedure.report import page
 from calib.procedure.robot_kinds import stage_of
 from calib.procedure.session import steps
@@ -220,22 +220,19 @@ def _limits(
     """Return the files of the given limits (name -> path or text) after checking them, and the limits file's name."""
     if stated is None:
         return {}, ""
-    if not isinstance(stated, Mapping):
-        stated = Path(stated)
-        if motions:
-            read_motion_limits(stated, chain, source)
-        read_limits(stated, targets_of(chain), source)
-        return {LIMITS: stated, **beside(stated)}, LIMITS
-    cell = parse(ConstraintsFile, stated, "the cell")
-    limits_of(cell, targets_of(chain), source, "the cell")
-    if cell.camera is None:
-        return {LIMITS: f"{HEAD}{dumps(stated)}"}, LIMITS
-    if not cell.camera.unknown:
-        needed("camera_view")(cell.camera, chain, "the cell", Path())
-    given = {key: getattr(cell.camera, key) for key in CAMERA_FILES if key not in cell.camera.unknown}
-    tables = {**stated, "camera": {**stated["camera"], **{key: CAMERA_FILES[key] for key in given}}}
+    stated = Path(stated) if isinstance(stated, str) else stated
+    if motions and isinstance(stated, Path):
+        read_motion_limits(stated, chain, source)
+    read_limits(stated, targets_of(chain), source)
+    found, _ = tables_of(stated, chain, source, "")
+    if isinstance(found, str | Path):
+        return {LIMITS: Path(found), **beside(Path(found))}, LIMITS
+    tables = dict(found or {})
+    camera = tables.get("camera", {})
+    given = {key: camera[key] for key in CAMERA_FILES if camera.get(key, UNKNOWN) != UNKNOWN}
+    named = {"camera": {**camera, **{key: CAMERA_FILES[key] for key in given}}} if given else {}
     copied = {CAMERA_FILES[key]: Path(name) for key, name in given.items()}
-    return {LIMITS: f"{HEAD}{dumps(tables)}", **copied}, LIMITS
+    return {LIMITS: f"{HEAD}{dumps(tables | named)}", **copied}, LIMITS
 
 
 def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", plots: bool = True) -> _Stop:

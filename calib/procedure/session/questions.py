@@ -144,7 +144,7 @@ def checked(given: Answers) -> dict[str, Any]:
     require(dynamics or not (given.payloads or given.torques), words, UsageError)
     result = {"robot": robot, "instrument": instrument, "dynamics": dynamics, "limits": given.limits}
     if given.limits is not None:
-        require(given.limits.is_file(), f"--limits {given.limits}: no such file", UsageError)
+        require(given.limits.exists(), f"--limits {given.limits}: no such file", UsageError)
         option = next(iter(given.cell), "").replace("_", "-").replace("obstacles", "obstacle")
         words = f"--{option} and --limits both describe the cell; put it into {given.limits}"
         require(not given.cell, words, UsageError)

@@ -2,8 +2,11 @@
 
 OFFERS = {
     "commands": "commands:app",
+    "exports": "logs:translated",
     "topics": ":TOPICS",
     "check_controller": "table:check_controller",
+    "joint_origins": "joint_origins:joint_origins",
+    "ur_kinematics": "ur_kinematics:kinematics",
     "write_program": "program:write_program",
     "as_described": "table:as_described",
     "motors_as_described": "table:motors_as_described",
@@ -13,5 +16,6 @@ TOPICS = {
         "programs for robot controllers, of calib program",
         "calib.rooms.controllers.program calib.rooms.controllers.motion "
         "calib.rooms.controllers.targets calib.rooms.controllers.table",
-    )
+    ),
+    "logs": ("logs of robot controllers, by brand", "calib.rooms.controllers.logs"),
 }

@@ -3,9 +3,9 @@
 from functools import lru_cache
 from pathlib import Path
 
-from calib.rooms.descriptions import mjcf, xacro_files
+from calib.rooms.descriptions import mjcf, ur_calibration, xacro_files
 
-READERS = {".xacro": xacro_files.expand, ".xml": mjcf.convert, ".mjcf": mjcf.convert}
+READERS = {".xacro": xacro_files.expand, ".xml": mjcf.convert, ".mjcf": mjcf.convert, ".conf": ur_calibration.convert}
 
 
 def takes(path: str) -> bool:

@@ -2,7 +2,7 @@
 
 Arguments follow the file as they do on the command line of xacro, all in quotes::
 
-    calib fit "ur.urdf.xacro ur_type:=ur5e name:=ur5e" measured.csv --out fit
+    calib fit "ur.urdf.xacro ur_type:=ur5e name:=ur" measured.csv --out fit
 
 ``$(find NAME)`` and ``package://NAME`` need no ROS: a package is a folder of that name, or one whose ``package.xml``
 has the name, among the folders above the file and those beside them, in the installed ROS (``AMENT_PREFIX_PATH``), or
@@ -29,7 +29,8 @@ from xml.etree import ElementTree as ET
 from calib.errors import RobotError, refuse_robot, suggestion
 from calib.robot.collision import PACKAGE_PATH, package_folders
 
-_ARGUMENTS = re.compile(r"(?<=\.xacro)\s+(?=\w+:=)")
+_ARGUMENTS = re.compile(r"(?:(?<=\.xacro)|(?<=\.conf))\s+(?=\w+:=)")
+_MISSING = re.compile(r"Undefined substitution argument (\w+)")
 MAX_ABOVE = 4  # folders above the file in which packages are looked for (our choice)
 
 
@@ -80,7 +81,9 @@ def expand(path: str) -> str:
             inner = cause
         if isinstance(inner, RobotError):
             raise inner from None
-        raise RobotError(f"{_place(xacro, file)}: xacro: {' '.join(str(error).split()) or repr(error)}") from error
+        words = " ".join(str(error).split()) or repr(error)
+        hint = f"; say it behind the file: {named[1]}:=…" if (named := _MISSING.search(words)) else ""
+        raise RobotError(f"{_place(xacro, file)}: xacro: {words}{hint}") from error
     if unknown := [name for name in given if name not in arguments.asked]:
         known = [str(name) for name in arguments.asked]
         there = f"it has {', '.join(sorted(known))}" if known else "it has none"

@@ -146,6 +146,30 @@ def test_ros2_bags_without_ros(tmp_path, series, kind):
         refused(bare, "has no joint 'elbow'", Joints(("elbow",)))
 
 
+def test_franka_ros2_bags_are_read_by_their_measured_joint_state(tmp_path, series):
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store, name = get_typestore(Stores.ROS2_HUMBLE), "franka_msgs/msg/FrankaRobotState"
+    fields = "std_msgs/Header header\nsensor_msgs/JointState measured_joint_state\nfloat64[3] dtau_j\n"
+    store.register(get_types_from_msg(fields, name))
+    whole, state, header, stamp = (
+        store.types[each]
+        for each in (name, "sensor_msgs/msg/JointState", "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
+    )
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        topic = writer.add_connection("/franka_robot_state_broadcaster/robot_state", name, typestore=store)
+        for k in range(200):
+            time = header(stamp=stamp(sec=10, nanosec=k * 5_000_000), frame_id="")
+            q, v, tau = (series[key][k].copy() for key in ("q", "dq", "tau"))
+            own = state(header=time, name=["a", "b", "c"], position=q, velocity=v, effort=tau)
+            message = whole(header=time, measured_joint_state=own, dtau_j=np.zeros(3))
+            writer.write(topic, 10**10 + k, store.serialize_cdr(message, name))
+    recording = read_recording(tmp_path / "bag", ROBOT)
+    np.testing.assert_array_equal(recording.q, series["q"][:200])
+    np.testing.assert_array_equal(recording.effort, series["tau"][:200])
+
+
 def test_a_cut_does_not_hide_damage(archive):
     path = archive()
     assert len(read_recording(f"{path}@0:1", ROBOT)) > 0

@@ -156,12 +156,12 @@ def test_what_is_mounted_behind_wrist_3_is_not_in_its_kinematics(cell, calib, ol
 
 
 def test_an_arm_without_ur_axes_has_no_ur_kinematics(cell, calib):
-    from calib.procedure.export.geometry import ur_kinematics
     from calib.robot.calibrated import CalibratedChain
+    from calib.rooms.controllers.ur_kinematics import kinematics
 
     panda = load("panda")
     with pytest.raises(Exception, match="not have the axes of a UR arm"):
-        ur_kinematics(CalibratedChain(panda, panda))
+        kinematics(CalibratedChain(panda, panda))
 
 
 def test_a_failed_result_is_exported_with_its_verdict_and_exit_code_1(cell, calib, fitted):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from calib.procedure.export.geometry import block
+from calib.rooms.controllers.joint_origins import block
 
 yaml = pytest.importorskip("yaml")
 
