@@ -12,7 +12,6 @@ from typing import Any, Concatenate, ParamSpec
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator, NullLocator
@@ -56,12 +55,10 @@ def line(
     x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     if form == "-":
         x, y = style.thinned(x, y)
-    axes.plot(
-        x, y, form, color=colour, linewidth=width, markersize=size, label=label,
+    axes.errorbar(
+        x, y, spread, fmt=form, color=colour, linewidth=width, markersize=size, label=label,
         markerfacecolor="white" if hollow else colour, markeredgewidth=0.8 if hollow or form == "+" else 0.0,
     )  # fmt: skip
-    if spread is not None:
-        axes.errorbar(x, y, spread, fmt="none", ecolor=colour, elinewidth=width)
 
 
 @layer
@@ -71,17 +68,15 @@ def bars(
 ) -> None:  # fmt: skip
     """Draw bars (k,) from `base` at 0, 1, …, in one colour or one each; `spread` (k,): half the error bars' length."""
     values = np.asarray(values, dtype=float)
-    turn = slice(None, None, 1 if upright else -1)
-    ends = np.stack([np.full(len(values), base), values], axis=1)[:, [0, 1, 1, 0]]
-    sides = (np.arange(len(values)) + shift)[:, None] + 0.5 * thick * np.array([-1.0, -1.0, 1.0, 1.0])
-    drawn = PolyCollection(np.stack([sides, ends][turn], axis=2), facecolors=colours, label=label)  # one, not k patches
-    (drawn.sticky_edges.y if upright else drawn.sticky_edges.x).append(base)
-    axes.add_collection(drawn)
-    axes.autoscale_view()
+    fill, error = (axes.fill_between, "yerr") if upright else (axes.fill_betweenx, "xerr")
+    place = np.arange(len(values)) + shift
+    ends = (place[:, None] + thick * np.array([-0.5, 0.5, np.nan])).ravel()
+    drawn = fill(ends, base, np.repeat(values, 3), color=colours, linewidth=0.0, label=label)  # k patches cost more
+    getattr(drawn.sticky_edges, error[0]).append(base)
     if spread is not None:
-        errors: Any = {"yerr" if upright else "xerr": spread}
-        place = (np.arange(len(values)) + shift, values)[turn]
-        axes.errorbar(*place, **errors, fmt="none", ecolor=MARK, capsize=1.8, elinewidth=0.9)
+        x, y = (place, values) if upright else (values, place)
+        errors: Any = {error: spread, "fmt": "none", "ecolor": MARK, "capsize": 1.8, "elinewidth": 0.9}
+        axes.errorbar(x, y, **errors)
 
 
 @layer
