@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -500,6 +500,11 @@ def _twist_of(known: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarray) -
     return full[1][:, selected], full[2][:, selected]
 
 
+@lru_cache(maxsize=32)  # of a search, whose objectives and limits all ask for the same places and those beside them
+def _placed(known: ClosedRobot, x: bytes, near: Posture | None = None) -> Posture:
+    return known.place(np.frombuffer(x).reshape(-1, known.robot.r), near)
+
+
 @dataclass(frozen=True, eq=False)
 class PlatformRegressor:
     """Regressor in platform coordinates and actuator torques as functions of x, v, a; gradients are by differences.
@@ -517,7 +522,8 @@ class PlatformRegressor:
 
     def motion(self, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> LoopMotion:
         """Return the motion of all joints for x, v, a (N, r); x is clipped to the robot's box."""
-        return along(self.model.known, self._reachable(x), v, a)
+        known, within = self.model.known, self._reachable(x)
+        return of_platform(known, _placed(known, within.tobytes()), *_twist_of(known, within, v, a))
 
     def regressor(self, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return W (N, r, b) in the selected columns."""
@@ -560,7 +566,7 @@ class PlatformRegressor:
         """
         known, (count, r) = self.model.known, x.shape
         within = self._reachable(x)
-        near, inside = known.place(within), within == x
+        near, inside = _placed(known, within.tobytes()), within == x
         still = loop_jacobians(known, near)
         result = np.empty((3, count, r))
         for order, step in enumerate((STEP, 1e-3, 1.0)):
@@ -569,7 +575,7 @@ class PlatformRegressor:
                 for shift in (step * np.eye(r)[j], -step * np.eye(r)[j]):
                     moved = [within, v, a]
                     moved[order] = moved[order] + shift
-                    posture = known.place(moved[0], near) if order == 0 else near
+                    posture = _placed(known, moved[0].tobytes(), near) if order == 0 else near
                     twist = _twist_of(known, *moved)
                     ends.append(of(of_platform(known, posture, *twist, None if order == 0 else still)))
                 result[order, :, j] = ((ends[0] - ends[1]) * weights).reshape(count, -1).sum(axis=1) / (2.0 * step)
