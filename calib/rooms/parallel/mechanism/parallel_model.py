@@ -465,7 +465,7 @@ def _to_platform(known: ClosedRobot, q: np.ndarray, v: np.ndarray) -> np.ndarray
     return loop_jacobians(known, known.locate(q)).readings.transpose(0, 2, 1)
 
 
-STEP = 1e-6  # of the differences by x
+STEPS = (1e-6, 1e-3, 1.0)  # of the differences by x, v and a
 
 
 def along(known: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarray, near: Posture | None = None) -> LoopMotion:
@@ -500,9 +500,29 @@ def _twist_of(known: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarray) -
     return full[1][:, selected], full[2][:, selected]
 
 
-@lru_cache(maxsize=32)  # of a search, whose objectives and limits all ask for the same places and those beside them
-def _placed(known: ClosedRobot, x: bytes, near: Posture | None = None) -> Posture:
-    return known.place(np.frombuffer(x).reshape(-1, known.robot.r), near)
+@lru_cache(maxsize=4)  # of a search, whose objectives and limits all ask for the same motion and for those beside it
+def _moving(known: ClosedRobot, *motion: bytes) -> LoopMotion:
+    """Return the motion of all joints for x, v, a (N, r) of the platform."""
+    x, v, a = (np.frombuffer(one).reshape(-1, known.robot.r) for one in motion)
+    return along(known, x, v, a)
+
+
+@lru_cache(maxsize=4)
+def _beside(known: ClosedRobot, *motion: bytes) -> list[tuple[LoopMotion, LoopMotion]]:
+    """Return the motions of all joints beside x, v, a (N, r): each of their columns raised and lowered by its step."""
+    given, result = [np.frombuffer(one).reshape(-1, known.robot.r) for one in motion], []
+    near = _moving(known, *motion).posture
+    still = loop_jacobians(known, near)
+    for order, step in enumerate(STEPS):
+        for shift in step * np.eye(known.robot.r):
+            ends = []
+            for moved in ([*given], [*given]):
+                moved[order] = moved[order] + (-shift if ends else shift)
+                posture = known.place(moved[0], near) if order == 0 else near
+                twist = _twist_of(known, *moved)
+                ends.append(of_platform(known, posture, *twist, None if order == 0 else still))
+            result.append(tuple(ends))
+    return result
 
 
 @dataclass(frozen=True, eq=False)
@@ -522,8 +542,7 @@ class PlatformRegressor:
 
     def motion(self, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> LoopMotion:
         """Return the motion of all joints for x, v, a (N, r); x is clipped to the robot's box."""
-        known, within = self.model.known, self._reachable(x)
-        return of_platform(known, _placed(known, within.tobytes()), *_twist_of(known, within, v, a))
+        return _moving(self.model.known, *(one.tobytes() for one in (self._reachable(x), v, a)))
 
     def regressor(self, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return W (N, r, b) in the selected columns."""
@@ -564,19 +583,10 @@ class PlatformRegressor:
         Args:
             of: the motion of N samples -> values (N, ...); weights: of the same shape.
         """
-        known, (count, r) = self.model.known, x.shape
-        within = self._reachable(x)
-        near, inside = _placed(known, within.tobytes()), within == x
-        still = loop_jacobians(known, near)
-        result = np.empty((3, count, r))
-        for order, step in enumerate((STEP, 1e-3, 1.0)):
-            for j in range(r):
-                ends = []
-                for shift in (step * np.eye(r)[j], -step * np.eye(r)[j]):
-                    moved = [within, v, a]
-                    moved[order] = moved[order] + shift
-                    posture = _placed(known, moved[0].tobytes(), near) if order == 0 else near
-                    twist = _twist_of(known, *moved)
-                    ends.append(of(of_platform(known, posture, *twist, None if order == 0 else still)))
-                result[order, :, j] = ((ends[0] - ends[1]) * weights).reshape(count, -1).sum(axis=1) / (2.0 * step)
-        return result[0] * inside, result[1], result[2]
+        within, result = self._reachable(x), np.empty((3, *x.shape))
+        found = _beside(self.model.known, *(one.tobytes() for one in (within, v, a)))
+        for k, (raised, lowered) in enumerate(found):
+            order, j = divmod(k, x.shape[1])
+            change = ((of(raised) - of(lowered)) * weights).reshape(len(x), -1)
+            result[order, :, j] = change.sum(axis=1) / (2.0 * STEPS[order])
+        return result[0] * (within == x), result[1], result[2]
