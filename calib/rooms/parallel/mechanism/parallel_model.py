@@ -468,14 +468,9 @@ def _to_platform(known: ClosedRobot, q: np.ndarray, v: np.ndarray) -> np.ndarray
 STEPS = (1e-6, 1e-3, 1.0)  # of the differences by x, v and a
 
 
-def along(known: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarray, near: Posture | None = None) -> LoopMotion:
-    """Return the motion of all joints for platform coordinates x (N, r) and their derivatives v, a.
-
-    Args:
-        near: (N,) postures to start Newton from; None: from home.
-    """
-    posture = known.place(x, near)
-    return of_platform(known, posture, *_twist_of(known, x, v, a))
+def along(known: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> LoopMotion:
+    """Return the motion of all joints for platform coordinates x (N, r) and their derivatives v, a."""
+    return of_platform(known, known.place(x), *_twist_of(known, x, v, a))
 
 
 def _twist_of(known: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
