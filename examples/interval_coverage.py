@@ -1,9 +1,10 @@
 """How the errors that fits and identifications state hold: one row per recording and split, and simulated parameters.
 
-CALIB_DATA=... python examples/interval_coverage.py [torques] [regimes] [parameters] [positions [ROW ...]]
+CALIB_DATA=... python examples/interval_coverage.py [torques] [regimes] [parameters] [positions] [ROW ...]
 
-A ROW of the positions is named by its first cells: "Motoman small | each region". Without any all are made. Regimes:
-the open recordings' pairs of `extrapolation.py` whose test is of another regime (faster, another range or motion).
+A ROW of positions or torques is named by its first cells: "Motoman small | each region". Without any all are made.
+Regimes: the open recordings' pairs of `extrapolation.py` whose test is of another regime (faster, another range or
+motion).
 """
 
 from __future__ import annotations
@@ -132,9 +133,11 @@ def torque_row(name: str, split: str, model: DynamicsModel) -> str:
     )
 
 
-def motion_rows() -> Iterator[str]:
-    """Yield the rows of the torques' table."""
+def motion_rows(chosen: Sequence[str] = ()) -> Iterator[str]:
+    """Yield the rows of the torques' table, all or those whose first cells are chosen."""
     for name, train, unseen, options in MOTIONS:
+        if chosen and not f"{name} | {Path(unseen).name}".startswith(tuple(chosen)):
+            continue
         robot = (DATA / train).parent / "model.urdf"
         files = [str(DATA / each) for each in (train, unseen)]
         model = calib.identify_dynamics(robot, files[0], validate=files[1], options=parse_options(options))
@@ -216,11 +219,11 @@ def parameters(seeds: int = SEEDS) -> None:
 
 
 def main() -> None:
-    wanted = sys.argv[1:] or ["torques", "regimes", "parameters", "positions"]
-    place = wanted.index("positions") + 1 if "positions" in wanted else len(wanted)
-    wanted, chosen = wanted[:place], wanted[place:]
+    tables = ("torques", "regimes", "parameters", "positions")
+    wanted = [name for name in tables if name in sys.argv[1:]] or tables
+    chosen = [name for name in sys.argv[1:] if name not in tables]
     if "torques" in wanted:
-        torques(motion_rows())
+        torques(motion_rows(chosen))
     if "regimes" in wanted:
         torques(regime_rows())
     if "parameters" in wanted:

@@ -244,7 +244,7 @@ def _updated(triangle: np.ndarray, columns: np.ndarray) -> np.ndarray:
     stacked[: len(columns)] = triangle[:, live]
     stacked[len(columns) :] = columns[live].T
     result = np.zeros_like(triangle)
-    result[: len(live), live] = retriangulate(stacked)
+    result[: len(live), live] = retriangulate(stacked, overwrite=True)
     return result
 
 

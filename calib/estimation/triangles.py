@@ -123,12 +123,8 @@ def combine(data: Triangles, std: np.ndarray | None = None) -> np.ndarray:
     return retriangulate((data.factors / scale[:, None, None]).reshape(data.groups * size, size))
 
 
-def retriangulate(stacked: np.ndarray) -> np.ndarray:
+def retriangulate(stacked: np.ndarray, overwrite: bool = False) -> np.ndarray:
     """Return the R factor of any matrix as a square upper triangular matrix, padded with zero rows."""
-    return _factor(stacked, overwrite=False)
-
-
-def _factor(stacked: np.ndarray, overwrite: bool) -> np.ndarray:
     size = stacked.shape[1]
     result = np.zeros((size, size))
     if stacked.size:
@@ -192,7 +188,7 @@ def _update(factor: np.ndarray, matrix: np.ndarray, target: np.ndarray) -> np.nd
     stacked[len(old) :, :-1] = matrix[:, live[:-1]]
     stacked[len(old) :, -1] = target
     result = np.zeros_like(factor)
-    result[: len(live), live] = _factor(stacked, overwrite=True)  # live[i] >= i: still upper triangular
+    result[: len(live), live] = retriangulate(stacked, overwrite=True)  # live[i] >= i: still upper triangular
     return result
 
 

@@ -1,6 +1,6 @@
 """The DualV study: parameters of an actuation-redundant parallel robot by its inverse dynamic and power models.
 
-    python examples/dualv/study.py --out dualv-study [--seeds 5] [--readme]
+    python examples/dualv/study.py --out dualv-study [--seeds 5] [--trials 5] [--readme]
 
 A simulated DualV (Briot, Gautier & Krut 2013, two papers) runs designed motions without and with a payload of 5.37 kg,
 under computed torque with an internal preload. IDIM-WLS on the platform's coordinates and PIM-WLS on the power identify
@@ -71,6 +71,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("dualv-study"))
     parser.add_argument("--seeds", type=int, default=SEEDS, help="of motions and noise; three at least")
+    parser.add_argument("--trials", type=int, default=SEEDS, help="identifications, each from three of the motions")
     parser.add_argument("--workers", type=int, default=2, help="local processes for the designs")
     parser.add_argument("--readme", action="store_true", help="put the tables into the README beside this script")
     options = parser.parse_args()
@@ -81,7 +82,7 @@ def main() -> None:
         designs = list(pool.map(designed, seeds))
     robot = Robot()
     runs = [{label: robot.run(designs[k], LOADS[label], k) for label in LOADS} for k in seeds]
-    found = [Trial(robot, *(runs[(k + later) % len(runs)] for later in range(3))) for k in seeds]
+    found = [Trial(robot, *(runs[(k + later) % len(runs)] for later in range(3))) for k in seeds[: options.trials]]
     figures(robot, found[0], options.out)
     metrics = report(designs, found)
     spent = sum(now - then for now, then in zip(os.times()[:4], used))

@@ -26,10 +26,10 @@ def test_reprojection_beats_two_steps_on_rendered_images(tmp_path):
 @pytest.mark.slow
 def test_stated_sigmas_hold_and_reprojection_is_better_over_seeds(tmp_path):
     subprocess.run(
-        [sys.executable, str(EXAMPLE), "--seeds", "20", "--out", str(tmp_path)], check=True, capture_output=True
+        [sys.executable, str(EXAMPLE), "--seeds", "8", "--out", str(tmp_path)], check=True, capture_output=True
     )
     found = json.loads((tmp_path / "seeds.json").read_text())
-    assert 0.92 < found["coverage_of_95_percent"] < 0.98  # of 50 seeds 0.948
-    assert found["two_steps_over_reprojection"]["median"] > 1.5  # 2.7
+    assert 0.92 < found["coverage_of_95_percent"] < 0.98  # of 8 seeds 0.954, of 50 0.948
+    assert found["two_steps_over_reprojection"]["median"] > 1.5  # 3.6; of 50 seeds 2.7
     assert found["two_steps_over_reprojection"]["share_better"] >= 0.9
-    assert len((tmp_path / "seeds.csv").read_text().splitlines()) == 21
+    assert len((tmp_path / "seeds.csv").read_text().splitlines()) == 9

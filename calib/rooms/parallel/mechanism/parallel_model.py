@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -465,17 +465,12 @@ def _to_platform(known: ClosedRobot, q: np.ndarray, v: np.ndarray) -> np.ndarray
     return loop_jacobians(known, known.locate(q)).readings.transpose(0, 2, 1)
 
 
-STEP = 1e-6  # of the differences by x
+STEPS = (1e-6, 1e-3, 1.0)  # of the differences by x, v and a
 
 
-def along(known: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarray, near: Posture | None = None) -> LoopMotion:
-    """Return the motion of all joints for platform coordinates x (N, r) and their derivatives v, a.
-
-    Args:
-        near: (N,) postures to start Newton from; None: from home.
-    """
-    posture = known.place(x, near)
-    return of_platform(known, posture, *_twist_of(known, x, v, a))
+def along(known: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> LoopMotion:
+    """Return the motion of all joints for platform coordinates x (N, r) and their derivatives v, a."""
+    return of_platform(known, known.place(x), *_twist_of(known, x, v, a))
 
 
 def _twist_of(known: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -500,6 +495,31 @@ def _twist_of(known: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarray) -
     return full[1][:, selected], full[2][:, selected]
 
 
+@lru_cache(maxsize=4)  # of a search, whose objectives and limits all ask for the same motion and for those beside it
+def _moving(known: ClosedRobot, *motion: bytes) -> LoopMotion:
+    """Return the motion of all joints for x, v, a (N, r) of the platform."""
+    x, v, a = (np.frombuffer(one).reshape(-1, known.robot.r) for one in motion)
+    return along(known, x, v, a)
+
+
+@lru_cache(maxsize=4)
+def _beside(known: ClosedRobot, *motion: bytes) -> list[tuple[LoopMotion, LoopMotion]]:
+    """Return the motions of all joints beside x, v, a (N, r): each of their columns raised and lowered by its step."""
+    given, result = [np.frombuffer(one).reshape(-1, known.robot.r) for one in motion], []
+    near = _moving(known, *motion).posture
+    still = loop_jacobians(known, near)
+    for order, step in enumerate(STEPS):
+        for shift in step * np.eye(known.robot.r):
+            ends = []
+            for moved in ([*given], [*given]):
+                moved[order] = moved[order] + (-shift if ends else shift)
+                posture = known.place(moved[0], near) if order == 0 else near
+                twist = _twist_of(known, *moved)
+                ends.append(of_platform(known, posture, *twist, None if order == 0 else still))
+            result.append(tuple(ends))
+    return result
+
+
 @dataclass(frozen=True, eq=False)
 class PlatformRegressor:
     """Regressor in platform coordinates and actuator torques as functions of x, v, a; gradients are by differences.
@@ -517,7 +537,7 @@ class PlatformRegressor:
 
     def motion(self, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> LoopMotion:
         """Return the motion of all joints for x, v, a (N, r); x is clipped to the robot's box."""
-        return along(self.model.known, self._reachable(x), v, a)
+        return _moving(self.model.known, *(one.tobytes() for one in (self._reachable(x), v, a)))
 
     def regressor(self, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return W (N, r, b) in the selected columns."""
@@ -558,19 +578,10 @@ class PlatformRegressor:
         Args:
             of: the motion of N samples -> values (N, ...); weights: of the same shape.
         """
-        known, (count, r) = self.model.known, x.shape
-        within = self._reachable(x)
-        near, inside = known.place(within), within == x
-        still = loop_jacobians(known, near)
-        result = np.empty((3, count, r))
-        for order, step in enumerate((STEP, 1e-3, 1.0)):
-            for j in range(r):
-                ends = []
-                for shift in (step * np.eye(r)[j], -step * np.eye(r)[j]):
-                    moved = [within, v, a]
-                    moved[order] = moved[order] + shift
-                    posture = known.place(moved[0], near) if order == 0 else near
-                    twist = _twist_of(known, *moved)
-                    ends.append(of(of_platform(known, posture, *twist, None if order == 0 else still)))
-                result[order, :, j] = ((ends[0] - ends[1]) * weights).reshape(count, -1).sum(axis=1) / (2.0 * step)
-        return result[0] * inside, result[1], result[2]
+        within, result = self._reachable(x), np.empty((3, *x.shape))
+        found = _beside(self.model.known, *(one.tobytes() for one in (within, v, a)))
+        for k, (raised, lowered) in enumerate(found):
+            order, j = divmod(k, x.shape[1])
+            change = ((of(raised) - of(lowered)) * weights).reshape(len(x), -1)
+            result[order, :, j] = change.sum(axis=1) / (2.0 * STEPS[order])
+        return result[0] * (within == x), result[1], result[2]
