@@ -1,10 +1,10 @@
-"""Command for many sessions: run."""
+"""Commands for many robots: run, fleet."""
 
 from pathlib import Path
 
 import typer
 
-from calib.cli.shared import command, reporting
+from calib.cli.shared import command, exit_failed, reporting, say
 
 app = typer.Typer()
 
@@ -22,12 +22,12 @@ def run(sessions: list[Path], workers: str = "1", plots: bool = True) -> None:
     """
     import time
 
-    from calib.rooms.fleet import fleet
+    from calib.rooms.fleet import fleet as runs
 
-    folders, started, outcomes = fleet.folders_of(sessions), time.perf_counter(), []
+    folders, started, outcomes = runs.folders_of(sessions), time.perf_counter(), []
     with reporting() as (say, progress):
         progress(f"running {len(folders)} sessions")
-        for outcome in fleet.run_sessions(
+        for outcome in runs.run_sessions(
             folders, workers=workers, plots=plots, command=f"calib run --workers {workers}"
         ):
             outcomes.append(outcome)
@@ -35,8 +35,30 @@ def run(sessions: list[Path], workers: str = "1", plots: bool = True) -> None:
             progress(f"{len(outcomes)} of {len(folders)} sessions")
     places = [str(folder) for folder in folders]
     outcomes.sort(key=lambda one: places.index(one.folder))
-    say(fleet.table(outcomes), result=True)
-    say(*fleet.remarks(outcomes))
-    say(fleet.summary(outcomes, time.perf_counter() - started))
+    say(runs.table(outcomes), result=True)
+    say(*runs.remarks(outcomes))
+    say(runs.summary(outcomes, time.perf_counter() - started))
     if code := max(one.code for one in outcomes):
         raise typer.Exit(code)
+
+
+@command(app, "Files and studies")
+def fleet(calibrations: list[Path], out: Path | None = None) -> None:
+    """Compare the calibrations of many arms: which drift, which share a bad tool, how far do arms of a type differ?
+
+    With --out, each type gets a prior for its next arm, which then needs fewer poses:
+    calib fit fleet/prior/ur5 measured.csv --options fleet/prior/ur5/options.toml
+
+    Example: calib fleet cell1 cell2 cell3 --out fleet
+
+    Args:
+        calibrations: folders of fits or sessions; those of one robot (serial number) in order of time
+        out: folder for the report and the priors. Default: nothing is written
+    """
+    from calib.rooms.fleet.report import report_fleet
+
+    found = report_fleet(calibrations)
+    if out is not None:
+        found.save(out)
+    say(*found.renderables(), *([f"written to {out}"] if out else []))
+    exit_failed(found.verdict.level)

@@ -24,7 +24,6 @@ from calib.geometry.installation import Installation
 from calib.geometry.observation import families
 from calib.robot import calibrated
 from calib.robot.calibrated import CalibratedChain, nominal_of
-from calib.robot.chain import Chain
 
 FAMILY = 4.0  # arms that the variance of a family of parameters counts as (our choice)
 MIN_WIDTH = 1e-6  # [m, rad] of the prior (our choice)
