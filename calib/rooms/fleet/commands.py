@@ -10,33 +10,34 @@ app = typer.Typer()
 
 
 @command(app, "Files and studies")
-def run(sessions: list[Path], workers: str = "1", plots: bool = True) -> None:
+def run(sessions: list[str], workers: str = "1", plots: bool = True) -> None:
     """Run many SESSIONS, one folder per robot, as far as possible. A table at the end shows their states.
 
-    A robot that fails does not stop the others; see its folder's run.log. The exit code is the worst of all.
+    A robot that fails does not stop the others; see its folder's run.log. The exit code is the worst of all. The same
+    command again goes on from what is done, also after a scheduler, a worker or this command was killed.
 
     Example: calib run cell1 cell2 --workers 2
 
     Args:
-        sessions: session.toml files, or the sessions' folders
+        sessions: session.toml files, the sessions' folders, or addresses such as 's3://bucket/cells/*'
     """
     import time
 
     from calib.rooms.fleet import fleet as runs
+    from calib.rooms.fleet.throughput import Throughput
+    from calib.workers import workers as opened
 
-    folders, started, outcomes = runs.folders_of(sessions), time.perf_counter(), []
+    folders, started, outcomes, pace = runs.folders_of(sessions), time.perf_counter(), [], Throughput()
     with reporting() as (say, progress):
         progress(f"running {len(folders)} sessions")
-        for outcome in runs.run_sessions(
-            folders, workers=workers, plots=plots, command=f"calib run --workers {workers}"
-        ):
+        for outcome in runs.run(folders, opened(workers), f"calib run --workers {workers}", plots, pace):
             outcomes.append(outcome)
             say(outcome.line())
             progress(f"{len(outcomes)} of {len(folders)} sessions")
     places = [str(folder) for folder in folders]
     outcomes.sort(key=lambda one: places.index(one.folder))
     say(runs.table(outcomes), result=True)
-    say(*runs.remarks(outcomes))
+    say(*runs.remarks(outcomes), *pace.lines())
     say(runs.summary(outcomes, time.perf_counter() - started))
     if code := max(one.code for one in outcomes):
         raise typer.Exit(code)
@@ -60,5 +61,6 @@ def fleet(calibrations: list[Path], out: Path | None = None) -> None:
     found = report_fleet(calibrations)
     if out is not None:
         found.save(out)
-    say(*found.renderables(), *([f"written to {out}"] if out else []))
+    say(*found.renderables(), result=True)
+    say(*([f"written to {out}"] if out else []))
     exit_failed(found.verdict.level)

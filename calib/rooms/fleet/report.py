@@ -160,7 +160,7 @@ def report_fleet(calibrations: str | Path | Sequence[str | Path]) -> FleetReport
     Raises:
         UsageError: for a folder that holds no fit, or one given twice.
     """
-    found = [read(folder, folder) for folder in folders_of(calibrations)]
+    found = [read(folder, Path(folder)) for folder in folders_of(calibrations)]
     visits: dict[str, list[Calibration]] = {}
     for one in found:
         visits.setdefault(one.serial or one.name, []).append(one)
