@@ -94,15 +94,16 @@ class FleetReport(Judged):
         """Write a folder: report.html, metrics.json, and for each type a prior for the fit of its next arm."""
         out = Path(out)
         folders.check_target(out, OURS, (folders.METRICS,), "fleet report")
-        return folders.write_staged(out, (*OURS, PRIOR), self._write)
+        folders.write_staged(out, OURS, self._write)
+        for one in self.types:
+            if one.parameters:
+                prior.write(out / PRIOR / one.name, [each.robot for each in one.plausible], one.parameters)
+        return out
 
     def _write(self, folder: Path) -> None:
         from calib.rooms.certificate.record import report
         from calib.rooms.certificate.rendering import html
 
-        for one in self.types:
-            if one.parameters:
-                prior.write(folder / PRIOR / one.name, [each.robot for each in one.plausible], one.parameters)
         count = sum(len(one.arms) for one in self.types)
         files.write(folder / PAGE, html(report("Fleet", f"{count} arms", (), [self.section()])))
         files.write_json(folder / folders.METRICS, self.to_dict())
