@@ -3,8 +3,8 @@
 python tests/benchmarks/fleet_prior.py --factory FOLDER [--draws 8]
 
 FOLDER/ur5 holds factory calibrations of UR5 arms, as `ur_calibration` writes them (``my_robot_calibration.yaml``; many
-stand in public repositories), FOLDER/ur10 of UR10 arms. An arm of those is measured by simulation (0.1 mm of noise); the
-measured UR5, UR10 and Pandas are those of the recordings. Rms errors in mm, the median over draws of the poses.
+stand in public repositories), FOLDER/ur10 of UR10 arms. An arm of those is measured by simulation (0.1 mm of noise);
+the measured UR5, UR10 and Pandas are those of the recordings. Rms errors in mm, the median over draws of the poses.
 """
 
 import argparse
@@ -26,6 +26,7 @@ from calib.robot.kinematics import forward
 from calib.rooms.fleet import prior
 
 DATA = Path(__file__).parents[3] / "shared/data"
+LINKS = "shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3"
 SIZES = 8, 10, 15, 20, 40
 GEOMETRY = calib.FitSettings(model="geometry")
 
@@ -61,10 +62,16 @@ def rms(arm: Arm, way: str, others: Sequence[CalibratedChain], few: np.ndarray, 
     return 1e3 * float(np.sqrt(np.mean(position**2)))
 
 
-def line(name: str, arms: Mapping[str, Arm], others: Mapping[str, Sequence[CalibratedChain]], draws: int) -> None:
+def line(
+    name: str,
+    arms: Mapping[str, Arm],
+    others: Mapping[str, Sequence[CalibratedChain]],
+    draws: int,
+    sizes: Sequence[int],
+) -> None:
     """Print, by number of poses, the errors of each way over arms and draws."""
     print(name)
-    for size in SIZES:
+    for size in sizes:
         found = {way: list[float]() for way in ("offsets", "no prior", "any prior", "fleet")}
         for key, arm in arms.items():
             for seed in range(draws):
@@ -106,7 +113,8 @@ def placed(origin: Mapping[str, float]) -> np.ndarray:
 def factory(path: Path, nominal: Chain) -> Chain:
     """Return the arm of a factory calibration."""
     values = []
-    for joint, origin in enumerate(yaml.safe_load(path.read_text())["kinematics"].values()):
+    found = yaml.safe_load(path.read_text())["kinematics"]
+    for joint, origin in enumerate(found[link] for link in LINKS):
         place = nominal.elements[6 * joint].placement
         step = np.linalg.solve(np.eye(4) if place is None else place, placed(origin))
         values += [*step[:3, 3], *Rotation.from_matrix(step[:3, :3]).as_euler("XYZ")]
@@ -135,12 +143,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--factory", type=Path, required=True)
     parser.add_argument("--draws", type=int, default=8)
+    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES)
     given = parser.parse_args()
     none = FitOptions()
     robot = calib.load(DATA / "ur5_gts3800/model.urdf")
     arms, fits = universal(given.factory / "ur5", robot)
     rest = {name: [one for other, one in fits.items() if other != name] for name in arms}
-    line(f"each of {len(arms)} UR5 (real geometry, simulated measurements), by the others", arms, rest, 1)
+    line(f"each of {len(arms)} UR5 (real geometry, simulated measurements), by the others", arms, rest, 1, given.sizes)
     measured = calib.read_poses(DATA / "ur5_gts3800/grid_800.csv", robot)[0]
     target = np.genfromtxt(DATA / "ur5_gts3800/grid_800.csv", delimiter=",", skip_header=1)[:, 6:9]
     for sign, block in (
@@ -158,13 +167,19 @@ def main() -> None:
     _, fits = universal(given.factory / "ur10", robot)
     block = calib.read_poses(DATA / "ur10_ipa/B_joint_configurations.csv", robot)[0]
     one = {"ur10": Arm(robot, block, none, anywhere(len(block)))}
-    line(f"the measured UR10, by {len(fits)} other", one, {"ur10": [*fits.values()]}, given.draws)
+    line(f"the measured UR10, by {len(fits)} other", one, {"ur10": [*fits.values()]}, given.draws, given.sizes)
     sockets, robot = FitOptions(socket_distance=0.05), calib.load(DATA / "mukca_sockets/panda.urdf")
     blocks = {k: calib.read_poses(DATA / f"mukca_sockets/panda_{k}.csv", robot, options=sockets)[0] for k in (2, 3)}
     fits = {k: calib.fit_geometry(robot, block, GEOMETRY, options=sockets).robot for k, block in blocks.items()}
     for k, other in ((2, 3), (3, 2)):
         one = {"panda": Arm(robot, blocks[k], sockets, one_place(blocks[k]))}
-        line(f"Panda {k} (sockets of one place), by Panda {other}", one, {"panda": [fits[other]]}, given.draws)
+        line(
+            f"Panda {k} (sockets of one place), by Panda {other}",
+            one,
+            {"panda": [fits[other]]},
+            given.draws,
+            given.sizes,
+        )
 
 
 if __name__ == "__main__":
