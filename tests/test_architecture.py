@@ -56,6 +56,7 @@ HOMES = {
     "pyarrow": ["calib.rooms.studies.store"],
     "dask": ["calib.workers.cluster"],
     "distributed": ["calib.workers.cluster"],
+    "fsspec": ["calib.rooms.fleet.stores"],
     "cloudpickle": ["calib.workers.cluster"],
     "threadpoolctl": ["calib.workers.threads"],
     "typer": ["calib.cli", "calib.cli.", "calib.rooms."],

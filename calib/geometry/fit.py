@@ -74,8 +74,8 @@ def fit(
             "these rows determine no parameter of the robot: each socket, bar, plane or pair needs several "
             "rows at different joint values; measure more rows of each"
         )
-    _enough(cell, blocks, len(free))
     stated = np.full(len(table.names), np.inf) if prior is None else prior
+    _enough(cell, blocks, int(np.isinf(stated[free]).sum()))
     if regularised:
         free = np.setdiff1d(free, _scale_reference(cell, split, candidates))
         return replace(_shrunk_fit(cell, blocks, free, settings, stated[free]), split=split, candidates=candidates)

@@ -193,8 +193,8 @@ class Weigher:
         """Noise that the rows of each part share; None for a part without."""
         return [piece.part.noise for piece in self.pieces]
 
-    def update(self, state: Installation, first: bool) -> None:
-        """Set sigmas and weights from the residuals at a state."""
+    def update(self, state: Installation, first: bool, resting: float = 0.0) -> None:
+        """Set sigmas and weights from the residuals at a state; `resting`: parameters that rest on the prior."""
         owned = [(number, part) for number, block in enumerate(self.blocks) for part in observe(state, block, _NONE)]
         rows = sum(part.value.size for _, part in owned)
         unknown = len(self.free) + sum(part.nuisances for _, part in owned)
@@ -204,7 +204,7 @@ class Weigher:
                 f"{rows} measured numbers do not determine {unknown} unknowns; measure more poses, or fit a smaller "
                 "model ('frames' or 'offsets')",
             )
-        share = max(1.0 - unknown / rows, 0.05)
+        share = max(1.0 - (unknown - resting) / rows, 0.05)
         loss, scale = "none" if self.settings.loss == "auto" else self.settings.loss, self.settings.loss_scale
         robustly, self.pieces = loss != "none", []
         for number, part in owned:
@@ -221,7 +221,8 @@ class Weigher:
         """
         before, noises = self.pieces, self.noises
         self.used = before
-        self.update(solution.state, first=False)
+        resting = 0.0 if self.prior is None else float(np.sum(np.diag(covariance(solution.factor)) / self.prior**2))
+        self.update(solution.state, first=False, resting=resting)
         both = list(zip(self.pieces, before))
         ratios = [float(np.mean(new.sigma / old.sigma)) for new, old in both]
         steady = all(np.abs(new.weight - old.weight).max(initial=0.0) < 0.02 for new, old in both)

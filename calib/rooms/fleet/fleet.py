@@ -18,6 +18,9 @@ from calib.procedure.findings import LEVELS
 from calib.procedure.session.commands import COLOURS, go_on
 from calib.procedure.session.folder import SETTINGS, Say
 from calib.procedure.session.steps import DONE
+from calib.rooms.fleet import stores
+from calib.rooms.fleet.stores import LEASE
+from calib.rooms.fleet.throughput import Throughput
 from calib.workers import Workers
 from calib.workers import workers as opened
 
@@ -63,15 +66,19 @@ class FleetRow:
         return f"{self.folder}: {', '.join(words)}"
 
 
-def folders_of(given: str | Path | Sequence[str | Path]) -> list[Path]:
-    """Return the folders of sessions, given as one or several folders or ``session.toml`` files.
+def folders_of(given: str | Path | Sequence[str | Path]) -> list[Path | str]:
+    """Return the folders of sessions, given as one or several folders, ``session.toml`` files or addresses.
 
     Raises:
         UsageError: for a duplicate, or an empty list.
     """
-    paths = [Path(each) for each in ([given] if isinstance(given, (str, Path)) else given)]
-    found = [path.parent if path.name == SETTINGS else path for path in paths]
-    real = [path.resolve() for path in found]
+    found = list[Path | str]()
+    for each in [given] if isinstance(given, (str, Path)) else given:
+        if stores.is_address(each):
+            found += stores.sessions(str(each))
+        else:
+            found.append(Path(each).parent if Path(each).name == SETTINGS else Path(each))
+    real = [one.resolve() if isinstance(one, Path) else one for one in found]
     twice = [path for path, own in zip(found, real) if real.count(own) > 1]
     if twice:
         raise UsageError(f"{twice[0]} is given twice")
@@ -90,7 +97,8 @@ def run_sessions(
     """Run sessions as far as possible, and yield the outcome of each; failures do not stop the others.
 
     Args:
-        folders: of the sessions, or their ``session.toml``; one or several.
+        folders: of the sessions, or their ``session.toml``; one or several. Or addresses of fsspec, with or without
+            wildcards (``s3://bucket/cells/*``): each worker fetches its session, and puts it back.
         workers: local processes, or the address of a Dask scheduler.
         plots: whether figures are drawn.
         command: for the sessions' records.
@@ -105,19 +113,43 @@ def run_sessions(
 
 
 def run(
-    folders: Sequence[Path], workers: AbstractContextManager[Workers], command: str, plots: bool = True
+    folders: Sequence[Path | str],
+    workers: AbstractContextManager[Workers],
+    command: str,
+    plots: bool = True,
+    pace: Throughput | None = None,
 ) -> Iterator[FleetRow]:
-    """Run every session and yield each outcome; workers on other machines need the same folder paths."""
+    """Run every session and yield each outcome; workers on other machines need the same folder paths, or addresses."""
+    pace = pace or Throughput()
     with workers as crew:
-        sent = folders if crew.here else [folder.absolute() for folder in folders]
-        for number, outcome in crew.completed(partial(run_one, command=command, plots=plots), sent):
+        sent = [one if crew.here or isinstance(one, str) else one.absolute() for one in folders]
+        for number, outcome in pace.completed(crew, partial(run_one, command=command, plots=plots), sent):
             name = str(folders[number])
             lost = isinstance(outcome, TaskLost)
             yield FleetRow(name, FAILED, words=str(outcome), code=2) if lost else replace(outcome, folder=name)
 
 
-def run_one(folder: Path, command: str = "calib run", plots: bool = True) -> FleetRow:
-    """Run one session as far as possible, and write its output to ``run.log``. It raises nothing but Ctrl-C."""
+def run_one(folder: Path | str, command: str = "calib run", plots: bool = True, lease: float = LEASE) -> FleetRow:
+    """Run one session as far as possible, and write its output to ``run.log``. It raises nothing but Ctrl-C.
+
+    Args:
+        folder: of the session, or its address.
+        command: for the record.
+        plots: whether figures are drawn.
+        lease: see `calib.rooms.fleet.stores`.
+    """
+    if isinstance(folder, Path):
+        return _run_here(folder, command, plots)
+    started = time.perf_counter()
+    try:
+        with stores.held(folder, lease) as copy:
+            outcome = _run_here(copy, command, plots)
+    except CalibError as error:
+        outcome = FleetRow(folder, FAILED, words=str(error), code=2)
+    return replace(outcome, folder=folder, seconds=time.perf_counter() - started)
+
+
+def _run_here(folder: Path, command: str, plots: bool) -> FleetRow:
     started, said = time.perf_counter(), []
     try:
         outcome = _go_on(folder, said.append, command, plots)

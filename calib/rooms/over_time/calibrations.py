@@ -100,10 +100,10 @@ def read_pair(before: str | Path, after: str | Path) -> tuple[Calibration, Calib
     fitted = [_is_fitted(Path(each)) for each in (before, after)]
     words = f"neither {before} nor {after} is the folder of a fit or of a session; give at least one"
     require(any(fitted), words, UsageError)
-    given = [_read(each, Path(each)) if known else None for each, known in zip((before, after), fitted)]
+    given = [read(each, Path(each)) if known else None for each, known in zip((before, after), fitted)]
     chain = next(each.chain for each in given if each is not None)
     one, two = (each or _nominal(name, chain) for each, name in zip(given, (before, after)))
-    _check_same(one, two)
+    check_same(one, two)
     return one, two
 
 
@@ -115,7 +115,12 @@ def _is_fitted(path: Path) -> bool:
     return True
 
 
-def _read(name: str | Path, path: Path) -> Calibration:
+def read(name: str | Path, path: Path) -> Calibration:
+    """Return the calibration in the folder of a fit or a session; `name`: as the user gave it.
+
+    Raises:
+        UsageError: where the folder holds none.
+    """
     session = open_session(path) if (path / SESSION).exists() else None
     folder = session.fit if session else FitFolder(path)
     go_on = command_line("next", path)
@@ -142,7 +147,7 @@ def _nominal(name: str | Path, like: Chain) -> Calibration:
     return Calibration(str(name), robot, Installation(robot.chain), np.zeros(0, dtype=int), np.zeros((0, 0)))
 
 
-def _check_same(one: Calibration, two: Calibration) -> None:
+def check_same(one: Calibration, two: Calibration) -> None:
     """Refuse two calibrations whose nominal descriptions differ."""
     first, second = ((each.robot.nominal or each.chain) for each in (one, two))
     both = f"{one.name} and {two.name} are of different robots"

@@ -1,5 +1,6 @@
 """Commands that compare identification methods: study (simulated, known truth), compare (recordings)."""
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -15,7 +16,7 @@ app = typer.Typer()
 @command(app, "Files and studies")
 def study(
     studies: Annotated[list[str] | None, typer.Argument()] = None,
-    out: Path | None = None,
+    out: str | None = None,
     methods: str | None = None,
     runs: Annotated[int | None, typer.Option(min=0)] = None,
     workers: str = "1",
@@ -33,7 +34,7 @@ def study(
 
     Args:
         studies: study files, or names of shipped ones: MCS-TX40-1-1, 'MCS-*'
-        out: folder for rows and report; default: the study's name
+        out: folder for rows and report, or its address (s3://bucket/study); default: the study's name
         methods: methods instead of the file's: wls,iv,didim
         runs: data sets per condition, instead of the file's
         report_only: report existing rows without running trials
@@ -42,6 +43,7 @@ def study(
     """
     from calib.identification.methods.registry import METHODS
     from calib.procedure.report import page
+    from calib.rooms.fleet import stores
     from calib.rooms.studies import report
 
     if list_methods or list_studies:
@@ -51,9 +53,10 @@ def study(
         raise UsageError("no study given: name a file, or a study of calib study --list")
     if out is None and (len(studies) > 1 or any(mark in studies[0] for mark in "*?[")):
         raise UsageError("several studies need one folder: give --out DIR")
-    folder = out or Path(f"{Path(studies[0]).stem}-study")
+    place = out or f"{Path(studies[0]).stem}-study"
     log_interval = 30.0  # [s] between two lines on progress where the output is no terminal
-    with reporting(log_interval) as (_, progress):
+    kept = stores.held(place) if stores.is_address(place) else nullcontext(Path(place))
+    with kept as folder, reporting(log_interval) as (_, progress):
         found = report.run_study(
             studies, folder, methods=_names(methods), runs=runs, where=workers, report_only=report_only, plots=plots,
             say=progress,
@@ -65,7 +68,7 @@ def study(
     else:
         blocks = [block for one in seen for block in (report.condition_table(one), *report.failures(one))]
     say(*page.rendered(blocks), result=True)
-    say(*found.described(), f"written to {folder}: {report.REPORT} shows it")
+    say(*found.described(), f"written to {place}: {report.REPORT} shows it")
 
 
 @command(app, "Files and studies")

@@ -277,7 +277,7 @@ class StudyOutcome:
         done = self.progress
         lines = [f"note: {note}" for note in self.notes]
         if done.wanted:
-            lines.append(f"{done} in {span(done.seconds)}")
+            lines += [f"{done} in {span(done.seconds)}", *done.pace.lines()]
         return [*lines, self.rows] if self.rows else lines
 
 

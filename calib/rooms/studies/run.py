@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from calib.errors import TaskLost
 from calib.identification.methods.registry import method_named
+from calib.rooms.fleet.throughput import Throughput
 from calib.rooms.studies.conditions import Study
 from calib.rooms.studies.store import RowStore
 from calib.rooms.studies.trial import Trials, grouped, run_trials
@@ -22,6 +23,7 @@ class Progress:
         done, failed: that have ended; of these without an estimate.
         lost: that no worker brought back.
         seconds: since it began.
+        pace: of each worker.
     """
 
     wanted: int
@@ -30,6 +32,7 @@ class Progress:
     lost: int = 0
     spent: dict[str, list[float]] = field(default_factory=dict)
     left: Counter = field(default_factory=Counter)
+    pace: Throughput = field(default_factory=Throughput)
     began: float = field(default_factory=time.monotonic)
 
     @property
@@ -91,7 +94,7 @@ def run(study: Study, store: RowStore, workers: Workers, say: Callable[[Progress
     progress.left.update(name for task in tasks for name in task.methods)
     said = 0.0
     word_interval = 1.0  # [s] between two words on progress
-    for number, rows in workers.completed(run_trials, tasks):
+    for number, rows in progress.pace.completed(workers, run_trials, tasks):
         methods = tasks[number].methods
         progress.left.subtract(methods)
         if isinstance(rows, TaskLost):

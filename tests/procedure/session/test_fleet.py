@@ -79,6 +79,17 @@ def test_a_fleet_on_a_cluster(cells: Path, tmp_path: Path, monkeypatch, capsys: 
     assert "Bring " in (cells / "c/run.log").read_text()
 
 
+def test_a_session_runs_at_its_address(cells: Path, capsys: pytest.CaptureFixture) -> None:
+    """As in its folder; wildcards name sessions alone, and one that is named twice is refused."""
+    address = f"file://{cells}"
+    assert run("run", f"{address}/[ac]") == 0
+    said = capsys.readouterr().out
+    assert "1 of 2 done" in said and "1 waiting" in said
+    assert "Bring " in (cells / "c/run.log").read_text() and not list(cells.glob("*/calib.claim"))
+    assert run("run", f"{address}/*", f"{address}/a") == 2
+    assert "is given twice" in capsys.readouterr().err
+
+
 def test_what_workers_get_pickles(cells: Path) -> None:
     task = pickle.loads(pickle.dumps(partial(fleet.run_one, command="test")))
     outcome = task(cells / "d")

@@ -1,0 +1,118 @@
+"""Distribution of geometric parameters over arms of one type, and from it a prior for the next arm's fit.
+
+With x_i the deviations of arm i's parameters from nominal, of which its fit tells x̂_i with covariance C_i,
+
+    x̂_i ~ N(x_i, C_i),  x_i ~ N(μ, diag τ²)
+
+Mean and variance are the most probable ones by expectation maximisation (Dempster, Laird and Rubin 1977; parametric
+empirical Bayes, Morris 1983). Two choices are ours, for fleets of a few arms: the nominal counts as one more arm, and
+a parameter's τ² is drawn to that of its family (joint offsets, other angles, lengths) as if `FAMILY` more arms had
+it. The next arm is expected at μ ± τ √(1 + 1/n), n counting the nominal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from calib import files
+from calib.errors import UsageError, require
+from calib.geometry.installation import Installation
+from calib.geometry.observation import families
+from calib.robot import calibrated
+from calib.robot.calibrated import CalibratedChain, nominal_of
+
+FAMILY = 4.0  # arms that the variance of a family of parameters counts as (our choice)
+MIN_WIDTH = 1e-6  # [m, rad] of the prior (our choice)
+OPTIONS = "options.toml"  # in the prior's folder
+
+
+@dataclass(frozen=True)
+class ParameterSpread:
+    """One parameter over the arms of a type.
+
+    Attributes:
+        name, unit: of the parameter.
+        arms: that it was fitted in.
+        mean, sigma: of its deviation from nominal over arms, without the fits' own uncertainty.
+        width: standard deviation about ``nominal + mean`` that the next arm is expected within.
+    """
+
+    name: str
+    unit: str
+    arms: int
+    mean: float
+    sigma: float
+    width: float
+
+
+def spread(robots: Sequence[CalibratedChain]) -> tuple[ParameterSpread, ...]:
+    """Return the distribution of each parameter that was fitted in one arm at least; arms of one nominal.
+
+    Raises:
+        UsageError: where no fit states its covariance.
+    """
+    chain = nominal_of(robots[0])
+    covariances = [np.zeros((len(chain.values),) * 2) if r.covariance is None else r.covariance for r in robots]
+    fitted = np.array([np.diag(one) > 0.0 for one in covariances])
+    where = np.flatnonzero(fitted.any(axis=0))
+    require(len(where), "no fit of these arms states the covariance of its geometry; fit them again", UsageError)
+    data = []
+    for robot, covariance, own in zip(robots, covariances, fitted[:, where]):
+        k = where[own]
+        information = np.linalg.inv(covariance[np.ix_(k, k)])
+        data.append((own, information, information @ (robot.chain.values - chain.values)[k]))
+    _, family = np.unique(families(Installation(chain))[where], return_inverse=True)
+    mean, sigma = _most_probable(data, family)
+    count = fitted[:, where].sum(axis=0)
+    width = np.maximum(sigma * np.sqrt(1.0 + 1.0 / (count + 1)), MIN_WIDTH)
+    rows = zip(where, count, mean, sigma, width)
+    return tuple(
+        ParameterSpread(chain.names[k], chain.elements[k].unit, int(n), *map(float, each)) for k, n, *each in rows
+    )
+
+
+def _most_probable(
+    data: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], family: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return μ (k,) and τ (k,) of each arm's (fitted parameters, C⁻¹, C⁻¹ x̂) by expectation maximisation."""
+    mean, variance = np.zeros(len(family)), np.full(len(family), 1e-4)
+    count = np.sum([own for own, _, _ in data], axis=0)
+    max_updates, settled = 500, 1e-4  # of τ² (our choice)
+    for _ in range(max_updates):
+        total, square, seen = np.zeros_like(mean), np.zeros_like(mean), list[tuple[np.ndarray, np.ndarray]]()
+        for own, information, pull in data:
+            spread = np.linalg.inv(information + np.diag(1.0 / variance[own]))
+            found = spread @ (pull + mean[own] / variance[own])
+            total[own] += found
+            square[own] += np.diag(spread)
+            seen.append((own, found))
+        mean, before = total / (count + 1), variance
+        for own, found in seen:
+            square[own] += (found - mean[own]) ** 2
+        square += mean**2  # of the nominal
+        pooled = np.bincount(family, square) / np.bincount(family, count)
+        variance = np.maximum((FAMILY * pooled[family] + square) / (FAMILY + count), MIN_WIDTH**2)
+        if np.abs(np.log(variance / before)).max() < settled:
+            break
+    return mean, np.sqrt(variance)
+
+
+def expected_arm(robots: Sequence[CalibratedChain], found: Sequence[ParameterSpread]) -> CalibratedChain:
+    """Return the arm that the next one of this type is expected to be, of the nominal one that `robots` share."""
+    nominal = nominal_of(robots[0])
+    moved = {one.name: one.mean for one in found}
+    values = nominal.values + np.array([moved.get(name, 0.0) for name in nominal.names])
+    return replace(robots[0], chain=nominal.with_values(values), nominal=nominal, covariance=None, corrections=None)
+
+
+def write(folder: Path, robots: Sequence[CalibratedChain], found: Sequence[ParameterSpread]) -> Path:
+    """Write the prior for `calib fit`: ``robot.toml``, the expected arm, and the options with its widths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    calibrated.write(folder, expected_arm(robots, found), comment=f"mean of {len(robots)} arms")
+    lines = [f'"{one.name}" = {one.width:.4g}' for one in found]
+    files.write(folder / OPTIONS, "\n".join(["[prior]", *lines, ""]))
+    return folder

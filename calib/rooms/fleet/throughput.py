@@ -1,0 +1,48 @@
+"""Throughput of workers: who ran how many tasks, and how fast."""
+
+import os
+import socket
+import time
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from typing import Any
+
+from calib.errors import TaskLost
+from calib.workers import Workers
+
+
+class Throughput:
+    """Seconds of every task by worker (host and process), since it was made."""
+
+    def __init__(self) -> None:
+        self.began, self.spent = time.monotonic(), dict[str, list[float]]()
+
+    def completed(self, crew: Workers, function: Callable[[Any], Any], tasks: Iterable[Any]) -> Iterator[tuple]:
+        """Yield (number of the task, its result) as `Workers.completed` does, noting who ran it."""
+        for number, answer in crew.completed(partial(_signed, function), tasks):
+            if isinstance(answer, TaskLost):
+                yield number, answer
+                continue
+            result, worker, seconds = answer
+            self.spent.setdefault(worker, []).append(seconds)
+            yield number, result
+
+    def lines(self, most: int = 8) -> list[str]:
+        """Return a line per worker, the slowest first; none for a single worker."""
+        minutes = max((time.monotonic() - self.began) / 60.0, 1e-9)
+        ranked = sorted(self.spent.items(), key=lambda one: len(one[1]))
+        if len(ranked) < 2:
+            return []
+        lines = [
+            f"worker {name}: {len(own)} tasks, {len(own) / minutes:.3g} a minute, {sum(own) / len(own):.2g} s each"
+            for name, own in ranked[:most]
+        ]
+        more = len(ranked) - most
+        return [*lines, f"{more} more workers, faster than these"] if more > 0 else lines
+
+
+def _signed(function: Callable[[Any], Any], task: Any) -> tuple[Any, str, float]:
+    """Run a task; return its result, who ran it, and the seconds of wall time."""
+    started = time.monotonic()
+    result = function(task)
+    return result, f"{socket.gethostname()}:{os.getpid()}", time.monotonic() - started
