@@ -20,7 +20,8 @@ from calib.procedure.report.page import Block, Column, KeyFigure, Picture, Pictu
 from calib.records import plain
 from calib.rooms.over_time import geometry_change
 from calib.rooms.over_time.calibrations import Calibration, read_pair
-from calib.rooms.over_time.geometry_change import GeometryChange, ParameterChange, ToolMotion
+from calib.rooms.over_time.change_test import ParameterChange
+from calib.rooms.over_time.geometry_change import GeometryChange, ToolMotion
 from calib.rooms.over_time.settings import DEFAULT_DIFF, DiffSettings
 from calib.units import JOINT, SMALL, small
 
