@@ -12,7 +12,7 @@ import numpy as np
 
 from calib.errors import Finding, finding
 from calib.procedure.findings import Verdict, lines_of, settle
-from calib.procedure.report.page import Block, Column, KeyFigure, Section, Text, table
+from calib.procedure.report.page import Block, Column, KeyFigure, Section, Text, met, table
 from calib.rooms.over_time.change_test import Change
 from calib.units import SMALL
 
@@ -35,6 +35,8 @@ class ChangePart(ABC):
     kind: ClassVar[str]
     table: ClassVar[str]
     captions: ClassVar[Sequence[str]]
+    error_words: ClassVar[str]
+    model_option: ClassVar[str]
 
     before: Any
     after: Any
@@ -94,7 +96,8 @@ class ChangePart(ABC):
             change = plus_minus(first.alone, first.alone_sigma, first.unit)
             yield finding(code, name=first.name, change=change, left=found.unexplained, rivals=found.rivals)
         if any(found.extra):
-            yield finding("combinations-left-out", earlier=found.extra[0], later=found.extra[1], **names)
+            earlier, later = found.extra
+            yield finding("combinations-left-out", earlier=earlier, later=later, option=self.model_option, **names)
         for each in (self.before, self.after):
             if each.judged[0] == "fail":
                 yield finding("earlier-failed", name=each.name, reason=each.judged[1])
@@ -104,16 +107,14 @@ class ChangePart(ABC):
     def section(self) -> Section:
         """Return a report section with verdict, what moved, changed parameters and notes."""
         allowed = self.shown(self.tolerance) if self.tolerance else ""
-        met = ("yes" if self.today <= self.tolerance else "NO") if self.tolerance else ""
-        figure = KeyFigure(self.error_words, "", self.shown(self.today), "", self.basis, allowed, met)
+        reached = met(self.today, self.tolerance or 0.0)
+        figure = KeyFigure(self.error_words, "", self.shown(self.today), "", self.basis, allowed, reached)
         shown = [one for one in self.found.parameters if one.sigma or one.explained][:MOST]
         note = f"All in {self.table}."
         first, *rest = self.blocks()
         parameters = table("Changed parameters, those first that explain most", _PARAMETERS, shown, note)
         blocks = [first, Text("Notes", lines_of(self.noticed), "note"), *rest, parameters]
         return Section(f"Change of the {self.kind}", blocks, self.verdict.level, self.verdict.reason, [figure])
-
-    error_words: ClassVar[str]
 
     @property
     @abstractmethod

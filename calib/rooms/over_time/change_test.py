@@ -6,8 +6,9 @@ With δ the difference of the combinations and Σ the sum of both covariances, V
 
 has as many degrees of freedom as combinations were estimated. If parameter k alone changed, by the size x, then
 δ = x v_k with v_k the column of V: x = v_kᵀ Σ⁻¹ δ / v_kᵀ Σ⁻¹ v_k, σ² = 1 / v_kᵀ Σ⁻¹ v_k, and χ² falls by (x/σ)² (Baarda
-1968, data snooping); for several parameters together, by what their columns explain. A combination that only one of two
-estimates has is taken out by conditioning: that one is as if it had kept it at the value that the other has.
+1968, data snooping); for several parameters together, by what their columns explain. The difference is tested as a
+whole, and for the parameter that explains most. A combination that only one of two estimates has is taken out by
+conditioning: that one is as if it had kept it at the value that the other has.
 """
 
 from __future__ import annotations
@@ -63,12 +64,14 @@ class Change:
 
     @property
     def probability(self) -> float:
-        """Of a χ² at least so large where nothing changed."""
-        return float(chi2.sf(self.chi2, self.freedom))
+        """Of so large a χ², or of one parameter that explains so much of it, where nothing changed (Bonferroni)."""
+        tried = [each.explained for each in self.parameters if each.explained]
+        single = max(len(tried), 1) * chi2.sf(max(tried, default=0.0), 1)
+        return min(2.0 * float(min(chi2.sf(self.chi2, self.freedom), single)), 1.0)
 
     @property
     def sigmas(self) -> float:
-        """The deviation of a single normal variable that is as unlikely as χ², at most 37."""
+        """The deviation of a single normal variable that is as unlikely, at most 37."""
         return float(norm.isf(max(self.probability, 1e-300) / 2.0))
 
     @property

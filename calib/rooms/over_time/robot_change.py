@@ -166,11 +166,11 @@ def _torque_parts(before: Place, after: Place, settings: DiffSettings) -> list[C
         return []
     one, two = read_models(before, after)
     motions = {**two.motions, **one.motions}
-    for name in settings.states:
+    for name in settings.motions:
         states = read_states(Path(name), two.model.n)
         require(states, f"{name}: no accelerations; expected columns q_…, v_… and a_…", UsageError)
         motions[name] = states  # type: ignore[assignment]
-    words = f"neither {one.name} nor {two.name} holds a motion without payload; give one with --states"
+    words = f"neither {one.name} nor {two.name} holds a motion without payload; give one with --motion"
     require(motions, words, UsageError)
     found = torque_change.compare(one, two, motions)
     return [TorquePart(one, two, found, settings.torque_tolerance or two.tolerance or one.tolerance or None)]

@@ -17,7 +17,7 @@ class DiffSettings:
             it the verdict is fail. Default: that of the later fit or session, else of the earlier one
         torque_tolerance: largest share [%] that the earlier model leaves unexplained of the torques measured for the
             later one; above it the verdict is fail. Default: that of the later session, else of the earlier one
-        states: tables of further motions (q, v, a), over which the change of the torque is stated
+        motions: tables of further motions (q, v, a), over which the change of the torque is stated
         same_base: robot and instrument stood in the same places at both visits: a change of the base placement counts
         same_tool: the same target on the same mount: a change of the tool placement counts
         seed: of the random poses
@@ -25,7 +25,7 @@ class DiffSettings:
 
     tolerance: Tolerance = None
     torque_tolerance: Positive | None = None
-    states: tuple[Text, ...] = ()
+    motions: tuple[Text, ...] = ()
     same_base: Flag = False
     same_tool: Flag = False
     seed: Seed = 0

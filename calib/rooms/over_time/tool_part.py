@@ -32,6 +32,7 @@ class ToolPart(ChangePart):
         "Grey: less than two sigmas.",
     )
     error_words: ClassVar = "error with the earlier parameters"
+    model_option: ClassVar = "--model"
 
     settings: DiffSettings = DEFAULT_DIFF
 

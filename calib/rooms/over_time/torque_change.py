@@ -20,6 +20,7 @@ from calib.rooms.over_time.change_test import Change, ParameterChange, Tested, t
 from calib.rooms.over_time.identifications import Identified, States
 
 PARALLEL = 1e-6  # sine of an angle between what two parameters do to the combinations, below which they are one
+NEARLY_ALL = 0.9  # of χ²; σ of real motions holds no unmodelled effects, which leave a rest (our choice)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,9 +79,10 @@ class DynamicsChange(Change):
 
     @property
     def part(self) -> PartChange | None:
-        """The smallest part whose change alone explains the difference; None if none does."""
-        enough = [each for each in self.parts if self.suffices(each.explained, each.count)]
-        return min(enough, key=lambda each: each.count, default=None)
+        """The part that explains most, if it explains all but chance, or `NEARLY_ALL` of χ²; else None."""
+        first = self.parts[0]
+        enough = self.suffices(first.explained, first.count) or first.explained > NEARLY_ALL * self.chi2
+        return first if enough else None
 
 
 def compare(before: Identified, after: Identified, motions: dict[str, States]) -> DynamicsChange:

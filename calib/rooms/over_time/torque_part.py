@@ -25,6 +25,7 @@ class TorquePart(ChangePart):
     table: ClassVar = "torque_changes.csv"
     captions: ClassVar = ("Change of the torque from the earlier to the later model. Dashed: two sigmas.",)
     error_words: ClassVar = "torque unexplained by the earlier model"
+    model_option: ClassVar = "--friction"
 
     @cached_property
     def judged(self) -> TorqueChange:
@@ -59,7 +60,7 @@ class TorquePart(ChangePart):
         if self.tolerance:
             times = self.today / self.tolerance
             result.append(finding("model-outgrown", times=times, today=self.today, after=self.after.name))
-        left = one.unexplained[1] * 1e-2 * _rms(one.torque) if one.unexplained else 0.0
+        left = 1e-2 * min(one.unexplained) * _rms(one.torque) if one.unexplained else 0.0
         beyond = one.rms / max(left, 1e-12)
         result.append(finding(
             "dynamics-changed", sigmas=found.sigmas, beyond=0.0 if self.tolerance else beyond, unit=self.unit,
@@ -67,7 +68,9 @@ class TorquePart(ChangePart):
         ))  # fmt: skip
         if found.changed and not found.alone and found.part:
             part = found.part
-            result.append(finding("part-changed", name=part.name, rms=part.rms, unit=self.unit))
+            result.append(
+                finding("part-changed", name=part.name, share=part.explained / found.chi2, rms=part.rms, unit=self.unit)
+            )
         return result
 
     def blocks(self) -> list[Block]:
