@@ -9,8 +9,8 @@ from recordings import DATA
 import calib
 from calib import cli
 from calib.errors import RobotError, UsageError
+from calib.rooms.over_time.comparison.tool_part import ToolPart
 from calib.rooms.over_time.settings import DiffSettings
-from calib.rooms.over_time.tool_part import ToolPart
 
 UR5 = DATA / "ur5_gts3800"
 pytestmark = pytest.mark.skipif(not UR5.is_dir(), reason=f"no recording of a UR5 at {UR5} (set CALIB_DATA)")

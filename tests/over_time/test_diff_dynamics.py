@@ -14,8 +14,8 @@ from calib import cli
 from calib.errors import RobotError, UsageError
 from calib.procedure.findings import Verdict
 from calib.robot import description
-from calib.rooms.over_time import change_test
-from calib.rooms.over_time.robot_change import RobotChange
+from calib.rooms.over_time.comparison import change_test
+from calib.rooms.over_time.comparison.robot_change import RobotChange
 from calib.rooms.over_time.settings import DiffSettings
 
 UR10E = DATA / "ur10e_innopolis"
@@ -128,7 +128,7 @@ def test_a_real_payload_is_the_body_of_the_last_link(tmp_path):
     gains = calib.IdentifySettings(gains=(14.87, 13.26, 11.13, 10.62, 11.03, 11.47), friction="standard")
     for name in ("14harm50sec", "14harm50secLoad"):
         log = UR10E / f"ur-20_02_19_{name}.npz"
-        calib.identify_dynamics(UR10E / "model.urdf", f"{log}@0:30", gains, validate=f"{log}@30:50").save(
+        calib.identify_dynamics(UR10E / "model.urdf", f"{log}@0:14", gains, validate=f"{log}@14:22").save(
             tmp_path / name, plots=False
         )
     found = calib.diff(tmp_path / "14harm50sec", tmp_path / "14harm50secLoad")

@@ -1,17 +1,22 @@
-"""Commands on a robot over time: diff."""
+"""Commands on a robot over time: diff, drift."""
 
 from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
+from calib.cli.completion import Robot
 from calib.cli.shared import command, exit_failed, say
-from calib.rooms.over_time.settings import DiffSettings
+from calib.rooms.over_time.settings import DiffSettings, DriftSettings
 
 app = typer.Typer()
+Folder = Annotated[
+    Path | None, typer.Option("--out", help="folder for report, table and figures. Default: nothing is written")
+]
 
 
 @command(app, "Geometry")
-def diff(before: str, after: str, settings: DiffSettings, out: Path | None = None, plots: bool = True) -> None:
+def diff(before: str, after: str, settings: DiffSettings, out: Folder = None, plots: bool = True) -> None:
     """Compare two calibrations of one robot: what changed, in σ, mm and N m. Is it still within tolerance?
 
     Exit codes: 0 the earlier parameters are still within tolerance, or none is given; 1 they are not.
@@ -21,11 +26,33 @@ def diff(before: str, after: str, settings: DiffSettings, out: Path | None = Non
     Args:
         before: folder of the earlier fit, identification or session, or the nominal robot
         after: folder of the later one, or the nominal robot
-        out: folder for report, table and figures. Default: nothing is written
     """
-    from calib.rooms.over_time import robot_change
+    from calib.rooms.over_time.comparison import robot_change
 
     found = robot_change.diff(before, after, settings)
+    _shown(found, out, plots)
+
+
+@command(app, "Geometry")
+def drift(
+    robot: Robot, measured: list[Path], settings: DriftSettings, out: Folder = None, plots: bool = True,
+    options: Annotated[Path | None, typer.Option(help="TOML, see calib formats options")] = None,
+    base: str | None = None, tip: str | None = None,
+) -> None:  # fmt: skip
+    """Show how the target drifts with time and temperature, from poses of ROBOT measured more than once.
+
+    Example: calib drift robot.urdf measured.csv drift.csv --tolerance 0.1
+
+    Args:
+        measured: CSV files (calib formats measurements) with a column time, or temperature
+    """
+    from calib.rooms.over_time import drift_page
+
+    _shown(drift_page.drift(robot, measured, settings, options, base, tip), out, plots)
+
+
+def _shown(found: Any, out: Path | None, plots: bool) -> None:
+    """Write a result where asked to, print it, and exit with 1 if its verdict is fail."""
     if out is not None:
         found.save(out, plots=plots)
     say(*found.renderables(), *([f"written to {out}"] if out else []))

@@ -1,4 +1,4 @@
-"""Settings of the comparison of two calibrations."""
+"""Settings of the comparison of two calibrations, and of drift."""
 
 from dataclasses import dataclass
 
@@ -32,3 +32,21 @@ class DiffSettings:
 
 
 DEFAULT_DIFF = DiffSettings()
+
+
+@checked
+@dataclass(frozen=True)
+class DriftSettings:
+    """Settings of a study of drift.
+
+    Attributes:
+        tolerance: way of the target over the whole measurement [m; on the command line mm] above which it is beyond
+            need. Default: how far noise of sigma lets two readings differ; without a sigma, none
+        sigma: of one measured position, per axis [m; on the command line mm]
+    """
+
+    tolerance: Tolerance = None
+    sigma: Tolerance = None
+
+
+DEFAULT_DRIFT = DriftSettings()

@@ -1,8 +1,8 @@
 """What changed between two identified models of a robot's dynamics: a test in base parameters, and the torque's change.
 
 The combinations are the base parameters, each by its σ; what a standard parameter, or all of a joint's friction or of
-its link, does to them is in the regrouping of the later model. The test is `calib.rooms.over_time.change_test`. The
-change of the torque is what the two models differ by over motions, Δτ = W₂ χ₂ - W₁ χ₁, each with its own geometry; both
+its link, does to them is in the regrouping of the later model. They are tested (`change_test`). The change of the
+torque is what the two models differ by over motions, Δτ = W₂ χ₂ - W₁ χ₁, each with its own geometry; both
 covariances let expect (w₁ Σ₁ w₁ᵀ + w₂ Σ₂ w₂ᵀ) of its square.
 """
 
@@ -16,8 +16,8 @@ import numpy as np
 from calib.dynamics.base import standard_name
 from calib.dynamics.idim import IdentificationModel
 from calib.identification.torque_errors import parameter_variances
-from calib.rooms.over_time.change_test import Change, ParameterChange, Tested, tested
-from calib.rooms.over_time.identifications import Identified, States
+from calib.rooms.over_time.comparison.change_test import Change, ParameterChange, Tested, tested
+from calib.rooms.over_time.comparison.identifications import Identified, States
 
 PARALLEL = 1e-6  # sine of an angle between what two parameters do to the combinations, below which they are one
 NEARLY_ALL = 0.9  # of χ²; σ of real motions holds no unmodelled effects, which leave a rest (our choice)

@@ -11,9 +11,9 @@ import numpy as np
 from calib.errors import Finding, finding
 from calib.procedure.report.fit_report import FittedParameter
 from calib.procedure.report.page import Block, Column, Text, table
-from calib.rooms.over_time import geometry_change
-from calib.rooms.over_time.change_part import ChangePart
-from calib.rooms.over_time.geometry_change import ToolMotion
+from calib.rooms.over_time.comparison import geometry_change
+from calib.rooms.over_time.comparison.change_part import ChangePart
+from calib.rooms.over_time.comparison.geometry_change import ToolMotion
 from calib.rooms.over_time.settings import DEFAULT_DIFF, DiffSettings
 from calib.units import JOINT
 

@@ -2,7 +2,7 @@
 
 With J the derivative of the target's pose over the poses of both fits, from which every motion of base and tool is
 projected out (they are not the robot's), the rows of V from J = U S Vᵀ are the combinations that poses can show. They
-are tested (`calib.rooms.over_time.change_test`).
+are tested (`calib.rooms.over_time.comparison.change_test`).
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from calib.geometry.observation import layout_counts, target_jacobian
 from calib.procedure.kinematic_stage.inputs import gravity_of
 from calib.robot.calibrated import evaluate
 from calib.robot.chain import random_joints
-from calib.rooms.over_time.calibrations import Calibration
-from calib.rooms.over_time.change_test import Change, ParameterChange, Tested, span, tested
+from calib.rooms.over_time.comparison.calibrations import Calibration
+from calib.rooms.over_time.comparison.change_test import Change, ParameterChange, Tested, span, tested
 from calib.rooms.over_time.settings import DiffSettings
 from calib.transforms import invert, rotation_vector
 

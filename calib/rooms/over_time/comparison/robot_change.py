@@ -6,32 +6,31 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from calib import files, folders
 from calib.api.dynamic import DynamicsModel
 from calib.api.kinematic import GeometryFit
 from calib.api.rendering import Drawn, Judged, saved
 from calib.arguments import checked
 from calib.errors import Finding, UsageError, require
 from calib.procedure.findings import LEVELS, Verdict
-from calib.procedure.report.page import Pictures, Section
+from calib.procedure.report.page import Section
 from calib.records import plain
-from calib.rooms.over_time import geometry_change, torque_change
-from calib.rooms.over_time.calibrations import read_fits
-from calib.rooms.over_time.change_part import ChangePart
-from calib.rooms.over_time.change_test import ParameterChange
-from calib.rooms.over_time.geometry_change import GeometryChange
-from calib.rooms.over_time.identifications import read_models, read_states
-from calib.rooms.over_time.places import Place, place_of
+from calib.rooms.over_time import pages
+from calib.rooms.over_time.comparison import geometry_change, torque_change
+from calib.rooms.over_time.comparison.calibrations import read_fits
+from calib.rooms.over_time.comparison.change_part import ChangePart
+from calib.rooms.over_time.comparison.change_test import ParameterChange
+from calib.rooms.over_time.comparison.geometry_change import GeometryChange
+from calib.rooms.over_time.comparison.identifications import read_models, read_states
+from calib.rooms.over_time.comparison.places import Place, place_of
+from calib.rooms.over_time.comparison.tool_part import ToolPart
+from calib.rooms.over_time.comparison.torque_change import DynamicsChange
+from calib.rooms.over_time.comparison.torque_part import TorquePart
 from calib.rooms.over_time.settings import DEFAULT_DIFF, DiffSettings
-from calib.rooms.over_time.tool_part import ToolPart
-from calib.rooms.over_time.torque_change import DynamicsChange
-from calib.rooms.over_time.torque_part import TorquePart
 
 if TYPE_CHECKING:
     from calib.procedure.report.charts import Chart
 
-PAGE, PICTURE = "report.html", "plot_{}.png"
-OURS = (ToolPart.table, TorquePart.table, PAGE, folders.METRICS, PICTURE.format("[mpt]*"))
+TABLES = (ToolPart.table, TorquePart.table)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,28 +83,16 @@ class RobotChange(Drawn, Judged):
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write a folder: report.html, tables of all parameters, metrics.json, and the figures as PNG."""
-        folders.check_target(Path(out), OURS, (folders.METRICS, PAGE), "comparison")
-        return folders.write_staged(Path(out), OURS, lambda folder: self._write(folder, plots))
-
-    def _write(self, folder: Path, plots: bool) -> None:
-        from calib.procedure.report.charts import picture
-        from calib.rooms.certificate.record import Entry, report
-        from calib.rooms.certificate.rendering import html
-
-        sections = list[Section]()
-        for part in self.parts:
-            charts = part.charts() if plots else {}
-            drawn = {name: picture(chart, words) for (name, chart), words in zip(charts.items(), part.captions)}
-            for name, one in drawn.items():
-                files.write(folder / PICTURE.format(name), one.image)
-            own = part.section()
-            blocks = [*own.blocks, Pictures("", list(drawn.values()))]
-            sections.append(Section(own.title, blocks, own.verdict, own.reason, own.figures))
-            files.write_table(folder / part.table, ParameterChange._fields, part.found.parameters)
+        parts = [
+            pages.Part(
+                part.section(), part.charts() if plots else {}, part.captions,
+                (part.table, ParameterChange._fields, part.found.parameters),
+            )
+            for part in self.parts
+        ]  # fmt: skip
         one, two, robot = self._names
-        setup = [Entry("earlier", one), Entry("later", two)]
-        files.write(folder / PAGE, html(report(f"Change of {robot}", f"{one} to {two}", setup, sections)))
-        files.write_json(folder / folders.METRICS, self.to_dict())
+        setup = {"earlier": one, "later": two}
+        return pages.save(Path(out), "comparison", f"Change of {robot}", setup, parts, self.to_dict(), TABLES)
 
     @property
     def _names(self) -> tuple[str, str, str]:

@@ -13,7 +13,7 @@ import numpy as np
 from calib.errors import Finding, finding
 from calib.procedure.findings import Verdict, lines_of, settle
 from calib.procedure.report.page import Block, Column, KeyFigure, Section, Text, met, table
-from calib.rooms.over_time.change_test import Change
+from calib.rooms.over_time.comparison.change_test import Change
 from calib.units import SMALL
 
 if TYPE_CHECKING:

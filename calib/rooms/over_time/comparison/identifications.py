@@ -18,7 +18,7 @@ from calib.identification.prediction import Dynamics
 from calib.identification.torque_errors import estimated_columns
 from calib.robot import calibrated
 from calib.robot.calibrated import CalibratedChain
-from calib.rooms.over_time.places import Place, check_same_robot
+from calib.rooms.over_time.comparison.places import Place, check_same_robot
 from calib.units import TORQUE
 
 

@@ -16,7 +16,7 @@ from calib.robot import calibrated
 from calib.robot.calibrated import CalibratedChain, Deflection
 from calib.robot.chain import Chain
 from calib.robot.library import load_calibrated
-from calib.rooms.over_time.places import Place, check_same_robot
+from calib.rooms.over_time.comparison.places import Place, check_same_robot
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,8 +10,8 @@ import numpy as np
 
 from calib.errors import Finding, finding
 from calib.procedure.report.page import Block, Column, Text, table
-from calib.rooms.over_time.change_part import ChangePart
-from calib.rooms.over_time.torque_change import TorqueChange
+from calib.rooms.over_time.comparison.change_part import ChangePart
+from calib.rooms.over_time.comparison.torque_change import TorqueChange
 
 if TYPE_CHECKING:
     from calib.procedure.report.charts import Chart
