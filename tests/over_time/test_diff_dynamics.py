@@ -41,6 +41,7 @@ def models(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_two_identifications_of_an_unchanged_robot_do_not_differ(models):
     found = calib.diff(models / "first", models / "again", DiffSettings(torque_tolerance=5.0))
     assert found.geometry is None and found.dynamics.probability > 0.01
@@ -49,6 +50,7 @@ def test_two_identifications_of_an_unchanged_robot_do_not_differ(models):
         assert one.rms < 2.0 * np.sqrt(np.mean(one.expected**2))
 
 
+@pytest.mark.slow
 def test_a_planted_friction_is_found_and_named_with_its_size(models):
     found = calib.diff(models / "first", models / "dry")
     first = found.dynamics.parameters[0]
@@ -56,18 +58,21 @@ def test_a_planted_friction_is_found_and_named_with_its_size(models):
     assert found.verdict == "marginal" and "Fc2 alone explains it" in str(found)
 
 
+@pytest.mark.slow
 def test_several_terms_of_a_joint_s_friction_are_named_as_one_part(models):
     found = calib.diff(models / "first", models / "rubs")
     assert not found.dynamics.alone and found.dynamics.part.name == "the friction of joint 2"
     assert found.dynamics.part.rms == pytest.approx(found.dynamics.torques[0].rms, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_payload_is_a_change_of_the_last_body(models):
     found = calib.diff(models / "first", models / "loaded")
     assert found.dynamics.part.name == "the body of link 3"
     assert found.dynamics.torques[0].unexplained[0] > 5.0 * found.dynamics.torques[0].unexplained[1]
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_folder_and_exits_with_1_beyond_the_tolerance(models, tmp_path, capsys):
     pair, motion = [str(models / "first"), str(models / "loaded")], str(models / "again" / "torques_1.csv")
     assert cli.run(["diff", *pair, "--torque-tolerance", "10", "--motion", motion, "--out", str(tmp_path / "out")]) == 1
@@ -79,6 +84,7 @@ def test_the_command_writes_a_folder_and_exits_with_1_beyond_the_tolerance(model
     assert json.loads((tmp_path / "out/metrics.json").read_text())["dynamics"]["verdict"] == "fail"
 
 
+@pytest.mark.slow
 def test_what_cannot_be_compared_is_refused(models, tmp_path):
     with pytest.raises(UsageError, match=r"nothing to compare: .* holds dynamics, panda holds the nominal robot"):
         calib.diff(models / "first", "panda")

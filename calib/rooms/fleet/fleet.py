@@ -18,6 +18,7 @@ from calib.procedure.findings import LEVELS
 from calib.procedure.session.commands import COLOURS, go_on
 from calib.procedure.session.folder import SETTINGS, Say
 from calib.procedure.session.steps import DONE
+from calib.rooms.fleet.errors import position_errors, torque_error
 from calib.workers import Workers
 from calib.workers import workers as opened
 
@@ -140,14 +141,7 @@ def _go_on(folder: Path, say: Say, command: str, plots: bool) -> FleetRow:
             say(words)
         words = f"{stop.waiting.words} (step {stop.waiting.step.name}); instructions are in {LOG}"
         return FleetRow(str(folder), WAITS, words=words, asks=stop.lines[1:])
-    found = session.validation.metrics() if session.geometric else None
-    sets = found.validation.values() if found else ()
-    pairs = [(one.nominal.main, one.judged(found.deliverable).main) for one in sets if found]
-    rms = [(before.rms, after.rms) for before, after in pairs if before is not None and after is not None]
-    errors, torque = max(rms, key=lambda pair: pair[1], default=(None, None)), None
-    if session.dynamic:
-        unseen = session.identification.unseen.read()
-        torque = max((one.raw.total for one in (unseen.validation or unseen.fit).values()), default=None)
+    errors, torque = position_errors(session) or (None, None), torque_error(session)
     return FleetRow(str(folder), DONE, stop.verdict, "", *errors, torque, code=1 if stop.verdict == "fail" else 0)
 
 

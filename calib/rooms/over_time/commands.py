@@ -1,4 +1,4 @@
-"""Commands on a robot over time: diff, drift."""
+"""Commands on a robot over time: diff, drift, log."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -51,9 +51,25 @@ def drift(
     _shown(drift_page.drift(robot, measured, settings, options, base, tip), out, plots)
 
 
-def _shown(found: Any, out: Path | None, plots: bool) -> None:
-    """Write a result where asked to, print it, and exit with 1 if its verdict is fail."""
+@command(app, "Files and studies")
+def log(sessions: list[Path], out: Folder = None, plots: bool = True, mixed: bool = False) -> None:
+    """List the calibrations of one robot: date, verdict, errors, and what changed since the one before.
+
+    Example: calib log cell2025 cell2026 --out history
+
+    Args:
+        sessions: folders of finished sessions of one robot
+        mixed: take robots of other names or serial numbers for one
+    """
+    from calib.rooms.over_time import log as robot_log
+
+    _shown(robot_log.log(sessions, mixed=mixed), out, plots, result=True)
+
+
+def _shown(found: Any, out: Path | None, plots: bool, result: bool = False) -> None:
+    """Write a result where asked to, print it (tables, too, if they are the `result`), and exit with 1 if it fails."""
     if out is not None:
         found.save(out, plots=plots)
-    say(*found.renderables(), *([f"written to {out}"] if out else []))
-    exit_failed(found.verdict.level)
+    say(*found.renderables(), result=result)
+    say(*([f"written to {out}"] if out else []))
+    exit_failed(found.section().verdict)
