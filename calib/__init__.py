@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from calib.rooms.compensation.api import JointCommands, compensate
     from calib.rooms.fleet.fleet import run_sessions
     from calib.rooms.instruments.joining import join
-    from calib.rooms.over_time.robot_change import diff
+    from calib.rooms.over_time.comparison.robot_change import diff
     from calib.rooms.placements.api import base, hand_eye, tool
 
 # what `import calib` offers, and where it lives: loaded when first asked for, so that `calib --help` starts at once
@@ -50,7 +50,7 @@ _HOMES = {
     "robot.calibrated": ("CalibratedChain",),
     "rooms.compensation.api": ("compensate", "JointCommands"),
     "rooms.instruments.joining": ("join",),
-    "rooms.over_time.robot_change": ("diff",),
+    "rooms.over_time.comparison.robot_change": ("diff",),
     "rooms.placements.api": ("tool", "base", "hand_eye"),
     "procedure.kinematic_stage.settings": ("SelectionSettings", "FitSettings"),
     "procedure.excitation.settings": ("ExcitationSettings", "PlanSettings"),

@@ -11,8 +11,6 @@ The command is what an arm's model says of the mean joints of the cycles, so tha
 an accuracy of their own, while repeatability is the robot's (and the instrument's). Rotation vectors in place of the
 norm's Euler angles are our choice; for the small angles at hand they differ by nothing that counts.
 
-Drift of an instrument or a base between two measurements of the same poses.
-
 Rows that stand twice in what was measured: copied, or a file given twice. They count twice, and prove nothing.
 """
 
@@ -30,60 +28,6 @@ from calib.errors import counted
 from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, predict, prepare, rows_of
 from calib.records import stored
-from calib.robot.chain import Chain
-from calib.robot.kinematics import forward
-
-
-@dataclass(frozen=True)
-class Drift:
-    """Differences between two measurements of the same poses.
-
-    Attributes:
-        poses: pairs of measurements.
-        rms: rms distance of the measured points, minus the displacement by differing joint values [m].
-    """
-
-    poses: int
-    rms: float
-
-    def exceeds(self, sigma: float) -> bool:
-        """Return whether the differences exceed `min_drift_sigmas` standard errors at noise `sigma` per axis [m]."""
-        min_drift_sigmas = 3.0  # standard errors that repeated poses have to be off to be called drift
-        return self.rms > (min_drift_sigmas / np.sqrt(self.poses) + 1.0) * noise_of_difference(sigma)
-
-
-def noise_of_difference(sigma: float) -> float:
-    """Return the rms distance [m] of two points, each measured with `sigma` per axis [m]."""
-    return float(np.sqrt(6.0) * sigma)
-
-
-def drift_of(chain: Chain, later: PoseMeasurements, first: Sequence[PoseMeasurements] | None = None) -> Drift | None:
-    """Return the drift between measurements and earlier ones of the same poses; None without common poses.
-
-    Displacements by differing joint values (nominal arm) are subtracted by magnitude: the instrument frame is unknown.
-
-    Args:
-        chain: the nominal arm.
-        later: measured poses or positions; other kinds are ignored.
-        first: the earlier ones; None for earlier rows of `later`.
-    """
-    before = [later] if first is None else first
-    earlier = [(block, k) for block in before if isinstance(block, Positions) for k in range(len(block))]
-    if not earlier or not isinstance(later, Positions):
-        return None
-    q, squares = np.array([block.q[k] for block, k in earlier]), []
-    tool = np.array([block.tool[k] for block, k in earlier])
-    max_apart = 1e-3  # joints of a pose that is visited again differ by less [rad or m]; our choice
-    for k in range(len(later)):
-        same = (np.abs(q - later.q[k]).max(axis=1) < max_apart) & (tool == later.tool[k])
-        near = np.flatnonzero(same if first is not None else same[:k])
-        if len(near):
-            other, row = earlier[near[0]]
-            was, now = forward(chain, np.array([other.q[row], later.q[k]]))[:, :3, 3]
-            shift, joints = later.position[k] - other.position[row], now - was
-            squares.append(max(float(shift @ shift) - float(joints @ joints), 0.0))
-    return Drift(len(squares), float(np.sqrt(np.mean(squares)))) if squares else None
-
 
 SAME = 1e-3  # joints of one commanded pose, as read back, differ by less [rad or m]; our choice, as the next two
 ARMS = ("nominal", "calibrated")

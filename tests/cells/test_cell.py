@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit, polish_frames
+from calib.geometry.observation import observe
 from calib.geometry.weighing import GeometricFit, Settings
 from calib.robot.chain import random_joints
 from calib.robot.kinematics import forward
@@ -46,7 +47,7 @@ def test_planted_truth_is_recovered_within_its_covariance(robot: str, seeds: int
     cell = rigid(perturbed_cell(load(robot), 3, SimulatedInstrument(encoder_sigma=0.0)))
     for seed in range(seeds):
         found = calibrate(cell, q, seed)
-        part = next(p.part for p in found.pieces if p.part.label == "position")
+        part = next(part for part in observe(found.cell, found.blocks[0], found.free) if part.label == "position")
         predicted = np.einsum("fim,fg,gim->im", part.jacobian, found.estimate.covariance, part.jacobian)
         seen = found.cell.stations[0] @ forward(found.cell.chain, q) @ found.cell.tools[0]
         error = (seen[:, :3, 3] - true_poses(cell, q)[:, :3, 3]).T

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from sessions import begin, edit
 
+from calib import cli
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.pose_files import read_measurements
 from calib.data.recordings.recording_files import read_recording
@@ -126,6 +127,20 @@ def test_other_bytes_stay_when_targets_are_rewritten(tmp_path):
     assert new == text.replace(b"-2.50", b"-2.250000")
     turned = found.poses()[0]
     np.testing.assert_allclose(turned[:3], [[-1, 0, 0, 0.5005], [0, 1, 0, 0], [0, 0, -1, 0.4]], atol=1e-15)
+
+
+def test_moves_without_a_target_are_named_with_their_lines(tmp_path, capsys):
+    """A program that was edited by hand is brought back: a typing error leaves no pose out unnoticed."""
+    path = written(tmp_path, "krl", np.radians([[10.0, 20.0, 30.0, 0.0, 0.0, 0.0], [0.0] * 6]))[".src"]
+    text = path.read_text()
+    path.write_text(text.replace("A2 20", "A2 2o"))
+    (line,) = [number for number, own in enumerate(path.read_text().split("\n"), 1) if "2o" in own]
+    assert cli.run(["program", str(path), "--for", "csv", "--out", str(tmp_path / "back.csv")]) == 0
+    said = capsys.readouterr().out
+    assert "2 moves, 1 targets" in said and f"named or incomplete, are not read (line {line})" in said
+    path.write_text(text.replace("A2", "A2 x"))
+    with pytest.raises(MeasurementError, match=f"its moves are in line {line}, "):
+        read_program(path)
 
 
 def test_a_yaskawa_gets_pulses(tmp_path):

@@ -1,6 +1,5 @@
 """Two calibrations of one robot: nothing moved, or what moved is found and named."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,7 +9,7 @@ from recordings import DATA
 import calib
 from calib import cli
 from calib.errors import RobotError, UsageError
-from calib.rooms.over_time import robot_change
+from calib.rooms.over_time.comparison.tool_part import ToolPart
 from calib.rooms.over_time.settings import DiffSettings
 
 UR5 = DATA / "ur5_gts3800"
@@ -50,7 +49,7 @@ def test_a_planted_joint_offset_is_found_and_named(fits):
 
 def test_a_tolerance_that_holds_near_the_fits_alone_is_marginal(fits):
     found = calib.diff(fits / "first", fits / "crashed", DiffSettings(tolerance=3e-4))
-    assert found.today < 3e-4 < found.geometry.motions[1].rms
+    assert found.parts[0].today < 3e-4 < found.geometry.motions[1].rms
     assert found.verdict == "marginal" and "near the poses of the fits" in str(found)
 
 
@@ -85,7 +84,7 @@ def test_the_nominal_robot_is_one_of_the_two(fits):
     found = calib.diff(UR5 / "model.urdf", fits / "first")
     assert found.geometry.sigmas > 30.0 and not found.geometry.alone
     with pytest.raises(UsageError, match="a nominal robot has no base placement"):
-        calib.diff(UR5 / "model.urdf", fits / "first", replace(found.settings, same_base=True))
+        calib.diff(UR5 / "model.urdf", fits / "first", DiffSettings(same_base=True))
 
 
 def test_what_cannot_be_compared_is_refused(fits, tmp_path):
@@ -104,10 +103,10 @@ def test_what_makes_two_calibrations_hard_to_compare_is_said():
     moved = SimpleNamespace(rms=1e-3, expected=1e-5)
     first = SimpleNamespace(name="joint_3.offset", alone=1e-3, alone_sigma=1e-5, unit="rad")
     found = SimpleNamespace(
-        motions=[moved, moved], sigmas=9.0, probability=1e-9, changed=True, parameters=[first], alone=False,
-        unexplained=50.0, rivals=[], extra=(1, 2), frames={},
+        motions=[moved, moved], chi2=99.0, freedom=9, sigmas=9.0, probability=1e-9, changed=True,
+        parameters=[first], alone=False, unexplained=50.0, rivals=[], extra=(1, 2), frames={},
     )  # fmt: skip
-    codes = {each.code for each in robot_change._findings(one, two, found, DiffSettings(), None)}
+    codes = {each.code for each in ToolPart(one, two, found, None, DiffSettings()).noticed}
     assert {"combinations-left-out", "earlier-failed", "other-serial-number", "several-parameters-changed"} <= codes
 
 

@@ -28,10 +28,9 @@ from calib.data.poses.pose_lists import (
 )
 from calib.data.schema import Joints
 from calib.errors import CalibError, Finding, UsageError, finding
-from calib.extensions import needed
+from calib.extensions import needed, offered
 from calib.folders import write_staged
 from calib.geometry.observability import SIGMA_ORIENTATION, observation, targets_of
-from calib.geometry.repeatability import drift_of, noise_of_difference
 from calib.geometry.weighing import Settings
 from calib.identification.model_file import MODEL
 from calib.procedure.findings import UNJUDGED, Warned, lines_of
@@ -203,10 +202,11 @@ def select(session: Session, say: Say) -> list[str]:
 
 def arrive(session: Session, say: Say) -> list[str]:
     """Check the measured files for the fit, and return notes."""
-    chain, sigma = chain_of(session), session.settings.instrument.sigma_position
+    chain = chain_of(session)
     blocks, again = (read_measured(session, chain, session.brought(kind)) for kind in ("measured", "drift"))
     notes = notes_on(session, chain, blocks, POSES)
-    notes += lines_of(drift(chain, [block for _, block in blocks], [block for _, block in again], sigma))
+    for drift in offered("drift"):
+        notes += lines_of(drift(session, chain, *([block for _, block in own] for own in (blocks, again))))
     files.write(session.path(POSES_CHECKED), "\n".join(notes) + "\n")
     return notes
 
@@ -256,28 +256,6 @@ def readback(plan: np.ndarray, measured: PoseMeasurements) -> list[Finding]:
         return [finding("readback-copied")]
     joint = measured.joint_names[int(np.argmax(off.max(axis=0)))]
     return [finding("readback", rms=np.sqrt(np.mean(off**2)), largest=off.max(), joint=joint)]
-
-
-def drift(
-    chain: Chain, blocks: Sequence[PoseMeasurements], again: Sequence[PoseMeasurements], sigma: float
-) -> list[Finding]:
-    """Return findings on drift, from poses measured again at the end, and from poses repeated within a block.
-
-    Args:
-        chain: the nominal arm.
-        blocks: measured for the fit.
-        again: files whose name starts with drift.
-        sigma: of one position, per axis [m]; 0: not known, then only the figure is given.
-    """
-    pairs = [(later.file, "again at the end", drift_of(chain, later, blocks)) for later in again]
-    pairs += [(block.file, "more than once", drift_of(chain, block)) for block in blocks]
-    return [
-        finding(
-            "poses-moved" if sigma and found.exceeds(sigma) else "poses-repeat", file=Path(file).name, when=when,
-            poses=found.poses, rms=found.rms, noise=noise_of_difference(sigma) if sigma else None,
-        )
-        for file, when, found in pairs if found is not None
-    ]  # fmt: skip
 
 
 def _fit_settings(session: Session) -> FitSettings:

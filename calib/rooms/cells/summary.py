@@ -6,9 +6,8 @@ In letters that every terminal has, at most 60 of them a line.
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from math import nan
 from shutil import get_terminal_size
-
-import numpy as np
 
 from calib.data.csv_table import read_table
 from calib.errors import command_line
@@ -20,6 +19,7 @@ from calib.procedure.kinematic_stage.metrics import ValidationMetrics
 from calib.procedure.session.folder import SETTINGS, WAYS, Say, Session
 from calib.procedure.session.geometry_steps import chain_of
 from calib.procedure.session.steps import steps_of
+from calib.rooms.over_time.sessions import position_errors, torque_error
 from calib.rooms.viewer import viewer
 
 PICTURE = "demo.png"
@@ -32,20 +32,6 @@ SECONDS = {  # of processor time, about, by which the share done is told
 def row(name: str, number: float, words: str) -> str:
     """Return a line of the summary: whose number, the number with three digits, what it is."""
     return f"{name:<11} {number:>6.3g} {words}"
-
-
-def position_errors(session: Session) -> tuple[float, float]:
-    """Return the rms errors of nominal robot and robot.urdf on unseen poses [mm]."""
-    metrics = session.validation.metrics()
-    (rows,) = metrics.validation.values()
-    before, after = (errors.main for errors in (rows.nominal, rows.judged(metrics.deliverable)))
-    return (before.rms, after.rms) if before and after else (np.nan, np.nan)
-
-
-def torque_error(session: Session) -> float:
-    """Return the share of the torque that is unexplained on the unseen motion [%]."""
-    (score,) = session.identification.unseen.read().proofs.values()
-    return score.raw.relative_error_percent.total
 
 
 def _exported(session: Session) -> tuple[float, str]:
@@ -66,13 +52,13 @@ NUMBERS: Mapping[str, Callable[[Session], tuple[float, str]]] = {
     "measure": lambda s: (_minutes(s), "min at the robot to measure them"),
     "fit": lambda s: (len(read_estimate(s.fit.path)), "parameters of its geometry, with sigma"),
     "validate": lambda s: (
-        position_errors(s)[1], f"mm error left on unseen poses: {s.validation.metrics().verdict}"
+        (position_errors(s) or (nan, nan))[1], f"mm error left on unseen poses: {s.validation.metrics().verdict}"
     ),
     "excite": lambda s: (s.settings.dynamics.period, "s of motion designed for its dynamics"),
     "record": lambda s: (s.settings.dynamics.repeats, "periods of it logged, with torques"),
     "identify": lambda s: (len(read_estimate(s.identification.path)), "parameters of its dynamics, with sigma"),
     "predict": lambda s: (
-        torque_error(s), f"% of unseen torque unexplained: {s.identification.unseen.read().verdict}"
+        torque_error(s) or nan, f"% of unseen torque unexplained: {s.identification.unseen.read().verdict}"
     ),
     "export": _exported,
 }  # fmt: skip

@@ -50,6 +50,7 @@ def compensate(
         partial: write the reached targets even if others are not reached
     """
     from calib import files
+    from calib.errors import UsageError
     from calib.procedure.export.geometry import results
     from calib.rooms.compensation import api
     from calib.rooms.compensation.programs import compensated
@@ -58,6 +59,11 @@ def compensate(
     may = numbers(tolerance, 2, "--tolerance")
     fitted = api.read_fitted(folder)
     whole = read_program(targets, controller) if controller or is_program(targets) else None
+    if whole is not None and targets.suffix.lower() in whole.controller.saved:
+        words = (
+            "lists registers that the controller saved, no program: compensate the program, or calib program --for csv"
+        )
+        raise UsageError(f"{targets}: {words}")
     written = [(out, (".csv",) if whole is None else (targets.suffix,))]
     files.check_results(written, [targets, *results(fitted.folder)], overwrite)
     asked: dict[str, Any] = {

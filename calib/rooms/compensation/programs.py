@@ -52,9 +52,7 @@ class CompensatedProgram:
         met = [one for one in self.commands if one.reached.any()]
         shown = [line for one in met for line in lines(one) if not line.startswith("not reached")]
         kept = ["not reached, left as it was: " + words for words in self.lost]
-        moves, known = self.program.moves, len(self.values)
-        more = f"warning: {moves} moves, {known} targets: relative moves and targets that are computed or named stay"
-        return [*dict.fromkeys(shown), *kept, *([more] if moves > known else [])]
+        return [*dict.fromkeys(shown), *kept, *filter(None, [self.program.unread])]
 
     def write(self, out: Path, partial: bool) -> Path:
         """Write the program with its new targets.

@@ -38,6 +38,7 @@ def program(
     from calib.errors import UsageError, require
     from calib.rooms.controllers.program import program_files
     from calib.rooms.controllers.table import controllers
+    from calib.rooms.controllers.targets import is_program, read_program
 
     if listed:
         for name, each in controllers().items():
@@ -54,6 +55,8 @@ def program(
     assert poses is not None
     target = out or poses.with_suffix(".csv" if controller == CSV else "")
     texts = program_files(poses, target, controller, settings, source)
+    if (source or is_program(poses)) and (words := read_program(poses, source).unread):
+        say(words)
     with files.results([(path, ()) for path in texts], [poses], overwrite):
         say(*(f"written to {files.write(path, text)}" for path, text in texts.items()))
 

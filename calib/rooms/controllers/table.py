@@ -45,6 +45,7 @@ class Controller:
     pulses: bool = False
     axes: tuple[int, ...] = ()
     suffixes: tuple[str, ...] = ()
+    saved: tuple[str, ...] = ()
     signs: tuple[int, ...] = ()
     coupled: tuple[tuple[int, int, int], ...] = ()
     joints: str = ""

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.errors import MeasurementError, UsageError
+from calib.errors import MeasurementError, UsageError, listing
 from calib.rooms.controllers.table import Controller, controller_of
 from calib.transforms import pose as pose_of
 from calib.units import ANGLES
@@ -64,6 +64,17 @@ class Program:
     def moves(self) -> int:
         """Number of motion statements, comments aside."""
         return len(_matches(self.text, self.controller.moves, self.controller.comment))
+
+    @property
+    def unread(self) -> str:
+        """Warning where motion statements have no target here, with the first of their lines; else empty."""
+        known = {each.line for each in self.targets}
+        lines = [line for line in _lines_of_moves(self.text, self.controller) if line not in known]
+        if self.moves <= len(self.targets) or not lines:
+            return ""
+        place = f"line {listing(lines, 3)}"
+        words = "relative moves, and targets that are computed, named or incomplete, are not read"
+        return f"warning: {self.moves} moves, {len(self.targets)} targets: {words} ({place})"
 
     def joints(self) -> np.ndarray:
         """Return the joint targets (m, n) as joints of a description [rad]."""
@@ -145,7 +156,9 @@ def read_program(path: Path, controller: str = "") -> Program:
         raise MeasurementError(f"cannot be read: {error.strerror or error}", path) from error
     found = [each for name in ("joints", "pose") for each in _found(text, name, kind)]
     if not found:
-        raise MeasurementError(f"has no targets with all their numbers, as {kind.title} writes them", path)
+        moves = listing(_lines_of_moves(text, kind), 3)
+        words = f"has no targets with all their numbers, as {kind.title} writes them"
+        raise MeasurementError(words + (f"; its moves are in line {moves}" if moves else "; nor any moves"), path)
     return Program(path, kind, text, tuple(sorted(found, key=lambda each: each.spans[0])))
 
 
@@ -155,6 +168,12 @@ def _matches(text: str, pattern: str, comment: str) -> list[re.Match[str]]:
     return [
         one for one in found if not comment or comment not in text[text.rfind("\n", 0, one.start()) + 1 : one.start()]
     ]
+
+
+def _lines_of_moves(text: str, controller: Controller) -> list[int]:
+    """Return the lines of the motion statements, from 1."""
+    found = _matches(text, controller.moves, controller.comment)
+    return [text.count("\n", 0, one.end()) + 1 for one in found]
 
 
 def _found(text: str, kind: str, controller: Controller) -> list[Target]:

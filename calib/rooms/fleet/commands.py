@@ -24,10 +24,12 @@ def run(sessions: list[str], workers: str = "1", plots: bool = True) -> None:
     import time
 
     from calib.rooms.fleet import fleet as runs
+    from calib.rooms.fleet import stores
     from calib.rooms.fleet.throughput import Throughput
+    from calib.rooms.over_time.sessions import folders_of
     from calib.workers import workers as opened
 
-    folders, started, outcomes, pace = runs.folders_of(sessions), time.perf_counter(), [], Throughput()
+    folders, started, outcomes, pace = folders_of(sessions, stores.sessions), time.perf_counter(), [], Throughput()
     with reporting() as (say, progress):
         progress(f"running {len(folders)} sessions")
         for outcome in runs.run(folders, opened(workers), f"calib run --workers {workers}", plots, pace):

@@ -13,7 +13,7 @@ from rich.text import Text
 
 from calib import bug_reports, files
 from calib.arguments import checked
-from calib.errors import CalibError, TaskLost, UsageError, complaint, require
+from calib.errors import CalibError, TaskLost, complaint
 from calib.procedure.findings import LEVELS
 from calib.procedure.session.commands import COLOURS, go_on
 from calib.procedure.session.folder import SETTINGS, Say
@@ -21,6 +21,7 @@ from calib.procedure.session.steps import DONE
 from calib.rooms.fleet import stores
 from calib.rooms.fleet.stores import LEASE
 from calib.rooms.fleet.throughput import Throughput
+from calib.rooms.over_time.sessions import folders_of, position_errors, torque_error
 from calib.workers import Workers
 from calib.workers import workers as opened
 
@@ -66,26 +67,6 @@ class FleetRow:
         return f"{self.folder}: {', '.join(words)}"
 
 
-def folders_of(given: str | Path | Sequence[str | Path]) -> list[Path | str]:
-    """Return the folders of sessions, given as one or several folders, ``session.toml`` files or addresses.
-
-    Raises:
-        UsageError: for a duplicate, or an empty list.
-    """
-    found = list[Path | str]()
-    for each in [given] if isinstance(given, (str, Path)) else given:
-        if stores.is_address(each):
-            found += stores.sessions(str(each))
-        else:
-            found.append(Path(each).parent if Path(each).name == SETTINGS else Path(each))
-    real = [one.resolve() if isinstance(one, Path) else one for one in found]
-    twice = [path for path, own in zip(found, real) if real.count(own) > 1]
-    if twice:
-        raise UsageError(f"{twice[0]} is given twice")
-    require(found, "no session given; give folders or their session.toml", UsageError)
-    return found
-
-
 @checked
 def run_sessions(
     folders: str | Path | Sequence[str | Path],
@@ -109,7 +90,7 @@ def run_sessions(
     Raises:
         UsageError: for a session that is named twice, or where none is.
     """
-    return run(folders_of(folders), opened(workers), command, plots)
+    return run(folders_of(folders, stores.sessions), opened(workers), command, plots)
 
 
 def run(
@@ -172,14 +153,7 @@ def _go_on(folder: Path, say: Say, command: str, plots: bool) -> FleetRow:
             say(words)
         words = f"{stop.waiting.words} (step {stop.waiting.step.name}); instructions are in {LOG}"
         return FleetRow(str(folder), WAITS, words=words, asks=stop.lines[1:])
-    found = session.validation.metrics() if session.geometric else None
-    sets = found.validation.values() if found else ()
-    pairs = [(one.nominal.main, one.judged(found.deliverable).main) for one in sets if found]
-    rms = [(before.rms, after.rms) for before, after in pairs if before is not None and after is not None]
-    errors, torque = max(rms, key=lambda pair: pair[1], default=(None, None)), None
-    if session.dynamic:
-        unseen = session.identification.unseen.read()
-        torque = max((one.raw.total for one in (unseen.validation or unseen.fit).values()), default=None)
+    errors, torque = position_errors(session) or (None, None), torque_error(session)
     return FleetRow(str(folder), DONE, stop.verdict, "", *errors, torque, code=1 if stop.verdict == "fail" else 0)
 
 

@@ -14,17 +14,18 @@ import numpy as np
 from calib import files, folders
 from calib.api.rendering import Judged
 from calib.arguments import checked
-from calib.errors import Finding, RobotError, finding
+from calib.errors import Finding, RobotError, UsageError, finding, require
 from calib.geometry.fit import PLAUSIBLE
 from calib.procedure.findings import Verdict, lines_of, settle
 from calib.procedure.report.page import Block, Column, Section, Text, table
 from calib.records import plain
 from calib.rooms.fleet import prior
-from calib.rooms.fleet.fleet import folders_of
 from calib.rooms.fleet.prior import ParameterSpread
 from calib.rooms.fleet.tools import ToolUse, tools
-from calib.rooms.over_time.calibrations import Calibration, check_same, read
-from calib.rooms.over_time.robot_change import RobotChange, diff
+from calib.rooms.over_time.comparison.calibrations import Calibration, read_fit
+from calib.rooms.over_time.comparison.places import check_same_robot, place_of
+from calib.rooms.over_time.comparison.robot_change import RobotChange, diff
+from calib.rooms.over_time.sessions import folders_of
 from calib.units import small
 
 PAGE, PRIOR = "report.html", "prior"
@@ -74,8 +75,9 @@ class FleetReport(Judged):
     def section(self) -> Section:
         """Return the report's section."""
         drift = [
-            Column("arm", "{0[0]}", number=False), Column("from", lambda one: Path(one[1].before.name).name, False),
-            Column("to", lambda one: Path(one[1].after.name).name, False),
+            Column("arm", "{0[0]}", number=False),
+            Column("from", lambda one: Path(one[1].parts[0].before.name).name, False),
+            Column("to", lambda one: Path(one[1].parts[0].after.name).name, False),
             Column("tool moved, mm rms", lambda one: f"{1e3 * one[1].geometry.motions[0].rms:.3g}"),
             Column("σ of that", lambda one: f"{1e3 * one[1].geometry.motions[0].expected:.2g}"),
             Column("p", lambda one: f"{one[1].geometry.probability:.1g}"),
@@ -161,7 +163,7 @@ def report_fleet(calibrations: str | Path | Sequence[str | Path]) -> FleetReport
     Raises:
         UsageError: for a folder that holds no fit, or one given twice.
     """
-    found = [read(folder, Path(folder)) for folder in folders_of(calibrations)]
+    found = [_fit_of(folder) for folder in folders_of(calibrations)]
     visits: dict[str, list[Calibration]] = {}
     for one in found:
         visits.setdefault(one.serial or one.name, []).append(one)
@@ -182,9 +184,15 @@ def report_fleet(calibrations: str | Path | Sequence[str | Path]) -> FleetReport
     return FleetReport(made, tuple(changes), noticed, Verdict.of(words, noticed))
 
 
+def _fit_of(folder: str | Path) -> Calibration:
+    place = place_of(folder)
+    require(place.fit, f"a fleet's report takes fitted geometries, but {place.words}", UsageError)
+    return read_fit(place)
+
+
 def _same(one: Calibration, two: Calibration) -> bool:
     with suppress(RobotError):
-        check_same(one, two)
+        check_same_robot((one.name, two.name), (one.robot, two.robot))
         return True
     return False
 

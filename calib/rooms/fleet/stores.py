@@ -36,7 +36,9 @@ def is_address(place: object) -> bool:
 
 
 def sessions(address: str) -> list[str]:
-    """Return the addresses of the sessions that match one with or without wildcards."""
+    """Return the addresses of the sessions that match one with or without wildcards; empty for a path."""
+    if not is_address(address):
+        return []
     files, root = _opened(address)
     with refused_as(UsageError, Exception, f"{address} cannot be read: {{}}"):
         found = sorted(files.glob(f"{root}/{SESSION}"))

@@ -381,3 +381,11 @@ def test_a_target_of_a_program_that_is_not_reached_is_named_with_its_line(cell, 
     code, _, err = calib("compensate", fitted, "joints.src", "--out", "no.src")
     assert code == 2 and "line 4: the target itself is outside the limits" in err
     assert not (here / "no.src").exists()
+
+
+def test_registers_that_a_controller_saved_are_no_program_to_compensate(fitted, tmp_path, capsys):
+    (tmp_path / "POSREG.VA").write_text(
+        "[1,1] =   'P1'   Group: 1\n" + "  ".join(f"J{k} = 1.0 deg" for k in range(1, 7))
+    )
+    assert cli.run(["compensate", str(fitted), str(tmp_path / "POSREG.VA"), "--out", str(tmp_path / "o.VA")]) == 2
+    assert "lists registers that the controller saved, no program" in capsys.readouterr().err

@@ -13,11 +13,12 @@ from calib.procedure.kinematic_stage import inputs
 from calib.procedure.session.answers import CAMERA, Answers
 from calib.procedure.session.dynamics_steps import options_of
 from calib.procedure.session.folder import Session
-from calib.procedure.session.geometry_steps import chain_of, drift, read_measured, readback
+from calib.procedure.session.geometry_steps import chain_of, read_measured, readback
 from calib.procedure.session.questions import QUESTIONS, checked, with_answer
 from calib.robot.chain import random_joints
 from calib.rooms.cells.cell import measure, wandering
 from calib.rooms.cells.virtual_cells import virtual_cell
+from calib.rooms.over_time import drift
 
 CELL = virtual_cell("lwr4plus")
 Q = random_joints(CELL.nominal, 30, 3)
@@ -26,7 +27,7 @@ Q = random_joints(CELL.nominal, 30, 3)
 def repeated(size: float, seed: int) -> list[Finding]:
     first = wandering(measure(CELL, Q, seed), size, seed)
     again = wandering(measure(CELL, Q[:4], seed + 100), size, seed, begin=1.0)
-    return drift(CELL.nominal, [first], [replace(again, file="drift.csv")], 60e-6)
+    return drift.repeats(CELL.nominal, [first], [replace(again, file="drift.csv")], 60e-6)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -36,9 +37,9 @@ def test_drift_is_told_from_noise(seed: int) -> None:
 
 def test_a_pose_measured_twice_in_one_file_counts() -> None:
     found = measure(CELL, np.concatenate([Q, Q[:3]]), 1)
-    (repeats,) = drift(CELL.nominal, [found], [], 60e-6)
+    (repeats,) = drift.repeats(CELL.nominal, [found], [], 60e-6)
     assert (repeats.code, repeats.values["poses"], repeats.values["when"]) == ("poses-repeat", 3, "more than once")
-    assert drift(CELL.nominal, [take(found, range(20))], [], 60e-6) == []
+    assert drift.repeats(CELL.nominal, [take(found, range(20))], [], 60e-6) == []
 
 
 def test_commanded_joints_in_place_of_read_ones_are_noticed() -> None:

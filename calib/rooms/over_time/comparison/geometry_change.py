@@ -1,34 +1,25 @@
 """What moved between two calibrations of a robot: a test in identifiable combinations, and the tool's motion.
 
-With δ the difference of the parameters, Σ the sum of both covariances and J the derivative of the target's pose over
-the poses of both fits, from which every motion of base and tool is projected out (they are not the robot's), the rows
-of V from J = U S Vᵀ are the combinations that poses can show. In them
-
-    z = V δ,  C = V Σ Vᵀ,  χ² = zᵀ C⁻¹ z
-
-has as many degrees of freedom as combinations were fitted. If parameter k alone changed, by the size x, then z = x v_k
-with v_k the column of V: x = v_kᵀ C⁻¹ z / v_kᵀ C⁻¹ v_k, σ² = 1 / v_kᵀ C⁻¹ v_k, and χ² falls by (x/σ)² (Baarda 1968,
-data snooping). A combination that only one of two fits has fitted is taken out by conditioning: that fit is as if
-it had kept it at nominal, too.
+With J the derivative of the target's pose over the poses of both fits, from which every motion of base and tool is
+projected out (they are not the robot's), the rows of V from J = U S Vᵀ are the combinations that poses can show. They
+are tested (`calib.rooms.over_time.comparison.change_test`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2, norm
 
 from calib.errors import UsageError, require
 from calib.geometry.installation import Installation, NoOptics, see
 from calib.geometry.model_choice.cross_validation import project_out
 from calib.geometry.observation import layout_counts, target_jacobian
-from calib.procedure.findings import limit
 from calib.procedure.kinematic_stage.inputs import gravity_of
 from calib.robot.calibrated import evaluate
 from calib.robot.chain import random_joints
-from calib.rooms.over_time.calibrations import Calibration
+from calib.rooms.over_time.comparison.calibrations import Calibration
+from calib.rooms.over_time.comparison.change_test import Change, ParameterChange, Tested, span, tested
 from calib.rooms.over_time.settings import DiffSettings
 from calib.transforms import invert, rotation_vector
 
@@ -36,30 +27,6 @@ LEVER = 0.1  # that weighs a target's turn against its way [m/rad]: a tool's usu
 MAX_POSES = 300  # of each fit, and at random
 SHOWN = 1e-7  # of the largest singular value: below it, no pose shows a combination
 PARALLEL = 1e-2  # share of a parameter's motion that base and tool do not take up; below it, no pose shows it alone
-SPAN = 1e-5  # sine of an angle below which two combinations are one
-CHANCE = 0.01  # probability below which a χ² is no chance, as 2.6 σ
-AS_WELL = 4.0  # χ² by which a second explanation may be worse: 2 σ
-
-
-class ParameterChange(NamedTuple):
-    """Change of one parameter.
-
-    Attributes:
-        name, unit: of the parameter.
-        before, after: its values; one that was not fitted has its nominal value.
-        sigma: of the difference, from both covariances; 0 where it was fitted in neither.
-        alone, alone_sigma: its change if nothing else had changed; NaN where no pose shows it.
-        explained: by how much that lowers χ².
-    """
-
-    name: str
-    unit: str
-    before: float
-    after: float
-    sigma: float
-    alone: float
-    alone_sigma: float
-    explained: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,57 +55,18 @@ class ToolMotion:
 
 
 @dataclass(frozen=True)
-class GeometryChange:
-    """What moved between two calibrations.
+class GeometryChange(Change):
+    """What moved between two calibrations; the test is in `Change`.
 
     Attributes:
-        chi2, freedom: of the test that nothing moved, and its degrees of freedom.
-        parameters: of the arm, the one that explains most first.
         by_joint: (joint, rms motion of the target if only what describes that joint had changed [m]).
         motions: at the poses of both fits, then at random ones.
-        extra: how many combinations only the earlier, and only the later one fitted.
         frames: motion (6,) [m, rad] of ``base`` and ``tool`` between the two; empty for a nominal robot.
     """
 
-    chi2: float
-    freedom: int
-    parameters: tuple[ParameterChange, ...]
     by_joint: tuple[tuple[str, float], ...]
     motions: tuple[ToolMotion, ...]
-    extra: tuple[int, int]
     frames: dict[str, np.ndarray]
-
-    @property
-    def probability(self) -> float:
-        """Of a χ² at least so large where nothing moved."""
-        return float(chi2.sf(self.chi2, self.freedom))
-
-    @property
-    def sigmas(self) -> float:
-        """The deviation of a single normal variable that is as unlikely as χ², at most 37."""
-        return float(norm.isf(max(self.probability, 1e-300) / 2.0))
-
-    @property
-    def changed(self) -> bool:
-        """Whether the test says that something moved."""
-        return self.sigmas > limit("arm-changed", "sigmas", "marginal")
-
-    @property
-    def unexplained(self) -> float:
-        """χ² that is left where only the first parameter changed."""
-        return max(self.chi2 - self.parameters[0].explained, 0.0) if self.parameters else self.chi2
-
-    @property
-    def alone(self) -> bool:
-        """Whether the change of the first parameter alone explains the whole difference."""
-        return bool(chi2.sf(self.unexplained, max(self.freedom - 1, 1)) > CHANCE)
-
-    @property
-    def rivals(self) -> tuple[str, ...]:
-        """The parameters whose change explains the difference about as well as that of the first one."""
-        return tuple(
-            each.name for each in self.parameters[1:] if each.explained > self.parameters[0].explained - AS_WELL
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,23 +135,21 @@ def compare(before: Calibration, after: Calibration, settings: DiffSettings) -> 
     pair, chain = _pair(before, after, settings), before.chain
     learnt = [each.learnt for each in (before, after) if each.learnt is not None]
     seen = pair.see(np.concatenate([each[:: max(1, -(-len(each) // MAX_POSES))] for each in learnt]))
-    z, combinations, covariance, extra = _tested(pair, seen)
-    solved = np.linalg.solve(covariance, np.column_stack([z, combinations]))
-    along, across = combinations.T @ solved[:, 0], np.einsum("zk,zk->k", combinations, solved[:, 1:])
+    found, combinations = _tested(pair, seen)
     total, sizes = np.add(*pair.covariances), np.linalg.norm(combinations, axis=0)
-    found, steps = [], np.zeros((chain.n, len(pair.change)))
+    changes, steps = list[ParameterChange](), np.zeros((chain.n, len(pair.change)))
     for k, (element, one, two) in enumerate(zip(chain.elements, chain.values, after.chain.values)):
         steps[min(element.owner, chain.n - 1), k] = pair.change[k]
-        known = sizes[k] > PARALLEL * sizes.max()
-        alone = (along[k] / across[k], across[k] ** -0.5, along[k] ** 2 / across[k]) if known else (np.nan, np.nan, 0.0)
-        found.append(ParameterChange(element.name, element.unit, one, two, float(np.sqrt(total[k, k])), *alone))
-    found.sort(key=lambda each: -each.explained)
+        alone, sigma = found.alone(k, sizes[k] > PARALLEL * sizes.max()), float(np.sqrt(total[k, k]))
+        changes.append(ParameterChange(element.name, element.unit, one, two, sigma, *alone))
+    changes.sort(key=lambda each: -each.explained)
     motions = [seen.motion("poses of the fits", total)]
     motions.append(pair.see(random_joints(chain, MAX_POSES, settings.seed)).motion("random poses within limits", total))
     by_joint = tuple((name, seen.size(step[None])) for name, step in zip(chain.joint_names, steps))
     return GeometryChange(
-        float(z @ solved[:, 0]), len(z), tuple(found), by_joint, tuple(motions), extra, frame_changes(before, after)
-    )
+        found.chi2, len(found.difference), tuple(changes), found.extra, by_joint, tuple(motions),
+        frame_changes(before, after),
+    )  # fmt: skip
 
 
 def corrected_motion(before: Calibration, after: Calibration, settings: DiffSettings) -> float:
@@ -290,32 +216,12 @@ def _pair(before: Calibration, after: Calibration, settings: DiffSettings) -> _P
     return _Pair((cells[0], cells[1]), taken_up, free, change[free], (one, two))
 
 
-def _tested(pair: _Pair, seen: _Seen) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[int, int]]:
-    """Return the tested combinations: their change (k,), derivatives (k, p), covariance (k, k), and how many were left.
-
-    Those are fitted by one of the two only: that one is conditioned on having kept them.
-    """
+def _tested(pair: _Pair, seen: _Seen) -> tuple[Tested, np.ndarray]:
+    """Return the test of the combinations that the poses show, and what each parameter does to those tested (k, p)."""
     _, size, shown = np.linalg.svd(seen.rows.T, full_matrices=False)
     shown = shown[size > SHOWN * size[0]]
-    spans = [_span(shown[:, np.diag(each) > 0.0]) for each in pair.covariances]
-    fitted = [each for each in spans if each.shape[1]]
-    change, covariances = shown @ pair.change, [shown @ each @ shown.T for each in pair.covariances]
-    extra = [np.zeros((len(shown), 0))] * 2
-    if len(fitted) == 2:
-        extra = [_span(own - other @ (other.T @ own)) for own, other in (spans, spans[::-1])]
-        for place, beyond in enumerate(extra):
-            gain = np.linalg.lstsq(beyond.T @ covariances[place] @ beyond, beyond.T @ covariances[place])[0].T
-            change = change - gain @ (beyond.T @ change)
-            covariances[place] = covariances[place] - gain @ beyond.T @ covariances[place]
-    together, beyond = _span(np.hstack(fitted)), np.hstack(extra)
-    kept = _span(together - beyond @ (beyond.T @ together))
-    return kept.T @ change, kept.T @ shown, kept.T @ np.add(*covariances) @ kept, (extra[0].shape[1], extra[1].shape[1])
-
-
-def _span(columns: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis (k, r) of the space of columns (k, any), each of a size near 1 or none."""
-    basis, size, _ = np.linalg.svd(columns, full_matrices=False)
-    return basis[:, size > SPAN]
+    spans = [span(shown[:, np.diag(each) > 0.0]) for each in pair.covariances]
+    return tested(shown @ pair.change, [shown @ each @ shown.T for each in pair.covariances], spans, shown)
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:

@@ -1,0 +1,1 @@
+"""Two calibrations of one robot compared: geometry, dynamics, or both."""

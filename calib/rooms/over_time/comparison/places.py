@@ -1,0 +1,97 @@
+"""Where two calibrations are: folders of fits, of identifications, of sessions, or a robot's description."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from calib.errors import RobotError, UsageError, command_line, listing, require
+from calib.folders import COVARIANCE, METRICS, SESSION
+from calib.identification.model_file import MODEL
+from calib.procedure.dynamic_stage.folder import IdentificationFolder
+from calib.procedure.kinematic_stage.folder import FitFolder
+from calib.procedure.session.folder import Session, open_session
+from calib.robot.calibrated import CalibratedChain
+from calib.robot.chain import Element
+
+SAME = 1e-9  # of two nominal descriptions: largest difference [m, rad] that rounding in files explains
+
+
+@dataclass(frozen=True)
+class Place:
+    """What one calibration is read from.
+
+    Attributes:
+        name: as the user gave it.
+        session: None where it is no session's folder.
+        fit, identification: folders of the results that are there; None: there is none.
+    """
+
+    name: str
+    session: Session | None = None
+    fit: FitFolder | None = None
+    identification: IdentificationFolder | None = None
+
+    @property
+    def nominal(self) -> bool:
+        """Whether it is a robot's description, not a folder."""
+        return not (self.session or self.fit or self.identification)
+
+    @property
+    def serial(self) -> str:
+        """Serial number of the robot as its session states it; empty if unknown."""
+        return self.session.settings.certificate.robot_serial if self.session else ""
+
+    @property
+    def words(self) -> str:
+        """What it holds, in a clause."""
+        held = [name for name, one in (("geometry", self.fit), ("dynamics", self.identification)) if one]
+        if held or not self.session:
+            return f"{self.name} holds {' and '.join(held) or 'the nominal robot'}"
+        return f"{self.name} holds no result yet ({command_line('next', self.name)})"
+
+
+def place_of(given: str | Path) -> Place:
+    """Return what a calibration is read from; what is no folder counts as a description.
+
+    Raises:
+        UsageError: for a folder of something else.
+    """
+    path, name = Path(given), str(given)
+    if not path.is_dir():
+        return Place(name)
+    if (path / SESSION).exists():
+        session = open_session(path)
+        fit, model = session.fit, session.identification
+        fitted = session.geometric and (fit.path / METRICS).exists() and (fit.path / COVARIANCE).exists()
+        known = session.dynamic and model.numbers.exists() and model.unseen.report.exists()
+        return Place(name, session, fit if fitted else None, model if known else None)
+    if (path / MODEL).exists():
+        return Place(name, None, None, IdentificationFolder(path))
+    words = f"{name} is neither the folder of a fit (robot.toml, {METRICS}), of an identification, nor of a session"
+    require((path / METRICS).exists() and FitFolder(path).robot.exists(), f"{words} ({SESSION})", UsageError)
+    return Place(name, None, FitFolder(path))
+
+
+def check_same_robot(names: tuple[str, str], robots: tuple[CalibratedChain, CalibratedChain]) -> None:
+    """Raise `RobotError` for two calibrations whose nominal descriptions differ."""
+    first, second = (each.nominal or each.chain for each in robots)
+    both = f"{names[0]} and {names[1]} are of different robots"
+    for what in ("joint_names", "names"):
+        mine, other = getattr(first, what), getattr(second, what)
+        strange = [name for name in (*mine, *other) if (name in mine) != (name in other)]
+        kind = "joints" if what == "joint_names" else "parameters"
+        words = f"{both} ({first.name}, {second.name}): {kind} {listing(strange, 5)} exist in one of them only"
+        require(mine == other, words if strange else f"{both}: their {kind} are in another order", RobotError)
+    away = np.abs(first.values - second.values)
+    away = np.maximum(away, [np.abs(_placed(a) - _placed(b)).max() for a, b in zip(first.elements, second.elements)])
+    moved = [name for name, size in zip(first.names, away) if size > SAME]
+    tail = np.abs(first.tail - second.tail).max()
+    words = f"{both}: the nominal {listing(moved or ['tip'], 5)} differ; fit both from one description"
+    require(not moved and tail <= SAME, words, RobotError)
+
+
+def _placed(element: Element) -> np.ndarray:
+    return np.eye(4) if element.placement is None else element.placement

@@ -1,0 +1,251 @@
+"""Drift of instrument, base or tool during a measurement, from poses measured more than once.
+
+Two figures, of which a session says the first at once: how far repeated poses are apart (by the nominal arm, what
+differing joints explain subtracted by magnitude), and, where the file has a column of time or temperature, the trend:
+with p the measured points less what the placed nominal arm predicts, each pose's mean taken out of p and of x,
+
+    p̃ = s x̃ + noise,   s = Σ x̃ p̃ / Σ x̃²,   σ² = Σ |p̃ - s x̃|² / dof,   dof = 3 (visits - poses - 1)
+
+per axis alike; whether s differs from 0, Σ x̃² |s|² / 3 σ² says by its F distribution. A translation of the target is
+what a base or a tracker that moves does; arms that warm up also grow by pose, which this averages.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import KDTree
+from scipy.stats import f, norm
+
+from calib.data.csv_table import Table, read_table
+from calib.data.poses.measurements import PoseMeasurements, Positions
+from calib.errors import CalibError, Finding, finding
+from calib.geometry.first_guess import install
+from calib.geometry.observation import predict, prepare
+from calib.procedure.session.folder import Session
+from calib.robot.chain import Chain
+from calib.robot.kinematics import forward
+
+SAME = 1e-3  # joints of a pose that is visited again differ by less [rad or m]; our choice
+MIN_DRIFT_SIGMAS = 3.0  # standard errors that repeated poses have to be off to be called drift
+TIMES = {"": 1.0, "s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
+COVARIATES = {"time": re.compile(r"t|time|date|timestamp|date.?time", re.I), "temperature": re.compile(r"temp.*", re.I)}
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Differences between two measurements of the same poses.
+
+    Attributes:
+        poses: pairs of measurements.
+        rms: rms distance of the measured points, minus the displacement by differing joint values [m].
+    """
+
+    poses: int
+    rms: float
+
+    def exceeds(self, sigma: float) -> bool:
+        """Return whether the differences exceed `MIN_DRIFT_SIGMAS` standard errors at noise `sigma` per axis [m]."""
+        return self.rms > (MIN_DRIFT_SIGMAS / np.sqrt(self.poses) + 1.0) * noise_of_difference(sigma)
+
+
+@dataclass(frozen=True, eq=False)
+class Trend:
+    """Motion of the target with time or temperature.
+
+    Attributes:
+        what: name of the column.
+        unit: of it, as shown: h or °C.
+        x: (m,) time from the start or temperature of the visits to repeated poses, in that unit.
+        moved: (m, 3) their points, less the arm's prediction and their poses' mean [m], in the instrument's frame.
+        poses: repeated poses.
+        span: of the column over all rows.
+        slope, sigma: (3,) of the target, and its standard deviation per axis [m per unit].
+        sigmas: deviation of a normal variable that is as unlikely as so large a slope without drift.
+    """
+
+    what: str
+    unit: str
+    x: np.ndarray
+    moved: np.ndarray
+    poses: int
+    span: float
+    slope: np.ndarray
+    sigma: float
+    sigmas: float
+
+    @property
+    def size(self) -> float:
+        """Size of the slope [m per unit]."""
+        return float(np.linalg.norm(self.slope))
+
+    @property
+    def total(self) -> float:
+        """Way of the target over all rows [m]."""
+        return self.size * self.span
+
+    def finding(self, need: float) -> Finding:
+        """Return the finding on this trend; `need`: the way that would matter [m], 0: unknown."""
+        rate = f"{1e3 * self.size:.2g} ± {1e3 * self.sigma:.1g} mm/{self.unit}"
+        times = self.total / need if need else 0.0
+        return finding("target-drifts", sigmas=self.sigmas, times=times, rate=rate, total=self.total, column=self.what)
+
+
+def noise_of_difference(sigma: float) -> float:
+    """Return the rms distance [m] of two points, each measured with `sigma` per axis [m]."""
+    return float(np.sqrt(6.0) * sigma)
+
+
+def of_session(
+    session: Session, chain: Chain, blocks: Sequence[PoseMeasurements], again: Sequence[PoseMeasurements]
+) -> list[Finding]:
+    """Return what a session says of drift when its measurements have arrived."""
+    sigma, tolerance = session.settings.instrument.sigma_position, 1e-3 * session.settings.fit.tolerance_mm
+    trended = [one.finding(tolerance or noise_of_difference(sigma)) for one in trends(chain, blocks, again, sigma)]
+    return [*repeats(chain, blocks, again, sigma), *trended]
+
+
+def repeats(
+    chain: Chain, blocks: Sequence[PoseMeasurements], again: Sequence[PoseMeasurements], sigma: float
+) -> list[Finding]:
+    """Return findings on drift, from poses measured again at the end, and from poses repeated within a block.
+
+    Args:
+        chain: the nominal arm.
+        blocks: measured for the fit.
+        again: files whose name starts with drift.
+        sigma: of one position, per axis [m]; 0: not known, then only the figure is given.
+    """
+    pairs = [(later.file, "again at the end", drift_of(chain, later, blocks)) for later in again]
+    pairs += [(block.file, "more than once", drift_of(chain, block)) for block in blocks]
+    return [
+        finding(
+            "poses-moved" if sigma and found.exceeds(sigma) else "poses-repeat", file=Path(file).name, when=when,
+            poses=found.poses, rms=found.rms, noise=noise_of_difference(sigma) if sigma else None,
+        )
+        for file, when, found in pairs if found is not None
+    ]  # fmt: skip
+
+
+def drift_of(chain: Chain, later: PoseMeasurements, first: Sequence[PoseMeasurements] | None = None) -> Drift | None:
+    """Return the drift between measurements and earlier ones of the same poses; None without common poses.
+
+    Displacements by differing joint values (nominal arm) are subtracted by magnitude: the instrument frame is unknown.
+
+    Args:
+        chain: the nominal arm.
+        later: measured poses or positions; other kinds are ignored.
+        first: the earlier ones; None for earlier rows of `later`.
+    """
+    before = [later] if first is None else first
+    earlier = [(block, k) for block in before if isinstance(block, Positions) for k in range(len(block))]
+    if not earlier or not isinstance(later, Positions):
+        return None
+    q, squares = np.array([block.q[k] for block, k in earlier]), []
+    tool = np.array([block.tool[k] for block, k in earlier])
+    for k in range(len(later)):
+        same = (np.abs(q - later.q[k]).max(axis=1) < SAME) & (tool == later.tool[k])
+        near = np.flatnonzero(same if first is not None else same[:k])
+        if len(near):
+            other, row = earlier[near[0]]
+            was, now = forward(chain, np.array([other.q[row], later.q[k]]))[:, :3, 3]
+            shift, joints = later.position[k] - other.position[row], now - was
+            squares.append(max(float(shift @ shift) - float(joints @ joints), 0.0))
+    return Drift(len(squares), float(np.sqrt(np.mean(squares)))) if squares else None
+
+
+def trends(
+    chain: Chain, blocks: Sequence[PoseMeasurements], again: Sequence[PoseMeasurements] = (), sigma: float = 0.0
+) -> list[Trend]:
+    """Return the target's motion with time and with each temperature that the files state; empty without repeats.
+
+    Args:
+        chain: the nominal arm.
+        blocks: measured poses or positions; other kinds are ignored. A time counts if all files are of one clock: they
+            do not overlap.
+        again: measured from where the first block was.
+        sigma: of one position, per axis [m]; 0: not known. The σ of a slope rests on at least that.
+    """
+    seen = [block for block in blocks if isinstance(block, Positions)]
+    seen += [replace(block, station=seen[0].station) for block in again if seen and isinstance(block, Positions)]
+    try:
+        cell = install(chain, seen) if seen else None
+    except CalibError:  # too few rows to place the instrument
+        cell = None
+    if cell is None:
+        return []
+    ready = prepare(cell, seen)
+    off = [block.position - predict(cell, one).point.T for block, one in zip(seen, ready)]
+    key = [
+        np.column_stack([block.q, 1e3 * block.tool, np.full(len(block), 1e3 * k.station)])
+        for block, k in zip(seen, ready)
+    ]
+    pose = _poses(np.concatenate(key))
+    tables = [_columns(Path(block.file), block.rows) for block in seen]
+    shared = [name for name in tables[0] if all(name in each for each in tables)]
+    columns = [(name, tables[0][name][0], [each[name][1] for each in tables]) for name in shared]
+    found = (
+        _trend(name, unit, np.concatenate(values), np.concatenate(off), pose, sigma)
+        for name, unit, values in columns if unit != "h" or _one_clock(values)
+    )  # fmt: skip
+    return [one for one in found if one is not None]
+
+
+def _poses(key: np.ndarray) -> np.ndarray:
+    """Return the number of each row's pose (m,): that of the first row near it."""
+    return np.array([min(near) for near in KDTree(key).query_ball_point(key, SAME, p=np.inf)])
+
+
+def _one_clock(times: Sequence[np.ndarray]) -> bool:
+    """Return whether files follow each other in time; where each counts from its own start they overlap."""
+    spans = sorted((each.min(), each.max()) for each in times)
+    return all(one[1] <= two[0] for one, two in pairwise(spans))
+
+
+def _trend(what: str, unit: str, x: np.ndarray, off: np.ndarray, pose: np.ndarray, sigma: float) -> Trend | None:
+    _, place, count = np.unique(pose, return_inverse=True, return_counts=True)
+    again = count[place] > 1
+    poses, visits = int((count > 1).sum()), int(again.sum())
+    dof = 3 * (visits - poses - 1)
+    means = [np.bincount(place, one) / count for one in (x, *off.T)]
+    centred, moved = (x - means[0][place])[again], (off - np.transpose(means[1:])[place])[again]
+    spread = float(centred @ centred)
+    if dof < 1 or spread <= 1e-12 * max(float(np.ptp(x)) ** 2, 1e-300) or not np.ptp(x):
+        return None
+    slope = centred @ moved / spread
+    left = max(float(np.sqrt(np.sum((moved - np.outer(centred, slope)) ** 2) / dof)), sigma, 1e-12)
+    chance = f.sf(spread * float(slope @ slope) / (3.0 * left**2), 3, dof)
+    sigmas = float(norm.isf(max(float(chance), 1e-300) / 2.0))
+    return Trend(what, unit, x[again], moved, poses, float(np.ptp(x)), slope, left / np.sqrt(spread), sigmas)
+
+
+def _columns(path: Path, rows: np.ndarray) -> dict[str, tuple[str, np.ndarray]]:
+    """Return time [h] and temperatures [°C] of a file's rows, numbered from 1: name -> unit and values (m,)."""
+    if not path.is_file():
+        return {}
+    table = read_table(path)
+    return {name: (unit, values[rows - 1]) for name, unit, values in _covariates(table) if len(values) >= rows.max()}
+
+
+def _covariates(table: Table) -> Iterator[tuple[str, str, np.ndarray]]:
+    for name, unit, cells in zip(table.header, table.units, table.cells):
+        if COVARIATES["temperature"].fullmatch(name) and cells.dtype == float and np.isfinite(cells).all():
+            yield name, "°C", cells
+        elif COVARIATES["time"].fullmatch(name) and (seconds := _seconds(cells, unit)) is not None:
+            yield name, "h", seconds / 3600.0
+
+
+def _seconds(cells: np.ndarray, unit: str) -> np.ndarray | None:
+    """Return times [s] of a column: numbers in a unit of `TIMES`, or dates as ISO 8601 writes them; else None."""
+    if cells.dtype == float:
+        return TIMES[unit] * cells if unit in TIMES and np.isfinite(cells).all() else None
+    try:
+        return np.array([datetime.fromisoformat(str(cell)).timestamp() for cell in cells])
+    except ValueError:
+        return None

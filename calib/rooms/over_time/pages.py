@@ -1,0 +1,58 @@
+"""Folder of a result of this room: report.html with its figures, tables, metrics.json."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from calib import files, folders
+from calib.procedure.report.page import Pictures, Section
+
+if TYPE_CHECKING:
+    from calib.procedure.report.charts import Chart
+
+PAGE, PICTURE = "report.html", "plot_{}.png"
+
+
+class Part(NamedTuple):
+    """A section of the page with its charts, their captions, and a table on disk (name, header, rows)."""
+
+    section: Section
+    charts: Mapping[str, Chart]
+    captions: Sequence[str]
+    table: tuple[str, Sequence[str], Iterable[Sequence[Any]]]
+
+
+def save(
+    out: Path, kind: str, title: str, setup: Mapping[str, str], parts: Sequence[Part], numbers: Any,
+    tables: Sequence[str],
+) -> Path:  # fmt: skip
+    """Write the folder `out` and return its path; `tables`: names of all that this `kind` of result may write.
+
+    Raises:
+        UsageError: for a folder that holds something else.
+    """
+    ours = (*tables, PAGE, folders.METRICS, PICTURE.format("*"))
+    folders.check_target(out, ours, (folders.METRICS, PAGE), kind)
+    return folders.write_staged(out, ours, lambda folder: _write(folder, title, setup, parts, numbers))
+
+
+def _write(folder: Path, title: str, setup: Mapping[str, str], parts: Sequence[Part], numbers: Any) -> None:
+    from calib.procedure.report.charts import picture
+    from calib.rooms.certificate.record import Entry, report
+    from calib.rooms.certificate.rendering import html
+
+    sections = list[Section]()
+    for part in parts:
+        drawn = {name: picture(chart, words) for (name, chart), words in zip(part.charts.items(), part.captions)}
+        for name, one in drawn.items():
+            files.write(folder / PICTURE.format(name), one.image)
+        blocks = [*part.section.blocks, Pictures("", list(drawn.values()))]
+        sections.append(replace(part.section, blocks=blocks))
+        name, header, rows = part.table
+        files.write_table(folder / name, header, rows)
+    entries = [Entry(*each) for each in setup.items()]
+    files.write(folder / PAGE, html(report(title, " to ".join(setup.values()), entries, sections)))
+    files.write_json(folder / folders.METRICS, numbers)
