@@ -124,4 +124,3 @@ def test_a_loop_that_saturation_alone_keeps_finite_is_said_to_be_unstable():
     simulate(plant, wild, reference, Sensing(every=10))
     with pytest.raises(NotConverged, match="these gains cannot stabilise"):
         simulate_tangents(plant, wild, reference, np.arange(len(plant.parameters)), 10.0)
-

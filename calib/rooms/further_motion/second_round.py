@@ -1,7 +1,7 @@
 """A further motion, where joints or parameters fall short of what ``session.toml`` asks for.
 
-Where the session states no need, its end says what falls short of the default ones, σ of essential parameters up to
-`SIGMA` and the verdict's limit of torque for each joint, and how to have a motion designed for it. Else asked are
+Where the session states no need, its end says which joints' torques and which essential parameters' σ are above `NEED`,
+and how to have a motion designed for them. Else asked are
 ``tolerance_percent``, of the torques on unseen motion, and ``sigma_percent``, of essential parameters. The
 motion is designed after the identification, into ``6-excitation/round2`` (``round3`` once round2 was recorded …); a log
 whose name begins like that folder is identified together with all others.
@@ -27,8 +27,9 @@ from calib.procedure.findings import limit
 from calib.procedure.session.dynamics_steps import next_round, options_of
 from calib.procedure.session.folder import ROUND, Say, Session, read_state
 from calib.procedure.session.steps import SessionStep
+from calib.robot.library import load_calibrated
 
-SIGMA, TORQUE = 10.0, limit("torque-unexplained", "share", "marginal")  # [%] needs that no session states (our choice)
+NEED = limit("torque-unexplained", "share", "marginal")  # [%] of torques and σ, where none is stated
 MIN_GAIN = 0.02  # of a joint's error: a smaller gain is no reason to record more (our choice)
 
 
@@ -144,16 +145,18 @@ def promised(session: Session) -> tuple[str, ...]:
 
 def _short_of_default(session: Session) -> tuple[str, ...]:
     """Return a line on joints and parameters that fall short of the default needs, and what designs a motion."""
-    joints, weak = _short_joints(session, TORQUE), _weak_parameters(session, SIGMA)
-    names = session.identification.dynamics().chain.joint_names
+    joints, weak = _short_joints(session, NEED), _weak_parameters(session, NEED)
+    names = load_calibrated(session.fit.path).chain.joint_names
     parts = [f"torque of {names[one.joint]} ({one.error:.2g} %)" for one in joints]
-    parts += [f"σ of {listing(weak, 6)}"] if weak else []
+    own = {one.name: one.rsd or 0.0 for one in read_estimate(session.identification.path, _Parameter)}
+    worst = listing((f"{name} ({own[name]:.2g} %)" for name in sorted(weak, key=lambda one: -own[one])), 4)
+    parts += [f"σ of essential parameters {worst}"] if weak else []
     if not parts:
-        return (f"no further motion is needed: σ of essential parameters up to {SIGMA:g} %, torques {TORQUE:g} %",)
-    keys = [f"sigma_percent = {SIGMA:g}"] * bool(weak) + [f"tolerance_percent = {TORQUE:g}"] * bool(joints)
+        return (f"no further motion is needed: torques of joints and σ of essential parameters are within {NEED:g} %",)
+    keys = [f"sigma_percent = {NEED:g}"] * bool(weak) + [f"tolerance_percent = {NEED:g}"] * bool(joints)
     return (
-        f"more than {SIGMA:g} % (torques {TORQUE:g} %): {'; '.join(parts)}. For a motion that improves them write "
-        f"{' and '.join(keys)} under [dynamics] in session.toml, then: {command_line('next', session.folder)}",
+        f"above {NEED:g} %: {'; '.join(parts)}; for a motion that improves them write {' and '.join(keys)} under "
+        f"[dynamics] in session.toml, then: {command_line('next', session.folder)}",
     )
 
 

@@ -8,9 +8,9 @@ ones are those of the bodies and the link side along the simulated motion, filte
 
 q_s and tau_s of the loop simulated without noise (Leboutet et al. 2021, sections 5.1 and 5.2, after Landau 1979;
 Gautier, Janot & Vandanjon 2013), each joint weighed by what is left of it. Gauss and Newton's steps, damped, need
-∂q_s/∂χ and ∂tau_s/∂χ: here the tangents of the simulation itself in one pass (`tangent_kernels`)
-where differences take one simulation per parameter, as they do for parallel robots, of whose simulation nobody wrote
-tangents. Redundant actuators' torques are compared on the platform's coordinates, as least squares takes them. What is left is what noise did in the loop, correlated over time;
+∂q_s/∂χ and ∂tau_s/∂χ: here the tangents of the simulation itself in one pass (`tangent_kernels`) where differences take
+one simulation per parameter, as they do for parallel robots. Torques of redundant actuators are compared on the
+platform's coordinates, as least squares takes them. What is left is what noise did in the loop, correlated over time;
 the covariance H⁻¹ S H⁻¹ knows of it, S the scatter of the scores (`score_covariance`).
 
 What slides call CLIE, (ZᵀZ)⁻¹Zᵀy with Z the simulated observation matrix, is the survey's DIDIM; so it is here.

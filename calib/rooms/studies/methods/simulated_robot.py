@@ -223,9 +223,7 @@ def serial_arm(problem: IdentificationProblem, method: Method) -> Identification
     return model
 
 
-def believed_robot(
-    problem: IdentificationProblem, method: Method, steps: np.ndarray | None = None
-) -> BelievedRobot:
+def believed_robot(problem: IdentificationProblem, method: Method, steps: np.ndarray | None = None) -> BelievedRobot:
     """Return the robot model that simulates an identification problem.
 
     Without motor torques (rows link) nothing in the problem tells how the motors move: inertia, friction and offset of
