@@ -15,14 +15,17 @@ from calib.rooms.closed_loop.loop_recordings import ClosedLoops, close_loops
 from calib.rooms.closed_loop.simulation import Sensing, simulate
 
 
-def closed(shift: int = 0, timing: str = "checked", copied=None, **gains) -> ClosedLoops:
-    """Return the loops of a log whose reference comes `shift` samples of 5 ms late, or is `copied` of the positions."""
+def closed(shift: int = 0, timing: str = "checked", copied=None, noise: float = 0.0, **gains) -> ClosedLoops:
+    """Return the loops of a log whose reference comes `shift` samples of 5 ms late, or is `copied` of the positions.
+
+    `noise`: of the logged positions, which the loop did not feel.
+    """
     plant, model, _ = small_arm.robot()
     run = simulate(plant, small_arm.PD, small_arm.motion(), Sensing(2e-5, sigma_tau=0.05, every=3.5), 1)
     asked = copied(run.measured) if copied else small_arm.motion().at(np.arange(len(run.t)) * 3.5)[0]
-    rows = slice(10, -10)
+    rows, measured = slice(10, -10), run.measured + noise * np.random.default_rng(3).normal(size=run.measured.shape)
     late = Recording(
-        run.t[rows], run.measured[rows], run.tau[rows], "torque", ("joint1", "joint2"),
+        run.t[rows], measured[rows], run.tau[rows], "torque", ("joint1", "joint2"),
         q_ref=np.roll(asked, shift, axis=0)[rows],
     )  # fmt: skip
     case = make_case("log", make_motion(late, FilterOptions(cutoff=40.0, band=20.0, clock="stamps")))
@@ -50,6 +53,7 @@ def test_a_reference_is_moved_to_where_the_torques_say_it_was_played(shift):
 @pytest.mark.parametrize(
     ("how", "says"),
     [({"shift": 2}, "late by 10"), ({"shift": -1}, "early by 4.9"),
+     ({"shift": 12, "noise": 3e-3}, "late by 60 "),
      ({"copied": np.array}, "is the measured positions: "), ({"copied": smoothed}, "is the measured positions: "),
      ({"copied": rounded}, "is the measured positions: "),
      ({"copied": np.array, "shift": 2}, "measured positions, 10 ms later")],

@@ -12,7 +12,7 @@ from calib.errors import CalibError, NotConverged
 from calib.rooms.cells import known_robots
 from calib.rooms.closed_loop import controllers
 from calib.rooms.closed_loop.simulation import Plant, Sensing, simulate
-from calib.rooms.studies.methods.simulated_robot import simulate_tangents
+from calib.rooms.studies.methods.simulated_robot import simulate_differences, simulate_tangents
 
 RATE = 1000.0
 SHAPES = [
@@ -61,6 +61,8 @@ def test_tangents_are_the_derivative_of_the_simulation(name):
     found = simulate_tangents(plant, controller, reference, columns, every=2.5)
     run = simulate(plant, controller, reference, Sensing(every=2.5))
     assert np.array_equal(found.q, run.q) and np.array_equal(found.torque, run.torque)
+    forward = simulate_differences(plant, controller, reference, columns[-2:], np.full(2, 1e-6), every=2.5)
+    assert np.abs(forward.by_q - found.by_q[:, :, -2:]).max() < 1e-3 * np.abs(found.by_q[:, :, -2:]).max()
 
     def at(column: int, step: float):
         x = plant.parameters.copy()

@@ -34,7 +34,7 @@ from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
 from trajectories.constraints import BoxLimit
 
-MANY_POSTURES = 400
+MANY_POSTURES, MAX_UNHELD = 400, 0.5  # postures; share of them that the torque limits need not hold (our choice)
 SMOOTH = 0.05  # [rad/s or m/s] of the Coulomb sign while searching; the figures reported have the model's own
 
 
@@ -189,7 +189,7 @@ def read_inputs(
     if settings.noise is not None and (after is not None or known.noise is not None):
         raise UsageError(f"noise: {after or '[noise] of the limits file'} states the torque errors; leave --noise out")
     dynamics = read_model(chain, model, settings.drives, known, options, settings.loads, nominal)
-    dynamics = replace(dynamics, notes=(*dynamics.notes, *_unheld(dynamics, known)))
+    _check_held(dynamics, known)
     noise = None if known.noise is None or after is not None else known.noise[dynamics.exact.joint_of_row]
     locked = _read_locked(settings.lock, chain, known.positions)
     spreads = [find(robot, source, chain, dynamics, after) for find in offered("geometry_spread")]
@@ -257,25 +257,22 @@ def read_model(
     return excited_model(model, cases, values, bool(known), notes, nominal)
 
 
-def _unheld(model: ExcitedModel, limits: MotionLimits) -> list[str]:
-    """Return a note if gravity is beyond the torque limits in most postures (payload too heavy, wrong masses).
-
-    Raises:
-        UsageError: where it is in all.
-    """
+def _check_held(model: ExcitedModel, limits: MotionLimits) -> None:
+    """Raise an error where gravity is beyond the torque limits in most postures: payload too heavy, or wrong masses."""
     if model.values is None:
-        return []
+        return
     exact, box = model.exact, limits.positions
     low, high = np.maximum(box.lower, -np.pi), np.minimum(box.upper, np.pi)
     q = low + (high - low) * np.random.default_rng(0).random((MANY_POSTURES, len(low)))
-    shares = np.abs(exact.regressor(q, 0.0 * q, 0.0 * q) @ model.values) / exact.of_rows(limits.torque)
-    beyond, row = float(np.mean(shares.max(axis=1) > 1.0)), int(shares.max(axis=0).argmax())
+    torques, held = exact.regressor(q, 0.0 * q, 0.0 * q) @ model.values, exact.of_rows(limits.torque)
+    beyond = float(np.mean((np.abs(torques) > held).any(axis=1)))
+    posture, row = np.unravel_index(np.argmax(np.abs(torques) / held), torques.shape)
     words = (
-        f"gravity is beyond the torque limits in {beyond:.0%} of the postures, up to {shares.max():.2g} times at "
-        f"{exact.row_names[row]}: take a lighter payload, or correct masses or limits"
+        f"gravity is beyond the torque limits in {beyond:.0%} of the postures: at {exact.row_names[row]} "
+        f"{abs(torques[posture, row]):.4g}, limit {held[row]:.4g} N m (or N), in the posture "
+        f"{', '.join(f'{x:.2f}' for x in q[posture])} rad (or m); take a lighter payload, or correct masses or limits"
     )
-    require(beyond < 1.0, words, UsageError)
-    return [words] if beyond > 0.5 else []
+    require(beyond <= MAX_UNHELD, words, UsageError)
 
 
 def _designable(rows: TorqueRows) -> bool:

@@ -194,7 +194,8 @@ class DynamicsSection:
             none
         tolerance_percent: largest accepted torque error of the exported robot on unseen motion [%]; 0: none
         sigma_percent: largest standard deviation of essential parameters that is wanted [%]; 0: none. Where joints are
-            above tolerance_percent, or parameters above this, a further motion is designed (6-excitation/round2)
+            above tolerance_percent, or parameters above this, a further motion is designed (6-excitation/round2);
+            with neither stated, the session's end names what is above 10 %
         payloads: masses [kg] of bodies at the flange by label, as loaded = 3.28
     """
 

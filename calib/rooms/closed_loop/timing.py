@@ -30,7 +30,8 @@ class ReferenceShift:
 
     Attributes:
         seconds: by which the reference comes later than stated; sigma: standard deviation [s].
-        left, before: share of the torque that the controller does not explain, with this shift and without.
+        left, before: share of the torque that the controller does not explain, with this shift and without; of torques
+            along the reference's own motion.
         effect: change of the reference's torque by one sigma, as a share of the torque.
     """
 
@@ -56,7 +57,6 @@ def reference_shift(
         NotConverged: where no shift within `MAX_SHIFT` explains the torques best.
     """
     law = _Law(case, reference, every, controller, band)
-    before = law.left(0.0)
     shift = _by_positions(law.asked, law.measured, law.t[law.rows])
     for _ in range(30):
         residual, slopes = law.linearised(shift)
@@ -72,7 +72,7 @@ def reference_shift(
     sigma = float(np.sqrt(tau / max(information, 1e-300)))
     torque, rise = (law.torque(law.t, order)[law.rows] for order in (0, 1))
     effect = float(sigma * np.sqrt(np.mean(rise.var(axis=0) / np.maximum(torque.var(axis=0), 1e-300))))
-    return ReferenceShift(shift, sigma, law.left(shift), before, effect)
+    return ReferenceShift(shift, sigma, *law.left(shift), effect)
 
 
 class _Law:
@@ -109,10 +109,22 @@ class _Law:
         residual, slopes = ((x[self.rows]) for x in (self.torque(self.t) - law, slopes))
         return residual - residual.mean(axis=0), slopes - slopes.mean(axis=0)
 
-    def left(self, shift: float) -> float:
-        """Return the share of the torques that the law does not explain."""
-        residual, torque = self.linearised(shift)[0], self.torque(self.t[self.rows])
-        return float(np.sqrt(np.mean(residual.var(axis=0) / np.maximum(torque.var(axis=0), 1e-300))))
+    def left(self, shift: float) -> tuple[float, float]:
+        """Return the shares of the torques that the law does not explain, with the shift and without.
+
+        Of torques and residuals counts what goes with the reference, shifted or not, and its derivatives, joint by
+        joint: noise of positions, which goes through the law, hides no delay (our choice).
+        """
+        times = [np.clip(self.t[self.rows] - own, self.t[0], self.t[-1]) for own in (shift, 0.0)]
+        moved = np.array([self.asked(own, order) for own in times for order in range(3)])
+        moved = (moved - moved.mean(axis=1, keepdims=True)) / np.maximum(moved.std(axis=1, keepdims=True), 1e-300)
+        along = np.linalg.qr(moved.transpose(2, 1, 0))[0].transpose(0, 2, 1)
+        torque, *residuals = (
+            np.sum((along @ x.T[:, :, None]) ** 2, axis=(1, 2))
+            for x in (self.torque(self.t[self.rows]), self.linearised(shift)[0], self.linearised(0.0)[0])
+        )
+        late, stated = (float(np.sqrt(np.mean(one / np.maximum(torque, 1e-300)))) for one in residuals)
+        return late, stated
 
 
 def _by_positions(asked: CubicSpline, measured: CubicSpline, t: np.ndarray) -> float:

@@ -1,6 +1,8 @@
 """A further motion, where joints or parameters fall short of what ``session.toml`` asks for.
 
-Asked are ``tolerance_percent``, of the torques on unseen motion, and ``sigma_percent``, of essential parameters. The
+Where the session states no need, its end says which joints' torques and which essential parameters' σ are above `NEED`,
+and how to have a motion designed for them. Else asked are
+``tolerance_percent``, of the torques on unseen motion, and ``sigma_percent``, of essential parameters. The
 motion is designed after the identification, into ``6-excitation/round2`` (``round3`` once round2 was recorded …); a log
 whose name begins like that folder is identified together with all others.
 
@@ -21,10 +23,13 @@ from calib.procedure.excitation import folder as motion_folder
 from calib.procedure.excitation.coefficients import RUN, SAMPLES
 from calib.procedure.excitation.inputs import ExcitationInputs, read_inputs
 from calib.procedure.excitation.settings import ExcitationSettings
+from calib.procedure.findings import limit
 from calib.procedure.session.dynamics_steps import next_round, options_of
 from calib.procedure.session.folder import ROUND, Say, Session, read_state
 from calib.procedure.session.steps import SessionStep
+from calib.robot.library import load_calibrated
 
+NEED = limit("torque-unexplained", "share", "marginal")  # [%] of torques and σ, where none is stated
 MIN_GAIN = 0.02  # of a joint's error: a smaller gain is no reason to record more (our choice)
 
 
@@ -50,7 +55,8 @@ class _Short(NamedTuple):
 def extend(session: Session, say: Say) -> list[str]:
     """Design a further motion where joints or parameters fall short, and return what it will bring as notes."""
     section, place, round_name = session.settings.dynamics, session.identification, next_round(session)
-    short, weak = _short_joints(session), _weak_parameters(session)
+    short = _short_joints(session, section.tolerance_percent)
+    weak = _weak_parameters(session, section.sigma_percent or np.inf)
     if not short and not weak:
         return ["no further motion is needed: joints and parameters are as asked for"]
     payloads = tuple(options_of(session).settings.payloads)
@@ -76,9 +82,9 @@ def extend(session: Session, say: Say) -> list[str]:
     return [*_gains(designed, helped, designed.inputs.columns.aimed_names if weak else ()), *notes]
 
 
-def _short_joints(session: Session) -> list[_Short]:
-    """Return the joints whose motor torque is worse than tolerated, where the torques together are."""
-    report, asked = session.identification.unseen.read(), session.settings.dynamics.tolerance_percent
+def _short_joints(session: Session, asked: float) -> list[_Short]:
+    """Return the joints whose motor torque is worse than tolerated [%], where the torques together are."""
+    report = session.identification.unseen.read()
     worst = max((report.proofs or report.fit).values(), key=lambda one: one.raw.relative_error_percent.total).raw
     if not asked or worst.relative_error_percent.total <= asked:
         return []
@@ -88,9 +94,9 @@ def _short_joints(session: Session) -> list[_Short]:
     return [_Short(j, error, size) for j, (error, size) in rows if error > asked]
 
 
-def _weak_parameters(session: Session) -> tuple[str, ...]:
-    """Return the essential parameters whose relative σ is above the one asked for, and that a design can aim at."""
-    place, asked = session.identification, session.settings.dynamics.sigma_percent or np.inf
+def _weak_parameters(session: Session, asked: float) -> tuple[str, ...]:
+    """Return the essential parameters whose relative σ [%] is above the one asked for, and that a design can aim at."""
+    place = session.identification
     without = {one.name for one in place.dynamics().model.columns if not one.form.slopes}
     rows = read_estimate(place.path, _Parameter)
     return tuple(
@@ -122,7 +128,12 @@ def _gains(designed: design.Designed, joints: list[_Short], parameters: tuple[st
 
 
 def promised(session: Session) -> tuple[str, ...]:
-    """Return what a further motion will bring to a complete session, and how to carry it out; empty without one."""
+    """Return what a further motion will bring to a complete session, and how to carry it out; empty without one.
+
+    Of a session that states no need: what falls short of the default ones.
+    """
+    if session.dynamic and session.settings.dynamics.plan and not session.needs:
+        return _short_of_default(session)
     name, notes = next_round(session), read_state(session).notes(STEP.name)
     folder = session.path(f"6-excitation/{name}")
     if not session.needs or not notes or not folder.exists():
@@ -130,6 +141,23 @@ def promised(session: Session) -> tuple[str, ...]:
     played = folder / (RUN if session.settings.dynamics.repeats > 1 else SAMPLES)
     task = f"play {played}, bring its log as {session.path(f'7-recorded/{name}_log.csv')}; then: "
     return (notes[0], f"if wanted, {task}{command_line('next', session.folder)}")
+
+
+def _short_of_default(session: Session) -> tuple[str, ...]:
+    """Return a line on joints and parameters that fall short of the default needs, and what designs a motion."""
+    joints, weak = _short_joints(session, NEED), _weak_parameters(session, NEED)
+    names = load_calibrated(session.fit.path).chain.joint_names
+    parts = [f"torque of {names[one.joint]} ({one.error:.2g} %)" for one in joints]
+    own = {one.name: one.rsd or 0.0 for one in read_estimate(session.identification.path, _Parameter)}
+    worst = listing((f"{name} ({own[name]:.2g} %)" for name in sorted(weak, key=lambda one: -own[one])), 4)
+    parts += [f"σ of essential parameters {worst}"] if weak else []
+    if not parts:
+        return (f"no further motion is needed: torques of joints and σ of essential parameters are within {NEED:g} %",)
+    keys = [f"sigma_percent = {NEED:g}"] * bool(weak) + [f"tolerance_percent = {NEED:g}"] * bool(joints)
+    return (
+        f"above {NEED:g} %: {'; '.join(parts)}; for a motion that improves them write {' and '.join(keys)} under "
+        f"[dynamics] in session.toml, then: {command_line('next', session.folder)}",
+    )
 
 
 STEP = SessionStep(

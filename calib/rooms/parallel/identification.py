@@ -45,7 +45,7 @@ from calib.rooms.parallel.robots import ParallelMechanism
 from calib.workers.threads import one_blas_thread
 
 OF_ARMS = {"couplings", "terms", "gravity", "payload_values"}  # settings
-SIMULATED = ("iv", "didim", "pc-iv", "pc-didim")  # methods that simulate any robot
+SIMULATED = ("iv", "didim", "pc-iv", "pc-didim", "cloe", "clie")  # methods that simulate any robot
 MAX_SAMPLES = 200  # of a recording, at which redundant encoders are compared
 
 Recorded = str | Path | Recording

@@ -222,7 +222,12 @@ def _parquet(rows: Iterable[TrialRow]) -> bytes:
     ]  # fmt: skip
     sink = pyarrow.BufferOutputStream()
     schema = pyarrow.schema(list(zip(COLUMNS, (one.type for one in arrays))), metadata={"store": _HEAD[0]})
-    parquet.write_table(pyarrow.Table.from_arrays(arrays, schema=schema), sink, compression="zstd")
+    numbers: Any = [name for name, kind in zip(COLUMNS, _TYPES) if kind is float]  # byte by byte: a third smaller
+    others: Any = [name for name in COLUMNS if name not in numbers]
+    parquet.write_table(
+        pyarrow.Table.from_arrays(arrays, schema=schema), sink, compression="zstd", compression_level=19,
+        use_dictionary=others, use_byte_stream_split=numbers,
+    )  # fmt: skip
     return sink.getvalue().to_pybytes()
 
 

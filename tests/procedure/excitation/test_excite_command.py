@@ -504,3 +504,11 @@ def test_a_torque_goal_works_before_friction_is_known():
 def test_models_that_no_motion_can_be_designed_for(options, settings, words):
     with pytest.raises(UsageError, match=re.escape(words)):
         design.excite("lwr4plus", replace(SHORT, **settings), options=parse_options(options).settings)
+
+
+def test_a_payload_that_the_limits_cannot_carry_is_refused():
+    """60 kg on a TX40, rated 2 kg: joint, torque, limit and posture are said; 5 kg are designed for."""
+    heavy, light = (parse_options({"payload": {"tool": {"mass": mass}}}).settings for mass in (60.0, 5.0))
+    with pytest.raises(UsageError, match=r"in 7\d% of the postures: at joint 2 .* limit 131.8 N m .* in the posture"):
+        read_inputs("tx40", ExcitationSettings(), options=heavy)
+    assert read_inputs("tx40", ExcitationSettings(), options=light).model.values is not None

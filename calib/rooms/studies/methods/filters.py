@@ -62,7 +62,7 @@ class _KalmanFilter(Method):
 
     def _estimate(self, problem: IdentificationProblem, plain: MethodEstimate, robot: BelievedRobot) -> MethodEstimate:
         values, sigma = plain.estimate.values, plain.estimate.sigma
-        start = start_of(problem, self, values, _inertia(problem), lambda x: _moves(robot, problem, x))
+        start = start_of(problem, values, _inertia(problem), lambda x: _moves(robot, problem, x))
         start_sigmas = 5.0  # standard deviations of least squares that the parameters are uncertain by at first
         wide = np.maximum(start_sigmas * sigma, np.abs(start - values))
         noise = plain.std / np.sqrt(np.sum(np.square(problem.decimator.taps)))  # of one sample of the torques

@@ -8,8 +8,9 @@ ones are those of the bodies and the link side along the simulated motion, filte
 
 q_s and tau_s of the loop simulated without noise (Leboutet et al. 2021, sections 5.1 and 5.2, after Landau 1979;
 Gautier, Janot & Vandanjon 2013), each joint weighed by what is left of it. Gauss and Newton's steps, damped, need
-∂q_s/∂χ and ∂tau_s/∂χ: here the tangents of the simulation itself in one pass (`tangent_kernels`)
-where differences take one simulation per parameter. What is left is what noise did in the loop, correlated over time;
+∂q_s/∂χ and ∂tau_s/∂χ: here the tangents of the simulation itself in one pass (`tangent_kernels`) where differences take
+one simulation per parameter, as they do for parallel robots. Torques of redundant actuators are compared on the
+platform's coordinates, as least squares takes them. What is left is what noise did in the loop, correlated over time;
 the covariance H⁻¹ S H⁻¹ knows of it, S the scatter of the scores (`score_covariance`).
 
 What slides call CLIE, (ZᵀZ)⁻¹Zᵀy with Z the simulated observation matrix, is the survey's DIDIM; so it is here.
@@ -22,7 +23,7 @@ import scipy.linalg
 
 from calib.data.signals.filtering import decimate
 from calib.dynamics.idim import IdentificationModel
-from calib.dynamics.torque_rows import LINK, TorqueRows
+from calib.dynamics.torque_rows import BODIES, LINK, TorqueRows
 from calib.errors import CalibError, NotConverged, UsageError
 from calib.estimation import nonlinear
 from calib.estimation.linear import LinearFit
@@ -32,16 +33,9 @@ from calib.identification.methods.method import EstimateStatus, IdentificationPr
 from calib.identification.rows import Case, thinned
 from calib.rooms.closed_loop.loop_recordings import ClosedLoops, close_loops, followed, low_passed, simulated_samples
 from calib.rooms.closed_loop.simulated import attempted_in_loop
-from calib.rooms.closed_loop.simulation import Plant, Sensing, simulate
+from calib.rooms.closed_loop.simulation import Plant, Sensing
 from calib.rooms.studies.methods.score_covariance import scatter
-from calib.rooms.studies.methods.simulated_robot import (
-    BelievedRobot,
-    Sensitivities,
-    believed_robot,
-    serial_arm,
-    simulate_tangents,
-    start_of,
-)
+from calib.rooms.studies.methods.simulated_robot import BelievedRobot, Sensitivities, believed_robot, start_of
 
 
 @dataclass(frozen=True)
@@ -64,7 +58,7 @@ class _OutputError(Method):
 
         Torques of sensors alone do not tell how the motors move; positions do.
         """
-        return super().takes(rows) and (rows.with_motors or not self.torques)
+        return super().takes(rows) and (not rows.sensed or rows.with_motors or not self.torques)
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
         """Return the estimate of the problem's parameters; one simulation gives motion and Jacobian.
@@ -77,17 +71,18 @@ class _OutputError(Method):
         plain = WLS.estimate(problem)
         if not plain.found:
             return replace(plain, method=self.name)
-        loops = close_loops(serial_arm(problem, self), problem.cases, problem.decimator, problem.loop, problem.cad)
-        return attempted_in_loop(self.name, problem, loops, lambda: self._estimate(problem, plain, loops))
+        step = 0.01  # of the differences of a robot without tangents, in standard deviations (our choice)
+        robot = believed_robot(problem, self, step * np.asarray(plain.estimate.sigma))
+        loops = close_loops(robot.model, problem.cases, problem.decimator, problem.loop, problem.cad)
+        task = _Comparison(problem, robot, loops, self.torques)
+        return attempted_in_loop(self.name, problem, loops, lambda: self._estimate(problem, plain, task))
 
-    def _estimate(self, problem: IdentificationProblem, plain: MethodEstimate, loops: ClosedLoops) -> MethodEstimate:
-        task = _Comparison(problem, believed_robot(problem, self), loops, self.torques)
+    def _estimate(self, problem: IdentificationProblem, plain: MethodEstimate, task: "_Comparison") -> MethodEstimate:
+        loops = task.loops
         with np.errstate(divide="ignore", invalid="ignore"):
             inertia = loops.controller.kd**2 / (2.0 * loops.controller.kp)
         inertia = np.where(np.isfinite(inertia) & (inertia > 0.0), inertia, 1.0)
-        values = start_of(
-            problem, self, plain.estimate.values, inertia, lambda x: task.simulated(task.whole(x, inertia))
-        )
+        values = start_of(problem, plain.estimate.values, inertia, lambda x: task.simulated(task.whole(x, inertia)))
         values = task.whole(values, inertia)
         first, _ = task.linearised(values)
         std, count = task.spread(first, 0), 1
@@ -145,7 +140,7 @@ class _Comparison:
             if loop.design is not None:
                 controller = controller.scaled(plant.inertia_diagonal(loop.reference.q[::200]) / loop.design)
             self.count[0] += 1
-            simulate(plant, controller, loop.reference, Sensing(every=loop.every))
+            plant.run(controller, loop.reference, Sensing(every=loop.every))
 
     def linearised(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return residuals (M, r), zero at samples not compared, and the Jacobian (M, r, p) of simulated signals."""
@@ -157,21 +152,24 @@ class _Comparison:
                 controller = controller.scaled(diagonal / loop.design)
                 relative = self._inertia_slopes(loop.reference.q[::200]) / diagonal[:, None]
             self.count[0] += 1
-            run = simulate_tangents(plant, controller, loop.reference, self.robot.columns, loop.every, relative)
+            run = self.robot.sensitivities(values, case, controller, loop.reference, loop.every, relative)
             index, motion = simulated_samples(case, run.t, loop), case.motion
             parts = [self._sensed(plant, case, run, index)] if self.rows.sensed else []
             if not self.torques:
                 moved, slope = (low_passed(x, motion)[index] for x in (run.q, run.by_q))
                 parts.append((motion.q - moved, slope))
+            elif self.rows.projection is not None:
+                torques = np.dstack([run.torque, run.by_torque])[index]
+                seen = self.rows.observe(torques, [BODIES] * torques.shape[2], motion.q, motion.v)
+                parts.append((case.target - seen[:, :, 0], seen[:, :, 1:]))
             elif self.rows.with_motors:
                 parts.append((case.target[:, -motion.n :] - run.torque[index], run.by_torque[index]))
             rest, slope = (np.concatenate(one, axis=1) for one in zip(*parts))
-            there = self.robot.carried(case)[self.robot.columns]
-            known = np.tile(case.present[:, : motion.n], len(parts))
+            known = case.present[:, np.arange(rest.shape[1]) % min(motion.n, case.present.shape[1])]
             used = thinned(known, motion.segment, self.problem.decimator)
             rest, slope = (decimate(x, self.problem.decimator, motion.segment) for x in (rest, slope))
             residuals.append(np.where(used, rest, 0.0))
-            slopes.append(np.where(used[:, :, None], slope * there, 0.0))
+            slopes.append(np.where(used[:, :, None], slope, 0.0))
         return np.concatenate(residuals), np.concatenate(slopes)
 
     def _sensed(self, plant: Plant, case: Case, run: Sensitivities, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -5,6 +5,7 @@ Closed loops with their slopes by parameters: a whole run at once, or states adv
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +18,18 @@ from calib.identification.methods.method import IdentificationProblem, Method
 from calib.identification.rows import Case
 from calib.records import frozen, shaped
 from calib.rooms.closed_loop.controllers import Reference
-from calib.rooms.closed_loop.simulation import LOWER, Packed, Plant, body_rows, failure, layout_of, packed, sample_ticks
+from calib.rooms.closed_loop.simulation import (
+    LOWER,
+    Packed,
+    Plant,
+    Sensing,
+    body_rows,
+    failure,
+    layout_of,
+    packed,
+    plant_of,
+    sample_ticks,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +96,27 @@ def simulate_tangents(
     return Sensitivities(t, *(frozen(x) for x in out), *(frozen(x) for x in slopes))
 
 
+def simulate_differences(
+    plant: Any, controller: Controller, reference: Reference, columns: np.ndarray, steps: np.ndarray, every: float = 1
+) -> Sensitivities:
+    """Return what `simulate_tangents` does of a robot without tangents, by one more simulation per parameter.
+
+    Args:
+        plant: of a model's `plant`, with the payloads on board.
+        steps: (c,) of the forward differences: so small that the motion is linear, see `BelievedRobot.steps`.
+    """
+
+    def moved(parameters: np.ndarray) -> np.ndarray:
+        run = plant.with_parameters(parameters).run(controller, reference, Sensing(every=every))
+        return np.array([run.q, run.v, run.torque])
+
+    values = np.array(plant.parameters)
+    here, shifts = moved(values), np.eye(len(values))[columns] * steps[:, None]
+    slopes = np.stack([(moved(values + shift) - here) / step for shift, step in zip(shifts, steps)], axis=-1)
+    tick = sample_ticks(len(reference.t), every)
+    return Sensitivities(reference.t[0] + tick * reference.period, *map(frozen, (*here, *slopes)))
+
+
 @dataclass(frozen=True, eq=False)
 class Stepper:
     """Simulated robot prepared for single time steps with varying parameters and states."""
@@ -148,24 +181,33 @@ class BelievedRobot:
         model: with richer friction, where the problem has any.
         columns: (p,) place of each of the problem's parameters among the plant's; without motor torques, those of the
             motors follow.
-        plant: with all parameters zero.
+        plant: with all parameters zero; of another model than a serial arm's, what its `plant` returns.
+        steps: (p,) of differences for a robot without tangents, 0.01 σ of least squares; None for a serial arm.
     """
 
-    model: IdentificationModel
+    model: Any
     columns: np.ndarray
-    plant: Plant
+    plant: Any
+    steps: np.ndarray | None = None
 
-    def at(self, values: np.ndarray, case: Case | None = None) -> Plant:
+    def at(self, values: np.ndarray, case: Case | None = None) -> Any:
         """Return the robot with parameters (p,) and the payloads of a case."""
         parameters = np.zeros(len(self.plant.parameters))
         parameters[self.columns] = values
-        return replace(self.plant, parameters=parameters * self.carried(case))
+        plant = self.plant.with_parameters(parameters)
+        return plant if case is None else plant.carrying(case.carried)
 
-    def carried(self, case: Case | None) -> np.ndarray:
-        """Return a factor per robot parameter: 0 for payloads that are not attached in a case, otherwise 1."""
-        if case is None:
-            return np.ones(len(self.plant.parameters))
-        return np.append(self.model.carried_columns(case.carried), np.ones(len(self.plant.terms)))
+    def sensitivities(
+        self, values: np.ndarray, case: Case, controller: Controller, reference: Reference, every: float,
+        relative: np.ndarray | None = None,
+    ) -> Sensitivities:  # fmt: skip
+        """Return the simulated motion with parameters (p,) and its slopes by them; none by payloads not attached."""
+        plant = self.at(values, case)
+        if self.steps is not None:
+            return simulate_differences(plant, controller, reference, self.columns, self.steps, every)
+        found = simulate_tangents(plant, controller, reference, self.columns, every, relative)
+        there = np.append(self.model.carried_columns(case.carried), np.ones(len(plant.terms)))[self.columns]
+        return replace(found, **{name: vars(found)[name] * there for name in ("by_q", "by_v", "by_torque")})
 
 
 def serial_arm(problem: IdentificationProblem, method: Method) -> IdentificationModel:
@@ -181,16 +223,22 @@ def serial_arm(problem: IdentificationProblem, method: Method) -> Identification
     return model
 
 
-def believed_robot(problem: IdentificationProblem, method: Method) -> BelievedRobot:
+def believed_robot(problem: IdentificationProblem, method: Method, steps: np.ndarray | None = None) -> BelievedRobot:
     """Return the robot model that simulates an identification problem.
 
     Without motor torques (rows link) nothing in the problem tells how the motors move: inertia, friction and offset of
     each are parameters more, the last ones (our choice).
 
+    Args:
+        steps: of a model that is no serial arm, of the differences; None: such a model is refused.
+
     Raises:
-        UsageError: for a model that is no serial arm with torque rows that the method takes.
+        UsageError: for a model that cannot be simulated, or torque rows that the method does not take.
         CannotSimulate: for friction that the simulator does not know, or an exact sign.
     """
+    if steps is not None and not isinstance(problem.model, IdentificationModel):
+        columns = np.array(problem.base.kept)
+        return BelievedRobot(problem.model, columns, plant_of(problem.model, np.zeros(problem.model.p)), steps)
     model, columns = with_friction(problem, serial_arm(problem, method))
     terms, size = model.columns, model.p
     if not model.torque_rows.with_motors:
@@ -212,33 +260,29 @@ def with_friction(problem: IdentificationProblem, model: IdentificationModel) ->
 
 
 def start_of(
-    problem: IdentificationProblem,
-    method: Method,
-    plain: np.ndarray,
-    inertia: np.ndarray,
-    simulated: Callable[[np.ndarray], object],
+    problem: IdentificationProblem, plain: np.ndarray, inertia: np.ndarray, simulated: Callable[[np.ndarray], object]
 ) -> np.ndarray:
     """Return initial parameters (p,): the given ones, or those nearest to least squares that can be simulated.
 
     Args:
-        method: the one that simulates.
         plain: (p,) of weighted least squares.
         inertia: (n,) of a regular robot, which nothing couples [kg m² or kg].
         simulated: raises `CalibError` where values cannot be simulated.
 
     Raises:
         CannotSimulate: where none can be.
-        UsageError: for a model that is no serial arm with torque rows that the method takes.
     """
     if problem.start is not None:
         return np.array(problem.start, dtype=float)
-    model, own = serial_arm(problem, method), problem.base.b
-    standard = np.zeros(model.p)
-    for k, one in enumerate(model.columns):
-        if one.shape == "acceleration" and one.joint is not None:
-            standard[model.inertial + k] = inertia[one.joint]
+    model: Any = problem.model
+    own, standard = problem.base.b, np.zeros(model.p)
+    serial = isinstance(model, IdentificationModel)
+    motors = {one.joint: k for k, one in enumerate(model.columns, model.inertial) if one.shape == "acceleration"}
+    for joint, own_inertia in zip(range(model.n) if serial else model.known.robot.actuated, inertia):
+        if joint in motors:
+            standard[motors[joint]] = own_inertia
     regular = np.append(problem.base.transform @ standard, np.zeros(len(plain) - own))
-    if not np.any(standard):
+    if serial and not np.any(standard):
         regular = np.append(problem.base.transform @ _hubs(model, inertia), np.zeros(len(plain) - own))
     failure: CalibError | None = None
     for share in SHARES:
