@@ -126,7 +126,7 @@ def reduced(pieces: Callable[[], Iterable[Rows]]) -> Reduced:
     factor, failed = dpotrf(total.square / np.outer(scale, scale), clean=True)
     if failed or dtrcon(factor)[0] * MAX_CONDITION < 1.0:
         return _by_qr(pieces())
-    target = scipy.linalg.solve_triangular(factor, total.cross / scale, trans="T")
+    target = scipy.linalg.solve_triangular(factor.T, total.cross / scale, lower=True)
     return Reduced(factor * scale, target, total.total, total.rows)
 
 

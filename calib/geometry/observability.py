@@ -124,7 +124,7 @@ def observation_matrix(cell: Installation, blocks: Sequence[Block], columns: np.
 
     The reach (rms distance of targets from the arm's base) makes orientation rows comparable with position rows.
     """
-    rows = []
+    rows = list[np.ndarray]()
     for block in blocks:
         scales = []
         for part in observe(cell, block, columns[:0]):

@@ -26,7 +26,7 @@ between series. Both measurements are noisy, and the base's orientation noise ac
 Rows that belong together: sockets, planes, pairs and bars.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -214,7 +214,8 @@ def read_measurements(
     header = () if options.format or table is not None else read_header(path)[0]
     form = options.format or next((name for name, (known, _) in forms.items() if known(header)), "csv")
     if form in forms:
-        table, options, notes = forms[form][1](path, len(robot.names), options)
+        reader: Callable[..., tuple[Table, FileOptions, tuple[str, ...]]] = forms[form][1]
+        table, options, notes = reader(path, len(robot.names), options)
     table = table or read_table(path)
     if table.notes:  # names that were understood need no map
         maps = {ours: theirs for ours, theirs in options.columns.items() if theirs in table or ours not in table}

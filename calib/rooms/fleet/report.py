@@ -23,6 +23,7 @@ from calib.rooms.fleet import prior
 from calib.rooms.fleet.prior import ParameterSpread
 from calib.rooms.fleet.tools import ToolUse, tools
 from calib.rooms.over_time.comparison.calibrations import Calibration, read_fit
+from calib.rooms.over_time.comparison.geometry_change import ToolMotion
 from calib.rooms.over_time.comparison.places import check_same_robot, place_of
 from calib.rooms.over_time.comparison.robot_change import RobotChange, diff
 from calib.rooms.over_time.sessions import folders_of
@@ -78,8 +79,8 @@ class FleetReport(Judged):
             Column("arm", "{0[0]}", number=False),
             Column("from", lambda one: Path(one[1].parts[0].before.name).name, False),
             Column("to", lambda one: Path(one[1].parts[0].after.name).name, False),
-            Column("tool moved, mm rms", lambda one: f"{1e3 * one[1].geometry.motions[0].rms:.3g}"),
-            Column("σ of that", lambda one: f"{1e3 * one[1].geometry.motions[0].expected:.2g}"),
+            Column("tool moved, mm rms", lambda one: f"{1e3 * _moved(one[1]).rms:.3g}"),
+            Column("σ of that", lambda one: f"{1e3 * _moved(one[1]).expected:.2g}"),
             Column("p", lambda one: f"{one[1].geometry.probability:.1g}"),
             Column("", "{0[1].verdict.level}", number=False),
         ]  # fmt: skip
@@ -212,9 +213,14 @@ def _farthest(one: Calibration) -> tuple[str, float]:
     return nominal.names[k], float(sizes[k])
 
 
+def _moved(change: RobotChange) -> ToolMotion:
+    assert change.geometry is not None
+    return change.geometry.motions[0]
+
+
 def _findings(types: Sequence[ArmType], changes: Sequence[tuple[str, RobotChange]]) -> list[Finding]:
     found = [
-        finding("arm-drifts", arm=arm, moved=one.geometry.motions[0].rms, reason=one.verdict.reason)
+        finding("arm-drifts", arm=arm, moved=_moved(one).rms, reason=one.verdict.reason)
         for arm, one in changes if one.verdict.level in ("marginal", "fail")
     ]  # fmt: skip
     for one in types:

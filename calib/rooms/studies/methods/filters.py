@@ -148,7 +148,7 @@ def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
         return before
     columns, p = before.robot.columns, len(before.mean)
     made = stepper(before.robot.at(before.mean, case), columns)
-    there = before.robot.carried(case)[columns]
+    there = before.robot.carried(case)
     seen = np.maximum(motion.cutoffs.noise / np.sqrt(thin), 1e-9 * np.ptp(motion.q, axis=0).max())
     period = thin / motion.rate
     torque = noise * np.sqrt(1.0 / thin)

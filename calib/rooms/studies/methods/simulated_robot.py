@@ -206,8 +206,12 @@ class BelievedRobot:
         if self.steps is not None:
             return simulate_differences(plant, controller, reference, self.columns, self.steps, every)
         found = simulate_tangents(plant, controller, reference, self.columns, every, relative)
-        there = np.append(self.model.carried_columns(case.carried), np.ones(len(plant.terms)))[self.columns]
+        there = self.carried(case)
         return replace(found, **{name: vars(found)[name] * there for name in ("by_q", "by_v", "by_torque")})
+
+    def carried(self, case: Case) -> np.ndarray:
+        """Return a factor (p,) per parameter of a serial arm: 0 for payloads not attached in a case, otherwise 1."""
+        return np.append(self.model.carried_columns(case.carried), np.ones(len(self.plant.terms)))[self.columns]
 
 
 def serial_arm(problem: IdentificationProblem, method: Method) -> IdentificationModel:
