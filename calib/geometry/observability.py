@@ -141,7 +141,7 @@ def observation_matrix(cell: Installation, blocks: Sequence[Block], columns: np.
         for _, matrix in whitened(cell, block, columns, scales):
             rows.append(matrix)
             if sum(map(len, rows)) > MOST_ROWS:
-                rows = [np.linalg.qr(np.concatenate(rows), mode="r")]
+                rows = [np.asarray(np.linalg.qr(np.concatenate(rows), mode="r"))]
     return np.concatenate(rows)
 
 
