@@ -19,7 +19,7 @@ from calib import files
 from calib.errors import CalibError, RobotError, UsageError, refuse_robot, refused_as, require
 from calib.records import plain_text, read_rows
 
-METRICS, SESSION = "metrics.json", "session.toml"
+METRICS, SESSION, STATE = "metrics.json", "session.toml", "state.json"
 """Files that identify results and sessions; the metrics are written last and mark a folder as complete."""
 REPORT, CERTIFICATE = "report.json", "certificate.html"
 """The certificate, and the data for it and its figures."""

@@ -95,6 +95,6 @@ def test_the_command_writes_page_table_and_figure(cell, tmp_path, capsys):
     path = measured(cell, tmp_path, MOVES)
     assert cli.run(["drift", "ur5", str(path), "--sigma", "0.06", "--out", str(tmp_path / "out")]) == 0
     assert "the target drifts with time by" in capsys.readouterr().out
-    assert {"report.html", "drift.csv", "metrics.json", "plot_drift.png"} == {
+    assert {"report.html", "trends.csv", "metrics.json", "plot_drift.png"} == {
         each.name for each in (tmp_path / "out").iterdir()
     }

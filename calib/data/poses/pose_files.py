@@ -16,7 +16,7 @@ sockets, plane      ``socket`` (grouped together with ``tool_position``), ``plan
 tool                ``tool``: label of the reflector that a row saw
 ==================  ===================================================================================================
 
-All other columns are ignored and listed. Other forms: calib formats robodk.
+All other columns are ignored and listed. Files of RoboDK: `calib formats robodk`.
 
 A frame on the robot's base measured beside the target: what is relative to it does not care for the instrument.
 

@@ -43,7 +43,7 @@ from calib.config import parse
 from calib.config_types import Text
 from calib.data.poses import CORNERS, is_image_folder
 from calib.errors import SessionError, command_line, refused_as
-from calib.folders import CERTIFICATE, METRICS, PARAMETERS, write_staged
+from calib.folders import CERTIFICATE, METRICS, PARAMETERS, STATE, write_staged
 from calib.folders import SESSION as SETTINGS
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.findings import Verdict, Verdicts
@@ -186,7 +186,7 @@ class Session:
 
     def write_state(self, state: StateFile) -> None:
         """Write `state` to ``state.json``, completely or not at all."""
-        files.write_json(self.path("state.json"), {"schema": SCHEMA, **plain(state)})
+        files.write_json(self.path(STATE), {"schema": SCHEMA, **plain(state)})
 
     def verdicts(self) -> Verdicts:
         """Return the verdict of each stage; without an export, the dynamics are for prediction only."""
@@ -274,7 +274,7 @@ def read_state(session: Session) -> StateFile:
     Raises:
         SessionError: for a damaged file or one by a newer version, with what to do.
     """
-    path = session.path("state.json")
+    path = session.path(STATE)
     if not path.exists():
         return StateFile()
     damaged = f"{path} is damaged ({{}}); delete it, and `calib next` repeats the steps"

@@ -197,7 +197,7 @@ def _shift(part: Case, loop: LoopSettings, fed_forward: Callable[..., Controller
             f"{part.name}: {where}the reference was moved {shown} {way}; the controller explains "
             f"{100 * (1 - found.left):.3g} % of the torques, one σ of time changes them by {100 * found.effect:.2g} %",
         )
-    min_shift, min_gain, max_left = 1.5e-3, 2.0, 1.0  # [s], and shares of the torques (our choice)
+    min_shift, min_gain, max_left = 1.5e-3, 2.0, 0.5  # [s], and shares of the torques (our choice)
     late = abs(found.seconds) > max(5.0 * found.sigma, min_shift)
     if late and found.left < max_left and found.before > min_gain * found.left:
         refuse_data(

@@ -267,7 +267,7 @@ def _metrics(test: LoopTest, beside: bool) -> LoopMetrics:
     found, loops = test.found, test.loops
     notes = () if loops is None else loops.notes
     if found is None or loops is None:
-        return LoopMetrics(test.failure, notes)
+        return LoopMetrics(test.failure, notes, valid=False, explains=False)
     identified, strength, apart = loops.identified, found.strength, found.apart
     if apart.any():
         notes += (

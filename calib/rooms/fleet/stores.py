@@ -22,10 +22,10 @@ from threading import Event, Thread
 from typing import Any
 
 from calib.errors import CalibError, UsageError, refused_as, require
-from calib.folders import SESSION
+from calib.folders import SESSION, STATE
 
 CLAIM = "calib.claim"
-LAST = ("state.json", "rows.csv")  # of a session, of a study
+LAST = (STATE, "rows.csv")  # of a session, of a study
 PASSING = (".part", ".lock")  # suffixes of files that stay where they are
 LEASE = 20.0  # [s] that a claim may go unchanged (our choice)
 

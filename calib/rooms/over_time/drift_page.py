@@ -24,7 +24,7 @@ from calib.rooms.over_time.settings import DEFAULT_DRIFT, DriftSettings
 if TYPE_CHECKING:
     from calib.procedure.report.charts import Chart
 
-TABLE = "drift.csv"
+TABLE = "trends.csv"
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ class DriftFound(Drawn, Judged):
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write a folder: report.html, drift.csv, metrics.json, and the figure as PNG."""
+        """Write a folder: report.html, trends.csv, metrics.json, and the figure as PNG."""
         header = ("column", "unit", "x", "dx [mm]", "dy [mm]", "dz [mm]")
         rows = [(one.what, one.unit, x, *(1e3 * moved)) for one in self.trends for x, moved in zip(one.x, one.moved)]
         part = pages.Part(
