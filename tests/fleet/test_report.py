@@ -12,6 +12,7 @@ from calib.data.poses.measurements import Positions
 from calib.robot.chain import random_joints
 from calib.robot.kinematics import forward
 from calib.rooms.fleet import report
+from calib.rooms.over_time.comparison.places import Place
 
 pytestmark = pytest.mark.slow
 NOMINAL = calib.load("ur5").chain
@@ -45,14 +46,14 @@ def test_the_command_writes_report_and_prior(fits: Path, tmp_path: Path, capsys)
 
 def test_an_arm_that_drifted_is_named(fits: Path, monkeypatch) -> None:
     """Two calibrations with one serial number are of one arm, and count once in the distribution."""
-    read = report.read
+    read = report.read_fit
 
-    def with_serial(name: Path, path: Path):
-        found = read(name, path)
-        object.__setattr__(found, "serial", {"one": "R7", "two": "R7"}.get(path.name, ""))
+    def with_serial(place: Place):
+        found = read(place)
+        object.__setattr__(found, "serial", {"one": "R7", "two": "R7"}.get(Path(place.name).name, ""))
         return found
 
-    monkeypatch.setattr(report, "read", with_serial)
+    monkeypatch.setattr(report, "read_fit", with_serial)
     found = report.report_fleet([fits / "one", fits / "two", fits / "three"])
     ((arm, change),) = found.changes
     assert arm == "R7" and change.verdict.level == "marginal" and "R7 drifts" in found.verdict.reason

@@ -118,5 +118,5 @@ def test_joint_corrections_are_compared_apart(fits):
     )
     found = calib.diff(fits / "first", fits / "corrected")
     (note,) = (each for each in found.noticed if each.code == "corrections-not-compared")
-    assert note.values["names"] == (str(fits / "corrected"),) and found.after.cell.deflection.terms
+    assert note.values["names"] == (str(fits / "corrected"),) and found.parts[0].after.cell.deflection.terms
     assert note.values["moved"] > 2.0 * found.geometry.motions[0].rms

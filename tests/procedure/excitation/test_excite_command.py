@@ -341,7 +341,7 @@ def test_bad_input_is_refused_with_exit_code_2(cell, calib, extra, options, word
 @pytest.mark.parametrize(
     ("extra", "changed", "words"),
     [
-        ("[torque]\nall = 5.0", {"lock": ("joint2=1.57",)}, r"breaks the torque limit .*that of \[torque\]"),
+        ("[torque]\nall = 34.0", {"lock": ("joint2=1.57",)}, r"breaks the torque limit .*that of \[torque\]"),
         ("", {"hard": ("wrist=0.9",)}, "hard goal wrist=0.9 was not reached"),
     ],
 )
