@@ -4,9 +4,11 @@ import os
 import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
+import urllib.request
 from collections.abc import Iterator
 from html import unescape
 from pathlib import Path
@@ -193,3 +195,35 @@ def test_in_a_browser_nothing_is_lost(session: Session, browser: Any) -> None:
     finally:
         served.process.send_signal(signal.SIGINT)
         served.process.wait(20)
+
+
+def test_the_view_is_of_this_computer_only(session: Session, client: TestClient) -> None:
+    """Rerun's viewer and its data listen here alone; another computer is told so, and a session without a recording."""
+    rerun = pytest.importorskip("rerun")
+    assert client.get("/view").status_code == 404
+    with rerun.RecordingStream("calib") as stream:
+        stream.save(str(session.path("session.rrd")))
+        stream.log("point", rerun.Points3D([[0.0, 0.0, 0.0]]))
+    assert client.get("/view").status_code == 403  # of a client named otherwise
+    app = client.app
+    with TestClient(app, base_url="http://127.0.0.1:8000", client=("127.0.0.1", 50000)) as here:
+        places = [here.get("/view", follow_redirects=False).headers["location"] for _ in range(2)]
+    try:
+        assert places[0] == places[1] and places[0].startswith("http://127.0.0.1:")
+        with urllib.request.urlopen(places[0], timeout=10) as answer:
+            assert answer.status == 200 and b"rerun" in answer.read().lower()
+        port = int(places[0].split(":")[2].split("/")[0])
+        with pytest.raises(OSError), socket.create_connection((other_address(), port), 2.0):
+            pass
+    finally:
+        app.state.view.close()
+    with pytest.raises(OSError):
+        for _ in range(50):  # the killed viewer takes a moment to go
+            socket.create_connection(("127.0.0.1", port), 2.0).close()
+            time.sleep(0.1)
+
+
+def other_address() -> str:
+    """Return an address of this computer by which others reach it, or else one of the loopback's others."""
+    found = {str(each[4][0]) for each in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)}
+    return next((each for each in found if not each.startswith("127.")), "127.0.0.2")

@@ -1,5 +1,6 @@
 """The pages of a served session, and who may ask for them."""
 
+import atexit
 import hmac
 import ipaddress
 import re
@@ -20,6 +21,8 @@ from calib.procedure.report.templates import filled
 from calib.procedure.session import commands, steps
 from calib.procedure.session.folder import BROUGHT, Session, open_session
 from calib.rooms.serve import uploads
+from calib.rooms.serve.view import HERE as HERE_ONLY
+from calib.rooms.serve.view import View
 from calib.rooms.serve.work import CHECK, NEXT, REDO, Work
 from calib.rooms.viewer.viewer import FILE as RECORDING
 
@@ -89,13 +92,15 @@ def application(work: Work, token: str = "", host: str = "127.0.0.1") -> Starlet
     steps.clear_staging(open_session(work.folder))
     routes = [
         Route("/", page), Route("/page.js", script), Route("/files/{name:path}", file),
+        Route("/view", view),
         Route("/next", go_on, methods=["POST"]), Route("/redo/{step}", go_on, methods=["POST"]),
         Route("/bring/{kind}", bring, methods=["POST"]), Route("/aside/{name:path}", set_aside, methods=["POST"]),
     ]  # fmt: skip
     guard = Middleware(Guard, token=token, host=host)  # type: ignore[arg-type]
     errors = {CalibError: refused, OSError: refused}
     made = Starlette(routes=routes, middleware=[guard], exception_handlers=errors)  # type: ignore[arg-type]
-    made.state.work = work
+    made.state.work, made.state.view = work, View()
+    atexit.register(made.state.view.close)
     return made
 
 
@@ -163,6 +168,16 @@ def file(request: Request) -> Response:
         return PlainTextResponse("no such file in this session", 404)
     policy = {} if path.suffix == ".pdf" else {"Content-Security-Policy": SANDBOX}  # viewers of PDF are scripts
     return FileResponse(path, headers={**policy, "X-Content-Type-Options": "nosniff", "Cache-Control": "no-cache"})
+
+
+def view(request: Request) -> Response:
+    """Lead to the 3-D view of the session's recording; at this computer only, where Rerun's server listens."""
+    recording = open_session(request.app.state.work.folder).path(RECORDING)
+    if not recording.exists():
+        return PlainTextResponse("no recording yet", 404)
+    if request.client is None or request.client.host not in (HERE_ONLY, "::1"):
+        return PlainTextResponse(f"The 3-D view is for the computer that serves; download {RECORDING} here.", 403)
+    return RedirectResponse(request.app.state.view.address_of(recording), 303)
 
 
 def go_on(request: Request) -> Response:

@@ -1,0 +1,65 @@
+"""The 3-D view of a session's recording: Rerun's web viewer, which this computer's browsers alone reach."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from urllib.parse import quote
+
+from calib.errors import CalibError, require
+
+HERE = "127.0.0.1"
+START = 20.0  # [s] that the viewer may take to answer (our choice)
+
+
+class View:
+    """A viewer's process, begun at the first question and anew for a new recording."""
+
+    def __init__(self) -> None:
+        self.process: subprocess.Popen[bytes] | None = None
+        self.shown, self.address = (Path(), 0), ""
+
+    def address_of(self, recording: Path) -> str:
+        """Return the address at which the viewer shows a recording.
+
+        Raises:
+            CalibError: where Rerun does not start.
+        """
+        now = recording, recording.stat().st_mtime_ns
+        if self.process is None or self.process.poll() is not None or self.shown != now:
+            self.close()
+            pages, data = _free_ports(2)
+            ports = ["--bind", HERE, "--web-viewer-port", str(pages), "--port", str(data)]
+            command = [sys.executable, "-m", "rerun", "--serve-web", *ports, str(recording)]
+            quiet = subprocess.DEVNULL
+            self.process = subprocess.Popen(command, stdout=quiet, stderr=quiet, start_new_session=True)
+            require(_answers(pages), f"Rerun's viewer does not start; try: calib view {recording.parent}", CalibError)
+            source = quote(f"rerun+http://{HERE}:{data}/proxy", safe="")
+            self.shown, self.address = now, f"http://{HERE}:{pages}/?url={source}"
+        return self.address
+
+    def close(self) -> None:
+        """End the viewer."""
+        if self.process is not None:
+            with suppress(ProcessLookupError):
+                os.killpg(self.process.pid, signal.SIGKILL)  # Rerun's command starts its viewer as a process of its own
+            self.process.wait()
+
+
+def _free_ports(count: int) -> list[int]:
+    with ExitStack() as stack:
+        found = [stack.enter_context(socket.create_server((HERE, 0))) for _ in range(count)]
+        return [one.getsockname()[1] for one in found]
+
+
+def _answers(port: int) -> bool:
+    end = time.monotonic() + START
+    while time.monotonic() < end:
+        with suppress(OSError), socket.create_connection((HERE, port), 1.0):
+            return True
+        time.sleep(0.1)
+    return False
