@@ -123,7 +123,7 @@ def evaluate(deflection: Deflection, q: np.ndarray, torque: np.ndarray | None = 
         elif term.basis == "joint":
             result[e] = q[:, term.source]
         elif term.basis in ("cos", "sin"):
-            turned = powers[term.source][term.order - 1]  # exp(i k q), a tenth of the time of cosines
+            turned = powers[term.source][term.order - 1]  # exp(i k q): a quarter of the time of cosines
             result[e] = turned.real if term.basis == "cos" else turned.imag
     if where := [e for e, term in enumerate(deflection.terms) if term.basis == "lever"]:
         if (chain := deflection.reference) is None:

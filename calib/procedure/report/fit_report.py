@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -194,32 +195,27 @@ def rows_of(name: str, comparison: Comparison, unseen: bool) -> RowErrors:
 
     Of more than `SHOWN` such rows a random sample, and the worst.
     """
-    q, sizes = np.concatenate([block.q for block in comparison.blocks]), comparison.errors[1].main
-    if len(sizes) != len(q):
-        return _row_errors(name, comparison, unseen, slice(None))
-    points = _points(comparison)
-    if len(q) <= SHOWN:
-        return _row_errors(name, comparison, unseen, slice(None), q, points)
-    chosen = np.sort(np.random.default_rng(0).choice(len(q), SHOWN, replace=False))
-    worst = _row_errors(name, comparison, unseen, np.array([np.argmax(sizes)]), q, points)
-    return replace(_row_errors(name, comparison, unseen, chosen, q, points), worst=worst)
+    sizes = comparison.errors[1].main
+    points = _points(comparison) if len(sizes) == sum(map(len, comparison.blocks)) else None
+    chosen = partial(_row_errors, name, comparison, unseen, points)
+    if points is None or len(sizes) <= SHOWN:
+        return chosen(slice(None))
+    some = np.sort(np.random.default_rng(0).choice(len(sizes), SHOWN, replace=False))
+    return replace(chosen(some), worst=chosen(np.array([np.argmax(sizes)])))
 
 
 def _row_errors(
-    name: str,
-    comparison: Comparison,
-    unseen: bool,
-    chosen: slice | np.ndarray,
-    q: np.ndarray | None = None,
-    points: np.ndarray | None = None,
+    name: str, comparison: Comparison, unseen: bool, points: np.ndarray | None, chosen: slice | np.ndarray
 ) -> RowErrors:
+    """Return the errors of the chosen rows; with joints and `points` (rows, 3) where each row has one error."""
     nominal, calibrated, alone = (
         {nature: _plain(size[chosen]) for nature in NATURES if (size := getattr(found, nature, None)) is not None}
         for found in (*comparison.errors, comparison.alone)
     )
     rows = RowErrors(name, unseen, comparison.poses, nominal, calibrated, urdf_alone=alone)
-    if q is None or points is None:
+    if points is None:
         return rows
+    q = np.concatenate([block.q for block in comparison.blocks])
     expected = () if comparison.intervals is None else _plain(comparison.intervals.radius[chosen])
     numbers = np.concatenate([block.rows for block in comparison.blocks])[chosen]
     return replace(

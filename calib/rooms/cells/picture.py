@@ -11,8 +11,8 @@ from calib.procedure.report.geometry_figures import error_histogram
 from calib.procedure.report.style import AFTER, BEFORE, BROWN, INK, QUIET
 from calib.procedure.session.folder import Session
 from calib.procedure.session.geometry_steps import chain_of
+from calib.procedure.session.results import position_errors, torque_error
 from calib.rooms.cells.summary import PICTURE
-from calib.rooms.over_time.sessions import position_errors, torque_error
 from calib.rooms.viewer import scene
 
 AZIMUTH, ELEVATION = np.deg2rad([-60.0, 20.0])  # from where the cell is seen
@@ -48,7 +48,7 @@ def _errors(session: Session) -> Panel:
     """Return the histogram of the errors of nominal robot and robot.urdf on unseen poses."""
     (rows,) = (one for one in fit_report.read(session.validation.report).sets if one.unseen)
     one, two = (np.array(sizes["position"]) for sizes in (rows.nominal, rows.urdf_alone or rows.calibrated))
-    before, after = position_errors(session) or (0.0, 0.0)
+    before, after = position_errors(session) or (np.nan, np.nan)
     return replace(error_histogram(one, two).panels[0], title=f"unseen poses: {before:.2f} → {after:.2f} mm")
 
 

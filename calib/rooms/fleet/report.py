@@ -18,6 +18,7 @@ from calib.errors import Finding, RobotError, UsageError, finding, require
 from calib.geometry.fit import PLAUSIBLE
 from calib.procedure.findings import Verdict, lines_of, settle
 from calib.procedure.report.page import Block, Column, Section, Text, table
+from calib.procedure.session.results import folders_of
 from calib.records import plain
 from calib.rooms.fleet import prior
 from calib.rooms.fleet.prior import ParameterSpread
@@ -26,7 +27,6 @@ from calib.rooms.over_time.comparison.calibrations import Calibration, read_fit
 from calib.rooms.over_time.comparison.geometry_change import ToolMotion
 from calib.rooms.over_time.comparison.places import check_same_robot, place_of
 from calib.rooms.over_time.comparison.robot_change import RobotChange, diff
-from calib.rooms.over_time.sessions import folders_of
 from calib.units import small
 
 PAGE, PRIOR = "report.html", "prior"
@@ -168,9 +168,7 @@ def report_fleet(calibrations: str | Path | Sequence[str | Path]) -> FleetReport
     visits: dict[str, list[Calibration]] = {}
     for one in found:
         visits.setdefault(one.serial or one.name, []).append(one)
-    changes = [
-        (arm, diff(one.name, two.name)) for arm, own in visits.items() for one, two in pairwise(own)
-    ]  # fmt: skip
+    changes = [(arm, diff(one.name, two.name)) for arm, own in visits.items() for one, two in pairwise(own)]
     types: list[list[Calibration]] = []
     for own in visits.values():
         alike = next((each for each in types if _same(each[0], own[-1])), None)

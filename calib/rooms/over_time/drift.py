@@ -27,7 +27,7 @@ from calib.data.csv_table import Table, read_table
 from calib.data.poses.measurements import PoseMeasurements, Positions
 from calib.errors import CalibError, Finding, finding
 from calib.geometry.first_guess import install
-from calib.geometry.observation import predict, prepare
+from calib.geometry.observation import positions, prepare
 from calib.procedure.session.folder import Session
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
@@ -181,7 +181,7 @@ def trends(
     if cell is None:
         return []
     ready = prepare(cell, seen)
-    off = [block.position - predict(cell, one).point.T for block, one in zip(seen, ready)]
+    off = [block.position - positions(cell, one).T for block, one in zip(seen, ready)]
     key = [
         np.column_stack([block.q, 1e3 * block.tool, np.full(len(block), 1e3 * k.station)])
         for block, k in zip(seen, ready)

@@ -78,7 +78,7 @@ class DriftFound(Drawn, Judged):
         """Write a folder: report.html, trends.csv, metrics.json, and the figure as PNG."""
         header = ("column", "unit", "x", "dx [mm]", "dy [mm]", "dz [mm]")
         rows = [(one.what, one.unit, x, *(1e3 * moved)) for one in self.trends for x, moved in zip(one.x, one.moved)]
-        part = pages.Part(
+        part = pages.ResultPart(
             self.section(), self.charts() if plots else {}, ["Targets of repeated poses less the arm's prediction."],
             (TABLE, header, rows),
         )  # fmt: skip

@@ -14,13 +14,13 @@ from calib.errors import SessionError, UsageError, command_line, require
 from calib.folders import METRICS
 from calib.procedure.report.page import Column, Section, table
 from calib.procedure.session.folder import Session, open_session
+from calib.procedure.session.results import folders_of, position_errors, torque_error
 from calib.records import plain
 from calib.rooms.over_time import pages
 from calib.rooms.over_time.comparison.change_part import plus_minus
 from calib.rooms.over_time.comparison.change_test import ParameterChange
 from calib.rooms.over_time.comparison.geometry_change import GeometryChange
 from calib.rooms.over_time.comparison.robot_change import diff
-from calib.rooms.over_time.sessions import folders_of, position_errors, torque_error
 
 if TYPE_CHECKING:
     from calib.procedure.report.charts import Chart
@@ -119,7 +119,7 @@ class RobotLog(Drawn, Judged):
         """Write a folder: report.html, log.csv, metrics.json, and the figure as PNG."""
         rows = [one.row(self.robot) for one in self.lines]
         charts = self.charts() if plots else {}
-        part = pages.Part(self.section(), charts, ["Errors, and motion of the tool."], (TABLE, HEADER, rows))
+        part = pages.ResultPart(self.section(), charts, ["Errors, and motion of the tool."], (TABLE, HEADER, rows))
         numbers = plain({"robot": self.robot, "lines": [dict(zip(HEADER, row)) for row in rows]})
         setup = {"robot": self.robot}
         return pages.save(Path(out), "log", f"Calibrations of {self.robot}", setup, [part], numbers, [TABLE])

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 PAGE, PICTURE = "report.html", "plot_{}.png"
 
 
-class Part(NamedTuple):
+class ResultPart(NamedTuple):
     """A section of the page with its charts, their captions, and a table on disk (name, header, rows)."""
 
     section: Section
@@ -26,7 +26,7 @@ class Part(NamedTuple):
 
 
 def save(
-    out: Path, kind: str, title: str, setup: Mapping[str, str], parts: Sequence[Part], numbers: Any,
+    out: Path, kind: str, title: str, setup: Mapping[str, str], parts: Sequence[ResultPart], numbers: Any,
     tables: Sequence[str],
 ) -> Path:  # fmt: skip
     """Write the folder `out` and return its path; `tables`: names of all that this `kind` of result may write.
@@ -39,7 +39,7 @@ def save(
     return folders.write_staged(out, ours, lambda folder: _write(folder, title, setup, parts, numbers))
 
 
-def _write(folder: Path, title: str, setup: Mapping[str, str], parts: Sequence[Part], numbers: Any) -> None:
+def _write(folder: Path, title: str, setup: Mapping[str, str], parts: Sequence[ResultPart], numbers: Any) -> None:
     from calib.procedure.report.charts import picture
     from calib.rooms.certificate.record import Entry, report
     from calib.rooms.certificate.rendering import html

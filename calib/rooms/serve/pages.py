@@ -21,8 +21,7 @@ from calib.procedure.report.templates import filled
 from calib.procedure.session import commands, steps
 from calib.procedure.session.folder import BROUGHT, Session, open_session
 from calib.rooms.serve import uploads
-from calib.rooms.serve.view import HERE as HERE_ONLY
-from calib.rooms.serve.view import View
+from calib.rooms.serve.web_viewer import LOCAL, WebViewer
 from calib.rooms.serve.work import CHECK, NEXT, REDO, Work
 from calib.rooms.viewer.viewer import FILE as RECORDING
 
@@ -99,7 +98,7 @@ def application(work: Work, token: str = "", host: str = "127.0.0.1") -> Starlet
     guard = Middleware(Guard, token=token, host=host)  # type: ignore[arg-type]
     errors = {CalibError: refused, OSError: refused}
     made = Starlette(routes=routes, middleware=[guard], exception_handlers=errors)  # type: ignore[arg-type]
-    made.state.work, made.state.view = work, View()
+    made.state.work, made.state.view = work, WebViewer()
     atexit.register(made.state.view.close)
     return made
 
@@ -175,7 +174,7 @@ def view(request: Request) -> Response:
     recording = open_session(request.app.state.work.folder).path(RECORDING)
     if not recording.exists():
         return PlainTextResponse("no recording yet", 404)
-    if request.client is None or request.client.host not in (HERE_ONLY, "::1"):
+    if request.client is None or request.client.host not in LOCAL:
         return PlainTextResponse(f"The 3-D view is for the computer that serves; download {RECORDING} here.", 403)
     return RedirectResponse(request.app.state.view.address_of(recording), 303)
 

@@ -13,7 +13,7 @@ import numpy as np
 from calib.errors import Finding, finding
 from calib.procedure.findings import Verdict, lines_of, settle
 from calib.procedure.report.page import Block, Column, KeyFigure, Section, Text, met, table
-from calib.rooms.over_time.comparison.change_test import Change
+from calib.rooms.over_time.comparison.change_test import ChangeTest
 from calib.units import SMALL
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ class ChangePart(ABC):
         return Verdict.of(figures, self.noticed)
 
     def _shared_findings(self) -> Iterator[Finding]:
-        found: Change = self.found
+        found: ChangeTest = self.found
         names = {"before": self.before.name, "after": self.after.name}
         if found.changed and found.parameters:
             first = found.parameters[0]
@@ -123,7 +123,7 @@ class ChangePart(ABC):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the numbers as in ``metrics.json`` [SI]."""
-        found: Change = self.found
+        found: ChangeTest = self.found
         return {
             "verdict": self.verdict.level, "reason": self.verdict.reason, "tolerance": self.tolerance,
             "today": self.today, "chi2": found.chi2, "freedom": found.freedom, "probability": found.probability,

@@ -48,7 +48,7 @@ class ParameterChange(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Change:
+class ChangeTest:
     """The test's result.
 
     Attributes:
@@ -105,7 +105,7 @@ class Tested:
     """What is tested, whitened by its covariance: the difference (k,) and what p parameters do to it (k, p).
 
     Attributes:
-        extra: see `Change`.
+        extra: see `ChangeTest`.
     """
 
     difference: np.ndarray

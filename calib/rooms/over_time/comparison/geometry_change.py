@@ -19,7 +19,7 @@ from calib.procedure.kinematic_stage.inputs import gravity_of
 from calib.robot.calibrated import evaluate
 from calib.robot.chain import random_joints
 from calib.rooms.over_time.comparison.calibrations import Calibration
-from calib.rooms.over_time.comparison.change_test import Change, ParameterChange, Tested, span, tested
+from calib.rooms.over_time.comparison.change_test import ChangeTest, ParameterChange, Tested, span, tested
 from calib.rooms.over_time.settings import DiffSettings
 from calib.transforms import invert, rotation_vector
 
@@ -55,8 +55,8 @@ class ToolMotion:
 
 
 @dataclass(frozen=True)
-class GeometryChange(Change):
-    """What moved between two calibrations; the test is in `Change`.
+class GeometryChange(ChangeTest):
+    """What moved between two calibrations; the test is in `ChangeTest`.
 
     Attributes:
         by_joint: (joint, rms motion of the target if only what describes that joint had changed [m]).

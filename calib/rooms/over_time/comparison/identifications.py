@@ -23,7 +23,7 @@ from calib.units import TORQUE
 
 
 @dataclass(frozen=True, eq=False)
-class States:
+class MotionStates:
     """States of a motion: times (N,) [s], q, v, a (N, n), and the torques (N, rows) measured there, if any."""
 
     t: np.ndarray
@@ -58,7 +58,7 @@ class Identified:
     columns: np.ndarray
     covariance: np.ndarray
     regrouping: Mapping[Hashable, Mapping[str, float]]
-    motions: Mapping[str, States]
+    motions: Mapping[str, MotionStates]
     unit: str
     judged: tuple[str, str]
     tolerance: float
@@ -131,7 +131,7 @@ def _key(model: IdentificationModel, column: int) -> Hashable:
     return name, term.shape, term.settings
 
 
-def read_states(path: Path, joints: int) -> States | None:
+def read_states(path: Path, joints: int) -> MotionStates | None:
     """Return the states of a motion, with the torques ``measured_…`` if there are any, from a table; None without v, a.
 
     Raises:
@@ -144,4 +144,4 @@ def read_states(path: Path, joints: int) -> States | None:
     words = f"{path}: columns q_…, v_… and a_… of {joints} joints each are needed"
     require({each.shape[1] for each in (q, v, a)} == {joints}, words, UsageError)
     t = table.numbers("t", None) if "t" in table.header else np.arange(len(q), dtype=float)
-    return States(t, (q, v, a), measured)
+    return MotionStates(t, (q, v, a), measured)

@@ -84,7 +84,7 @@ class RobotChange(Drawn, Judged):
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write a folder: report.html, tables of all parameters, metrics.json, and the figures as PNG."""
         parts = [
-            pages.Part(
+            pages.ResultPart(
                 part.section(), part.charts() if plots else {}, part.captions,
                 (part.table, ParameterChange._fields, part.found.parameters),
             )

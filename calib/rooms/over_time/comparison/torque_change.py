@@ -16,8 +16,8 @@ import numpy as np
 from calib.dynamics.base import standard_name
 from calib.dynamics.idim import IdentificationModel
 from calib.identification.torque_errors import parameter_variances
-from calib.rooms.over_time.comparison.change_test import Change, ParameterChange, Tested, tested
-from calib.rooms.over_time.comparison.identifications import Identified, States
+from calib.rooms.over_time.comparison.change_test import ChangeTest, ParameterChange, Tested, tested
+from calib.rooms.over_time.comparison.identifications import Identified, MotionStates
 
 PARALLEL = 1e-6  # sine of an angle between what two parameters do to the combinations, below which they are one
 NEARLY_ALL = 0.9  # of χ²; σ of real motions holds no unmodelled effects, which leave a rest (our choice)
@@ -66,8 +66,8 @@ class PartChange:
 
 
 @dataclass(frozen=True)
-class DynamicsChange(Change):
-    """What changed between two identified models; the test is in `Change`.
+class DynamicsChange(ChangeTest):
+    """What changed between two identified models; the test is in `ChangeTest`.
 
     Attributes:
         parts: friction of each joint, body of each link: the one that explains most first.
@@ -85,7 +85,7 @@ class DynamicsChange(Change):
         return first if enough else None
 
 
-def compare(before: Identified, after: Identified, motions: dict[str, States]) -> DynamicsChange:
+def compare(before: Identified, after: Identified, motions: dict[str, MotionStates]) -> DynamicsChange:
     """Return what changed between two models of one robot, the torque over motions."""
     keys = list(dict.fromkeys([*before.keys, *after.keys]))
     values, covariances = zip(*(_spread(each, keys) for each in (before, after)))
@@ -143,7 +143,7 @@ def _apart(columns: np.ndarray, first: int) -> list[int]:
     return chosen
 
 
-def _parts(found: Tested, arm: IdentificationModel, names: list[str], states: States) -> tuple[PartChange, ...]:
+def _parts(found: Tested, arm: IdentificationModel, names: list[str], states: MotionStates) -> tuple[PartChange, ...]:
     """Return each joint's friction and each link's body with what it explains."""
     place, result = {name: k for k, name in enumerate(arm.names)}, []
     for part, own in {**_frictions(arm), **_links(arm)}.items():
@@ -166,7 +166,7 @@ def _links(model: IdentificationModel) -> dict[str, set[str]]:
     return {f"the body of link {k // 10 + 1}": set(names[k : k + 10]) for k in range(0, len(names), 10)}
 
 
-def _torque(name: str, states: States, before: Identified, after: Identified) -> TorqueChange:
+def _torque(name: str, states: MotionStates, before: Identified, after: Identified) -> TorqueChange:
     one, two = (each.model.torque(each.dynamics.values, *states.motion, ()) for each in (before, after))
     variances = [
         parameter_variances(each.dynamics, each.columns, each.covariance, *states.motion, ())

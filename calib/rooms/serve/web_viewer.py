@@ -12,11 +12,12 @@ from urllib.parse import quote
 
 from calib.errors import CalibError, require
 
-HERE = "127.0.0.1"
+LOCAL = ("127.0.0.1", "::1")  # who asks from this computer
+HERE = LOCAL[0]
 START = 20.0  # [s] that the viewer may take to answer (our choice)
 
 
-class View:
+class WebViewer:
     """A viewer's process, begun at the first question and anew for a new recording."""
 
     def __init__(self) -> None:
