@@ -51,6 +51,7 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
     rate = 1000.0                    # of files without stamps [Hz]
     topic = "/joint_states"
     use_range = true                 # follow the file's own use_range
+    samples = 600000                 # used of a longer recording, in pieces spread over it
     lag = 0.0                        # by which torques and currents come later than the positions of their row [s]
     names = { torque = "tau_m" }     # our name = the file's
     units = { q = "deg" }            # of columns that state none
@@ -117,6 +118,8 @@ from calib.dynamics.shapes import SHAPES
 from calib.dynamics.torque_rows import MOTOR, ROWS
 from calib.errors import CalibError, UsageError, refused_as
 from calib.identification.settings import Choices, Coupling, IdentificationSettings, Payload
+
+USED = 600_000  # samples of a recording, unless stated: ten minutes at 1 kHz (our choice)
 
 
 def _no_zero(value: Any) -> Any:
@@ -216,10 +219,9 @@ class IdentifyOptions:
     def file_settings(self, path: str | Path) -> FileSettings:
         """Return the settings of a recording (or a cut of one), with the torques that the model's rows explain."""
         found = own_table(self.files, parse_cut(str(path))[0]) or self.every
-        rows = self.settings.torque_rows
-        return replace(
-            found, recording=replace(found.recording, rows=rows.name, motors=rows.driven, sensors=rows.sensed)
-        )
+        rows, samples = self.settings.torque_rows, found.recording.samples or USED
+        explained = {"rows": rows.name, "motors": rows.driven, "sensors": rows.sensed}
+        return replace(found, recording=replace(found.recording, samples=samples, **explained))
 
 
 def read_options(path: str | Path | None = None) -> IdentifyOptions:

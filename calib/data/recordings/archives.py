@@ -3,9 +3,8 @@
 Beside the names of `recording_options` an archive may hold ``joint_names`` (n texts), ``drive_gain`` (n) and
 ``use_range`` (first row, end row; from 0), which is followed unless the path has a cut of its own or the options say
 otherwise. An average over repeats (`calib recall`) says how noisy it is: ``variance_tau`` (or the effort's name; N, n)
-of a single sample, and the number of ``periods`` averaged. Members are decompressed one after the other and only the
-rows asked for are kept: a compressed member cannot be mapped into memory, so time grows with the file (some 200 MB/s)
-and memory with its largest member and the cut.
+of a single sample, and the number of ``periods`` averaged. Members are decompressed one after the other, some rows
+at a time, and only the rows asked for are kept: time grows with the file (some 200 MB/s), memory with what is used.
 """
 
 import lzma
@@ -24,7 +23,7 @@ from typing import IO, NoReturn
 import numpy as np
 from numpy.lib import format as npy
 
-from calib.data.recordings.recording import Recording, read_only, rows_of_cut
+from calib.data.recordings.recording import Recording, read_only, rows_in_pieces, rows_of_cut
 from calib.data.recordings.recording_options import (
     KEYS_BESIDE_SERIES,
     RATES,
@@ -37,7 +36,8 @@ from calib.data.recordings.recording_options import (
 from calib.data.schema import Joints
 from calib.errors import MeasurementError, refuse_data, refused_as, require
 
-MAX_MEMBERS, MAX_BYTES = 1000, 8_000_000_000  # of an archive, and of a member (our choices)
+MAX_MEMBERS, MAX_BYTES = 1000, 80_000_000_000  # of an archive, and of a member (our choices)
+TOGETHER = 1 << 16  # rows read at a time
 Ends = tuple[float | None, float | None]
 
 
@@ -109,8 +109,8 @@ class _Archive:
             self.fail(f"has {size / 1e9:.3g} GB, the limit is {MAX_BYTES / 1e9:g} GB: save a shorter recording", name)
         return stream, shape, fortran, dtype
 
-    def read(self, name: str, rows: slice | None = None, exact: bool = False, kinds: str = "fiub") -> np.ndarray:
-        """Return the `rows` of a member as floats (`exact`: in its stored type), without loading the others.
+    def read(self, name: str, rows: np.ndarray | None = None, exact: bool = False, kinds: str = "fiub") -> np.ndarray:
+        """Return a member as floats (`exact`: in its stored type), all or the `rows` (numbers, rising).
 
         Args:
             kinds: accepted kinds of numpy's types.
@@ -119,9 +119,18 @@ class _Archive:
         with stream:
             if dtype.kind not in kinds:
                 self.fail(f"contains {dtype}, expected {'texts' if 'U' in kinds else 'numbers'}", name)
-            values = np.frombuffer(stream.read(), dtype, prod(shape)).reshape(shape, order="F" if fortran else "C")
-        values = values[rows] if rows is not None and shape else values
-        return values if exact else values.astype(float)
+            kind, step = dtype if exact else np.dtype(float), TOGETHER
+            if rows is None or fortran or not shape:
+                values = np.frombuffer(stream.read(), dtype, prod(shape)).reshape(shape, order="F" if fortran else "C")
+                return (values if rows is None or not shape else values[rows]).astype(kind, copy=False)
+            rows = rows[: np.searchsorted(rows, shape[0])]  # a member of another length is refused later
+            result, size = np.empty((len(rows), *shape[1:]), kind), prod(shape[1:]) * dtype.itemsize
+            for start in range(0, shape[0], step):
+                count = min(step, shape[0] - start)
+                some = np.frombuffer(stream.read(count * size), dtype).reshape(count, *shape[1:])
+                own = slice(*np.searchsorted(rows, (start, start + step)))
+                result[own] = some[rows[own] - start]
+        return result
 
     def few(self, name: str, count: int) -> np.ndarray | None:
         """Return a member of `count` finite numbers; None if the archive has no such member."""
@@ -141,7 +150,8 @@ def _recording(archive: _Archive, joints: Joints | None, options: RecordingOptio
     stream, shape, _, _ = archive.header(found["q"])
     stream.close()
     t = _stamps(archive, found, options, (shape or (0,))[0])
-    rows, notes = _range(archive, t, options, ends)
+    used, notes = _range(archive, t, options, ends)
+    rows, spread = rows_in_pieces(used.start, used.stop, options.samples)
     q = archive.read(found["q"], rows)
     if q.ndim != 2:
         archive.fail(f"has shape {q.shape}, expected (samples, joints)", found["q"])
@@ -170,13 +180,13 @@ def _recording(archive: _Archive, joints: Joints | None, options: RecordingOptio
         drive_gain=None if gain is None else gain[order],
         effort_variance=None if noise is None else noise[order] * options.factor(kind) ** 2,
         file=str(path),
-        rows=np.arange(rows.start, rows.stop) + 1,
-        notes=(*notes, *([f"not read: {', '.join(sorted(unused))}"] if unused else [])),
+        rows=rows + 1,
+        notes=(*notes, *spread, *([f"not read: {', '.join(sorted(unused))}"] if unused else [])),
         **series,
     )
 
 
-def _variance(archive: _Archive, name: str, shape: tuple[int, ...], rows: slice) -> np.ndarray | None:
+def _variance(archive: _Archive, name: str, shape: tuple[int, ...], rows: np.ndarray) -> np.ndarray | None:
     """Return the mean variance (n,) of the effort averaged over periods (variance of one sample / periods)."""
     periods = archive.few("periods", 1)
     if name not in archive.members or periods is None:

@@ -204,7 +204,8 @@ def _jumps(recording: Recording, joints: Joints | None) -> list[str]:
         return []
     step = np.diff(recording.t)
     slope = np.diff(recording.q, axis=0) / step[:, None]
-    around = np.median(np.stack([slope[:-4], slope[1:-3], slope[3:-1], slope[4:]]), axis=0)
+    low, high = np.minimum(slope[:-1], slope[1:]), np.maximum(slope[:-1], slope[1:])
+    around = (np.maximum(low[:-3], low[3:]) + np.minimum(high[:-3], high[3:])) / 2  # median of two before, two after
     off = np.abs(slope[2:-2] - around) * step[2:-2, None]
     usual = np.maximum(np.median(off, axis=0), 1e-9)
     apart = (step[2:-2] < 3 * np.median(step))[:, None]  # not over a gap

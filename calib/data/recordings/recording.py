@@ -131,6 +131,30 @@ class Recording:
         return replace(self, t=self.t[index], rows=self.rows[index], **picked)
 
 
+def rows_in_pieces(first: int, stop: int, most: int | None, pieces: int = 20) -> tuple[np.ndarray, list[str]]:
+    """Return the rows to use of a recording's rows `first` to `stop`, and notes: all, or at most `most` in pieces.
+
+    A piece lies at a random place in each of `pieces` equal parts: the whole time takes part, and no period of the
+    motion meets the same phase each time.
+    """
+    count = stop - first
+    if most is None or count <= most:
+        return np.arange(first, stop), []
+    edges, length = np.linspace(first, stop, pieces + 1).astype(int), most // pieces
+    starts = edges[:-1] + np.random.default_rng(0).integers(np.diff(edges) - length + 1)
+    note = (
+        f"{pieces * length} of {count} samples are used, in {pieces} pieces spread over the recording "
+        "([recording] samples = … for more)"
+    )
+    return (starts[:, None] + np.arange(length)).ravel(), [note]
+
+
+def in_pieces(recording: Recording, most: int | None) -> Recording:
+    """Return a recording of at most `most` samples: itself, or pieces spread over it (`rows_in_pieces`)."""
+    rows, notes = rows_in_pieces(0, len(recording), most)
+    return replace(recording.take(rows), notes=(*recording.notes, *notes)) if notes else recording
+
+
 def settled(values: np.ndarray) -> np.ndarray:
     """Return `values` itself if it is a read-only float array, else a frozen copy (logs are large)."""
     owner = values.base if isinstance(values, np.ndarray) and values.base is not None else values

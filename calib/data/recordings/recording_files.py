@@ -17,7 +17,7 @@ from calib.data.csv_table import Table, read_table
 from calib.data.recordings.archives import Ends, read_archive
 from calib.data.recordings.bags import read_bag
 from calib.data.recordings.checks import check_recording
-from calib.data.recordings.recording import Recording, earlier, named, parse_cut
+from calib.data.recordings.recording import Recording, earlier, in_pieces, named, parse_cut
 from calib.data.recordings.recording_options import (
     MEASURED,
     SCALES,
@@ -188,6 +188,7 @@ def read_recording(
     recording = _described(_reader(Path(file), (start, stop))(Path(file), joints, options), options.controller)
     if (start, stop) != (None, None):
         recording = recording.cut(start, stop)
+    recording = in_pieces(recording, options.samples)
     if joints is not None and recording.n != len(joints.names):
         message = (
             f"has {recording.n} joints ({', '.join(recording.joint_names)}), the robot has {len(joints.names)} "

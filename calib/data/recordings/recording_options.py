@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from calib.config import strict
-from calib.config_types import Checked, Flag, Hidden, Name, OneOf, Positive, Real, Text, shown
+from calib.config_types import Checked, Flag, Hidden, Name, OneOf, Positive, Real, Text, Whole, shown
 from calib.data.recordings.recording import named
 from calib.data.schema import Joints
 from calib.errors import UsageError, refuse_data, refused_as, require, suggestion
@@ -90,6 +90,7 @@ class RecordingOptions:
         topic: name of the topic to read, for a ROS bag with several topics of joint states.
         use_range: use only the rows of the file's `use_range` if the path has no cut.
         controller: joints are as this controller shows them (`calib program --list`); torques take its signs only.
+        samples: largest number of samples used; of a longer recording, pieces spread over it; None: all.
         lag: delay of torques and currents relative to the positions in the same row [s].
         rows: name of the torques to be explained, for messages.
         motors, sensors: whether these need the motors' torques, the torques of sensors after the gears; if they need
@@ -103,6 +104,7 @@ class RecordingOptions:
     topic: Name = ""
     controller: Name = ""
     use_range: Flag = True
+    samples: Annotated[int, Whole(10_000, 1_000_000_000)] | None = None
     lag: Annotated[float, Real(least=-MAX_LAG, most=MAX_LAG, unit="s")] = 0.0
     rows: Annotated[str, Hidden()] = "motor"
     motors: Annotated[bool, Hidden()] = True

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from calib.data.signals.filtering import factor_for, longest
+from calib.data.signals.filtering import factor_for, segments
 from calib.data.signals.resampling import Resampled
 from calib.errors import refuse_data
 from calib.records import frozen
@@ -56,13 +56,14 @@ def propose_cutoffs(sampled: Resampled, dynamics: float | None = None) -> Cutoff
     """
     from scipy.signal import welch  # slow to load
 
-    own = longest(sampled.segment)
     window_length = 4.0  # length of the spectra's windows [s]
-    size = min(own.stop - own.start, max(64, int(window_length * sampled.rate)))
-    overlap = size - size // 2
-    f, power = welch(sampled.series["q"][own], sampled.rate, "hann", size, overlap, detrend="linear", axis=0)
+    parts = segments(sampled.segment)
+    size = min(max(own.stop - own.start for own in parts), max(64, int(window_length * sampled.rate)))
+    long = [sampled.series["q"][own] for own in parts if own.stop - own.start >= size]
+    spectra = [welch(q, sampled.rate, "hann", size, size - size // 2, detrend="linear", axis=0) for q in long]
+    f, power = spectra[0][0], np.average([one for _, one in spectra], axis=0, weights=[len(q) for q in long])
     floor = np.median(power[int(0.6 * len(f)) : int(0.9 * len(f))], axis=0)
-    active = _active(sampled.series["q"][own])
+    active = _active(np.concatenate([np.diff(q, axis=0) for q in long]))
     read = [_joint_dynamics(f, power[:, j], floor[j]) if active[j] else (0.0, np.nan) for j in range(len(active))]
     dynamics, reason = _choose(np.array([joint for joint, _ in read]), dynamics)
     reasons = [reason]
@@ -109,12 +110,12 @@ def _position_cutoff(
     return (lower, f"f_q = {lower:.3g} Hz: at 5 f_dyn = {5 * dynamics:.3g} Hz noise exceeds 5 % of the acceleration")
 
 
-def _active(q: np.ndarray, min_speed_share: float = 0.05) -> np.ndarray:
-    """Return the mask (n,) of joints that move fast enough to determine the bandwidth.
+def _active(steps: np.ndarray, min_speed_share: float = 0.05) -> np.ndarray:
+    """Return the mask (n,) of joints that move fast enough to determine the bandwidth, given their steps (N, n).
 
     `min_speed_share`: slower joints, relative to the fastest one, are not used.
     """
-    speed = np.quantile(np.abs(np.diff(q, axis=0)), 0.95, axis=0)
+    speed = np.quantile(np.abs(steps), 0.95, axis=0)
     return speed > min_speed_share * speed.max()
 
 

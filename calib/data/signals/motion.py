@@ -161,11 +161,15 @@ ROWS = (
 )  # fmt: skip
 
 
-def make_motion(recording: Recording, options: FilterOptions | None = None, sampled: Resampled | None = None) -> Motion:
+def make_motion(
+    recording: Recording, options: FilterOptions | None = None, sampled: Resampled | None = None,
+    cutoffs: Cutoffs | None = None,
+) -> Motion:  # fmt: skip
     """Return the motion of a recording: resampled to an even grid, low-passed without phase shift, differentiated.
 
     Args:
         sampled: the recording on its grid if already computed with the same clock and gap.
+        cutoffs: proposed for it, if already computed with the same f_dyn.
 
     Raises:
         MeasurementError: for a cut-off at or above the Nyquist frequency; for segments that the filters eat up.
@@ -173,7 +177,7 @@ def make_motion(recording: Recording, options: FilterOptions | None = None, samp
     """
     options = options or FilterOptions()
     sampled = resample(recording, options.clock, options.gap) if sampled is None else sampled
-    cutoffs = propose_cutoffs(sampled, options.dynamics)
+    cutoffs = propose_cutoffs(sampled, options.dynamics) if cutoffs is None else cutoffs
     cutoff = _per_joint(cutoffs.position if options.cutoff is None else options.cutoff, recording)
     faster = None if options.velocity_cutoff is None else _per_joint(options.velocity_cutoff, recording)
     for value in (*cutoff, *(() if faster is None else faster)):

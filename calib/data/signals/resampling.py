@@ -207,7 +207,10 @@ class SamplingReport:
             lines.append(f"{self.repeated} samples were read twice; the second one is not used")
         if self.lost:
             lines.append(f"{self.lost} samples are missing in short gaps; interpolated with weight 0")
-        lines += [f"gap of {length:.3g} s at {start:.6g} s: recording split" for start, length in self.gaps]
+        if len(self.gaps) > 3:
+            lines.append(f"{len(self.gaps)} gaps of up to {max(gap for _, gap in self.gaps):.3g} s: recording split")
+        else:
+            lines += [f"gap of {length:.3g} s at {start:.6g} s: recording split" for start, length in self.gaps]
         lines += [
             f"{length:.3g} s at {start:.6g} s between gaps: too short, not used" for start, length in self.dropped
         ]

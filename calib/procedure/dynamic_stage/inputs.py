@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from calib.data.recordings.checks import check_recording
-from calib.data.recordings.recording import Recording, earlier, parse_cut
+from calib.data.recordings.recording import Recording, earlier, in_pieces, parse_cut
 from calib.data.recordings.recording_files import read_recording
 from calib.data.schema import Joints
 from calib.data.signals.filtering import SHARE
@@ -233,7 +233,8 @@ def read_motion(
     """
     joints = chain if isinstance(chain, Joints) else joints_of(chain)
     if isinstance(given, Recording):
-        recording = check_recording(earlier(given, own.recording.lag), joints)
+        some = in_pieces(given, own.recording.samples)
+        recording = check_recording(earlier(some, own.recording.lag), joints)
     else:
         recording = read_recording(given, joints, own.recording)
     sampled = resample(recording, own.filter.clock, own.filter.gap)
@@ -249,7 +250,7 @@ def read_motion(
         return motion
     band = SHARE * motion.rate / (2 * max(1, int(widest)))
     same = replace(own.filter, cutoff=_joints(motion.cutoff), velocity_cutoff=_joints(motion.velocity_cutoff))
-    wider = make_motion(recording, replace(same, band=min(band, 0.45 * motion.rate)), sampled)
+    wider = make_motion(recording, replace(same, band=min(band, 0.45 * motion.rate)), sampled, motion.cutoffs)
     note = f"f_p = {wider.band:.3g} Hz instead, so that decimation does not remove the ends of a short recording"
     return replace(wider, notes=(*motion.notes, note))
 
@@ -272,9 +273,9 @@ def _sharper(recording: Recording, motion: Motion, options: FilterOptions, sampl
         return motion
     borders = 2.0 / cutoff if options.borders is None else options.borders  # no samples that the wider band would add
     same = replace(options, velocity_cutoff=_joints(motion.velocity_cutoff), borders=borders)
-    sharper = make_motion(recording, replace(same, cutoff=f), sampled)
+    sharper = make_motion(recording, replace(same, cutoff=f), sampled, motion.cutoffs)
     note = f"f_q = {f:.3g} Hz instead: the position noise is low enough"
-    return replace(sharper, notes=(*motion.notes, note), cutoffs=motion.cutoffs)
+    return replace(sharper, notes=(*motion.notes, note))
 
 
 def _referred(
@@ -298,7 +299,8 @@ def _with_design(
 
     They are looked for in the whole file: a cut may contain less than a period.
     """
-    whole = given if isinstance(given, Recording) else read_recording(parse_cut(str(given))[0], joints, own.recording)
+    options = replace(own.recording, samples=None)
+    whole = given if isinstance(given, Recording) else read_recording(parse_cut(str(given))[0], joints, options)
     for design in designed:
         if (found := locate(whole, design)) is None:
             continue

@@ -1,0 +1,90 @@
+"""A recording longer than what is used is read in pieces: which rows, from every file, and what the user is told."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from calib.data.recordings.recording import Recording, in_pieces, rows_in_pieces
+from calib.data.recordings.recording_files import read_recording
+from calib.data.recordings.recording_options import RecordingOptions
+from calib.data.signals.motion import make_motion
+from calib.data.signals.resampling import resample
+
+RATE, SECONDS = 100.0, 1800
+OPTIONS = RecordingOptions(samples=20_000)
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    t = np.arange(int(SECONDS * RATE)) / RATE
+    q = np.stack([np.sin(2 * np.pi * 0.3 * t), np.cos(2 * np.pi * 0.2 * t)], axis=1)
+    noise = np.random.default_rng(0).normal(size=q.shape)
+    return Recording.of(t, q + 1e-6 * noise, 3.0 * q + 0.1 * noise)
+
+
+def test_pieces_are_spread_over_the_recording_and_as_many_as_asked_for():
+    rows, notes = rows_in_pieces(1000, 181_000, 20_000)
+    parts = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
+    assert len(rows) == 20_000 and len(parts) == 20 and "20000 of 180000" in notes[0]
+    for number, part in enumerate(parts):
+        assert 1000 + 9000 * number <= part[0] and part[-1] < 1000 + 9000 * (number + 1)
+    assert len({int(part[0] - 1000) % 9000 for part in parts}) > 15  # no phase of a motion is met each time
+
+
+def test_a_short_recording_is_used_whole(recording):
+    assert in_pieces(recording, 10**6) is recording and in_pieces(recording, None) is recording
+    rows, notes = rows_in_pieces(3, 50, 47)
+    np.testing.assert_array_equal(rows, np.arange(3, 50))
+    assert notes == []
+
+
+@pytest.mark.parametrize("save", [np.savez, np.savez_compressed, "csv"])
+def test_every_file_is_read_in_the_same_pieces(recording, save, tmp_path):
+    if save == "csv":
+        path = tmp_path / "log.csv"
+        table = np.hstack([recording.t[:, None], recording.q, recording.effort])
+        np.savetxt(path, table, delimiter=",", header="t,q1,q2,tau1,tau2", comments="", fmt="%.17g")
+    else:
+        path = tmp_path / "log.npz"
+        save(path, t=recording.t, q=recording.q, tau=recording.effort)
+    found, expected = read_recording(path, options=OPTIONS), in_pieces(recording, 20_000)
+    for name in ("t", "q", "effort"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    np.testing.assert_array_equal(found.rows, expected.rows)
+    assert sum("samples are used" in note for note in found.notes) == 1
+
+
+def test_a_cut_is_taken_before_the_pieces(recording, tmp_path):
+    np.savez(tmp_path / "log.npz", t=recording.t, q=recording.q, tau=recording.effort)
+    found = read_recording(f"{tmp_path / 'log.npz'}@600:1200", options=OPTIONS)
+    assert len(found) == 20_000 and found.t[0] >= 600.0 and 1180.0 < found.t[-1] < 1200.0
+
+
+def test_pieces_become_segments_without_a_line_each(recording):
+    used = in_pieces(recording, 20_000)
+    sampled = resample(used)
+    assert sampled.segment[-1] == 19 and sampled.report.lost == 0
+    motion = make_motion(used, sampled=sampled)
+    assert [line for line in motion.notes if "gap" in line] == [line for line in motion.notes if "19 gaps" in line]
+    whole = make_motion(recording)
+    where = np.searchsorted(whole.t, motion.t)
+    np.testing.assert_allclose(motion.a, whole.a[where], atol=0.02 * np.ptp(whole.a))
+    assert motion.decimator.factor == whole.decimator.factor
+
+
+def test_motion_that_fills_only_the_end_of_a_recording_counts(recording):
+    slow = 0.01 * np.sin(2 * np.pi * 0.05 * recording.t)[:, None]
+    late = np.where(recording.t[:, None] > 900.0, recording.q, slow)
+    motion = make_motion(in_pieces(dataclasses.replace(recording, q=late), 20_000))
+    assert motion.cutoffs.band == pytest.approx(make_motion(in_pieces(recording, 20_000)).cutoffs.band, rel=0.3)
+
+
+def test_a_number_of_samples_that_is_none_is_refused():
+    from calib.errors import UsageError
+    from calib.identification.identify_options import parse_options
+
+    with pytest.raises(UsageError, match="samples"):
+        parse_options({"recording": {"samples": 5}})
+    assert parse_options({}).file_settings("a.npz").recording.samples == 600_000
+    assert parse_options({"recording": {"samples": 10**7}}).file_settings("a.npz").recording.samples == 10**7
