@@ -336,16 +336,22 @@ def write_numbers(
     Args:
         notes: comment lines above the header.
     """
-    text = _headed(header)
     line = ",".join(["%.12g"] * values.shape[1]) + "\n"
-    if names:
-        first = csv.writer(text, lineterminator=",")
-        for name, row in zip(names, values.tolist()):
-            first.writerow([_cell(name)])
-            text.write(line % tuple(row))
-    else:
-        text.write((line * len(values)) % tuple(values.ravel().tolist()))
-    return write(path, remarks(notes) + text.getvalue())
+
+    def parts(many: int = 10_000) -> Iterator[str]:
+        yield remarks(notes) + _headed(header).getvalue()
+        for start in range(0, len(values), many):
+            some, text = values[start : start + many], io.StringIO()
+            if names:
+                first = csv.writer(text, lineterminator=",")
+                for name, row in zip(names[start:], some.tolist()):
+                    first.writerow([_cell(name)])
+                    text.write(line % tuple(row))
+            else:
+                text.write((line * len(some)) % tuple(some.ravel().tolist()))
+            yield text.getvalue()
+
+    return write(path, parts())
 
 
 def remarks(notes: Sequence[str]) -> str:

@@ -23,7 +23,7 @@ from typing import IO, NoReturn
 import numpy as np
 from numpy.lib import format as npy
 
-from calib.data.recordings.recording import Recording, read_only, rows_in_pieces, rows_of_cut
+from calib.data.recordings.recording import Ends, Recording, read_only, rows_in_pieces, rows_used
 from calib.data.recordings.recording_options import (
     KEYS_BESIDE_SERIES,
     RATES,
@@ -38,7 +38,6 @@ from calib.errors import MeasurementError, refuse_data, refused_as, require
 
 MAX_MEMBERS, MAX_BYTES = 1000, 80_000_000_000  # of an archive, and of a member (our choices)
 TOGETHER = 1 << 16  # rows read at a time
-Ends = tuple[float | None, float | None]
 
 
 def read_archive(path: Path, joints: Joints | None, options: RecordingOptions, ends: Ends = (None, None)) -> Recording:
@@ -150,8 +149,7 @@ def _recording(archive: _Archive, joints: Joints | None, options: RecordingOptio
     stream, shape, _, _ = archive.header(found["q"])
     stream.close()
     t = _stamps(archive, found, options, (shape or (0,))[0])
-    used, notes = _range(archive, t, options, ends)
-    rows, spread = rows_in_pieces(used.start, used.stop, options.samples)
+    rows, notes = _used(archive, t, options, ends)
     q = archive.read(found["q"], rows)
     if q.ndim != 2:
         archive.fail(f"has shape {q.shape}, expected (samples, joints)", found["q"])
@@ -181,7 +179,7 @@ def _recording(archive: _Archive, joints: Joints | None, options: RecordingOptio
         effort_variance=None if noise is None else noise[order] * options.factor(kind) ** 2,
         file=str(path),
         rows=rows + 1,
-        notes=(*notes, *spread, *([f"not read: {', '.join(sorted(unused))}"] if unused else [])),
+        notes=(*notes, *([f"not read: {', '.join(sorted(unused))}"] if unused else [])),
         **series,
     )
 
@@ -217,20 +215,18 @@ def _stamps(archive: _Archive, found: Mapping[str, str], options: RecordingOptio
     return (t - t[0] if len(t) else t).astype(float) * options.factor("t")
 
 
-def _range(archive: _Archive, t: np.ndarray, options: RecordingOptions, ends: Ends) -> tuple[slice, list[str]]:
-    """Return the rows to read (from the cut, else the file's use_range, else all), and notes."""
-    if ends != (None, None):
-        ordered = np.maximum.accumulate(np.nan_to_num(t, nan=-np.inf))  # time that runs back is refused later
-        return rows_of_cut(ordered, *ends, archive.path), []
-    stated = archive.few("use_range", 2) if options.use_range else None
+def _used(archive: _Archive, t: np.ndarray, options: RecordingOptions, ends: Ends) -> tuple[np.ndarray, list[str]]:
+    """Return the rows to read (of the cut, else of the file's use_range, else of all), and notes."""
+    stated = archive.few("use_range", 2) if options.use_range and ends == (None, None) else None
     if stated is None:
-        return slice(0, len(t)), []
+        return rows_used(t, ends, options.samples, archive.path)
     first, end = (int(value) for value in np.clip(stated, -1, len(t) + 1))
     if not 0 <= first < end <= len(t):
         archive.fail(f"is {first} to {end}, the file has {len(t)} samples", "use_range")
-    whole = first == 0 and end == len(t)
-    note = f"rows {first + 1} to {end} of {len(t)} are used, as its use_range states"
-    return slice(first, end), [] if whole else [note]
+    rows, notes = rows_in_pieces(first, end, options.samples)
+    if (first, end) != (0, len(t)):
+        notes.append(f"rows {first + 1} to {end} of {len(t)} are used, as its use_range states")
+    return rows, notes
 
 
 def _names(archive: _Archive) -> list[str]:

@@ -17,6 +17,7 @@ from calib.records import frozen
 KINDS = ("torque", "current")
 SERIES = ("q", "v", "effort", "tau_link", "tau_motor", "q_link", "q_ref", "tau_ff")
 LATE = ("effort", "tau_link", "tau_motor")  # what may come late: they have a path of their own to the log
+Ends = tuple[float | None, float | None]
 _CUT = re.compile(r"^(?P<file>.+)@(?P<start>[^@:/\\]*):(?P<stop>[^@:/\\]*)$")
 
 
@@ -147,6 +148,13 @@ def rows_in_pieces(first: int, stop: int, most: int | None, pieces: int = 20) ->
         "([recording] samples = … for more)"
     )
     return (starts[:, None] + np.arange(length)).ravel(), [note]
+
+
+def rows_used(t: np.ndarray, ends: Ends, most: int | None, file: str | Path) -> tuple[np.ndarray, list[str]]:
+    """Return the rows of a file with stamps `t` (N,) [s] that a cut leaves, at most `most` in pieces, and notes."""
+    ordered = np.maximum.accumulate(np.nan_to_num(t, nan=-np.inf))  # time that runs back is refused later
+    cut = slice(0, len(t)) if ends == (None, None) else rows_of_cut(ordered, *ends, file)
+    return rows_in_pieces(cut.start, cut.stop, most)
 
 
 def in_pieces(recording: Recording, most: int | None) -> Recording:

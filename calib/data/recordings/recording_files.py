@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from calib.data.csv_table import Table, read_table
-from calib.data.recordings.archives import Ends, read_archive
+from calib.data.recordings.archives import read_archive
 from calib.data.recordings.bags import read_bag
 from calib.data.recordings.checks import check_recording
-from calib.data.recordings.recording import Recording, earlier, in_pieces, named, parse_cut
+from calib.data.recordings.recording import Ends, Recording, earlier, in_pieces, named, parse_cut, rows_used
 from calib.data.recordings.recording_options import (
     MEASURED,
     SCALES,
@@ -34,8 +34,8 @@ from calib.extensions import needed
 from calib.files import check_regular
 
 
-def read_log(path: Path, joints: Joints | None, options: RecordingOptions) -> Recording:
-    """Return the recording in a CSV table; only shapes are checked; about 20 MB/s."""
+def read_log(path: Path, joints: Joints | None, options: RecordingOptions, ends: Ends = (None, None)) -> Recording:
+    """Return the recording in a CSV table from ends[0] to ends[1] [s]; only shapes are checked; about 20 MB/s."""
     table = _numbered_brackets(read_table(path, doubles=True))
     found = _find(table, options, joints.names if joints else ())
     chosen = one_effort({ours: ours for ours in found}, options, table.header, path)
@@ -45,15 +45,18 @@ def read_log(path: Path, joints: Joints | None, options: RecordingOptions) -> Re
         if ours != "t" and len(columns) != n:
             refuse_data(path, f"{len(columns)} columns of {ours} ({', '.join(_called(table, columns))}) for {n} of q")
         check_units(ours, [table.units[place] for place in columns], joints, path)
+    t = _stamps(table, found, options)
+    used, spread = rows_used(t, ends, options.samples, path)
+    table = table.where(used)
     kind = "current" if "current" in found else "torque"
     series: dict[str, Any] = {
         "effort" if ours == kind else ours: np.column_stack([_values(table, c, ours, options) for c in columns])
         for ours, columns in found.items()
         if ours not in ("t", "q")
     }
-    used = {place for columns in found.values() for place in columns}
-    unused = [name for place, name in enumerate(table.header) if place not in used]
-    notes = [*table.notes, *([f"not read: {', '.join(unused)}"] if unused else [])]
+    taken = {place for columns in found.values() for place in columns}
+    unused = [name for place, name in enumerate(table.header) if place not in taken]
+    notes = [*table.notes, *spread, *([f"not read: {', '.join(unused)}"] if unused else [])]
     for ours, columns in found.items():
         if stem_of(table.header[columns[0]])[0].startswith(MEASURED):
             notes.append(f"{ours} is read from {', '.join(_called(table, columns))}")
@@ -61,7 +64,7 @@ def read_log(path: Path, joints: Joints | None, options: RecordingOptions) -> Re
             notes.append(f"the columns of {ours} have different units ({', '.join(units)}): is this intended?")
     names = joints.names if joints is not None and len(joints.names) == n else _joint_names(table, found["q"])
     return Recording(
-        _stamps(table, found, options),
+        t[used],
         np.column_stack([_values(table, place, "q", options) for place in found["q"]]),
         kind=kind,
         joint_names=named(names, n),
@@ -224,7 +227,7 @@ def _reader(path: Path, ends: Ends) -> Reader:
         hint = "; write a cut as log.npz@0:9.4, in seconds" if "@" in path.name else ""
         raise MeasurementError(f"cannot be read: {error.strerror}{hint}", path) from error
     if head[:2] == b"PK":
-        return partial(read_archive, ends=ends)  # other rows are not kept
+        return partial(read_archive, ends=ends)
     if head and path.suffix == ".npz":
         refuse_data(path, "is not a NumPy archive despite its name: was it written by np.savez?")
     if not head or b"\0" in head:
@@ -232,4 +235,4 @@ def _reader(path: Path, ends: Ends) -> Reader:
         refuse_data(path, f"{found}: expected .npz, .csv, .mcap, .bag or a ROS 2 bag's folder")
     if len(head) == 1 << 16 and b"\n" not in head:
         refuse_data(path, "has a first line of more than 64 kB: not a table")
-    return read_log
+    return partial(read_log, ends=ends)

@@ -190,18 +190,18 @@ def _write_torques(
     payload on board with speeds and accelerations, too, for `read_torques`.
     """
     motion = case.motion
-    step = max(1, round(motion.rate / TORQUE_RATE))
-    columns = {"measured": np.asarray(case.target), "predicted": predicted, "q": np.asarray(motion.q)}
+    rows = np.arange(0, len(motion), max(1, round(motion.rate / TORQUE_RATE)))
+    columns = {"measured": case.target[rows], "predicted": predicted[rows], "q": motion.q[rows]}
     if expected is not None:
-        near = np.searchsorted(expected.index, np.arange(len(motion)))
+        near = np.searchsorted(expected.index, rows)
         columns |= {"sigma": expected.sigma[near], "extrapolated": expected.beyond[near]}
     if not case.carried:
-        columns |= {"v": np.asarray(motion.v), "a": np.asarray(motion.a)}
+        columns |= {"v": motion.v[rows], "a": motion.a[rows]}
     names, titles = ["t [s]"], inputs.options.settings.torque_rows.titles(inputs.chain.joint_names)
     for what, one in columns.items():
-        rows = [f"{what}_{title} [{unit}]" for title, unit in zip(titles, inputs.row_units)]
-        names += [what] if one.ndim == 1 else headings(what, inputs.chain.joints) if what in "qva" else rows
-    return files.write_numbers(path, names, np.column_stack([motion.t, *columns.values()])[::step])
+        torques = [f"{what}_{title} [{unit}]" for title, unit in zip(titles, inputs.row_units)]
+        names += [what] if one.ndim == 1 else headings(what, inputs.chain.joints) if what in "qva" else torques
+    return files.write_numbers(path, names, np.column_stack([motion.t[rows], *columns.values()]))
 
 
 def read_torques(path: Path) -> dict[str, np.ndarray]:
