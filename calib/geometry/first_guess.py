@@ -237,6 +237,7 @@ def check_scale(block: PoseMeasurements, chain: Chain) -> None:
     """
     if not isinstance(block, Positions) or len(block) < 3:
         return
+    block = take(block, np.unique(np.linspace(0, len(block) - 1, MAX_GUESS_ROWS).astype(int)))
     (measured, second), (predicted, across) = _spread(block.position), _spread(forward(chain, block.q)[:, :3, 3])
     min_spread = 1e-3  # of predicted positions, from which they are held against the measured ones [m] (our choice)
     if predicted < min_spread:

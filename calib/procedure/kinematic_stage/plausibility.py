@@ -14,7 +14,9 @@ from calib.extensions import needed
 from calib.geometry.accuracy import NATURE, errors
 from calib.geometry.diagnosis import Scale, length_factor, scale_of, wrong_columns
 from calib.geometry.installation import Installation
+from calib.geometry.model_choice.cross_validation import JUDGED_POSES
 from calib.geometry.model_choice.ladder import MAX_RESIDUAL, ModelSelection
+from calib.geometry.observation import sampled
 from calib.geometry.weighing import GeometricFit
 from calib.procedure.findings import level_of, limit
 from calib.procedure.kinematic_stage.metrics import Outlier
@@ -102,7 +104,7 @@ def findings(
     """
     before, after = (errors(cell, blocks).rms for cell in (nominal, fit.cell))
     remains = after if left is None else left
-    shown = list(map(_as_positions, blocks))
+    shown = [_as_positions(take(block, rows)) for block, rows in zip(blocks, sampled(blocks, JUDGED_POSES))]
     result = _wrong_way(nominal, shown, before, reach) or _moved(fit, reach)
     result.append(finding("unexplained", rms=remains, reach=reach, share=remains / reach))
     if 0.0 < after < TOO_GOOD:
