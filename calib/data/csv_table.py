@@ -95,14 +95,14 @@ class Table:
         column = self.index(name)
         cells = self.cells[column]
         if cells.dtype != float:
-            row = next(i for i, cell in enumerate(cells) if not _is_number(cell))
-            self.fail(_not_a_number(cells[row]), name, row)
+            bad = [i for i, cell in enumerate(cells) if not _is_number(cell)]
+            self.fail(_not_a_number(cells[bad[0]]) + _more(len(bad)), name, bad[0])
         wrong = np.isinf(cells) if gaps else ~np.isfinite(cells)
         if wrong.any():
             row = int(np.argmax(wrong))
             found = "an empty or NaN cell" if np.isnan(cells[row]) else f"{cells[row]}"
-            message = f"found {found} where a number is needed; leave the row out, or measure it again"
-            self.fail(message, name, row)
+            message = f"found {found} where a number is needed{_more(wrong.sum())}"
+            self.fail(f"{message}; leave the row out, or measure it again", name, row)
         if dimension is None:
             return cells
         known = {"angle": ANGLES, "length": LENGTHS, "joint": ANGLES | LENGTHS, "": {"1": 1.0, "-": 1.0}}[dimension]
@@ -343,6 +343,10 @@ def _as_texts(part: np.ndarray) -> np.ndarray:
 
 def _filled(cells: np.ndarray) -> bool:
     return cells.dtype != float or not np.isnan(cells).all()
+
+
+def _more(count: int) -> str:
+    return f" (and in {count - 1} more rows)" if count > 1 else ""
 
 
 def _is_number(cell: str) -> bool:
