@@ -1,15 +1,12 @@
 """How time and memory grow with poses, samples, joints, parameters and candidates, beside other tools.
 
-python tests/benchmarks/growth.py --out ROWS.csv [--only poses samples …] [--picture FILE] [--page FILE] [--largest]
-
-Goes on from the rows that are there; ``--again`` measures those of ``--only`` anew, ``--no-runs`` none. Rows are written
-one by one. Each is a process of its own (`growth_work.py`, `growth_peers.py`): processor time, peak memory. The rows
-that are kept, their picture and their page:
-
     G=tests/benchmarks/growth; python $G.py --out $G.csv --picture docs/growth.svg --page docs/growth.md
 
-Exponents p of ``cost ~ size^p`` are least-squares lines of the logarithms, over the sizes within a factor of `UPPER` of a
-curve's largest one; their σ is from the scatter about the line.
+Goes on from the rows that are there, and writes each as it comes: a process of its own (`growth_work.py`,
+`growth_peers.py`), its processor time and peak memory. ``--only samples --again`` measures one part anew.
+
+Exponents p of ``cost ~ size^p`` are least-squares lines through the logarithms at the sizes within a factor of `UPPER`
+of a curve's largest one; their σ is from the scatter about the line.
 """
 
 import argparse
@@ -25,19 +22,21 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from growth_work import PARAMETERS
 
 from calib.files import write, write_table
 from calib.records import read_rows
 
 HERE = Path(__file__).parent
-UPPER = 33.0  # three decades' third: the sizes of which exponents are fitted
+UPPER = 33.0  # sizes below the largest one by more than this are left out of exponents (our choice)
 LIMIT = 1.1  # largest exponent, above that of the work itself
 
 
 class Curve(NamedTuple):
-    """A curve to measure: what it is about, its name, the function of `growth_work` or `growth_peers`, largest size.
+    """A curve to measure: what it is about, its name, the function of `growth_work` or `growth_peers`, its sizes.
 
-    `order` is the exponent of the work itself: 2 where the result has n² numbers, 3 where its triangle takes n³ products.
+    `order` is the exponent of the work itself: 2 where a result has n² numbers or a least-squares triangle is of n
+    columns, 3 where it has rows in proportion to n, too.
     """
 
     about: str
@@ -46,6 +45,7 @@ class Curve(NamedTuple):
     largest: int
     order: int = 1
     peer: bool = False
+    smallest: int = 0
 
 
 class Row(NamedTuple):
@@ -63,7 +63,7 @@ SIZES = {
     "poses": (100, 300, 1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000),
     "samples": (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 600_000, 3_600_000),
     "joints": (3, 5, 7, 10, 15, 20, 30),
-    "parameters": (24, 32, 40, 52, 72, 92, 132),
+    "parameters": tuple(PARAMETERS),
     "candidates": (100, 200, 500, 1_000, 2_000, 5_000, 10_000, 20_000),
 }
 BEYOND = {"poses": 100_000, "samples": 600_000}  # larger sizes with --largest only
@@ -74,7 +74,7 @@ CURVES = (
     Curve("poses", "SciPy least_squares, differences", "scipy_differences", 30_000, peer=True),
     Curve("poses", "FIGAROH, its forward kinematics in SciPy", "figaroh_fit", 3_000, peer=True),
     Curve("samples", "calib identify, whole command", "command_identify", 3_600_000),
-    Curve("samples", "calib, log read to model", "identify_log", 3_600_000),
+    Curve("samples", "calib, log read to model", "identify_log", 3_600_000, smallest=10_000),
     Curve("samples", "calib, regressor", "regressor_samples", 600_000),
     Curve("samples", "Pinocchio's regressor in a loop", "pinocchio_samples", 600_000, peer=True),
     Curve("samples", "FIGAROH's regressor", "figaroh_regressor", 30_000, peer=True),
@@ -86,8 +86,8 @@ CURVES = (
     Curve("joints", "Pinocchio's regressor in a loop", "pinocchio_joints", 30, 2, peer=True),
     Curve("joints", "LAPACK's QR of as many rows and columns", "lapack_joints", 30, 3, peer=True),
     Curve("joints", "FIGAROH's base parameters", "figaroh_base", 30, 3, peer=True),
-    Curve("parameters", "calib, the fit alone", "fit_parameters", 132),
-    Curve("parameters", "SciPy least_squares, our Jacobian", "scipy_parameters", 132, peer=True),
+    Curve("parameters", "calib, the fit alone", "fit_parameters", 93, 2),
+    Curve("parameters", "SciPy least_squares, our Jacobian", "scipy_parameters", 93, 2, peer=True),
     Curve("candidates", "calib select, whole command", "command_select", 20_000),
     Curve("candidates", "calib, the choice alone", "select_candidates", 20_000),
     Curve("candidates", "FIGAROH's cone program", "figaroh_selection", 200, peer=True),
@@ -96,8 +96,7 @@ WORDS = {
     "poses": "Positions of a UR5's target, six joints, 34 unknowns.",
     "samples": "Samples of the LWR4+ at 1 kHz, seven joints. Regressors go block by block into the same memory.",
     "joints": "Joints of random arms, every third prismatic: 10,000 samples, of base parameters 1000.",
-    "parameters": "Parameters offered to the fit (four per joint, twelve of the frames) of arms of 3 to 30 joints, "
-    "1000 positions.",
+    "parameters": "Identifiable parameters of arms of 3 to 30 joints, frames included, from 1000 positions.",
     "candidates": "Poses of the LWR4+ of which 40 are chosen.",
 }
 
@@ -129,7 +128,7 @@ def run(out: Path, abouts: Sequence[str], again: bool, largest: bool, most: floa
         for size in SIZES[about]:
             beyond = not largest and size > BEYOND.get(about, size)
             for curve in CURVES:
-                if curve.about != about or beyond or size > min(curve.largest, most):
+                if curve.about != about or beyond or not curve.smallest <= size <= min(curve.largest, most):
                     continue
                 if (about, curve.name, size) in there:
                     continue

@@ -20,6 +20,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 SHORT, LONG = 1.0, 5.0  # [s] of processor time: work is repeated for so long; work that takes longer is done once
+PARAMETERS = {13: 3, 20: 5, 25: 7, 35: 10, 49: 15, 65: 20, 93: 30}  # identifiable ones of `arm`s, and their joints
 AT_ONCE = 10_000  # rows of which input is made, and regressors are filled, at a time
 
 
@@ -30,7 +31,7 @@ class Command(NamedTuple):
 
 
 def arm(n: int):
-    """Return an arm of n random joints in modified Denavit–Hartenberg rows, every third one prismatic, with inertias."""
+    """Return an arm of n joints in random modified Denavit–Hartenberg rows, every third prismatic, with inertias."""
     from arms import physical
 
     from calib.robot.chain import Chain, Element, Joint
@@ -96,7 +97,8 @@ def fit_poses(count: int) -> Callable:
 def fit_parameters(count: int) -> Callable:
     from calib.geometry.fit import fit
 
-    start, block, _ = problem(arm((count - 12) // 4), 1000)
+    start, block, free = problem(arm(PARAMETERS[count]), 1000)
+    assert len(free) == count
     return lambda: fit(start, [block])
 
 
@@ -130,7 +132,7 @@ def scipy_differences(count: int) -> Callable:
 
 
 def scipy_parameters(count: int) -> Callable:
-    return scipy_fit(*problem(arm((count - 12) // 4), 1000), exact=True)
+    return scipy_fit(*problem(arm(PARAMETERS[count]), 1000), exact=True)
 
 
 def command_fit(count: int) -> Command:
@@ -258,7 +260,7 @@ def base_joints(n: int) -> Callable:
 
 
 def lapack_joints(n: int) -> Callable:
-    """Return LAPACK's triangle of as many rows and columns as 1000 samples of the regressor have: the least there is."""
+    """Return LAPACK's triangle of as many rows and columns as 1000 samples of the regressor have."""
     rows = np.random.default_rng(0).normal(size=(1000 * n, 10 * n))
     return lambda: np.linalg.qr(rows, mode="r")
 
