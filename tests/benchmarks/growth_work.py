@@ -21,7 +21,9 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 SHORT, LONG = 1.0, 5.0  # [s] of processor time: work is repeated for so long; work that takes longer is done once
 PARAMETERS = {13: 3, 20: 5, 25: 7, 35: 10, 49: 15, 65: 20, 93: 30}  # identifiable ones of `arm`s, and their joints
-AT_ONCE = 10_000  # rows of which input is made, and regressors are filled, at a time
+AT_ONCE = 10_000  # rows of which input is made at a time; samples of chains of growing length
+BLOCK = 500_000  # numbers of a regressor filled at a time, which the processor's cache holds
+LANES = 64  # samples side by side in the kernels: blocks are of multiples
 
 
 class Command(NamedTuple):
@@ -185,17 +187,22 @@ def states(chain, count: int) -> np.ndarray:
     return np.random.default_rng(0).normal(size=(3, count, chain.n))
 
 
+def block_of(chain) -> int:
+    """Return the samples of a block."""
+    return LANES * max(1, round(BLOCK / (10 * chain.n**2 * LANES)))
+
+
 def filled(chain, count: int) -> Callable:
     """Return the regressor of `count` samples, block by block into the same memory, as an identification takes it."""
     from calib.dynamics.bodies import bodies_of
     from calib.dynamics.rigid_body import fill_regressor
 
-    given, bodies = states(chain, count), bodies_of(chain)
-    out = np.zeros((10 * chain.n, chain.n, min(AT_ONCE, count)))
+    given, bodies, block = states(chain, count), bodies_of(chain), block_of(chain)
+    out = np.zeros((10 * chain.n, chain.n, block))
 
     def run():
-        for i in range(0, count, AT_ONCE):
-            part = given[:, i : i + AT_ONCE]
+        for i in range(0, count, block):
+            part = given[:, i : i + block]
             fill_regressor(bodies, *part, out[:, :, : part.shape[1]])
 
     return run
@@ -214,12 +221,12 @@ def looped(chain, count: int) -> Callable:
     import pinocchio as pin
     import pinocchio_model
 
-    model, given = pinocchio_model.model(chain), states(chain, count)
-    data, out = model.createData(), np.empty((AT_ONCE, chain.n, 10 * chain.n))
+    model, given, block = pinocchio_model.model(chain), states(chain, count), block_of(chain)
+    data, out = model.createData(), np.empty((block, chain.n, 10 * chain.n))
 
     def run():
         for i, state in enumerate(given.transpose(1, 0, 2)):
-            out[i % AT_ONCE] = pin.computeJointTorqueRegressor(model, data, *state)
+            out[i % block] = pin.computeJointTorqueRegressor(model, data, *state)
 
     return run
 
@@ -282,7 +289,7 @@ def command_select(count: int) -> Command:
 def least(work: Callable) -> float:
     """Return the least processor time of runs that together take `SHORT` [s]."""
     found: list[float] = []
-    while len(found) < 2 or (sum(found) < SHORT and len(found) < 20):
+    while len(found) < 2 or (sum(found) < SHORT and len(found) < 50):
         began = time.process_time()
         work()
         found.append(time.process_time() - began)
