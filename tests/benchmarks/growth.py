@@ -202,22 +202,26 @@ def digest(rows: Sequence[Row]) -> str:
 
 def draw(rows: Sequence[Row], path: Path) -> None:
     """Draw time above memory against size, a column for each kind of size; peers dashed."""
-    from matplotlib import pyplot, rcParams
+    from matplotlib import pyplot, rcParams, ticker
 
-    rcParams["svg.hashsalt"] = "growth"
-    figure, axes = pyplot.subplots(2, len(SIZES), figsize=(17, 8), layout="constrained", sharex="col")
+    rcParams.update({"svg.hashsalt": "growth", "svg.fonttype": "none"})
+    figure, axes = pyplot.subplots(2, len(SIZES), figsize=(18, 9), layout="constrained", sharex="col", sharey="row")
     for (above, below), about in zip(axes.T, SIZES):
         for curve in (one for one in CURVES if one.about == about):
             for place, cost in ((above, "cpu"), (below, "memory")):
                 found = growth(curve, rows, cost)
-                label = f"{curve.name}: {found.exponent:.2f}" if found.exponent == found.exponent else curve.name
+                label = curve.name if np.isnan(found.exponent) else f"{curve.name}: {found.exponent:.2f}"
                 style = {"linestyle": "--", "marker": "s"} if curve.peer else {"marker": "o"}
                 place.plot(found.sizes, found.costs, markersize=3, label=label, **style)
-        above.set(xscale="log", yscale="log", title=about)
-        below.set(xscale="log", yscale="log", xlabel=about)
-        above.legend(fontsize=6)
         for place in (above, below):
-            place.grid(alpha=0.3, which="both")
+            place.set(xscale="log", yscale="log")
+            place.grid(alpha=0.3)
+            place.xaxis.set_minor_formatter(ticker.NullFormatter())
+            place.yaxis.set_minor_formatter(ticker.NullFormatter())
+        above.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+        below.set_xlabel(about)
+        if max(SIZES[about]) < 100:
+            below.set_xticks(SIZES[about], map(str, SIZES[about]))
     axes[0, 0].set_ylabel("processor time [s]")
     axes[1, 0].set_ylabel("peak memory [MB]")
     figure.savefig(path, metadata={"Date": None, "Description": digest(rows)})
