@@ -93,7 +93,7 @@ CURVES = (
     Curve("candidates", "FIGAROH's cone program", "figaroh_selection", 200, peer=True),
 )
 WORDS = {
-    "poses": "Positions of a UR5's target, six joints, 34 unknowns.",
+    "poses": "Positions of a UR5's target, six joints, 27 unknowns.",
     "samples": "Samples of the LWR4+ at 1 kHz, seven joints. Regressors go block by block into the same memory.",
     "joints": "Joints of random arms, every third prismatic: 10,000 samples, of base parameters 1000.",
     "parameters": "Identifiable parameters of arms of 3 to 30 joints, frames included, from 1000 positions.",
