@@ -1,6 +1,6 @@
 """How time and memory grow with poses, samples, joints, parameters and candidates, beside other tools.
 
-    G=tests/benchmarks/growth; python $G.py --out $G.csv --picture docs/growth.svg --page docs/growth.md
+    G=tests/benchmarks/growth; python $G.py --out $G.csv --picture docs/growth.png --page docs/growth.md
 
 Goes on from the rows that are there, and writes each as it comes: a process of its own (`growth_work.py`,
 `growth_peers.py`), its processor time and peak memory. ``--only samples --again`` measures one part anew.
@@ -101,19 +101,19 @@ WORDS = {
 }
 
 
-def measured(curve: Curve, size: int, python: str = sys.executable) -> Row:
+def measured(curve: Curve, size: int) -> Row:
     """Return the row of a curve at a size, measured in a process of its own."""
     script = HERE / ("growth_peers.py" if curve.work.startswith(("figaroh", "sysid")) else "growth_work.py")
     places = {"PYTHONPATH": os.pathsep.join([str(HERE.parents[1]), os.environ.get("PYTHONPATH", "")])}
     done = subprocess.run(
-        [python, str(script), curve.work, str(size)], capture_output=True, text=True,
+        [sys.executable, str(script), curve.work, str(size)], capture_output=True, text=True,
         env=os.environ | places | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
     )  # fmt: skip
     if done.returncode == 0:
         found = json.loads(done.stdout.splitlines()[-1])
         return Row(curve.about, curve.name, size, round(found["cpu"], 5), round(found["memory"], 1))
     last = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
-    if absent := re.fullmatch(r"ModuleNotFoundError: No module named '([\w.]+)'", last):
+    if absent := re.fullmatch(r"ModuleNotFoundError: No module named '([^']+)'", last):
         return Row(curve.about, curve.name, size, None, None, f"{absent[1]} is not installed")
     if not curve.peer:
         raise SystemExit(f"{curve.name} at {size}:\n{done.stderr}")
@@ -202,9 +202,8 @@ def digest(rows: Sequence[Row]) -> str:
 
 def draw(rows: Sequence[Row], path: Path) -> None:
     """Draw time above memory against size, a column for each kind of size; peers dashed."""
-    from matplotlib import pyplot, rcParams, ticker
+    from matplotlib import pyplot, ticker
 
-    rcParams.update({"svg.hashsalt": "growth", "svg.fonttype": "none"})
     figure, axes = pyplot.subplots(2, len(SIZES), figsize=(18, 9), layout="constrained", sharex="col", sharey="row")
     for (above, below), about in zip(axes.T, SIZES):
         for curve in (one for one in CURVES if one.about == about):
@@ -224,7 +223,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
             below.set_xticks(SIZES[about], map(str, SIZES[about]))
     axes[0, 0].set_ylabel("processor time [s]")
     axes[1, 0].set_ylabel("peak memory [MB]")
-    figure.savefig(path, metadata={"Date": None, "Description": digest(rows)})
+    figure.savefig(path, dpi=80, metadata={"Description": digest(rows)})
 
 
 def written(text: str, rows: Sequence[Row]) -> str:

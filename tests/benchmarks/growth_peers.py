@@ -107,6 +107,8 @@ def sysid_identify(samples: int) -> Callable:
 
     from calib.robot.formats.urdf_write import write_new
 
+    if not hasattr(sysid, "optimize"):  # MuJoCo without what its sysid needs
+        raise ModuleNotFoundError("No module named 'mujoco[sysid]'")
     length = min(samples, 1000)
     chain = replace(ours.library("lwr4plus"), inertias=physical(7))
     described = MjSpec.from_string(write_new(chain))
