@@ -3,7 +3,8 @@
     G=tests/benchmarks/growth; python $G.py --out $G.csv --picture docs/growth.png --page docs/growth.md
 
 Goes on from the rows that are there, and writes each as it comes: a process of its own (`growth_work.py`,
-`growth_peers.py`), its processor time and peak memory. ``--only samples --again`` measures one part anew.
+`growth_peers.py`), its processor time and peak memory. ``--only samples --again`` measures one part anew; a
+killed one goes on without ``--again``.
 
 Exponents p of ``cost ~ size^p`` are least-squares lines through the logarithms at the sizes within a factor of `UPPER`
 of a curve's largest one; their σ is from the scatter about the line.
