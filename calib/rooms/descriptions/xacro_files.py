@@ -23,7 +23,6 @@ from io import StringIO
 from pathlib import Path
 from types import ModuleType
 from typing import Any
-from unittest.mock import patch
 from xml.etree import ElementTree as ET
 
 from calib.errors import RobotError, refuse_robot, suggestion
@@ -99,6 +98,8 @@ def _place(xacro: Any, file: str) -> str:
 @contextmanager
 def _packages_for(file: Path) -> Iterator[None]:
     """Let ``$(find NAME)`` of xacro, which asks ROS's index by this import, find packages by `package_folder`."""
+    from unittest.mock import patch  # slow to load
+
     index = ModuleType("ament_index_python.packages")
     index.get_package_share_directory = lambda name: str(package_folder(name, file))  # type: ignore[attr-defined]
     with patch.dict(sys.modules, {"ament_index_python": ModuleType("ament_index_python"), index.__name__: index}):
