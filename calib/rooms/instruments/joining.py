@@ -41,12 +41,11 @@ from calib.robot.chain import Chain
 from calib.robot.library import load_calibrated
 from calib.rooms.controllers.program import joints_table
 from calib.rooms.controllers.targets import is_program
+from calib.rooms.instruments.names import CLOCKS, NAMES, column_of
 from calib.rooms.instruments.order import MAX_MISFIT, MIN_FOUND, MIN_POINTS, find_order
 from calib.units import TIMES
 
 WAYS = ("name", "time", "row", "geometry")
-NAMES = ("name", "point", "pointname", "pointid", "pose", "poseid", "id", "label", "target", "number", "no", "nr")
-CLOCKS = ("t", "time", "timestamp", "datetime")
 MAX_APART = 1e-3  # of two readings of one pose [m], where nothing is known of their scatter (our choice)
 TIMES_USUAL = 10.0  # the median distance of two readings of one pose, up to which they are one (our choice)
 MIN_REPEATS = 5  # degrees of freedom of a scatter that is stated as sigma (our choice)
@@ -241,12 +240,6 @@ def _averaged(points: Table, name: str, groups: dict[int, np.ndarray], position:
         return np.array([cells[rows].mean() for rows in groups.values()])
     away = (np.linalg.norm(position[rows] - position[rows].mean(axis=0), axis=1) for rows in groups.values())
     return cells[[rows[np.argmin(size)] for rows, size in zip(groups.values(), away)]]
-
-
-def column_of(table: Table, known: Sequence[str]) -> str:
-    """Return the table's first column that has one of the `known` names, in any spelling; "" without any."""
-    plain = {re.sub(r"[^a-z0-9]", "", name.lower()): name for name in reversed(table.header)}
-    return next((plain[name] for name in known if name in plain), "")
 
 
 def _labels(joints: Table) -> list[str]:

@@ -1,0 +1,207 @@
+"""Clock of an instrument against a controller's, from points measured while the arm moves.
+
+A point at the instrument's time t belongs to the joints q(t - offset - drift (t - middle)) of the log. Where to begin is
+found without any frame: the speed of the nominal arm's tip against that of the points, at every offset
+(cross-correlation); the best few are tried by placing instrument and target. Then offset, drift, both placements and the
+arm's geometry are fitted together (Gauss-Newton, Huber's weights), since an arm that is wrong by millimetres would else
+pass for a late clock. Thresholds are our choice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.signal import correlate, correlation_lags
+
+from calib.data.poses.measurements import Positions, take
+from calib.errors import listing, refuse_data
+from calib.estimation import robust
+from calib.geometry.first_guess import install
+from calib.geometry.fit import plausible_deviation
+from calib.geometry.installation import Installation
+from calib.geometry.observability import base_columns
+from calib.geometry.observation import layout, observe, parameter_values, prepare, step
+from calib.robot.chain import Chain
+from calib.robot.kinematics import forward
+from calib.rooms.instruments.order import MAX_MISFIT
+from calib.rooms.instruments.stream_files import Stream
+from calib.transforms import invert, rotation_vector
+
+GRID = 0.05  # of the offsets that are tried first [s]
+LEVERS = (0.0, 0.15, 0.4)  # by which the tip's turning counts as speed: the target's own is not known [m]
+PEAKS, APART = 3, 1.0  # offsets that are tried for each lever, and their least distance [s]
+OVERLAP = 0.5  # share of the shorter file that the longer one has, at least
+PLACED = 300  # rows that placements are guessed from
+MAX_RATIO = 0.15  # of the points' spread that a log of the same motion leaves with the nominal arm
+RIVAL = 1.3  # times the residual of the best offset, up to which another one is as good
+MAX_DRIFT = 1e-3  # prior standard deviation of a clock's drift
+BESIDE = 1e-3  # difference of times by which speeds are computed [s]
+ROUNDS = 12  # of Gauss-Newton
+SETTLED = 1e-7  # change of the offset after which it ends [s]
+_NONE = np.array([], dtype=int)
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Clock of an instrument against the controller's.
+
+    Attributes:
+        offset, sigma: the instrument's time minus the controller's at `middle`, and its standard deviation [s].
+        drift, drift_sigma: change of the offset with time [s/s].
+        middle: time of the instrument [s].
+    """
+
+    offset: float
+    sigma: float = np.inf
+    drift: float = 0.0
+    drift_sigma: float = np.inf
+    middle: float = 0.0
+
+    def controller(self, t: np.ndarray) -> np.ndarray:
+        """Return the controller's times of the instrument's times t (m,) [s]."""
+        return t - self.offset - self.drift * (t - self.middle)
+
+    def __str__(self) -> str:
+        seen, ppm = abs(self.drift) > 3.0 * self.drift_sigma, f"± {1e6 * self.drift_sigma:.2g} ppm"
+        drift = f"drifts by {1e6 * self.drift:.4g} {ppm}" if seen else f"does not drift ({ppm})"
+        return f"the instrument's clock is {self.offset:+.6g} ± {self.sigma:.1g} s off the controller's, and {drift}"
+
+
+class Motion:
+    """Joints of a log at any time."""
+
+    def __init__(self, log: Stream) -> None:
+        self.log, self.at = log, CubicSpline(log.t, log.values)
+
+    def knows(self, t: np.ndarray) -> np.ndarray:
+        """Return which times (m,) are between two rows of the log that are no gap apart."""
+        after = np.clip(np.searchsorted(self.log.t, t), 1, len(self.log.t) - 1)
+        near = self.log.t[after] - self.log.t[after - 1] <= self.log.gap
+        return near & (t >= self.log.t[0]) & (t <= self.log.t[-1])
+
+
+def begin(chain: Chain, motion: Motion, stream: Stream, measured: Positions) -> tuple[Installation, Clock, list[str]]:
+    """Return the nominal arm placed, the clock to begin with, and notes.
+
+    Args:
+        measured: the stream's rows; their joints are not used.
+
+    Raises:
+        MeasurementError: where no offset brings the points onto the nominal arm's path.
+    """
+    found, middle = list[tuple[float, float, Installation]](), float(stream.t[[0, -1]].mean())
+    for offset in _offsets(chain, motion, stream):
+        clock = Clock(offset, middle=middle)
+        rows = np.flatnonzero(motion.knows(clock.controller(stream.t)))
+        rows = rows[np.unique(np.linspace(0, len(rows) - 1, PLACED).astype(int))] if len(rows) >= PLACED else rows[:0]
+        if len(rows):
+            placed = install(chain, [_at(motion, measured, stream.t, clock, rows)])
+            cell, clock = fitted(placed, motion, stream, measured, rows, clock, arm=False)
+            left = observe(cell, *prepare(cell, [_at(motion, measured, stream.t, clock, rows)]), _NONE)[0]
+            found.append((float(np.sqrt(np.mean(robust_square(left.sizes())))), clock.offset, cell))
+    spread = float(np.linalg.norm(measured.position.std(axis=0)))
+    limit = min(MAX_RATIO * spread, MAX_MISFIT * chain.stretched_length())
+    if not found or min(found)[0] > limit:
+        best = f"the best leaves {1e3 * min(found)[0]:.3g} mm of a motion of {1e3 * spread:.3g} mm" if found else "none"
+        refuse_data(
+            stream.file,
+            f"at no offset of the clocks its points are on the path of the nominal arm by {motion.log.file} ({best}): "
+            "is it the log of this motion, and of this robot, and did instrument and target stay in place?",
+        )
+    least, offset, cell = min(found, key=lambda each: each[0])
+    rivals = {round(other, 2) for left, other, _ in found if left < RIVAL * least and abs(other - offset) > APART}
+    words = "the motion repeats itself: the clocks' offset may as well be {} s; joints are right as far as it does"
+    return cell, Clock(offset, middle=middle), [words.format(listing(sorted(rivals)))] if rivals else []
+
+
+def robust_square(sizes: np.ndarray) -> np.ndarray:
+    """Return the squares of sizes (m,), the worst tenth left out."""
+    return np.sort(sizes**2)[: max(int(0.9 * len(sizes)), 1)]
+
+
+def _offsets(chain: Chain, motion: Motion, stream: Stream) -> list[float]:
+    """Return offsets of the clocks [s] at which the speeds of the arm and of the points go together."""
+    log, apart = motion.log, float(stream.t[0] - motion.log.t[0])
+    times = np.arange(log.t[0], log.t[-1], GRID)
+    arm = forward(chain, motion.at(times))
+    turns = np.linalg.norm(rotation_vector(invert(arm[:-1])[:, :3, :3] @ arm[1:, :3, :3]), axis=1)
+    ways = np.linalg.norm(np.diff(arm[:, :3, 3], axis=0), axis=1)
+    seen = np.arange(stream.t[0], stream.t[-1], GRID)
+    points = np.column_stack([np.interp(seen, stream.t, column) for column in stream.values[:, :3].T])
+    theirs = _standard(np.linalg.norm(np.diff(points, axis=0), axis=1))
+    lags = GRID * correlation_lags(len(theirs), len(ways))
+    shared = correlate(np.ones(len(theirs)), np.ones(len(ways)))
+    possible, found = shared > OVERLAP * min(len(theirs), len(ways)), list[float]()
+    for lever in LEVERS:
+        alike = correlate(theirs, _standard(np.hypot(ways, lever * turns))) / np.maximum(shared, 1.0)
+        alike[~possible] = -np.inf
+        for _ in range(PEAKS):
+            best = float(lags[int(np.argmax(alike))])
+            alike[np.abs(lags - best) < APART] = -np.inf
+            found.append(apart - best)
+    return [one for k, one in enumerate(found) if all(abs(one - other) > APART / 2 for other in found[:k])]
+
+
+def _standard(speed: np.ndarray) -> np.ndarray:
+    """Return speeds (m,) about their mean in standard deviations; jumps are cut."""
+    cut = np.minimum(speed, 2.0 * np.quantile(speed, 0.95))
+    return (cut - cut.mean()) / max(float(cut.std()), 1e-12)
+
+
+def _at(motion: Motion, measured: Positions, t: np.ndarray, clock: Clock, rows: np.ndarray) -> Positions:
+    """Return some rows with the joints of the log at their times."""
+    return replace(take(measured, rows), q=motion.at(clock.controller(t[rows])))
+
+
+def residuals(
+    cell: Installation, motion: Motion, stream: Stream, measured: Positions, rows: np.ndarray, clock: Clock
+) -> np.ndarray:
+    """Return the residuals (3 or 6, m) of rows: of positions [m], then of orientations [rad]."""
+    parts = observe(cell, *prepare(cell, [_at(motion, measured, stream.t, clock, rows)]), _NONE)
+    return np.concatenate([part.value for part in parts])
+
+
+def fitted(
+    cell: Installation, motion: Motion, stream: Stream, measured: Positions, rows: np.ndarray, clock: Clock,
+    arm: bool = True,
+) -> tuple[Installation, Clock]:  # fmt: skip
+    """Return the installation and the clock that fit some rows best; σ is that of independent rows.
+
+    Args:
+        cell, clock: where to start; the arm's parameters have a wide prior about their values there.
+        arm: whether the arm's geometry and the drift are fitted, too, not placements and offset alone.
+    """
+    start, table, t = cell, layout(cell), stream.t[rows] - clock.middle
+    first = prepare(cell, [_at(motion, measured, stream.t, clock, rows)])
+    free = table.rigid_index if arm else table.frame_index
+    free = free[base_columns(cell, first, free).kept]
+    prior = np.concatenate([plausible_deviation(cell, free), [np.inf, MAX_DRIFT if arm else 1e-12]])
+    for _ in range(ROUNDS):
+        at = _at(motion, measured, stream.t, clock, rows)
+        ways = BESIDE * motion.at(clock.controller(stream.t[rows]), 1)
+        now, ahead, behind = (
+            observe(cell, *prepare(cell, [replace(at, q=at.q + sign * ways)]), index)
+            for sign, index in ((0.0, free), (1.0, _NONE), (-1.0, _NONE))
+        )
+        pulled = np.append((parameter_values(start) - parameter_values(cell))[free], [0.0, -clock.drift])
+        known = np.isfinite(prior)
+        left, slopes = [pulled[known] / prior[known]], [np.diag(1.0 / prior)[known]]
+        for part, one, other in zip(now, ahead, behind):
+            late = (one.value - other.value) / (2.0 * BESIDE)  # of the prediction, by a clock that is ahead
+            sigma = max(robust.spread(part.value), 1e-9)
+            weight = np.sqrt(robust.weights(np.sqrt(np.mean(part.value**2, axis=0)) / sigma, "huber")) / sigma
+            left.append((weight * part.value).ravel())
+            slopes.append((weight * np.concatenate([part.jacobian, [late, t * late]])).reshape(len(prior), -1).T)
+        matrix, wanted = np.concatenate(slopes), np.concatenate(left)
+        size = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
+        change = np.linalg.lstsq(matrix / size, wanted, rcond=1e-10)[0] / size
+        cell = step(cell, free, change[:-2])
+        clock = replace(clock, offset=clock.offset + change[-2], drift=clock.drift + change[-1])
+        if abs(change[-2]) < SETTLED:
+            break
+    rest = wanted - matrix @ change
+    scale = np.sqrt(rest @ rest / max(len(rest) - len(prior), 1))
+    spread = scale * np.sqrt(np.diag(np.linalg.pinv((matrix / size).T @ (matrix / size)))) / size
+    return cell, replace(clock, sigma=float(spread[-2]), drift_sigma=float(spread[-1]))

@@ -1,0 +1,205 @@
+"""Points measured while an arm moves, joined with the log of its controller, and thinned to independent rows.
+
+The joints are those of the log at the points' times (`calib.rooms.instruments.clocks`). Left out are points far from
+what the arm, fitted to them, predicts, and those where the speed times the uncertainty of a time exceeds the noise: the
+residuals along the motion are then larger than those across it. Residuals of neighbours are correlated (air, vibration,
+what no model holds): N rows count as N / τ (`calib.estimation.whiteness.inflation`), and a fit to all of them would state
+sigmas √τ too small. Of rows apart by 1 + 1.5 (τ - 1) steps neighbours are correlated by 0.05, where correlation dies away
+exponentially. Thresholds are our choice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from calib.data.csv_table import Table
+from calib.data.poses.columns import POSITION, QUATERNION, Sheet
+from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.plausible import check_joints, outside, unit_quaternions
+from calib.data.schema import BOUNDS, max_travel
+from calib.errors import MeasurementError, require
+from calib.estimation import robust
+from calib.estimation.whiteness import autocorrelation, inflation
+from calib.procedure.robot_kinds import joints_of
+from calib.robot.chain import Chain, joint_kinds
+from calib.rooms.instruments.clocks import Clock, Motion, begin, fitted, residuals
+from calib.rooms.instruments.stream_files import Kind, Stream, read_stream
+from calib.units import JOINT
+
+RESOLUTION, LOG_RESOLUTION = 0.004, 0.008  # time between the rows that are held, of instrument and log [s]
+MIN_MOTION = 1e-3  # travel of a joint [rad or m] and of the points [m]
+FITTED = 3000  # rows that clock and geometry are fitted to first
+OUTLIER = 6.0  # robust sigmas
+MIN_ROWS, MAX_ROWS = 20, 20_000  # of the table
+MOVED = 1e-3  # by which a joint moves at least between two rows of the table [rad or m]
+
+
+@dataclass(frozen=True, eq=False)
+class Streamed:
+    """Points of a stream with the joints at their times, thinned.
+
+    Attributes:
+        table: joints, positions and, where measured, orientations; the instrument's time.
+        rows: of the instrument's file, from 1.
+        clock: the instrument's.
+        sigma: robust standard deviation of the residuals of positions, per axis [m].
+        correlation: τ of the residuals before thinning [s].
+        factor: √ of the number of rows that counted as one: by so much sigmas of all rows would be too small.
+        left: correlation of neighbours after thinning.
+        notes: what was found and left out.
+    """
+
+    table: Table
+    rows: np.ndarray
+    clock: Clock
+    sigma: float
+    correlation: float
+    factor: float
+    left: float
+    notes: tuple[str, ...]
+
+
+def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
+    """Return the points of an instrument's stream with the joints of a controller's log, thinned to independent ones.
+
+    Args:
+        log_file: times and joint values, by the controller's clock.
+        file: times and positions, with or without quaternions, by the instrument's clock.
+        chain: the nominal arm.
+
+    Raises:
+        MeasurementError: where the files are no streams, the arm hardly moves, or the two do not belong together.
+    """
+    log, stream = read_stream(log_file, _joints(chain)), _fresh(read_stream(file, _target()))
+    for each in (log, stream):
+        words = "hardly moves, and without motion no clock is found: start both recordings, then move the arm"
+        require(np.ptp(each.values[:, : chain.n], axis=0).max() > MIN_MOTION, words, MeasurementError, each.file)
+    position, turn = stream.values[:, :3], stream.values[:, 3:] if stream.values.shape[1] > 3 else None
+    q = np.zeros((len(position), chain.n))
+    measured = PoseMeasurements.of(q, position, turn, joint_names=chain.joint_names, file=str(file), rows=stream.rows)
+    motion = Motion(log)
+    cell, clock, notes = begin(chain, motion, stream, measured)
+    known = np.flatnonzero(motion.knows(clock.controller(stream.t)))
+    some = known[np.unique(np.linspace(0, len(known) - 1, FITTED).astype(int))]
+    cell, clock = fitted(cell, motion, stream, measured, some, clock)
+    kept = np.flatnonzero(motion.knows(clock.controller(stream.t)))
+    stream.dropped["outside the log or in its gaps"] = len(stream.t) - len(kept)
+    left = residuals(cell, motion, stream, measured, kept, clock)
+    near = (np.abs(left) < OUTLIER * np.array([[robust.spread(row)] for row in left])).all(axis=0)
+    stream.dropped["far from the arm's path"] = int((~near).sum())
+    kept, left = kept[near], left[:, near]
+    slow, said = _slow(position[kept], stream.t[kept], left[:3])
+    stream.dropped["too fast"] = int((~slow).sum())
+    kept, left = kept[slow], left[:, slow]
+    tau = max(inflation(row) for row in left)
+    chosen = _thinned(motion, clock, stream.t[kept], stream.step * (1.0 + 1.5 * (tau - 1.0)))
+    words = f"only {len(chosen)} independent rows: measure for longer, and over more of the workspace"
+    require(len(chosen) >= MIN_ROWS, words, MeasurementError, file)
+    rest = max(float(autocorrelation(row, 1)[0]) for row in left[:, chosen])
+    rows, correlation, sigma = kept[chosen], tau * stream.step, robust.spread(left[:3])
+    _, clock = fitted(cell, motion, stream, measured, rows, clock)
+    thinned = (
+        f"{len(rows)} of {len(kept)} rows: residuals of {1e3 * sigma:.2g} mm per axis are correlated over "
+        f"{correlation:.2g} s, so that {tau:.3g} neighbours count as one and σ from all rows would be "
+        f"{np.sqrt(tau):.2g} times too small; of the rows taken neighbours are correlated by {rest:.2f}"
+    )
+    notes = (*log.lines(), *stream.lines(), *notes, str(clock), *said, thinned)
+    table = _table(chain, motion.at(clock.controller(stream.t[rows])), stream, rows)
+    return Streamed(table, stream.rows[rows], clock, sigma, correlation, float(np.sqrt(tau)), rest, notes)
+
+
+def _joints(chain: Chain) -> Kind:
+    """Return how a log's joints are read."""
+    robot = joints_of(chain)
+    travel = max_travel(robot.kinds)
+    low, high = (np.where(np.isfinite(own), own, side * travel) for own, side in ((robot.lower, -1), (robot.upper, 1)))
+
+    def values(table: Table, strictly: bool) -> np.ndarray:
+        q, names = Sheet(table).joints(robot.names)
+        if strictly:
+            check_joints(q, Sheet(table), names, robot)
+        return q
+
+    return Kind(
+        lambda table: Sheet(table).find_joints(robot.names), values, lambda q: ~outside(q, low, high).any(axis=1),
+        LOG_RESOLUTION,
+    )  # fmt: skip
+
+
+def _target() -> Kind:
+    """Return how an instrument's positions [m], and its quaternions where it has some, are read."""
+
+    def names(table: Table) -> tuple[str, ...]:
+        found = Sheet(table).family(POSITION.names)
+        require(found, f"has no x, y, z; found {', '.join(table.header)}", MeasurementError, table.file)
+        return (*found, *Sheet(table).family(QUATERNION.names))
+
+    def values(table: Table, strictly: bool) -> np.ndarray:
+        own = names(table)
+        position = np.column_stack([table.numbers(name, "length") for name in own[:3]])
+        turn = np.column_stack([table.numbers(name) for name in own[3:]]) if own[3:] else np.zeros((len(table), 0))
+        if strictly:
+            POSITION.check(position, table, own[:3])
+            unit_quaternions(turn, table, own[3:])
+        return np.concatenate([position, turn], axis=1)
+
+    def sound(values: np.ndarray) -> np.ndarray:
+        position, turn = values[:, :3], values[:, 3:]
+        unit = np.abs(np.linalg.norm(turn, axis=1) - 1.0) <= BOUNDS.max_norm_error
+        return (np.abs(position) <= BOUNDS.max_length).all(axis=1) & position.any(axis=1) & (unit | (not turn.size))
+
+    return Kind(names, values, sound, RESOLUTION)
+
+
+def _fresh(stream: Stream) -> Stream:
+    """Return the stream without readings that repeat the one before: nothing new was seen."""
+    new = np.concatenate([[True], np.diff(stream.values, axis=0).any(axis=1)])
+    stream.dropped["repeating the reading before"] = int((~new).sum())
+    return replace(stream, t=stream.t[new], values=stream.values[new], rows=stream.rows[new])
+
+
+def _slow(position: np.ndarray, t: np.ndarray, left: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    """Return which rows (m,) are slow enough for the uncertainty of their times, and a note where some are not.
+
+    Residuals (3, m) have the variance σ² across the motion, and σ² + v² σ_t² along it.
+    """
+    velocity = np.gradient(position, t, axis=0).T
+    speed = np.linalg.norm(velocity, axis=0)
+    along = (left * velocity).sum(axis=0) / np.maximum(speed, 1e-9)
+    across = ((left**2).sum(axis=0) - along**2) / 2.0
+    late = np.sqrt(max(float(np.sum(speed**2 * (along**2 - across)) / np.sum(speed**4)), 0.0))
+    sigma = float(np.sqrt(across.mean()))
+    slow = speed * late <= sigma
+    words = (
+        f"faster than {1e3 * sigma / max(late, 1e-12):.3g} mm/s, left out: times are uncertain by {1e3 * late:.2g} ms, "
+        f"which costs more there than the noise of {1e3 * sigma:.2g} mm"
+    )
+    return slow, [] if slow.all() else [words]
+
+
+def _thinned(motion: Motion, clock: Clock, t: np.ndarray, apart: float) -> np.ndarray:
+    """Return the indices of times t (m,) that are at least `apart` [s], and between which a joint moves."""
+    apart = max(0.999 * apart, (t[-1] - t[0]) / MAX_ROWS)
+    found, q = [0], motion.at(clock.controller(t))
+    while (after := int(np.searchsorted(t, t[found[-1]] + apart))) < len(t):
+        moved = np.abs(q[after : after + 1000] - q[found[-1]]).max(axis=1) > MOVED
+        while not moved.any() and (after := after + 1000) < len(t):
+            moved = np.abs(q[after : after + 1000] - q[found[-1]]).max(axis=1) > MOVED
+        if after >= len(t):
+            break
+        found.append(after + int(np.argmax(moved)))
+    return np.array(found)
+
+
+def _table(chain: Chain, q: np.ndarray, stream: Stream, rows: np.ndarray) -> Table:
+    """Return rows of a stream with their joints q (m, n) as a table of measured poses."""
+    units = [JOINT["prismatic" if kind == "prismatic" else "revolute"] for kind in joint_kinds(chain)]
+    turn = QUATERNION.names if stream.values.shape[1] > 3 else ()
+    header = ("time", *chain.joint_names, *POSITION.names, *turn)
+    cells = (stream.t[rows], *(q * [factor for factor, _ in units]).T, *(1e3 * stream.values[rows, :3]).T)
+    cells += tuple(stream.values[rows, 3:].T)
+    named = ("s", *(unit for _, unit in units), *("mm",) * 3, *("",) * len(turn))
+    return Table(stream.file, header, named, cells, stream.rows[rows])
