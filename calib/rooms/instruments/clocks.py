@@ -1,10 +1,10 @@
 """Clock of an instrument against a controller's, from points measured while the arm moves.
 
-A point at the instrument's time t belongs to the joints q(t - offset - drift (t - middle)) of the log. Where to begin is
-found without any frame: the speed of the nominal arm's tip against that of the points, at every offset
-(cross-correlation); the best few are tried by placing instrument and target. Then offset, drift, both placements and the
-arm's geometry are fitted together (Gauss-Newton, Huber's weights), since an arm that is wrong by millimetres would else
-pass for a late clock. Thresholds are our choice.
+A point at the instrument's time t belongs to the joints q(t - offset - drift (t - middle)) of the log. Where to begin
+is found without any frame: the speed of the nominal arm's tip against that of the points, at every offset
+(cross-correlation); the best few are tried by placing instrument and target. Then offset, drift, both placements and
+the arm's geometry are fitted together (Gauss-Newton), since the errors of an arm would else pass for those of a clock.
+Thresholds are our choice.
 """
 
 from __future__ import annotations
@@ -165,13 +165,14 @@ def residuals(
 
 def fitted(
     cell: Installation, motion: Motion, stream: Stream, measured: Positions, rows: np.ndarray, clock: Clock,
-    arm: bool = True,
+    arm: bool = True, loss: str = "huber",
 ) -> tuple[Installation, Clock]:  # fmt: skip
     """Return the installation and the clock that fit some rows best; σ is that of independent rows.
 
     Args:
         cell, clock: where to start; the arm's parameters have a wide prior about their values there.
         arm: whether the arm's geometry and the drift are fitted, too, not placements and offset alone.
+        loss: of each row's size (`calib.estimation.robust`).
     """
     start, table, t = cell, layout(cell), stream.t[rows] - clock.middle
     first = prepare(cell, [_at(motion, measured, stream.t, clock, rows)])
@@ -191,7 +192,7 @@ def fitted(
         for part, one, other in zip(now, ahead, behind):
             late = (one.value - other.value) / (2.0 * BESIDE)  # of the prediction, by a clock that is ahead
             sigma = max(robust.spread(part.value), 1e-9)
-            weight = np.sqrt(robust.weights(np.sqrt(np.mean(part.value**2, axis=0)) / sigma, "huber")) / sigma
+            weight = np.sqrt(robust.weights(np.sqrt(np.mean(part.value**2, axis=0)) / sigma, loss)) / sigma
             left.append((weight * part.value).ravel())
             slopes.append((weight * np.concatenate([part.jacobian, [late, t * late]])).reshape(len(prior), -1).T)
         matrix, wanted = np.concatenate(slopes), np.concatenate(left)

@@ -18,9 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from calib.data.csv_table import Table, opened, plain_rows, split_units
-from calib.data.poses.columns import Sheet
 from calib.errors import MeasurementError, listing, refuse_data, refused_as, require
-from calib.rooms.instruments.names import CLOCKS, column_of
+from calib.rooms.instruments.joined import CLOCKS, column_of
 from calib.units import TIMES
 
 PIECE = 50_000  # rows read at once (our choice)

@@ -26,6 +26,7 @@ from calib.estimation.whiteness import autocorrelation, inflation
 from calib.procedure.robot_kinds import joints_of
 from calib.robot.chain import Chain, joint_kinds
 from calib.rooms.instruments.clocks import Clock, Motion, begin, fitted, residuals
+from calib.rooms.instruments.joined import Joined
 from calib.rooms.instruments.stream_files import Kind, Stream, read_stream
 from calib.units import JOINT
 
@@ -38,28 +39,22 @@ MOVED = 1e-3  # by which a joint moves at least between two rows of the table [r
 
 
 @dataclass(frozen=True, eq=False)
-class Streamed:
-    """Points of a stream with the joints at their times, thinned.
+class Streamed(Joined):
+    """Points of a stream with the joints at their times, thinned; the table has the instrument's time, too.
 
     Attributes:
-        table: joints, positions and, where measured, orientations; the instrument's time.
-        rows: of the instrument's file, from 1.
         clock: the instrument's.
         sigma: robust standard deviation of the residuals of positions, per axis [m].
         correlation: τ of the residuals before thinning [s].
         factor: √ of the number of rows that counted as one: by so much sigmas of all rows would be too small.
         left: correlation of neighbours after thinning.
-        notes: what was found and left out.
     """
 
-    table: Table
-    rows: np.ndarray
     clock: Clock
     sigma: float
     correlation: float
     factor: float
     left: float
-    notes: tuple[str, ...]
 
 
 def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
@@ -100,7 +95,7 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
     require(len(chosen) >= MIN_ROWS, words, MeasurementError, file)
     rest = max(float(autocorrelation(row, 1)[0]) for row in left[:, chosen])
     rows, correlation, sigma = kept[chosen], tau * stream.step, robust.spread(left[:3])
-    _, clock = fitted(cell, motion, stream, measured, rows, clock)
+    _, clock = fitted(cell, motion, stream, measured, rows, clock, loss="none")
     thinned = (
         f"{len(rows)} of {len(kept)} rows: residuals of {1e3 * sigma:.2g} mm per axis are correlated over "
         f"{correlation:.2g} s, so that {tau:.3g} neighbours count as one and σ from all rows would be "
@@ -108,7 +103,7 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
     )
     notes = (*log.lines(), *stream.lines(), *notes, str(clock), *said, thinned)
     table = _table(chain, motion.at(clock.controller(stream.t[rows])), stream, rows)
-    return Streamed(table, stream.rows[rows], clock, sigma, correlation, float(np.sqrt(tau)), rest, notes)
+    return Streamed(table, stream.rows[rows] - 1, notes, clock, sigma, correlation, float(np.sqrt(tau)), rest)
 
 
 def _joints(chain: Chain) -> Kind:
