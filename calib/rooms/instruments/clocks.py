@@ -66,14 +66,18 @@ class Clock:
     def __str__(self) -> str:
         seen, ppm = abs(self.drift) > 3.0 * self.drift_sigma, f"± {1e6 * self.drift_sigma:.2g} ppm"
         drift = f"drifts by {1e6 * self.drift:.4g} {ppm}" if seen else f"does not drift ({ppm})"
-        return f"the instrument's clock is {self.offset:+.6g} ± {self.sigma:.1g} s off the controller's, and {drift}"
+        return f"the instrument's clock is {self.offset:+.5f} ± {self.sigma:.1g} s off the controller's, and {drift}"
 
 
 class Motion:
     """Joints of a log at any time."""
 
     def __init__(self, log: Stream) -> None:
-        self.log, self.at = log, CubicSpline(log.t, log.values)
+        self.log, self._path = log, CubicSpline(log.t, log.values)
+
+    def at(self, t: np.ndarray, order: int = 0) -> np.ndarray:
+        """Return the joints (m, n) at times t (m,) [s], or a derivative; outside the log those of its ends."""
+        return self._path(np.clip(t, self.log.t[0], self.log.t[-1]), order)
 
     def knows(self, t: np.ndarray) -> np.ndarray:
         """Return which times (m,) are between two rows of the log that are no gap apart."""
@@ -130,24 +134,32 @@ def _offsets(chain: Chain, motion: Motion, stream: Stream) -> list[float]:
     ways = np.linalg.norm(np.diff(arm[:, :3, 3], axis=0), axis=1)
     seen = np.arange(stream.t[0], stream.t[-1], GRID)
     points = np.column_stack([np.interp(seen, stream.t, column) for column in stream.values[:, :3].T])
-    theirs = _standard(np.linalg.norm(np.diff(points, axis=0), axis=1))
+    theirs = _cut(np.linalg.norm(np.diff(points, axis=0), axis=1))
     lags = GRID * correlation_lags(len(theirs), len(ways))
     shared = correlate(np.ones(len(theirs)), np.ones(len(ways)))
     possible, found = shared > OVERLAP * min(len(theirs), len(ways)), list[float]()
     for lever in LEVERS:
-        alike = correlate(theirs, _standard(np.hypot(ways, lever * turns))) / np.maximum(shared, 1.0)
+        alike = _alike(theirs, _cut(np.hypot(ways, lever * turns)))
         alike[~possible] = -np.inf
         for _ in range(PEAKS):
             best = float(lags[int(np.argmax(alike))])
             alike[np.abs(lags - best) < APART] = -np.inf
-            found.append(apart - best)
+            found.append(apart + best)
     return [one for k, one in enumerate(found) if all(abs(one - other) > APART / 2 for other in found[:k])]
 
 
-def _standard(speed: np.ndarray) -> np.ndarray:
-    """Return speeds (m,) about their mean in standard deviations; jumps are cut."""
-    cut = np.minimum(speed, 2.0 * np.quantile(speed, 0.95))
-    return (cut - cut.mean()) / max(float(cut.std()), 1e-12)
+def _cut(speed: np.ndarray) -> np.ndarray:
+    """Return speeds (m,) about their median, jumps cut."""
+    return np.minimum(speed, 2.0 * np.quantile(speed, 0.95)) - np.median(speed)
+
+
+def _alike(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return the correlation coefficient of two series where they overlap, at every lag."""
+    here, there = np.ones(len(one)), np.ones(len(other))
+    count = np.maximum(np.round(correlate(here, there)), 1.0)
+    mean, its = correlate(one, there) / count, correlate(here, other) / count
+    power = (correlate(one**2, there) / count - mean**2) * (correlate(here, other**2) / count - its**2)
+    return (correlate(one, other) / count - mean * its) / np.sqrt(np.maximum(power, 1e-6 * power.max()))
 
 
 def _at(motion: Motion, measured: Positions, t: np.ndarray, clock: Clock, rows: np.ndarray) -> Positions:

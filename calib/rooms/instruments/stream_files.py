@@ -1,9 +1,8 @@
 """Files of rows over time (a tracker's stream, a controller's log): read in pieces, and what cannot be used counted.
 
-A row is left out where a cell that is needed is no number, is beyond what it can be, or is all zero (a tracker that saw
-nothing); where its cells are too few or too many; and where its time is not after all times before. Of the rest as many
-are held as `resolution` asks for, so that memory grows with time, not with the rate: an hour of six joints and positions
-takes 50 MB, whatever its rate.
+A row is left out where a cell that is needed is no number or beyond what it can be, where all are zero (a tracker that
+saw nothing), where its cells are too few or too many, and where its time is not after all times before. Of the rest
+only as many are held as the resolution asks for, so that memory grows with time, not with the rate.
 """
 
 from __future__ import annotations

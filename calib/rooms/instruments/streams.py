@@ -1,11 +1,11 @@
 """Points measured while an arm moves, joined with the log of its controller, and thinned to independent rows.
 
 The joints are those of the log at the points' times (`calib.rooms.instruments.clocks`). Left out are points far from
-what the arm, fitted to them, predicts, and those where the speed times the uncertainty of a time exceeds the noise: the
-residuals along the motion are then larger than those across it. Residuals of neighbours are correlated (air, vibration,
-what no model holds): N rows count as N / τ (`calib.estimation.whiteness.inflation`), and a fit to all of them would state
-sigmas √τ too small. Of rows apart by 1 + 1.5 (τ - 1) steps neighbours are correlated by 0.05, where correlation dies away
-exponentially. Thresholds are our choice.
+what the arm, fitted to them, predicts, and those where the speed times the uncertainty of a time exceeds the noise:
+there residuals along the motion are larger than those across it. Residuals of neighbours are correlated (air,
+vibration, what no model holds): N rows count as N / τ (`calib.estimation.whiteness.inflation`), and a fit to all of
+them would state sigmas √τ times too small. At distances of 1 + 1.5 (τ - 1) steps the correlation is 0.05 where it dies
+away exponentially. Thresholds are our choice.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from calib.data.poses.columns import POSITION, QUATERNION, Sheet
 from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.plausible import check_joints, outside, unit_quaternions
 from calib.data.schema import BOUNDS, max_travel
-from calib.errors import MeasurementError, require
+from calib.errors import MeasurementError, refuse_data, require
 from calib.estimation import robust
 from calib.estimation.whiteness import autocorrelation, inflation
 from calib.procedure.robot_kinds import joints_of
@@ -46,7 +46,7 @@ class Streamed(Joined):
         clock: the instrument's.
         sigma: robust standard deviation of the residuals of positions, per axis [m].
         correlation: τ of the residuals before thinning [s].
-        factor: √ of the number of rows that counted as one: by so much sigmas of all rows would be too small.
+        factor: √ of how many steps count as one: by so much a fit to all of them would state too small sigmas.
         left: correlation of neighbours after thinning.
     """
 
@@ -69,9 +69,12 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
         MeasurementError: where the files are no streams, the arm hardly moves, or the two do not belong together.
     """
     log, stream = read_stream(log_file, _joints(chain)), _fresh(read_stream(file, _target()))
-    for each in (log, stream):
-        words = "hardly moves, and without motion no clock is found: start both recordings, then move the arm"
-        require(np.ptp(each.values[:, : chain.n], axis=0).max() > MIN_MOTION, words, MeasurementError, each.file)
+    for each, k, unit in ((log, chain.n, ""), (stream, 3, " m")):
+        most = float(np.ptp(each.values[:, :k], axis=0).max())
+        words = (
+            f"hardly moves (by {most:.2g}{unit}), and without motion no clock is found: is the unit right? Else start "
+        )
+        require(most > MIN_MOTION, f"{words} both recordings, then move the arm", MeasurementError, each.file)
     position, turn = stream.values[:, :3], stream.values[:, 3:] if stream.values.shape[1] > 3 else None
     q = np.zeros((len(position), chain.n))
     measured = PoseMeasurements.of(q, position, turn, joint_names=chain.joint_names, file=str(file), rows=stream.rows)
@@ -91,15 +94,25 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
     kept, left = kept[slow], left[:, slow]
     tau = max(inflation(row) for row in left)
     chosen = _thinned(motion, clock, stream.t[kept], stream.step * (1.0 + 1.5 * (tau - 1.0)))
-    words = f"only {len(chosen)} independent rows: measure for longer, and over more of the workspace"
-    require(len(chosen) >= MIN_ROWS, words, MeasurementError, file)
+    correlation, sigma = tau * stream.step, robust.spread(left[:3])
+    scatter = f"residuals of {1e3 * sigma:.2g} mm per axis are correlated over {correlation:.2g} s"
+    if len(chosen) < MIN_ROWS:
+        lines = "; ".join([*log.lines(), *stream.lines()])
+        advice = "did a clock jump, or instrument or target move? Else measure for longer, over more of the workspace"
+        refuse_data(file, f"only {len(chosen)} of its rows are independent, since {scatter}: {advice} ({lines})")
     rest = max(float(autocorrelation(row, 1)[0]) for row in left[:, chosen])
-    rows, correlation, sigma = kept[chosen], tau * stream.step, robust.spread(left[:3])
+    rows = kept[chosen]
     _, clock = fitted(cell, motion, stream, measured, rows, clock, loss="none")
+    way = clock.sigma * np.sqrt(np.mean(np.sum(np.diff(position[kept], axis=0) ** 2, axis=1))) / stream.step
+    words = (
+        f"the offset of its clock is known to {1e3 * clock.sigma:.2g} ms only, in which the target moves by "
+        f"{1e3 * way:.2g} mm (noise {1e3 * sigma:.2g} mm): measure for longer, each way forth and back"
+    )
+    require(way < sigma, words, MeasurementError, file)
     thinned = (
-        f"{len(rows)} of {len(kept)} rows: residuals of {1e3 * sigma:.2g} mm per axis are correlated over "
-        f"{correlation:.2g} s, so that {tau:.3g} neighbours count as one and σ from all rows would be "
-        f"{np.sqrt(tau):.2g} times too small; of the rows taken neighbours are correlated by {rest:.2f}"
+        f"{len(rows)} rows are taken, of {len(kept)} in steps of {stream.step:.2g} s: {scatter}, so that {tau:.3g} steps "
+        f"count as one and σ from all would be {np.sqrt(tau):.2g} times too small; neighbours taken are correlated by "
+        f"{rest:.2f}"
     )
     notes = (*log.lines(), *stream.lines(), *notes, str(clock), *said, thinned)
     table = _table(chain, motion.at(clock.controller(stream.t[rows])), stream, rows)
