@@ -33,6 +33,7 @@ GRID = 0.05  # of the offsets that are tried first [s]
 LEVERS = (0.0, 0.15, 0.4)  # by which the tip's turning counts as speed: the target's own is not known [m]
 PEAKS, APART = 3, 1.0  # offsets that are tried for each lever, and their least distance [s]
 OVERLAP = 0.5  # share of the shorter file that the longer one has, at least
+TRIMMED = 90  # percent of the residuals that an offset is judged by
 PLACED = 300  # rows that placements are guessed from
 MAX_RATIO = 0.15  # of the points' spread that a log of the same motion leaves with the nominal arm
 RIVAL = 1.3  # times the residual of the best offset, up to which another one is as good
@@ -103,26 +104,23 @@ def begin(chain: Chain, motion: Motion, stream: Stream, measured: Positions) -> 
         if len(rows):
             placed = install(chain, [_at(motion, measured, stream.t, clock, rows)])
             cell, clock = fitted(placed, motion, stream, measured, rows, clock, arm=False)
-            left = observe(cell, *prepare(cell, [_at(motion, measured, stream.t, clock, rows)]), _NONE)[0]
-            found.append((float(np.sqrt(np.mean(robust_square(left.sizes())))), clock.offset, cell))
+            sizes = np.sort(np.linalg.norm(residuals(cell, motion, stream, measured, rows, clock)[:3], axis=0))
+            found.append((float(np.sqrt(np.mean(sizes[: TRIMMED * len(rows) // 100] ** 2))), clock.offset, cell))
     spread = float(np.linalg.norm(measured.position.std(axis=0)))
     limit = min(MAX_RATIO * spread, MAX_MISFIT * chain.stretched_length())
-    if not found or min(found)[0] > limit:
-        best = f"the best leaves {1e3 * min(found)[0]:.3g} mm of a motion of {1e3 * spread:.3g} mm" if found else "none"
+    found.sort(key=lambda each: each[0])
+    if not found or found[0][0] > limit:
+        best = f"the best leaves {1e3 * found[0][0]:.3g} mm of a motion of {1e3 * spread:.3g} mm" if found else "none"
         refuse_data(
             stream.file,
             f"at no offset of the clocks its points are on the path of the nominal arm by {motion.log.file} ({best}): "
             "is it the log of this motion, and of this robot, and did instrument and target stay in place?",
         )
-    least, offset, cell = min(found, key=lambda each: each[0])
-    rivals = {round(other, 2) for left, other, _ in found if left < RIVAL * least and abs(other - offset) > APART}
-    words = "the motion repeats itself: the clocks' offset may as well be {} s; joints are right as far as it does"
-    return cell, Clock(offset, middle=middle), [words.format(listing(sorted(rivals)))] if rivals else []
-
-
-def robust_square(sizes: np.ndarray) -> np.ndarray:
-    """Return the squares of sizes (m,), the worst tenth left out."""
-    return np.sort(sizes**2)[: max(int(0.9 * len(sizes)), 1)]
+    alike = [each for each in found if each[0] < RIVAL * found[0][0]]
+    _, offset, cell = max(alike, key=lambda each: motion.knows(stream.t - each[1]).sum())
+    rivals = sorted({round(other, 2) for _, other, _ in alike if abs(other - offset) > APART})
+    words = f"the motion repeats itself: the clocks' offset may as well be {listing(rivals)} s; the joints are as good"
+    return cell, Clock(offset, middle=middle), [words] if rivals else []
 
 
 def _offsets(chain: Chain, motion: Motion, stream: Stream) -> list[float]:
@@ -136,10 +134,10 @@ def _offsets(chain: Chain, motion: Motion, stream: Stream) -> list[float]:
     points = np.column_stack([np.interp(seen, stream.t, column) for column in stream.values[:, :3].T])
     theirs = _cut(np.linalg.norm(np.diff(points, axis=0), axis=1))
     lags = GRID * correlation_lags(len(theirs), len(ways))
-    shared = correlate(np.ones(len(theirs)), np.ones(len(ways)))
+    shared = np.round(correlate(np.ones(len(theirs)), np.ones(len(ways))))
     possible, found = shared > OVERLAP * min(len(theirs), len(ways)), list[float]()
     for lever in LEVERS:
-        alike = _alike(theirs, _cut(np.hypot(ways, lever * turns)))
+        alike = _alike(theirs, _cut(np.hypot(ways, lever * turns))) * np.sqrt(shared / shared.max())
         alike[~possible] = -np.inf
         for _ in range(PEAKS):
             best = float(lags[int(np.argmax(alike))])
@@ -171,8 +169,8 @@ def residuals(
     cell: Installation, motion: Motion, stream: Stream, measured: Positions, rows: np.ndarray, clock: Clock
 ) -> np.ndarray:
     """Return the residuals (3 or 6, m) of rows: of positions [m], then of orientations [rad]."""
-    parts = observe(cell, *prepare(cell, [_at(motion, measured, stream.t, clock, rows)]), _NONE)
-    return np.concatenate([part.value for part in parts])
+    (block,) = prepare(cell, [_at(motion, measured, stream.t, clock, rows)])
+    return np.concatenate([part.value for part in observe(cell, block, _NONE)])
 
 
 def fitted(
@@ -187,19 +185,18 @@ def fitted(
         loss: of each row's size (`calib.estimation.robust`).
     """
     start, table, t = cell, layout(cell), stream.t[rows] - clock.middle
-    first = prepare(cell, [_at(motion, measured, stream.t, clock, rows)])
     free = table.rigid_index if arm else table.frame_index
-    free = free[base_columns(cell, first, free).kept]
+    free = free[base_columns(cell, prepare(cell, [_at(motion, measured, stream.t, clock, rows)]), free).kept]
     prior = np.concatenate([plausible_deviation(cell, free), [np.inf, MAX_DRIFT if arm else 1e-12]])
+    known, spread = np.isfinite(prior), np.full(len(prior), np.inf)
     for _ in range(ROUNDS):
         at = _at(motion, measured, stream.t, clock, rows)
         ways = BESIDE * motion.at(clock.controller(stream.t[rows]), 1)
         now, ahead, behind = (
-            observe(cell, *prepare(cell, [replace(at, q=at.q + sign * ways)]), index)
+            observe(cell, prepare(cell, [replace(at, q=at.q + sign * ways)])[0], index)
             for sign, index in ((0.0, free), (1.0, _NONE), (-1.0, _NONE))
         )
         pulled = np.append((parameter_values(start) - parameter_values(cell))[free], [0.0, -clock.drift])
-        known = np.isfinite(prior)
         left, slopes = [pulled[known] / prior[known]], [np.diag(1.0 / prior)[known]]
         for part, one, other in zip(now, ahead, behind):
             late = (one.value - other.value) / (2.0 * BESIDE)  # of the prediction, by a clock that is ahead
@@ -209,12 +206,13 @@ def fitted(
             slopes.append((weight * np.concatenate([part.jacobian, [late, t * late]])).reshape(len(prior), -1).T)
         matrix, wanted = np.concatenate(slopes), np.concatenate(left)
         size = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
-        change = np.linalg.lstsq(matrix / size, wanted, rcond=1e-10)[0] / size
+        matrix /= size
+        change = np.linalg.lstsq(matrix, wanted, rcond=1e-10)[0]
+        rest = float(np.sum((wanted - matrix @ change) ** 2)) / max(len(wanted) - len(prior), 1)
+        spread = np.sqrt(rest * np.diag(np.linalg.pinv(matrix.T @ matrix))) / size
+        change /= size
         cell = step(cell, free, change[:-2])
         clock = replace(clock, offset=clock.offset + change[-2], drift=clock.drift + change[-1])
         if abs(change[-2]) < SETTLED:
             break
-    rest = wanted - matrix @ change
-    scale = np.sqrt(rest @ rest / max(len(rest) - len(prior), 1))
-    spread = scale * np.sqrt(np.diag(np.linalg.pinv((matrix / size).T @ (matrix / size)))) / size
     return cell, replace(clock, sigma=float(spread[-2]), drift_sigma=float(spread[-1]))

@@ -89,7 +89,8 @@ def join(
     one_of(by or "row", WAYS, "by", UsageError)
     arm = load_calibrated(robot, base, tip) if isinstance(robot, str | Path) else robot
     if by == "motion":
-        require(arm, "by motion the joints are found on the nominal arm's path: give --robot", UsageError)
+        if arm is None:
+            raise UsageError("by motion the clocks are found from the nominal arm's path: give --robot")
         return join_streams(Path(joints), Path(points), arm.complete)
     own = joints_table(Path(joints)) if is_program(Path(joints)) else read_table(joints)
     return _joined(own, read_table(points), by, arm and arm.complete)

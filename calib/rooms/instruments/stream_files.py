@@ -2,7 +2,7 @@
 
 A row is left out where a cell that is needed is no number or beyond what it can be, where all are zero (a tracker that
 saw nothing), where its cells are too few or too many, and where its time is not after all times before. Of the rest
-only as many are held as the resolution asks for, so that memory grows with time, not with the rate.
+only as many are held as the resolution asks for, and `HELD` at most, so that memory is bounded.
 """
 
 from __future__ import annotations
@@ -22,9 +22,11 @@ from calib.rooms.instruments.joined import CLOCKS, column_of
 from calib.units import TIMES
 
 PIECE = 50_000  # rows read at once (our choice)
+HELD = 500_000  # rows held, at most: beyond them every second one (our choice)
 SLOWEST = 0.2  # time between two rows of a stream, at most [s] (our choice)
 MIN_ROWS = 200  # of a stream (our choice)
 BRIDGED = 0.05  # the longest time without a row that is no gap [s], or five rows (our choice)
+DAMAGED, LATE = "damaged, empty or not seen", "with a time not after the row before"
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,14 +74,16 @@ class Kind:
 
     Attributes:
         names: table → its columns that are needed.
-        values: table of sound cells → (m, k) [SI]; raises where a column as a whole cannot be what it says.
+        values: table of numbers → (m, k) [SI].
         sound: values → which rows (m,) can be.
+        refuse: table, values; raises where most of them cannot be, with the likely cause.
         resolution: time between the rows that are held, about [s].
     """
 
     names: Callable[[Table], Sequence[str]]
-    values: Callable[[Table, bool], np.ndarray]
+    values: Callable[[Table], np.ndarray]
     sound: Callable[[np.ndarray], np.ndarray]
+    refuse: Callable[[Table, np.ndarray], None]
     resolution: float
 
 
@@ -92,40 +96,58 @@ def read_stream(path: Path, kind: Kind) -> Stream:
     """
     parts, dropped, last, every, read = list[tuple[np.ndarray, ...]](), Counter[str](), -np.inf, 0, 0
     for table in _pieces(path):
-        clock = column_of(table, CLOCKS)
-        found = f"found {listing(table.header)}. What was measured at stops is joined by name, time or row"
-        require(clock, f"has no column of times ({', '.join(CLOCKS)}); {found}", MeasurementError, path)
-        place, names = table.index(clock), kind.names(table)
-        t = table.cells[place] * table.factor(place, TIMES, "")
-        whole = np.isfinite(np.column_stack([t, *(table.cells[table.index(name)] for name in names)])).all(axis=1)
-        whole[1:-1] &= ~((t[1:-1] > t[2:]) & (t[2:] > t[:-2]))  # one time too late, not all that follow
-        values = np.full((len(t), 0), np.nan)
-        if whole.any():
-            sound = kind.sound(own := kind.values(table.where(whole), False))
-            if sound.mean() < 0.5:
-                kind.values(table.where(whole), True)
-            values = np.full((len(t), own.shape[1]), np.nan)
-            values[whole] = own
-            whole[whole] = sound
+        t, values, whole = _piece(table, kind)
         before = np.maximum.accumulate(np.concatenate([[last], np.where(whole, t, -np.inf)]))
         ahead = whole & (t > before[:-1])
-        dropped["damaged, empty or not seen"] += int((~whole).sum())
-        dropped["with a time not after the row before"] += int((whole & ~ahead).sum())
+        dropped.update({DAMAGED: int((~whole).sum()), LATE: int((whole & ~ahead).sum())})
         last, read = before[-1], read + len(t)
         if not every and ahead.sum() > 1:
-            step = float(np.median(np.diff(t[ahead])))
-            words = f"its rows are {step:.3g} s apart, a stream's {SLOWEST:g} s at most. Is t in ms ('t [ms]')?"
-            words += " What was measured at stops is joined by name, time or row"
-            require(step <= SLOWEST, words, MeasurementError, path, None, clock)
-            every = max(int(kind.resolution / step + 0.01), 1)
+            every = max(int(kind.resolution / _step(t[ahead], table) + 0.01), 1)
         held = ahead & ((table.rows - 1) % max(every, 1) == 0)
         parts.append((t[held], values[held], table.rows[held]))
-    used = read - sum(dropped.values())
-    said = ", ".join(f"{count} {why}" for why, count in dropped.items() if count)
-    if used < max(MIN_ROWS, read / 2):
-        refuse_data(path, f"only {used} of {read} rows can be used ({said}): is it a stream, and one recording?")
+        if sum(len(part[0]) for part in parts) > HELD:
+            every *= 2
+            parts = [tuple(own[(part[2] - 1) % every == 0] for own in part) for part in parts]
+    if read - sum(dropped.values()) < max(MIN_ROWS, read / 2):
+        said = ", ".join(f"{count} {why}" for why, count in dropped.items() if count)
+        words = f"only {read - sum(dropped.values())} of {read} rows can be used{said and f' ({said})'}"
+        refuse_data(path, f"{words}: is it a stream, and one recording?")
     t, values, rows = (np.concatenate(each) for each in zip(*(part for part in parts if len(part[0]))))
     return Stream(str(path), t, values, rows, float(np.median(np.diff(t))), read, dropped)
+
+
+def _piece(table: Table, kind: Kind) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return times (m,) [s] and values (m, k) [SI] of a table, and which rows (m,) can be."""
+    clock, names = _clock(table), kind.names(table)
+    t = table.cells[table.index(clock)] * table.factor(table.index(clock), TIMES, "")
+    whole = np.ones(len(t), dtype=bool)
+    for cells in (t, *(table.cells[table.index(name)] for name in names)):
+        whole &= np.isfinite(cells)
+    whole[1:-1] &= ~((t[1:-1] > t[2:]) & (t[2:] > t[:-2]))  # one time too late, not all that follow
+    own = kind.values(table.where(whole))
+    sound = kind.sound(own)
+    if len(own) and sound.mean() < 0.5:
+        kind.refuse(table.where(whole), own)
+    values = np.full((len(t), own.shape[1]), np.nan)
+    values[whole] = own
+    whole[whole] = sound
+    return t, values, whole
+
+
+def _clock(table: Table) -> str:
+    found = f"found {listing(table.header)}. What was measured at stops is joined by name, time or row"
+    words = f"has no column of times ({', '.join(CLOCKS)}); {found}"
+    require(clock := column_of(table, CLOCKS), words, MeasurementError, table.file)
+    return clock
+
+
+def _step(t: np.ndarray, table: Table) -> float:
+    """Return the time between rows [s]; refuse a file that was measured at stops."""
+    step = float(np.median(np.diff(t)))
+    words = f"its rows are {step:.3g} s apart, a stream's {SLOWEST:g} s at most. Is t in ms ('t [ms]')?"
+    if step > SLOWEST:
+        refuse_data(table.file, f"{words} What was measured at stops is joined by name, time or row", _clock(table))
+    return step
 
 
 def _pieces(path: Path) -> Iterator[Table]:

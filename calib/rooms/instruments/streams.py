@@ -125,15 +125,15 @@ def _joints(chain: Chain) -> Kind:
     travel = max_travel(robot.kinds)
     low, high = (np.where(np.isfinite(own), own, side * travel) for own, side in ((robot.lower, -1), (robot.upper, 1)))
 
-    def values(table: Table, strictly: bool) -> np.ndarray:
-        q, names = Sheet(table).joints(robot.names)
-        if strictly:
-            check_joints(q, Sheet(table), names, robot)
-        return q
+    def names(table: Table) -> tuple[str, ...]:
+        return Sheet(table).find_joints(robot.names)
+
+    def sound(q: np.ndarray) -> np.ndarray:
+        return np.logical_not(outside(q, low, high)).all(axis=1)
 
     return Kind(
-        lambda table: Sheet(table).find_joints(robot.names), values, lambda q: ~outside(q, low, high).any(axis=1),
-        LOG_RESOLUTION,
+        names, lambda table: Sheet(table).joints(robot.names)[0], sound,
+        lambda table, q: check_joints(q, Sheet(table), names(table), robot) and None, LOG_RESOLUTION,
     )  # fmt: skip
 
 
@@ -145,21 +145,19 @@ def _target() -> Kind:
         require(found, f"has no x, y, z; found {', '.join(table.header)}", MeasurementError, table.file)
         return (*found, *Sheet(table).family(QUATERNION.names))
 
-    def values(table: Table, strictly: bool) -> np.ndarray:
-        own = names(table)
-        position = np.column_stack([table.numbers(name, "length") for name in own[:3]])
-        turn = np.column_stack([table.numbers(name) for name in own[3:]]) if own[3:] else np.zeros((len(table), 0))
-        if strictly:
-            POSITION.check(position, table, own[:3])
-            unit_quaternions(turn, table, own[3:])
-        return np.concatenate([position, turn], axis=1)
+    def values(table: Table) -> np.ndarray:
+        return np.column_stack([table.numbers(name, "" if k > 2 else "length") for k, name in enumerate(names(table))])
 
     def sound(values: np.ndarray) -> np.ndarray:
         position, turn = values[:, :3], values[:, 3:]
         unit = np.abs(np.linalg.norm(turn, axis=1) - 1.0) <= BOUNDS.max_norm_error
         return (np.abs(position) <= BOUNDS.max_length).all(axis=1) & position.any(axis=1) & (unit | (not turn.size))
 
-    return Kind(names, values, sound, RESOLUTION)
+    def refuse(table: Table, values: np.ndarray) -> None:
+        POSITION.check(values[:, :3], table, names(table)[:3])
+        unit_quaternions(values[:, 3:], table, names(table)[3:])
+
+    return Kind(names, values, sound, refuse, RESOLUTION)
 
 
 def _fresh(stream: Stream) -> Stream:
