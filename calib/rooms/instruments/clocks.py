@@ -114,7 +114,8 @@ def begin(chain: Chain, motion: Motion, stream: Stream, measured: Positions) -> 
         refuse_data(
             stream.file,
             f"at no offset of the clocks its points are on the path of the nominal arm by {motion.log.file} ({best}): "
-            "is it the log of this motion, and of this robot, and did instrument and target stay in place?",
+            "is it the log of this motion, and of this robot, and did instrument and target stay in place? "
+            f"({'; '.join([*motion.log.lines(), *stream.lines()])})",
         )
     alike = [each for each in found if each[0] < RIVAL * found[0][0]]
     _, offset, cell = max(alike, key=lambda each: motion.knows(stream.t - each[1]).sum())

@@ -17,12 +17,13 @@ import numpy as np
 
 from calib.data.csv_table import Table
 from calib.data.poses.columns import POSITION, QUATERNION, Sheet
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.measurements import PoseMeasurements, Positions
 from calib.data.poses.plausible import check_joints, outside, unit_quaternions
 from calib.data.schema import BOUNDS, max_travel
 from calib.errors import MeasurementError, refuse_data, require
 from calib.estimation import robust
 from calib.estimation.whiteness import autocorrelation, inflation
+from calib.geometry.installation import Installation
 from calib.procedure.robot_kinds import joints_of
 from calib.robot.chain import Chain, joint_kinds
 from calib.rooms.instruments.clocks import Clock, Motion, begin, fitted, residuals
@@ -71,52 +72,56 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
     log, stream = read_stream(log_file, _joints(chain)), _fresh(read_stream(file, _target()))
     for each, k, unit in ((log, chain.n, ""), (stream, 3, " m")):
         most = float(np.ptp(each.values[:, :k], axis=0).max())
-        words = (
-            f"hardly moves (by {most:.2g}{unit}), and without motion no clock is found: is the unit right? Else start "
-        )
-        require(most > MIN_MOTION, f"{words} both recordings, then move the arm", MeasurementError, each.file)
-    position, turn = stream.values[:, :3], stream.values[:, 3:] if stream.values.shape[1] > 3 else None
-    q = np.zeros((len(position), chain.n))
-    measured = PoseMeasurements.of(q, position, turn, joint_names=chain.joint_names, file=str(file), rows=stream.rows)
+        words = f"hardly moves (by {most:.2g}{unit}), and without motion no clock is found: is the unit right?"
+        require(most > MIN_MOTION, words, MeasurementError, each.file)
+    turn = stream.values[:, 3:] if stream.values.shape[1] > 3 else None
+    points = PoseMeasurements.of(
+        np.zeros((len(stream.t), chain.n)), stream.values[:, :3], turn, joint_names=chain.joint_names, file=str(file)
+    )
     motion = Motion(log)
-    cell, clock, notes = begin(chain, motion, stream, measured)
+    cell, clock, notes = begin(chain, motion, stream, points)
     known = np.flatnonzero(motion.knows(clock.controller(stream.t)))
     some = known[np.unique(np.linspace(0, len(known) - 1, FITTED).astype(int))]
-    cell, clock = fitted(cell, motion, stream, measured, some, clock)
-    kept = np.flatnonzero(motion.knows(clock.controller(stream.t)))
-    stream.dropped["outside the log or in its gaps"] = len(stream.t) - len(kept)
-    left = residuals(cell, motion, stream, measured, kept, clock)
-    near = (np.abs(left) < OUTLIER * np.array([[robust.spread(row)] for row in left])).all(axis=0)
-    stream.dropped["far from the arm's path"] = int((~near).sum())
-    kept, left = kept[near], left[:, near]
-    slow, said = _slow(position[kept], stream.t[kept], left[:3])
-    stream.dropped["too fast"] = int((~slow).sum())
-    kept, left = kept[slow], left[:, slow]
-    tau = max(inflation(row) for row in left)
+    cell, clock = fitted(cell, motion, stream, points, some, clock)
+    kept, left, said = _usable(cell, motion, stream, points, clock)
+    tau, sigma = max(inflation(row) for row in left), robust.spread(left[:3])
     chosen = _thinned(motion, clock, stream.t[kept], stream.step * (1.0 + 1.5 * (tau - 1.0)))
-    correlation, sigma = tau * stream.step, robust.spread(left[:3])
-    scatter = f"residuals of {1e3 * sigma:.2g} mm per axis are correlated over {correlation:.2g} s"
+    lines = [*log.lines(), *stream.lines()]
+    scatter = f"residuals of {1e3 * sigma:.2g} mm per axis are correlated over {tau * stream.step:.2g} s"
     if len(chosen) < MIN_ROWS:
-        lines = "; ".join([*log.lines(), *stream.lines()])
         advice = "did a clock jump, or instrument or target move? Else measure for longer, over more of the workspace"
-        refuse_data(file, f"only {len(chosen)} of its rows are independent, since {scatter}: {advice} ({lines})")
-    rest = max(float(autocorrelation(row, 1)[0]) for row in left[:, chosen])
-    rows = kept[chosen]
-    _, clock = fitted(cell, motion, stream, measured, rows, clock, loss="none")
-    way = clock.sigma * np.sqrt(np.mean(np.sum(np.diff(position[kept], axis=0) ** 2, axis=1))) / stream.step
+        refuse_data(file, f"only {len(chosen)} rows are independent, since {scatter}: {advice} ({'; '.join(lines)})")
+    rows, rest = kept[chosen], max(float(autocorrelation(row, 1)[0]) for row in left[:, chosen])
+    _, clock = fitted(cell, motion, stream, points, rows, clock, loss="none")
+    ways = np.linalg.norm(np.diff(stream.values[kept, :3], axis=0), axis=1) / np.diff(stream.t[kept])
+    late = clock.sigma * float(np.sqrt(np.mean(ways**2)))
     words = (
         f"the offset of its clock is known to {1e3 * clock.sigma:.2g} ms only, in which the target moves by "
-        f"{1e3 * way:.2g} mm (noise {1e3 * sigma:.2g} mm): measure for longer, each way forth and back"
+        f"{1e3 * late:.2g} mm (noise {1e3 * sigma:.2g} mm): measure for longer, each way forth and back"
     )
-    require(way < sigma, words, MeasurementError, file)
+    require(late < sigma, words, MeasurementError, file)
     thinned = (
-        f"{len(rows)} rows are taken, of {len(kept)} in steps of {stream.step:.2g} s: {scatter}, so that {tau:.3g} steps "
-        f"count as one and σ from all would be {np.sqrt(tau):.2g} times too small; neighbours taken are correlated by "
-        f"{rest:.2f}"
+        f"{len(rows)} rows are taken, of {len(kept)} in steps of {stream.step:.2g} s: {scatter}, so that {tau:.3g} "
+        f"steps count as one and σ from all would be {np.sqrt(tau):.2g} times too small; neighbours taken are "
+        f"correlated by {rest:.2f}"
     )
-    notes = (*log.lines(), *stream.lines(), *notes, str(clock), *said, thinned)
     table = _table(chain, motion.at(clock.controller(stream.t[rows])), stream, rows)
-    return Streamed(table, stream.rows[rows] - 1, notes, clock, sigma, correlation, float(np.sqrt(tau)), rest)
+    notes = (*lines, *notes, str(clock), *said, thinned)
+    return Streamed(table, stream.rows[rows] - 1, notes, clock, sigma, tau * stream.step, float(np.sqrt(tau)), rest)
+
+
+def _usable(
+    cell: Installation, motion: Motion, stream: Stream, points: Positions, clock: Clock
+) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Return the indices of usable rows, their residuals (3 or 6, m), and notes; count in the stream what is not."""
+    kept = np.flatnonzero(motion.knows(clock.controller(stream.t)))
+    left = residuals(cell, motion, stream, points, kept, clock)
+    near = (np.abs(left) < OUTLIER * np.array([[robust.spread(row)] for row in left])).all(axis=0)
+    slow, said = _slow(points.position[kept[near]], stream.t[kept[near]], left[:3, near])
+    stream.dropped["outside the log or in its gaps"] = len(stream.t) - len(kept)
+    stream.dropped["far from the arm's path"] = int((~near).sum())
+    stream.dropped["too fast"] = int((~slow).sum())
+    return kept[near][slow], left[:, near][:, slow], said
 
 
 def _joints(chain: Chain) -> Kind:
@@ -129,12 +134,12 @@ def _joints(chain: Chain) -> Kind:
         return Sheet(table).find_joints(robot.names)
 
     def sound(q: np.ndarray) -> np.ndarray:
-        return np.logical_not(outside(q, low, high)).all(axis=1)
+        return np.all(~outside(q, low, high), axis=1)
 
-    return Kind(
-        names, lambda table: Sheet(table).joints(robot.names)[0], sound,
-        lambda table, q: check_joints(q, Sheet(table), names(table), robot) and None, LOG_RESOLUTION,
-    )  # fmt: skip
+    def refuse(table: Table, q: np.ndarray) -> None:
+        check_joints(q, Sheet(table), names(table), robot)
+
+    return Kind(names, lambda table: Sheet(table).joints(robot.names)[0], sound, refuse, LOG_RESOLUTION)
 
 
 def _target() -> Kind:
