@@ -3,7 +3,6 @@
 import errno
 import os
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -45,19 +44,19 @@ def slow_motion(n: int, seed: int, period: float = 240.0) -> Callable[[np.ndarra
 
 
 def recorded(
-    folder: Path, cell: Cell, seed: int, seconds: float = 110.0, rate: float = 250.0, drift: float = 0.0,
-    poses: bool = False,
+    folder: Path, cell: Cell, seed: int, seconds: float = 110.0, rate: float = 100.0, drift: float = 0.0,
+    poses: bool = False, pace: Callable[[np.ndarray], np.ndarray] = np.array,
 ) -> tuple[Path, Path]:  # fmt: skip
-    """Write a log at 125 Hz and an instrument's stream that begins 2 s later and has a clock of its own."""
+    """Write a log at 50 Hz and an instrument's stream that begins 2 s later; `pace`: time → the motion's time."""
     chain, rng, folder = cell.nominal, np.random.default_rng([seed, 1]), folder / f"{seed}"
     folder.mkdir(parents=True, exist_ok=True)
-    path, t = slow_motion(chain.n, seed), np.arange(0.0, seconds, 0.008)
+    path, t = slow_motion(chain.n, seed), np.arange(0.0, seconds, 0.02)
     shown = [("mm", 1e3) if joint.kind == "prismatic" else ("deg", 180.0 / np.pi) for joint in chain.joints]
     header = ",".join(["t [s]", *(f"{name} [{unit}]" for name, (unit, _) in zip(chain.joint_names, shown))])
-    log = np.column_stack([t, path(t) * [factor for _, factor in shown]])
+    log = np.column_stack([t, path(pace(t)) * [factor for _, factor in shown]])
     np.savetxt(folder / "log.csv", log, "%.7f", ",", header=header, comments="")
     t = np.arange(2.0, seconds - 3.0, 1.0 / rate)
-    seen, memory = true_poses(cell, path(t)), np.exp(-1.0 / (rate * MEMORY))
+    seen, memory = true_poses(cell, path(pace(t))), np.exp(-1.0 / (rate * MEMORY))
     pushes = SIGMA * np.sqrt(1.0 - memory**2) * rng.normal(size=(len(t), 3))
     points = 1e3 * (seen[:, :3, 3] + lfilter([1.0], [1.0, -memory], pushes, axis=0))
     turns = to_quaternion(seen) if poses else np.zeros((len(t), 0))
@@ -95,7 +94,7 @@ def changed(source: Path, path: Path, change: Callable[[np.ndarray], np.ndarray]
 
 
 def test_the_clock_is_found_and_neighbours_that_are_kept_are_nearly_independent(found):
-    clock, step = found.clock, 0.004
+    clock, step = found.clock, 0.01
     assert abs(clock.offset - OFFSET) < 3.0 * clock.sigma < 0.5e-3
     assert abs(clock.drift) < 3.0 * clock.drift_sigma < 2e-5
     assert found.sigma == pytest.approx(SIGMA, rel=0.1)
@@ -103,7 +102,7 @@ def test_the_clock_is_found_and_neighbours_that_are_kept_are_nearly_independent(
     assert found.correlation == pytest.approx(step * (1.0 + memory) / (1.0 - memory), rel=0.25)
     assert found.factor == pytest.approx(np.sqrt(found.correlation / step))
     assert found.left < 0.15
-    assert len(found.table) == pytest.approx(105.0 / (1.5 * found.correlation), rel=0.1)
+    assert len(found.table) == pytest.approx(105.0 / (1.5 * found.correlation), rel=0.15)
 
 
 def test_the_command_writes_a_table_for_fit_with_the_reasons_above_it(tmp_path, files, found, capsys):
@@ -112,7 +111,7 @@ def test_the_command_writes_a_table_for_fit_with_the_reasons_above_it(tmp_path, 
     assert run(line) == 0
     assert f"{len(found.table)} measured poses written" in capsys.readouterr().out
     comments = [row for row in out.read_text().splitlines() if row.startswith("#")]
-    assert any("clock is +0.137" in row for row in comments) and any("count as one" in row for row in comments)
+    assert any("clock is +0.13" in row for row in comments) and any("count as one" in row for row in comments)
     (block,) = calib.read_poses(out, "ur5")
     assert len(block) == len(found.table) and block.kind == "position"
     log = np.loadtxt(files[0], delimiter=",", skiprows=1)
@@ -137,20 +136,22 @@ def test_one_percent_of_damaged_rows_is_dropped_and_counted(tmp_path, files, fou
     assert abs(again.clock.offset - found.clock.offset) < found.clock.sigma
 
 
+@pytest.mark.slow
 def test_drift_gaps_and_rows_that_go_back_in_time_are_said(tmp_path):
     cell = rigid(perturbed_cell(load("ur5"), 2))
     log, stream = recorded(tmp_path, cell, 2, drift=50e-6)
 
     def change(rows: np.ndarray) -> np.ndarray:
-        return np.delete(np.insert(rows, 9000, rows[8900:8950], axis=0), np.arange(15_000, 16_000), axis=0)
+        return np.delete(np.insert(rows, 4000, rows[3900:3950], axis=0), np.arange(6000, 6400), axis=0)
 
     again = joined(log, changed(stream, tmp_path / "t.csv", change))
     assert again.clock.drift == pytest.approx(50e-6, abs=3.0 * again.clock.drift_sigma)
     assert "drifts by" in str(again.clock)
     assert "50 with a time not after the row before" in again.notes[1]
-    assert "1 gaps, the longest 4 s" in again.notes[2]
+    assert "1 gap not bridged, the longest 4.01 s" in again.notes[2]
 
 
+@pytest.mark.slow
 def test_rows_too_fast_for_uncertain_times_are_left_out(tmp_path, files, found):
     noise = np.random.default_rng(1).uniform(-3e-3, 3e-3, 20_000)
     log = changed(files[0], tmp_path / "log.csv", lambda rows: np.column_stack([rows[:, 0] + noise[: len(rows)],
@@ -165,28 +166,17 @@ def test_rows_too_fast_for_uncertain_times_are_left_out(tmp_path, files, found):
     assert np.quantile(speeds(again), 0.95) < np.quantile(speeds(found), 0.95)
 
 
-def test_an_arm_that_stands_still_for_a_while_gives_one_row_there(tmp_path, files, found):
-    wait = 30.0
-
-    def paused(rows: np.ndarray) -> np.ndarray:
-        k = len(rows) // 2
-        step = rows[k, 0] - rows[k - 1, 0]
-        rest = np.repeat(rows[k - 1 : k], round(wait / step), axis=0)
-        rest[:, 0] += step * np.arange(1, len(rest) + 1)
-        rest[:, 1:] += 1e-4 * np.random.default_rng(2).normal(size=rest[:, 1:].shape)
-        return np.concatenate([rows[:k], rest, rows[k:] + [wait, *[0.0] * (rows.shape[1] - 1)]])
-
-    def pausing(rows: np.ndarray) -> np.ndarray:  # where the log does
-        k = int(np.searchsorted(rows[:, 0], middle))
-        return np.concatenate([paused(rows[: 2 * k])[: k + round(wait / 0.004)], rows[k:] + [wait, 0, 0, 0]])
-
-    log = np.loadtxt(files[0], delimiter=",", skiprows=1)
-    middle = log[len(log) // 2, 0] + OFFSET
-    still = joined(changed(files[0], tmp_path / "log.csv", paused), changed(files[1], tmp_path / "t.csv", pausing))
-    assert len(still.table) < len(found.table) + 10
-    assert abs(still.clock.offset - OFFSET) < 4.0 * still.clock.sigma
+@pytest.mark.slow
+def test_an_arm_that_stands_still_for_a_while_gives_no_rows_there(tmp_path):
+    cell = rigid(perturbed_cell(load("ur5"), 3))
+    log, stream = recorded(tmp_path, cell, 3, 140.0, pace=lambda t: np.interp(t, [0, 50, 80, 200], [0, 50, 50, 170]))
+    again = joined(log, stream)
+    at = again.clock.controller(again.table.cells[0])
+    assert ((at > 50.5) & (at < 79.5)).sum() <= 1
+    assert abs(again.clock.offset - OFFSET) < 3.0 * again.clock.sigma < 1e-3
 
 
+@pytest.mark.slow
 def test_sliding_joints_and_full_poses(tmp_path):
     robot = tmp_path / "gantry.urdf"
     robot.write_text(GANTRY)
@@ -201,24 +191,18 @@ def test_sliding_joints_and_full_poses(tmp_path):
     np.testing.assert_allclose(block.q, q, atol=1e-5)
 
 
-def test_of_a_motion_that_repeats_itself_the_offset_is_said_to_be_ambiguous(tmp_path, files):
-    def twice(rows: np.ndarray) -> np.ndarray:
-        there_and_back = np.concatenate([rows, rows[::-1]])
-        whole = np.concatenate([there_and_back, there_and_back])
-        whole[:, 0] = rows[0, 0] + np.arange(len(whole)) * (rows[1, 0] - rows[0, 0])
-        return whole
-
-    cut = changed(files[0], tmp_path / "cut.csv", lambda rows: rows[(rows[:, 0] >= 2.0) & (rows[:, 0] < 60.0)])
-    seen = changed(files[1], tmp_path / "seen.csv", lambda rows: rows[rows[:, 0] < 60.0 + OFFSET - 1e-6])
-    again = joined(changed(cut, tmp_path / "log.csv", twice), changed(seen, tmp_path / "t.csv", twice))
+@pytest.mark.slow
+def test_of_a_motion_that_repeats_itself_the_offset_is_said_to_be_ambiguous(tmp_path):
+    cell = rigid(perturbed_cell(load("ur5"), 3))
+    again = joined(*recorded(tmp_path, cell, 3, 160.0, pace=lambda t: 25.0 * np.sin(2.0 * np.pi * t / 40.0)))
     assert any(note.startswith("the motion repeats itself") for note in again.notes)
-    assert again.clock.offset == pytest.approx(OFFSET, abs=2e-3)
+    assert again.clock.offset == pytest.approx(OFFSET, abs=3.0 * again.clock.sigma)
 
 
 REFUSED = {
     "no times": (lambda rows: rows[:, 1:], "x [mm],y [mm],z [mm]", "no column of times.*joined by name, time or row"),
-    "stops": (lambda rows: rows[::500], "", "rows are 2 s apart, a stream's 0.2 s at most. Is t in ms"),
-    "milliseconds": (lambda rows: rows * [1e3, 1, 1, 1], "", "rows are 4 s apart.*Is t in ms"),
+    "stops": (lambda rows: rows[::500], "", "rows are 5 s apart, a stream's 0.2 s at most. Is t in ms"),
+    "milliseconds": (lambda rows: rows * [1e3, 1, 1, 1], "", "rows are 10 s apart.*Is t in ms"),
     "mm as m": (lambda rows: rows, "t,x,y,z", r"if it is in mm, name the column 'x \[mm\]'"),
     "m as mm": (lambda rows: rows * [1, 1e-3, 1e-3, 1e-3], "", "hardly moves.*is the unit right"),
     "inches": (lambda rows: rows / [1, 25.4, 25.4, 25.4], "", "inches"),
@@ -228,7 +212,7 @@ REFUSED = {
                   "only 1 of .* rows can be used .*a time not after the row before"),
     "a jump of the clock": (lambda rows: rows + (rows[:, :1] > 60.0) * [7.0, 0, 0, 0], "",
                             "did a clock jump|at no offset of the clocks"),
-    "too short": (lambda rows: rows[:1000], "", "offset of its clock is known to .* ms only|independent"),
+    "too short": (lambda rows: rows[:400], "", "offset of its clock is known to .* ms only|independent"),
     "nothing seen": (lambda rows: rows * [1, 0, 0, 0], "", "only 0 of .* rows can be used"),
 }  # fmt: skip
 
@@ -242,10 +226,10 @@ def test_what_cannot_be_joined_is_refused_with_the_cause(tmp_path, files, case):
 
 def test_a_stream_of_another_motion_or_a_log_at_rest_is_refused(tmp_path, files):
     other, _ = recorded(tmp_path, rigid(perturbed_cell(load("ur5"), 3)), 5)
-    with pytest.raises(MeasurementError, match="at no offset of the clocks .*is it the log of this motion"):
+    with pytest.raises(MeasurementError, match=r"at no offset of the clocks .*is it the log of this motion"):
         joined(other, files[1])
     still = changed(files[0], tmp_path / "still.csv", lambda rows: rows * ([1.0] + [0.0] * 6))
-    with pytest.raises(MeasurementError, match="hardly moves .*without motion no clock is found"):
+    with pytest.raises(MeasurementError, match=r"hardly moves .*without motion no clock is found"):
         joined(still, files[1])
     radians = changed(files[0], tmp_path / "rad.csv", lambda rows: rows, "t,q1,q2,q3,q4,q5,q6")
     with pytest.raises(MeasurementError, match=r"name the column 'q\d \[deg\]'"):
@@ -264,8 +248,9 @@ def test_a_full_disk_leaves_nothing_half_written(tmp_path, found, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_rows_held_are_bounded_however_long_the_stream(files, monkeypatch, found):
-    monkeypatch.setattr(stream_files, "HELD", 4000)
+    monkeypatch.setattr(stream_files, "HELD", 3000)
     monkeypatch.setattr(stream_files, "PIECE", 1000)
     again = joined(*files)
     assert again.correlation == pytest.approx(found.correlation, rel=0.4)
@@ -307,7 +292,7 @@ def test_at_1_khz_offsets_and_parameters_err_as_their_sigmas_say_and_without_thi
     assert np.mean(np.abs(all_rows) < 2.0) < 0.7
 
 
+@pytest.mark.slow
 def test_a_cell_with_deflections_that_no_rigid_arm_has_keeps_its_clock(tmp_path):
-    cell = replace(perturbed_cell(load("ur5"), 6))
-    again = joined(*recorded(tmp_path, cell, 6))
+    again = joined(*recorded(tmp_path, perturbed_cell(load("ur5"), 6), 6))
     assert abs(again.clock.offset - OFFSET) < 4.0 * again.clock.sigma < 1e-3

@@ -40,7 +40,7 @@ RIVAL = 1.3  # times the residual of the best offset, up to which another one is
 MAX_DRIFT = 1e-3  # prior standard deviation of a clock's drift
 BESIDE = 1e-3  # difference of times by which speeds are computed [s]
 ROUNDS = 12  # of Gauss-Newton
-SETTLED = 1e-7  # change of the offset after which it ends [s]
+SETTLED = 1e-6  # change of the offset after which it ends [s]
 _NONE = np.array([], dtype=int)
 
 

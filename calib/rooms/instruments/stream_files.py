@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.data.csv_table import Table, opened, plain_rows, split_units
-from calib.errors import MeasurementError, listing, refuse_data, refused_as, require
+from calib.errors import MeasurementError, counted, listing, refuse_data, refused_as, require
 from calib.rooms.instruments.joined import CLOCKS, column_of
 from calib.units import TIMES
 
@@ -64,7 +64,7 @@ class Stream:
         if reasons:
             found[0] += f"; left out: {', '.join(reasons)}"
         if gaps := int((apart > self.gap).sum()):
-            found.append(f"{Path(self.file).name}: {gaps} gaps, the longest {apart.max():.3g} s, are not bridged")
+            found.append(f"{Path(self.file).name}: {counted(gaps, 'gap')} not bridged, the longest {apart.max():.3g} s")
         return found
 
 

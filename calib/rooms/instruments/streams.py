@@ -33,7 +33,7 @@ from calib.units import JOINT
 
 RESOLUTION, LOG_RESOLUTION = 0.004, 0.008  # time between the rows that are held, of instrument and log [s]
 MIN_MOTION = 1e-3  # travel of a joint [rad or m] and of the points [m]
-FITTED = 3000  # rows that clock and geometry are fitted to first
+FITTED = 2000  # rows that clock and geometry are fitted to first
 OUTLIER = 6.0  # robust sigmas
 MIN_ROWS, MAX_ROWS = 20, 20_000  # of the table
 MOVED = 1e-3  # by which a joint moves at least between two rows of the table [rad or m]
@@ -160,7 +160,8 @@ def _target() -> Kind:
 
     def refuse(table: Table, values: np.ndarray) -> None:
         POSITION.check(values[:, :3], table, names(table)[:3])
-        unit_quaternions(values[:, 3:], table, names(table)[3:])
+        if values.shape[1] > 3:
+            unit_quaternions(values[:, 3:], table, names(table)[3:])
 
     return Kind(names, values, sound, refuse, RESOLUTION)
 
@@ -194,14 +195,11 @@ def _slow(position: np.ndarray, t: np.ndarray, left: np.ndarray) -> tuple[np.nda
 def _thinned(motion: Motion, clock: Clock, t: np.ndarray, apart: float) -> np.ndarray:
     """Return the indices of times t (m,) that are at least `apart` [s], and between which a joint moves."""
     apart = max(0.999 * apart, (t[-1] - t[0]) / MAX_ROWS)
-    found, q = [0], motion.at(clock.controller(t))
-    while (after := int(np.searchsorted(t, t[found[-1]] + apart))) < len(t):
-        moved = np.abs(q[after : after + 1000] - q[found[-1]]).max(axis=1) > MOVED
-        while not moved.any() and (after := after + 1000) < len(t):
-            moved = np.abs(q[after : after + 1000] - q[found[-1]]).max(axis=1) > MOVED
-        if after >= len(t):
-            break
-        found.append(after + int(np.argmax(moved)))
+    found, after, q, ahead = [0], 0, motion.at(clock.controller(t)), 64
+    while (after := max(after, int(np.searchsorted(t, t[found[-1]] + apart)))) < len(t):
+        moved = np.flatnonzero(np.abs(q[after : after + ahead] - q[found[-1]]).max(axis=1) > MOVED)
+        found += (after + moved[:1]).tolist()
+        after += 0 if len(moved) else ahead
     return np.array(found)
 
 
