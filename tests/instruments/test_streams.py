@@ -111,7 +111,9 @@ def test_the_command_writes_a_table_for_fit_with_the_reasons_above_it(tmp_path, 
     assert run(line) == 0
     assert f"{len(found.table)} measured poses written" in capsys.readouterr().out
     comments = [row for row in out.read_text().splitlines() if row.startswith("#")]
-    assert any("clock is +0.13" in row for row in comments) and any("count as one" in row for row in comments)
+    assert any("the instrument's clock minus" in row for row in comments) and any(
+        "correlated" in row for row in comments
+    )
     (block,) = calib.read_poses(out, "ur5")
     assert len(block) == len(found.table) and block.kind == "position"
     log = np.loadtxt(files[0], delimiter=",", skiprows=1)
@@ -146,7 +148,6 @@ def test_drift_gaps_and_rows_that_go_back_in_time_are_said(tmp_path):
 
     again = joined(log, changed(stream, tmp_path / "t.csv", change))
     assert again.clock.drift == pytest.approx(50e-6, abs=3.0 * again.clock.drift_sigma)
-    assert "drifts by" in str(again.clock)
     assert "50 with a time not after the row before" in again.notes[1]
     assert "1 gap not bridged, the longest 4.01 s" in again.notes[2]
 
@@ -195,7 +196,7 @@ def test_sliding_joints_and_full_poses(tmp_path):
 def test_of_a_motion_that_repeats_itself_the_offset_is_said_to_be_ambiguous(tmp_path):
     cell = rigid(perturbed_cell(load("ur5"), 3))
     again = joined(*recorded(tmp_path, cell, 3, 160.0, pace=lambda t: 25.0 * np.sin(2.0 * np.pi * t / 40.0)))
-    assert any(note.startswith("the motion repeats itself") for note in again.notes)
+    assert any("the motion repeats itself" in note for note in again.notes)
     assert again.clock.offset == pytest.approx(OFFSET, abs=3.0 * again.clock.sigma)
 
 
@@ -211,7 +212,7 @@ REFUSED = {
     "backwards": (lambda rows: np.column_stack([rows[::-1, 0], rows[:, 1:]]), "",
                   "only 1 of .* rows can be used .*a time not after the row before"),
     "a jump of the clock": (lambda rows: rows + (rows[:, :1] > 60.0) * [7.0, 0, 0, 0], "",
-                            "did a clock jump|at no offset of the clocks"),
+                            "at no offset of the clocks.*did no clock jump|did a clock jump"),
     "too short": (lambda rows: rows[:400], "", "offset of its clock is known to .* ms only|independent"),
     "nothing seen": (lambda rows: rows * [1, 0, 0, 0], "", "only 0 of .* rows can be used"),
 }  # fmt: skip

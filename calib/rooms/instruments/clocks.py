@@ -10,13 +10,14 @@ Thresholds are our choice.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.signal import correlate, correlation_lags
 
 from calib.data.poses.measurements import Positions, take
-from calib.errors import listing, refuse_data
+from calib.errors import refuse_data
 from calib.estimation import robust
 from calib.geometry.first_guess import install
 from calib.geometry.fit import plausible_deviation
@@ -64,87 +65,99 @@ class Clock:
         """Return the controller's times of the instrument's times t (m,) [s]."""
         return t - self.offset - self.drift * (t - self.middle)
 
-    def __str__(self) -> str:
-        seen, ppm = abs(self.drift) > 3.0 * self.drift_sigma, f"± {1e6 * self.drift_sigma:.2g} ppm"
-        drift = f"drifts by {1e6 * self.drift:.4g} {ppm}" if seen else f"does not drift ({ppm})"
-        return f"the instrument's clock is {self.offset:+.5f} ± {self.sigma:.1g} s off the controller's, and {drift}"
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A motion as both recordings have it.
+
+    Attributes:
+        log: the controller's joints.
+        stream: the instrument's rows; `points` are these as measurements, without their joints.
+    """
+
+    log: Stream
+    stream: Stream
+    points: Positions
+
+    @cached_property
+    def _path(self) -> CubicSpline:
+        return CubicSpline(self.log.t, self.log.values)
+
+    def joints(self, clock: Clock, rows: np.ndarray, order: int = 0) -> np.ndarray:
+        """Return the log's joints (m, n) at the times of rows, or a derivative; outside the log those of its ends."""
+        return self._path(np.clip(clock.controller(self.stream.t[rows]), *self.log.t[[0, -1]]), order)
+
+    def known(self, clock: Clock, most: int | None = None) -> np.ndarray:
+        """Return the rows, or as many of them evenly, whose times are between two of the log that are no gap apart."""
+        t, log = clock.controller(self.stream.t), self.log
+        after = np.clip(np.searchsorted(log.t, t), 1, len(log.t) - 1)
+        near = log.t[after] - log.t[after - 1] <= log.gap
+        rows = np.flatnonzero(near & (t >= log.t[0]) & (t <= log.t[-1]))
+        return rows if most is None else rows[np.unique(np.linspace(0, len(rows) - 1, most).astype(int))]
+
+    def lines(self) -> list[str]:
+        """Return what is to be said of both files."""
+        return [*self.log.lines(), *self.stream.lines()]
+
+    def at(self, clock: Clock, rows: np.ndarray) -> Positions:
+        """Return rows as measurements with their joints."""
+        return replace(take(self.points, rows), q=self.joints(clock, rows))
 
 
-class Motion:
-    """Joints of a log at any time."""
-
-    def __init__(self, log: Stream) -> None:
-        self.log, self._path = log, CubicSpline(log.t, log.values)
-
-    def at(self, t: np.ndarray, order: int = 0) -> np.ndarray:
-        """Return the joints (m, n) at times t (m,) [s], or a derivative; outside the log those of its ends."""
-        return self._path(np.clip(t, self.log.t[0], self.log.t[-1]), order)
-
-    def knows(self, t: np.ndarray) -> np.ndarray:
-        """Return which times (m,) are between two rows of the log that are no gap apart."""
-        after = np.clip(np.searchsorted(self.log.t, t), 1, len(self.log.t) - 1)
-        near = self.log.t[after] - self.log.t[after - 1] <= self.log.gap
-        return near & (t >= self.log.t[0]) & (t <= self.log.t[-1])
-
-
-def begin(chain: Chain, motion: Motion, stream: Stream, measured: Positions) -> tuple[Installation, Clock, list[str]]:
-    """Return the nominal arm placed, the clock to begin with, and notes.
-
-    Args:
-        measured: the stream's rows; their joints are not used.
+def begin(chain: Chain, run: Run) -> tuple[Installation, Clock, tuple[float, ...]]:
+    """Return the nominal arm placed, the clock to begin with, and other offsets that are as good [s].
 
     Raises:
         MeasurementError: where no offset brings the points onto the nominal arm's path.
     """
-    found, middle = list[tuple[float, float, Installation]](), float(stream.t[[0, -1]].mean())
-    for offset in _offsets(chain, motion, stream):
+    found, middle = list[tuple[float, Clock, Installation]](), float(run.stream.t[[0, -1]].mean())
+    for offset in _offsets(chain, run):
         clock = Clock(offset, middle=middle)
-        rows = np.flatnonzero(motion.knows(clock.controller(stream.t)))
-        rows = rows[np.unique(np.linspace(0, len(rows) - 1, PLACED).astype(int))] if len(rows) >= PLACED else rows[:0]
-        if len(rows):
-            placed = install(chain, [_at(motion, measured, stream.t, clock, rows)])
-            cell, clock = fitted(placed, motion, stream, measured, rows, clock, arm=False)
-            sizes = np.sort(np.linalg.norm(residuals(cell, motion, stream, measured, rows, clock)[:3], axis=0))
-            found.append((float(np.sqrt(np.mean(sizes[: TRIMMED * len(rows) // 100] ** 2))), clock.offset, cell))
-    spread = float(np.linalg.norm(measured.position.std(axis=0)))
-    limit = min(MAX_RATIO * spread, MAX_MISFIT * chain.stretched_length())
-    found.sort(key=lambda each: each[0])
-    if not found or found[0][0] > limit:
-        best = f"the best leaves {1e3 * found[0][0]:.3g} mm of a motion of {1e3 * spread:.3g} mm" if found else "none"
+        if len(run.known(clock)) < PLACED:
+            continue
+        rows = run.known(clock, PLACED)
+        cell, clock = fitted(install(chain, [run.at(clock, rows)]), run, rows, clock, arm=False)
+        sizes = np.sort(np.linalg.norm(residuals(cell, run, rows, clock)[:3], axis=0))
+        found.append((float(np.sqrt(np.mean(sizes[: TRIMMED * len(rows) // 100] ** 2))), clock, cell))
+    spread, least = (
+        float(np.linalg.norm(run.points.position.std(axis=0))),
+        min((each[0] for each in found), default=9.9),
+    )
+    if least > min(MAX_RATIO * spread, MAX_MISFIT * chain.stretched_length()):
         refuse_data(
-            stream.file,
-            f"at no offset of the clocks its points are on the path of the nominal arm by {motion.log.file} ({best}): "
-            "is it the log of this motion, and of this robot, and did instrument and target stay in place? "
-            f"({'; '.join([*motion.log.lines(), *stream.lines()])})",
+            run.stream.file,
+            f"at no offset of the clocks its points are on the path of the nominal arm by {run.log.file} (the best "
+            f"leaves {1e3 * least:.3g} mm of a motion of {1e3 * spread:.3g} mm): is it the log of this motion, and of "
+            f"this robot, did instrument and target stay in place, and did no clock jump? ({'; '.join(run.lines())})",
         )
-    alike = [each for each in found if each[0] < RIVAL * found[0][0]]
-    _, offset, cell = max(alike, key=lambda each: motion.knows(stream.t - each[1]).sum())
-    rivals = sorted({round(other, 2) for _, other, _ in alike if abs(other - offset) > APART})
-    words = f"the motion repeats itself: the clocks' offset may as well be {listing(rivals)} s; the joints are as good"
-    return cell, Clock(offset, middle=middle), [words] if rivals else []
+    alike = [each for each in found if each[0] < RIVAL * least]
+    _, clock, cell = max(alike, key=lambda each: len(run.known(each[1])))
+    rivals = {round(other.offset, 2) for _, other, _ in alike if abs(other.offset - clock.offset) > APART}
+    return cell, Clock(clock.offset, middle=middle), tuple(sorted(rivals))
 
 
-def _offsets(chain: Chain, motion: Motion, stream: Stream) -> list[float]:
+def _offsets(chain: Chain, run: Run) -> list[float]:
     """Return offsets of the clocks [s] at which the speeds of the arm and of the points go together."""
-    log, apart = motion.log, float(stream.t[0] - motion.log.t[0])
-    times = np.arange(log.t[0], log.t[-1], GRID)
-    arm = forward(chain, motion.at(times))
+    arm = forward(chain, _even(run.log))
     turns = np.linalg.norm(rotation_vector(invert(arm[:-1])[:, :3, :3] @ arm[1:, :3, :3]), axis=1)
-    ways = np.linalg.norm(np.diff(arm[:, :3, 3], axis=0), axis=1)
-    seen = np.arange(stream.t[0], stream.t[-1], GRID)
-    points = np.column_stack([np.interp(seen, stream.t, column) for column in stream.values[:, :3].T])
-    theirs = _cut(np.linalg.norm(np.diff(points, axis=0), axis=1))
-    lags = GRID * correlation_lags(len(theirs), len(ways))
+    ways, theirs = (np.linalg.norm(np.diff(p, axis=0), axis=1) for p in (arm[:, :3, 3], _even(run.stream)[:, :3]))
+    lags = GRID * correlation_lags(len(theirs), len(ways)) + run.stream.t[0] - run.log.t[0]
     shared = np.round(correlate(np.ones(len(theirs)), np.ones(len(ways))))
     possible, found = shared > OVERLAP * min(len(theirs), len(ways)), list[float]()
     for lever in LEVERS:
-        alike = _alike(theirs, _cut(np.hypot(ways, lever * turns))) * np.sqrt(shared / shared.max())
+        alike = _alike(_cut(theirs), _cut(np.hypot(ways, lever * turns))) * np.sqrt(shared / shared.max())
         alike[~possible] = -np.inf
         for _ in range(PEAKS):
             best = float(lags[int(np.argmax(alike))])
             alike[np.abs(lags - best) < APART] = -np.inf
-            found.append(apart + best)
+            found.append(best)
     return [one for k, one in enumerate(found) if all(abs(one - other) > APART / 2 for other in found[:k])]
+
+
+def _even(stream: Stream) -> np.ndarray:
+    """Return a stream's values (m, k) on the grid of the offsets."""
+    t = np.arange(stream.t[0], stream.t[-1], GRID)
+    return np.column_stack([np.interp(t, stream.t, column) for column in stream.values.T])
 
 
 def _cut(speed: np.ndarray) -> np.ndarray:
@@ -161,23 +174,15 @@ def _alike(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return (correlate(one, other) / count - mean * its) / np.sqrt(np.maximum(power, 1e-6 * power.max()))
 
 
-def _at(motion: Motion, measured: Positions, t: np.ndarray, clock: Clock, rows: np.ndarray) -> Positions:
-    """Return some rows with the joints of the log at their times."""
-    return replace(take(measured, rows), q=motion.at(clock.controller(t[rows])))
-
-
-def residuals(
-    cell: Installation, motion: Motion, stream: Stream, measured: Positions, rows: np.ndarray, clock: Clock
-) -> np.ndarray:
+def residuals(cell: Installation, run: Run, rows: np.ndarray, clock: Clock) -> np.ndarray:
     """Return the residuals (3 or 6, m) of rows: of positions [m], then of orientations [rad]."""
-    (block,) = prepare(cell, [_at(motion, measured, stream.t, clock, rows)])
+    (block,) = prepare(cell, [run.at(clock, rows)])
     return np.concatenate([part.value for part in observe(cell, block, _NONE)])
 
 
 def fitted(
-    cell: Installation, motion: Motion, stream: Stream, measured: Positions, rows: np.ndarray, clock: Clock,
-    arm: bool = True, loss: str = "huber",
-) -> tuple[Installation, Clock]:  # fmt: skip
+    cell: Installation, run: Run, rows: np.ndarray, clock: Clock, arm: bool = True, loss: str = "huber"
+) -> tuple[Installation, Clock]:
     """Return the installation and the clock that fit some rows best; σ is that of independent rows.
 
     Args:
@@ -185,14 +190,13 @@ def fitted(
         arm: whether the arm's geometry and the drift are fitted, too, not placements and offset alone.
         loss: of each row's size (`calib.estimation.robust`).
     """
-    start, table, t = cell, layout(cell), stream.t[rows] - clock.middle
+    start, table, t = cell, layout(cell), run.stream.t[rows] - clock.middle
     free = table.rigid_index if arm else table.frame_index
-    free = free[base_columns(cell, prepare(cell, [_at(motion, measured, stream.t, clock, rows)]), free).kept]
+    free = free[base_columns(cell, prepare(cell, [run.at(clock, rows)]), free).kept]
     prior = np.concatenate([plausible_deviation(cell, free), [np.inf, MAX_DRIFT if arm else 1e-12]])
     known, spread = np.isfinite(prior), np.full(len(prior), np.inf)
     for _ in range(ROUNDS):
-        at = _at(motion, measured, stream.t, clock, rows)
-        ways = BESIDE * motion.at(clock.controller(stream.t[rows]), 1)
+        at, ways = run.at(clock, rows), BESIDE * run.joints(clock, rows, 1)
         now, ahead, behind = (
             observe(cell, prepare(cell, [replace(at, q=at.q + sign * ways)])[0], index)
             for sign, index in ((0.0, free), (1.0, _NONE), (-1.0, _NONE))

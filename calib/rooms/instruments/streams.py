@@ -12,21 +12,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from calib.data.csv_table import Table
 from calib.data.poses.columns import POSITION, QUATERNION, Sheet
-from calib.data.poses.measurements import PoseMeasurements, Positions
+from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.plausible import check_joints, outside, unit_quaternions
 from calib.data.schema import BOUNDS, max_travel
-from calib.errors import MeasurementError, refuse_data, require
+from calib.errors import Finding, MeasurementError, finding, refuse_data, require
 from calib.estimation import robust
 from calib.estimation.whiteness import autocorrelation, inflation
 from calib.geometry.installation import Installation
+from calib.procedure.findings import lines_of
 from calib.procedure.robot_kinds import joints_of
 from calib.robot.chain import Chain, joint_kinds
-from calib.rooms.instruments.clocks import Clock, Motion, begin, fitted, residuals
+from calib.rooms.instruments.clocks import Clock, Run, begin, fitted, residuals
 from calib.rooms.instruments.joined import Joined
 from calib.rooms.instruments.stream_files import Kind, Stream, read_stream
 from calib.units import JOINT
@@ -75,53 +77,59 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
         words = f"hardly moves (by {most:.2g}{unit}), and without motion no clock is found: is the unit right?"
         require(most > MIN_MOTION, words, MeasurementError, each.file)
     turn = stream.values[:, 3:] if stream.values.shape[1] > 3 else None
-    points = PoseMeasurements.of(
-        np.zeros((len(stream.t), chain.n)), stream.values[:, :3], turn, joint_names=chain.joint_names, file=str(file)
-    )
-    motion = Motion(log)
-    cell, clock, notes = begin(chain, motion, stream, points)
-    known = np.flatnonzero(motion.knows(clock.controller(stream.t)))
-    some = known[np.unique(np.linspace(0, len(known) - 1, FITTED).astype(int))]
-    cell, clock = fitted(cell, motion, stream, points, some, clock)
-    kept, left, said = _usable(cell, motion, stream, points, clock)
+    q, names = np.zeros((len(stream.t), chain.n)), chain.joint_names
+    run = Run(log, stream, PoseMeasurements.of(q, stream.values[:, :3], turn, joint_names=names, file=str(file)))
+    cell, clock, rivals = begin(chain, run)
+    cell, clock = fitted(cell, run, run.known(clock, FITTED), clock)
+    kept, left, velocity, said = _usable(cell, run, clock)
     tau, sigma = max(inflation(row) for row in left), robust.spread(left[:3])
-    chosen = _thinned(motion, clock, stream.t[kept], stream.step * (1.0 + 1.5 * (tau - 1.0)))
-    lines = [*log.lines(), *stream.lines()]
-    scatter = f"residuals of {1e3 * sigma:.2g} mm per axis are correlated over {tau * stream.step:.2g} s"
-    if len(chosen) < MIN_ROWS:
-        advice = "did a clock jump, or instrument or target move? Else measure for longer, over more of the workspace"
-        refuse_data(file, f"only {len(chosen)} rows are independent, since {scatter}: {advice} ({'; '.join(lines)})")
+    chosen = _thinned(stream.t[kept], run.joints(clock, kept), stream.step * (1.0 + 1.5 * (tau - 1.0)))
     rows, rest = kept[chosen], max(float(autocorrelation(row, 1)[0]) for row in left[:, chosen])
-    _, clock = fitted(cell, motion, stream, points, rows, clock, loss="none")
-    ways = np.linalg.norm(np.diff(stream.values[kept, :3], axis=0), axis=1) / np.diff(stream.t[kept])
-    late = clock.sigma * float(np.sqrt(np.mean(ways**2)))
+    found: dict[str, Any] = {
+        "sigma": sigma,
+        "correlation": tau * stream.step,
+        "factor": float(np.sqrt(tau)),
+        "left": rest,
+    }
+    thinned = finding("stream-thinned", taken=len(rows), of=len(kept), step=stream.step, **found)
+    if len(rows) < MIN_ROWS:
+        words = "too few rows are independent: did a clock jump, or instrument or target move? Else measure for longer"
+        refuse_data(file, f"{words}, over more of the workspace ({'; '.join([*run.lines(), *lines_of([thinned])])})")
+    _, clock = fitted(cell, run, rows, clock, loss="none")
+    late = clock.sigma * float(np.sqrt(np.mean(np.sum(velocity**2, axis=0))))
     words = (
         f"the offset of its clock is known to {1e3 * clock.sigma:.2g} ms only, in which the target moves by "
         f"{1e3 * late:.2g} mm (noise {1e3 * sigma:.2g} mm): measure for longer, each way forth and back"
     )
     require(late < sigma, words, MeasurementError, file)
-    thinned = (
-        f"{len(rows)} rows are taken, of {len(kept)} in steps of {stream.step:.2g} s: {scatter}, so that {tau:.3g} "
-        f"steps count as one and σ from all would be {np.sqrt(tau):.2g} times too small; neighbours taken are "
-        f"correlated by {rest:.2f}"
-    )
-    table = _table(chain, motion.at(clock.controller(stream.t[rows])), stream, rows)
-    notes = (*lines, *notes, str(clock), *said, thinned)
-    return Streamed(table, stream.rows[rows] - 1, notes, clock, sigma, tau * stream.step, float(np.sqrt(tau)), rest)
+    said += [finding("stream-repeats", offsets=rivals)] if rivals else []
+    said += [finding("stream-clock", **vars(clock) | {"ppm": 1e6 * clock.drift, "ppm_sigma": 1e6 * clock.drift_sigma})]
+    notes = (*run.lines(), *lines_of([*said, thinned]))
+    table = _table(chain, run.joints(clock, rows), stream, rows)
+    return Streamed(table, stream.rows[rows] - 1, notes, clock, **found)
 
 
-def _usable(
-    cell: Installation, motion: Motion, stream: Stream, points: Positions, clock: Clock
-) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Return the indices of usable rows, their residuals (3 or 6, m), and notes; count in the stream what is not."""
-    kept = np.flatnonzero(motion.knows(clock.controller(stream.t)))
-    left = residuals(cell, motion, stream, points, kept, clock)
+def _usable(cell: Installation, run: Run, clock: Clock) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Finding]]:
+    """Return usable rows, their residuals (3 or 6, m) and velocities (3, m), and findings; count what is not.
+
+    Residuals have the variance σ² across the motion, and σ² + v² σ_t² along it.
+    """
+    stream, kept = run.stream, run.known(clock)
+    left = residuals(cell, run, kept, clock)
     near = (np.abs(left) < OUTLIER * np.array([[robust.spread(row)] for row in left])).all(axis=0)
-    slow, said = _slow(points.position[kept[near]], stream.t[kept[near]], left[:3, near])
     stream.dropped["outside the log or in its gaps"] = len(stream.t) - len(kept)
     stream.dropped["far from the arm's path"] = int((~near).sum())
+    kept, left = kept[near], left[:, near]
+    velocity = np.gradient(stream.values[kept, :3], stream.t[kept], axis=0).T
+    speed = np.linalg.norm(velocity, axis=0)
+    along = (left[:3] * velocity).sum(axis=0) / np.maximum(speed, 1e-9)
+    across = (np.sum(left[:3] ** 2, axis=0) - along**2) / 2.0
+    late = np.sqrt(max(float(np.sum(speed**2 * (along**2 - across)) / np.sum(speed**4)), 1e-24))
+    sigma = float(np.sqrt(across.mean()))
+    slow = speed * late <= sigma
     stream.dropped["too fast"] = int((~slow).sum())
-    return kept[near][slow], left[:, near][:, slow], said
+    said = [] if slow.all() else [finding("stream-fast", speed=sigma / late, late=late, sigma=sigma)]
+    return kept[slow], left[:, slow], velocity[:, slow], said
 
 
 def _joints(chain: Chain) -> Kind:
@@ -173,29 +181,9 @@ def _fresh(stream: Stream) -> Stream:
     return replace(stream, t=stream.t[new], values=stream.values[new], rows=stream.rows[new])
 
 
-def _slow(position: np.ndarray, t: np.ndarray, left: np.ndarray) -> tuple[np.ndarray, list[str]]:
-    """Return which rows (m,) are slow enough for the uncertainty of their times, and a note where some are not.
-
-    Residuals (3, m) have the variance σ² across the motion, and σ² + v² σ_t² along it.
-    """
-    velocity = np.gradient(position, t, axis=0).T
-    speed = np.linalg.norm(velocity, axis=0)
-    along = (left * velocity).sum(axis=0) / np.maximum(speed, 1e-9)
-    across = ((left**2).sum(axis=0) - along**2) / 2.0
-    late = np.sqrt(max(float(np.sum(speed**2 * (along**2 - across)) / np.sum(speed**4)), 0.0))
-    sigma = float(np.sqrt(across.mean()))
-    slow = speed * late <= sigma
-    words = (
-        f"faster than {1e3 * sigma / max(late, 1e-12):.3g} mm/s, left out: times are uncertain by {1e3 * late:.2g} ms, "
-        f"which costs more there than the noise of {1e3 * sigma:.2g} mm"
-    )
-    return slow, [] if slow.all() else [words]
-
-
-def _thinned(motion: Motion, clock: Clock, t: np.ndarray, apart: float) -> np.ndarray:
-    """Return the indices of times t (m,) that are at least `apart` [s], and between which a joint moves."""
-    apart = max(0.999 * apart, (t[-1] - t[0]) / MAX_ROWS)
-    found, after, q, ahead = [0], 0, motion.at(clock.controller(t)), 64
+def _thinned(t: np.ndarray, q: np.ndarray, apart: float) -> np.ndarray:
+    """Return the indices of times t (m,) at least `apart` [s], between which one of the joints q (m, n) moves."""
+    apart, found, after, ahead = max(0.999 * apart, (t[-1] - t[0]) / MAX_ROWS), [0], 0, 64
     while (after := max(after, int(np.searchsorted(t, t[found[-1]] + apart)))) < len(t):
         moved = np.flatnonzero(np.abs(q[after : after + ahead] - q[found[-1]]).max(axis=1) > MOVED)
         found += (after + moved[:1]).tolist()
