@@ -93,7 +93,7 @@ class Run:
         after = np.clip(np.searchsorted(log.t, t), 1, len(log.t) - 1)
         near = log.t[after] - log.t[after - 1] <= log.gap
         rows = np.flatnonzero(near & (t >= log.t[0]) & (t <= log.t[-1]))
-        return rows if most is None else rows[np.unique(np.linspace(0, len(rows) - 1, most).astype(int))]
+        return rows[np.linspace(0, len(rows) - 1, most).astype(int)] if most and len(rows) > most else rows
 
     def lines(self) -> list[str]:
         """Return what is to be said of both files."""
@@ -113,16 +113,13 @@ def begin(chain: Chain, run: Run) -> tuple[Installation, Clock, tuple[float, ...
     found, middle = list[tuple[float, Clock, Installation]](), float(run.stream.t[[0, -1]].mean())
     for offset in _offsets(chain, run):
         clock = Clock(offset, middle=middle)
-        if len(run.known(clock)) < PLACED:
+        if len(rows := run.known(clock, PLACED)) < PLACED / 3:
             continue
-        rows = run.known(clock, PLACED)
         cell, clock = fitted(install(chain, [run.at(clock, rows)]), run, rows, clock, arm=False)
         sizes = np.sort(np.linalg.norm(residuals(cell, run, rows, clock)[:3], axis=0))
         found.append((float(np.sqrt(np.mean(sizes[: TRIMMED * len(rows) // 100] ** 2))), clock, cell))
-    spread, least = (
-        float(np.linalg.norm(run.points.position.std(axis=0))),
-        min((each[0] for each in found), default=9.9),
-    )
+    least = min((each[0] for each in found), default=np.inf)
+    spread = float(np.linalg.norm(run.points.position.std(axis=0)))
     if least > min(MAX_RATIO * spread, MAX_MISFIT * chain.stretched_length()):
         refuse_data(
             run.stream.file,
