@@ -22,8 +22,11 @@ from calib.estimation import robust
 from calib.geometry.first_guess import install
 from calib.geometry.fit import plausible_deviation
 from calib.geometry.installation import Installation
+from calib.geometry.model_choice.cross_validation import term_sizes
+from calib.geometry.model_choice.ladder import EFFECTS
 from calib.geometry.observability import base_columns
 from calib.geometry.observation import layout, observe, parameter_values, prepare, step
+from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 from calib.rooms.instruments.order import MAX_MISFIT
@@ -40,6 +43,7 @@ MAX_RATIO = 0.15  # of the points' spread that a log of the same motion leaves w
 RIVAL = 1.3  # times the residual of the best offset, up to which another one is as good
 MAX_DRIFT = 1e-3  # prior standard deviation of a clock's drift
 BESIDE = 1e-3  # difference of times by which speeds are computed [s]
+ORDERS = 6  # of the harmonics that are fitted
 ROUNDS = 12  # of Gauss-Newton
 SETTLED = 1e-6  # change of the offset after which it ends [s]
 _NONE = np.array([], dtype=int)
@@ -184,13 +188,19 @@ def fitted(
 
     Args:
         cell, clock: where to start; the arm's parameters have a wide prior about their values there.
-        arm: whether the arm's geometry and the drift are fitted, too, not placements and offset alone.
+        arm: whether the arm, with all effects that a model of `calib fit` may have, is fitted, too, not placements,
+            offset and drift alone.
         loss: of each row's size (`calib.estimation.robust`).
     """
+    if arm and not cell.deflection.terms:
+        terms = tuple(term for effect in EFFECTS.values() for term in effect(cell.chain, False) if term.order <= ORDERS)
+        cell = replace(cell, deflection=Deflection(terms, np.zeros(len(terms)), cell.chain))
     start, table, t = cell, layout(cell), run.stream.t[rows] - clock.middle
     free = table.rigid_index if arm else table.frame_index
     free = free[base_columns(cell, prepare(cell, [run.at(clock, rows)]), free).kept]
-    prior = np.concatenate([plausible_deviation(cell, free), [np.inf, MAX_DRIFT if arm else 1e-12]])
+    prior = np.concatenate([plausible_deviation(cell, free), term_sizes(cell.deflection.terms), [np.inf, MAX_DRIFT]])
+    if arm:
+        free = np.concatenate([free, table.index("deflection")])
     known, spread = np.isfinite(prior), np.full(len(prior), np.inf)
     for _ in range(ROUNDS):
         at, ways = run.at(clock, rows), BESIDE * run.joints(clock, rows, 1)
@@ -209,9 +219,10 @@ def fitted(
         matrix, wanted = np.concatenate(slopes), np.concatenate(left)
         size = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
         matrix /= size
-        change = np.linalg.lstsq(matrix, wanted, rcond=1e-10)[0]
+        inverse = np.linalg.pinv(matrix.T @ matrix, 1e-13, hermitian=True)
+        change = inverse @ (matrix.T @ wanted)
         rest = float(np.sum((wanted - matrix @ change) ** 2)) / max(len(wanted) - len(prior), 1)
-        spread = np.sqrt(rest * np.diag(np.linalg.pinv(matrix.T @ matrix))) / size
+        spread = np.sqrt(rest * np.diag(inverse)) / size
         change /= size
         cell = step(cell, free, change[:-2])
         clock = replace(clock, offset=clock.offset + change[-2], drift=clock.drift + change[-1])

@@ -95,7 +95,8 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
     if len(rows) < MIN_ROWS:
         words = "too few rows are independent: did a clock jump, or instrument or target move? Else measure for longer"
         refuse_data(file, f"{words}, over more of the workspace ({'; '.join([*run.lines(), *lines_of([thinned])])})")
-    _, clock = fitted(cell, run, rows, clock, loss="none")
+    few = rows[np.linspace(0, len(rows) - 1, min(FITTED, len(rows))).astype(int)]
+    _, clock = fitted(cell, run, few, clock, loss="none")
     late = clock.sigma * float(np.sqrt(np.mean(np.sum(velocity**2, axis=0))))
     words = (
         f"the offset of its clock is known to {1e3 * clock.sigma:.2g} ms only, in which the target moves by "
