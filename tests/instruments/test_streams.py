@@ -20,7 +20,7 @@ from calib.robot.chain import Chain
 from calib.robot.library import load
 from calib.rooms.cells.cell import Cell, true_poses
 from calib.rooms.cells.virtual_cells import perturbed_cell, rigid
-from calib.rooms.instruments import stream_files
+from calib.rooms.instruments import joining, stream_files
 from calib.rooms.instruments.streams import Streamed
 from calib.transforms import to_quaternion
 
@@ -74,9 +74,20 @@ def files(tmp_path_factory) -> tuple[Path, Path]:
     return recorded(tmp_path_factory.mktemp("stream"), rigid(perturbed_cell(load("ur5"), 3)), 3)
 
 
+BAD = np.random.default_rng(0).choice(np.arange(1, 10_000), 105, replace=False)  # one row in a hundred
+
+
 @pytest.fixture(scope="module")
 def found(files) -> Streamed:
-    return joined(*files)
+    """Return what is found of a stream with damaged rows."""
+    head, *rows = files[1].read_text().splitlines()
+    for k, i in enumerate(BAD):
+        t, x, y, z = rows[i].split(",")
+        rows[i] = (f"{t},{x}", f"{t},nan,{y},{z}", f"{t},---,,", f"{t},0.0,0,0", f"{t},{x},9e99,{z}",
+                   f"{float(t) + 500},{x},{y},{z}", f"{t},{x},{y},{float(z) + 20}")[k % 7]  # fmt: skip
+    damaged = files[1].with_name("damaged.csv")
+    damaged.write_text("\n".join([head, *rows]))
+    return joined(files[0], damaged)
 
 
 def joined(log: Path, stream: Path, robot: str | Path = "ur5") -> Streamed:
@@ -105,10 +116,13 @@ def test_the_clock_is_found_and_neighbours_that_are_kept_are_nearly_independent(
     assert len(found.table) == pytest.approx(105.0 / (1.5 * found.correlation), rel=0.15)
 
 
-def test_the_command_writes_a_table_for_fit_with_the_reasons_above_it(tmp_path, files, found, capsys):
+def test_the_command_writes_a_table_for_fit_with_the_reasons_above_it(tmp_path, files, found, capsys, monkeypatch):
+    asked = list[object]()
+    monkeypatch.setattr(joining, "join_streams", lambda *given: asked.extend(given) or found)
     out = tmp_path / "poses.csv"
     line = ["join", *map(str, files), "--by", "motion", "--robot", "ur5", "--out", str(out)]
     assert run(line) == 0
+    assert asked[:2] == list(files)
     assert f"{len(found.table)} measured poses written" in capsys.readouterr().out
     comments = [row for row in out.read_text().splitlines() if row.startswith("#")]
     assert any("the instrument's clock minus" in row for row in comments) and any(
@@ -122,20 +136,11 @@ def test_the_command_writes_a_table_for_fit_with_the_reasons_above_it(tmp_path, 
         np.testing.assert_allclose(own, np.radians(np.interp(times, log[:, 0], column)), atol=1e-5)
 
 
-def test_one_percent_of_damaged_rows_is_dropped_and_counted(tmp_path, files, found):
-    head, *rows = files[1].read_text().splitlines()
-    rng = np.random.default_rng(0)
-    bad = rng.choice(np.arange(1, len(rows) - 1), len(rows) // 100, replace=False)
-    for k, i in enumerate(bad):
-        t, x, y, z = rows[i].split(",")
-        rows[i] = (f"{t},{x}", f"{t},nan,{y},{z}", f"{t},---,,", f"{t},0.0,0,0", f"{t},{x},9e99,{z}",
-                   f"{float(t) + 500},{x},{y},{z}", f"{t},{x},{y},{float(z) + 20}")[k % 7]  # fmt: skip
-    damaged = tmp_path / "tracker.csv"
-    damaged.write_text("\n".join([head, *rows]))
-    again = joined(files[0], damaged)
-    jumps = len(range(6, len(bad), 7))
-    assert f"left out: {len(bad) - jumps} damaged, empty or not seen, {jumps} far from the arm's path" in again.notes[1]
-    assert abs(again.clock.offset - found.clock.offset) < found.clock.sigma
+def test_one_percent_of_damaged_rows_is_dropped_and_counted(found):
+    jumps = len(BAD) // 7
+    words = f"left out: {len(BAD) - jumps} damaged, empty or not seen, {jumps} far from the arm's path"
+    assert found.notes[1].endswith(words)
+    assert not set(found.poses) & set(BAD)
 
 
 @pytest.mark.slow
@@ -273,19 +278,19 @@ def errors_in_sigmas(chain: Chain, cell: Cell, q: np.ndarray, position: np.ndarr
 
 
 @pytest.mark.slow
-def test_at_1_khz_offsets_and_parameters_err_as_their_sigmas_say_and_without_thinning_they_would_not(tmp_path):
+def test_offsets_and_parameters_err_as_their_sigmas_say_and_without_thinning_they_would_not(tmp_path):
     offsets, thinned, every = list[float](), list[np.ndarray](), list[np.ndarray]()
-    for seed in range(6):
+    for seed in range(3):
         cell = rigid(perturbed_cell(load("ur5"), seed))
-        log, stream = recorded(tmp_path, cell, seed, rate=1000.0)
+        log, stream = recorded(tmp_path, cell, seed, rate=250.0)
         one = joined(log, stream)
         offsets.append((one.clock.offset - OFFSET) / one.clock.sigma)
         cells = np.column_stack(one.table.cells)
         thinned.append(errors_in_sigmas(cell.nominal, cell, np.radians(cells[:, 1:7]), 1e-3 * cells[:, 7:10]))
-        rows = np.loadtxt(stream, delimiter=",", skiprows=1)[::8]
+        rows = np.loadtxt(stream, delimiter=",", skiprows=1)[::2]
         q = slow_motion(6, seed)(one.clock.controller(rows[:, 0]))
         every.append(errors_in_sigmas(cell.nominal, cell, q, 1e-3 * rows[:, 1:4]))
-    assert np.abs(offsets).max() < 3.0 and np.mean(np.abs(offsets) < 2.0) >= 0.8
+    assert np.abs(offsets).max() < 2.5
     ours, all_rows = np.concatenate(thinned), np.concatenate(every)
     assert np.mean(np.abs(ours) < 2.0) == pytest.approx(0.95, abs=0.05)
     assert np.sqrt(np.mean(ours**2)) == pytest.approx(1.0, abs=0.2)

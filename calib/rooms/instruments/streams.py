@@ -35,7 +35,7 @@ from calib.units import JOINT
 
 RESOLUTION, LOG_RESOLUTION = 0.004, 0.008  # time between the rows that are held, of instrument and log [s]
 MIN_MOTION = 1e-3  # travel of a joint [rad or m] and of the points [m]
-FITTED = 2000  # rows that clock and geometry are fitted to first
+FITTED = 1500  # rows that clock and geometry are fitted to first
 OUTLIER = 6.0  # robust sigmas
 MIN_ROWS, MAX_ROWS = 20, 20_000  # of the table
 MOVED = 1e-3  # by which a joint moves at least between two rows of the table [rad or m]
