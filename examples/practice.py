@@ -85,7 +85,7 @@ def tracker(plan: str, path: str, robot: str = "tx40") -> None:
 def stream(log: str, points: str, robot: str = "tx40") -> None:
     """Follow a slow motion of 4 min with a laser tracker at 1 kHz, and log the joints at 125 Hz.
 
-    The tracker's clock is 0.137 s ahead. Its noise, 15 µm, is correlated over some 0.06 s; now and then its beam is broken.
+    The tracker's clock is 0.137 s ahead. Its noise, 15 µm, is correlated over some 0.06 s; its beam breaks at times.
     """
     arm, rng, rate = virtual_cells.virtual_cell(robot, 0), np.random.default_rng(1), 1000.0
     speeds = np.full(arm.nominal.n, 0.15)
