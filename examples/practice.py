@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.signal import lfilter
 
 import calib
 from calib.data.poses.pose_lists import read_poses
@@ -79,6 +80,27 @@ def tracker(plan: str, path: str, robot: str = "tx40") -> None:
     arm = virtual_cells.virtual_cell(robot, 0, instrument)
     q = read_poses(Path(plan), Joints.of(arm.nominal.joint_names))
     write_measured(cell.measure(arm, q, seed=1), path)
+
+
+def stream(log: str, points: str, robot: str = "tx40") -> None:
+    """Follow a slow motion of 4 min with a laser tracker at 1 kHz, and log the joints at 125 Hz.
+
+    The tracker's clock is 0.137 s ahead. Its noise, 15 µm, is correlated over some 0.06 s; its beam breaks at times.
+    """
+    arm, rng, rate = virtual_cells.virtual_cell(robot, 0), np.random.default_rng(1), 1000.0
+    speeds = np.full(arm.nominal.n, 0.15)
+    motion = random_fourier(arm.nominal.lower, arm.nominal.upper, speeds, 240.0, rate, harmonics=12, seed=2)
+    joints = np.degrees(motion.q[::8] + rng.normal(0.0, 1e-5, motion.q[::8].shape))
+    write_numbers(
+        log, ["t [s]", *(f"{name} [deg]" for name in arm.nominal.joint_names)], np.column_stack([motion.t[::8], joints])
+    )
+    memory = np.exp(-1.0 / (0.03 * rate))
+    noise = lfilter([15e-6 * np.sqrt(1.0 - memory**2)], [1.0, -memory], rng.normal(size=(len(motion.t), 3)), axis=0)
+    seen = 1e3 * (cell.true_poses(arm, motion.q)[:, :3, 3] + noise)
+    seen[rng.uniform(size=len(seen)) < 0.01] = 0.0
+    write_numbers(
+        points, ["t [s]", "x [mm]", "y [mm]", "z [mm]"], np.column_stack([motion.t + 0.137, seen])[1000:-2000]
+    )
 
 
 def photos(folder: str, count: str = "30") -> None:

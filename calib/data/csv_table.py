@@ -135,8 +135,8 @@ def read_table(path: str | Path, header: Sequence[str] | None = None, doubles: b
         MeasurementError: for a file that is missing, empty, not UTF-8, without a header, or with decimal commas; for
             a name that occurs twice; for a row of another length than the header.
     """
-    with _opened(path, header is None) as (lines, separator, found):
-        names, units = (tuple(header), ("",) * len(header)) if header is not None else _split_units(found)
+    with opened(path, header is None) as (lines, separator, found):
+        names, units = (tuple(header), ("",) * len(header)) if header is not None else split_units(found)
         if not doubles and len(set(names)) < len(names):
             name = next(name for i, name in enumerate(names) if name in names[:i])
             places = " and ".join(str(i + 1) for i, other in enumerate(names) if other == name)
@@ -151,25 +151,25 @@ def read_table(path: str | Path, header: Sequence[str] | None = None, doubles: b
 
 def read_header(path: str | Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the column names and units of the CSV file at `path` without reading its rows."""
-    with _opened(path, True) as (_, _, found):
-        return _split_units(found)
+    with opened(path, True) as (_, _, found):
+        return split_units(found)
 
 
 def row_width(path: str | Path) -> int:
     """Return the number of cells in the first line of the CSV file at `path`."""
-    with _opened(path, False) as (_, _, first):
+    with opened(path, False) as (_, _, first):
         return len(first)
 
 
 @contextmanager
-def _opened(path: str | Path, headed: bool) -> Iterator[tuple[IO[str], str, list[str]]]:
+def opened(path: str | Path, headed: bool) -> Iterator[tuple[IO[str], str, list[str]]]:
     """Yield a file positioned after its header line, its separator, and the header's cells."""
     try:
         check_regular(path)
-        opened = open(path, encoding="utf-8-sig", newline="")  # noqa: SIM115 (closed below)
+        raw = open(path, encoding="utf-8-sig", newline="")  # noqa: SIM115 (closed below)
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise MeasurementError(f"cannot be read: {getattr(error, 'strerror', None) or error}", path) from error
-    with opened as own:
+    with raw as own:
         exports = (export for room in offered("exports") if headed and (export := room(path)) is not None)
         file = next(exports, own)
         yield file, *_first_line(file, path, headed)
@@ -243,7 +243,7 @@ def _comment_header(comment: str, separator: str, width: int, path: str | Path) 
     refuse_data(path, message)
 
 
-def _split_units(cells: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def split_units(cells: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     names, units = [], []
     for i, cell in enumerate(map(plain_text, cells)):
         match = _HEADING.match(cell)
@@ -259,7 +259,7 @@ def _read_columns(lines: IO[str], separator: str, names: tuple[str, ...], path: 
     blocks: list[np.ndarray] = []
     try:
         while block := list(islice(body, _CHUNK)):
-            numbers = _numbers(block, separator, len(names))
+            numbers = plain_rows(block, separator, len(names))
             if numbers is None:
                 body = chain(block, body)
                 break
@@ -274,7 +274,7 @@ def _read_columns(lines: IO[str], separator: str, names: tuple[str, ...], path: 
     return tuple(_join([column, *part]) for column, part in zip(table, parts))
 
 
-def _numbers(block: list[str], separator: str, width: int) -> np.ndarray | None:
+def plain_rows(block: list[str], separator: str, width: int) -> np.ndarray | None:
     """Return the lines as an array (m, width); None if a cell is not a number or the widths of rows differ."""
     delimiter = None if separator == " " else separator
     try:

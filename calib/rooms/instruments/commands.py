@@ -16,7 +16,7 @@ def join(
     joints: Path,
     points: Path,
     out: Out,
-    by: Annotated[str, typer.Option(metavar="name|time|row|geometry")] = "",
+    by: Annotated[str, typer.Option(metavar="name|time|row|geometry|motion")] = "",
     robot: Annotated[Robot | None, typer.Option()] = None,
     base: str | None = None,
     tip: str | None = None,
@@ -25,6 +25,7 @@ def join(
     """Join the JOINTS of the controller and the POINTS of the instrument to one file of measured poses.
 
     Several readings of one pose are averaged; missing poses, and readings that contradict each other, are named.
+    With --by motion, points measured while the arm moves: the clocks' offset is found, and rows are thinned.
 
     Example: calib join joints.csv points.csv --out m.csv
 
@@ -33,7 +34,7 @@ def join(
         points: CSV of measured points: calib formats join
         out: CSV file of measured poses, for calib fit
         by: how rows are matched. Default: the first that both files have columns for
-        robot: its nominal geometry checks the order, or finds it (--by geometry)
+        robot: its nominal geometry checks the order, or finds it (--by geometry), or the clocks (--by motion)
     """
     from calib.files import results
     from calib.rooms.instruments import joining

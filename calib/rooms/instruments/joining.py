@@ -9,18 +9,22 @@ by time             a column ``t``, ``time`` or ``timestamp`` in both (a number,
                     measured while the arm moved are left out
 by row              as many rows in both
 by geometry         with a robot: the order in which the nominal arm explains the points
+by motion           with a robot: points measured while the arm moves, by a clock of their own, and a log over time
 ==================  ===================================================================================================
 
 Several readings of one pose are averaged; their pooled scatter becomes ``sigma_x``, ``_y``, ``_z`` of the mean where it
 has at least five degrees of freedom and the file states no sigma. A pose whose readings are further apart than
 1 mm, and than ten times what such readings usually are, is left out and named. Units are those of the two files.
+
+By motion, both files have a column of times (seconds, or ``t [ms]``; 5 Hz or more), each by its own clock, and run
+while the arm moves slowly. Offset and drift of the clocks are found from the motion; rows that cannot be used are left
+out and counted; the rest is thinned to rows whose errors are independent. Notes above the table's header say all of it.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from datetime import datetime
 from itertools import pairwise
 from pathlib import Path
@@ -28,7 +32,6 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.distance import pdist
 
-from calib import files
 from calib.arguments import checked
 from calib.data.csv_table import Table, read_table
 from calib.data.poses.columns import POSITION, SIGMA, Sheet
@@ -41,38 +44,18 @@ from calib.robot.chain import Chain
 from calib.robot.library import load_calibrated
 from calib.rooms.controllers.program import joints_table
 from calib.rooms.controllers.targets import is_program
+from calib.rooms.instruments.joined import CLOCKS, NAMES, Joined, column_of
 from calib.rooms.instruments.order import MAX_MISFIT, MIN_FOUND, MIN_POINTS, find_order
+from calib.rooms.instruments.streams import join_streams
 from calib.units import TIMES
 
-WAYS = ("name", "time", "row", "geometry")
-NAMES = ("name", "point", "pointname", "pointid", "pose", "poseid", "id", "label", "target", "number", "no", "nr")
-CLOCKS = ("t", "time", "timestamp", "datetime")
+WAYS = ("name", "time", "row", "geometry", "motion")
 MAX_APART = 1e-3  # of two readings of one pose [m], where nothing is known of their scatter (our choice)
 TIMES_USUAL = 10.0  # the median distance of two readings of one pose, up to which they are one (our choice)
 MIN_REPEATS = 5  # degrees of freedom of a scatter that is stated as sigma (our choice)
 STANDSTILL = 0.25  # before and after a point the arm stands [s], moving at most
 MAX_MOTION = 1e-3  # of a joint's whole travel (our choice)
 _MEASURED = re.compile(r"[xyz]\d*(_meas|_measured)?")
-
-
-@dataclass(frozen=True, eq=False)
-class Joined:
-    """Joint values and points in one table, with what there is to say of it.
-
-    Attributes:
-        table: one row per pose that was measured.
-        poses: the index of each row's pose among the joints.
-        notes: how it was joined, what is missing.
-    """
-
-    table: Table
-    poses: np.ndarray
-    notes: tuple[str, ...]
-
-    def write(self, path: Path) -> Path:
-        """Write the table as CSV, the notes as comments above it."""
-        header = [f"{name} [{unit}]" if unit else name for name, unit in zip(self.table.header, self.table.units)]
-        return files.write_table(path, header, zip(*(cells.tolist() for cells in self.table.cells)), self.notes)
 
 
 @checked
@@ -91,11 +74,13 @@ def join(
         joints: CSV file of joint values, one row per pose, or a log over time; or the file in which a controller kept
             the joints of `calib program`.
         points: CSV file of measured points.
-        by: ``name``, ``time``, ``row`` or ``geometry``; empty: the first of them that both files have columns for.
+        by: ``name``, ``time``, ``row``, ``geometry`` or ``motion``; empty: the first of these that both files have
+            columns for, but not ``motion``.
         robot, base, tip: the nominal robot, as of `calib.load`, whose geometry checks the order, or finds it.
 
     Returns:
-        The table, the index of each row's pose, and notes; ``write(path)`` writes the CSV that `fit_geometry` takes.
+        The table, the index of each row's pose, and notes; ``write(path)`` writes the CSV that `fit_geometry` takes. By
+        motion, also the clock (`calib.rooms.instruments.streams.Streamed`).
 
     Raises:
         UsageError: for another `by`, or one that the files have no columns for.
@@ -103,6 +88,10 @@ def join(
     """
     one_of(by or "row", WAYS, "by", UsageError)
     arm = load_calibrated(robot, base, tip) if isinstance(robot, str | Path) else robot
+    if by == "motion":
+        if arm is None:
+            raise UsageError("by motion the clocks are found from the nominal arm's path: give --robot")
+        return join_streams(Path(joints), Path(points), arm.complete)
     own = joints_table(Path(joints)) if is_program(Path(joints)) else read_table(joints)
     return _joined(own, read_table(points), by, arm and arm.complete)
 
@@ -243,12 +232,6 @@ def _averaged(points: Table, name: str, groups: dict[int, np.ndarray], position:
     return cells[[rows[np.argmin(size)] for rows, size in zip(groups.values(), away)]]
 
 
-def column_of(table: Table, known: Sequence[str]) -> str:
-    """Return the table's first column that has one of the `known` names, in any spelling; "" without any."""
-    plain = {re.sub(r"[^a-z0-9]", "", name.lower()): name for name in reversed(table.header)}
-    return next((plain[name] for name in known if name in plain), "")
-
-
 def _labels(joints: Table) -> list[str]:
     """Return a name per row of joints: those of its column of names, else its numbers from 1."""
     name = column_of(joints, NAMES)
@@ -285,7 +268,9 @@ def _at_times(joints: Table, points: Table, one: str, other: str) -> tuple[Table
     inside = (at >= t[0]) & (at <= t[-1])
     if inside.mean() < 0.5:
         words = f"its points are of {at.min():.10g} to {at.max():.10g} s, the joints of {t[0]:.10g} to {t[-1]:.10g} s"
-        refuse_data(points.file, f"{words}: are both times of the same clock? Otherwise join by row or name", other)
+        refuse_data(
+            points.file, f"{words}: are both times of the same clock? Otherwise join by motion, row or name", other
+        )
     names = [name for name in joints.header if name != one and joints.cells[joints.index(name)].dtype == float]
     values = np.column_stack([joints.numbers(name, None) for name in names])
     around = np.stack([_interpolated(at + shift, t, values) for shift in np.linspace(-STANDSTILL, STANDSTILL, 5)])

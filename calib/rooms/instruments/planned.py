@@ -19,7 +19,8 @@ from calib.procedure.findings import lines_of
 from calib.procedure.robot_kinds import joints_of
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
-from calib.rooms.instruments.joining import MIN_POINTS, NAMES, column_of, merged, ordered
+from calib.rooms.instruments.joined import NAMES, column_of
+from calib.rooms.instruments.joining import MIN_POINTS, merged, ordered
 from calib.rooms.instruments.robodk import recognises
 
 SIGMA_JOINT = 1e-4  # between a commanded and a reached joint position [rad or m] (our choice)

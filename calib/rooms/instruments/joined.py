@@ -1,0 +1,40 @@
+"""Joint values and points in one table, and the names of the columns by which files are joined."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from calib import files
+from calib.data.csv_table import Table
+
+NAMES = ("name", "point", "pointname", "pointid", "pose", "poseid", "id", "label", "target", "number", "no", "nr")
+CLOCKS = ("t", "time", "timestamp", "datetime")
+
+
+def column_of(table: Table, known: Sequence[str]) -> str:
+    """Return the table's first column that has one of the `known` names, in any spelling; "" without any."""
+    plain = {re.sub(r"[^a-z0-9]", "", name.lower()): name for name in reversed(table.header)}
+    return next((plain[name] for name in known if name in plain), "")
+
+
+@dataclass(frozen=True, eq=False)
+class Joined:
+    """Joint values and points in one table, with what there is to say of it.
+
+    Attributes:
+        table: one row per pose that was measured.
+        poses: the index of each row's pose among the joints; by motion, of its point in the points' file.
+        notes: how it was joined, what is missing.
+    """
+
+    table: Table
+    poses: np.ndarray
+    notes: tuple[str, ...]
+
+    def write(self, path: Path) -> Path:
+        """Write the table as CSV, the notes as comments above it."""
+        header = [f"{name} [{unit}]" if unit else name for name, unit in zip(self.table.header, self.table.units)]
+        return files.write_table(path, header, zip(*(cells.tolist() for cells in self.table.cells)), self.notes)
