@@ -17,9 +17,17 @@ from calib.dynamics.kernels import (
     PATH,
     REVOLUTE,
     SCALE,
+    add,
     advance,
     carry,
+    cross,
+    dot,
+    increase,
+    inertia_times,
     place,
+    scaled,
+    three,
+    turned,
 )
 from calib.records import frozen
 
@@ -30,40 +38,21 @@ def _share(links, order, i, weights, motion, twists, slopes, bars):
 
     ``slopes`` (B + 1, 9) belongs to w, dw, a; ``bars`` (B + 1, n, 6) to the twists.
     """
-    h, first = i + 1, 10 * i
-    k0, k1, k2, k3, k4 = order[i, 0], order[i, 1], order[i, 2], order[i, 3], order[i, 4]
-    k5, k6, k7, k8 = order[i, 5], order[i, 6], order[i, 7], order[i, 8]
-    wx, wy, wz = motion[h, 0], motion[h, 1], motion[h, 2]
-    ex, ey, ez = motion[h, 3], motion[h, 4], motion[h, 5]
-    ax, ay, az = motion[h, 6], motion[h, 7], motion[h, 8]
-    square = wx * wx + wy * wy + wz * wz
+    h, own = i + 1, order[i]
+    w, e, a = three(motion, h, 0), three(motion, h, 3), three(motion, h, 6)
+    twist, bar = twists[h], bars[h]
     for k in range(links[i, DEPTH]):
         j = links[i, PATH + k]
-        ux, uy, uz = twists[h, j, 0], twists[h, j, 1], twists[h, j, 2]
-        sx, sy, sz = twists[h, j, 3], twists[h, j, 4], twists[h, j, 5]
-        xx, xy, xz = weights[j, first + k0], weights[j, first + k1], weights[j, first + k2]
-        yy, yz, zz = weights[j, first + k3], weights[j, first + k4], weights[j, first + k5]
-        hx, hy, hz = weights[j, first + k6], weights[j, first + k7], weights[j, first + k8]
-        mass = weights[j, first + 9]
-        px, py, pz = xx * wx + xy * wy + xz * wz, xy * wx + yy * wy + yz * wz, xz * wx + yz * wy + zz * wz
-        dot = wx * hx + wy * hy + wz * hz
-        bars[h, j, 0] += xx * ex + xy * ey + xz * ez + wy * pz - wz * py + hy * az - hz * ay
-        bars[h, j, 1] += xy * ex + yy * ey + yz * ez + wz * px - wx * pz + hz * ax - hx * az
-        bars[h, j, 2] += xz * ex + yz * ey + zz * ez + wx * py - wy * px + hx * ay - hy * ax
-        bars[h, j, 3] += mass * ax + ey * hz - ez * hy + wx * dot - hx * square
-        bars[h, j, 4] += mass * ay + ez * hx - ex * hz + wy * dot - hy * square
-        bars[h, j, 5] += mass * az + ex * hy - ey * hx + wz * dot - hz * square
-        cx, cy, cz = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx
-        sw, sh = sx * wx + sy * wy + sz * wz, 2.0 * (sx * hx + sy * hy + sz * hz)
-        slopes[h, 0] += py * uz - pz * uy + xx * cx + xy * cy + xz * cz + sx * dot + hx * sw - wx * sh
-        slopes[h, 1] += pz * ux - px * uz + xy * cx + yy * cy + yz * cz + sy * dot + hy * sw - wy * sh
-        slopes[h, 2] += px * uy - py * ux + xz * cx + yz * cy + zz * cz + sz * dot + hz * sw - wz * sh
-        slopes[h, 3] += xx * ux + xy * uy + xz * uz + hy * sz - hz * sy
-        slopes[h, 4] += xy * ux + yy * uy + yz * uz + hz * sx - hx * sz
-        slopes[h, 5] += xz * ux + yz * uy + zz * uz + hx * sy - hy * sx
-        slopes[h, 6] += mass * sx + uy * hz - uz * hy
-        slopes[h, 7] += mass * sy + uz * hx - ux * hz
-        slopes[h, 8] += mass * sz + ux * hy - uy * hx
+        u, s, g = three(twist, j, 0), three(twist, j, 3), weights[j, 10 * i : 10 * i + 10]
+        J = g[own[0]], g[own[1]], g[own[2]], g[own[3]], g[own[4]], g[own[5]]
+        m, mass = (g[own[6]], g[own[7]], g[own[8]]), g[own[9]]
+        p = inertia_times(J, w)
+        increase(bar, j, 0, add(add(inertia_times(J, e), cross(w, p)), cross(m, a)))
+        increase(bar, j, 3, add(add(scaled(mass, a), cross(e, m)), cross(w, cross(w, m))))
+        turning = add(cross(p, u), inertia_times(J, cross(u, w)))
+        increase(slopes, h, 0, add(turning, add(cross(cross(w, m), s), cross(m, cross(s, w)))))
+        increase(slopes, h, 3, add(inertia_times(J, u), cross(m, s)))
+        increase(slopes, h, 6, add(scaled(mass, s), cross(u, m)))
 
 
 @njit(**OPTIONS)
@@ -93,61 +82,33 @@ def _unadvance(links, i, rate, frames, motion, slopes):
         by_amount += slopes[h, 0] * vy - slopes[h, 1] * vx
         by_amount += slopes[h, 3] * (motion[h, 4] + vx * rate) - slopes[h, 4] * (motion[h, 3] - vy * rate)
         by_amount += slopes[h, 6] * motion[h, 7] - slopes[h, 7] * motion[h, 6]
-    sx, sy, sz = slopes[h, 6], slopes[h, 7], slopes[h, 8]
-    gx = frames[i, 0] * sx + frames[i, 1] * sy + frames[i, 2] * sz
-    gy = frames[i, 3] * sx + frames[i, 4] * sy + frames[i, 5] * sz
-    gz = frames[i, 6] * sx + frames[i, 7] * sy + frames[i, 8] * sz
-    for r in range(3):
-        tx, ty, tz = frames[i, 3 * r], frames[i, 3 * r + 1], frames[i, 3 * r + 2]
-        slopes[p, r] += tx * slopes[h, 0] + ty * slopes[h, 1] + tz * slopes[h, 2]
-        slopes[p, 3 + r] += tx * slopes[h, 3] + ty * slopes[h, 4] + tz * slopes[h, 5]
-    wx, wy, wz = motion[p, 0], motion[p, 1], motion[p, 2]
-    x, y, z = frames[i, 9], frames[i, 10], frames[i, 11]
-    dot, gw, gt = wx * x + wy * y + wz * z, gx * wx + gy * wy + gz * wz, 2.0 * (gx * x + gy * y + gz * z)
-    slopes[p, 0] += gx * dot + x * gw - wx * gt
-    slopes[p, 1] += gy * dot + y * gw - wy * gt
-    slopes[p, 2] += gz * dot + z * gw - wz * gt
-    slopes[p, 3] += y * gz - z * gy
-    slopes[p, 4] += z * gx - x * gz
-    slopes[p, 5] += x * gy - y * gx
-    slopes[p, 6] += gx
-    slopes[p, 7] += gy
-    slopes[p, 8] += gz
+    g, w, x = turned(frames, i, three(slopes, h, 6)), three(motion, p, 0), three(frames, i, 9)
+    across = cross(w, g)
+    turning = add(cross(cross(w, x), g), cross(across, x))
+    increase(slopes, p, 0, add(turned(frames, i, three(slopes, h, 0)), turning))
+    increase(slopes, p, 3, add(turned(frames, i, three(slopes, h, 3)), cross(x, g)))
+    increase(slopes, p, 6, g)
     if links[i, KIND] > REVOLUTE:  # the slope by the shift, along z
-        ex, ey, ez = motion[p, 3], motion[p, 4], motion[p, 5]
-        square = wx * wx + wy * wy + wz * wz
-        by_amount += frames[i, 2] * (gy * ez - gz * ey + wx * gw - gx * square)
-        by_amount += frames[i, 5] * (gz * ex - gx * ez + wy * gw - gy * square)
-        by_amount += frames[i, 8] * (gx * ey - gy * ex + wz * gw - gz * square)
+        shift = frames[i, 2], frames[i, 5], frames[i, 8]
+        by_amount += dot(shift, add(cross(g, three(motion, p, 3)), cross(w, across)))
     return by_amount
 
 
 @njit(**OPTIONS)
 def _uncarry(links, i, frames, twists, bars):
     """Propagate body i's twist derivatives to its parent; return the derivative with respect to the joint position."""
-    p, h = links[i, PARENT], i + 1
-    x, y, z = frames[i, 9], frames[i, 10], frames[i, 11]
-    by_amount = 0.0
+    p, by_amount = links[i, PARENT], 0.0
+    twist, bar, twist_up, bar_up = twists[i + 1], bars[i + 1], twists[p + 1], bars[p + 1]
     for k in range(links[p, DEPTH] if p >= 0 else 0):
         j = links[p, PATH + k]
-        bx, by, bz = bars[h, j, 0], bars[h, j, 1], bars[h, j, 2]
-        cx, cy, cz = bars[h, j, 3], bars[h, j, 4], bars[h, j, 5]
-        sx = frames[i, 0] * cx + frames[i, 1] * cy + frames[i, 2] * cz
-        sy = frames[i, 3] * cx + frames[i, 4] * cy + frames[i, 5] * cz
-        sz = frames[i, 6] * cx + frames[i, 7] * cy + frames[i, 8] * cz
-        bars[p + 1, j, 0] += frames[i, 0] * bx + frames[i, 1] * by + frames[i, 2] * bz + y * sz - z * sy
-        bars[p + 1, j, 1] += frames[i, 3] * bx + frames[i, 4] * by + frames[i, 5] * bz + z * sx - x * sz
-        bars[p + 1, j, 2] += frames[i, 6] * bx + frames[i, 7] * by + frames[i, 8] * bz + x * sy - y * sx
-        bars[p + 1, j, 3] += sx
-        bars[p + 1, j, 4] += sy
-        bars[p + 1, j, 5] += sz
+        b, c = three(bar, j, 0), three(bar, j, 3)
+        s = turned(frames, i, c)
+        increase(bar_up, j, 0, add(turned(frames, i, b), cross(three(frames, i, 9), s)))
+        increase(bar_up, j, 3, s)
         if links[i, KIND] == REVOLUTE:
-            by_amount += bx * twists[h, j, 1] - by * twists[h, j, 0] + cx * twists[h, j, 4] - cy * twists[h, j, 3]
+            by_amount += cross(b, three(twist, j, 0))[2] + cross(c, three(twist, j, 3))[2]
         elif links[i, KIND] != FIXED:
-            ux, uy, uz = twists[p + 1, j, 0], twists[p + 1, j, 1], twists[p + 1, j, 2]
-            by_amount += frames[i, 2] * (sy * uz - sz * uy)
-            by_amount += frames[i, 5] * (sz * ux - sx * uz)
-            by_amount += frames[i, 8] * (sx * uy - sy * ux)
+            by_amount += dot((frames[i, 2], frames[i, 5], frames[i, 8]), cross(s, three(twist_up, j, 0)))
     return by_amount
 
 

@@ -23,6 +23,7 @@ SCALE = 12  # of constants, behind the placement's three rows; its last row is g
 L = 64  # samples side by side in the regressor: 8 to 128 measured, flat from 64 on
 ROUND = 6755399441055744.0  # 1.5 · 2^52: adding and taking off rounds to the nearest whole number
 OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
+JOINED = {**OPTIONS, "forceinline": True}
 
 
 @njit(**OPTIONS)
@@ -61,22 +62,87 @@ def place(links, constants, i, amount, cosine, sine, frames):
         frames[i, 9 + r] = t
 
 
+@njit(**JOINED)
+def three(x, i, k):
+    """Return three numbers of row i from column k on: a vector is a tuple, which the compiler keeps in registers."""
+    return x[i, k], x[i, k + 1], x[i, k + 2]
+
+
+@njit(**JOINED)
+def write(x, i, k, a):
+    """Write a vector into row i from column k on."""
+    x[i, k], x[i, k + 1], x[i, k + 2] = a
+
+
+@njit(**JOINED)
+def increase(x, i, k, a):
+    """Add a vector to what stands in row i from column k on."""
+    write(x, i, k, add(three(x, i, k), a))
+
+
+@njit(**JOINED)
+def add(a, b):
+    """Return a + b."""
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+@njit(**JOINED)
+def scaled(k, a):
+    """Return k a."""
+    return k * a[0], k * a[1], k * a[2]
+
+
+@njit(**JOINED)
+def dot(a, b):
+    """Return a · b."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(**JOINED)
+def cross(a, b):
+    """Return a × b."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@njit(**JOINED)
+def inertia_times(J, a):
+    """Return J a, J being XX, XY, XZ, YY, YZ, ZZ."""
+    return dot((J[0], J[1], J[2]), a), dot((J[1], J[3], J[4]), a), dot((J[2], J[4], J[5]), a)
+
+
+@njit(**JOINED)
+def turned(frames, i, a, k=0):
+    """Return R a, R being the matrix by rows in row i from column k on."""
+    return dot(three(frames, i, k), a), dot(three(frames, i, k + 3), a), dot(three(frames, i, k + 6), a)
+
+
+@njit(**JOINED)
+def turned_back(frames, i, a, k=0):
+    """Return Rᵀ a."""
+    x, y = scaled(a[0], three(frames, i, k)), scaled(a[1], three(frames, i, k + 3))
+    return add(add(x, y), scaled(a[2], three(frames, i, k + 6)))
+
+
+@njit(**JOINED)
+def ten_columns(w, e, a, u, s):
+    """Return a body's ten columns in the row of a coordinate with twist (u, s), from w, dw = e and a."""
+    c = cross(u, w)
+    xx, xy, xz = u[0] * e[0] + c[0] * w[0], u[0] * e[1] + c[0] * w[1], u[0] * e[2] + c[0] * w[2]
+    yx, yy, yz = u[1] * e[0] + c[1] * w[0], u[1] * e[1] + c[1] * w[1], u[1] * e[2] + c[1] * w[2]
+    zx, zy, zz = u[2] * e[0] + c[2] * w[0], u[2] * e[1] + c[2] * w[1], u[2] * e[2] + c[2] * w[2]
+    h = add(add(cross(s, e), cross(w, cross(w, s))), cross(a, u))
+    return xx, xy + yx, xz + zx, yy, yz + zy, zz, h[0], h[1], h[2], dot(s, a)
+
+
 @njit(**OPTIONS)
 def advance(links, i, rate, change, frames, motion):
     """Write w, dw, a of body i from its parent's into row i + 1 of `motion` (B + 1, 9)."""
     p, h = links[i, PARENT] + 1, i + 1
-    wx, wy, wz = motion[p, 0], motion[p, 1], motion[p, 2]
-    ex, ey, ez = motion[p, 3], motion[p, 4], motion[p, 5]
-    x, y, z = frames[i, 9], frames[i, 10], frames[i, 11]
-    dot, square = wx * x + wy * y + wz * z, wx * wx + wy * wy + wz * wz
-    ax = motion[p, 6] + ey * z - ez * y + wx * dot - x * square
-    ay = motion[p, 7] + ez * x - ex * z + wy * dot - y * square
-    az = motion[p, 8] + ex * y - ey * x + wz * dot - z * square
-    for r in range(3):
-        tx, ty, tz = frames[i, r], frames[i, 3 + r], frames[i, 6 + r]
-        motion[h, r] = tx * wx + ty * wy + tz * wz
-        motion[h, 3 + r] = tx * ex + ty * ey + tz * ez
-        motion[h, 6 + r] = tx * ax + ty * ay + tz * az
+    w, e, x = three(motion, p, 0), three(motion, p, 3), three(frames, i, 9)
+    a = add(add(three(motion, p, 6), cross(e, x)), cross(w, cross(w, x)))
+    write(motion, h, 0, turned_back(frames, i, w))
+    write(motion, h, 3, turned_back(frames, i, e))
+    write(motion, h, 6, turned_back(frames, i, a))
     if links[i, KIND] == REVOLUTE:
         motion[h, 3] += motion[h, 1] * rate
         motion[h, 4] -= motion[h, 0] * rate
@@ -91,28 +157,18 @@ def advance(links, i, rate, change, frames, motion):
 @njit(**OPTIONS)
 def carry(links, constants, i, frames, twists):
     """Write the twists (u_j, s_j) of body i from its parent's into row i + 1 of `twists` (B + 1, n, 6)."""
-    t00, t01, t02 = frames[i, 0], frames[i, 1], frames[i, 2]
-    t10, t11, t12 = frames[i, 3], frames[i, 4], frames[i, 5]
-    t20, t21, t22 = frames[i, 6], frames[i, 7], frames[i, 8]
-    x, y, z = frames[i, 9], frames[i, 10], frames[i, 11]
-    p, h, own = links[i, PARENT], i + 1, links[i, COORDINATE]
+    p, own = links[i, PARENT], links[i, COORDINATE]
+    up, here = twists[p + 1], twists[i + 1]
     if own >= 0:
         for r in range(6):
-            twists[h, own, r] = 0.0
+            here[own, r] = 0.0
     for k in range(links[p, DEPTH] if p >= 0 else 0):
         j = links[p, PATH + k]
-        ux, uy, uz = twists[p + 1, j, 0], twists[p + 1, j, 1], twists[p + 1, j, 2]
-        sx = twists[p + 1, j, 3] + uy * z - uz * y
-        sy = twists[p + 1, j, 4] + uz * x - ux * z
-        sz = twists[p + 1, j, 5] + ux * y - uy * x
-        twists[h, j, 0] = t00 * ux + t10 * uy + t20 * uz
-        twists[h, j, 1] = t01 * ux + t11 * uy + t21 * uz
-        twists[h, j, 2] = t02 * ux + t12 * uy + t22 * uz
-        twists[h, j, 3] = t00 * sx + t10 * sy + t20 * sz
-        twists[h, j, 4] = t01 * sx + t11 * sy + t21 * sz
-        twists[h, j, 5] = t02 * sx + t12 * sy + t22 * sz
+        u = three(up, j, 0)
+        write(here, j, 0, turned_back(frames, i, u))
+        write(here, j, 3, turned_back(frames, i, add(three(up, j, 3), cross(u, three(frames, i, 9)))))
     if own >= 0:
-        twists[h, own, 2 if links[i, KIND] == REVOLUTE else 5] += constants[i, SCALE]
+        here[own, 2 if links[i, KIND] == REVOLUTE else 5] += constants[i, SCALE]
 
 
 @njit(**OPTIONS)
@@ -129,74 +185,58 @@ def _place_lanes(constants, i, joint, turn):
         turn[9 * L + k], turn[10 * L + k], turn[11 * L + k] = x + shift * a2, y + shift * b2, z + shift * c2
 
 
+@njit(**JOINED)
+def _lane(x, r, k):
+    """Return the vector that sample k has in rows r to r + 2."""
+    return x[r * L + k], x[(r + 1) * L + k], x[(r + 2) * L + k]
+
+
+@njit(**JOINED)
+def _write_lane(x, r, k, a):
+    x[r * L + k], x[(r + 1) * L + k], x[(r + 2) * L + k] = a
+
+
+@njit(**JOINED)
+def _lane_back(turn, k, a):
+    """Return Rᵀ a of sample k."""
+    x, y, z = scaled(a[0], _lane(turn, 0, k)), scaled(a[1], _lane(turn, 3, k)), scaled(a[2], _lane(turn, 6, k))
+    return add(add(x, y), z)
+
+
 @njit(**OPTIONS)
 def _advance_lanes(turning, joint, turn, up, here):
     """`advance` for L samples, the joint about (turning 1) or along (turning 0) z."""
-    f, g = turning, 1.0 - turning
+    f, g = turning, 2.0 - 2.0 * turning
     for k in range(L):
-        wx, wy, wz = up[k], up[L + k], up[2 * L + k]
-        ex, ey, ez = up[3 * L + k], up[4 * L + k], up[5 * L + k]
-        x, y, z = turn[9 * L + k], turn[10 * L + k], turn[11 * L + k]
-        t00, t01, t02 = turn[k], turn[L + k], turn[2 * L + k]
-        t10, t11, t12 = turn[3 * L + k], turn[4 * L + k], turn[5 * L + k]
-        t20, t21, t22 = turn[6 * L + k], turn[7 * L + k], turn[8 * L + k]
+        w, e, x = _lane(up, 0, k), _lane(up, 3, k), _lane(turn, 9, k)
         rate, change = joint[3 * L + k], joint[4 * L + k]
-        dot, square = wx * x + wy * y + wz * z, wx * wx + wy * wy + wz * wz
-        ax = up[6 * L + k] + ey * z - ez * y + wx * dot - x * square
-        ay = up[7 * L + k] + ez * x - ex * z + wy * dot - y * square
-        az = up[8 * L + k] + ex * y - ey * x + wz * dot - z * square
-        px, py = t00 * wx + t10 * wy + t20 * wz, t01 * wx + t11 * wy + t21 * wz
-        here[k], here[L + k] = px, py
-        here[2 * L + k] = t02 * wx + t12 * wy + t22 * wz + f * rate
-        here[3 * L + k] = t00 * ex + t10 * ey + t20 * ez + f * rate * py
-        here[4 * L + k] = t01 * ex + t11 * ey + t21 * ez - f * rate * px
-        here[5 * L + k] = t02 * ex + t12 * ey + t22 * ez + f * change
-        here[6 * L + k] = t00 * ax + t10 * ay + t20 * az + 2.0 * g * rate * py
-        here[7 * L + k] = t01 * ax + t11 * ay + t21 * az - 2.0 * g * rate * px
-        here[8 * L + k] = t02 * ax + t12 * ay + t22 * az + g * change
+        own = _lane_back(turn, k, w)
+        across = rate * own[1], -rate * own[0], change
+        a = add(add(_lane(up, 6, k), cross(e, x)), cross(w, cross(w, x)))
+        _write_lane(here, 0, k, (own[0], own[1], own[2] + f * rate))
+        _write_lane(here, 3, k, add(_lane_back(turn, k, e), scaled(f, across)))
+        _write_lane(here, 6, k, add(_lane_back(turn, k, a), (g * across[0], g * across[1], 0.5 * g * change)))
 
 
 @njit(**OPTIONS)
 def _carry_lanes(turn, up, here):
     """`carry` of one coordinate's twist for L samples."""
     for k in range(L):
-        x, y, z = turn[9 * L + k], turn[10 * L + k], turn[11 * L + k]
-        t00, t01, t02 = turn[k], turn[L + k], turn[2 * L + k]
-        t10, t11, t12 = turn[3 * L + k], turn[4 * L + k], turn[5 * L + k]
-        t20, t21, t22 = turn[6 * L + k], turn[7 * L + k], turn[8 * L + k]
-        ux, uy, uz = up[k], up[L + k], up[2 * L + k]
-        sx = up[3 * L + k] + uy * z - uz * y
-        sy = up[4 * L + k] + uz * x - ux * z
-        sz = up[5 * L + k] + ux * y - uy * x
-        here[k] = t00 * ux + t10 * uy + t20 * uz
-        here[L + k] = t01 * ux + t11 * uy + t21 * uz
-        here[2 * L + k] = t02 * ux + t12 * uy + t22 * uz
-        here[3 * L + k] = t00 * sx + t10 * sy + t20 * sz
-        here[4 * L + k] = t01 * sx + t11 * sy + t21 * sz
-        here[5 * L + k] = t02 * sx + t12 * sy + t22 * sz
+        u = _lane(up, 0, k)
+        _write_lane(here, 0, k, _lane_back(turn, k, u))
+        _write_lane(here, 3, k, _lane_back(turn, k, add(_lane(up, 3, k), cross(u, _lane(turn, 9, k)))))
 
 
 @njit(**OPTIONS)
 def _project_lanes(motion, twist, columns):
     """Write the ten columns of one body in one coordinate's row for L samples."""
     for k in range(L):
-        wx, wy, wz = motion[k], motion[L + k], motion[2 * L + k]
-        ex, ey, ez = motion[3 * L + k], motion[4 * L + k], motion[5 * L + k]
-        ax, ay, az = motion[6 * L + k], motion[7 * L + k], motion[8 * L + k]
-        ux, uy, uz = twist[k], twist[L + k], twist[2 * L + k]
-        sx, sy, sz = twist[3 * L + k], twist[4 * L + k], twist[5 * L + k]
-        xx, yy, zz, xy, xz, yz = wx * wx, wy * wy, wz * wz, wx * wy, wx * wz, wy * wz
-        cx, cy, cz = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx
-        columns[k] = ux * ex + cx * wx
-        columns[L + k] = ux * ey + uy * ex + cx * wy + cy * wx
-        columns[2 * L + k] = ux * ez + uz * ex + cx * wz + cz * wx
-        columns[3 * L + k] = uy * ey + cy * wy
-        columns[4 * L + k] = uy * ez + uz * ey + cy * wz + cz * wy
-        columns[5 * L + k] = uz * ez + cz * wz
-        columns[6 * L + k] = sy * (xy + ez) + sz * (xz - ey) - sx * (yy + zz) + ay * uz - az * uy
-        columns[7 * L + k] = sx * (xy - ez) + sz * (yz + ex) - sy * (xx + zz) + az * ux - ax * uz
-        columns[8 * L + k] = sx * (xz + ey) + sy * (yz - ex) - sz * (xx + yy) + ax * uy - ay * ux
-        columns[9 * L + k] = sx * ax + sy * ay + sz * az
+        w, e, a = _lane(motion, 0, k), _lane(motion, 3, k), _lane(motion, 6, k)
+        u, s = _lane(twist, 0, k), _lane(twist, 3, k)
+        (
+            columns[k], columns[L + k], columns[2 * L + k], columns[3 * L + k], columns[4 * L + k],
+            columns[5 * L + k], columns[6 * L + k], columns[7 * L + k], columns[8 * L + k], columns[9 * L + k],
+        ) = ten_columns(w, e, a, u, s)  # fmt: skip
 
 
 @njit(**OPTIONS)
@@ -263,42 +303,23 @@ def regressor(links, constants, order, amount, v, a, out):
 @njit(**OPTIONS)
 def _wrench(i, parameters, motion, wrench):
     """Write force and moment of body i about its own frame's origin (row i of `wrench`, (B, 6))."""
-    h, k = i + 1, 10 * i
-    wx, wy, wz = motion[h, 0], motion[h, 1], motion[h, 2]
-    ex, ey, ez = motion[h, 3], motion[h, 4], motion[h, 5]
-    ax, ay, az = motion[h, 6], motion[h, 7], motion[h, 8]
-    xx, xy, xz = parameters[k], parameters[k + 1], parameters[k + 2]
-    yy, yz, zz = parameters[k + 3], parameters[k + 4], parameters[k + 5]
-    hx, hy, hz, mass = parameters[k + 6], parameters[k + 7], parameters[k + 8], parameters[k + 9]
-    dot, square = wx * hx + wy * hy + wz * hz, wx * wx + wy * wy + wz * wz
-    wrench[i, 0] = mass * ax + ey * hz - ez * hy + wx * dot - hx * square
-    wrench[i, 1] = mass * ay + ez * hx - ex * hz + wy * dot - hy * square
-    wrench[i, 2] = mass * az + ex * hy - ey * hx + wz * dot - hz * square
-    px, py, pz = xx * wx + xy * wy + xz * wz, xy * wx + yy * wy + yz * wz, xz * wx + yz * wy + zz * wz
-    wrench[i, 3] = xx * ex + xy * ey + xz * ez + wy * pz - wz * py + hy * az - hz * ay
-    wrench[i, 4] = xy * ex + yy * ey + yz * ez + wz * px - wx * pz + hz * ax - hx * az
-    wrench[i, 5] = xz * ex + yz * ey + zz * ez + wx * py - wy * px + hx * ay - hy * ax
+    w, e, a = three(motion, i + 1, 0), three(motion, i + 1, 3), three(motion, i + 1, 6)
+    own = parameters[10 * i : 10 * i + 10]
+    h = own[6], own[7], own[8]
+    write(wrench, i, 0, add(add(scaled(own[9], a), cross(e, h)), cross(w, cross(w, h))))
+    write(wrench, i, 3, add(add(inertia_times(own, e), cross(w, inertia_times(own, w))), cross(h, a)))
 
 
 @njit(**OPTIONS)
 def _return(links, constants, i, frames, wrench, tau):
     """Add body i's torque to tau (n,) and its wrench to the parent's."""
     c, p = links[i, COORDINATE], links[i, PARENT]
-    fx, fy, fz = wrench[i, 0], wrench[i, 1], wrench[i, 2]
-    nx, ny, nz = wrench[i, 3], wrench[i, 4], wrench[i, 5]
     if c >= 0:
-        tau[c] += constants[i, SCALE] * (nz if links[i, KIND] == REVOLUTE else fz)
+        tau[c] += constants[i, SCALE] * wrench[i, 5 if links[i, KIND] == REVOLUTE else 2]
     if p >= 0:
-        gx = frames[i, 0] * fx + frames[i, 1] * fy + frames[i, 2] * fz
-        gy = frames[i, 3] * fx + frames[i, 4] * fy + frames[i, 5] * fz
-        gz = frames[i, 6] * fx + frames[i, 7] * fy + frames[i, 8] * fz
-        x, y, z = frames[i, 9], frames[i, 10], frames[i, 11]
-        wrench[p, 0] += gx
-        wrench[p, 1] += gy
-        wrench[p, 2] += gz
-        wrench[p, 3] += frames[i, 0] * nx + frames[i, 1] * ny + frames[i, 2] * nz + y * gz - z * gy
-        wrench[p, 4] += frames[i, 3] * nx + frames[i, 4] * ny + frames[i, 5] * nz + z * gx - x * gz
-        wrench[p, 5] += frames[i, 6] * nx + frames[i, 7] * ny + frames[i, 8] * nz + x * gy - y * gx
+        force = turned(frames, i, three(wrench, i, 0))
+        increase(wrench, p, 0, force)
+        increase(wrench, p, 3, add(turned(frames, i, three(wrench, i, 3)), cross(three(frames, i, 9), force)))
 
 
 @njit(**OPTIONS)

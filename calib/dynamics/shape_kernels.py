@@ -8,9 +8,8 @@ from math import cos, exp, isinf, pi, sin, sqrt, tanh
 
 from numba import njit
 
-from calib.dynamics.kernels import OPTIONS
+from calib.dynamics.kernels import JOINED, OPTIONS
 
-JOINED = {**OPTIONS, "forceinline": True}
 ACCELERATION, VELOCITY, ONE, POSITION, SIGN, DEAD, SPEED, CUBIC, ROOT = range(9)
 STRIBECK, LOAD, LOAD_VELOCITY, STOP, PRESLIDING, SINE, COSINE, SINE_BAND, COSINE_BAND = range(9, 18)
 FADE = 0.1  # [rad] over which ripple of a band fades outside the positions it was identified at
