@@ -25,18 +25,8 @@ from math import cos, sin, sqrt
 import numpy as np
 from numba import njit
 
-from calib.dynamics.kernels import OPTIONS
-from calib.dynamics.shape_kernels import (
-    JOINED,
-    LOAD,
-    LOAD_VELOCITY,
-    PRESLIDING,
-    SIGN,
-    STOP,
-    shape,
-    smooth_sign,
-    steepest,
-)
+from calib.dynamics.kernels import JOINED, OPTIONS, add, cross, dot, inertia_times, scaled, three, turned, write
+from calib.dynamics.shape_kernels import LOAD, LOAD_VELOCITY, PRESLIDING, SIGN, STOP, shape, smooth_sign, steepest
 
 FIXED, REVOLUTE, PRISMATIC = 0, 1, 2
 MAX_STEPS = 64  # steps that friction may ask for in one period
@@ -46,87 +36,84 @@ FINE, SINGULAR, STIFF, DIVERGED = -1, 1, 2, 3
 
 
 @njit(**JOINED)
+def twist_cross(w, v, u, s):
+    """Return the motion (w, v) × (u, s) of twists: angular and linear part."""
+    return cross(w, u), add(cross(w, s), cross(v, u))
+
+
+@njit(**JOINED)
+def inertia_of(work, i):
+    """Return the inertia of body i and of what it carries: about the base's origin, first moments, mass."""
+    J = work[i, 36], work[i, 37], work[i, 38], work[i, 39], work[i, 40], work[i, 41]
+    return J, three(work, i, 42), work[i, 45]
+
+
+@njit(**JOINED)
+def momentum(inertia, w, v):
+    """Return the angular and linear momentum of a body with a twist (w, v)."""
+    J, h, mass = inertia
+    return add(inertia_times(J, w), cross(h, v)), add(scaled(mass, v), cross(w, h))
+
+
+@njit(**JOINED)
+def wrench(inertia, w, v, e, a):
+    """Return moment and force I A + V ×* I V of a body, V = (w, v), A = (e, a), and its linear momentum."""
+    angular, linear = momentum(inertia, w, v)
+    n, f = momentum(inertia, e, a)
+    return add(add(n, cross(w, angular)), cross(v, linear)), add(f, cross(w, linear)), linear
+
+
+@njit(**JOINED)
 def _body(tree, body, i, amount, rate, work):
     """Write pose, velocity, twist and acceleration (at zero joint acceleration) of body i from those of its parent."""
     p, kind, scale = tree[i, 0], tree[i, 1], body[i, 22]
-    a, b, c = body[i, 0], body[i, 1], body[i, 2]
-    d, e, f = body[i, 3], body[i, 4], body[i, 5]
-    g, h, k = body[i, 6], body[i, 7], body[i, 8]
-    x, y, z = body[i, 9], body[i, 10], body[i, 11]
+    x, y, z, place = three(body, i, 0), three(body, i, 3), three(body, i, 6), three(body, i, 9)
     if kind == REVOLUTE:
         co, si = cos(amount), sin(amount)
-        a, b = co * a + si * b, co * b - si * a
-        d, e = co * d + si * e, co * e - si * d
-        g, h = co * g + si * h, co * h - si * g
+        x = co * x[0] + si * x[1], co * x[1] - si * x[0], x[2]
+        y = co * y[0] + si * y[1], co * y[1] - si * y[0], y[2]
+        z = co * z[0] + si * z[1], co * z[1] - si * z[0], z[2]
     elif kind == PRISMATIC:
-        x, y, z = x + amount * c, y + amount * f, z + amount * k
+        place = add(place, scaled(amount, (x[2], y[2], z[2])))
     for r in range(0, 9, 3):
-        r0, r1, r2 = work[p, r], work[p, r + 1], work[p, r + 2]
-        work[i, r] = r0 * a + r1 * d + r2 * g
-        work[i, r + 1] = r0 * b + r1 * e + r2 * h
-        work[i, r + 2] = r0 * c + r1 * f + r2 * k
-    x, y, z = (
-        work[p, 9] + work[p, 0] * x + work[p, 1] * y + work[p, 2] * z,
-        work[p, 10] + work[p, 3] * x + work[p, 4] * y + work[p, 5] * z,
-        work[p, 11] + work[p, 6] * x + work[p, 7] * y + work[p, 8] * z,
-    )
-    ux, uy, uz = work[i, 2], work[i, 5], work[i, 8]
-    wx, wy, wz, vx, vy, vz = work[p, 12], work[p, 13], work[p, 14], work[p, 15], work[p, 16], work[p, 17]
-    bx, by, bz, ax, ay, az = work[p, 18], work[p, 19], work[p, 20], work[p, 21], work[p, 22], work[p, 23]
-    work[i, 9], work[i, 10], work[i, 11] = x, y, z
-    sx, sy, sz = y * uz - z * uy, z * ux - x * uz, x * uy - y * ux
-    if kind == PRISMATIC:
-        sx, sy, sz, ux, uy, uz = ux, uy, uz, 0.0, 0.0, 0.0
-    ux, uy, uz, sx, sy, sz = scale * ux, scale * uy, scale * uz, scale * sx, scale * sy, scale * sz
-    work[i, 24], work[i, 25], work[i, 26], work[i, 27], work[i, 28], work[i, 29] = ux, uy, uz, sx, sy, sz
-    work[i, 18] = bx + rate * (wy * uz - wz * uy)
-    work[i, 19] = by + rate * (wz * ux - wx * uz)
-    work[i, 20] = bz + rate * (wx * uy - wy * ux)
-    work[i, 21] = ax + rate * (wy * sz - wz * sy + vy * uz - vz * uy)
-    work[i, 22] = ay + rate * (wz * sx - wx * sz + vz * ux - vx * uz)
-    work[i, 23] = az + rate * (wx * sy - wy * sx + vx * uy - vy * ux)
-    work[i, 12], work[i, 13], work[i, 14] = wx + rate * ux, wy + rate * uy, wz + rate * uz
-    work[i, 15], work[i, 16], work[i, 17] = vx + rate * sx, vy + rate * sy, vz + rate * sz
+        up = three(work, p, r)
+        write(work, i, r, add(add(scaled(up[0], x), scaled(up[1], y)), scaled(up[2], z)))
+    place = add(three(work, p, 9), turned(work, p, place))
+    axis, w, v = scaled(scale, (work[i, 2], work[i, 5], work[i, 8])), three(work, p, 12), three(work, p, 15)
+    u, s = (axis, cross(place, axis)) if kind != PRISMATIC else ((0.0, 0.0, 0.0), axis)
+    bent, moved = twist_cross(w, v, u, s)
+    write(work, i, 9, place)
+    write(work, i, 12, add(w, scaled(rate, u)))
+    write(work, i, 15, add(v, scaled(rate, s)))
+    write(work, i, 18, add(three(work, p, 18), scaled(rate, bent)))
+    write(work, i, 21, add(three(work, p, 21), scaled(rate, moved)))
+    write(work, i, 24, u)
+    write(work, i, 27, s)
 
 
 @njit(**JOINED)
 def _load(body, i, work):
     """Write the inertial parameters of body i about the base's origin, and the wrench of its motion."""
-    r00, r01, r02 = work[i, 0], work[i, 1], work[i, 2]
-    r10, r11, r12 = work[i, 3], work[i, 4], work[i, 5]
-    r20, r21, r22 = work[i, 6], work[i, 7], work[i, 8]
-    x, y, z = work[i, 9], work[i, 10], work[i, 11]
-    xx, xy, xz = body[i, 12], body[i, 13], body[i, 14]
-    yy, yz, zz = body[i, 15], body[i, 16], body[i, 17]
-    mx, my, mz, mass = body[i, 18], body[i, 19], body[i, 20], body[i, 21]
-    gx, gy, gz = r00 * mx + r01 * my + r02 * mz, r10 * mx + r11 * my + r12 * mz, r20 * mx + r21 * my + r22 * mz
-    a0, a1, a2 = xx * r00 + xy * r01 + xz * r02, xy * r00 + yy * r01 + yz * r02, xz * r00 + yz * r01 + zz * r02
-    b0, b1, b2 = xx * r10 + xy * r11 + xz * r12, xy * r10 + yy * r11 + yz * r12, xz * r10 + yz * r11 + zz * r12
-    c0, c1, c2 = xx * r20 + xy * r21 + xz * r22, xy * r20 + yy * r21 + yz * r22, xz * r20 + yz * r21 + zz * r22
+    x, y, z, t = three(work, i, 0), three(work, i, 3), three(work, i, 6), three(work, i, 9)
+    own, mass = (body[i, 12], body[i, 13], body[i, 14], body[i, 15], body[i, 16], body[i, 17]), body[i, 21]
+    g, a, b = turned(work, i, three(body, i, 18)), inertia_times(own, x), inertia_times(own, y)
     # J about the base's origin = R J Rᵀ + (2 t·g + m t·t) 1 - (g tᵀ + t gᵀ) - m t tᵀ, h = g + m t, with h and g it is
     # R J Rᵀ + t·(g + h) 1 - (g tᵀ + t hᵀ), symmetric because h - g is along t
-    hx, hy, hz = gx + mass * x, gy + mass * y, gz + mass * z
-    px, py, pz = x * (gx + hx), y * (gy + hy), z * (gz + hz)
-    jxx, jyy = r00 * a0 + r01 * a1 + r02 * a2 + py + pz, r10 * b0 + r11 * b1 + r12 * b2 + px + pz
-    jzz = r20 * c0 + r21 * c1 + r22 * c2 + px + py
-    jxy = r10 * a0 + r11 * a1 + r12 * a2 - gx * y - x * hy
-    jxz = r20 * a0 + r21 * a1 + r22 * a2 - gx * z - x * hz
-    jyz = r20 * b0 + r21 * b1 + r22 * b2 - gy * z - y * hz
-    work[i, 36], work[i, 37], work[i, 38] = jxx, jxy, jxz
-    work[i, 39], work[i, 40], work[i, 41] = jyy, jyz, jzz
-    work[i, 42], work[i, 43], work[i, 44], work[i, 45] = hx, hy, hz, mass
-    wx, wy, wz, vx, vy, vz = work[i, 12], work[i, 13], work[i, 14], work[i, 15], work[i, 16], work[i, 17]
-    ex, ey, ez, ax, ay, az = work[i, 18], work[i, 19], work[i, 20], work[i, 21], work[i, 22], work[i, 23]
-    lx, ly, lz = mass * vx + wy * hz - wz * hy, mass * vy + wz * hx - wx * hz, mass * vz + wx * hy - wy * hx
-    kx = jxx * wx + jxy * wy + jxz * wz + hy * vz - hz * vy
-    ky = jxy * wx + jyy * wy + jyz * wz + hz * vx - hx * vz
-    kz = jxz * wx + jyz * wy + jzz * wz + hx * vy - hy * vx
-    work[i, 30] = jxx * ex + jxy * ey + jxz * ez + hy * az - hz * ay + wy * kz - wz * ky + vy * lz - vz * ly
-    work[i, 31] = jxy * ex + jyy * ey + jyz * ez + hz * ax - hx * az + wz * kx - wx * kz + vz * lx - vx * lz
-    work[i, 32] = jxz * ex + jyz * ey + jzz * ez + hx * ay - hy * ax + wx * ky - wy * kx + vx * ly - vy * lx
-    work[i, 33] = mass * ax + ey * hz - ez * hy + wy * lz - wz * ly
-    work[i, 34] = mass * ay + ez * hx - ex * hz + wz * lx - wx * lz
-    work[i, 35] = mass * az + ex * hy - ey * hx + wx * ly - wy * lx
+    h = add(g, scaled(mass, t))
+    px, py, pz = t[0] * (g[0] + h[0]), t[1] * (g[1] + h[1]), t[2] * (g[2] + h[2])
+    jxx, jyy, jzz = dot(x, a) + py + pz, dot(y, b) + px + pz, dot(z, inertia_times(own, z)) + px + py
+    jxy, jxz = dot(y, a) - g[0] * t[1] - t[0] * h[1], dot(z, a) - g[0] * t[2] - t[0] * h[2]
+    jyz = dot(z, b) - g[1] * t[2] - t[1] * h[2]
+    moment, force, _ = wrench(
+        ((jxx, jxy, jxz, jyy, jyz, jzz), h, mass), three(work, i, 12), three(work, i, 15), three(work, i, 18),
+        three(work, i, 21),
+    )  # fmt: skip
+    write(work, i, 30, moment)
+    write(work, i, 33, force)
+    write(work, i, 36, (jxx, jxy, jxz))
+    write(work, i, 39, (jyy, jyz, jzz))
+    write(work, i, 42, h)
+    work[i, 45] = mass
 
 
 @njit(**JOINED)
@@ -147,21 +134,15 @@ def dynamics(tree, body, linear, q, v, work, matrix, out):
     for i in range(count - 1, -1, -1):
         p, c = tree[i, 0], tree[i, 2]
         if c >= 0:
-            ux, uy, uz, sx, sy, sz = work[i, 24], work[i, 25], work[i, 26], work[i, 27], work[i, 28], work[i, 29]
-            out[c] -= ux * work[i, 30] + uy * work[i, 31] + uz * work[i, 32]
-            out[c] -= sx * work[i, 33] + sy * work[i, 34] + sz * work[i, 35]
-            hx, hy, hz, mass = work[i, 42], work[i, 43], work[i, 44], work[i, 45]
-            nx = work[i, 36] * ux + work[i, 37] * uy + work[i, 38] * uz + hy * sz - hz * sy
-            ny = work[i, 37] * ux + work[i, 39] * uy + work[i, 40] * uz + hz * sx - hx * sz
-            nz = work[i, 38] * ux + work[i, 40] * uy + work[i, 41] * uz + hx * sy - hy * sx
-            fx, fy, fz = mass * sx + uy * hz - uz * hy, mass * sy + uz * hx - ux * hz, mass * sz + ux * hy - uy * hx
-            matrix[c, c] += nx * ux + ny * uy + nz * uz + fx * sx + fy * sy + fz * sz
+            u, s = three(work, i, 24), three(work, i, 27)
+            out[c] -= dot(u, three(work, i, 30)) + dot(s, three(work, i, 33))
+            n, f = momentum(inertia_of(work, i), u, s)
+            matrix[c, c] += dot(n, u) + dot(f, s)
             k = p
             while k < count:
                 d = tree[k, 2]
                 if d >= 0:
-                    share = nx * work[k, 24] + ny * work[k, 25] + nz * work[k, 26]
-                    share += fx * work[k, 27] + fy * work[k, 28] + fz * work[k, 29]
+                    share = dot(n, three(work, k, 24)) + dot(f, three(work, k, 27))
                     if d == c:  # a follower and its leader
                         matrix[c, c] += 2.0 * share
                     else:

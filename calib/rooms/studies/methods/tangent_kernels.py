@@ -25,7 +25,7 @@ Arrays are those of `loop_kernels`; besides
 import numpy as np
 from numba import njit
 
-from calib.dynamics.kernels import OPTIONS
+from calib.dynamics.kernels import OPTIONS, add, cross, dot, scaled, ten_columns, three, turned, turned_back, write
 from calib.rooms.closed_loop.loop_kernels import (
     DIVERGED,
     FINE,
@@ -36,10 +36,14 @@ from calib.rooms.closed_loop.loop_kernels import (
     act,
     command,
     dynamics,
+    inertia_of,
     linearise_command,
+    momentum,
     set_parameters,
     stiffness,
     substitute,
+    twist_cross,
+    wrench,
 )
 
 
@@ -61,49 +65,30 @@ def _outward(tree, body, v, a, work, own, more):
     for i in range(count):
         p, c = tree[i, 0], tree[i, 2]
         rate, change = (v[c], a[c]) if c >= 0 else (0.0, 0.0)
-        wx, wy, wz, nx, ny, nz = work[p, 12], work[p, 13], work[p, 14], work[p, 15], work[p, 16], work[p, 17]
-        bx, by, bz, ax, ay, az = more[p, 0], more[p, 1], more[p, 2], more[p, 3], more[p, 4], more[p, 5]
-        ux, uy, uz, sx, sy, sz = work[i, 24], work[i, 25], work[i, 26], work[i, 27], work[i, 28], work[i, 29]
-        ex, ey, ez = wy * uz - wz * uy, wz * ux - wx * uz, wx * uy - wy * ux
-        fx = wy * sz - wz * sy + ny * uz - nz * uy
-        fy = wz * sx - wx * sz + nz * ux - nx * uz
-        fz = wx * sy - wy * sx + nx * uy - ny * ux
-        more[i, 6], more[i, 7], more[i, 8], more[i, 9], more[i, 10], more[i, 11] = ex, ey, ez, fx, fy, fz
-        more[i, 12] = by * uz - bz * uy + wy * ez - wz * ey
-        more[i, 13] = bz * ux - bx * uz + wz * ex - wx * ez
-        more[i, 14] = bx * uy - by * ux + wx * ey - wy * ex
-        more[i, 15] = by * sz - bz * sy + ay * uz - az * uy + wy * fz - wz * fy + ny * ez - nz * ey
-        more[i, 16] = bz * sx - bx * sz + az * ux - ax * uz + wz * fx - wx * fz + nz * ex - nx * ez
-        more[i, 17] = bx * sy - by * sx + ax * uy - ay * ux + wx * fy - wy * fx + nx * ey - ny * ex
-        bx, by, bz = bx + rate * ex + change * ux, by + rate * ey + change * uy, bz + rate * ez + change * uz
-        ax, ay, az = ax + rate * fx + change * sx, ay + rate * fy + change * sy, az + rate * fz + change * sz
-        more[i, 0], more[i, 1], more[i, 2], more[i, 3], more[i, 4], more[i, 5] = bx, by, bz, ax, ay, az
-        wx, wy, wz, nx, ny, nz = work[i, 12], work[i, 13], work[i, 14], work[i, 15], work[i, 16], work[i, 17]
-        jxx, jxy, jxz, jyy, jyz, jzz = own[i, 0], own[i, 1], own[i, 2], own[i, 3], own[i, 4], own[i, 5]
-        hx, hy, hz, mass = own[i, 6], own[i, 7], own[i, 8], own[i, 9]
-        lx, ly, lz = mass * nx + wy * hz - wz * hy, mass * ny + wz * hx - wx * hz, mass * nz + wx * hy - wy * hx
-        kx = jxx * wx + jxy * wy + jxz * wz + hy * nz - hz * ny
-        ky = jxy * wx + jyy * wy + jyz * wz + hz * nx - hx * nz
-        kz = jxz * wx + jyz * wy + jzz * wz + hx * ny - hy * nx
-        more[i, 18] = jxx * bx + jxy * by + jxz * bz + hy * az - hz * ay + wy * kz - wz * ky + ny * lz - nz * ly
-        more[i, 19] = jxy * bx + jyy * by + jyz * bz + hz * ax - hx * az + wz * kx - wx * kz + nz * lx - nx * lz
-        more[i, 20] = jxz * bx + jyz * by + jzz * bz + hx * ay - hy * ax + wx * ky - wy * kx + nx * ly - ny * lx
-        more[i, 21] = mass * ax + by * hz - bz * hy + wy * lz - wz * ly
-        more[i, 22] = mass * ay + bz * hx - bx * hz + wz * lx - wx * lz
-        more[i, 23] = mass * az + bx * hy - by * hx + wx * ly - wy * lx
-        half = 0.5 * (jxx + jyy + jzz)
-        xx, yy, zz, dot = half - jxx, half - jyy, half - jzz, hx * nx + hy * ny + hz * nz
-        # P = -[ω] Σ - [h][ν], [h][ν] = ν hᵀ - (h·ν) 1; Σ has the off-diagonals of -J
-        more[i, 24] = -(wy * -jxz - wz * -jxy) - (nx * hx - dot)
-        more[i, 25] = -(wy * -jyz - wz * yy) - nx * hy
-        more[i, 26] = -(wy * zz - wz * -jyz) - nx * hz
-        more[i, 27] = -(wz * xx - wx * -jxz) - ny * hx
-        more[i, 28] = -(wz * -jxy - wx * -jyz) - (ny * hy - dot)
-        more[i, 29] = -(wz * -jxz - wx * zz) - ny * hz
-        more[i, 30] = -(wx * -jxy - wy * xx) - nz * hx
-        more[i, 31] = -(wx * yy - wy * -jxy) - nz * hy
-        more[i, 32] = -(wx * -jyz - wy * -jxz) - (nz * hz - dot)
-        more[i, 33], more[i, 34], more[i, 35] = lx, ly, lz
+        w, n, b, a_p = three(work, p, 12), three(work, p, 15), three(more, p, 0), three(more, p, 3)
+        u, s = three(work, i, 24), three(work, i, 27)
+        e, f = twist_cross(w, n, u, s)
+        (first, second), (third, fourth) = twist_cross(b, a_p, u, s), twist_cross(w, n, e, f)
+        write(more, i, 6, e)
+        write(more, i, 9, f)
+        write(more, i, 12, add(first, third))
+        write(more, i, 15, add(second, fourth))
+        write(more, i, 0, add(b, add(scaled(rate, e), scaled(change, u))))
+        write(more, i, 3, add(a_p, add(scaled(rate, f), scaled(change, s))))
+        w, n = three(work, i, 12), three(work, i, 15)
+        J = own[i, 0], own[i, 1], own[i, 2], own[i, 3], own[i, 4], own[i, 5]
+        h = three(own, i, 6)
+        moment, force, linear = wrench((J, h, own[i, 9]), w, n, three(more, i, 0), three(more, i, 3))
+        write(more, i, 18, moment)
+        write(more, i, 21, force)
+        half, along = 0.5 * (J[0] + J[3] + J[5]), dot(h, n)
+        # P = -[ω] Σ - [h][ν], [h][ν] = ν hᵀ - (h·ν) 1; Σ has the off-diagonals of -J; its columns one by one
+        sigma = (half - J[0], -J[1], -J[2]), (-J[1], half - J[3], -J[4]), (-J[2], -J[4], half - J[5])
+        for k in range(3):
+            turning = cross(sigma[k], w)
+            for r in range(3):
+                more[i, 24 + 3 * r + k] = turning[r] - n[r] * h[k] + (along if r == k else 0.0)
+        write(more, i, 33, linear)
 
 
 @njit(**OPTIONS)
@@ -113,63 +98,29 @@ def _slopes(tree, work, more, by_q, by_v):
     for i in range(count - 1, -1, -1):
         p, c = tree[i, 0], tree[i, 2]
         if c >= 0:
-            ux, uy, uz, sx, sy, sz = work[i, 24], work[i, 25], work[i, 26], work[i, 27], work[i, 28], work[i, 29]
-            jxx, jxy, jxz = work[i, 36], work[i, 37], work[i, 38]
-            jyy, jyz, jzz = work[i, 39], work[i, 40], work[i, 41]
-            hx, hy, hz, mass = work[i, 42], work[i, 43], work[i, 44], work[i, 45]
-            p0, p1, p2, p3, p4 = more[i, 24], more[i, 25], more[i, 26], more[i, 27], more[i, 28]
-            p5, p6, p7, p8 = more[i, 29], more[i, 30], more[i, 31], more[i, 32]
-            lx, ly, lz = more[i, 33], more[i, 34], more[i, 35]
-            # y = I S and x = Pᵀ u + L × s
-            yx = jxx * ux + jxy * uy + jxz * uz + hy * sz - hz * sy
-            yy = jxy * ux + jyy * uy + jyz * uz + hz * sx - hx * sz
-            yz = jxz * ux + jyz * uy + jzz * uz + hx * sy - hy * sx
-            gx, gy, gz = mass * sx + uy * hz - uz * hy, mass * sy + uz * hx - ux * hz, mass * sz + ux * hy - uy * hx
-            xx = p0 * ux + p3 * uy + p6 * uz + ly * sz - lz * sy
-            xy = p1 * ux + p4 * uy + p7 * uz + lz * sx - lx * sz
-            xz = p2 * ux + p5 * uy + p8 * uz + lx * sy - ly * sx
-            wx, wy, wz, nx, ny, nz = more[i, 6], more[i, 7], more[i, 8], more[i, 9], more[i, 10], more[i, 11]
-            bx, by, bz, ax, ay, az = more[i, 12], more[i, 13], more[i, 14], more[i, 15], more[i, 16], more[i, 17]
-            tx, ty, tz, fx, fy, fz = more[i, 18], more[i, 19], more[i, 20], more[i, 21], more[i, 22], more[i, 23]
+            u, s, inertia, linear = three(work, i, 24), three(work, i, 27), inertia_of(work, i), three(more, i, 33)
+            y, g = momentum(inertia, u, s)
+            x = add(turned_back(more, i, u, 24), cross(linear, s))
+            e, f = three(more, i, 6), three(more, i, 9)
+            once, twice = momentum(inertia, e, f), momentum(inertia, three(more, i, 12), three(more, i, 15))
+            moment, force = three(more, i, 18), three(more, i, 21)
             # by q: 2 B ψ̇ + I ψ̈ + S ×* f
-            q0 = 2.0 * (p0 * wx + p1 * wy + p2 * wz) + jxx * bx + jxy * by + jxz * bz + hy * az - hz * ay
-            q1 = 2.0 * (p3 * wx + p4 * wy + p5 * wz) + jxy * bx + jyy * by + jyz * bz + hz * ax - hx * az
-            q2 = 2.0 * (p6 * wx + p7 * wy + p8 * wz) + jxz * bx + jyz * by + jzz * bz + hx * ay - hy * ax
-            q0 += uy * tz - uz * ty + sy * fz - sz * fy
-            q1 += uz * tx - ux * tz + sz * fx - sx * fz
-            q2 += ux * ty - uy * tx + sx * fy - sy * fx
-            q3 = 2.0 * (wy * lz - wz * ly) + mass * ax + by * hz - bz * hy + uy * fz - uz * fy
-            q4 = 2.0 * (wz * lx - wx * lz) + mass * ay + bz * hx - bx * hz + uz * fx - ux * fz
-            q5 = 2.0 * (wx * ly - wy * lx) + mass * az + bx * hy - by * hx + ux * fy - uy * fx
+            q0 = add(add(scaled(2.0, turned(more, i, e, 24)), twice[0]), add(cross(u, moment), cross(s, force)))
+            q1 = add(add(scaled(2.0, cross(e, linear)), twice[1]), cross(u, force))
             # by v: 2 B S + 2 I ψ̇
-            v0 = 2.0 * (p0 * ux + p1 * uy + p2 * uz + jxx * wx + jxy * wy + jxz * wz + hy * nz - hz * ny)
-            v1 = 2.0 * (p3 * ux + p4 * uy + p5 * uz + jxy * wx + jyy * wy + jyz * wz + hz * nx - hx * nz)
-            v2 = 2.0 * (p6 * ux + p7 * uy + p8 * uz + jxz * wx + jyz * wy + jzz * wz + hx * ny - hy * nx)
-            v3 = 2.0 * (uy * lz - uz * ly + mass * nx + wy * hz - wz * hy)
-            v4 = 2.0 * (uz * lx - ux * lz + mass * ny + wz * hx - wx * hz)
-            v5 = 2.0 * (ux * ly - uy * lx + mass * nz + wx * hy - wy * hx)
-            by_q[c, c] += ux * q0 + uy * q1 + uz * q2 + sx * q3 + sy * q4 + sz * q5
-            by_v[c, c] += ux * v0 + uy * v1 + uz * v2 + sx * v3 + sy * v4 + sz * v5
+            v0 = scaled(2.0, add(turned(more, i, u, 24), once[0]))
+            v1 = scaled(2.0, add(cross(u, linear), once[1]))
+            by_q[c, c] += dot(u, q0) + dot(s, q1)
+            by_v[c, c] += dot(u, v0) + dot(s, v1)
             k = p
             while k < count:
                 d = tree[k, 2]
                 if d >= 0:
-                    ax, ay, az, bx, by, bz = (
-                        work[k, 24],
-                        work[k, 25],
-                        work[k, 26],
-                        work[k, 27],
-                        work[k, 28],
-                        work[k, 29],
-                    )
-                    by_q[d, c] += ax * q0 + ay * q1 + az * q2 + bx * q3 + by * q4 + bz * q5
-                    by_v[d, c] += ax * v0 + ay * v1 + az * v2 + bx * v3 + by * v4 + bz * v5
-                    ex, ey, ez, ox, oy, oz = more[k, 6], more[k, 7], more[k, 8], more[k, 9], more[k, 10], more[k, 11]
-                    once = yx * ex + yy * ey + yz * ez + gx * ox + gy * oy + gz * oz
-                    by_v[c, d] += 2.0 * (xx * ax + xy * ay + xz * az + once)
-                    twice = yx * more[k, 12] + yy * more[k, 13] + yz * more[k, 14]
-                    twice += gx * more[k, 15] + gy * more[k, 16] + gz * more[k, 17]
-                    by_q[c, d] += 2.0 * (xx * ex + xy * ey + xz * ez) + twice
+                    a, b, e, f = three(work, k, 24), three(work, k, 27), three(more, k, 6), three(more, k, 9)
+                    by_q[d, c] += dot(a, q0) + dot(b, q1)
+                    by_v[d, c] += dot(a, v0) + dot(b, v1)
+                    by_v[c, d] += 2.0 * (dot(x, a) + dot(y, e) + dot(g, f))
+                    by_q[c, d] += 2.0 * dot(x, e) + dot(y, three(more, k, 12)) + dot(g, three(more, k, 15))
                 k = tree[k, 0]
         if p < count:
             for r in range(18, 36):
@@ -177,7 +128,7 @@ def _slopes(tree, work, more, by_q, by_v):
 
 
 @njit(**OPTIONS)
-def _columns(tree, order, find, work, more, ten, out):
+def _columns(tree, order, find, work, more, out):
     """Add the derivatives Y (n, c) with respect to the bodies' parameters that have a column."""
     count = tree.shape[0]
     for i in range(count):
@@ -186,42 +137,18 @@ def _columns(tree, order, find, work, more, ten, out):
             wanted = wanted or find[10 * i + order[i, k]] >= 0
         if not wanted:
             continue
-        r00, r01, r02 = work[i, 0], work[i, 1], work[i, 2]
-        r10, r11, r12 = work[i, 3], work[i, 4], work[i, 5]
-        r20, r21, r22 = work[i, 6], work[i, 7], work[i, 8]
-        x, y, z = work[i, 9], work[i, 10], work[i, 11]
-        gx, gy, gz = work[i, 12], work[i, 13], work[i, 14]
-        wx, wy, wz = r00 * gx + r10 * gy + r20 * gz, r01 * gx + r11 * gy + r21 * gz, r02 * gx + r12 * gy + r22 * gz
-        fx, fy, fz = work[i, 15] + gy * z - gz * y, work[i, 16] + gz * x - gx * z, work[i, 17] + gx * y - gy * x
-        bx, by, bz = more[i, 0], more[i, 1], more[i, 2]
+        x, g = three(work, i, 9), three(work, i, 12)
+        w, b = turned_back(work, i, g), three(more, i, 0)
         # acceleration of the body's origin: spatial, moved there, and ω × ν
-        ax = more[i, 3] + by * z - bz * y + gy * fz - gz * fy
-        ay = more[i, 4] + bz * x - bx * z + gz * fx - gx * fz
-        az = more[i, 5] + bx * y - by * x + gx * fy - gy * fx
-        ax, ay, az = r00 * ax + r10 * ay + r20 * az, r01 * ax + r11 * ay + r21 * az, r02 * ax + r12 * ay + r22 * az
-        bx, by, bz = r00 * bx + r10 * by + r20 * bz, r01 * bx + r11 * by + r21 * bz, r02 * bx + r12 * by + r22 * bz
-        j = i
+        moving = add(three(work, i, 15), cross(g, x))
+        a = turned_back(work, i, add(add(three(more, i, 3), cross(b, x)), cross(g, moving)))
+        b, j = turned_back(work, i, b), i
         while j < count:
             d = tree[j, 2]
             if d >= 0:
-                ux, uy, uz = work[j, 24], work[j, 25], work[j, 26]
-                sx, sy, sz = work[j, 27] + uy * z - uz * y, work[j, 28] + uz * x - ux * z, work[j, 29] + ux * y - uy * x
-                ux, uy, uz = (
-                    r00 * ux + r10 * uy + r20 * uz, r01 * ux + r11 * uy + r21 * uz, r02 * ux + r12 * uy + r22 * uz
-                )  # fmt: skip
-                sx, sy, sz = (
-                    r00 * sx + r10 * sy + r20 * sz, r01 * sx + r11 * sy + r21 * sz, r02 * sx + r12 * sy + r22 * sz
-                )  # fmt: skip
-                zx, zy, zz = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx
-                ten[0], ten[3], ten[5] = ux * bx + zx * wx, uy * by + zy * wy, uz * bz + zz * wz
-                ten[1] = ux * by + uy * bx + zx * wy + zy * wx
-                ten[2] = ux * bz + uz * bx + zx * wz + zz * wx
-                ten[4] = uy * bz + uz * by + zy * wz + zz * wy
-                ex, ey, ez = sy * wz - sz * wy, sz * wx - sx * wz, sx * wy - sy * wx
-                ten[6] = ay * uz - az * uy + sy * bz - sz * by + ey * wz - ez * wy
-                ten[7] = az * ux - ax * uz + sz * bx - sx * bz + ez * wx - ex * wz
-                ten[8] = ax * uy - ay * ux + sx * by - sy * bx + ex * wy - ey * wx
-                ten[9] = sx * ax + sy * ay + sz * az
+                u = three(work, j, 24)
+                s = turned_back(work, i, add(three(work, j, 27), cross(u, x)))
+                ten = ten_columns(w, b, a, turned_back(work, i, u), s)
                 for k in range(10):
                     column = find[10 * i + order[i, k]]
                     if column >= 0:
@@ -231,7 +158,7 @@ def _columns(tree, order, find, work, more, ten, out):
 
 @njit(**OPTIONS)
 def _linearise(
-    tree, body, linear, kinds, acts, order, entries, shares, owners, find, memory, q, v, a, work, own, more, ten,
+    tree, body, linear, kinds, acts, order, entries, shares, owners, find, memory, q, v, a, work, own, more,
     by_q, by_v, out,
 ):  # fmt: skip
     """Write K, D (n, n) and Y (n, c) of the inverse dynamics at q, v, a; `work` is that of `dynamics`."""
@@ -243,7 +170,7 @@ def _linearise(
             by_v[j, k] = linear[j, n + k]
     _outward(tree, body, v, a, work, own, more)
     if find.shape[0]:
-        _columns(tree, order, find, work, more, ten, out)
+        _columns(tree, order, find, work, more, out)
     _slopes(tree, work, more, by_q, by_v)
     for t in range(kinds.shape[0]):
         row = kinds[t, 0]
@@ -292,7 +219,7 @@ def _advance_tangent(
 ):  # fmt: skip
     """Advance q, v (n,) and δq, δv (n, c) by one period as `loop_kernels.advance` does; `slopes[0]` is not used."""
     tree, body, linear, kinds, acts = plant
-    own, more, ten, by_q, by_v, columns, at, rate, dat, drate = rooms
+    own, more, by_q, by_v, columns, at, rate, dat, drate = rooms
     n, c = dq.shape
     if not accelerate(tree, body, linear, kinds, acts, memory, loads, q, v, tau, work, matrix, slopes[0]):
         return SINGULAR
@@ -325,7 +252,7 @@ def _advance_tangent(
                 state = (at, rate, tau, work, matrix, slopes[stage])
                 if not accelerate(tree, body, linear, kinds, acts, memory, loads, *state):
                     return SINGULAR
-            where = (at, rate, slopes[stage], work, own, more, ten, by_q, by_v, columns)
+            where = (at, rate, slopes[stage], work, own, more, by_q, by_v, columns)
             _linearise(tree, body, linear, kinds, acts, *layout, memory, *where)  # pyright: ignore[reportCallIssue]
             _solve(matrix, by_q, by_v, columns, dat, drate, dtau, dslopes[stage])
         for j in range(n):
@@ -342,9 +269,9 @@ def _advance_tangent(
 @njit(**OPTIONS)
 def _workspace(bodies, n, c):
     """Return the work arrays of `_advance_tangent`."""
-    own, more, ten = np.empty((bodies, 10)), np.empty((bodies + 1, 36)), np.empty(10)
+    own, more = np.empty((bodies, 10)), np.empty((bodies + 1, 36))
     square, wide = (np.empty((n, n)), np.empty((n, n))), np.empty((n, c))
-    return own, more, ten, square[0], square[1], wide, np.empty(n), np.empty(n), np.empty((n, c)), np.empty((n, c))
+    return own, more, square[0], square[1], wide, np.empty(n), np.empty(n), np.empty((n, c)), np.empty((n, c))
 
 
 @njit(**OPTIONS)
@@ -384,7 +311,7 @@ def _command_tangent(
     work, matrix, rooms,
 ):  # fmt: skip
     """Write the derivatives (n, c) of the command before saturation; feedback (n,) is its feedback part."""
-    own, more, ten, by_q, by_v, columns, at, _, dat, _ = rooms
+    own, more, by_q, by_v, columns, at, _, dat, _ = rooms
     tree, linear = plant[0], plant[2]
     n = len(dwish)
     for j in range(n):
@@ -395,7 +322,7 @@ def _command_tangent(
         dynamics(tree, model, linear, read, speed, work, matrix, wish)
         bare = np.zeros_like(linear)
         order, entries, shares, owners, find = layout
-        where = (read, speed, at, work, own, more, ten, by_q, by_v, columns)
+        where = (read, speed, at, work, own, more, by_q, by_v, columns)
         none = (np.zeros((0, 2), dtype=np.int64), np.zeros((0, 8 + n)))
         _linearise(tree, model, bare, none[0], none[1], order, entries, shares, owners, empty, np.zeros((0, 2)), *where)
         dat[:] = 0.0
