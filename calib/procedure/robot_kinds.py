@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from inspect import signature
 from pathlib import Path
@@ -120,24 +120,6 @@ def _run(run: Callable[..., Any], found: Mechanism, *args: Any, **given: Any) ->
             instead = found.instead.get(key, "leave it out")
             raise UsageError(f"{key} is for serial arms only, not for a {found.kind}; {instead}")
     return run(found, *args, **{key: value for key, value in given.items() if key in known})
-
-
-def refuse_unread(settings: Any, plain: Any, read: Collection[str], where: object = "") -> None:
-    """Raise an error for settings that a stage does not use, unless their values are default or False.
-
-    Args:
-        settings, plain: dataclasses of one type: the given values, and the defaults.
-        read: names of the fields that the stage reads.
-        where: the file that contains them.
-
-    Raises:
-        UsageError: naming the first.
-    """
-    for each in fields(settings):
-        value = getattr(settings, each.name)
-        if each.name not in read and value is not False and value != getattr(plain, each.name):
-            place, shown = f"{where}: " if where else "", f" '{value}'" if isinstance(value, str) else ""
-            raise UsageError(f"{place}{each.name}{shown} is for serial arms only, not for this kind of robot")
 
 
 def joints_of(chain: Any) -> Joints:

@@ -19,7 +19,6 @@ from calib.procedure.excitation.design import GUARD, INSTANTS, search_motion
 from calib.procedure.excitation.inputs import ExcitationInputs
 from calib.procedure.excitation.limits import MotionBounds, MotionLimits
 from calib.procedure.excitation.settings import COARSE, DEFAULT_DESIGN, ExcitationSettings
-from calib.procedure.robot_kinds import refuse_unread
 from calib.robot.calibrated import COVARIANCE, ROBOT
 from calib.robot.chain import Joint
 from calib.robot.tables import dumps
@@ -27,7 +26,7 @@ from calib.rooms.parallel.mechanism.closure import ClosedRobot
 from calib.rooms.parallel.mechanism.parallel_model import ParallelModel, PlatformRegressor
 from calib.rooms.parallel.mechanism.velocities import LoopMotion
 from calib.rooms.parallel.purpose import Purpose, foretold, of_folder, of_options, purpose_of, read_model, whole
-from calib.rooms.parallel.robots import ParallelMechanism
+from calib.rooms.parallel.robots import ParallelMechanism, refuse_unread
 from calib.units import headings
 from trajectories.basis import SampledMotion
 from trajectories.constraints import BoxLimit, MotionConstraint, TwoSided

@@ -35,13 +35,12 @@ from calib.procedure.dynamic_stage.verdict import (
     with_prior,
 )
 from calib.procedure.findings import Verdict, lines_of, settle
-from calib.procedure.robot_kinds import refuse_unread
 from calib.rooms.parallel.geometry_share import propagate
 from calib.rooms.parallel.identical_legs import legs_differ
 from calib.rooms.parallel.mechanism.closure import ClosedRobot
 from calib.rooms.parallel.mechanism.parallel_model import PLATFORM, ParallelModel, make_parallel_model, rows_named
 from calib.rooms.parallel.mechanism.velocities import loop_jacobians, overconstraint
-from calib.rooms.parallel.robots import ParallelMechanism
+from calib.rooms.parallel.robots import ParallelMechanism, refuse_unread
 from calib.workers.threads import one_blas_thread
 
 OF_ARMS = {"couplings", "terms", "gravity", "payload_values"}  # settings

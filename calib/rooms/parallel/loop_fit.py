@@ -31,7 +31,6 @@ from calib.folders import COVARIANCE, ESTIMATE, METRICS, check_target, write_cov
 from calib.procedure.findings import Verdict
 from calib.procedure.kinematic_stage.folder import RESIDUALS
 from calib.procedure.kinematic_stage.settings import FitSettings
-from calib.procedure.robot_kinds import refuse_unread
 from calib.robot import calibrated
 from calib.robot.calibrated import ROBOT
 from calib.rooms.parallel.mechanism import parallel_robot
@@ -45,7 +44,7 @@ from calib.rooms.parallel.mechanism.geometric_fit import (
     platform_errors,
 )
 from calib.rooms.parallel.mechanism.parallel_robot import COORDINATES, ParallelRobot
-from calib.rooms.parallel.robots import ParallelMechanism
+from calib.rooms.parallel.robots import ParallelMechanism, refuse_unread
 
 if TYPE_CHECKING:
     from calib.procedure.report.page import Section

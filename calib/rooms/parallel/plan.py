@@ -18,14 +18,14 @@ from calib.api.motions import MotionPlan
 from calib.data.csv_table import read_table
 from calib.errors import MeasurementError, NoPosture, UsageError, refuse_data, refuse_option
 from calib.procedure.excitation.settings import DEFAULT_PLAN, PlanSettings
-from calib.procedure.robot_kinds import joints_of, refuse_unread
+from calib.procedure.robot_kinds import joints_of
 from calib.records import shaped
 from calib.rooms.parallel.excite import actuator_bounds, write_motion
 from calib.rooms.parallel.loop_fit import read_coordinates, read_rows
 from calib.rooms.parallel.mechanism.closure import ClosedRobot, coordinates_of
 from calib.rooms.parallel.mechanism.parallel_model import ParallelModel
 from calib.rooms.parallel.purpose import read_model
-from calib.rooms.parallel.robots import ParallelMechanism
+from calib.rooms.parallel.robots import ParallelMechanism, refuse_unread
 from trajectories.setpoints import joined
 from trajectories.timing.limits import TimingLimits
 from trajectories.timing.path import Path as JointPath

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from calib.errors import UsageError
 from calib.folders import read_covariance, write_covariance
 from calib.robot.calibrated import COVARIANCE, ROBOT
 from calib.rooms.parallel.mechanism import parallel_robot
@@ -107,3 +109,21 @@ def find(robot: object) -> ParallelMechanism | None:
     beside = path.with_name(COVARIANCE)
     covariance = LoopCovariance(*read_covariance(beside)) if path.name == ROBOT and beside.is_file() else None
     return ParallelMechanism(closed(parallel_robot.read(path)), path, covariance)
+
+
+def refuse_unread(settings: Any, plain: Any, read: Collection[str], where: object = "") -> None:
+    """Raise an error for settings that a stage does not use, unless their values are default or False.
+
+    Args:
+        settings, plain: dataclasses of one type: the given values, and the defaults.
+        read: names of the fields that the stage reads.
+        where: the file that contains them.
+
+    Raises:
+        UsageError: naming the first.
+    """
+    for each in fields(settings):
+        value = getattr(settings, each.name)
+        if each.name not in read and value is not False and value != getattr(plain, each.name):
+            place, shown = f"{where}: " if where else "", f" '{value}'" if isinstance(value, str) else ""
+            raise UsageError(f"{place}{each.name}{shown} is for serial arms only, not for this kind of robot")

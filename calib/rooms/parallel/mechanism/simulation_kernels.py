@@ -322,9 +322,7 @@ def run(robot, values, q, pose, rate, mixing, gains, reference, encoder, period,
             out[0, k, j], out[1, k, j], out[2, k, j] = q2[actuated[j]], read[j], tau[j]
         left, span = period, 0.0
         while left > 1e-9 * period:
-            for half in range(
-                2
-            ):  # one call of what is joined into this loop by the compiler: two take it twice as long
+            for half in range(2):  # one call, which the compiler joins into this loop: two take it twice as long
                 decay = _accelerate(robot, values, q2, pose2, rate2, tau, rates, twist, change)
                 if decay < 0.0:
                     return SINGULAR, k
