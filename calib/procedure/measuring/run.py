@@ -24,7 +24,6 @@ import numpy as np
 from scipy.sparse.csgraph import shortest_path
 
 from calib import files
-from calib.data.csv_table import read_table
 from calib.data.poses.pose_lists import joint_columns
 from calib.procedure.measuring import DEFAULT_RUN, RunSettings
 from calib.robot.chain import Chain
@@ -265,26 +264,6 @@ def write_run(path: Path, run: Run, chain: Chain) -> Path:
         clock += run.dwell
         rows.append([round(clock, 3), k + 1, *(place * factors)])
     return files.write_table(path, ["t [s]", "pose", *header], rows)
-
-
-def is_run(path: Path) -> bool:
-    """Return whether a CSV file contains a run."""
-    with path.open(encoding="utf-8", errors="replace") as file:
-        return file.readline().startswith(("t [s],pose,", "t,pose,"))
-
-
-def rehearsed_samples(path: Path, chain: Chain, rate: float = 10.0) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (N,) [s] and joint values (N, n) [rad or m] of a run's file at `rate` [Hz], for a rehearsal.
-
-    Raises:
-        MeasurementError: if a joint's column is missing.
-    """
-    table = read_table(path)
-    columns = {name.split(" [")[0]: name for name in reversed(table.header)}
-    stops = np.column_stack([table.numbers(columns.get(name, name), "joint") for name in chain.joint_names])
-    times = table.numbers("t", None)
-    t = np.linspace(times[0], times[-1], max(int((times[-1] - times[0]) * rate), 2))
-    return t, np.column_stack([np.interp(t, times, column) for column in stops.T])
 
 
 def _speeds(chain: Chain, share: float) -> tuple[np.ndarray, np.ndarray]:

@@ -22,7 +22,6 @@ from calib.identification import model_file
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.excitation import coefficients
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
-from calib.procedure.measuring.run import is_run, rehearsed_samples
 from calib.procedure.robot_kinds import stage_of
 from calib.records import Frozen
 from calib.robot import calibrated, library
@@ -293,6 +292,26 @@ def _measured(place: Path, chain: Chain | Drawn | None) -> Measured:
 def _triples(table: Table, head: str, dimension: str) -> np.ndarray:
     """Return the columns x, y, z of a table whose names begin with `head`, as (m, 3) in SI; NaN where empty."""
     return np.column_stack([table.numbers(f"{head}{axis}", dimension, gaps=True) for axis in "xyz"])
+
+
+def is_run(path: Path) -> bool:
+    """Return whether a CSV file contains a run."""
+    with path.open(encoding="utf-8", errors="replace") as file:
+        return file.readline().startswith(("t [s],pose,", "t,pose,"))
+
+
+def rehearsed_samples(path: Path, chain: Chain, rate: float = 10.0) -> tuple[np.ndarray, np.ndarray]:
+    """Return times (N,) [s] and joint values (N, n) [rad or m] of a run's file at `rate` [Hz], for a rehearsal.
+
+    Raises:
+        MeasurementError: if a joint's column is missing.
+    """
+    table = read_table(path)
+    columns = {name.split(" [")[0]: name for name in reversed(table.header)}
+    stops = np.column_stack([table.numbers(columns.get(name, name), "joint") for name in chain.joint_names])
+    times = table.numbers("t", None)
+    t = np.linspace(times[0], times[-1], max(int((times[-1] - times[0]) * rate), 2))
+    return t, np.column_stack([np.interp(t, times, column) for column in stops.T])
 
 
 def _joined(fitted: Measured, errors: Path) -> Measured:

@@ -17,19 +17,11 @@ from calib.procedure.measuring import run as measuring
 from calib.procedure.measuring.constraints_file import ConstraintsFile
 from calib.procedure.measuring.pose_limits import Limits, limits_of, read_limits
 from calib.procedure.measuring.prediction import predicted
-from calib.procedure.measuring.run import (
-    Exchange,
-    RunSettings,
-    drivable,
-    is_run,
-    plan_run,
-    rehearsed_samples,
-    turns,
-    write_run,
-)
+from calib.procedure.measuring.run import Exchange, RunSettings, drivable, plan_run, turns, write_run
 from calib.procedure.session.questions import cell_tables
 from calib.robot.chain import Chain, random_joints
 from calib.robot.library import load
+from calib.rooms.viewer.scene import is_run, rehearsed_samples
 from poses.candidates import draw_candidates
 from poses.space import is_feasible
 
