@@ -23,6 +23,7 @@ A room is a package of `calib.rooms` with a table ``OFFERS``: what it adds, and 
                            a robot that is not a serial arm (`calib.identification.gains.DriveGains`)
     image_folders          a module: `read_images` reads a folder of images as a block of measurements
     exports                functions: path → the file as a stream of our text, None where it is our table already
+    read_bag               function: ROS bag, joints, options → `calib.data.recordings.recording.Recording`
     pose_forms             files of poses that are no standard table: by ``format``, whether a header is of that form,
                            and its reader
     planned_poses          function: file of points, nominal arm, options → blocks with the joints of planned poses

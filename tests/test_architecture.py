@@ -39,7 +39,7 @@ HOMES = {
     ],
     "ruamel": ["calib.rooms.camera.lens", "calib.rooms.descriptions.moveit"],
     "mcap": ["calib.data.", "calib.rooms.camera."],
-    "rosbags": ["calib.data.", "calib.rooms.camera."],
+    "rosbags": ["calib.rooms.controllers.bags", "calib.rooms.camera."],
     "pandas": ["calib.api.rendering"],
     "starlette": ["calib.rooms.serve.pages"],
     "uvicorn": ["calib.rooms.serve.commands"],

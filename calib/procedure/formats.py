@@ -40,8 +40,7 @@ TOPICS: Mapping[str, tuple[str, str]] = {
     ),
     "recordings": (
         "recordings of motion, for calib identify",
-        "calib.data.recordings.recording_options calib.data.recordings.recording_files "
-        "calib.data.recordings.archives calib.data.recordings.bags",
+        "calib.data.recordings.recording_options calib.data.recordings.recording_files calib.data.recordings.archives",
     ),
     **merged("topics"),
 }

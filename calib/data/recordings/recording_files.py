@@ -2,7 +2,8 @@
 
 A CSV table has one column of stamps, one per joint and quantity (``q1 [deg]``, ``tau_elbow [Nm]``). A quantity's name
 (`recording_options`) is before or after the joint's number or name, with or without a ``_`` (``q1``, ``q_1``,
-``position_elbow``, ``elbow_position``, ``J1 pos``; ``q[1]`` has a number, not a unit); numbers start at 0 or 1.
+``position_elbow``, ``elbow_position``, ``J1 pos``; ``q[1]`` has a number, not a unit); numbers start at 0 or 1. What
+bags hold: ``calib formats logs``.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,7 +16,6 @@ import numpy as np
 
 from calib.data.csv_table import Table, read_table
 from calib.data.recordings.archives import read_archive
-from calib.data.recordings.bags import read_bag
 from calib.data.recordings.checks import check_recording
 from calib.data.recordings.recording import Ends, Recording, earlier, in_pieces, named, parse_cut, rows_used
 from calib.data.recordings.recording_options import (
@@ -220,7 +220,7 @@ def _reader(path: Path, ends: Ends) -> Reader:
         if path.exists():
             check_regular(path)
         if path.is_dir() or path.suffix in (".bag", ".mcap", ".db3"):
-            return read_bag
+            return needed("read_bag")
         with open(path, "rb") as file:
             head = file.read(1 << 16)
     except OSError as error:

@@ -3,6 +3,7 @@
 OFFERS = {
     "commands": "commands:app",
     "exports": "logs:translated",
+    "read_bag": "bags:read_bag",
     "topics": ":TOPICS",
     "check_controller": "table:check_controller",
     "joint_origins": "joint_origins:joint_origins",
@@ -17,5 +18,8 @@ TOPICS = {
         "calib.rooms.controllers.program calib.rooms.controllers.motion "
         "calib.rooms.controllers.targets calib.rooms.controllers.table",
     ),
-    "logs": ("logs of robot controllers, by brand", "calib.rooms.controllers.logs"),
+    "logs": (
+        "logs of robot controllers, by brand, and ROS bags",
+        "calib.rooms.controllers.logs calib.rooms.controllers.bags",
+    ),
 }
