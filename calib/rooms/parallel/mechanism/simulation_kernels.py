@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from calib.dynamics.kernels import OPTIONS, inverse_dynamics
+from calib.dynamics.kernels import OPTIONS, add, cross, dot, increase, inertia_times, inverse_dynamics, scaled, three
 from calib.rooms.closed_loop.loop_kernels import (
     DIVERGED,
     FINE,
@@ -25,14 +25,6 @@ from calib.rooms.parallel.mechanism.closure_kernels import SCALE, invert, one_le
 
 
 @njit(**OPTIONS)
-def _cross(a, b, out):
-    """Add a × b to `out`."""
-    out[0] += a[1] * b[2] - a[2] * b[1]
-    out[1] += a[2] * b[0] - a[0] * b[2]
-    out[2] += a[0] * b[1] - a[1] * b[0]
-
-
-@njit(**OPTIONS)
 def _add(A, x, out):
     """Add A x to `out`."""
     for i in range(A.shape[0]):
@@ -43,24 +35,17 @@ def _add(A, x, out):
 @njit(**OPTIONS)
 def _platform(body, pose, turn, gravity, M, h):
     """Write the platform's inertia M (6, 6), zero on entry, and its wrench h (6,) where the twist does not change."""
-    S, across, spin, load = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(6)
-    own = np.array([[body[0], body[1], body[2]], [body[1], body[3], body[4]], [body[2], body[4], body[5]]])
+    w, g = (turn[0], turn[1], turn[2]), (gravity[0], gravity[1], gravity[2])
+    rows = (three(pose, 0, 0), three(pose, 1, 0), three(pose, 2, 0))
+    moments = body[6], body[7], body[8]
+    S = dot(rows[0], moments), dot(rows[1], moments), dot(rows[2], moments)
     for i in range(3):
         M[i, i] = body[9]
         for k in range(3):
-            S[i] += pose[i, k] * body[6 + k]
-            for a in range(3):
-                for b in range(3):
-                    M[3 + i, 3 + k] += pose[i, a] * own[a, b] * pose[k, b]
-    for i in range(3):
-        for k in range(3):
-            spin[i] += M[3 + i, 3 + k] * turn[k]
-    _cross(turn, S, across)
-    _cross(turn, across, load[:3])
-    _cross(turn, spin, load[3:])
-    _cross(gravity, S, load[3:])
-    for i in range(3):
-        h[i], h[3 + i] = load[i] - body[9] * gravity[i], load[3 + i]
+            M[3 + i, 3 + k] = dot(rows[i], inertia_times(body, rows[k]))
+    spin = dot(three(M, 3, 3), w), dot(three(M, 4, 3), w), dot(three(M, 5, 3), w)
+    h[0], h[1], h[2] = add(cross(w, cross(w, S)), scaled(-body[9], g))
+    h[3], h[4], h[5] = add(cross(w, spin), cross(g, S))
     M[0, 4] = M[4, 0] = S[2]
     M[1, 5] = M[5, 1] = S[0]
     M[2, 3] = M[3, 2] = S[1]
@@ -70,21 +55,16 @@ def _platform(body, pose, turn, gravity, M, h):
 
 
 @njit(**OPTIONS)
-def _bent(full, v, turn, lever, out):
-    """Write the shift (6,) of a leg's acceleration equations J q̈ = G ṫ - out, see `velocities`."""
-    w, moved, turned, across = np.zeros(3), np.empty(3), np.empty(3), np.zeros(3)
+def _bent(full, v, turn, lever, leg, shift):
+    """Add to row `leg` of `shift` (L, 6) that of a leg's acceleration equations J q̈ = G ṫ - shift, see `velocities`."""
+    w, t = (0.0, 0.0, 0.0), (turn[0], turn[1], turn[2])
     for j in range(v.shape[0]):
-        for m in range(3):
-            moved[m], turned[m] = full[m, j] * v[j], full[3 + m, j] * v[j]
-        _cross(w, moved, out)
-        _cross(w, turned, out[3:])
-        for m in range(3):
-            w[m] += turned[m]
-        _cross(w, moved, out)
-    _cross(turn, lever, across)
-    for m in range(3):
-        across[m] = -across[m]
-    _cross(turn, across, out)
+        moved = scaled(v[j], (full[0, j], full[1, j], full[2, j]))
+        turned = scaled(v[j], (full[3, j], full[4, j], full[5, j]))
+        increase(shift, leg, 3, cross(w, turned))
+        increase(shift, leg, 0, cross(add(scaled(2.0, w), turned), moved))
+        w = add(w, turned)
+    increase(shift, leg, 0, cross(t, cross(three(lever, leg, 0), t)))
 
 
 @njit(**OPTIONS)
@@ -232,7 +212,7 @@ def _accelerate(robot, values, q, pose, rate, tau, rates, twist, change):
         first, last = starts[leg], starts[leg + 1]
         _follow(held[leg], inverse[leg], carried[leg], gap[leg], mend, D, q[first:last], J[first:last])
         _add(J[first:last], rate, rates[first:last])
-        _bent(full[leg], rates[first:last], twist[3:], lever[leg], shift[leg])
+        _bent(full[leg], rates[first:last], twist[3:], lever, leg, shift)
         _add(back[leg], shift[leg], still)
     for leg in range(L):
         first, last = starts[leg], starts[leg + 1]
