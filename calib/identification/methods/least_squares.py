@@ -94,10 +94,9 @@ def _settled(problem: IdentificationProblem, prior: Prior) -> tuple[LinearFit, n
     pooled, noise = problem.pooled, problem.noise
     std, tau, tempering = prior.first.std, prior.first.inflation, prior.tempering
     fit, covariance, known = _regularised(problem, prior, std, tau, tempering)
-    rounds = 2  # of weighing rows by the residuals that richer friction leaves
-    for _ in range(rounds):
+    for alike in (True, True, False):  # weighing rows by the residuals that richer friction leaves
         own = fit.estimate
-        std, tau = weighing(problem.rows, pooled, own.values, own.covariance, std, tau, noise)
+        std, tau = weighing(problem.rows, pooled, own.values, own.covariance, std, tau, noise, alike, whole=True)
         fit, covariance, known = _regularised(problem, prior, std, tau, tempering)
     values = _braking(problem, fit.estimate.values, std * np.sqrt(tau), known)
     covariance[: problem.base.b, : problem.base.b] *= tempering
