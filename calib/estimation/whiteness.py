@@ -80,7 +80,7 @@ def _normality(skewness: float, kurtosis: float, n: int) -> float:
 
 
 def autocorrelation(residual: np.ndarray, lags: int) -> np.ndarray:
-    """Return ρ_k = Σ_t x_t x_{t+k} / Σ_t x_t² for k = 1 … lags, the mean removed (by FFT); sums run over columns, too."""
+    """Return ρ_k = Σ_t x_t x_{t+k} / Σ_t x_t² for k = 1 … lags, means removed (by FFT); sums run over columns, too."""
     columns = np.asarray(residual, dtype=float).reshape(len(residual), -1).T
     size = 1 << (2 * len(residual) - 1).bit_length()
     spectrum = sum(np.abs(np.fft.rfft(x - x.mean(), size)) ** 2 for x in columns)

@@ -197,10 +197,8 @@ def first_fit(rows: Sequence[ObservationRows], noise: np.ndarray | None = None) 
     values = np.zeros(data.parameters)
     for _ in range(4):
         values, _ = estimate(data, std, tau, np.full(data.parameters, -1))
-        residuals = np.concatenate([np.where(part.present, part.target - part.matrix @ values, 0.0) for part in rows])
-        used = np.concatenate([part.present for part in rows]).sum(axis=0)
-        std = np.sqrt((residuals**2).sum(axis=0) / np.maximum(used, 1))
-        std = scaled(noise, np.maximum(std, 1e-9 * max(float(std.max()), 1e-300)), used)
+        std = np.sqrt(data.residual_squares(values) / np.maximum(data.rows, 1))
+        std = scaled(noise, np.maximum(std, MIN_NOISE * max(float(std.max()), 1e-300)), data.rows)
     return FirstFit(std, residual_inflation(rows, values), values)
 
 
@@ -226,8 +224,8 @@ def weighing(
     max_inflation = 10.0  # rows of a residual that count as one, at most, where they are weighed (our choice)
     tau = np.minimum(residual_inflation(rows, values, covariance if whole else None), max_inflation)
     tau = np.full(len(tau), np.average(tau, weights=np.maximum(data.rows, 1))) if alike else tau
-    squares = np.sum((data.factors @ np.append(values, -1.0)) ** 2, axis=1)
-    std = np.sqrt(squares / np.maximum(data.rows - tau * taken, 0.1 * np.maximum(data.rows, 1)))
+    free = np.maximum(data.rows - tau * taken, 0.1 * np.maximum(data.rows, 1))
+    std = np.sqrt(data.residual_squares(values) / free)
     size = np.sqrt(np.sum(data.factors[:, :, -1] ** 2, axis=1) / np.maximum(data.rows, 1))
     std = np.maximum(std, MIN_NOISE * max(float(size.max()), 1e-300))
     return scaled(noise, std, data.rows), tau

@@ -113,9 +113,8 @@ def _braking(problem: IdentificationProblem, free: np.ndarray, std: np.ndarray, 
     wrong = _driving(problem, free)
     max_cost = 1.2  # of a joint's squared residuals, above which braking friction is not what was recorded (our choice)
     if wrong.any():
-        wrong &= (
-            pooled.residual_squares(values)[-len(wrong) :] > max_cost * pooled.residual_squares(free)[-len(wrong) :]
-        )
+        braked, least = (pooled.residual_squares(x)[-len(wrong) :] for x in (values, free))
+        wrong &= braked > max_cost * least
     if not wrong.any():
         return values
     reversed_ = [one is not None and one.form.dissipative and any(wrong[row] for row, _ in one.acts) for one in terms]
