@@ -80,10 +80,10 @@ def _normality(skewness: float, kurtosis: float, n: int) -> float:
 
 
 def autocorrelation(residual: np.ndarray, lags: int) -> np.ndarray:
-    """Return ρ_k = Σ_t x_t x_{t+k} / Σ_t x_t² for k = 1 … lags, the mean removed (by FFT)."""
-    x = np.asarray(residual, dtype=float) - np.mean(residual)
-    size = 1 << (2 * len(x) - 1).bit_length()
-    spectrum = np.abs(np.fft.rfft(x, size)) ** 2
+    """Return ρ_k = Σ_t x_t x_{t+k} / Σ_t x_t² for k = 1 … lags, means removed (by FFT); sums run over columns, too."""
+    columns = np.asarray(residual, dtype=float).reshape(len(residual), -1).T
+    size = 1 << (2 * len(residual) - 1).bit_length()
+    spectrum = sum(np.abs(np.fft.rfft(x - x.mean(), size)) ** 2 for x in columns)
     covariance = np.fft.irfft(spectrum, size)[: lags + 1]
     return covariance[1:] / covariance[0] if covariance[0] > 0.0 else np.zeros(lags)
 
@@ -113,8 +113,11 @@ def inflation(residual: np.ndarray) -> float:
     """Return the integrated autocorrelation τ = 1 + 2 Σ_{k<=m} ρ_k >= 1: N residuals count as N / τ white ones.
 
     The window is the smallest m >= 5 τ(m) (Sokal 1997): longer sums add noise only. At most N / 4.
+
+    Args:
+        residual: (N,), or (N, 1 + p) with the columns W C^(1/2) of a fit behind it: what it took out of the errors.
     """
-    x = shaped(residual, (None,), "residuals")
+    x = np.asarray(residual, dtype=float)
     if len(x) < 8:
         return 1.0
     tau = 1.0 + 2.0 * np.cumsum(autocorrelation(x, len(x) // 4))

@@ -73,11 +73,12 @@ def test_instruments_cure_the_bias_of_noise_in_the_loop():
 
 
 @pytest.mark.slow
-def test_output_error_recovers_a_parallel_robot_within_its_sigma():
-    """Five-bar, 1 s, without the payload: cloe, with noise of the encoders in the loop."""
+@pytest.mark.parametrize("method", ["cloe", "clie"])
+def test_output_error_recovers_a_parallel_robot_within_its_sigma(method):
+    """Five-bar, 1 s, without the payload, with noise of the encoders in the loop: 50 rows for 15 parameters."""
     (recording, _), robot = logs("fivebar", 4000.0, 40.0, 1e-5, 1.0), find("fivebar")
     found = identify_parallel(
-        robot, [recording], options=options("cloe", 4000.0, 40.0, 60.0, payload={}, files={}, essential="none")
+        robot, [recording], options=options(method, 4000.0, 40.0, 60.0, payload={}, files={}, essential="none")
     )
     errors = np.abs(away(found, "fivebar"))
     assert len(errors) > 10 and np.mean(errors < 2.0) > 0.85 and errors.max() < 4.0

@@ -251,7 +251,9 @@ def _packed(
     require_rank(factor, names, "the simulated motion does not distinguish them")
     inverse = scipy.linalg.solve_triangular(factor, np.eye(p)) / size[:, None]
     bread = inverse @ inverse.T
-    covariance = rows / max(rows - p, 1) * bread @ scatter(white, left) @ bread
+    covariance, rounds = rows / max(rows - p, 1) * bread @ scatter(white, left) @ bread, 5
+    for _ in range(rounds):
+        covariance = bread @ scatter(white, left, covariance) @ bread
     estimate = replace(
         plain.estimate, values=values[:own], covariance=covariance[:own, :own], residual_std=1.0
     )  # fmt: skip

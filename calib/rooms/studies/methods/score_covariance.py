@@ -6,7 +6,7 @@ from calib.estimation.whiteness import autocorrelation, inflation
 from calib.records import shaped
 
 
-def scatter(white: np.ndarray, residual: np.ndarray) -> np.ndarray:
+def scatter(white: np.ndarray, residual: np.ndarray, covariance: np.ndarray | None = None) -> np.ndarray:
     """Return Σ_j σ_j² Σ_kl ρ_j(k - l) w_jk w_jlᵀ (p, p): the covariance of Σ_k W_kᵀ r_k.
 
     σ_j², ρ_j are variance and autocorrelation of row j's residuals over one uninterrupted record, tapered linearly
@@ -17,6 +17,8 @@ def scatter(white: np.ndarray, residual: np.ndarray) -> np.ndarray:
     Args:
         white: W (N, rows, p).
         residual: r (N, rows); zero where a row is not in use.
+        covariance: C (p, p) of the estimate behind the residuals: σ_j² and ρ_j are then those of r and of what the fit
+            took out, E[e_k e_l] = r_k r_l + w_k C w_lᵀ; on a short record least of all is left where W is large.
     """
     white = shaped(white, (None, None, None), "rows")
     residual = shaped(residual, white.shape[:2], "residuals")
@@ -24,9 +26,11 @@ def scatter(white: np.ndarray, residual: np.ndarray) -> np.ndarray:
     size = 1 << (2 * count - 1).bit_length()
     result = np.zeros((p, p))
     min_lags = 12  # at least, of the residuals' autocorrelation
+    root = np.zeros((p, 0)) if covariance is None else np.linalg.cholesky(covariance)
     for row in range(white.shape[1]):
-        own, values = residual[:, row], white[:, row]
-        variance = float(np.mean(own**2))
+        values = white[:, row]
+        own = np.column_stack([residual[:, row], values @ root])
+        variance = float(np.sum(own**2) / count)
         if variance == 0.0 or count < 4 * min_lags:
             result += variance * values.T @ values
             continue
