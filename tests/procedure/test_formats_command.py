@@ -36,7 +36,8 @@ def test_every_format_has_its_documentation(calib):
             "identified",
             ("metrics.json", "torques_N.csv", "above_band_percent", "standing", "calib explain torque-unexplained"),
         ),
-        ("recordings", ("measured_torque", "JointState", "use_range")),
+        ("recordings", ("measured_torque", "calib formats logs", "use_range")),
+        ("logs", ("sensor_msgs/JointState", "RTDE")),
     ],
 )
 def test_what_a_user_looks_for_is_there(calib, topic, words):
