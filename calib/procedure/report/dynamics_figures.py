@@ -17,7 +17,7 @@ from calib.procedure.excitation import coefficients
 from calib.procedure.report.charts import Chart, Panel, bars, level, line, picture, save_all, text
 from calib.procedure.report.dynamics_section import DynamicReport, percent, proof_of
 from calib.procedure.report.page import Picture, Pictures
-from calib.procedure.report.style import AFTER, BEFORE, HALF_WIDTH, MARK, PAGE_WIDTH, QUIET
+from calib.procedure.report.style import AFTER, BEFORE, HALF_WIDTH, MARK, PAGE_WIDTH, QUIET, thinned
 from calib.procedure.robot_kinds import Mechanism
 from calib.records import read_rows
 from calib.robot.chain import Joint
@@ -114,10 +114,11 @@ def torques(
     panels = []
     for j, (row, unit) in enumerate(zip(rows, units)):
         left = f": {errors[j]:.3g} % unexplained" if j < len(errors) and np.isfinite(errors[j]) else ""
-        lines = [
-            line(t, measured[:, j], "-", BEFORE, 2.4, label="measured"),
-            line(t, predicted[:, j], "-", AFTER, 0.7, label="predicted"),
-            line(t, measured[:, j] - predicted[:, j], "-", QUIET, 0.5, label="measured - predicted"),
+        own, model = measured[:, j], predicted[:, j]
+        lines = [  # thinned here already: a chart of an hour would be held, and pickled, whole
+            line(*thinned(t, own), "-", BEFORE, 2.4, label="measured"),
+            line(*thinned(t, model), "-", AFTER, 0.7, label="predicted"),
+            line(*thinned(t, own - model), "-", QUIET, 0.5, label="measured - predicted"),
         ]
         panels.append(Panel(lines, f"{row} [{unit}]{left}", below, xlim=(t[0], t[-1])))
     return Chart(panels, 0.7 + 0.95 * -(-len(rows) // columns), columns, title=title, shared="x")
