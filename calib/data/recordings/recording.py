@@ -136,7 +136,7 @@ def rows_in_pieces(first: int, stop: int, most: int | None, pieces: int = 20) ->
     """Return the rows to use of a recording's rows `first` to `stop`, and notes: all, or at most `most` in pieces.
 
     A piece lies at a random place in each of `pieces` equal parts: the whole time takes part, and no period of the
-    motion meets the same phase each time. Up to a quarter more rows are used whole: what is left out should be worth it.
+    motion meets the same phase each time. Up to a quarter more rows are used whole.
     """
     count = stop - first
     if most is None or count <= 1.25 * most:
