@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-NEAR = 0.2  # relative: another rounding ends the short search elsewhere (other kernels, the same results but for it: 16 %)
+NEAR = 0.2  # relative: another rounding ends the short search elsewhere (of other kernels: by 16 %)
 
 
 @pytest.mark.slow
