@@ -197,35 +197,31 @@ def first_fit(rows: Sequence[ObservationRows], noise: np.ndarray | None = None) 
     values = np.zeros(data.parameters)
     for _ in range(4):
         values, _ = estimate(data, std, tau, np.full(data.parameters, -1))
-        std = np.sqrt(data.residual_squares(values) / np.maximum(data.rows, 1))
-        std = scaled(noise, np.maximum(std, MIN_NOISE * max(float(std.max()), 1e-300)), data.rows)
+        residuals = np.concatenate([np.where(part.present, part.target - part.matrix @ values, 0.0) for part in rows])
+        used = np.concatenate([part.present for part in rows]).sum(axis=0)
+        std = np.sqrt((residuals**2).sum(axis=0) / np.maximum(used, 1))
+        std = scaled(noise, np.maximum(std, 1e-9 * max(float(std.max()), 1e-300)), used)
     return FirstFit(std, residual_inflation(rows, values), values)
 
 
 def weighing(
     rows: Sequence[ObservationRows], data: Triangles, values: np.ndarray, covariance: np.ndarray, std: np.ndarray,
-    tau: np.ndarray, noise: np.ndarray | None = None, alike: bool = True, whole: bool = False,
+    tau: np.ndarray, noise: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return standard deviation and inflation of the residuals (rows,), by their degrees of freedom.
-
-    Where rows are weighed again and again by inflations of their own, one that counts less fits worse, is more alike in
-    time and counts less still. So all get the mean one, and their own once, from such a fit.
 
     Args:
         data: triangles of the rows, one group per torque row.
         values, covariance: (p,), (p, p) the estimate.
         std, tau: (rows,) that it was weighed with.
         noise: (rows,) of the torques up to a common factor; None: from the residuals.
-        alike: the mean inflation for all rows; or each row's own.
-        whole: inflation of the errors, with what the fit took out of them; or of the residuals, which sizes come from.
     """
     columns = data.factors[:, :, :-1]
     taken = np.einsum("gik,gik->g", columns @ covariance, columns) / (std**2 * tau)  # of the parameters, by row
     max_inflation = 10.0  # rows of a residual that count as one, at most, where they are weighed (our choice)
-    tau = np.minimum(residual_inflation(rows, values, covariance if whole else None), max_inflation)
-    tau = np.full(len(tau), np.average(tau, weights=np.maximum(data.rows, 1))) if alike else tau
-    free = np.maximum(data.rows - tau * taken, 0.1 * np.maximum(data.rows, 1))
-    std = np.sqrt(data.residual_squares(values) / free)
+    tau = np.minimum(residual_inflation(rows, values), max_inflation)
+    squares = np.sum((data.factors @ np.append(values, -1.0)) ** 2, axis=1)
+    std = np.sqrt(squares / np.maximum(data.rows - tau * taken, 0.1 * np.maximum(data.rows, 1)))
     size = np.sqrt(np.sum(data.factors[:, :, -1] ** 2, axis=1) / np.maximum(data.rows, 1))
     std = np.maximum(std, MIN_NOISE * max(float(size.max()), 1e-300))
     return scaled(noise, std, data.rows), tau
@@ -241,22 +237,13 @@ def scaled(noise: np.ndarray | None, std: np.ndarray, counts: np.ndarray) -> np.
     return std if noise is None else noise * np.sqrt(np.average((std / noise) ** 2, weights=np.maximum(counts, 1)))
 
 
-def residual_inflation(
-    all_rows: Sequence[ObservationRows], values: np.ndarray, covariance: np.ndarray | None = None
-) -> np.ndarray:
-    """Return the integrated autocorrelation of each row's residuals (rows,), averaged over cases by length.
-
-    A fit of many parameters to a short record takes most of what is alike in time out of its errors e: the
-    `covariance` C (p, p) of the values puts it back, E[e_t e_s | y] = r_t r_s + w_t C w_sᵀ (as in the EM algorithm).
-    """
+def residual_inflation(all_rows: Sequence[ObservationRows], values: np.ndarray) -> np.ndarray:
+    """Return the integrated autocorrelation of each row's residuals (rows,), averaged over cases by length."""
     rows = all_rows[0].target.shape[1]
-    axes, sizes, _ = np.linalg.svd(np.zeros((len(values), 0)) if covariance is None else covariance, False)
-    root = axes * np.sqrt(sizes)
     total, weight = np.zeros(rows), np.zeros(rows)
     for part in all_rows:
         residual, seen = part.target - part.matrix @ values, np.asarray(part.present.any(axis=0))
-        both = (np.column_stack([residual[:, row], part.matrix[:, row] @ root]) for row in range(rows))
-        own = [inflation(x) if known else 0.0 for x, known in zip(both, seen)]
+        own = [inflation(residual[:, row]) if seen[row] else 0.0 for row in range(rows)]
         total += len(residual) * np.array(own)
         weight += len(residual) * seen
     return np.maximum(total / np.maximum(weight, 1.0), 1.0)

@@ -94,9 +94,10 @@ def _settled(problem: IdentificationProblem, prior: Prior) -> tuple[LinearFit, n
     pooled, noise = problem.pooled, problem.noise
     std, tau, tempering = prior.first.std, prior.first.inflation, prior.tempering
     fit, covariance, known = _regularised(problem, prior, std, tau, tempering)
-    for alike in (True, True, False):  # weighing rows by the residuals that richer friction leaves
+    rounds = 2  # of weighing rows by the residuals that richer friction leaves
+    for _ in range(rounds):
         own = fit.estimate
-        std, tau = weighing(problem.rows, pooled, own.values, own.covariance, std, tau, noise, alike, whole=True)
+        std, tau = weighing(problem.rows, pooled, own.values, own.covariance, std, tau, noise)
         fit, covariance, known = _regularised(problem, prior, std, tau, tempering)
     values = _braking(problem, fit.estimate.values, std * np.sqrt(tau), known)
     covariance[: problem.base.b, : problem.base.b] *= tempering
@@ -113,8 +114,9 @@ def _braking(problem: IdentificationProblem, free: np.ndarray, std: np.ndarray, 
     wrong = _driving(problem, free)
     max_cost = 1.2  # of a joint's squared residuals, above which braking friction is not what was recorded (our choice)
     if wrong.any():
-        braked, least = (pooled.residual_squares(x)[-len(wrong) :] for x in (values, free))
-        wrong &= braked > max_cost * least
+        wrong &= (
+            pooled.residual_squares(values)[-len(wrong) :] > max_cost * pooled.residual_squares(free)[-len(wrong) :]
+        )
     if not wrong.any():
         return values
     reversed_ = [one is not None and one.form.dissipative and any(wrong[row] for row, _ in one.acts) for one in terms]

