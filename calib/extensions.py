@@ -39,7 +39,6 @@ A room is a package of `calib.rooms` with a table ``OFFERS``: what it adds, and 
     fit_pages, model_pages functions that write the certificate of a fit (report, figures, folder) and of an
                            identification (outcome, folder, whether with figures) into its folder
     check_controller       function: controller's name, number of joints; raises where it takes no such arm
-    cluster                context manager: address of a Dask scheduler → its workers (`calib.workers.processes.Crew`)
     write_program          function: CSV of poses, path, controller's name → files of its program
     joint_origins          function: texts of a nominal and a calibrated URDF, their name → YAML for tesseract
     ur_kinematics          function: calibrated robot → YAML for ur_description, and a remark

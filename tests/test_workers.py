@@ -184,7 +184,7 @@ def test_a_cluster_loses_workers_and_no_result(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_cluster_without_workers_is_not_waited_for_long(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("calib.rooms.fleet.cluster.NO_WORKERS", 1.0)
+    monkeypatch.setattr("calib.workers.cluster.NO_WORKERS", 1.0)
     alone = dask_cluster.running(tmp_path, workers=0)
     complaint = pytest.raises(CalibError, match="has had no workers for 1 s")
     with alone as cluster, workers(cluster.address) as crew, complaint:
@@ -192,7 +192,7 @@ def test_a_cluster_without_workers_is_not_waited_for_long(tmp_path: Path, monkey
 
 
 def test_where_nothing_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("calib.rooms.fleet.cluster.ANSWER", 0.3)
+    monkeypatch.setattr("calib.workers.cluster.ANSWER", 0.3)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         port = silent.getsockname()[1]
         for wrong in (f"tcp://127.0.0.1:{port}", "tcp://127.0.0.1:1", "tcp://127.0.0.1", "smoke://127.0.0.1:8786"):

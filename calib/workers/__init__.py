@@ -22,7 +22,6 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from calib.errors import TaskLost, UsageError
-from calib.extensions import needed
 
 if TYPE_CHECKING:
     from calib.workers.processes import Crew, Stream
@@ -108,10 +107,10 @@ def workers(where: str | int | None = None) -> Iterator[Workers]:
     if text.isdigit() and int(text) == 1:
         yield Workers(lambda function, tasks, near: ((n, function(*task), None) for n, task in enumerate(tasks)))
         return
-    from calib.workers import processes
+    from calib.workers import cluster, processes
 
     made: AbstractContextManager[Crew] = (
-        needed("cluster")(text) if "://" in text else closing(processes.Processes(int(text)))
+        cluster.dask(text) if "://" in text else closing(processes.Processes(int(text)))
     )
     with made as crew:
         yield Workers(partial(processes.streamed, crew), here="://" not in text)

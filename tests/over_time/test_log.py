@@ -8,8 +8,8 @@ import pytest
 import calib
 from calib import cli
 from calib.errors import SessionError, UsageError
+from calib.procedure.session.results import position_errors
 from calib.rooms.over_time.log import log
-from calib.rooms.over_time.results import position_errors
 
 pytestmark = pytest.mark.slow
 

@@ -11,8 +11,8 @@ from calib.procedure.report.geometry_figures import error_histogram
 from calib.procedure.report.style import AFTER, BEFORE, BROWN, INK, QUIET
 from calib.procedure.session.folder import Session
 from calib.procedure.session.geometry_steps import chain_of
+from calib.procedure.session.results import position_errors, torque_error
 from calib.rooms.cells.summary import PICTURE
-from calib.rooms.over_time.results import position_errors, torque_error
 from calib.rooms.viewer import scene
 
 AZIMUTH, ELEVATION = np.deg2rad([-60.0, 20.0])  # from where the cell is seen

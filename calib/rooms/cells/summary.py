@@ -18,8 +18,8 @@ from calib.procedure.kinematic_stage.folder import URDF
 from calib.procedure.kinematic_stage.metrics import ValidationMetrics
 from calib.procedure.session.folder import SETTINGS, WAYS, Say, Session
 from calib.procedure.session.geometry_steps import chain_of
+from calib.procedure.session.results import position_errors, torque_error
 from calib.procedure.session.steps import steps_of
-from calib.rooms.over_time.results import position_errors, torque_error
 from calib.rooms.viewer import viewer
 
 PICTURE = "demo.png"

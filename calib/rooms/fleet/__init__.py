@@ -1,3 +1,3 @@
 """Fleets: many sessions side by side, one folder per robot."""
 
-OFFERS = {"commands": "commands:app", "cluster": "cluster:dask"}
+OFFERS = {"commands": "commands:app"}

@@ -23,10 +23,10 @@ def run(sessions: list[str], workers: str = "1", plots: bool = True) -> None:
     """
     import time
 
+    from calib.procedure.session.results import folders_of
     from calib.rooms.fleet import fleet as runs
     from calib.rooms.fleet import stores
     from calib.rooms.fleet.throughput import Throughput
-    from calib.rooms.over_time.results import folders_of
     from calib.workers import workers as opened
 
     folders, started, outcomes, pace = folders_of(sessions, stores.sessions), time.perf_counter(), [], Throughput()

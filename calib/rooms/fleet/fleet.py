@@ -17,11 +17,11 @@ from calib.errors import CalibError, TaskLost, complaint
 from calib.procedure.findings import LEVELS
 from calib.procedure.session.commands import COLOURS, go_on
 from calib.procedure.session.folder import SETTINGS, Say
+from calib.procedure.session.results import folders_of, position_errors, torque_error
 from calib.procedure.session.steps import DONE
 from calib.rooms.fleet import stores
 from calib.rooms.fleet.stores import LEASE
 from calib.rooms.fleet.throughput import Throughput
-from calib.rooms.over_time.results import folders_of, position_errors, torque_error
 from calib.workers import Workers
 from calib.workers import workers as opened
 

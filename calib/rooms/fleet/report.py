@@ -18,6 +18,7 @@ from calib.errors import Finding, RobotError, UsageError, finding, require
 from calib.geometry.fit import PLAUSIBLE
 from calib.procedure.findings import Verdict, lines_of, settle
 from calib.procedure.report.page import Block, Column, Section, Text, table
+from calib.procedure.session.results import folders_of
 from calib.records import plain
 from calib.rooms.fleet import prior
 from calib.rooms.fleet.prior import ParameterSpread
@@ -26,7 +27,6 @@ from calib.rooms.over_time.comparison.calibrations import Calibration, read_fit
 from calib.rooms.over_time.comparison.geometry_change import ToolMotion
 from calib.rooms.over_time.comparison.places import check_same_robot, place_of
 from calib.rooms.over_time.comparison.robot_change import RobotChange, diff
-from calib.rooms.over_time.results import folders_of
 from calib.units import small
 
 PAGE, PRIOR = "report.html", "prior"

@@ -14,13 +14,13 @@ from calib.errors import SessionError, UsageError, command_line, require
 from calib.folders import METRICS
 from calib.procedure.report.page import Column, Section, table
 from calib.procedure.session.folder import Session, open_session
+from calib.procedure.session.results import folders_of, position_errors, torque_error
 from calib.records import plain
 from calib.rooms.over_time import pages
 from calib.rooms.over_time.comparison.change_part import plus_minus
 from calib.rooms.over_time.comparison.change_test import ParameterChange
 from calib.rooms.over_time.comparison.geometry_change import GeometryChange
 from calib.rooms.over_time.comparison.robot_change import diff
-from calib.rooms.over_time.results import folders_of, position_errors, torque_error
 
 if TYPE_CHECKING:
     from calib.procedure.report.charts import Chart
