@@ -194,6 +194,11 @@ def _adapter(kind: Any) -> Any:
     return TypeAdapter(kind)
 
 
+def evenly(count: int, most: int) -> np.ndarray:
+    """Return rows (m,) of `count`, spread evenly from the first to the last: all, or `most` of them."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
+
+
 def frozen(values: ArrayLike, dtype: type = float) -> np.ndarray:
     """Return a read-only, C-contiguous copy of `values`."""
     array = np.array(values, dtype=dtype, order="C")

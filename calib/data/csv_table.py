@@ -244,6 +244,7 @@ def _comment_header(comment: str, separator: str, width: int, path: str | Path) 
 
 
 def split_units(cells: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return names and units of a header's cells: ``q1 [deg]`` is ``q1`` in ``deg``; "" without a unit."""
     names, units = [], []
     for i, cell in enumerate(map(plain_text, cells)):
         match = _HEADING.match(cell)

@@ -26,6 +26,7 @@ from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, layout, observe, prepare
 from calib.geometry.residuals import Part
 from calib.geometry.weighing import GeometricFit, Settings
+from calib.records import evenly
 from calib.robot.chain import element_length
 from calib.robot.kinematics import forward
 
@@ -208,7 +209,7 @@ def wrong_columns(nominal: Installation, blocks: Blocks, mirrored: bool = False)
         mirrored: whether an instrument with left-handed axes is tried, too.
     """
     n, max_rows = nominal.chain.n, 200  # rows of a block (our choice)
-    few = [take(block, np.unique(np.linspace(0, len(block) - 1, max_rows).astype(int))) for block in blocks]
+    few = [take(block, evenly(len(block), max_rows)) for block in blocks]
     surely = 1.0 / 3.0  # share of the error that may be left where no second change goes with it (our choice)
     table = [Change("joint-sign", _of_joints(reversal(n, j)), (j,), max_left=0.8) for j in range(n)]
     table += [

@@ -28,6 +28,7 @@ from calib.geometry.model_choice.cross_validation import project_out, term_group
 from calib.geometry.model_choice.folds import Folds, random_folds
 from calib.geometry.model_choice.ladder import MAX_RESIDUAL, ModelSelection
 from calib.geometry.observation import layout, observe, pose_sigmas, prepare
+from calib.records import evenly
 from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
@@ -177,7 +178,7 @@ def _distances(q: np.ndarray, learnt: np.ndarray, levers: np.ndarray) -> tuple[n
 
 def _joint_levers(chain: Chain, q: np.ndarray) -> np.ndarray:
     """Return how far the tip moves per unit of each joint (n,) [m/rad or 1], rms over poses."""
-    rows = q[np.unique(np.linspace(0, len(q) - 1, 50).astype(int))]
+    rows = q[evenly(len(q), 50)]
     result, step = np.zeros(chain.n), 1e-4
     for j in range(chain.n):
         move = np.zeros(chain.n)

@@ -28,6 +28,7 @@ from calib.data.poses.measurements import KINDS, PoseMeasurements, Poses, Positi
 from calib.errors import refuse_data
 from calib.extensions import needed
 from calib.geometry.installation import Installation, NoOptics
+from calib.records import evenly
 from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
@@ -132,7 +133,7 @@ def check_orientations(chain: Chain, block: PoseMeasurements) -> None:
         return
     rows = np.flatnonzero(block.tool == np.argmax(np.bincount(block.tool)))
     max_rows = 200  # how many are looked at; our choice
-    rows = rows[np.unique(np.linspace(0, len(rows) - 1, max_rows).astype(int))]
+    rows = rows[evenly(len(rows), max_rows)]
     arm, position, stated = forward(chain, block.q[rows]), block.position[rows], block.quaternion[rows]
     min_angle = 20.0  # median misfit [deg] from which on the file's orientations are not what they are said to be
     if len(rows) < 4 or (found := _misfit(arm, position, stated)[0]) <= min_angle:
@@ -202,7 +203,7 @@ def install(chain: Chain, measured: Sequence[PoseMeasurements], known: Deflectio
     stations: dict[str, np.ndarray] = {}
     tools: dict[str, np.ndarray] = {}
     for block in sorted(measured, key=lambda b: (b.placing, -_turning(chain, b), -len(b))):
-        block = take(block, np.unique(np.linspace(0, len(block) - 1, MAX_GUESS_ROWS).astype(int)))
+        block = take(block, evenly(len(block), MAX_GUESS_ROWS))
         arm = forward(chain, block.q)
         check_scale(block, chain)
         for number in np.unique(block.tool):
@@ -237,7 +238,7 @@ def check_scale(block: PoseMeasurements, chain: Chain) -> None:
     """
     if not isinstance(block, Positions) or len(block) < 3:
         return
-    block = take(block, np.unique(np.linspace(0, len(block) - 1, MAX_GUESS_ROWS).astype(int)))
+    block = take(block, evenly(len(block), MAX_GUESS_ROWS))
     (measured, second), (predicted, across) = _spread(block.position), _spread(forward(chain, block.q)[:, :3, 3])
     min_spread = 1e-3  # of predicted positions, from which they are held against the measured ones [m] (our choice)
     if predicted < min_spread:
@@ -284,7 +285,7 @@ def _likely_units(block: Positions, chain: Chain, measured: float, predicted: fl
 
 def _turning(chain: Chain, block: PoseMeasurements) -> float:
     """Return how much a block's poses rotate about their second principal axis, in steps of `TURN` [rad]."""
-    rows = np.unique(np.linspace(0, len(block) - 1, MAX_GUESS_ROWS).astype(int))
+    rows = evenly(len(block), MAX_GUESS_ROWS)
     if len(rows) < 3:
         return 0.0
     _, turns = chordal_turns(forward(chain, block.q[rows])[:, :3, :3])

@@ -35,6 +35,7 @@ from calib.identification import time_folds
 from calib.identification.identify import Identification, common_decimator
 from calib.identification.prediction import Dynamics, IntervalCoverage
 from calib.identification.rows import Case, pool, segmented_states, triangulate
+from calib.records import evenly
 from trajectories.timing.profile import Sampled
 
 BLOCK = 4000
@@ -258,7 +259,7 @@ def intervals(errors: TorqueErrorModel, dynamics: Dynamics, case: Case, predicte
     """Return a model's 95 % error bounds on a recording, and which errors of `predicted` (N, rows) lie within them."""
     motion = case.motion
     max_samples = 5000  # samples of a recording that intervals are evaluated at
-    index = np.unique(np.linspace(0, len(motion) - 1, min(len(motion), max_samples)).astype(int))
+    index = evenly(len(motion), max_samples)
     q, v, a = (np.asarray(x[index]) for x in (motion.q, motion.v, motion.a))
     states = segmented_states(dynamics.model.columns, case)[:, index]
     sigma = errors.sigma(dynamics, q, v, a, case.carried, states)

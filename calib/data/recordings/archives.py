@@ -36,7 +36,7 @@ from calib.data.recordings.recording_options import (
 from calib.data.schema import Joints
 from calib.errors import MeasurementError, refuse_data, refused_as, require
 
-MAX_MEMBERS, MAX_BYTES = 1000, 80_000_000_000  # of an archive, and of a member (our choices)
+MAX_MEMBERS, MAX_BYTES = 1000, 8_000_000_000  # of an archive, and of a member (our choices)
 TOGETHER = 1 << 16  # rows read at a time
 
 

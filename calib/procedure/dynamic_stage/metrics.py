@@ -27,7 +27,7 @@ from calib.identification.rows import Case
 from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.identify import Assessment, IdentificationOutcome, ModelFindings
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
-from calib.records import Array, Number, Unbounded
+from calib.records import Array, Number, Unbounded, evenly
 from calib.units import TORQUE
 
 SCHEMA, UNSEEN_SCHEMA = 3, 2  # of metrics.json, and of unseen/report.json
@@ -215,7 +215,7 @@ class TorqueCurves:
     def of(cls, case: Case, predicted: np.ndarray) -> TorqueCurves:
         """Return the curves of a case and its prediction (N, rows)."""
         motion, measured = case.motion, np.asarray(case.target)
-        picked = np.unique(np.linspace(0, len(measured) - 1, MAX_POINTS).astype(int))
+        picked = evenly(len(measured), MAX_POINTS)
         low, other = (_five_digits(motion.in_band(one)[picked].T) for one in (measured, predicted))
         sigma = relative_error_sigma(measured[picked].T, predicted[picked].T)
         return cls(case.name, np.round(motion.t[picked], 4), low, other, motion.band, sigma)

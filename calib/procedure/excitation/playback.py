@@ -12,6 +12,7 @@ from calib.errors import UsageError, require
 from calib.procedure.excitation.inputs import ExcitationInputs, ExcitedModel
 from calib.procedure.excitation.limits import DEFAULT_RISE, MotionLimits
 from calib.procedure.excitation.settings import ExcitationSettings
+from calib.records import evenly
 from calib.robot.chain import Chain
 from trajectories.approach import straight_approach
 from trajectories.basis import Family, SampledMotion
@@ -107,7 +108,7 @@ def approach_to(
         for order, factor in ((2, APPROACH_RISE), (3, APPROACH_JERK))
     )
     found = straight_approach(here, goal, velocity, acceleration, jerk, rate)
-    rows = np.unique(np.linspace(0, len(found) - 1, 500).astype(int))
+    rows = evenly(len(found), 500)
     parts = (found.times, found.q, found.v, found.a, np.zeros(found.q.shape))
     notes = []
     for limit, broken, k in known.broken(SampledMotion(*(x[rows] for x in parts))):

@@ -20,6 +20,7 @@ from calib.geometry.observation import sampled
 from calib.geometry.weighing import GeometricFit
 from calib.procedure.findings import level_of, limit
 from calib.procedure.kinematic_stage.metrics import Outlier
+from calib.records import evenly
 from calib.units import ERRORS
 
 FLOOR = 4e-4  # rms per metre of reach: more is not left by a rigid geometry of a sound arm (our choice)
@@ -122,7 +123,7 @@ def _as_positions(block: PoseMeasurements) -> PoseMeasurements:
     """Return the block; images are replaced by board poses, scaled by the board's square."""
     if block.kind != IMAGES:
         return block
-    rows = np.unique(np.linspace(0, len(block) - 1, MAX_IMAGES).astype(int))
+    rows = evenly(len(block), MAX_IMAGES)
     return needed("camera_guess").pnp_poses(take(block, rows))
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.errors import CalibError, counted, refuse_data
+from calib.records import evenly
 from calib.rooms.camera.board import Board, corners
 from calib.rooms.camera.lens import Lens, rays
 from calib.transforms import orthonormal, pose
@@ -162,7 +163,7 @@ def estimate_lens(
             "(15 for a good one): take more, or give the lens (camera.yaml)",
         )
     max_images = 30  # images that a first lens is found from (our choice)
-    good = good[np.unique(np.linspace(0, len(good) - 1, max_images).astype(int))]
+    good = good[evenly(len(good), max_images)]
     own = pixel[good]
     found, rms, matrix = _fitted(board, own, size, model)
     if rms > BENT and model == "pinhole" and (other := _fitted(board, own, size, "fisheye")[1]) < BENT * rms:

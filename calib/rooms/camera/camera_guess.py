@@ -14,6 +14,7 @@ from calib.data.poses import IN_HAND, TO_HAND
 from calib.data.poses.measurements import PoseMeasurements, Poses, take
 from calib.errors import MeasurementError, counted, listing, refuse_data
 from calib.geometry.first_guess import average_pose, guess, misfit
+from calib.records import evenly
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 from calib.rooms.camera import pixel_residuals  # noqa: F401  # registers what images say of the geometry
@@ -180,7 +181,7 @@ def place_camera(block: Pixels, arm: np.ndarray) -> CameraPlacement:
         MeasurementError: where images and joints do not belong together.
     """
     max_images = 100  # images that it is placed by (our choice)
-    rows = np.unique(np.linspace(0, len(block) - 1, max_images).astype(int))
+    rows = evenly(len(block), max_images)
     found = board_poses(_lens_of(block), block.board, block.pixel[rows])
     good = np.flatnonzero(np.isfinite(found.rms))
     min_images = 3  # images that place a camera at all

@@ -26,6 +26,7 @@ from calib.geometry.model_choice.cross_validation import term_sizes
 from calib.geometry.model_choice.ladder import EFFECTS
 from calib.geometry.observability import base_columns
 from calib.geometry.observation import layout, observe, parameter_values, prepare, step
+from calib.records import evenly
 from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
@@ -97,7 +98,7 @@ class Run:
         after = np.clip(np.searchsorted(log.t, t), 1, len(log.t) - 1)
         near = log.t[after] - log.t[after - 1] <= log.gap
         rows = np.flatnonzero(near & (t >= log.t[0]) & (t <= log.t[-1]))
-        return rows[np.linspace(0, len(rows) - 1, most).astype(int)] if most and len(rows) > most else rows
+        return rows[evenly(len(rows), most)] if most else rows
 
     def lines(self) -> list[str]:
         """Return what is to be said of both files."""

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.data.csv_table import Table, opened, plain_rows, split_units
+from calib.data.signals.resampling import GAP
 from calib.errors import MeasurementError, counted, listing, refuse_data, refused_as, require
 from calib.rooms.instruments.joined import CLOCKS, column_of
 from calib.units import TIMES
@@ -25,7 +26,6 @@ PIECE = 50_000  # rows read at once (our choice)
 HELD = 500_000  # rows held, at most: beyond them every second one (our choice)
 SLOWEST = 0.2  # time between two rows of a stream, at most [s] (our choice)
 MIN_ROWS = 200  # of a stream (our choice)
-BRIDGED = 0.05  # the longest time without a row that is no gap [s], or five rows (our choice)
 DAMAGED, LATE = "damaged, empty or not seen", "with a time not after the row before"
 
 
@@ -54,7 +54,7 @@ class Stream:
     @property
     def gap(self) -> float:
         """Time between two rows from which on nothing is known between them [s]."""
-        return max(BRIDGED, 5.0 * self.step)
+        return max(GAP, 5.0 * self.step)
 
     def lines(self) -> list[str]:
         """Return what is to be said of the file's rows."""

@@ -27,6 +27,7 @@ from calib.estimation.whiteness import autocorrelation, inflation
 from calib.geometry.installation import Installation
 from calib.procedure.findings import lines_of
 from calib.procedure.robot_kinds import joints_of
+from calib.records import evenly
 from calib.robot.chain import Chain, joint_kinds
 from calib.rooms.instruments.clocks import Clock, Run, begin, fitted, residuals
 from calib.rooms.instruments.joined import Joined
@@ -95,7 +96,7 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
     if len(rows) < MIN_ROWS:
         words = "too few rows are independent: did a clock jump, or instrument or target move? Else measure for longer"
         refuse_data(file, f"{words}, over more of the workspace ({'; '.join([*run.lines(), *lines_of([thinned])])})")
-    few = rows[np.linspace(0, len(rows) - 1, min(FITTED, len(rows))).astype(int)]
+    few = rows[evenly(len(rows), FITTED)]
     _, clock = fitted(cell, run, few, clock, loss="none")
     late = clock.sigma * float(np.sqrt(np.mean(np.sum(velocity**2, axis=0))))
     words = (
