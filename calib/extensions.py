@@ -36,8 +36,8 @@ A room is a package of `calib.rooms` with a table ``OFFERS``: what it adds, and 
     image_words            what is said of images as they arrive
     recordings             functions: a session's folder → the name of the recording written there
     steps, endings         of a session: steps after the export; functions: a complete session → lines to print
-    fit_pages, model_pages functions that write the certificate of a fit (report, figures, folder) and of an
-                           identification (outcome, folder, whether with figures) into its folder
+    fit_pages, model_pages functions that write the certificate of a fit and of an identification into its folder
+                           (report, figures by name, folder)
     check_controller       function: controller's name, number of joints; raises where it takes no such arm
     write_program          function: CSV of poses, path, controller's name → files of its program
     joint_origins          function: texts of a nominal and a calibrated URDF, their name → YAML for tesseract

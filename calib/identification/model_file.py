@@ -34,10 +34,11 @@ findings behind them, ``noticed`` (code, values; `calib explain CODE`), ``verdic
 rows per second), ``seed``, ``schema`` (3; files without one are of earlier versions and are
 read, too). No number: null.
 
-Figures: ``plot_torque_N.png`` of every file in the order given, training first (measured, predicted, residual,
-low-passed to the identification band);
-``plot_residuals.png`` (autocorrelation; dashed: white noise), ``plot_friction.png`` (over velocity), and, where the
-geometry's uncertainty is known, what it adds to sigma.
+Figures: those of the report, as ``plot_torque_N.png`` of every unseen recording in the order given, of those to learn
+from where none is unseen (measured, predicted, residual, low-passed to the identification band), ``plot_errors.png``,
+``plot_residuals.png`` (autocorrelation; dashed: white noise), ``plot_significance.png``, and, where the geometry's
+uncertainty is known, what it adds to sigma; ``plot_friction.png`` (over velocity). Recordings to learn from are drawn
+by ``model.plot("torque_N")``, where N counts on after the unseen ones.
 """
 
 import json

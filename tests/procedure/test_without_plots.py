@@ -5,7 +5,7 @@ from pathlib import Path
 import planted_motion as planted
 import pytest
 
-from calib.procedure.report import style
+from calib.procedure.report import charts, style
 from calib.robot import description
 
 
@@ -55,11 +55,17 @@ def test_ctrl_c_while_figures_are_drawn_leaves_nothing_half_made(cell, calib, mo
     assert calib(*arguments)[0] == 0 and "plot_position.png" in names(cell.folder / "o")
 
 
-def test_an_identification_without_plots(tmp_path, calib, monkeypatch):
+def test_an_identification_draws_each_figure_once_and_none_without_plots(tmp_path, calib, monkeypatch):
     import numpy as np
 
     monkeypatch.chdir(tmp_path)
     description.write(tmp_path / "robot.toml", planted.arm())
     np.savez(tmp_path / "train.npz", **planted.series(0))
-    code, _, _ = calib("identify", "robot.toml", "train.npz", "--friction", "standard", "--out", "o", "--no-plots")
-    assert code == 0 and not [name for name in names(tmp_path / "o") if name.endswith(".png")]
+    arguments = ("identify", "robot.toml", "train.npz", "--friction", "standard", "--out", "o")
+    drawn, figure = [], charts.figure
+    monkeypatch.setattr(charts, "figure", lambda chart: drawn.append(chart) or figure(chart))
+    assert calib(*arguments)[0] == 0
+    files = [name for name in names(tmp_path / "o") if name.endswith(".png")]
+    assert len(drawn) == len(files) + 1 >= 5, "each is drawn once for its file and the report, and one for print"
+    assert calib(*arguments, "--no-plots")[0] == 0 and len(drawn) == len(files) + 1
+    assert not [name for name in names(tmp_path / "o") if name.endswith(".png")]

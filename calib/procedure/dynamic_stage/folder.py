@@ -34,7 +34,8 @@ OURS = (
     folders.METRICS, "drive_gains.csv", folders.REPORT, *folders.PAGES,
     "torques_1.csv", calibrated.COVARIANCE, geometry_tables.EFFECTS, geometry_tables.SENSITIVITY,
     geometry_tables.GEOMETRIES, geometry_tables.TORQUE_COVARIANCE, "plot_torque_[0-9]*.png",
-    *(f"plot_{name}.png" for name in ("residuals", "friction", "geometries", "geometry_effects")),
+    *(f"plot_{name}.png" for name in ("errors", "residuals", "friction", "significance")),
+    *(f"plot_{name}.png" for name in ("geometries", "geometry_effects")),
 )  # fmt: skip
 """Files of an earlier identification that a new one replaces."""
 TORQUE_RATE = 100.0  # of torques_1.csv [Hz]

@@ -233,6 +233,9 @@ class Chart:
     shared: str = ""
 
 
+Captioned = tuple[Chart, str]  # with what it shows, in a sentence
+
+
 def figure(chart: Chart) -> Figure:
     """Return the matplotlib figure of a chart, without a window."""
     with style.styled(quiet_titles=bool(chart.title)):
@@ -261,6 +264,11 @@ def figures(charts: Mapping[str, Chart]) -> dict[str, Figure]:
 def picture(chart: Chart, caption: str) -> Picture:
     """Return a chart with a caption as a picture for a page, from the cache if it was drawn before."""
     return Picture(_drawn(pickle.dumps(chart)), caption, chart.width > style.HALF_WIDTH, chart)
+
+
+def pictures(charts: Mapping[str, Captioned]) -> dict[str, Picture]:
+    """Return charts with their captions as pictures, by name."""
+    return {name: picture(*one) for name, one in charts.items()}
 
 
 def vector(chart: Chart, caption: str) -> Picture:

@@ -2,65 +2,69 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
-from calib import files
 from calib.dynamics.shapes import Joined
 from calib.estimation.whiteness import Whiteness
-from calib.identification.rows import Case
-from calib.procedure.dynamic_stage.geometry_tables import EFFECTS, GEOMETRIES, MIN_SHIFT, GeometricEffect, TwoGeometries
+from calib.procedure.dynamic_stage.geometry_tables import GEOMETRIES, MIN_SHIFT, GeometricEffect, TwoGeometries
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
-from calib.procedure.dynamic_stage.metrics import UnseenReport
-from calib.procedure.excitation import coefficients
-from calib.procedure.report.charts import Chart, Panel, bars, level, line, picture, save_all, text
-from calib.procedure.report.dynamics_section import DynamicReport, percent, proof_of
-from calib.procedure.report.page import Picture, Pictures
+from calib.procedure.dynamic_stage.metrics import TorqueCurves, UnseenReport
+from calib.procedure.report.charts import Captioned, Chart, Panel, bars, level, line, pictures, save_all, text
+from calib.procedure.report.dynamics_section import DynamicReport, IdentifiedParameter, percent, proof_of
+from calib.procedure.report.page import Picture
 from calib.procedure.report.style import AFTER, BEFORE, HALF_WIDTH, MARK, PAGE_WIDTH, QUIET, thinned
 from calib.procedure.robot_kinds import Mechanism
 from calib.records import read_rows
-from calib.robot.chain import Joint
 from calib.units import small
 
 MAX_HALF_PAGE_ROWS = 8  # torque rows whose figures fit half a page
 MAX_ELEMENTS = 15  # elements in the ranked figure
 MAX_LABELS = 40  # parameters along an axis: more cannot be read on A4
-T = TypeVar("T")
 
 
-def write(outcome: IdentificationOutcome, folder: Path) -> None:
-    """Write ``plot_torque_<n>.png`` of every file, ``plot_residuals.png``, ``plot_friction.png`` and more."""
-    save_all(figures(outcome), folder)
-    for name, drawn in from_folder(folder).items():
-        files.write(folder / f"plot_{name}.png", drawn.image)
+def captioned(found: DynamicReport, folder: Path | None = None) -> dict[str, Captioned]:
+    """Return the charts of an identification's report with captions, by name; charts without data are omitted.
+
+    Args:
+        folder: of the identification, for its comparison with the nominal geometry.
+    """
+    unseen = found.unseen
+    result = _errors(unseen) | {
+        f"torque_{number}": recorded(curves, unseen) for number, curves in enumerate(unseen.curves, 1)
+    }
+    result |= _of_geometry(found.effects, folder / GEOMETRIES if folder else None)
+    if known := [row for row in found.estimate if row.sigma]:
+        result["significance"] = _significance(known)
+    return result
+
+
+def write(outcome: IdentificationOutcome, found: DynamicReport, folder: Path) -> dict[str, Picture]:
+    """Write ``plot_<name>.png`` of all a report shows and of friction; return the report's pictures by name."""
+    shown = captioned(found, folder)
+    friction = {} if isinstance(outcome.inputs.robot, Mechanism) else {"friction": _friction(outcome)}
+    save_all({name: chart for name, (chart, _) in shown.items()} | friction, folder)
+    return pictures(shown)
 
 
 def figures(outcome: IdentificationOutcome) -> dict[str, Chart]:
-    """Return the figures of an identification by name: torques of every file, residuals, friction."""
-    cases = enumerate((*outcome.inputs.cases, *outcome.inputs.unseen), start=1)
-    drawn = {f"torque_{number}": file_torques(case, outcome.predictions[case.name], outcome) for number, case in cases}
-    drawn |= {"residuals": _autocorrelations(outcome)}
+    """Return the charts of an identification by name: torques of every recording, residuals, friction."""
+    report = UnseenReport.of(outcome.inputs, outcome)
+    cases = (*outcome.inputs.unseen, *outcome.inputs.cases)
+    curves = (TorqueCurves.of(case, outcome.predictions[case.name]) for case in cases)
+    drawn = {f"torque_{number}": recorded(one, report)[0] for number, one in enumerate(curves, 1)}
+    drawn |= {name: chart for name, (chart, _) in _errors(report).items()}
     return drawn if isinstance(outcome.inputs.robot, Mechanism) else drawn | {"friction": _friction(outcome)}
 
 
-def file_torques(case: Case, predicted: np.ndarray, outcome: IdentificationOutcome) -> Chart:
-    """Return the chart of one file's torques, measured and predicted (N, rows)."""
-    kind = "fitted" if case.name in outcome.fit else "repeat" if case.name in outcome.repeated else "unseen"
-    found = {**outcome.fit, **outcome.validation}[case.name].raw
-    title = f"{case.name} ({kind}): {found.total:.3g} % of the torque unexplained"
-    labels, units = _rows(outcome), outcome.inputs.row_units
-    motion = case.motion
-    measured, predicted = (motion.in_band(np.asarray(one)) for one in (case.target, predicted))
-    return torques(motion.t, measured, predicted, labels, units, title, found.joints, motion.band)
-
-
-def _autocorrelations(outcome: IdentificationOutcome) -> Chart:
-    """Return the autocorrelations of residuals low-passed to the identification band, for the file of the verdict."""
-    name = next(iter(outcome.validation or outcome.fit))
-    found = {**outcome.fit, **outcome.validation}[name]
-    title = f"{name}: autocorrelation of the residuals at {found.rate:.3g} Hz, dashed: limits for white noise"
-    return autocorrelations(found.whiteness, _rows(outcome), title)
+def recorded(curves: TorqueCurves, report: UnseenReport) -> Captioned:
+    """Return the chart of one recording's torques, measured and predicted."""
+    raw = {**report.fit, **report.validation}[curves.name].raw
+    seen = "fitted" if curves.name in report.fit else "unseen" if curves.name in report.proofs else "repeat"
+    title = f"{curves.name} ({seen}): {percent(raw.total)} unexplained"
+    sides = curves.measured.T, curves.predicted.T
+    chart = torques(curves.t, *sides, report.rows, report.units, title, raw.joints, curves.band)
+    return chart, f"Torques on {curves.name}, {seen}: measured, predicted, and the residual."
 
 
 def _friction(outcome: IdentificationOutcome) -> Chart:
@@ -88,11 +92,6 @@ def _friction(outcome: IdentificationOutcome) -> Chart:
         panels.append(Panel([cloud, line(grid, curve, width=1.2, label="model")], joint.name, speed, words))
     title = f"friction over velocity on {case.name}"
     return Chart(panels, 0.5 + 1.55 * -(-len(joints) // columns), columns, title=title)
-
-
-def _rows(outcome: IdentificationOutcome) -> tuple[str, ...]:
-    """Return the names of the torque rows."""
-    return outcome.found.settings.torque_rows.titles(outcome.inputs.chain.joint_names)
 
 
 def torques(
@@ -148,28 +147,25 @@ def autocorrelations(
     return Chart(panels or [Panel([])], height, columns, width, title, shared="xy")
 
 
-def from_folder(folder: Path) -> dict[str, Picture]:
-    """Return the figures on the geometry's effect on the dynamics, by name, from an identification's folder."""
-    result: dict[str, Picture] = {}
-    rows = [
-        row for row in _read(TwoGeometries, folder / GEOMETRIES) if row.essential == "yes" and row.calibrated != 0.0
-    ]
-    if rows:
+def _of_geometry(effects: Sequence[GeometricEffect], compared: Path | None) -> dict[str, Captioned]:
+    """Return the charts on the geometry's effect on the dynamics, by name."""
+    result: dict[str, Captioned] = {}
+    rows = read_rows(TwoGeometries, compared) if compared and compared.is_file() else ()
+    if rows := [row for row in rows if row.essential == "yes" and row.calibrated != 0.0]:
         words = (
             "Essential parameters identified from the same torques on the nominal (CAD) and on the calibrated geometry "
             "(as Fig. 7 of Kolyubin et al. 2019). Above: relative to the calibrated one, bars two sigmas (nominal: "
             "of torque noise; calibrated: with the geometry's uncertainty). Below: difference of the two, "
             "in sigmas of the calibrated one."
         )
-        result["geometries"] = picture(_geometries(rows), words)
-    known = [row for row in _read(GeometricEffect, folder / EFFECTS) if row.sigma is not None]
-    if known:
+        result["geometries"] = _geometries(rows), words
+    if known := [row for row in effects if row.sigma is not None]:
         words = (
             "Effect of geometric errors on the dynamics: largest parameter shift caused by one standard deviation of "
             "each error, in that parameter's sigma from torque noise. Below the dashed line no sigma grows by more "
             "than 1 %."
         )
-        result["geometry_effects"] = picture(_effects(known[:MAX_ELEMENTS]), words)
+        result["geometry_effects"] = _effects(known[:MAX_ELEMENTS]), words
     return result
 
 
@@ -210,37 +206,8 @@ def _effects(rows: Sequence[GeometricEffect]) -> Chart:
     return Chart([panel], 0.7 + 0.19 * len(rows), width=HALF_WIDTH)
 
 
-def _read(kind: type[T], path: Path) -> tuple[T, ...]:
-    return read_rows(kind, path) if path.is_file() else ()
-
-
-def draw_dynamics(
-    found: DynamicReport, folder: Path, excitation: Path | None, joints: Sequence[Joint]
-) -> dict[str, Pictures]:
-    """Return the pictures of the dynamics for a page, by name; empty lists if data are missing.
-
-    Args:
-        folder: of the identification.
-        excitation: folder with ``training/trajectory.csv`` and its ``metrics.json``; None where other motions
-            were played.
-        joints: of the robot.
-    """
-    motions = []
-    if excitation is not None and (excitation / "training" / coefficients.NAME).exists():
-        from calib.procedure.report.motion_figures import trained_on
-
-        motions = [trained_on(excitation / "training", joints)]
-    return {
-        "errors": Pictures("", _judged(found.unseen)),
-        "torques": Pictures("Torques", _torques(found.unseen)),
-        "excitation": Pictures("Excitation", motions),
-        "geometry": Pictures("", list(from_folder(folder).values())),
-        "parameters": Pictures("Dynamic parameters", [_significance(found)]),
-    }
-
-
-def _judged(unseen: UnseenReport) -> list[Picture]:
-    """Return the pictures of each row's error [%] and of the autocorrelations, for the recording that decides."""
+def _errors(unseen: UnseenReport) -> dict[str, Captioned]:
+    """Return the charts of each row's error [%] and of the autocorrelations, for the recording that decides."""
     _, proof, where = proof_of(unseen)
     fitted, left = (np.nan_to_num(one.raw.joints) for one in (next(iter(unseen.fit.values())), proof))
     shown = [
@@ -252,28 +219,14 @@ def _judged(unseen: UnseenReport) -> list[Picture]:
     width = PAGE_WIDTH if len(unseen.rows) > MAX_HALF_PAGE_ROWS else HALF_WIDTH
     errors = Chart([panel], 0.8 + 0.21 * len(unseen.rows), width=width, title=title)
     name, looked = next(iter((unseen.validation or unseen.fit).items()))
-    drawn = autocorrelations(looked.whiteness, unseen.rows, "Residuals", width)
+    residuals = autocorrelations(looked.whiteness, unseen.rows, "Residuals", width)
     shares = f"Unexplained share of each torque, on the training motion and on {where}."
     rest = f"Autocorrelation of residuals, low-passed to the identification band, {name}; dashed: white noise limits."
-    return [picture(errors, shares), picture(drawn, rest)]
+    return {"errors": (errors, shares), "residuals": (residuals, rest)}
 
 
-def _torques(unseen: UnseenReport) -> list[Picture]:
-    """Return the pictures of measured and predicted torques of unseen (otherwise of fitted) recordings."""
-    seen = "unseen" if unseen.validation else "fitted"
-    result = []
-    for curves in unseen.curves:
-        raw = {**unseen.fit, **unseen.validation}[curves.name].raw
-        sides = curves.measured.T, curves.predicted.T
-        title = f"{curves.name}: {percent(raw.total)} of the torque unexplained"
-        chart = torques(curves.t, *sides, unseen.rows, unseen.units, title, raw.joints, curves.band)
-        result.append(picture(chart, f"Torques on {curves.name}, {seen}: measured, predicted, and the residual."))
-    return result
-
-
-def _significance(found: DynamicReport) -> Picture:
-    """Return the picture of each parameter's distance from zero in sigmas; values below two are not significant."""
-    known = [row for row in found.estimate if row.sigma]
+def _significance(known: Sequence[IdentifiedParameter]) -> Captioned:
+    """Return the chart of each parameter's distance from zero in sigmas; values below two are not significant."""
     share = np.array([max(abs(row.value) / max(row.sigma or 0.0, 1e-300), 0.1) for row in known])
     title = f"{int((share > 2).sum())} of {len(known)} parameters differ from zero by two sigmas"
     chosen = np.sort(np.argsort(share, kind="stable")[:MAX_LABELS])
@@ -282,4 +235,4 @@ def _significance(found: DynamicReport) -> Picture:
     shown = bars(share, [AFTER if one > 2 else QUIET for one in share], upright=True, base=0.1)
     limits = 0.1, 2.0 * float(share.max(initial=2.0))
     chart = Chart([Panel([shown, level(2.0)], title, which, "|value| / σ", ylim=limits, log="y", xnames=names)], 2.3)
-    return picture(chart, "Distance of each parameter from zero, in its σ; grey: not significant.")
+    return chart, "Distance of each parameter from zero, in its σ; grey: not significant."

@@ -130,37 +130,42 @@ def read_lines(inputs: IdentificationInputs) -> list[str]:
     return [*lines, *(f"  {note}".replace(":: ", ": ") for note in inputs.notes)]
 
 
+def of_outcome(outcome: IdentificationOutcome) -> DynamicReport:
+    """Return the report of an identification without its parameters."""
+    effects = () if outcome.carried is None else geometry_tables.effects(outcome.carried)
+    return DynamicReport(record_of(outcome), (), tuple(effects), UnseenReport.of(outcome.inputs, outcome))
+
+
 def outcome_section(outcome: IdentificationOutcome) -> page.Section:
     """Return the console's section on an identification: that of its report, without figures and parameters."""
-    effects = () if outcome.carried is None else geometry_tables.effects(outcome.carried)
-    return report_section(
-        DynamicReport(record_of(outcome), (), tuple(effects), UnseenReport.of(outcome.inputs, outcome)), {}
-    )
+    return report_section(of_outcome(outcome), {})
 
 
 def report_section(
-    found: DynamicReport, drawn: Mapping[str, page.Pictures], exported: Sequence[str] = (), tolerance: float = 0.0,
+    found: DynamicReport, drawn: Mapping[str, page.Picture], exported: Sequence[str] = (), tolerance: float = 0.0,
     delivered: float | None = None,
 ) -> page.Section:  # fmt: skip
     """Return the section of a report: errors on unseen motion, torques, excitation, and parameters.
 
     Args:
-        drawn: figures by name (`draw_dynamics`); those that are not there are left out.
+        drawn: figures by name (`dynamics_figures.captioned`); those that are not there are left out.
         exported: what the export had to say.
         tolerance: largest error of the torque on unseen motion that is good enough [%]; 0: none.
         delivered: error of the exported robot there [%]; None where it is not known.
     """
     metrics, unseen = found.metrics, found.unseen
-    pictures = lambda name: [drawn[name]] if name in drawn else []  # noqa: E731
     blocks: list[page.Block] = [_error_table(unseen), _interval_table(unseen)]
-    blocks += [*pictures("errors"), *pictures("torques"), *pictures("excitation")]
+    recorded = [name for name in drawn if name.startswith("torque_")]
+    blocks += [page.pictures("", drawn, ("errors", "residuals")), page.pictures("Torques", drawn, recorded)]
+    blocks.append(page.pictures("Excitation", drawn, ("excitation",)))
     if len(metrics.ladder) > 1:
         blocks.append(_friction_table(metrics))
     blocks.append(page.Text("The model", _model_sentences(metrics)))
     blocks.append(page.Text("What the motion identifies", _identifiability(found)))
-    blocks += [*_geometry_blocks(metrics, found.effects), *pictures("geometry")]
+    blocks += [*_geometry_blocks(metrics, found.effects), page.pictures("", drawn, ("geometries", "geometry_effects"))]
     note = "R marks parameters that include others by regrouping; complete table: 8-dynamics/estimate.csv."
-    blocks += [*pictures("parameters"), page.table("Identified parameters", PARAMETERS, found.estimate, note)]
+    blocks.append(page.pictures("Dynamic parameters", drawn, ("significance",)))
+    blocks.append(page.table("Identified parameters", PARAMETERS, found.estimate, note))
     if metrics.loop:
         blocks.append(page.Text("Closed loop", _loop_sentences(metrics.loop)))
     blocks += tracking_blocks(unseen.tracking, unseen.tracking_failure)

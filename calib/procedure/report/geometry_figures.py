@@ -8,9 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from calib.geometry.model_choice.ladder import ModelStep
-from calib.procedure.report.charts import Chart, Panel, bars, dots, heat, histogram, level, line, picture, text
+from calib.procedure.report.charts import Captioned, Chart, Panel, bars, dots, heat, histogram, level, line, text
 from calib.procedure.report.fit_report import FittedParameter, Report
-from calib.procedure.report.page import Picture
 from calib.procedure.report.style import AFTER, BEFORE, BROWN, HALF_WIDTH, INK, MARK, PAGE_WIDTH, number
 from calib.units import ERRORS
 
@@ -249,14 +248,6 @@ def outlook_figure(others: Curve, own: tuple[float, float], along: str, across: 
         (0.7 * low[1], 1.4 * high[1]), log="xy", grid="both",
     )  # fmt: skip
     return Chart([panel], 2.4, width=HALF_WIDTH)
-
-
-Captioned = tuple[Chart, str]  # with what it shows, in a sentence
-
-
-def draw(report: Report) -> dict[str, Picture]:
-    """Return the pictures of a report, by name."""
-    return {name: picture(*found) for name, found in captioned(report).items()}
 
 
 def captioned(report: Report) -> dict[str, Captioned]:

@@ -89,17 +89,17 @@ def report_section(report: Report, drawn: Mapping[str, page.Picture]) -> page.Se
     """Return the section of a report: errors, ladder, parameters, identifiability, figures, outliers.
 
     Args:
-        drawn: figures by name (`geometry_figures.draw`); those that are not there are left out.
+        drawn: figures by name (`geometry_figures.captioned`); those that are not there are left out.
     """
     metrics = report.metrics
     blocks: list[page.Block] = [error_table(_sets(metrics), metrics.deliverable), *iso9283_tables(metrics)]
-    blocks.append(_pictures("Before and after", drawn, ("position", "orientation", "distance")))
-    blocks.append(_pictures("What remains", drawn, ("joints", "map")))
-    blocks.append(_pictures("Image coverage", drawn, [name for name in drawn if name.startswith("coverage")]))
+    blocks.append(page.pictures("Before and after", drawn, ("position", "orientation", "distance")))
+    blocks.append(page.pictures("What remains", drawn, ("joints", "map")))
+    blocks.append(page.pictures("Image coverage", drawn, [name for name in drawn if name.startswith("coverage")]))
     if any(step.cross_validated_mm is not None for step in metrics.ladder):
-        blocks += [_ladder_table(metrics), _pictures("", drawn, ("ladder",))]
+        blocks += [_ladder_table(metrics), page.pictures("", drawn, ("ladder",))]
     blocks.append(page.Text("Identifiability", _identifiability(report)))
-    blocks.append(_pictures("Parameters", drawn, ("parameters", "singular_values", "correlations")))
+    blocks.append(page.pictures("Parameters", drawn, ("parameters", "singular_values", "correlations")))
     blocks.append(_parameter_table(report))
     if metrics.outliers:
         note = "Rows beyond 4 robust sigmas. The fit includes these rows; a robust loss reduces their weight."
@@ -288,10 +288,6 @@ def _identifiability(report: Report) -> list[str]:
     else:
         lines.append("No two parameters correlate by more than 0.9.")
     return lines
-
-
-def _pictures(title: str, drawn: Mapping[str, page.Picture], names: Sequence[str]) -> page.Pictures:
-    return page.Pictures(title, [drawn[name] for name in names if name in drawn])
 
 
 def _repeated_sentences(metrics: FitMetrics) -> list[str]:

@@ -10,9 +10,8 @@ import numpy as np
 
 from calib.folders import METRICS
 from calib.procedure.excitation import coefficients
-from calib.procedure.report.charts import Chart, Panel, level, line, picture, save_all, text
+from calib.procedure.report.charts import Captioned, Chart, Panel, level, line, save_all, text
 from calib.procedure.report.geometry_figures import outlook_figure
-from calib.procedure.report.page import Picture
 from calib.procedure.report.style import AFTER, BEFORE, HALF_WIDTH, MARK, QUIET
 from calib.records import read_json
 from calib.robot.chain import Chain, Joint
@@ -173,8 +172,8 @@ def _profile_figure(planned: Planned) -> Chart:
     return Chart(panels, 3.8, title=f"{start:.3g} s, close to a limit for {planned.active_share:.0%} of the time")
 
 
-def trained_on(folder: Path, joints: Sequence[Joint]) -> Picture:
-    """Return the picture of a designed motion from its folder, with its condition number in the caption."""
+def trained_on(folder: Path, joints: Sequence[Joint]) -> Captioned:
+    """Return the chart of a designed motion from its folder, with its condition number in the caption."""
     from calib.procedure.excitation.design import DesignMetrics
 
     motion = coefficients.read(folder)
@@ -189,4 +188,4 @@ def trained_on(folder: Path, joints: Sequence[Joint]) -> Picture:
         f"instants; smallest margins: {margins}."
     )
     none = np.full(q.shape[1], np.inf)
-    return picture(_motion_sheet(t, [(q, -none, none), (v, -none, none)], joints), words)
+    return _motion_sheet(t, [(q, -none, none), (v, -none, none)], joints), words

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from calib import files
 from calib.extensions import offered
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.folder import FitFolder
@@ -23,20 +22,28 @@ def write_fit(outcome: Outcome, folder: Path, plots: bool = True, pages: bool = 
     fit_report.write(report, FitFolder(folder).report)
     drawn: Mapping[str, Picture] = {}
     if plots:
-        from calib.procedure.report.geometry_figures import draw
+        from calib.procedure.report.charts import pictures, save_all
+        from calib.procedure.report.geometry_figures import captioned
 
-        drawn = draw(report)
-    for name, figure in drawn.items():
-        files.write(folder / f"plot_{name}.png", figure.image)
+        shown = captioned(report)
+        save_all({name: chart for name, (chart, _) in shown.items()}, folder)
+        drawn = pictures(shown)
     for write in offered("fit_pages") if pages else ():
         write(report, drawn, folder)
 
 
-def write_model(outcome: IdentificationOutcome, folder: Path, plots: bool = True) -> None:
-    """Write figures (if `plots`) and the certificate of an identification into its folder, where the rest is."""
+def write_model(outcome: IdentificationOutcome, folder: Path, plots: bool = True, pages: bool = True) -> None:
+    """Write figures (if `plots`) and, outside sessions, ``report.json`` and certificate of an identification."""
+    from calib.procedure.dynamic_stage.folder import UnseenFolder
+    from calib.procedure.report import dynamics_section
+
+    if pages:
+        UnseenFolder(folder).write_report(outcome.inputs, outcome)
+    report = dynamics_section.read(folder) if pages else dynamics_section.of_outcome(outcome)
+    drawn: Mapping[str, Picture] = {}
     if plots:
         from calib.procedure.report import dynamics_figures
 
-        dynamics_figures.write(outcome, folder)
-    for write in offered("model_pages"):
-        write(outcome, folder, plots)
+        drawn = dynamics_figures.write(outcome, report, folder)
+    for write in offered("model_pages") if pages else ():
+        write(report, drawn, folder)

@@ -116,6 +116,11 @@ class Pictures:
         return len(self.pictures)
 
 
+def pictures(title: str, drawn: Mapping[str, Picture], names: Iterable[str]) -> Pictures:
+    """Return those of the figures drawn that have these names, side by side."""
+    return Pictures(title, [drawn[name] for name in names if name in drawn])
+
+
 Block = Table | Text | Pictures
 
 

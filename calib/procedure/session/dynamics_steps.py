@@ -5,6 +5,7 @@ The same functions as `calib excite` and `calib identify`; only the files are th
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NoReturn
 
@@ -280,15 +281,14 @@ def _gathered(
 def identify(session: Session, say: Say) -> list[str]:
     """Identify base parameters and friction on the calibrated geometry; validation files are not used."""
     from calib.procedure.dynamic_stage import folder as identification_outputs
+    from calib.procedure.report.outputs import write_model
 
-    draw = None
-    if session.plots:
-        from calib.procedure.report.dynamics_figures import write as draw
     given = _gathered(session, _divided(session)[0], (), say)
     outcome = identifying.run(replace(given, replayed=False), progress=say)  # `predict` replays unseen motion
     outcome = replace(outcome, verdict=UNJUDGED)
     say("writing")
-    identification_outputs.write_folder(outcome, session.identification.path, draw, owned=True)
+    write = partial(write_model, plots=session.plots, pages=False)
+    identification_outputs.write_folder(outcome, session.identification.path, write, owned=True)
     found = outcome.found
     raw, normalised = found.condition
     fitted = next(iter(outcome.fit.values()))

@@ -23,7 +23,7 @@ from calib.rooms.certificate.record import NO_DETAILS, Certificate, Entry, Page,
 
 if TYPE_CHECKING:
     from calib.api.rendering import Judged
-    from calib.procedure.dynamic_stage.identify import IdentificationOutcome
+    from calib.procedure.report.dynamics_section import DynamicReport
 
 
 def write_fit(found: Report, drawn: Mapping[str, Picture], folder: Path) -> None:
@@ -47,13 +47,14 @@ def read(folder: Path, plots: bool, details: CertificateSection) -> tuple[Certif
     words = f"{folder} belongs to a session, which has the certificate: {redo}"
     require(not (folder.absolute().parent / SESSION).exists(), words, UsageError)
     if IdentificationFolder(folder).model.exists():
-        return of_model(folder, plots, details)
+        return _read_model(folder, plots, details)
     require(FitFolder(folder).report.exists(), f"{folder} is neither of a fit nor of an identification", UsageError)
     found, drawn = fit_report.read(FitFolder(folder).report), {}
     if plots:
-        from calib.procedure.report.geometry_figures import draw
+        from calib.procedure.report.charts import pictures
+        from calib.procedure.report.geometry_figures import captioned
 
-        drawn = draw(found)
+        drawn = pictures(captioned(found))
     return of_fit(found, drawn, details)
 
 
@@ -81,31 +82,41 @@ def tolerance(millimetres: float | None, found: FitMetrics) -> str:
     return f"{millimetres:g} mm rms on unseen poses{of}"
 
 
-def write_model(outcome: IdentificationOutcome, folder: Path, plots: bool) -> None:
-    """Write certificate and report of an identification into its folder, where the numbers are already."""
-    from calib.procedure.dynamic_stage.folder import UnseenFolder
+def write_model(found: DynamicReport, drawn: Mapping[str, Picture], folder: Path) -> None:
+    """Write certificate and report of an identification into its folder.
 
-    UnseenFolder(folder).write_report(outcome.inputs, outcome)
-    rendering.write(folder, *of_model(folder, plots))
+    Args:
+        drawn: the report's figures by name; without any, the certificate has none either.
+    """
+    rendering.write(folder, *of_model(found, drawn))
 
 
-def of_model(folder: Path, plots: bool = True, details: CertificateSection = NO_DETAILS) -> tuple[Certificate, Page]:
-    """Return certificate and report of an identification, read from its folder."""
+def _read_model(folder: Path, plots: bool, details: CertificateSection) -> tuple[Certificate, Page]:
     from calib.procedure.report import dynamics_section
-    from calib.rooms.certificate import dynamics
 
     found, drawn = dynamics_section.read(folder), {}
     if plots:
-        from calib.procedure.report.dynamics_figures import draw_dynamics
+        from calib.procedure.report.charts import pictures
+        from calib.procedure.report.dynamics_figures import captioned
 
-        drawn = draw_dynamics(found, folder, None, ())
+        drawn = pictures(captioned(found, folder))
+    return of_model(found, drawn, details)
+
+
+def of_model(
+    found: DynamicReport, drawn: Mapping[str, Picture], details: CertificateSection = NO_DETAILS
+) -> tuple[Certificate, Page]:
+    """Return certificate and report of an identification."""
+    from calib.procedure.report import dynamics_section
+    from calib.rooms.certificate import dynamics
+
     unseen, metrics = found.unseen, found.metrics
     setup = [
         Entry("robot", unseen.robot), Entry("recordings", ", ".join((*unseen.fit, *unseen.validation))),
         Entry("torques", f"{len(unseen.rows)} rows"), Entry("method", metrics.method),
         Entry("friction", metrics.friction), Entry("seed", str(metrics.seed)), Entry("toolkit", versions()),
     ]  # fmt: skip
-    stages = [dynamics.stage(found, dynamics_section.report_section(found, drawn), plots)]
+    stages = [dynamics.stage(found, dynamics_section.report_section(found, drawn), bool(drawn))]
     unchecked = ["geometry: taken as described"]
     return records(f"Calibration of {unseen.robot}", "Dynamics", setup, stages, unchecked, details=details)
 

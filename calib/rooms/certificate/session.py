@@ -9,7 +9,7 @@ from calib.data.poses import CORNERS, JOINTS
 from calib.errors import command_line
 from calib.extensions import offered
 from calib.folders import CERTIFICATE, PAGES
-from calib.procedure.excitation.coefficients import SAMPLES
+from calib.procedure.excitation import coefficients
 from calib.procedure.export.delivery import prediction
 from calib.procedure.kinematic_stage.folder import SCHEMA, URDF
 from calib.procedure.kinematic_stage.metrics import FitMetrics
@@ -72,9 +72,10 @@ def pages(session: Session) -> tuple[Certificate, Page]:
 def _geometry(session: Session, whole: fit_report.Report) -> Stage:
     drawn = {}
     if session.plots:
-        from calib.procedure.report.geometry_figures import draw
+        from calib.procedure.report.charts import pictures
+        from calib.procedure.report.geometry_figures import captioned
 
-        drawn = draw(whole)
+        drawn = pictures(captioned(whole))
     found = geometry.stage(whole, drawn)
     return _with_arrival(found, _arrival_notes(session, "3-measured", "validate"))
 
@@ -84,10 +85,14 @@ def _dynamics(session: Session) -> Stage:
 
     found, drawn = dynamics_section.read(session.identification.path), {}
     if session.plots:
-        from calib.procedure.report.dynamics_figures import draw_dynamics
+        from calib.procedure.report.charts import picture, pictures
+        from calib.procedure.report.dynamics_figures import captioned
+        from calib.procedure.report.motion_figures import trained_on
 
-        motions = session.path("6-excitation") if session.settings.dynamics.plan else None
-        drawn = draw_dynamics(found, session.identification.path, motions, chain_of(session).joints)
+        drawn = pictures(captioned(found, session.identification.path))
+        training = session.path("6-excitation") / "training"
+        if session.settings.dynamics.plan and (training / coefficients.NAME).exists():
+            drawn["excitation"] = picture(*trained_on(training, chain_of(session).joints))
     allowed, exported = session.settings.dynamics.tolerance_percent, read_state(session).notes("export")
     known = prediction(session.path(session.export))
     section = dynamics_section.report_section(found, drawn, exported, allowed, known and known.exported)
@@ -230,7 +235,7 @@ def listed(session: Session) -> list[FileRow]:
     if session.dynamic:
         filed += [path for path in session.brought("training", "unseen") if path.is_file()]
         if session.settings.dynamics.plan:  # else other motions were played
-            filed += sorted(session.path("6-excitation").glob(f"*/{SAMPLES}"))
+            filed += sorted(session.path("6-excitation").glob(f"*/{coefficients.SAMPLES}"))
         filed += [*session.identification.tables, session.identification.model]
     filed += [*(session.fit.tables if session.geometric else ()), *exported[1:]]
     judged_files = read_json(session.path(VERDICT)).get("files", {}) if session.path(VERDICT).exists() else {}

@@ -21,6 +21,7 @@ from calib.identification.identify_options import IdentifyOptions
 from calib.identification.prediction import PredictionErrors, RelativeErrors
 from calib.procedure.dynamic_stage.gains import FoundGains
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
+from calib.procedure.dynamic_stage.metrics import TorqueCurves
 from calib.procedure.report import charts, dynamics_figures, dynamics_section, page
 from calib.robot.calibrated import CalibratedChain
 from calib.rooms.closed_loop.replay import Replay
@@ -74,12 +75,11 @@ def test_figures_have_units_at_their_axes():
     inputs = IdentificationInputs(
         arm, Path(), (), (), options, (), FoundGains(options, None, None, "N m", ())
     )  # fmt: skip
-    outcome: Any = SimpleNamespace(
+    report: Any = SimpleNamespace(
         fit={"train": SimpleNamespace(raw=PredictionErrors(RelativeErrors(5.0, np.full(3, 5.0)), np.zeros(3)))},
-        validation={}, repeated={}, found=SimpleNamespace(settings=SimpleNamespace(torque_rows=MOTOR)),
-        inputs=inputs,
+        validation={}, rows=MOTOR.titles(arm.chain.joint_names), units=inputs.row_units,
     )  # fmt: skip
-    figure = charts.figure(dynamics_figures.file_torques(one, np.asarray(one.target), outcome))
+    figure = charts.figure(dynamics_figures.recorded(TorqueCurves.of(one, np.asarray(one.target)), report)[0])
     units = [f"{joint.name} [{unit}]: 5 % unexplained" for joint, unit in zip(joints, ("N", "N m", "N m"))]
     assert [axis.get_title(loc="left") for axis in figure.axes] == units
     assert not any(axis.get_legend() for axis in figure.axes), "a legend inside would cover the curve"

@@ -235,7 +235,7 @@ def test_paper_is_white_and_peaks_are_kept() -> None:
 def test_what_the_data_do_not_give_is_left_out(finished_folder: Path) -> None:
     found = fit_report.read(finished_folder / "4-fit/report.json")
     bare = (replace(found.sets[0], q=(), points=()),)
-    drawn = geometry_figures.draw(replace(found, sets=bare, singular_values=()))
+    drawn = geometry_figures.captioned(replace(found, sets=bare, singular_values=()))
     assert "joints" not in drawn and "singular_values" not in drawn and "position" in drawn
 
 
