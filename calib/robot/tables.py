@@ -10,7 +10,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import tomlkit
+import rtoml
 
 from calib import config, config_types
 from calib.config_types import shown
@@ -103,13 +103,6 @@ def finite_limits(joint: Any) -> dict[str, float]:
     return {key: value for key in LIMITS if np.isfinite(value := getattr(joint, key))}
 
 
-def _stated(value: Any) -> Any:
-    """Return plain values without the keys of tables that are None."""
-    if isinstance(value, Mapping):
-        return {str(key): _stated(entry) for key, entry in value.items() if entry is not None}
-    return [_stated(entry) for entry in value] if isinstance(value, list) else value
-
-
 def dumps(table: Mapping[str, Any]) -> str:
-    """Return a table as TOML text, with floats in full precision (repr)."""
-    return tomlkit.dumps(_stated(config.plain_values(table)))
+    """Return a table as TOML text, with floats in full precision; None is left out."""
+    return rtoml.dumps(config.plain_values(table), none_value=None)

@@ -10,7 +10,7 @@ from pathlib import Path, PurePath
 from textwrap import wrap
 from typing import Annotated, Any, get_type_hints
 
-import tomlkit
+import rtoml
 
 from calib.config import described, parse, read_toml, strict
 from calib.config_types import (  # fmt: skip
@@ -312,10 +312,10 @@ def _lines(section: Any, place: str = "") -> Iterator[str]:
         value, about = getattr(section, key.name), words.get(key.name, "")
         if is_dataclass(value) or isinstance(value, Mapping):
             head = f"[{place}{key.name}]"
-            inner = _lines(value, f"{key.name}.") if is_dataclass(value) else tomlkit.dumps(value).splitlines()
+            inner = _lines(value, f"{key.name}.") if is_dataclass(value) else rtoml.dumps(value).splitlines()
             tables += ["", f"{head}  # {about}" if about else head, *inner]
         elif key.name != "schema":
-            entry = f"{key.name} = {tomlkit.item(value).as_string()}"
+            entry = rtoml.dumps({key.name: value}).rstrip()
             first, *rest = wrap(about, WIDTH - COLUMN) or [""]
             yield f"{entry:<{COLUMN - 3}} # {first}" if first else entry
             yield from (f"{'':{COLUMN - 2}}# {line}" for line in rest)
