@@ -25,7 +25,7 @@ from calib.errors import MeasurementError, refuse_data, require, suggestion
 from calib.extensions import offered
 from calib.files import check_regular
 from calib.records import frozen, plain_text
-from calib.units import ANGLES, LENGTHS, plain_number
+from calib.units import ANGLES, LENGTHS, QUANTITIES, TIMES, plain_number
 
 _HEADING = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
 _UNIT_APART = re.compile(r"[ ]+([\[(])")  # q1 [deg], where blanks part the names
@@ -85,7 +85,8 @@ class Table:
         """Return a column (m,) as floats in SI.
 
         Args:
-            dimension: ``angle`` [rad], ``length`` [m], ``joint`` (either), "" (a plain number) or None (as it is).
+            dimension: ``angle`` [rad], ``length`` [m], ``joint`` (either), ``speed`` [m/s], ``time`` [s], "" (a plain
+                number) or None (as it is).
             unit: what the column is in where its header does not say; "" for SI.
             gaps: leave empty and NaN cells as NaN, where otherwise they are refused.
 
@@ -105,8 +106,9 @@ class Table:
             self.fail(f"{message}; leave the row out, or measure it again", name, row)
         if dimension is None:
             return cells
-        known = {"angle": ANGLES, "length": LENGTHS, "joint": ANGLES | LENGTHS, "": {"1": 1.0, "-": 1.0}}[dimension]
-        return cells * self.factor(column, known, unit)
+        known = {"angle": ANGLES, "length": LENGTHS, "joint": ANGLES | LENGTHS, "": {"1": 1.0, "-": 1.0}}
+        known |= {"speed": QUANTITIES["speed"], "time": TIMES}
+        return cells * self.factor(column, known[dimension], unit)
 
     def factor(self, column: int, known: Mapping[str, float], unit: str) -> float:
         """Return the factor to SI of a column; the unit is in its header or in `unit`, and one of `known`."""

@@ -135,10 +135,15 @@ def _pose(measured: Poses, seen: Seen, jacobian: np.ndarray) -> list[Part]:
 
 @parts.register
 def _position(measured: Positions, seen: Seen, jacobian: np.ndarray) -> list[Part]:
-    """Position residual, measured minus predicted: r = y - p."""
+    """Position residual, measured minus predicted: r = y - p, without the errors that all rows share."""
     sigma = None if measured.sigma is None else measured.sigma.T
-    everywhere = np.arange(len(measured))
-    return [Part("position", measured.position.T - seen.point, jacobian[:, :3], sigma, 0, everywhere)]
+    value, slopes, shared = measured.position.T - seen.point, jacobian[:, :3], 0
+    if measured.late is not None and len(measured) > 1:
+        rows, shared = np.concatenate([value[None], slopes]).reshape(-1, value.size), measured.late.shape[1]
+        rows = _project(rows, measured.late.transpose(2, 0, 1).reshape(value.size, shared))
+        rows = rows.reshape(-1, *value.shape)
+        value, slopes = rows[0], rows[1:]
+    return [Part("position", value, slopes, sigma, shared, np.arange(len(measured)))]
 
 
 @parts.register

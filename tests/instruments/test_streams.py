@@ -3,6 +3,7 @@
 import errno
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,15 +12,15 @@ from scipy.signal import lfilter
 
 import calib
 from calib.cli import run
-from calib.data.poses.measurements import PoseMeasurements, Poses
+from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
 from calib.errors import CalibError, MeasurementError, UsageError
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit
-from calib.geometry.observation import predict, prepare, target_jacobian
+from calib.geometry.observation import observe, predict, prepare, target_jacobian
 from calib.robot.chain import Chain
 from calib.robot.library import load
 from calib.rooms.cells.cell import Cell, true_poses
-from calib.rooms.cells.virtual_cells import perturbed_cell, rigid
+from calib.rooms.cells.virtual_cells import perturbed_cell, rigid, virtual_cell
 from calib.rooms.instruments import joining, stream_files
 from calib.rooms.instruments.streams import Streamed
 from calib.transforms import to_quaternion
@@ -143,6 +144,31 @@ def test_one_percent_of_damaged_rows_is_dropped_and_counted(found):
     assert not set(found.poses) & set(BAD)
 
 
+def test_residuals_of_rows_measured_in_motion_do_not_feel_offset_and_drift_of_the_clock(tmp_path, found):
+    (block,) = calib.read_poses(found.write(tmp_path / "poses.csv"), "ur5")
+    assert isinstance(block, Positions) and block.late is not None
+    speed = np.gradient(block.position, found.table.cells[0], axis=0)
+    assert np.corrcoef(speed[:, 0], block.late[:, 0, 0])[0, 1] > 0.95
+    moved = block.position + np.einsum("mkj,k->mj", block.late, [1e-3, 1e-5])
+    cell = install(load("ur5"), [block])
+    one, other = (observe(cell, prepare(cell, [each])[0], cell.chain.moving)[0]
+                  for each in (block, replace(block, position=moved)))  # fmt: skip
+    np.testing.assert_allclose(other.value, one.value, atol=1e-12)
+    assert one.nuisances == 2 and np.ptp(moved - block.position) > 5e-5
+    bare = observe(cell, prepare(cell, [replace(block, late=None)])[0], cell.chain.moving)[0]
+    assert np.linalg.norm(one.jacobian) < np.linalg.norm(bare.jacobian)
+
+
+@pytest.mark.slow
+def test_backlash_and_gear_errors_do_not_pass_for_a_late_clock(tmp_path):
+    errors = list[float]()
+    for seed in range(4):
+        clock = joined(*recorded(tmp_path, virtual_cell("ur5", seed), seed)).clock
+        errors += [(clock.offset - OFFSET) / clock.sigma, clock.drift / clock.drift_sigma]
+        assert clock.sigma < 0.6e-3
+    assert np.abs(errors).max() < 2.5
+
+
 @pytest.mark.slow
 def test_drift_gaps_and_rows_that_go_back_in_time_are_said(tmp_path):
     cell = rigid(perturbed_cell(load("ur5"), 2))
@@ -263,10 +289,10 @@ def test_rows_held_are_bounded_however_long_the_stream(files, monkeypatch, found
     assert abs(again.clock.offset - OFFSET) < 3.0 * again.clock.sigma < 1e-3
 
 
-def errors_in_sigmas(chain: Chain, cell: Cell, q: np.ndarray, position: np.ndarray) -> np.ndarray:
+def errors_in_sigmas(chain: Chain, cell: Cell, q: np.ndarray, position: np.ndarray, **more) -> np.ndarray:
     """Return the errors of the fitted parameters in their sigmas, seen at poses of the motion (by least squares)."""
     names = chain.joint_names
-    block = PoseMeasurements.of(q, position, joint_names=names)
+    block = PoseMeasurements.of(q, position, joint_names=names, **more)
     found = fit(install(chain, [block]), [block])
     at = q[:: max(len(q) // 60, 1)]
     (seen,) = prepare(found.cell, [PoseMeasurements.of(at, np.zeros((len(at), 3)), joint_names=names)])
@@ -285,8 +311,9 @@ def test_offsets_and_parameters_err_as_their_sigmas_say_and_without_thinning_the
         log, stream = recorded(tmp_path, cell, seed, rate=250.0)
         one = joined(log, stream)
         offsets.append((one.clock.offset - OFFSET) / one.clock.sigma)
-        cells = np.column_stack(one.table.cells)
-        thinned.append(errors_in_sigmas(cell.nominal, cell, np.radians(cells[:, 1:7]), 1e-3 * cells[:, 7:10]))
+        (block,) = calib.read_poses(one.write(tmp_path / "poses.csv"), "ur5")
+        assert isinstance(block, Positions)
+        thinned.append(errors_in_sigmas(cell.nominal, cell, block.q, block.position, late=block.late))
         rows = np.loadtxt(stream, delimiter=",", skiprows=1)[::2]
         q = slow_motion(6, seed)(one.clock.controller(rows[:, 0]))
         every.append(errors_in_sigmas(cell.nominal, cell, q, 1e-3 * rows[:, 1:4]))

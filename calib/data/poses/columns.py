@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NoReturn
 
 import numpy as np
@@ -30,9 +30,10 @@ SIGMA_ROTATION = Column(
 DISTANCE = Column(("distance",), "length", "distance", BOUNDS.max_length, "mm", positive="a distance must be above 0")
 SIGMA_DISTANCE = Column(("sigma_distance",), "length", "sigma", positive=SIGMA.positive)
 BASE = Column(("base_x", "base_y", "base_z", "base_qx", "base_qy", "base_qz", "base_qw"))
+LATE, TIME = Column(("late_x", "late_y", "late_z"), "speed", "late"), Column(("time",), "time", "time")
 LABELS = ("distance", "pair", "bar", "socket", "plane", "tool")
 UNIT_GROUPS = ("joints", "position", "orientation", "distance", "sigma", "sigma_rotation")
-_FAMILIES = (POSITION, QUATERNION, MATRIX, TURNS, SIGMA, SIGMA_ROTATION, SIGMA_DISTANCE, BASE)
+_FAMILIES = (POSITION, QUATERNION, MATRIX, TURNS, SIGMA, SIGMA_ROTATION, SIGMA_DISTANCE, BASE, LATE)
 OURS = (*(name for column in _FAMILIES for name in column.names), *LABELS)
 LABEL_OF = {"distance": "pair", "bar": "bar", "sockets": "socket", "plane": "plane"}
 _TARGET = re.compile(r"(sigma_)?[xyz]\d+")
@@ -177,6 +178,7 @@ class Layout:
         tool: one name or "".
         group: the columns whose labels together name a row's group.
         base: position and quaternion of a frame on the robot's base, seven names, or none.
+        late: the target's velocity and the time, four names, or none.
         notes: what a user should know of the choice.
     """
 
@@ -190,13 +192,16 @@ class Layout:
     tool: str = ""
     group: tuple[str, ...] = ()
     base: tuple[str, ...] = ()
+    late: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
     @property
     def used(self) -> frozenset[str]:
         """The file's names of all columns that are read."""
         families = (*self.positions, *self.sigmas, self.orientation, self.sigma_rotation, self.distance, self.group)
-        return frozenset(name for names in (*families, self.joints, self.base, (self.tool,)) for name in names)
+        return frozenset(
+            name for names in (*families, self.joints, self.base, self.late, (self.tool,)) for name in names
+        )
 
 
 def find_layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
@@ -233,8 +238,12 @@ def _layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
     if not positions:
         sheet.table.index("x")
     tool, base = sheet.find("tool"), sheet.family(BASE.names)
+    late = sheet.family(LATE.names)
+    if late:
+        late = (*late, *TIME.names)
+    found = Layout(kind, columns, positions, sigmas, tool=tool, base=base, late=late, notes=notes)
     if kind == "position":
-        return Layout(kind, columns, positions, sigmas, tool=tool, base=base, notes=notes)
+        return found
     orientation = _find_orientation(sheet, columns)
     if not orientation:
         sheet.fail("kind 'pose' needs qx qy qz qw, r11 to r33, or rx ry rz; the header has none of them")
@@ -244,7 +253,7 @@ def _layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
         meaning = f" as {sheet.options.euler}" if len(orientation) == 3 else ""
         notes = (*notes, f"the orientation is read from {', '.join(orientation)}{meaning}")
     rotation = sheet.family(SIGMA_ROTATION.names)
-    return Layout(kind, columns, positions, sigmas, orientation, rotation, tool=tool, base=base, notes=notes)
+    return replace(found, orientation=orientation, sigma_rotation=rotation, notes=notes)
 
 
 def _check_one_source(sheet: Sheet, position: Sequence[str], orientation: Sequence[str]) -> None:

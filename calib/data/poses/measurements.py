@@ -126,11 +126,14 @@ class Positions(PoseMeasurements):
     Attributes:
         position: (m, 3) [m].
         sigma: (m, 3) standard deviation of the position [m]; None where not stated.
+        late: (m, k, 3) how positions change by k errors of unknown size that all rows share, as those of a clock (its
+            offset [m/s] and drift [m]); None without any.
     """
 
     position: np.ndarray
     _: KW_ONLY
     sigma: np.ndarray | None = None
+    late: np.ndarray | None = None
 
     kind: ClassVar[str] = "position"
     has_instrument: ClassVar[bool] = True

@@ -10,6 +10,8 @@ position, pose      ``x y z``; with ``qx qy qz qw``, ``r11`` to ``r33`` or three
 several reflectors  ``x1 y1 z1 x2 y2 z2 ...``, each a row of its own; an empty triple is a reflector not seen
 base frame          ``base_x`` … ``base_qw``, measured with every row: the target is then seen from there
 sigmas              ``sigma_x``, ``_y``, ``_z`` (numbered as the reflectors, or common), ``sigma_rx``, ``_ry``, ``_rz``
+measured moving     ``late_x``, ``_y``, ``_z``, the target's velocity, with ``time``: the fit then takes offset and
+                    drift of the instrument's clock as unknown
 distance            ``distance`` with ``pair`` (two rows share a label), or with ``bar`` (the unknown other end);
                     ``sigma_distance``
 sockets, plane      ``socket`` (grouped together with ``tool_position``), ``plane``
@@ -39,12 +41,14 @@ from calib.data.csv_table import Table, read_header, read_table
 from calib.data.poses import plausible
 from calib.data.poses.columns import (
     DISTANCE,
+    LATE,
     OURS,
     POSITION,
     SIGMA,
     SIGMA_DISTANCE,
     SIGMA_ROTATION,
     SUFFIXES,
+    TIME,
     Layout,
     Sheet,
     find_layout,
@@ -169,6 +173,8 @@ def relative_to_base(block: Positions, position: np.ndarray, quaternion: np.ndar
     lever = block.position - position
     turn = base.inv().as_matrix()
     changes: dict[str, np.ndarray] = {"position": base.inv().apply(lever)}
+    if block.late is not None:
+        changes["late"] = np.einsum("mij,mkj->mki", turn, block.late)
     stated = block.sigma_rotation if isinstance(block, Poses) else None
     if isinstance(block, Poses):
         changes["quaternion"] = (base.inv() * Rotation.from_quat(block.quaternion)).as_quat(canonical=True)
@@ -273,7 +279,7 @@ def _read_targets(sheet: Sheet, layout: Layout, q: np.ndarray) -> Positions:
     unseen = len(seen) - np.sum(seen, axis=0)
     common: dict[str, Any] = {
         "sigma": None if sigma is None else sigma[index, target], "tool": tool, "tool_names": names,
-        "file": table.file, "rows": table.rows[index],
+        "file": table.file, "rows": table.rows[index], "late": _late(sheet, layout, index),
         "notes": tuple(
             f"{', '.join(names)}: not seen in {count} of {len(seen)} rows"
             for names, count in zip(layout.positions, unseen)
@@ -314,6 +320,14 @@ def _sigma(sheet: Sheet, layout: Layout, seen: np.ndarray) -> np.ndarray | None:
         refuse(sheet.table, np.isnan(sigma) & there, names, lambda row, k: "is empty where a target was seen")
         stack.append(sigma)
     return np.stack(stack, axis=1)
+
+
+def _late(sheet: Sheet, layout: Layout, index: np.ndarray) -> np.ndarray | None:
+    """Return how the positions of rows change with a clock's offset and drift (m, 2, 3); None where not stated."""
+    if not layout.late:
+        return None
+    velocity, t = sheet.numbers(layout.late[:3], LATE)[index], sheet.numbers(layout.late[3:], TIME)[index]
+    return np.stack([velocity, (t - t.mean()) * velocity], axis=1)
 
 
 def _sigma_rotation(sheet: Sheet, layout: Layout) -> np.ndarray | None:

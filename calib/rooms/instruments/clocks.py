@@ -4,7 +4,8 @@ A point at the instrument's time t belongs to the joints q(t - offset - drift (t
 is found without any frame: the speed of the nominal arm's tip against that of the points, at every offset
 (cross-correlation); the best few are tried by placing instrument and target. Then offset, drift, both placements and
 the arm's geometry are fitted together (Gauss-Newton), since the errors of an arm would else pass for those of a clock.
-Thresholds are our choice.
+How large the terms of an effect may be is found from the data (`calib.estimation.relevance`): by a size that is given,
+σ of the clock is too large for arms with less of it, and too small for arms with more. Thresholds are our choice.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from scipy.signal import correlate, correlation_lags
 from calib.data.poses.measurements import Positions, take
 from calib.errors import refuse_data
 from calib.estimation import robust
+from calib.estimation.relevance import gram, relevance
 from calib.geometry.first_guess import install
 from calib.geometry.fit import plausible_deviation
 from calib.geometry.installation import Installation
@@ -47,6 +49,8 @@ BESIDE = 1e-3  # difference of times by which speeds are computed [s]
 ORDERS = 6  # of the harmonics that are fitted
 ROUNDS = 12  # of Gauss-Newton
 SETTLED = 1e-6  # change of the offset after which it ends [s]
+BACKLASH = 1e-4  # by which a joint comes to rest before where it was sent, from either side [rad or m]
+TERM_SIZES = (1e-3, 5.0)  # times their guessed size that terms are, at least and at most
 _NONE = np.array([], dtype=int)
 
 
@@ -182,51 +186,81 @@ def residuals(cell: Installation, run: Run, rows: np.ndarray, clock: Clock) -> n
     return np.concatenate([part.value for part in observe(cell, block, _NONE)])
 
 
+def velocities(cell: Installation, run: Run, rows: np.ndarray, clock: Clock) -> np.ndarray:
+    """Return the velocities (3 or 6, m) [m/s, then rad/s] of the target at rows, as the installation's arm moves it."""
+    later, sooner = (residuals(cell, run, rows, replace(clock, offset=clock.offset + s)) for s in (BESIDE, -BESIDE))
+    return (later - sooner) / (2.0 * BESIDE)
+
+
 def fitted(
-    cell: Installation, run: Run, rows: np.ndarray, clock: Clock, arm: bool = True, loss: str = "huber"
+    cell: Installation, run: Run, rows: np.ndarray, clock: Clock, arm: bool = True, play: bool = False
 ) -> tuple[Installation, Clock]:
     """Return the installation and the clock that fit some rows best; σ is that of independent rows.
 
     Args:
-        cell, clock: where to start; the arm's parameters have a wide prior about their values there.
+        cell, clock: where to start: the nominal arm, about which its parameters have a wide prior.
         arm: whether the arm, with all effects that a model of `calib fit` may have, is fitted, too, not placements,
             offset and drift alone.
-        loss: of each row's size (`calib.estimation.robust`).
+        play: whether the backlash of its joints is, too, which else passes for a clock that is late; rows are then
+            taken to have no outliers.
     """
-    if arm and not cell.deflection.terms:
-        terms = tuple(term for effect in EFFECTS.values() for term in effect(cell.chain, False) if term.order <= ORDERS)
-        cell = replace(cell, deflection=Deflection(terms, np.zeros(len(terms)), cell.chain))
+    families = [[t for t in effect(cell.chain, False) if t.order <= ORDERS] for effect in EFFECTS.values() if arm]
+    terms = tuple(term for family in families for term in family)
+    cell = replace(cell, deflection=Deflection(terms, np.zeros(len(terms)), cell.chain)) if arm else cell
     start, table, t = cell, layout(cell), run.stream.t[rows] - clock.middle
     free = table.rigid_index if arm else table.frame_index
     free = free[base_columns(cell, prepare(cell, [run.at(clock, rows)]), free).kept]
-    prior = np.concatenate([plausible_deviation(cell, free), term_sizes(cell.deflection.terms), [np.inf, MAX_DRIFT]])
-    if arm:
-        free = np.concatenate([free, table.index("deflection")])
-    known, spread = np.isfinite(prior), np.full(len(prior), np.inf)
+    moving, loss = (cell.chain.moving, "none") if play else (_NONE, "huber")
+    sizes = (plausible_deviation(cell, free), term_sizes(terms), np.full(len(moving), BACKLASH), [np.inf, MAX_DRIFT])
+    guess = np.concatenate(sizes)
+    group = np.repeat([-1, *range(len(families) + 1), -1], [len(free), *map(len, families), len(moving), 2])
+    free = np.concatenate([free, table.index("deflection")])
+    known, spread = np.isfinite(guess), np.full(len(guess), np.inf)
     for _ in range(ROUNDS):
-        at, ways = run.at(clock, rows), BESIDE * run.joints(clock, rows, 1)
-        now, ahead, behind = (
-            observe(cell, prepare(cell, [replace(at, q=at.q + sign * ways)])[0], index)
-            for sign, index in ((0.0, free), (1.0, _NONE), (-1.0, _NONE))
-        )
-        pulled = np.append((parameter_values(start) - parameter_values(cell))[free], [0.0, -clock.drift])
-        left, slopes = [pulled[known] / prior[known]], [np.diag(1.0 / prior)[known]]
-        for part, one, other in zip(now, ahead, behind):
-            late = (one.value - other.value) / (2.0 * BESIDE)  # of the prediction, by a clock that is ahead
+        (block,) = prepare(cell, [run.at(clock, rows)])
+        now, turned = observe(cell, block, free), observe(cell, block, moving)
+        pulled = np.zeros(len(guess))
+        pulled[: len(free)], pulled[-1] = (parameter_values(start) - parameter_values(cell))[free], -clock.drift
+        side = np.sign(run.joints(clock, rows, 1).T)[:, None] if play else 0.0
+        left, slopes = list[np.ndarray](), list[np.ndarray]()
+        for part, joints, speed in zip(now, turned, np.split(velocities(cell, run, rows, clock), len(now))):
             sigma = max(robust.spread(part.value), 1e-9)
             weight = np.sqrt(robust.weights(np.sqrt(np.mean(part.value**2, axis=0)) / sigma, loss)) / sigma
             left.append((weight * part.value).ravel())
-            slopes.append((weight * np.concatenate([part.jacobian, [late, t * late]])).reshape(len(prior), -1).T)
-        matrix, wanted = np.concatenate(slopes), np.concatenate(left)
+            columns = np.concatenate([part.jacobian, side * joints.jacobian, [-speed, -t * speed]])
+            slopes.append((weight * columns).reshape(len(guess), -1).T)
+        prior = _sized(np.concatenate(slopes), np.concatenate(left), pulled, guess, group) if arm else guess
+        matrix = np.concatenate([*slopes, np.diag(1.0 / prior)[known]])
+        wanted = np.concatenate([*left, (pulled / prior)[known]])
         size = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
         matrix /= size
         inverse = np.linalg.pinv(matrix.T @ matrix, 1e-13, hermitian=True)
         change = inverse @ (matrix.T @ wanted)
-        rest = float(np.sum((wanted - matrix @ change) ** 2)) / max(len(wanted) - len(prior), 1)
+        rest = float(np.sum((wanted - matrix @ change) ** 2)) / max(len(wanted) - len(guess), 1)
         spread = np.sqrt(rest * np.diag(inverse)) / size
         change /= size
-        cell = step(cell, free, change[:-2])
+        cell = step(cell, free, change[: len(free)])
         clock = replace(clock, offset=clock.offset + change[-2], drift=clock.drift + change[-1])
         if abs(change[-2]) < SETTLED:
             break
     return cell, replace(clock, sigma=float(spread[-2]), drift_sigma=float(spread[-1]))
+
+
+def _sized(
+    matrix: np.ndarray, wanted: np.ndarray, pulled: np.ndarray, guess: np.ndarray, group: np.ndarray
+) -> np.ndarray:
+    """Return the prior standard deviations (p,), those of a family of terms by the factor that is most probable.
+
+    Args:
+        matrix, wanted: whitened rows of the data, (rows, p) and (rows,).
+        pulled: (p,) the prior's mean minus the present values.
+        guess: (p,) prior standard deviations as they were guessed.
+        group: (p,) number of a term's family; -1 for other columns.
+    """
+    others = group < 0
+    held = others & np.isfinite(guess)
+    rows = np.concatenate([matrix, np.diag(1.0 / guess)[held]])
+    whole = np.concatenate([wanted - matrix @ np.where(others, 0.0, pulled), (pulled / guess)[held]])
+    unit = np.where(others, 1.0 / np.maximum(np.linalg.norm(rows, axis=0), 1e-300), guess)
+    found = relevance(gram(whole, rows * unit), group, np.ones(len(unit)))
+    return np.where(others, guess, np.clip(found.ridge, *TERM_SIZES) * guess)

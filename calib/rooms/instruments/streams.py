@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from calib.data.csv_table import Table
-from calib.data.poses.columns import POSITION, QUATERNION, Sheet
+from calib.data.poses.columns import LATE, POSITION, QUATERNION, Sheet
 from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.plausible import check_joints, outside, unit_quaternions
 from calib.data.schema import BOUNDS, max_travel
@@ -29,7 +29,7 @@ from calib.procedure.findings import lines_of
 from calib.procedure.robot_kinds import joints_of
 from calib.records import evenly
 from calib.robot.chain import Chain, joint_kinds
-from calib.rooms.instruments.clocks import Clock, Run, begin, fitted, residuals
+from calib.rooms.instruments.clocks import Clock, Run, begin, fitted, residuals, velocities
 from calib.rooms.instruments.joined import Joined
 from calib.rooms.instruments.stream_files import Kind, Stream, read_stream
 from calib.units import JOINT
@@ -80,8 +80,8 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
     turn = stream.values[:, 3:] if stream.values.shape[1] > 3 else None
     q, names = np.zeros((len(stream.t), chain.n)), chain.joint_names
     run = Run(log, stream, PoseMeasurements.of(q, stream.values[:, :3], turn, joint_names=names, file=str(file)))
-    cell, clock, rivals = begin(chain, run)
-    cell, clock = fitted(cell, run, run.known(clock, FITTED), clock)
+    nominal, clock, rivals = begin(chain, run)
+    cell, clock = fitted(nominal, run, run.known(clock, FITTED), clock)
     kept, left, velocity, said = _usable(cell, run, clock)
     tau, sigma = max(inflation(row) for row in left), robust.spread(left[:3])
     chosen = _thinned(stream.t[kept], run.joints(clock, kept), stream.step * (1.0 + 1.5 * (tau - 1.0)))
@@ -97,7 +97,9 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
         words = "too few rows are independent: did a clock jump, or instrument or target move? Else measure for longer"
         refuse_data(file, f"{words}, over more of the workspace ({'; '.join([*run.lines(), *lines_of([thinned])])})")
     few = rows[evenly(len(rows), FITTED)]
-    _, clock = fitted(cell, run, few, clock, loss="none")
+    _, clock = fitted(nominal, run, few, clock, play=True)
+    alike = float(np.sqrt((1.0 + max(rest, 0.0)) / (1.0 - max(rest, 0.0))))  # of neighbours, for what changes slowly
+    clock = replace(clock, sigma=alike * clock.sigma, drift_sigma=alike * clock.drift_sigma)
     late = clock.sigma * float(np.sqrt(np.mean(np.sum(velocity**2, axis=0))))
     words = (
         f"the offset of its clock is known to {1e3 * clock.sigma:.2g} ms only, in which the target moves by "
@@ -107,7 +109,7 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
     said += [finding("stream-repeats", offsets=rivals)] if rivals else []
     said += [finding("stream-clock", **vars(clock) | {"ppm": 1e6 * clock.drift, "ppm_sigma": 1e6 * clock.drift_sigma})]
     notes = (*run.lines(), *lines_of([*said, thinned]))
-    table = _table(chain, run.joints(clock, rows), stream, rows)
+    table = _table(chain, run.joints(clock, rows), stream, rows, velocities(cell, run, rows, clock)[:3])
     return Streamed(table, stream.rows[rows] - 1, notes, clock, **found)
 
 
@@ -193,12 +195,12 @@ def _thinned(t: np.ndarray, q: np.ndarray, apart: float) -> np.ndarray:
     return np.array(found)
 
 
-def _table(chain: Chain, q: np.ndarray, stream: Stream, rows: np.ndarray) -> Table:
-    """Return rows of a stream with their joints q (m, n) as a table of measured poses."""
+def _table(chain: Chain, q: np.ndarray, stream: Stream, rows: np.ndarray, velocity: np.ndarray) -> Table:
+    """Return rows of a stream with their joints q (m, n) and velocities (3, m) as a table of measured poses."""
     units = [JOINT["prismatic" if kind == "prismatic" else "revolute"] for kind in joint_kinds(chain)]
     turn = QUATERNION.names if stream.values.shape[1] > 3 else ()
-    header = ("time", *chain.joint_names, *POSITION.names, *turn)
+    header = ("time", *chain.joint_names, *POSITION.names, *turn, *LATE.names)
     cells = (stream.t[rows], *(q * [factor for factor, _ in units]).T, *(1e3 * stream.values[rows, :3]).T)
-    cells += tuple(stream.values[rows, 3:].T)
-    named = ("s", *(unit for _, unit in units), *("mm",) * 3, *("",) * len(turn))
+    cells += (*stream.values[rows, 3:].T, *(1e3 * velocity))
+    named = ("s", *(unit for _, unit in units), *("mm",) * 3, *("",) * len(turn), *("mm/s",) * 3)
     return Table(stream.file, header, named, cells, stream.rows[rows])
