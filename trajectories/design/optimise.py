@@ -5,7 +5,7 @@ repaired (the squared excess is minimised), then searched from (`trajectories.de
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import takewhile
@@ -17,7 +17,8 @@ from trajectories.design.problem import ExcitationProblem, exact_values, stretch
 from trajectories.design.search import STAGES, Method, SearchResult, Stage, Stuck, one_start
 from trajectories.errors import BadInput, NotExciting, NothingFeasible, require
 
-KEPT = 1 / 3  # of the starts, which the last stages are for (our choice)
+KEPT = 1 / 2  # of the starts, which the next round is for (our choice)
+ROUNDS = (STAGES[:1], STAGES[1:2], STAGES[2:])  # of a search: the first one tells most of what a start is worth
 
 
 def design(
@@ -49,20 +50,20 @@ def design(
     if method not in get_args(Method):
         raise BadInput(f"method '{method}' is not one of {', '.join(get_args(Method))}")
     began = time.perf_counter()
-    tasks: list[int | np.ndarray] = [*guesses, *range(starts)]
+    tasks: Sequence[int | np.ndarray] = [*guesses, *range(starts)]
     require(tasks, "no starts: ask for at least one, or give an initial guess")
-    search, polished = _Starts(problem, evaluations, method, seed, map, report, len(tasks)), list[SearchResult]()
+    search = _Starts(problem, evaluations, method, seed, map, report, len(tasks))
     try:
-        search.run(tasks, STAGES[:2])
-        if not search.interrupted:
-            polished = search.run(search.promising(), STAGES[2:])
+        for stages in ROUNDS:
+            if not search.interrupted:
+                tasks = search.run(tasks, stages)
     except KeyboardInterrupt:
         if not search.found:
             raise
         search.interrupted = True
     if not search.found:
         raise _nothing(problem, search.stuck, len(tasks))
-    best = min(polished or search.found, key=lambda one: one.merit)
+    best = min(search.last, key=lambda one: one.merit)
     share = sum(one.feasible * one.evaluations for one in search.found) / search.spent
     return replace(
         best, evaluations=search.spent, feasible=share, seconds=time.perf_counter() - began,
@@ -71,20 +72,23 @@ def design(
 
 
 class _Starts:
-    """Searches from several starts, in rounds."""
+    """Searches from several starts, in rounds: the best half of one goes into the next."""
 
     def __init__(
         self, problem: ExcitationProblem, evaluations: int, method: Method, seed: int, map: Callable,
         report: Callable[[int, int, str], None] | None, starts: int,
     ):  # fmt: skip
         self.problem, self.arguments, self.map, self.report = problem, (evaluations, method, seed), map, report
-        self.found, self.stuck = list[SearchResult](), list[Stuck]()
-        self.done, self.total = 0, starts + _kept(starts)
+        self.found, self.last, self.stuck = list[SearchResult](), list[SearchResult](), list[Stuck]()
+        self.done, self.total = 0, starts + _kept(starts) + _kept(_kept(starts))
         self.spent, self.interrupted = 0, False
 
-    def run(self, tasks: list[int | np.ndarray], stages: tuple[Stage, ...]) -> list[SearchResult]:
-        """Run the given stages of the search for each task; return the results."""
-        fresh = list[SearchResult]()
+    def run(self, tasks: Sequence[int | np.ndarray], stages: tuple[Stage, ...]) -> list[np.ndarray]:
+        """Run the given stages of the search for each task; return the variables of the best motions.
+
+        Infeasible ones come last, by constraint violation; `last` are the feasible ones of the last round with any.
+        """
+        fresh, stuck = list[SearchResult](), list[Stuck]()
         # a map in other processes may still hand back what it has
         wanted = takewhile(lambda _: not self.interrupted, tasks)
         for run in self.map(partial(one_start, self.problem, *self.arguments, stages=stages), wanted):
@@ -93,24 +97,22 @@ class _Starts:
             if isinstance(run, SearchResult):
                 fresh.append(run)
                 self.found.append(run)
+                self.last = fresh
                 self.interrupted |= run.interrupted
             else:
+                stuck.append(run)
                 self.stuck.append(run)
             if self.report:
                 best = min((one.merit for one in self.found), default=np.inf)
                 words = f"best so far {best:.4g}" if self.found else "nothing feasible yet"
                 self.report(self.done, self.total, words)
-        return fresh
-
-    def promising(self) -> list[int | np.ndarray]:
-        """Return the variables of the best motions so far; infeasible ones last, by constraint violation."""
-        ranked = sorted(self.found, key=lambda one: one.merit) + sorted(self.stuck, key=lambda one: one.excess)
+        ranked = sorted(fresh, key=lambda one: one.merit) + sorted(stuck, key=lambda one: one.excess)
         chosen = ranked[: _kept(len(ranked))]
         return [np.append(one.x, one.factor) if self.problem.free_period else one.x for one in chosen]
 
 
 def _kept(starts: int) -> int:
-    """Return the number of starts to search to the end."""
+    """Return the number of starts that the next round is for."""
     return max(1, round(KEPT * starts))
 
 

@@ -13,10 +13,18 @@ import numpy as np
 
 from trajectories.basis import Family, SampledMotion
 from trajectories.constraints import BoxLimit, MotionConstraint
-from trajectories.design.problem import ExcitationProblem, critical_times
+from trajectories.design.problem import ExcitationProblem, critical_times, exact_values, merit
 from trajectories.design.search import STAGES, SearchResult, one_start
 from trajectories.design.starts import shrunk
 from trajectories.errors import NothingFeasible
+
+
+WORTH = 0.01  # of the merit, so 1 % of condition numbers, that a motion may lose without being searched again
+
+
+def merit_of(problem: ExcitationProblem, found: SearchResult) -> float:
+    motion = dense_motion(problem.family, found.x, problem.basis().times[: problem.samples] * found.factor, found.factor)
+    return merit(problem, exact_values(problem, motion, problem.regressor(motion.q, motion.v, motion.a)))
 
 
 @dataclass(frozen=True)
@@ -100,8 +108,9 @@ def ensured(
 ) -> tuple[SearchResult, Verification]:
     """Return a motion that passes `verify_motion`.
 
-    One that does not is searched again from there, with the instants near what it breaks, and further inside the limits
-    that it breaks. Where that does not help, it is made smaller about its pose that is furthest inside.
+    One that does not is made a little smaller about its pose that is furthest inside. Where that does not help, or costs
+    more than `WORTH`, it is searched again from there, with the instants near what it breaks, and further inside the
+    limits that it breaks; at last it is made as small as needed.
 
     Args:
         constraints: to verify against, one for each of the problem's; default these.
@@ -115,28 +124,40 @@ def ensured(
     def verified(x: np.ndarray) -> Verification:
         return verify_motion(problem.family, x, checked, factor=found.factor, instants=instants)
 
-    report = verified(found.x)
-    max_evaluations = 240  # of a search that goes on from a motion, if all its stages are gone through
-    for _ in range(rounds):
+    def shrunk_to(shares: Sequence[float]) -> tuple[SearchResult, Verification] | None:
+        for share in shares:
+            small = shrunk(problem, found.x, share)
+            if (proof := verified(small)).feasible:
+                return replace(found, x=small), proof
+        return None
+
+    report, best = verified(found.x), merit_of(problem, found)
+    max_evaluations = 360  # of a search that goes on from a motion, if all its stages are gone through
+    for again in range(rounds + 1):
         if report.feasible:
             return found, report
+        small = shrunk_to((0.998, 0.995, 0.99, 0.98))
+        print("SHRUNK", again, small and merit_of(problem, small[0]) - best)
+        if small is not None and merit_of(problem, small[0]) <= best + WORTH:
+            return small
+        if again == rounds:
+            break
         y = np.append(found.x, found.factor) if problem.free_period else found.x
         lacking = np.array([max(-report.worst[one.name].share, 0.0) for one in checked])
+        print({one.name:report.worst[one.name].share for one in checked})
         further = np.where(lacking > 0.0, np.minimum(1.2 * lacking, 0.01) + 1e-4, 0.0)  # our choice
         extra = np.union1d(tighter.extra, critical_times(problem, y, 0.0, checked, instants))
         tighter = replace(tighter, extra=extra, tightening=tighter.tightening + further)
-        again = one_start(tighter, max_evaluations, "slsqp", found.seed, y, STAGES[2:])
-        found = replace(found, evaluations=found.evaluations + again.evaluations)
-        if isinstance(again, SearchResult):
+        run = one_start(tighter, max_evaluations, "slsqp", found.seed, y, STAGES[-1:])
+        found = replace(found, evaluations=found.evaluations + run.evaluations)
+        if isinstance(run, SearchResult):
             found = replace(
-                again, history=original.history, evaluations=found.evaluations, seconds=found.seconds + again.seconds,
-                interrupted=found.interrupted or again.interrupted,
+                run, history=original.history, evaluations=found.evaluations, seconds=found.seconds + run.seconds,
+                interrupted=found.interrupted or run.interrupted,
             )  # fmt: skip
             report = verified(found.x)
-    for share in 0.8 ** np.arange(21):
-        small = shrunk(problem, found.x, share)
-        if (proof := verified(small)).feasible:
-            return replace(found, x=small), proof
+    if (small := shrunk_to(0.8 ** np.arange(21))) is not None:
+        return small
     worst = min(report.margins, key=lambda one: one.share)
     raise NothingFeasible(
         f"feasible at the samples, but between them the {worst.name} limit ({worst.label}) is broken by "
