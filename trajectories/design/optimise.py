@@ -17,7 +17,7 @@ from trajectories.design.problem import ExcitationProblem, exact_values, stretch
 from trajectories.design.search import STAGES, Method, SearchResult, Stage, Stuck, one_start
 from trajectories.errors import BadInput, NotExciting, NothingFeasible, require
 
-KEPT = 1 / 2  # of the starts, which the next round is for (our choice)
+KEPT = 1 / 3  # of the starts, which the next round is for (our choice)
 ROUNDS = (STAGES[:1], STAGES[1:2], STAGES[2:])  # of a search: the first one tells most of what a start is worth
 
 
@@ -72,7 +72,7 @@ def design(
 
 
 class _Starts:
-    """Searches from several starts, in rounds: the best half of one goes into the next."""
+    """Searches from several starts, in rounds: the best third of one goes into the next."""
 
     def __init__(
         self, problem: ExcitationProblem, evaluations: int, method: Method, seed: int, map: Callable,
