@@ -137,14 +137,12 @@ def ensured(
         if report.feasible:
             return found, report
         small = shrunk_to((0.998, 0.995, 0.99, 0.98))
-        print("SHRUNK", again, small and merit_of(problem, small[0]) - best)
         if small is not None and merit_of(problem, small[0]) <= best + WORTH:
             return small
         if again == rounds:
             break
         y = np.append(found.x, found.factor) if problem.free_period else found.x
         lacking = np.array([max(-report.worst[one.name].share, 0.0) for one in checked])
-        print({one.name:report.worst[one.name].share for one in checked})
         further = np.where(lacking > 0.0, np.minimum(1.2 * lacking, 0.01) + 1e-4, 0.0)  # our choice
         extra = np.union1d(tighter.extra, critical_times(problem, y, 0.0, checked, instants))
         tighter = replace(tighter, extra=extra, tightening=tighter.tightening + further)
