@@ -34,6 +34,10 @@ def design(
 ) -> SearchResult:
     """Return the best motion over several starts.
 
+    The first stage of the search is for all starts, each later one for the best third of those before, at least one. A
+    stage ends where a step improves the merit by less than its tolerance (0.001, later 0.0001: 0.01 % of condition
+    numbers), or at its share of the evaluations.
+
     Args:
         problem: must pickle where `map` runs in other processes.
         starts: random ones, each from its own child of the seed, besides the guesses.

@@ -18,13 +18,8 @@ from trajectories.design.search import STAGES, SearchResult, one_start
 from trajectories.design.starts import shrunk
 from trajectories.errors import NothingFeasible
 
-
-WORTH = 0.01  # of the merit, so 1 % of condition numbers, that a motion may lose without being searched again
-
-
-def merit_of(problem: ExcitationProblem, found: SearchResult) -> float:
-    motion = dense_motion(problem.family, found.x, problem.basis().times[: problem.samples] * found.factor, found.factor)
-    return merit(problem, exact_values(problem, motion, problem.regressor(motion.q, motion.v, motion.a)))
+WORTH = 0.01  # of the merit, so 1 % of condition numbers, which a motion may lose without a new search (our choice)
+SMALLER = (0.998, 0.995, 0.99, 0.98)  # shares to which it is made smaller before (our choice)
 
 
 @dataclass(frozen=True)
@@ -108,9 +103,9 @@ def ensured(
 ) -> tuple[SearchResult, Verification]:
     """Return a motion that passes `verify_motion`.
 
-    One that does not is made a little smaller about its pose that is furthest inside. Where that does not help, or costs
-    more than `WORTH`, it is searched again from there, with the instants near what it breaks, and further inside the
-    limits that it breaks; at last it is made as small as needed.
+    One that does not is made a little smaller about its pose that is furthest inside. Where that does not help, or
+    costs more than `WORTH`, it is searched again from there, with the instants near what it breaks, and further inside
+    the limits that it breaks; at last it is made as small as needed.
 
     Args:
         constraints: to verify against, one for each of the problem's; default these.
@@ -119,10 +114,14 @@ def ensured(
     Raises:
         NothingFeasible: where none of that helps.
     """
-    checked, tighter, original = constraints or problem.constraints, problem, found
+    checked, tighter = constraints or problem.constraints, problem
 
     def verified(x: np.ndarray) -> Verification:
         return verify_motion(problem.family, x, checked, factor=found.factor, instants=instants)
+
+    def merit_of(one: SearchResult) -> float:
+        motion = dense_motion(problem.family, one.x, problem.basis().times[: problem.samples] * one.factor, one.factor)
+        return merit(problem, exact_values(problem, motion, problem.regressor(motion.q, motion.v, motion.a)))
 
     def shrunk_to(shares: Sequence[float]) -> tuple[SearchResult, Verification] | None:
         for share in shares:
@@ -131,13 +130,13 @@ def ensured(
                 return replace(found, x=small), proof
         return None
 
-    report, best = verified(found.x), merit_of(problem, found)
-    max_evaluations = 360  # of a search that goes on from a motion, if all its stages are gone through
+    report, original = verified(found.x), found
+    max_evaluations = 300  # of a search that goes on from a motion, if all its stages are gone through
     for again in range(rounds + 1):
         if report.feasible:
             return found, report
-        small = shrunk_to((0.998, 0.995, 0.99, 0.98))
-        if small is not None and merit_of(problem, small[0]) <= best + WORTH:
+        small = shrunk_to(SMALLER)
+        if small is not None and merit_of(small[0]) <= merit_of(original) + WORTH:
             return small
         if again == rounds:
             break
