@@ -6,7 +6,7 @@ coefficients (*proved*); for torques, places and distances it is estimated as tw
 (*estimated*: our choice; a jump between two instants, as of Coulomb friction, needs no allowance beyond it).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -123,7 +123,7 @@ def ensured(
         motion = dense_motion(problem.family, one.x, problem.basis().times[: problem.samples] * one.factor, one.factor)
         return merit(problem, exact_values(problem, motion, problem.regressor(motion.q, motion.v, motion.a)))
 
-    def shrunk_to(shares: Sequence[float]) -> tuple[SearchResult, Verification] | None:
+    def shrunk_to(shares: Iterable[float]) -> tuple[SearchResult, Verification] | None:
         for share in shares:
             small = shrunk(problem, found.x, share)
             if (proof := verified(small)).feasible:
