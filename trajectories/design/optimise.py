@@ -62,15 +62,14 @@ def design(
             if not search.interrupted:
                 tasks = search.run(tasks, stages)
     except KeyboardInterrupt:
-        if not search.found:
+        if not search.last:
             raise
         search.interrupted = True
-    if not search.found:
+    if not search.last:
         raise _nothing(problem, search.stuck, len(tasks))
     best = min(search.last, key=lambda one: one.merit)
-    share = sum(one.feasible * one.evaluations for one in search.found) / search.spent
     return replace(
-        best, evaluations=search.spent, feasible=share, seconds=time.perf_counter() - began,
+        best, evaluations=search.spent, feasible=search.feasible / search.spent, seconds=time.perf_counter() - began,
         interrupted=search.interrupted,
     )  # fmt: skip
 
@@ -83,9 +82,9 @@ class _Starts:
         report: Callable[[int, int, str], None] | None, starts: int,
     ):  # fmt: skip
         self.problem, self.arguments, self.map, self.report = problem, (evaluations, method, seed), map, report
-        self.found, self.last, self.stuck = list[SearchResult](), list[SearchResult](), list[Stuck]()
+        self.last, self.stuck = list[SearchResult](), list[Stuck]()
         self.done, self.total = 0, starts + _kept(starts) + _kept(_kept(starts))
-        self.spent, self.interrupted = 0, False
+        self.spent, self.feasible, self.interrupted = 0, 0.0, False
 
     def run(self, tasks: Sequence[int | np.ndarray], stages: tuple[Stage, ...]) -> list[np.ndarray]:
         """Run the given stages of the search for each task; return the variables of the best motions.
@@ -100,15 +99,14 @@ class _Starts:
             self.done += 1
             if isinstance(run, SearchResult):
                 fresh.append(run)
-                self.found.append(run)
-                self.last = fresh
-                self.interrupted |= run.interrupted
+                self.last, self.interrupted = fresh, self.interrupted or run.interrupted
+                self.feasible += run.feasible * run.evaluations
             else:
                 stuck.append(run)
                 self.stuck.append(run)
             if self.report:
-                best = min((one.merit for one in self.found), default=np.inf)
-                words = f"best so far {best:.4g}" if self.found else "nothing feasible yet"
+                best = min((one.merit for one in self.last), default=np.inf)
+                words = f"best so far {best:.4g}" if self.last else "nothing feasible yet"
                 self.report(self.done, self.total, words)
         ranked = sorted(fresh, key=lambda one: one.merit) + sorted(stuck, key=lambda one: one.excess)
         chosen = ranked[: _kept(len(ranked))]

@@ -50,9 +50,10 @@ class Stage(NamedTuple):
 
 
 STAGES = (
-    Stage(4.0, 100.0, 1e-3, 0.3, rough=True, coarse=True),
-    Stage(20.0, 400.0, 1e-4, 0.35, rough=True),
-    Stage(100.0, 2000.0, 1e-4, 0.35),
+    Stage(4.0, 100.0, 1e-3, 0.2, rough=True, coarse=True),
+    Stage(10.0, 200.0, 1e-4, 0.35, rough=True),
+    Stage(30.0, 500.0, 1e-4, 0.25),
+    Stage(100.0, 2000.0, 1e-4, 0.2),
 )
 """Our choice."""
 S_RANGE = (-4.0, 12.0)

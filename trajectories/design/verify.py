@@ -131,15 +131,13 @@ def ensured(
         return None
 
     report, original = verified(found.x), found
-    max_evaluations = 300  # of a search that goes on from a motion, if all its stages are gone through
-    for again in range(rounds + 1):
+    max_evaluations = 500  # of a search that goes on from a motion, if all its stages are gone through
+    for _ in range(rounds):
         if report.feasible:
             return found, report
         small = shrunk_to(SMALLER)
         if small is not None and merit_of(small[0]) <= merit_of(original) + WORTH:
             return small
-        if again == rounds:
-            break
         y = np.append(found.x, found.factor) if problem.free_period else found.x
         lacking = np.array([max(-report.worst[one.name].share, 0.0) for one in checked])
         further = np.where(lacking > 0.0, np.minimum(1.2 * lacking, 0.01) + 1e-4, 0.0)  # our choice
@@ -153,7 +151,7 @@ def ensured(
                 interrupted=found.interrupted or run.interrupted,
             )  # fmt: skip
             report = verified(found.x)
-    if (small := shrunk_to(0.8 ** np.arange(21))) is not None:
+    if (small := shrunk_to((1.0, *SMALLER, *0.8 ** np.arange(1, 21)))) is not None:
         return small
     worst = min(report.margins, key=lambda one: one.share)
     raise NothingFeasible(
