@@ -17,7 +17,7 @@ from trajectories.design.problem import ExcitationProblem, exact_values, stretch
 from trajectories.design.search import STAGES, Method, SearchResult, Stage, Stuck, one_start
 from trajectories.errors import BadInput, NotExciting, NothingFeasible, require
 
-KEPT = 1 / 3  # of the starts, which the next round is for (our choice)
+KEPT = 1 / 2  # of the starts, which the next round is for (our choice)
 ROUNDS = (STAGES[:1], STAGES[1:2], STAGES[2:])  # of a search: the first one tells most of what a start is worth
 
 
@@ -34,9 +34,9 @@ def design(
 ) -> SearchResult:
     """Return the best motion over several starts.
 
-    The first stage of the search is for all starts, each later one for the best third of those before, at least one. A
-    stage ends where a step improves the merit by less than its tolerance (0.001, later 0.0001: 0.01 % of condition
-    numbers), or at its share of the evaluations.
+    The first stage of the search is for all starts, the second for the best half of them, the others for the best half
+    of those. A stage ends where a step improves the merit by less than its tolerance (0.001, later 0.0001: 0.01 % of
+    condition numbers), or at its share of the evaluations.
 
     Args:
         problem: must pickle where `map` runs in other processes.
@@ -75,7 +75,7 @@ def design(
 
 
 class _Starts:
-    """Searches from several starts, in rounds: the best third of one goes into the next."""
+    """Searches from several starts, in rounds: the best half of one goes into the next."""
 
     def __init__(
         self, problem: ExcitationProblem, evaluations: int, method: Method, seed: int, map: Callable,
