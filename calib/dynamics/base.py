@@ -19,12 +19,12 @@ from calib.dynamics.idim import IdentificationModel, friction_states
 from calib.dynamics.regressor_model import Loads, RegressorModel, States
 from calib.errors import CalibError
 from calib.estimation.base_columns import ColumnSplit, split_columns
-from calib.estimation.triangles import retriangulate
+from calib.estimation.triangles import continued, retriangulate
 from calib.records import frozen, shaped
 
 SAMPLES = 500
 MIN_COEFFICIENT = 1e-4  # coefficients below are not printed: on a calibrated geometry nearly all are there, and small
-BLOCK = 2048  # samples per factorisation: bounds the memory, and keeps it in the processor's cache
+BLOCK = 1024  # samples per factorisation: bounds the memory, and keeps it in the processor's cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,11 +240,9 @@ def places(own: Sequence[str], names: Sequence[str], standard: Collection[str]) 
 def _updated(triangle: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Return the R factor of [R factor; columnsᵀ] (p, p); columns (p, N)."""
     live = np.flatnonzero(columns.any(axis=1) | triangle.any(axis=0))
-    stacked = np.empty((len(columns) + columns.shape[1], len(live)), order="F")
-    stacked[: len(columns)] = triangle[:, live]
-    stacked[len(columns) :] = columns[live].T
     result = np.zeros_like(triangle)
-    result[: len(live), live] = retriangulate(stacked, overwrite=True)
+    if len(live):  # live[i] >= i: what stood in other columns is upper triangular in these
+        result[: len(live), live] = continued(triangle[: len(live), live], columns[live].T)
     return result
 
 
@@ -282,9 +280,6 @@ def _describe(model: RegressorModel, split: ColumnSplit, factor: np.ndarray, sam
 def _require_same(base: Base, model: RegressorModel) -> None:
     if (base.rows, base.standard) != (model.torque_rows.name, model.names):
         raise CalibError("the base parameters belong to another model: rows or parameter names differ")
-
-
-BLOCK = 4000  # samples at a time
 
 
 def information(

@@ -15,7 +15,7 @@ move reaches, or, where there are none, among the best few by via-points.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
@@ -313,11 +313,17 @@ class Exchange:
 
     def ranked(self, q: np.ndarray) -> np.ndarray:
         """Return the candidates' numbers (N,), best first, by the index of each together with poses (m, n)."""
-        rows, trials = self._rows(q), self.jacobian(self.candidates)
+        rows = self._rows(q)
         flat = rows.reshape(-1, rows.shape[2])
-        matrices = flat.T @ flat + trials.transpose(0, 2, 1) @ trials
+        matrices = flat.T @ flat + self._alone
         values = log_det(matrices) if self.index == "O1" else merits(matrices, self.index)
         return np.argsort(-values, kind="stable")
+
+    @cached_property
+    def _alone(self) -> np.ndarray:
+        """Information matrices (N, p, p) of the candidates."""
+        trials = self.jacobian(self.candidates)
+        return trials.transpose(0, 2, 1) @ trials
 
     def _rows(self, q: np.ndarray) -> np.ndarray:
         rows = np.asarray(self.jacobian(q))
@@ -388,10 +394,8 @@ def _rejoined(
     q, found, ways = q.copy(), dict[int, int](), run.found_ways
     joined = [k for k in range(len(q)) if k not in run.cut_off]
     for place in run.cut_off:
-        ranked = [
-            int(k) for k in exchange.ranked(np.delete(q, place, axis=0))
-            if np.abs(q - exchange.candidates[k]).max(axis=1).min() > 1e-9
-        ]  # fmt: skip
+        apart = np.abs(q - exchange.candidates[:, None]).max(axis=2).min(axis=1)
+        ranked = [int(k) for k in exchange.ranked(np.delete(q, place, axis=0)) if apart[k] > 1e-9]
         itself = [(None, straight) for straight in (True, False)]
         others = [(k, True) for k in ranked[:MAX_STRAIGHT_TRIES]] + [(k, False) for k in ranked[:MAX_VIA_TRIES]]
         for number, straight in itself + others:
