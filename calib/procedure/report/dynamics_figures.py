@@ -194,7 +194,7 @@ def _geometries(rows: Sequence[TwoGeometries]) -> Chart:
 
 def _effects(rows: Sequence[GeometricEffect]) -> Chart:
     """Return the chart of geometric errors, ranked by the largest parameter shift they cause."""
-    size = np.array([row.shift_sigma or 0.0 for row in rows])
+    size = np.nan_to_num(np.array([row.shift_sigma or 0.0 for row in rows]), posinf=0.0)
     layers = [
         bars(size, [AFTER if one > MIN_SHIFT else QUIET for one in size]), level(MIN_SHIFT, upright=True),
         *(text(row.parameter, one, k, (3, 0), along="center") for k, (row, one) in enumerate(zip(rows, size))),
