@@ -101,7 +101,7 @@ def triangle(residual: np.ndarray, matrix: np.ndarray) -> Reduced:
 Rows = tuple[np.ndarray, np.ndarray]  # residual (m,) and W (m, p)
 
 
-def reduced(pieces: Callable[[], Iterable[Rows]]) -> Reduced:
+def reduced(pieces: Callable[[], Iterable[Rows]], total: Gram | None = None) -> Reduced:
     """Return the problem of many pieces of rows reduced in the memory of one piece.
 
     Up to `MOST_NUMBERS` by one QR. More by Cholesky of WᵀW with its columns scaled to unit norm, which takes a quarter
@@ -109,10 +109,10 @@ def reduced(pieces: Callable[[], Iterable[Rows]]) -> Reduced:
 
     Args:
         pieces: yields the rows, the same at every call.
+        total: their statistics, of many rows where they are known already.
     """
     start = list[Rows]()
-    total: Gram | None = None
-    for piece in pieces():
+    for piece in pieces() if total is None else ():
         start.append(piece)
         if total is not None or sum(matrix.size for _, matrix in start) > MOST_NUMBERS:
             each = [gram(*one) for one in start]

@@ -32,6 +32,10 @@ class Gram:
             self.square - other.square, self.cross - other.cross, self.total - other.total, self.rows - other.rows
         )
 
+    def scaled(self, factor: float) -> Gram:
+        """Return the statistics of rows multiplied by √factor."""
+        return Gram(factor * self.square, factor * self.cross, factor * self.total, self.rows)
+
 
 def gram(residual: np.ndarray, matrix: np.ndarray) -> Gram:
     """Return the sufficient statistics of residual (rows,) and W (rows, p)."""

@@ -9,14 +9,17 @@ from typing import Any
 
 import numpy as np
 
+from calib.data.poses.measurements import Positions
 from calib.errors import UsageError, one_of, refuse_data
 from calib.estimation import robust
 from calib.estimation.base_columns import ColumnSplit
 from calib.estimation.estimate import Estimate
-from calib.estimation.nonlinear import Reduced, Rows, Solution, covariance, reduced
+from calib.estimation.nonlinear import MOST_NUMBERS, Reduced, Rows, Solution, covariance, reduced
+from calib.estimation.relevance import gram
 from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, layout, observe, parameter_values, whitened
 from calib.geometry.residuals import Part
+from calib.geometry.squares import squares
 from calib.records import frozen
 from calib.robot.calibrated import CalibratedChain, CorrectedChain
 from calib.robot.chain import Chain
@@ -242,7 +245,19 @@ class Weigher:
             held = np.isfinite(self.prior)
             pull = (parameter_values(self.nominal) - parameter_values(state))[self.free] / self.prior
             known.append((pull[held], np.diag(1.0 / self.prior)[held]))
-        return reduced(lambda: chain(_rows(state, self.free, self.blocks, self.pieces), known))
+        total = None
+        if self._many:
+            each = [gram(*rows) for rows in known]
+            for number, block in enumerate(self.blocks):
+                each += [own for _, own in squares(state, block, self.free, _scales(self.pieces, number))]
+            total = sum(each[1:], each[0])
+        return reduced(lambda: chain(_rows(state, self.free, self.blocks, self.pieces), known), total)
+
+    @property
+    def _many(self) -> bool:
+        """Whether W is large and all its rows are positions or poses, whose statistics come cheaper than rows."""
+        count = sum(piece.sigma.size for piece in self.pieces) * len(self.free)
+        return count > MOST_NUMBERS and all(isinstance(block.measured, Positions) for block in self.blocks)
 
     def result(self, solution: Solution) -> GeometricFit:
         state = solution.state
@@ -270,9 +285,13 @@ class Weigher:
 def _rows(cell: Installation, free: np.ndarray, blocks: list[Block], pieces: list[Piece]) -> Iterator[Rows]:
     """Yield the residuals of all blocks and their Jacobians, whitened as in `pieces`."""
     for number, block in enumerate(blocks):
-        own = [piece for piece in pieces if piece.block == number]
-        scales = [piece.sigma / np.sqrt(piece.weight) for piece in own]
-        yield from whitened(cell, block, free, scales, [piece.part.noise for piece in own])
+        noises = [piece.part.noise for piece in pieces if piece.block == number]
+        yield from whitened(cell, block, free, _scales(pieces, number), noises)
+
+
+def _scales(pieces: list[Piece], number: int) -> list[np.ndarray]:
+    """Return the divisors (rows, m) of a block's residual parts, from sigmas and robust weights."""
+    return [piece.sigma / np.sqrt(piece.weight) for piece in pieces if piece.block == number]
 
 
 def _sigma(part: Part, share: float, start: bool, robustly: bool) -> np.ndarray:

@@ -9,16 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import repeat
 from typing import Any
 
 import numpy as np
 
-from calib.data.poses.measurements import PoseMeasurements, take
+from calib.data.poses.measurements import PoseMeasurements, Positions, take
 from calib.estimation.relevance import SETTLED, Condensed, Gram, Relevance, condensed, gram, relevance
 from calib.geometry.fit import plausible_deviation
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.folds import Folds
 from calib.geometry.observation import layout, observe, prepare, sampled
+from calib.geometry.squares import squares
 from calib.geometry.weighing import GeometricFit
 from calib.robot.calibrated import Deflection, Term
 from calib.robot.chain import Chain
@@ -237,27 +239,34 @@ class _Rows:
         """
         p, count = len(self.free), 0.0
         metric = whitened = Gram(np.zeros((p, p)), np.zeros(p), 0.0, 0)
-        station = np.flatnonzero(np.isin(self.free, layout(self.cell).index("station")))
         chunk = 1000  # poses observed at once
         for number, (block, rows) in enumerate(zip(self.measured, chosen)):
             frames: list[np.ndarray] = []
+            apart, scales = moved is not None and moved[number], self.scales[number]
             pieces = np.array_split(rows, max(1, len(rows) // chunk)) if block.has_instrument else [rows]
             for piece in filter(len, pieces):
-                ready = prepare(self.cell, [take(block, piece)])
+                ready, weights = prepare(self.cell, [take(block, piece)])[0], self.weights[number][piece]
+                if isinstance(block, Positions) and not apart:
+                    for part, own in squares(self.cell, ready, self.free, repeat(1.0 / np.sqrt(weights[None]))):
+                        whitened = whitened + own.scaled(scales[part.label] ** -2.0)
+                        if part.label in METRES:
+                            metric, count = metric + own, count + float(weights.sum())
+                    continue
                 noise = self.noises[number].unweighted(len(piece)) if self.noises[number] else None
-                for bare in observe(self.cell, ready[0], self.free):
-                    part, weight = replace(bare, noise=noise), self.weights[number][piece][bare.index]
+                for bare in observe(self.cell, ready, self.free):
+                    part, weight = replace(bare, noise=noise), weights[bare.index]
                     root = 1.0 / np.sqrt(weight)
-                    own = gram(*part.whitened(root * self.scales[number][part.label]))
+                    own = gram(*part.whitened(root * scales[part.label]))
                     whitened = whitened + replace(own, rows=part.value.size)
                     if part.label in METRES:
                         residual, matrix = bare.whitened(root * part.per_length)
                         count += float(weight.sum())
-                        if moved is not None and moved[number]:
+                        if apart:
                             frames.append(np.vstack([matrix.T, residual]))
                         else:
                             metric = metric + gram(residual, matrix)
             if frames:
+                station = np.flatnonzero(np.isin(self.free, layout(self.cell).index("station")))
                 columns = project_out(np.concatenate(frames, axis=1), station)
                 metric = metric + gram(columns[-1], columns[:-1].T)
         return metric, whitened, count
