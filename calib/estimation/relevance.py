@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -87,15 +88,16 @@ class Condensed:
 
     def gram(self, data: Gram) -> Gram:
         """Return statistics in these coordinates."""
-        square = self.columns(self.columns(data.square).T)
-        return Gram(square, self.columns(data.cross), data.total, data.rows)
+        half = self.columns(data.square)
+        parts = [half.take(own, 1) if basis is None else half.take(own, 1) @ basis for own, basis in self.blocks]
+        return Gram(np.concatenate(parts, axis=1), self.columns(data.cross), data.total, data.rows)
 
 
-def condensed(square: np.ndarray, groups: np.ndarray, start: np.ndarray) -> Condensed:
-    """Return coordinates of the columns with statistics WᵀW `square` (p, p), with equal prior magnitude within a group.
+def condensed(square: Callable[[np.ndarray], np.ndarray], groups: np.ndarray, start: np.ndarray) -> Condensed:
+    """Return coordinates of p columns with statistics WᵀW, with equal prior magnitude within a group.
 
     Args:
-        square: of all rows that will ever be used.
+        square: columns (k,) -> their WᵀW (k, k), of all rows that will ever be used.
         groups: (p,) group of each column; -1 for no ridge.
         start: (p,) first guess of each column's prior standard deviation; within a group their ratios stay.
     """
@@ -108,7 +110,7 @@ def condensed(square: np.ndarray, groups: np.ndarray, start: np.ndarray) -> Cond
         own = np.flatnonzero(groups == group)
         size = float(np.exp(np.log(start[own]).mean()))
         profile = start[own] / size
-        seen, basis = np.linalg.eigh(square[np.ix_(own, own)] * np.outer(profile, profile))
+        seen, basis = np.linalg.eigh(square(own) * np.outer(profile, profile))
         kept = seen > rounding * seen[-1]
         kept[-1] = True
         blocks.append((own, profile[:, None] * basis[:, kept]))

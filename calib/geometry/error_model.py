@@ -279,7 +279,10 @@ class _Rows:
             self.metric.append(next((each.value, each.jacobian) for each in parts if each.label == "position"))
         total = sum((self._gram(k, slice(None)) for k in range(1, len(self.measured))), self._gram(0, slice(None)))
         groups = np.concatenate([np.full(len(own), -1), term_groups(terms)]).astype(int)
-        self.coordinates = condensed(total.square, groups, np.concatenate([np.ones(len(own)), term_sizes(terms)]))
+        self.coordinates = condensed(
+            lambda columns: total.square[np.ix_(columns, columns)], groups,
+            np.concatenate([np.ones(len(own)), term_sizes(terms)]),
+        )  # fmt: skip
         self.total, columns = self.coordinates.gram(total), self.coordinates.columns
         self.whitened = [[(value, columns(jacobian)) for value, jacobian in block] for block in self.whitened]
         self.metric = [(value, columns(jacobian)) for value, jacobian in self.metric]

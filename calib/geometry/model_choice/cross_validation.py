@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from itertools import repeat
-from typing import Any
+from itertools import chain, repeat
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -162,23 +162,30 @@ def fold_statistics(
     rows_of = _Rows(cell, measured, free, found.used_sigmas(), weights, found.used_noises())
     rigid, groups, sizes = len(found.free), term_groups(terms), term_sizes(terms)
     pooled = all(block.has_instrument for block in measured)
-    each, held_out, rows = list[Gram](), list[Gram](), []
+    outside, shares, rows = list[list[_Share]](), list[list[_Share]](), []
     for fold in range(folds.count):
         inside = [np.flatnonzero(members == fold) for members in folds.members]
         seen = {block.station for block, chosen in zip(measured, inside) if len(chosen) < len(block)}
         moved = [block.has_instrument and block.station not in seen for block in measured]
-        metric, whitened, count = rows_of.statistics(inside, moved)
-        held_out.append(metric)
+        own, count = rows_of.statistics(inside, moved)
+        shares.append(own)
         rows.append(count)
         if not pooled:
-            whitened = rows_of.statistics([np.flatnonzero(members != fold) for members in folds.members])[1]
-        each.append(whitened)
-    total = sum(each[1:], each[0]) if pooled else rows_of.statistics([np.arange(len(b)) for b in measured])[1]
+            outside.append(rows_of.statistics([np.flatnonzero(members != fold) for members in folds.members])[0])
+    whole = list(chain(*shares)) if pooled else rows_of.statistics([np.arange(len(b)) for b in measured])[0]
     families = np.concatenate([np.full(rigid, -1), groups]).astype(int)
-    coordinates = condensed(total.square, families, np.concatenate([np.ones(rigid), sizes]))
-    total, *each = (coordinates.gram(own) for own in (total, *each))
-    held_out = [coordinates.gram(own) for own in held_out]
-    training = [total - own for own in each] if pooled else each
+    coordinates = condensed(
+        lambda columns: sum(one.whitened * one.data.square[np.ix_(columns, columns)] for one in whole),
+        families, np.concatenate([np.ones(rigid), sizes]),
+    )  # fmt: skip
+    shares = [[one._replace(data=coordinates.gram(one.data)) for one in own] for own in shares]
+    held_out = [_in_metres(own) for own in shares]
+    if pooled:
+        each = [_whitened(own) for own in shares]
+        total = sum(each[1:], each[0])
+        training = [total - own for own in each]
+    else:
+        total, *training = (coordinates.gram(_whitened(own)) for own in (whole, *outside))
     wide = plausible_deviation(found.cell, found.free) if found.prior is None else found.prior
     plausible = np.where(np.isfinite(wide), wide, 10.0)
     return FoldStatistics(rigid, groups, sizes, coordinates, plausible, training, held_out, np.array(rows), total)
@@ -206,8 +213,9 @@ def blind_folds(nominal: GeometricFit, measured: Sequence[PoseMeasurements], fol
     each, squares = [], []
     for fold in range(folds.count):
         inside = [np.flatnonzero(members == fold) for members in folds.members]
-        held, own, count = rows.statistics(inside, [True] * len(measured))
-        each.append(own)
+        own, count = rows.statistics(inside, [True] * len(measured))
+        held = _in_metres(own)
+        each.append(_whitened(own))
         squares.append((held.square / max(count, 1.0), held.total / max(count, 1.0)))
     total = sum(each[1:], each[0])
     result = np.zeros(folds.count, dtype=bool)
@@ -221,6 +229,24 @@ def blind_folds(nominal: GeometricFit, measured: Sequence[PoseMeasurements], fol
     return result
 
 
+class _Share(NamedTuple):
+    """Statistics of some rows, and factors that make of them those of whitened residuals, and of those in metres."""
+
+    data: Gram
+    whitened: float
+    metric: float
+
+
+def _whitened(shares: Sequence[_Share]) -> Gram:
+    first, *rest = (one.data.scaled(one.whitened) for one in shares if one.whitened)
+    return sum(rest, first)
+
+
+def _in_metres(shares: Sequence[_Share]) -> Gram:
+    first, *rest = (one.data.scaled(one.metric) for one in shares if one.metric)
+    return sum(rest, first)
+
+
 @dataclass(frozen=True, eq=False)
 class _Rows:
     """Measured blocks with the weights of their rows: rms sigma by label, robust weights, noise of images."""
@@ -232,13 +258,18 @@ class _Rows:
     weights: Sequence[np.ndarray]
     noises: Sequence[Any]
 
-    def statistics(self, chosen: Sequence[np.ndarray], moved: Sequence[bool] | None = None) -> tuple[Gram, Gram, float]:
-        """Return the statistics of chosen rows in metres and whitened, and the number of rows in metres.
+    def statistics(
+        self, chosen: Sequence[np.ndarray], moved: Sequence[bool] | None = None
+    ) -> tuple[list[_Share], float]:
+        """Return the statistics of chosen rows, and the number of rows in metres.
 
         Of the blocks that are `moved` the station's placement is projected out of the statistics in metres.
         """
-        p, count = len(self.free), 0.0
-        metric = whitened = Gram(np.zeros((p, p)), np.zeros(p), 0.0, 0)
+        found, count = dict[Any, _Share](), 0.0
+
+        def add(key: Any, data: Gram, whitened: float, metric: float) -> None:
+            found[key] = _Share(found[key].data + data if key in found else data, whitened, metric)
+
         chunk = 1000  # poses observed at once
         for number, (block, rows) in enumerate(zip(self.measured, chosen)):
             frames: list[np.ndarray] = []
@@ -248,28 +279,28 @@ class _Rows:
                 ready, weights = prepare(self.cell, [take(block, piece)])[0], self.weights[number][piece]
                 if isinstance(block, Positions) and not apart:
                     for part, own in squares(self.cell, ready, self.free, repeat(1.0 / np.sqrt(weights[None]))):
-                        whitened = whitened + own.scaled(scales[part.label] ** -2.0)
-                        if part.label in METRES:
-                            metric, count = metric + own, count + float(weights.sum())
+                        in_metres = part.label in METRES
+                        add((number, part.label), own, scales[part.label] ** -2.0, float(in_metres))
+                        count += float(weights.sum()) * in_metres
                     continue
                 noise = self.noises[number].unweighted(len(piece)) if self.noises[number] else None
                 for bare in observe(self.cell, ready, self.free):
                     part, weight = replace(bare, noise=noise), weights[bare.index]
                     root = 1.0 / np.sqrt(weight)
                     own = gram(*part.whitened(root * scales[part.label]))
-                    whitened = whitened + replace(own, rows=part.value.size)
+                    add("whitened", replace(own, rows=part.value.size), 1.0, 0.0)
                     if part.label in METRES:
                         residual, matrix = bare.whitened(root * part.per_length)
                         count += float(weight.sum())
                         if apart:
                             frames.append(np.vstack([matrix.T, residual]))
                         else:
-                            metric = metric + gram(residual, matrix)
+                            add("metric", gram(residual, matrix), 0.0, 1.0)
             if frames:
                 station = np.flatnonzero(np.isin(self.free, layout(self.cell).index("station")))
                 columns = project_out(np.concatenate(frames, axis=1), station)
-                metric = metric + gram(columns[-1], columns[:-1].T)
-        return metric, whitened, count
+                add("metric", gram(columns[-1], columns[:-1].T), 0.0, 1.0)
+        return list(found.values()), count
 
 
 def project_out(columns: np.ndarray, frames: np.ndarray) -> np.ndarray:
