@@ -27,7 +27,8 @@ from calib.geometry.left_out import LeftOut, Profile, unevenness
 from calib.geometry.model_choice.cross_validation import project_out, term_groups, term_sizes
 from calib.geometry.model_choice.folds import Folds, random_folds
 from calib.geometry.model_choice.ladder import MAX_RESIDUAL, ModelSelection
-from calib.geometry.observation import layout, observe, pose_sigmas, prepare
+from calib.geometry.observation import layout, observe, prepare
+from calib.geometry.squares import position_variances
 from calib.records import evenly
 from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain
@@ -95,7 +96,7 @@ class ErrorModel:
             station: index of the station of reference; -1 for the arm's base.
             tool: which of its tools, one or (m,).
         """
-        own = pose_sigmas(self.cell, rows, self.free, self.covariance, station, tool)[:, 0] ** 2
+        own = position_variances(self.cell, rows, self.free, self.covariance, station, tool)
         return self._sigma(own, rows.q)
 
     def sigma_on(self, cell: Installation, block: Positions, placed_anew: bool = False) -> np.ndarray:
