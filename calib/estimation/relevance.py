@@ -6,8 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
-from scipy.linalg.lapack import dpotrf, dtrtri  # type: ignore[attr-defined]
+from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri  # type: ignore[attr-defined]
 
 from calib.errors import Unidentifiable
 
@@ -203,7 +202,7 @@ def _posterior(
         raise Unidentifiable(
             "the measurements cannot distinguish the model's terms. Are rows repeated? Measure more poses"
         )
-    solution = scipy.linalg.cho_solve((factor, True), cross, check_finite=False)
+    solution, _ = dpotrs(factor, cross, lower=1)
     inverse = _inverse(factor)  # of the triangle: the variances need no more
     return solution, np.einsum("ij,ij->j", inverse, inverse) / beta
 

@@ -16,7 +16,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.linalg
+from scipy.linalg.blas import dtrsm  # type: ignore[attr-defined]
 from scipy.spatial import KDTree
 
 from calib.data.poses.measurements import PoseMeasurements, Positions, take
@@ -148,14 +148,16 @@ def outside(q: np.ndarray, learnt: np.ndarray) -> np.ndarray:
     return np.asarray((q < learnt.min(axis=0)) | (q > learnt.max(axis=0)))
 
 
-def _root_of_inverse(precision: np.ndarray) -> np.ndarray:
-    """Return a root R (p, p) of the covariance, R Rᵀ = P⁻¹, from a precision matrix P with unit diagonal."""
+def _variances(precision: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Return the diagonal (k,) of Jᵀ P⁻¹ J for columns J (p, k), from a precision matrix P with unit diagonal."""
     try:
         factor = np.linalg.cholesky(precision + 1e-12 * np.eye(len(precision)))
     except np.linalg.LinAlgError:  # by rounding; Cholesky is five times as fast
         values, vectors = np.linalg.eigh(precision)
-        return vectors / np.sqrt(np.maximum(values, 1e-12 * values[-1]))
-    return scipy.linalg.solve_triangular(factor, np.eye(len(precision)), lower=True).T
+        spread = columns.T @ vectors / np.sqrt(np.maximum(values, 1e-12 * values[-1]))
+    else:
+        spread = dtrsm(1.0, factor.T, columns.T, side=1)  # rows (L⁻¹ J)ᵀ, without copies
+    return np.einsum("kp,kp->k", spread, spread)
 
 
 def _distances(q: np.ndarray, learnt: np.ndarray, levers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -314,7 +316,7 @@ class _Rows:
             alive = np.flatnonzero(found.ridge > 0.0)
             precision = square[np.ix_(alive, alive)] / found.noise**2 + np.diag(found.ridge[alive] ** -2.0)
             scale = 1.0 / np.sqrt(np.diag(precision))
-            root = scale[:, None] * _root_of_inverse(precision * np.outer(scale, scale))
+            precision *= np.outer(scale, scale)
             learnt = np.concatenate([np.delete(b.q, rows, axis=0) for b, rows in zip(self.measured, inside)])
             stays = {b.station for b, rows in zip(self.measured, inside) if len(rows) < len(b)}
             for number, rows in enumerate(inside):
@@ -325,7 +327,7 @@ class _Rows:
                     both = project_out(np.concatenate([jacobian, value[None]]), self.station)
                     jacobian, value = both[:-1], both[-1]
                 error = value - np.einsum("f,fim->im", found.values, jacobian)
-                own = np.sum((root.T @ jacobian[alive].reshape(len(alive), -1)) ** 2, axis=0)
+                own = _variances(precision, scale[:, None] * jacobian[alive].reshape(len(alive), -1))
                 near = _distances(self.measured[number].q[rows], learnt, levers)
                 size, pose = np.sum(error**2, axis=0), self.pose[number][rows]
                 result = np.stack([size, own.reshape(3, -1).sum(axis=0), *near, pose], axis=1)

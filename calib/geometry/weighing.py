@@ -14,8 +14,8 @@ from calib.errors import UsageError, one_of, refuse_data
 from calib.estimation import robust
 from calib.estimation.base_columns import ColumnSplit
 from calib.estimation.estimate import Estimate
-from calib.estimation.nonlinear import MOST_NUMBERS, Reduced, Rows, Solution, covariance, reduced
-from calib.estimation.relevance import gram
+from calib.estimation.nonlinear import MOST_NUMBERS, Reduced, Rows, Solution, covariance, inverted, reduced
+from calib.estimation.relevance import Gram
 from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, layout, observe, parameter_values, whitened
 from calib.geometry.residuals import Part
@@ -224,7 +224,9 @@ class Weigher:
         """
         before, noises = self.pieces, self.noises
         self.used = before
-        resting = 0.0 if self.prior is None else float(np.sum(np.diag(covariance(solution.factor)) / self.prior**2))
+        resting = 0.0
+        if self.prior is not None:
+            resting = float(np.sum((inverted(solution.factor) / self.prior[:, None]) ** 2))
         self.update(solution.state, first=False, resting=resting)
         both = list(zip(self.pieces, before))
         ratios = [float(np.mean(new.sigma / old.sigma)) for new, old in both]
@@ -240,14 +242,13 @@ class Weigher:
 
     def linearise(self, state: Installation) -> Reduced:
         """Return the whitened problem at a state, reduced, with the prior."""
-        known = list[Rows]()
+        known, each, total = list[Rows](), list[Gram](), None
         if self.prior is not None:
             held = np.isfinite(self.prior)
             pull = (parameter_values(self.nominal) - parameter_values(state))[self.free] / self.prior
             known.append((pull[held], np.diag(1.0 / self.prior)[held]))
-        total = None
+            each.append(Gram(np.diag(self.prior**-2.0), pull / self.prior, float(pull @ pull), int(held.sum())))
         if self._many:
-            each = [gram(*rows) for rows in known]
             for number, block in enumerate(self.blocks):
                 each += [own for _, own in squares(state, block, self.free, _scales(self.pieces, number))]
             total = sum(each[1:], each[0])
