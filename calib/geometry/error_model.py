@@ -172,10 +172,11 @@ def _distances(q: np.ndarray, learnt: np.ndarray, levers: np.ndarray) -> tuple[n
     some = int(np.clip(round(near_share * count), 1, count))
     for j, lever in enumerate(levers):
         values = np.sort(learnt[:, j])
-        place = np.searchsorted(values, q[:, j])
-        first = np.clip(place[:, None] - some + np.arange(some + 1), 0, count - some)
-        way = np.maximum(np.abs(values[first] - q[:, j, None]), np.abs(values[first + some - 1] - q[:, j, None]))
-        alone += (lever * way.min(axis=1)) ** 2
+        low, high = values[: count - some + 1], values[some - 1 :]  # ends of all that are `some` values wide
+        middle = np.searchsorted(low + high, 2.0 * q[:, j])  # before it the low end is the further one
+        before, after = np.maximum(middle - 1, 0), np.minimum(middle, count - some)
+        way = np.minimum(*(np.maximum(np.abs(low[at] - q[:, j]), np.abs(high[at] - q[:, j])) for at in (before, after)))
+        alone += (lever * way) ** 2
     return nearest, alone
 
 
