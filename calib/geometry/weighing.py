@@ -190,6 +190,8 @@ class Weigher:
         self.prior = prior if prior is not None and np.isfinite(prior).any() else None
         self.pieces: list[Piece] = []
         self.used = self.pieces
+        self._seen: tuple[Installation | None, list[tuple[int, Part]]] = None, []
+        self._known: tuple[Installation | None, list[np.ndarray], list[Gram]] = None, [], []
 
     @property
     def noises(self) -> list[Any]:
@@ -198,7 +200,7 @@ class Weigher:
 
     def update(self, state: Installation, first: bool, resting: float = 0.0) -> None:
         """Set sigmas and weights from the residuals at a state; `resting`: parameters that rest on the prior."""
-        owned = [(number, part) for number, block in enumerate(self.blocks) for part in observe(state, block, _NONE)]
+        owned = self._observed(state)
         rows = sum(part.value.size for _, part in owned)
         unknown = len(self.free) + sum(part.nuisances for _, part in owned)
         if rows < unknown and self.prior is None:
@@ -249,10 +251,34 @@ class Weigher:
             known.append((pull[held], np.diag(1.0 / self.prior)[held]))
             each.append(Gram(np.diag(self.prior**-2.0), pull / self.prior, float(pull @ pull), int(held.sum())))
         if self._many:
-            for number, block in enumerate(self.blocks):
-                each += [own for _, own in squares(state, block, self.free, _scales(self.pieces, number))]
+            each += self._squares(state)
             total = sum(each[1:], each[0])
         return reduced(lambda: chain(_rows(state, self.free, self.blocks, self.pieces), known), total)
+
+    def _squares(self, state: Installation) -> list[Gram]:
+        """Return the statistics of the rows by block and part; at the last state, weighed otherwise, from those."""
+        scales = [_scales(self.pieces, number) for number in range(len(self.blocks))]
+        last, before, known = self._known
+        now = [each for own in scales for each in own]
+        ratios = [one / each for one, each in zip(before, now)] if state is last else []
+        if ratios and all(np.ptp(ratio) <= 1e-12 * ratio.flat[0] for ratio in ratios):
+            found = [own.scaled(float(ratio.flat[0]) ** 2) for own, ratio in zip(known, ratios)]
+        else:
+            found = list[Gram]()
+            for block, own in zip(self.blocks, scales):
+                parts = dict[str, Gram]()
+                for part, data in squares(state, block, self.free, own):
+                    parts[part.label] = parts[part.label] + data if part.label in parts else data
+                found += parts.values()
+        self._known = state, now, found
+        return found
+
+    def _observed(self, state: Installation) -> list[tuple[int, Part]]:
+        """Return the residual parts at a state, each with its block's number."""
+        if self._seen[0] is not state:
+            parts = ((number, observe(state, block, _NONE)) for number, block in enumerate(self.blocks))
+            self._seen = state, [(number, part) for number, each in parts for part in each]
+        return self._seen[1]
 
     @property
     def _many(self) -> bool:
@@ -262,7 +288,7 @@ class Weigher:
 
     def result(self, solution: Solution) -> GeometricFit:
         state = solution.state
-        parts = [part for block in self.blocks for part in observe(state, block, _NONE)]
+        parts = [part for _, part in self._observed(state)]
         pieces = [replace(one, part=replace(part, noise=one.part.noise)) for one, part in zip(self.pieces, parts)]
         table = layout(state)
         rows = sum(part.value.size for part in parts)
