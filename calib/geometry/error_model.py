@@ -281,17 +281,13 @@ class _Rows:
                   each.jacobian * root / scales[number][each.label]) for each in parts]
             )  # fmt: skip
             self.metric.append(next((each.value, each.jacobian) for each in parts if each.label == "position"))
-        whole = [each.reshape(len(each), -1) for block in self.whitened for _, each in block]
+        total = sum((self._gram(k, slice(None)) for k in range(1, len(self.measured))), self._gram(0, slice(None)))
         groups = np.concatenate([np.full(len(own), -1), term_groups(terms)]).astype(int)
-        self.coordinates = condensed(
-            lambda columns: sum(each[columns] @ each[columns].T for each in whole), groups,
-            np.concatenate([np.ones(len(own)), term_sizes(terms)]),
-        )  # fmt: skip
-        columns = self.coordinates.columns
+        start = np.concatenate([np.ones(len(own)), term_sizes(terms)])
+        self.coordinates = condensed(lambda columns: total.square[np.ix_(columns, columns)], groups, start)
+        self.total, columns = self.coordinates.gram(total), self.coordinates.columns
         self.whitened = [[(value, columns(jacobian)) for value, jacobian in block] for block in self.whitened]
         self.metric = [(value, columns(jacobian)) for value, jacobian in self.metric]
-        each = [self._gram(number, slice(None)) for number in range(len(self.measured))]
-        self.total = sum(each[1:], each[0])
 
     def _gram(self, block: int, rows: np.ndarray | slice) -> Gram:
         each = [

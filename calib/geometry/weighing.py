@@ -191,7 +191,7 @@ class Weigher:
         self.pieces: list[Piece] = []
         self.used = self.pieces
         self._seen: tuple[Installation | None, list[tuple[int, Part]]] = None, []
-        self._known: tuple[Installation | None, list[np.ndarray], list[Gram]] = None, [], []
+        self._known: tuple[Installation | None, list[np.ndarray], dict[Any, Gram]] = None, [], {}
 
     @property
     def noises(self) -> list[Any]:
@@ -258,20 +258,18 @@ class Weigher:
     def _squares(self, state: Installation) -> list[Gram]:
         """Return the statistics of the rows by block and part; at the last state, weighed otherwise, from those."""
         scales = [_scales(self.pieces, number) for number in range(len(self.blocks))]
+        found, now = dict[Any, Gram](), [each for own in scales for each in own]
         last, before, known = self._known
-        now = [each for own in scales for each in own]
-        ratios = [one / each for one, each in zip(before, now)] if state is last else []
-        if ratios and all(np.ptp(ratio) <= 1e-12 * ratio.flat[0] for ratio in ratios):
-            found = [own.scaled(float(ratio.flat[0]) ** 2) for own, ratio in zip(known, ratios)]
+        ratios = [one / each for one, each in zip(before, now)] if state is last else [np.arange(2.0)]
+        if all(np.ptp(ratio) <= 1e-12 * ratio.max() for ratio in ratios):
+            found = {key: known[key].scaled(float(ratio.max()) ** 2) for key, ratio in zip(known, ratios)}
         else:
-            found = list[Gram]()
-            for block, own in zip(self.blocks, scales):
-                parts = dict[str, Gram]()
-                for part, data in squares(state, block, self.free, own):
-                    parts[part.label] = parts[part.label] + data if part.label in parts else data
-                found += parts.values()
+            for number, own in enumerate(scales):
+                for part, data in squares(state, self.blocks[number], self.free, own):
+                    key = number, part.label
+                    found[key] = found[key] + data if key in found else data
         self._known = state, now, found
-        return found
+        return [*found.values()]
 
     def _observed(self, state: Installation) -> list[tuple[int, Part]]:
         """Return the residual parts at a state, each with its block's number."""

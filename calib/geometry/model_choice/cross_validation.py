@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, repeat
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -162,7 +162,7 @@ def fold_statistics(
     rows_of = _Rows(cell, measured, free, found.used_sigmas(), weights, found.used_noises())
     rigid, groups, sizes = len(found.free), term_groups(terms), term_sizes(terms)
     pooled = all(block.has_instrument for block in measured)
-    outside, shares, rows = list[list[_Share]](), list[list[_Share]](), []
+    outside, shares, rows = list[list[Share]](), list[list[Share]](), []
     for fold in range(folds.count):
         inside = [np.flatnonzero(members == fold) for members in folds.members]
         seen = {block.station for block, chosen in zip(measured, inside) if len(chosen) < len(block)}
@@ -173,19 +173,14 @@ def fold_statistics(
         if not pooled:
             outside.append(rows_of.statistics([np.flatnonzero(members != fold) for members in folds.members])[0])
     whole = list(chain(*shares)) if pooled else rows_of.statistics([np.arange(len(b)) for b in measured])[0]
-    families = np.concatenate([np.full(rigid, -1), groups]).astype(int)
     coordinates = condensed(
-        lambda columns: sum(one.whitened * one.data.square[np.ix_(columns, columns)] for one in whole),
-        families, np.concatenate([np.ones(rigid), sizes]),
+        lambda columns: sum(factor * own.square[np.ix_(columns, columns)] for own, factor, _ in whole),
+        np.concatenate([np.full(rigid, -1), groups]).astype(int), np.concatenate([np.ones(rigid), sizes]),
     )  # fmt: skip
-    shares = [[one._replace(data=coordinates.gram(one.data)) for one in own] for own in shares]
-    held_out = [_in_metres(own) for own in shares]
-    if pooled:
-        each = [_whitened(own) for own in shares]
-        total = sum(each[1:], each[0])
-        training = [total - own for own in each]
-    else:
-        total, *training = (coordinates.gram(_whitened(own)) for own in (whole, *outside))
+    shares = [[(coordinates.gram(data), *factors) for data, *factors in own] for own in shares]
+    held_out, each = ([_sum(own, which) for own in shares] for which in (METRIC, WHITENED))
+    total = sum(each[1:], each[0]) if pooled else coordinates.gram(_sum(whole, WHITENED))
+    training = [total - own for own in each] if pooled else [coordinates.gram(_sum(own, WHITENED)) for own in outside]
     wide = plausible_deviation(found.cell, found.free) if found.prior is None else found.prior
     plausible = np.where(np.isfinite(wide), wide, 10.0)
     return FoldStatistics(rigid, groups, sizes, coordinates, plausible, training, held_out, np.array(rows), total)
@@ -214,8 +209,8 @@ def blind_folds(nominal: GeometricFit, measured: Sequence[PoseMeasurements], fol
     for fold in range(folds.count):
         inside = [np.flatnonzero(members == fold) for members in folds.members]
         own, count = rows.statistics(inside, [True] * len(measured))
-        held = _in_metres(own)
-        each.append(_whitened(own))
+        held = _sum(own, METRIC)
+        each.append(_sum(own, WHITENED))
         squares.append((held.square / max(count, 1.0), held.total / max(count, 1.0)))
     total = sum(each[1:], each[0])
     result = np.zeros(folds.count, dtype=bool)
@@ -229,21 +224,13 @@ def blind_folds(nominal: GeometricFit, measured: Sequence[PoseMeasurements], fol
     return result
 
 
-class _Share(NamedTuple):
-    """Statistics of some rows, and factors that make of them those of whitened residuals, and of those in metres."""
-
-    data: Gram
-    whitened: float
-    metric: float
+Share = tuple[Gram, float, float]  # statistics of some rows, and factors that whiten them and put them in metres
+WHITENED, METRIC = 1, 2
 
 
-def _whitened(shares: Sequence[_Share]) -> Gram:
-    first, *rest = (one.data.scaled(one.whitened) for one in shares if one.whitened)
-    return sum(rest, first)
-
-
-def _in_metres(shares: Sequence[_Share]) -> Gram:
-    first, *rest = (one.data.scaled(one.metric) for one in shares if one.metric)
+def _sum(shares: Sequence[Share], which: int) -> Gram:
+    """Return the statistics of all shares, whitened or in metres."""
+    first, *rest = (share[0].scaled(float(share[which])) for share in shares if share[which])
     return sum(rest, first)
 
 
@@ -260,16 +247,12 @@ class _Rows:
 
     def statistics(
         self, chosen: Sequence[np.ndarray], moved: Sequence[bool] | None = None
-    ) -> tuple[list[_Share], float]:
+    ) -> tuple[list[Share], float]:
         """Return the statistics of chosen rows, and the number of rows in metres.
 
         Of the blocks that are `moved` the station's placement is projected out of the statistics in metres.
         """
-        found, count = dict[Any, _Share](), 0.0
-
-        def add(key: Any, data: Gram, whitened: float, metric: float) -> None:
-            found[key] = _Share(found[key].data + data if key in found else data, whitened, metric)
-
+        found, count = list[Share](), 0.0
         chunk = 1000  # poses observed at once
         for number, (block, rows) in enumerate(zip(self.measured, chosen)):
             frames: list[np.ndarray] = []
@@ -279,28 +262,28 @@ class _Rows:
                 ready, weights = prepare(self.cell, [take(block, piece)])[0], self.weights[number][piece]
                 if isinstance(block, Positions) and not apart:
                     for part, own in squares(self.cell, ready, self.free, repeat(1.0 / np.sqrt(weights[None]))):
-                        in_metres = part.label in METRES
-                        add((number, part.label), own, scales[part.label] ** -2.0, float(in_metres))
-                        count += float(weights.sum()) * in_metres
+                        in_metres = float(part.label in METRES)
+                        found.append((own, scales[part.label] ** -2.0, in_metres))
+                        count += in_metres * float(weights.sum())
                     continue
                 noise = self.noises[number].unweighted(len(piece)) if self.noises[number] else None
                 for bare in observe(self.cell, ready, self.free):
                     part, weight = replace(bare, noise=noise), weights[bare.index]
                     root = 1.0 / np.sqrt(weight)
                     own = gram(*part.whitened(root * scales[part.label]))
-                    add("whitened", replace(own, rows=part.value.size), 1.0, 0.0)
+                    found.append((replace(own, rows=part.value.size), 1.0, 0.0))
                     if part.label in METRES:
                         residual, matrix = bare.whitened(root * part.per_length)
                         count += float(weight.sum())
                         if apart:
                             frames.append(np.vstack([matrix.T, residual]))
                         else:
-                            add("metric", gram(residual, matrix), 0.0, 1.0)
+                            found.append((gram(residual, matrix), 0.0, 1.0))
             if frames:
                 station = np.flatnonzero(np.isin(self.free, layout(self.cell).index("station")))
                 columns = project_out(np.concatenate(frames, axis=1), station)
-                add("metric", gram(columns[-1], columns[:-1].T), 0.0, 1.0)
-        return list(found.values()), count
+                found.append((gram(columns[-1], columns[:-1].T), 0.0, 1.0))
+        return found, count
 
 
 def project_out(columns: np.ndarray, frames: np.ndarray) -> np.ndarray:
