@@ -177,10 +177,10 @@ def fold_statistics(
         lambda columns: sum(factor * own.square[np.ix_(columns, columns)] for own, factor, _ in whole),
         np.concatenate([np.full(rigid, -1), groups]).astype(int), np.concatenate([np.ones(rigid), sizes]),
     )  # fmt: skip
-    shares = [[(coordinates.gram(data), *factors) for data, *factors in own] for own in shares]
-    held_out, each = ([_sum(own, which) for own in shares] for which in (METRIC, WHITENED))
-    total = sum(each[1:], each[0]) if pooled else coordinates.gram(_sum(whole, WHITENED))
-    training = [total - own for own in each] if pooled else [coordinates.gram(_sum(own, WHITENED)) for own in outside]
+    shares = [[(coordinates.gram(data), white, metric) for data, white, metric in own] for own in shares]
+    held_out, each = ([_sum(own, in_metres) for own in shares] for in_metres in (True, False))
+    total = sum(each[1:], each[0]) if pooled else coordinates.gram(_sum(whole))
+    training = [total - own for own in each] if pooled else [coordinates.gram(_sum(own)) for own in outside]
     wide = plausible_deviation(found.cell, found.free) if found.prior is None else found.prior
     plausible = np.where(np.isfinite(wide), wide, 10.0)
     return FoldStatistics(rigid, groups, sizes, coordinates, plausible, training, held_out, np.array(rows), total)
@@ -209,8 +209,8 @@ def blind_folds(nominal: GeometricFit, measured: Sequence[PoseMeasurements], fol
     for fold in range(folds.count):
         inside = [np.flatnonzero(members == fold) for members in folds.members]
         own, count = rows.statistics(inside, [True] * len(measured))
-        held = _sum(own, METRIC)
-        each.append(_sum(own, WHITENED))
+        held = _sum(own, in_metres=True)
+        each.append(_sum(own))
         squares.append((held.square / max(count, 1.0), held.total / max(count, 1.0)))
     total = sum(each[1:], each[0])
     result = np.zeros(folds.count, dtype=bool)
@@ -225,12 +225,12 @@ def blind_folds(nominal: GeometricFit, measured: Sequence[PoseMeasurements], fol
 
 
 Share = tuple[Gram, float, float]  # statistics of some rows, and factors that whiten them and put them in metres
-WHITENED, METRIC = 1, 2
 
 
-def _sum(shares: Sequence[Share], which: int) -> Gram:
+def _sum(shares: Sequence[Share], in_metres: bool = False) -> Gram:
     """Return the statistics of all shares, whitened or in metres."""
-    first, *rest = (share[0].scaled(float(share[which])) for share in shares if share[which])
+    factors = [metric if in_metres else white for _, white, metric in shares]
+    first, *rest = (own.scaled(factor) for (own, *_), factor in zip(shares, factors) if factor)
     return sum(rest, first)
 
 
@@ -262,9 +262,8 @@ class _Rows:
                 ready, weights = prepare(self.cell, [take(block, piece)])[0], self.weights[number][piece]
                 if isinstance(block, Positions) and not apart:
                     for part, own in squares(self.cell, ready, self.free, repeat(1.0 / np.sqrt(weights[None]))):
-                        in_metres = float(part.label in METRES)
-                        found.append((own, scales[part.label] ** -2.0, in_metres))
-                        count += in_metres * float(weights.sum())
+                        found.append((own, scales[part.label] ** -2.0, float(part.label in METRES)))
+                    count += float(weights.sum())  # each has one position
                     continue
                 noise = self.noises[number].unweighted(len(piece)) if self.noises[number] else None
                 for bare in observe(self.cell, ready, self.free):
