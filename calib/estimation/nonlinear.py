@@ -206,18 +206,12 @@ def solve(
 
 
 def covariance(factor: np.ndarray, variance: float = 1.0) -> np.ndarray:
-    """Return variance · (RᵀR)⁻¹ (p, p)."""
-    inverse = inverted(factor)
-    return variance * (inverse @ inverse.T)
-
-
-def inverted(factor: np.ndarray) -> np.ndarray:
-    """Return the inverse of R (p, p).
+    """Return variance · (RᵀR)⁻¹ (p, p).
 
     Raises:
-        LinAlgError: for a zero on its diagonal.
+        LinAlgError: for an R with a zero on its diagonal.
     """
     inverse, failed = dtrtri(factor)
     if failed:
         raise np.linalg.LinAlgError(f"parameter {failed} of {len(factor)} is not determined")
-    return inverse
+    return variance * (inverse @ inverse.T)

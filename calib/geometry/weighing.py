@@ -14,7 +14,7 @@ from calib.errors import UsageError, one_of, refuse_data
 from calib.estimation import robust
 from calib.estimation.base_columns import ColumnSplit
 from calib.estimation.estimate import Estimate
-from calib.estimation.nonlinear import MOST_NUMBERS, Reduced, Rows, Solution, covariance, inverted, reduced
+from calib.estimation.nonlinear import MOST_NUMBERS, Reduced, Rows, Solution, covariance, reduced
 from calib.estimation.relevance import Gram
 from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, layout, observe, parameter_values, whitened
@@ -190,7 +190,6 @@ class Weigher:
         self.prior = prior if prior is not None and np.isfinite(prior).any() else None
         self.pieces: list[Piece] = []
         self.used = self.pieces
-        self._seen: tuple[Installation | None, list[tuple[int, Part]]] = None, []
         self._known: tuple[Installation | None, list[np.ndarray], dict[Any, Gram]] = None, [], {}
 
     @property
@@ -200,7 +199,7 @@ class Weigher:
 
     def update(self, state: Installation, first: bool, resting: float = 0.0) -> None:
         """Set sigmas and weights from the residuals at a state; `resting`: parameters that rest on the prior."""
-        owned = self._observed(state)
+        owned = [(number, part) for number, block in enumerate(self.blocks) for part in observe(state, block, _NONE)]
         rows = sum(part.value.size for _, part in owned)
         unknown = len(self.free) + sum(part.nuisances for _, part in owned)
         if rows < unknown and self.prior is None:
@@ -225,12 +224,10 @@ class Weigher:
         A common factor on all sigmas changes only the scale, unless the fit has a prior.
         """
         before, noises = self.pieces, self.noises
-        self.used = before
-        resting = 0.0
-        if self.prior is not None:
-            resting = float(np.sum((inverted(solution.factor) / self.prior[:, None]) ** 2))
+        resting = 0.0 if self.prior is None else float(np.sum(np.diag(covariance(solution.factor)) / self.prior**2))
         self.update(solution.state, first=False, resting=resting)
         both = list(zip(self.pieces, before))
+        self.used = [replace(old, part=replace(new.part, noise=old.part.noise)) for new, old in both]
         ratios = [float(np.mean(new.sigma / old.sigma)) for new, old in both]
         steady = all(np.abs(new.weight - old.weight).max(initial=0.0) < 0.02 for new, old in both)
         common = ratios[0] if self.prior is None and not any(noises) else 1.0
@@ -238,7 +235,7 @@ class Weigher:
         if not steady or any(abs(ratio / common - 1.0) > 0.02 for ratio in ratios):
             return None
         if self.prior is not None or any(noises):
-            self.pieces = before
+            self.pieces = self.used
             return solution
         return replace(solution, factor=solution.factor / common, cost=solution.cost / common**2)
 
@@ -271,13 +268,6 @@ class Weigher:
         self._known = state, now, found
         return [*found.values()]
 
-    def _observed(self, state: Installation) -> list[tuple[int, Part]]:
-        """Return the residual parts at a state, each with its block's number."""
-        if self._seen[0] is not state:
-            parts = ((number, observe(state, block, _NONE)) for number, block in enumerate(self.blocks))
-            self._seen = state, [(number, part) for number, each in parts for part in each]
-        return self._seen[1]
-
     @property
     def _many(self) -> bool:
         """Whether W is large and all its rows are positions or poses, whose statistics come cheaper than rows."""
@@ -286,11 +276,8 @@ class Weigher:
 
     def result(self, solution: Solution) -> GeometricFit:
         state = solution.state
-        parts = [part for _, part in self._observed(state)]
-        pieces = [replace(one, part=replace(part, noise=one.part.noise)) for one, part in zip(self.pieces, parts)]
-        table = layout(state)
-        rows = sum(part.value.size for part in parts)
-        dof = rows - len(self.free) - sum(part.nuisances for part in parts)
+        table, parts = layout(state), [piece.part for piece in self.pieces]
+        dof = sum(part.value.size - part.nuisances for part in parts) - len(self.free)
         if self.prior is not None:
             dof = max(dof + int(np.isfinite(self.prior).sum()), 1)
         variance = solution.cost / max(dof, 1)
@@ -303,7 +290,7 @@ class Weigher:
             dof,
         )
         return GeometricFit(
-            state, self.nominal, self.free, estimate, None, self.free, solution, self.blocks, pieces, self.prior
+            state, self.nominal, self.free, estimate, None, self.free, solution, self.blocks, self.pieces, self.prior
         )
 
 
