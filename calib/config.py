@@ -225,8 +225,8 @@ def located(loc: Sequence[Any]) -> str:
         if isinstance(part, int):
             result = f"[[{result}]] number {part + 1}" if k + 1 < len(loc) or k == 1 else result
             continue
-        before = ", " if result.endswith(tuple("0123456789")) and k > 1 else "." if result else ""
-        result = f"{result}{before}{_toml_key(part)}"
+        name = part if _BARE.fullmatch(part) else f'"{part}"'
+        result = f"{result}{', ' if result.endswith(tuple('0123456789')) and k > 1 else '.' if result else ''}{name}"
     return result
 
 
