@@ -190,7 +190,6 @@ class Weigher:
         self.prior = prior if prior is not None and np.isfinite(prior).any() else None
         self.pieces: list[Piece] = []
         self.used = self.pieces
-        self._known: tuple[Installation | None, list[np.ndarray], dict[Any, Gram]] = None, [], {}
 
     @property
     def noises(self) -> list[Any]:
@@ -248,25 +247,10 @@ class Weigher:
             known.append((pull[held], np.diag(1.0 / self.prior)[held]))
             each.append(Gram(np.diag(self.prior**-2.0), pull / self.prior, float(pull @ pull), int(held.sum())))
         if self._many:
-            each += self._squares(state)
+            for number, block in enumerate(self.blocks):
+                each += [own for _, own in squares(state, block, self.free, _scales(self.pieces, number))]
             total = sum(each[1:], each[0])
         return reduced(lambda: chain(_rows(state, self.free, self.blocks, self.pieces), known), total)
-
-    def _squares(self, state: Installation) -> list[Gram]:
-        """Return the statistics of the rows by block and part; at the last state, weighed otherwise, from those."""
-        scales = [_scales(self.pieces, number) for number in range(len(self.blocks))]
-        found, now = dict[Any, Gram](), [each for own in scales for each in own]
-        last, before, known = self._known
-        ratios = [one / each for one, each in zip(before, now)] if state is last else [np.arange(2.0)]
-        if all(np.ptp(ratio) <= 1e-12 * ratio.max() for ratio in ratios):
-            found = {key: known[key].scaled(float(ratio.max()) ** 2) for key, ratio in zip(known, ratios)}
-        else:
-            for number, own in enumerate(scales):
-                for part, data in squares(state, self.blocks[number], self.free, own):
-                    key = number, part.label
-                    found[key] = found[key] + data if key in found else data
-        self._known = state, now, found
-        return [*found.values()]
 
     @property
     def _many(self) -> bool:
