@@ -14,7 +14,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 import scipy.linalg
-from scipy.linalg.lapack import dpotrf, dtrcon  # type: ignore[attr-defined]
+from scipy.linalg.lapack import dpotrf, dtpqrt, dtrcon, dtrtri  # type: ignore[attr-defined]
 
 from calib.estimation.relevance import Gram, gram
 
@@ -101,24 +101,22 @@ def triangle(residual: np.ndarray, matrix: np.ndarray) -> Reduced:
 Rows = tuple[np.ndarray, np.ndarray]  # residual (m,) and W (m, p)
 
 
-def reduced(pieces: Callable[[], Iterable[Rows]]) -> Reduced:
+def reduced(pieces: Callable[[], Iterable[Rows]], total: Gram | None = None) -> Reduced:
     """Return the problem of many pieces of rows reduced in the memory of one piece.
 
-    Up to `MOST_ROWS` by one QR. More by Cholesky of WᵀW with its columns scaled to unit norm, which takes a quarter of
-    the time and squares the condition number: beyond `MAX_CONDITION` by QR, piece upon piece, after all.
+    Up to `MOST_NUMBERS` by one QR. More by Cholesky of WᵀW with its columns scaled to unit norm, which takes a quarter
+    of the time and squares the condition number: beyond `MAX_CONDITION` by QR, piece upon piece, after all.
 
     Args:
         pieces: yields the rows, the same at every call.
+        total: their statistics, of many rows where they are known already.
     """
     start = list[Rows]()
-    total: Gram | None = None
-    for piece in pieces():
-        if total is None and sum(len(one) for one, _ in start) <= MOST_ROWS:
-            start.append(piece)
-            continue
-        each = [*start, piece] if total is None else [piece]
-        start = []
-        total = sum((gram(*one) for one in each[1:]), gram(*each[0]) if total is None else total + gram(*each[0]))
+    for piece in pieces() if total is None else ():
+        start.append(piece)
+        if total is not None or sum(matrix.size for _, matrix in start) > MOST_NUMBERS:
+            each = [gram(*one) for one in start]
+            total, start = sum(each[1:], each[0] if total is None else total + each[0]), []
     if total is None:
         return triangle(np.concatenate([one for one, _ in start]), _stacked([matrix for _, matrix in start]))
     scale = np.sqrt(np.diag(total.square))
@@ -130,7 +128,7 @@ def reduced(pieces: Callable[[], Iterable[Rows]]) -> Reduced:
     return Reduced(factor * scale, target, total.total, total.rows)
 
 
-MOST_ROWS = 20_000  # rows held at once (our choice)
+MOST_NUMBERS = 500_000  # of W held at once (our choice)
 MAX_CONDITION = 1e5  # then R has relative errors of 1e-6 at most: κ² times rounding
 
 
@@ -149,12 +147,12 @@ def _stacked(matrices: list[np.ndarray]) -> np.ndarray:
 
 def damped_step(factor: np.ndarray, target: np.ndarray, damping: float) -> np.ndarray:
     """Solve [WᵀW + λ diag(WᵀW)] dx = Wᵀ r by QR of [R; sqrt(λ) D] (Kolyubin et al. 2019, eq. 12; λ = 0 is eq. 11)."""
-    if damping == 0.0:
-        return scipy.linalg.solve_triangular(factor, target)
-    p = factor.shape[1]
-    tail = np.sqrt(damping) * np.diag(np.linalg.norm(factor, axis=0))
-    found = triangle(np.append(target, np.zeros(p)), np.vstack([factor, tail]))
-    return scipy.linalg.solve_triangular(found.factor, found.target)
+    p, block = len(target), 32
+    whole, tail = np.zeros((2, p + 1, p + 1))
+    whole[:p, :p], whole[:p, p] = factor, target
+    np.fill_diagonal(tail[:p, :p], np.sqrt(damping) * np.linalg.norm(factor, axis=0))
+    found = dtpqrt(p + 1, min(block, p + 1), whole, tail)[0] if damping else whole  # both are triangles
+    return scipy.linalg.solve_triangular(found[:p, :p], found[:p, p])
 
 
 def solve(
@@ -208,6 +206,12 @@ def solve(
 
 
 def covariance(factor: np.ndarray, variance: float = 1.0) -> np.ndarray:
-    """Return variance · (RᵀR)⁻¹ (p, p)."""
-    inverse = scipy.linalg.solve_triangular(factor, np.eye(len(factor)))
-    return variance * inverse @ inverse.T
+    """Return variance · (RᵀR)⁻¹ (p, p).
+
+    Raises:
+        LinAlgError: for an R with a zero on its diagonal.
+    """
+    inverse, failed = dtrtri(factor)
+    if failed:
+        raise np.linalg.LinAlgError(f"parameter {failed} of {len(factor)} is not determined")
+    return variance * (inverse @ inverse.T)

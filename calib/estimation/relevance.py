@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-import scipy.linalg
-from scipy.linalg.lapack import dpotrf, dtrtri  # type: ignore[attr-defined]
+from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri  # type: ignore[attr-defined]
 
 from calib.errors import Unidentifiable
 
@@ -31,6 +32,10 @@ class Gram:
         return Gram(
             self.square - other.square, self.cross - other.cross, self.total - other.total, self.rows - other.rows
         )
+
+    def scaled(self, factor: float) -> Gram:
+        """Return the statistics of rows multiplied by √factor."""
+        return Gram(factor * self.square, factor * self.cross, factor * self.total, self.rows)
 
 
 def gram(residual: np.ndarray, matrix: np.ndarray) -> Gram:
@@ -83,15 +88,16 @@ class Condensed:
 
     def gram(self, data: Gram) -> Gram:
         """Return statistics in these coordinates."""
-        square = self.columns(self.columns(data.square).T)
-        return Gram(square, self.columns(data.cross), data.total, data.rows)
+        half = self.columns(data.square)
+        parts = [half.take(own, 1) if basis is None else half.take(own, 1) @ basis for own, basis in self.blocks]
+        return Gram(np.concatenate(parts, axis=1), self.columns(data.cross), data.total, data.rows)
 
 
-def condensed(square: np.ndarray, groups: np.ndarray, start: np.ndarray) -> Condensed:
-    """Return coordinates of the columns with statistics WᵀW `square` (p, p), with equal prior magnitude within a group.
+def condensed(square: Callable[[np.ndarray], Any], groups: np.ndarray, start: np.ndarray) -> Condensed:
+    """Return coordinates of p columns with statistics WᵀW, with equal prior magnitude within a group.
 
     Args:
-        square: of all rows that will ever be used.
+        square: columns (k,) -> their WᵀW (k, k), of all rows that will ever be used.
         groups: (p,) group of each column; -1 for no ridge.
         start: (p,) first guess of each column's prior standard deviation; within a group their ratios stay.
     """
@@ -104,7 +110,7 @@ def condensed(square: np.ndarray, groups: np.ndarray, start: np.ndarray) -> Cond
         own = np.flatnonzero(groups == group)
         size = float(np.exp(np.log(start[own]).mean()))
         profile = start[own] / size
-        seen, basis = np.linalg.eigh(square[np.ix_(own, own)] * np.outer(profile, profile))
+        seen, basis = np.linalg.eigh(square(own) * np.outer(profile, profile))
         kept = seen > rounding * seen[-1]
         kept[-1] = True
         blocks.append((own, profile[:, None] * basis[:, kept]))
@@ -197,6 +203,17 @@ def _posterior(
         raise Unidentifiable(
             "the measurements cannot distinguish the model's terms. Are rows repeated? Measure more poses"
         )
-    solution = scipy.linalg.cho_solve((factor, True), cross, check_finite=False)
-    inverse, _ = dtrtri(factor, lower=1, overwrite_c=1)  # of the triangle: the variances need no more
+    solution, _ = dpotrs(factor, cross, lower=1)
+    inverse = _inverse(factor)  # of the triangle: the variances need no more
     return solution, np.einsum("ij,ij->j", inverse, inverse) / beta
+
+
+def _inverse(lower: np.ndarray) -> np.ndarray:
+    """Return the inverse of a lower triangle (p, p), by halves: LAPACK takes twice the time over the whole."""
+    p, small = len(lower), 64
+    if p <= small:
+        return dtrtri(lower, lower=1)[0]
+    result, one, two = np.zeros((p, p), order="F"), slice(p // 2), slice(p // 2, p)
+    result[one, one], result[two, two] = _inverse(lower[one, one]), _inverse(lower[two, two])
+    result[two, one] = -result[two, two] @ (lower[two, one] @ result[one, one])
+    return result

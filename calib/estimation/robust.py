@@ -22,13 +22,13 @@ def variance_weights(
         counts: (m,) how many errors each is worth.
         rounds: of the fixed point; fewer will do from weights of nearly the same errors.
     """
-    weights = np.array(start, dtype=float)
+    weights, columns = np.array(start, dtype=float), np.ascontiguousarray(shapes.T)
     max_ratio = 9.0  # squared errors count as so many times their variance at most (our choice)
     for _ in range(rounds):
-        variance = np.maximum(shapes @ weights, 1e-30)
-        ratio = np.minimum(squares / variance, max_ratio)
-        push, pull = (counts * ratio / variance) @ shapes, (counts / variance) @ shapes
-        weights *= push / np.maximum(pull, 1e-300)
+        precision = 1.0 / np.maximum(weights @ columns, 1e-30)
+        counted = counts * precision
+        push = columns @ (counted * np.minimum(squares * precision, max_ratio))
+        weights *= push / np.maximum(columns @ counted, 1e-300)
     return weights
 
 

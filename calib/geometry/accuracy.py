@@ -16,7 +16,7 @@ from itertools import combinations
 
 import numpy as np
 
-from calib.data.poses.measurements import PoseMeasurements, Positions, Sockets
+from calib.data.poses.measurements import PoseMeasurements, Positions, Sockets, take
 from calib.geometry.installation import Installation
 from calib.geometry.observation import observe, positions, prepare
 from calib.units import ERRORS
@@ -137,11 +137,12 @@ def pair_errors(
     """
     generator = np.random.default_rng(seed)
     result = [np.zeros(0)]
-    for block in prepare(cell, measured):
-        if not isinstance(block.measured, Positions) or len(block.measured) < 2:
+    for block in measured:
+        if not isinstance(block, Positions) or len(block) < 2:
             continue
-        first, second = _pairs(len(block.measured), limit, generator)
-        point, seen = positions(cell, block).T, block.measured.position
+        used, place = np.unique(_pairs(len(block), limit, generator), return_inverse=True)
+        first, second = place.reshape(2, -1)
+        point, seen = positions(cell, prepare(cell, [take(block, used)])[0]).T, block.position[used]
         predicted = np.linalg.norm(point[first] - point[second], axis=1)
         result.append(np.abs(predicted - np.linalg.norm(seen[first] - seen[second], axis=1)))
     return np.concatenate(result)

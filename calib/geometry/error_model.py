@@ -16,7 +16,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.linalg
+from scipy.linalg.blas import dtrsm  # type: ignore[attr-defined]
 from scipy.spatial import KDTree
 
 from calib.data.poses.measurements import PoseMeasurements, Positions, take
@@ -27,7 +27,8 @@ from calib.geometry.left_out import LeftOut, Profile, unevenness
 from calib.geometry.model_choice.cross_validation import project_out, term_groups, term_sizes
 from calib.geometry.model_choice.folds import Folds, random_folds
 from calib.geometry.model_choice.ladder import MAX_RESIDUAL, ModelSelection
-from calib.geometry.observation import layout, observe, pose_sigmas, prepare
+from calib.geometry.observation import layout, observe, prepare
+from calib.geometry.squares import position_variances
 from calib.records import evenly
 from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain
@@ -95,7 +96,7 @@ class ErrorModel:
             station: index of the station of reference; -1 for the arm's base.
             tool: which of its tools, one or (m,).
         """
-        own = pose_sigmas(self.cell, rows, self.free, self.covariance, station, tool)[:, 0] ** 2
+        own = position_variances(self.cell, rows, self.free, self.covariance, station, tool)
         return self._sigma(own, rows.q)
 
     def sigma_on(self, cell: Installation, block: Positions, placed_anew: bool = False) -> np.ndarray:
@@ -147,14 +148,16 @@ def outside(q: np.ndarray, learnt: np.ndarray) -> np.ndarray:
     return np.asarray((q < learnt.min(axis=0)) | (q > learnt.max(axis=0)))
 
 
-def _root_of_inverse(precision: np.ndarray) -> np.ndarray:
-    """Return a root R (p, p) of the covariance, R Rᵀ = P⁻¹, from a precision matrix P with unit diagonal."""
+def _variances(precision: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Return the diagonal (k,) of Jᵀ P⁻¹ J for columns J (p, k), from a precision matrix P with unit diagonal."""
     try:
         factor = np.linalg.cholesky(precision + 1e-12 * np.eye(len(precision)))
     except np.linalg.LinAlgError:  # by rounding; Cholesky is five times as fast
         values, vectors = np.linalg.eigh(precision)
-        return vectors / np.sqrt(np.maximum(values, 1e-12 * values[-1]))
-    return scipy.linalg.solve_triangular(factor, np.eye(len(precision)), lower=True).T
+        spread = columns.T @ vectors / np.sqrt(np.maximum(values, 1e-12 * values[-1]))
+    else:
+        spread = dtrsm(1.0, factor.T, columns.T, side=1)  # rows (L⁻¹ J)ᵀ, without copies
+    return np.einsum("kp,kp->k", spread, spread)
 
 
 def _distances(q: np.ndarray, learnt: np.ndarray, levers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -169,10 +172,11 @@ def _distances(q: np.ndarray, learnt: np.ndarray, levers: np.ndarray) -> tuple[n
     some = int(np.clip(round(near_share * count), 1, count))
     for j, lever in enumerate(levers):
         values = np.sort(learnt[:, j])
-        place = np.searchsorted(values, q[:, j])
-        first = np.clip(place[:, None] - some + np.arange(some + 1), 0, count - some)
-        way = np.maximum(np.abs(values[first] - q[:, j, None]), np.abs(values[first + some - 1] - q[:, j, None]))
-        alone += (lever * way.min(axis=1)) ** 2
+        low, high = values[: count - some + 1], values[some - 1 :]  # ends of all that are `some` values wide
+        middle = np.searchsorted(low + high, 2.0 * q[:, j])  # before it the low end is the further one
+        before, after = np.maximum(middle - 1, 0), np.minimum(middle, count - some)
+        way = np.minimum(*(np.maximum(np.abs(low[at] - q[:, j]), np.abs(high[at] - q[:, j])) for at in (before, after)))
+        alone += (lever * way) ** 2
     return nearest, alone
 
 
@@ -279,7 +283,8 @@ class _Rows:
             self.metric.append(next((each.value, each.jacobian) for each in parts if each.label == "position"))
         total = sum((self._gram(k, slice(None)) for k in range(1, len(self.measured))), self._gram(0, slice(None)))
         groups = np.concatenate([np.full(len(own), -1), term_groups(terms)]).astype(int)
-        self.coordinates = condensed(total.square, groups, np.concatenate([np.ones(len(own)), term_sizes(terms)]))
+        start = np.concatenate([np.ones(len(own)), term_sizes(terms)])
+        self.coordinates = condensed(lambda columns: total.square[np.ix_(columns, columns)], groups, start)
         self.total, columns = self.coordinates.gram(total), self.coordinates.columns
         self.whitened = [[(value, columns(jacobian)) for value, jacobian in block] for block in self.whitened]
         self.metric = [(value, columns(jacobian)) for value, jacobian in self.metric]
@@ -310,7 +315,7 @@ class _Rows:
             alive = np.flatnonzero(found.ridge > 0.0)
             precision = square[np.ix_(alive, alive)] / found.noise**2 + np.diag(found.ridge[alive] ** -2.0)
             scale = 1.0 / np.sqrt(np.diag(precision))
-            root = scale[:, None] * _root_of_inverse(precision * np.outer(scale, scale))
+            precision *= np.outer(scale, scale)
             learnt = np.concatenate([np.delete(b.q, rows, axis=0) for b, rows in zip(self.measured, inside)])
             stays = {b.station for b, rows in zip(self.measured, inside) if len(rows) < len(b)}
             for number, rows in enumerate(inside):
@@ -321,7 +326,7 @@ class _Rows:
                     both = project_out(np.concatenate([jacobian, value[None]]), self.station)
                     jacobian, value = both[:-1], both[-1]
                 error = value - np.einsum("f,fim->im", found.values, jacobian)
-                own = np.sum((root.T @ jacobian[alive].reshape(len(alive), -1)) ** 2, axis=0)
+                own = _variances(precision, scale[:, None] * jacobian[alive].reshape(len(alive), -1))
                 near = _distances(self.measured[number].q[rows], learnt, levers)
                 size, pose = np.sum(error**2, axis=0), self.pose[number][rows]
                 result = np.stack([size, own.reshape(3, -1).sum(axis=0), *near, pose], axis=1)

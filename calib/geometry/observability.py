@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
 from calib.errors import Finding, Unidentifiable, UsageError, finding, one_of, require
 from calib.estimation.base_columns import ColumnSplit, split_columns
-from calib.estimation.nonlinear import MOST_ROWS
+from calib.estimation.nonlinear import MOST_NUMBERS
 from calib.geometry.installation import Installation, see
 from calib.geometry.observation import Block, families, layout, observe, prepare, target_jacobian, whitened
 from calib.geometry.weighing import GeometricFit
@@ -120,7 +120,7 @@ def _orientation_range(found: GeometricFit) -> float | None:
 def observation_matrix(cell: Installation, blocks: Sequence[Block], columns: np.ndarray) -> np.ndarray:
     """Return the observation matrix W (rows, c) of all blocks, scaled by stated sigmas; else by the arm's reach.
 
-    Of more than `MOST_ROWS` rows their R factor instead, whose columns have the same dependences.
+    Of more than `MOST_NUMBERS` numbers its R factor instead, whose columns have the same dependences.
 
     The reach (rms distance of targets from the arm's base) makes orientation rows comparable with position rows.
     """
@@ -140,7 +140,7 @@ def observation_matrix(cell: Installation, blocks: Sequence[Block], columns: np.
             scales.append(np.broadcast_to(scale, part.value.shape))
         for _, matrix in whitened(cell, block, columns, scales):
             rows.append(matrix)
-            if sum(map(len, rows)) > MOST_ROWS:
+            if sum(each.size for each in rows) > MOST_NUMBERS:
                 rows = [np.asarray(np.linalg.qr(np.concatenate(rows), mode="r"))]
     return np.concatenate(rows)
 

@@ -131,10 +131,10 @@ def repeated_rows(measured: PoseMeasurements) -> list[np.ndarray]:
     _, first = np.unique(np.round(table, 12), axis=0, return_index=True)
     rows = np.sort(first)
     key = np.hstack([measured.q[rows], 1e3 * measured.tool[rows, None]])  # another reflector is another pose
-    near = KDTree(key).query_ball_point(key, SAME, p=np.inf)
-    groups, taken = [], np.zeros(len(rows), dtype=bool)
     min_cycles = 3  # cycles that make a repeated pose
-    for k, each in enumerate(near):
+    tree, groups, taken = KDTree(key), [], np.zeros(len(rows), dtype=bool)
+    often = np.flatnonzero(tree.query_ball_point(key, SAME, p=np.inf, return_length=True) >= min_cycles)
+    for k, each in zip(often, tree.query_ball_point(key[often], SAME, p=np.inf)):
         own = np.array([i for i in each if not taken[i]], dtype=int)
         if not taken[k] and len(own) >= min_cycles:
             taken[own] = True

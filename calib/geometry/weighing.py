@@ -9,14 +9,17 @@ from typing import Any
 
 import numpy as np
 
+from calib.data.poses.measurements import Positions
 from calib.errors import UsageError, one_of, refuse_data
 from calib.estimation import robust
 from calib.estimation.base_columns import ColumnSplit
 from calib.estimation.estimate import Estimate
-from calib.estimation.nonlinear import Reduced, Rows, Solution, covariance, reduced
+from calib.estimation.nonlinear import MOST_NUMBERS, Reduced, Rows, Solution, covariance, reduced
+from calib.estimation.relevance import Gram
 from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, layout, observe, parameter_values, whitened
 from calib.geometry.residuals import Part
+from calib.geometry.squares import squares
 from calib.records import frozen
 from calib.robot.calibrated import CalibratedChain, CorrectedChain
 from calib.robot.chain import Chain
@@ -220,10 +223,10 @@ class Weigher:
         A common factor on all sigmas changes only the scale, unless the fit has a prior.
         """
         before, noises = self.pieces, self.noises
-        self.used = before
         resting = 0.0 if self.prior is None else float(np.sum(np.diag(covariance(solution.factor)) / self.prior**2))
         self.update(solution.state, first=False, resting=resting)
         both = list(zip(self.pieces, before))
+        self.used = [replace(old, part=replace(new.part, noise=old.part.noise)) for new, old in both]
         ratios = [float(np.mean(new.sigma / old.sigma)) for new, old in both]
         steady = all(np.abs(new.weight - old.weight).max(initial=0.0) < 0.02 for new, old in both)
         common = ratios[0] if self.prior is None and not any(noises) else 1.0
@@ -231,26 +234,34 @@ class Weigher:
         if not steady or any(abs(ratio / common - 1.0) > 0.02 for ratio in ratios):
             return None
         if self.prior is not None or any(noises):
-            self.pieces = before
+            self.pieces = self.used
             return solution
         return replace(solution, factor=solution.factor / common, cost=solution.cost / common**2)
 
     def linearise(self, state: Installation) -> Reduced:
         """Return the whitened problem at a state, reduced, with the prior."""
-        known = list[Rows]()
+        known, each, total = list[Rows](), list[Gram](), None
         if self.prior is not None:
             held = np.isfinite(self.prior)
             pull = (parameter_values(self.nominal) - parameter_values(state))[self.free] / self.prior
             known.append((pull[held], np.diag(1.0 / self.prior)[held]))
-        return reduced(lambda: chain(_rows(state, self.free, self.blocks, self.pieces), known))
+            each.append(Gram(np.diag(self.prior**-2.0), pull / self.prior, float(pull @ pull), int(held.sum())))
+        if self._many:
+            for number, block in enumerate(self.blocks):
+                each += [own for _, own in squares(state, block, self.free, _scales(self.pieces, number))]
+            total = sum(each[1:], each[0])
+        return reduced(lambda: chain(_rows(state, self.free, self.blocks, self.pieces), known), total)
+
+    @property
+    def _many(self) -> bool:
+        """Whether W is large and all its rows are positions or poses, whose statistics come cheaper than rows."""
+        count = sum(piece.sigma.size for piece in self.pieces) * len(self.free)
+        return count > MOST_NUMBERS and all(isinstance(block.measured, Positions) for block in self.blocks)
 
     def result(self, solution: Solution) -> GeometricFit:
         state = solution.state
-        parts = [part for block in self.blocks for part in observe(state, block, _NONE)]
-        pieces = [replace(one, part=replace(part, noise=one.part.noise)) for one, part in zip(self.pieces, parts)]
-        table = layout(state)
-        rows = sum(part.value.size for part in parts)
-        dof = rows - len(self.free) - sum(part.nuisances for part in parts)
+        table, parts = layout(state), [piece.part for piece in self.pieces]
+        dof = sum(part.value.size - part.nuisances for part in parts) - len(self.free)
         if self.prior is not None:
             dof = max(dof + int(np.isfinite(self.prior).sum()), 1)
         variance = solution.cost / max(dof, 1)
@@ -263,16 +274,20 @@ class Weigher:
             dof,
         )
         return GeometricFit(
-            state, self.nominal, self.free, estimate, None, self.free, solution, self.blocks, pieces, self.prior
+            state, self.nominal, self.free, estimate, None, self.free, solution, self.blocks, self.pieces, self.prior
         )
 
 
 def _rows(cell: Installation, free: np.ndarray, blocks: list[Block], pieces: list[Piece]) -> Iterator[Rows]:
     """Yield the residuals of all blocks and their Jacobians, whitened as in `pieces`."""
     for number, block in enumerate(blocks):
-        own = [piece for piece in pieces if piece.block == number]
-        scales = [piece.sigma / np.sqrt(piece.weight) for piece in own]
-        yield from whitened(cell, block, free, scales, [piece.part.noise for piece in own])
+        noises = [piece.part.noise for piece in pieces if piece.block == number]
+        yield from whitened(cell, block, free, _scales(pieces, number), noises)
+
+
+def _scales(pieces: list[Piece], number: int) -> list[np.ndarray]:
+    """Return the divisors (rows, m) of a block's residual parts, from sigmas and robust weights."""
+    return [piece.sigma / np.sqrt(piece.weight) for piece in pieces if piece.block == number]
 
 
 def _sigma(part: Part, share: float, start: bool, robustly: bool) -> np.ndarray:

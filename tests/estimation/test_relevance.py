@@ -120,7 +120,7 @@ def test_condensed_coordinates_give_what_all_columns_give_in_half_of_them():
     fall = np.concatenate([np.ones(3), np.tile(1.0 / order, 4)])
     y = matrix @ (fall * rng.normal(size=123)) + NOISE * rng.normal(size=400)
     data, size = gram(y, matrix), np.exp(np.log(1.0 / order).mean())
-    few = condensed(data.square, groups, fall)
+    few = condensed(lambda own: data.square[np.ix_(own, own)], groups, fall)
     found = relevance(few.gram(data), few.groups, few.sizes, 30, counts=few.counts)
     profile = np.where(groups < 0, 1.0, fall / size)
     every = relevance(gram(y, matrix * profile), groups, np.full(123, size), 30)

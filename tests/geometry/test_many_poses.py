@@ -39,7 +39,7 @@ def test_pieces_and_a_warm_start_change_nothing(kind, loss, sigmas, monkeypatch)
     whole = climbed(measured, loss)
     sizes, pairs = errors(whole.fit.cell, [measured]), pair_errors(whole.fit.cell, [measured])
     monkeypatch.setattr(observation, "PIECE", 40)
-    monkeypatch.setattr(nonlinear, "MOST_ROWS", 100)
+    monkeypatch.setattr(nonlinear, "MOST_NUMBERS", 2000)
     monkeypatch.setattr(fitting, "WARM_POSES", 30)
     counts = []
     monkeypatch.setattr(

@@ -9,16 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain, repeat
 from typing import Any
 
 import numpy as np
 
-from calib.data.poses.measurements import PoseMeasurements, take
+from calib.data.poses.measurements import PoseMeasurements, Positions, take
 from calib.estimation.relevance import SETTLED, Condensed, Gram, Relevance, condensed, gram, relevance
 from calib.geometry.fit import plausible_deviation
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.folds import Folds
 from calib.geometry.observation import layout, observe, prepare, sampled
+from calib.geometry.squares import squares
 from calib.geometry.weighing import GeometricFit
 from calib.robot.calibrated import Deflection, Term
 from calib.robot.chain import Chain
@@ -160,23 +162,25 @@ def fold_statistics(
     rows_of = _Rows(cell, measured, free, found.used_sigmas(), weights, found.used_noises())
     rigid, groups, sizes = len(found.free), term_groups(terms), term_sizes(terms)
     pooled = all(block.has_instrument for block in measured)
-    each, held_out, rows = list[Gram](), list[Gram](), []
+    outside, shares, rows = list[list[Share]](), list[list[Share]](), []
     for fold in range(folds.count):
         inside = [np.flatnonzero(members == fold) for members in folds.members]
         seen = {block.station for block, chosen in zip(measured, inside) if len(chosen) < len(block)}
         moved = [block.has_instrument and block.station not in seen for block in measured]
-        metric, whitened, count = rows_of.statistics(inside, moved)
-        held_out.append(metric)
+        own, count = rows_of.statistics(inside, moved)
+        shares.append(own)
         rows.append(count)
         if not pooled:
-            whitened = rows_of.statistics([np.flatnonzero(members != fold) for members in folds.members])[1]
-        each.append(whitened)
-    total = sum(each[1:], each[0]) if pooled else rows_of.statistics([np.arange(len(b)) for b in measured])[1]
-    families = np.concatenate([np.full(rigid, -1), groups]).astype(int)
-    coordinates = condensed(total.square, families, np.concatenate([np.ones(rigid), sizes]))
-    total, *each = (coordinates.gram(own) for own in (total, *each))
-    held_out = [coordinates.gram(own) for own in held_out]
-    training = [total - own for own in each] if pooled else each
+            outside.append(rows_of.statistics([np.flatnonzero(members != fold) for members in folds.members])[0])
+    whole = list(chain(*shares)) if pooled else rows_of.statistics([np.arange(len(b)) for b in measured])[0]
+    coordinates = condensed(
+        lambda columns: sum(factor * own.square[np.ix_(columns, columns)] for own, factor, _ in whole),
+        np.concatenate([np.full(rigid, -1), groups]).astype(int), np.concatenate([np.ones(rigid), sizes]),
+    )  # fmt: skip
+    shares = [[(coordinates.gram(data), white, metric) for data, white, metric in own] for own in shares]
+    held_out, each = ([_sum(own, in_metres) for own in shares] for in_metres in (True, False))
+    total = sum(each[1:], each[0]) if pooled else coordinates.gram(_sum(whole))
+    training = [total - own for own in each] if pooled else [coordinates.gram(_sum(own)) for own in outside]
     wide = plausible_deviation(found.cell, found.free) if found.prior is None else found.prior
     plausible = np.where(np.isfinite(wide), wide, 10.0)
     return FoldStatistics(rigid, groups, sizes, coordinates, plausible, training, held_out, np.array(rows), total)
@@ -204,8 +208,9 @@ def blind_folds(nominal: GeometricFit, measured: Sequence[PoseMeasurements], fol
     each, squares = [], []
     for fold in range(folds.count):
         inside = [np.flatnonzero(members == fold) for members in folds.members]
-        held, own, count = rows.statistics(inside, [True] * len(measured))
-        each.append(own)
+        own, count = rows.statistics(inside, [True] * len(measured))
+        held = _sum(own, in_metres=True)
+        each.append(_sum(own))
         squares.append((held.square / max(count, 1.0), held.total / max(count, 1.0)))
     total = sum(each[1:], each[0])
     result = np.zeros(folds.count, dtype=bool)
@@ -219,6 +224,16 @@ def blind_folds(nominal: GeometricFit, measured: Sequence[PoseMeasurements], fol
     return result
 
 
+Share = tuple[Gram, float, float]  # statistics of some rows, and factors that whiten them and put them in metres
+
+
+def _sum(shares: Sequence[Share], in_metres: bool = False) -> Gram:
+    """Return the statistics of all shares, whitened or in metres."""
+    factors = [metric if in_metres else white for _, white, metric in shares]
+    first, *rest = (own.scaled(factor) for (own, *_), factor in zip(shares, factors) if factor)
+    return sum(rest, first)
+
+
 @dataclass(frozen=True, eq=False)
 class _Rows:
     """Measured blocks with the weights of their rows: rms sigma by label, robust weights, noise of images."""
@@ -230,37 +245,44 @@ class _Rows:
     weights: Sequence[np.ndarray]
     noises: Sequence[Any]
 
-    def statistics(self, chosen: Sequence[np.ndarray], moved: Sequence[bool] | None = None) -> tuple[Gram, Gram, float]:
-        """Return the statistics of chosen rows in metres and whitened, and the number of rows in metres.
+    def statistics(
+        self, chosen: Sequence[np.ndarray], moved: Sequence[bool] | None = None
+    ) -> tuple[list[Share], float]:
+        """Return the statistics of chosen rows, and the number of rows in metres.
 
         Of the blocks that are `moved` the station's placement is projected out of the statistics in metres.
         """
-        p, count = len(self.free), 0.0
-        metric = whitened = Gram(np.zeros((p, p)), np.zeros(p), 0.0, 0)
-        station = np.flatnonzero(np.isin(self.free, layout(self.cell).index("station")))
+        found, count = list[Share](), 0.0
         chunk = 1000  # poses observed at once
         for number, (block, rows) in enumerate(zip(self.measured, chosen)):
             frames: list[np.ndarray] = []
+            apart, scales = moved is not None and moved[number], self.scales[number]
             pieces = np.array_split(rows, max(1, len(rows) // chunk)) if block.has_instrument else [rows]
             for piece in filter(len, pieces):
-                ready = prepare(self.cell, [take(block, piece)])
+                ready, weights = prepare(self.cell, [take(block, piece)])[0], self.weights[number][piece]
+                if isinstance(block, Positions) and not apart:
+                    for part, own in squares(self.cell, ready, self.free, repeat(1.0 / np.sqrt(weights[None]))):
+                        found.append((own, scales[part.label] ** -2.0, float(part.label in METRES)))
+                    count += float(weights.sum())  # each has one position
+                    continue
                 noise = self.noises[number].unweighted(len(piece)) if self.noises[number] else None
-                for bare in observe(self.cell, ready[0], self.free):
-                    part, weight = replace(bare, noise=noise), self.weights[number][piece][bare.index]
+                for bare in observe(self.cell, ready, self.free):
+                    part, weight = replace(bare, noise=noise), weights[bare.index]
                     root = 1.0 / np.sqrt(weight)
-                    own = gram(*part.whitened(root * self.scales[number][part.label]))
-                    whitened = whitened + replace(own, rows=part.value.size)
+                    own = gram(*part.whitened(root * scales[part.label]))
+                    found.append((replace(own, rows=part.value.size), 1.0, 0.0))
                     if part.label in METRES:
                         residual, matrix = bare.whitened(root * part.per_length)
                         count += float(weight.sum())
-                        if moved is not None and moved[number]:
+                        if apart:
                             frames.append(np.vstack([matrix.T, residual]))
                         else:
-                            metric = metric + gram(residual, matrix)
+                            found.append((gram(residual, matrix), 0.0, 1.0))
             if frames:
+                station = np.flatnonzero(np.isin(self.free, layout(self.cell).index("station")))
                 columns = project_out(np.concatenate(frames, axis=1), station)
-                metric = metric + gram(columns[-1], columns[:-1].T)
-        return metric, whitened, count
+                found.append((gram(columns[-1], columns[:-1].T), 0.0, 1.0))
+        return found, count
 
 
 def project_out(columns: np.ndarray, frames: np.ndarray) -> np.ndarray:

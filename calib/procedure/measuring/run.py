@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.sparse.csgraph import shortest_path
 
 from calib import files
 from calib.data.poses.pose_lists import joint_columns
@@ -174,6 +173,8 @@ def _joined(clear: Ways, cost: np.ndarray) -> tuple[np.ndarray, Ways]:
     direct = np.full(cost.shape, np.inf)
     for one, two in clear:
         direct[one, two] = direct[two, one] = cost[one, two]
+    from scipy.sparse.csgraph import shortest_path  # slow to load
+
     total, before = shortest_path(direct, directed=False, return_predecessors=True)
     order, ways = tour(np.where(np.isfinite(total), total, FORBIDDEN)), Ways()
     for one, two in (_pair(*pair) for pair in pairwise(order)):

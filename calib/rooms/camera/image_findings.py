@@ -39,7 +39,7 @@ def reprojection(cell: Installation, blocks: Sequence[PoseMeasurements]) -> floa
     """Return the rms distance between detected and predicted corners [px]; None without images."""
     squares = [
         np.sum(part.value**2, axis=0)
-        for block in prepare(cell, blocks)
+        for block in prepare(cell, [block for block in blocks if isinstance(block, Pixels)])
         for part in observe(cell, block, np.array([], dtype=int))
         if isinstance(part, PixelPart)
     ]
