@@ -122,6 +122,7 @@ def relevance(
     iterations: int = 15,
     settled: float = 0.0,
     counts: np.ndarray | None = None,
+    information: np.ndarray | None = None,
 ) -> Relevance:
     """Estimate x with prior x_g ~ N(0, 1/λ_g) per group, every λ and the noise at their most probable values.
 
@@ -138,6 +139,7 @@ def relevance(
         settled: the search ends when values change by less than this share of their standard deviations, rms
             (`SETTLED`); 0: never early.
         counts: (p,) how many columns each stands for (`Condensed`); None for one.
+        information: (p,) in the data on each column alone; None: the diagonal of WᵀW.
     """
     counts = np.ones(len(groups)) if counts is None else counts
     ridged = groups >= 0
@@ -145,7 +147,8 @@ def relevance(
     family = np.where(ridged, groups, count)  # columns without a ridge form the last family, with precision 0
     members = np.maximum(np.bincount(family, counts, count + 1), 1.0)
     lam = np.bincount(family, counts * np.where(ridged, start, np.inf) ** -2.0, count + 1) / members
-    information = np.bincount(family, np.diag(data.square), count + 1) / members
+    information = np.diag(data.square) if information is None else information
+    information = np.bincount(family, information, count + 1) / members
     beta, alive = 1.0, np.ones(count + 1, dtype=bool)
     index, solution, effective = np.arange(len(groups)), np.zeros(len(groups)), 0.0
     square, last = data.square, np.full(len(groups), np.inf)
@@ -186,6 +189,8 @@ def _posterior(
     A diagonal raised by 1e-12, or by as much more as it takes, keeps it regular to rounding: rows that repeat each
     other leave columns that no two poses distinguish.
     """
+    if not len(cross):
+        return cross, penalty
     for raised in 10.0 ** np.arange(-12.0, 1.0, 2.0):
         system = square.copy()
         diagonal = system.flat[:: len(penalty) + 1]

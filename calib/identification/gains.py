@@ -241,5 +241,6 @@ def _start(body: np.ndarray, load: np.ndarray, current: np.ndarray) -> np.ndarra
 
 
 def _parameters(body: np.ndarray, load: np.ndarray, current: np.ndarray, gain: np.ndarray) -> np.ndarray:
-    matrix, target = body / gain[:, None, None], current - load / gain[:, None]
-    return np.linalg.lstsq(matrix.reshape(-1, body.shape[2]), target.ravel(), rcond=1e-12)[0]
+    rows = np.concatenate([body / gain[:, None, None], (current - load / gain[:, None])[:, :, None]], axis=2)
+    stacked = retriangulate(rows.reshape(-1, rows.shape[2]))
+    return np.linalg.lstsq(stacked[:-1, :-1], stacked[:-1, -1], rcond=1e-12)[0]

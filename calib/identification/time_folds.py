@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+import scipy.linalg
 
 from calib.data.signals.filtering import Decimator, kept
 from calib.estimation.relevance import Gram, relevance
@@ -120,13 +121,20 @@ class CrossValidation:
         rounding = 1e-9 * (weight @ self.regimes.whole.diagonal(axis1=1, axis2=2))[index]
         result = np.zeros((len(self.regimes.squares), self.rows))
         for k, (held, counts) in enumerate(zip(self.regimes.squares, self.regimes.counts)):
-            rest = np.tensordot(weight, self.regimes.whole - held, 1).take(index, 0).take(index, 1)
+            rest = self._rests[k].take(index, 0).take(index, 1)
             rest.flat[:: len(index) + 1] += rounding  # differences are positive definite but for that
             rest += known
             rows = int(np.sum((self.regimes.total - counts) / self.inflation))
             values = np.append(_regularised(rest, rows, self.group[columns], self._kinds[columns])[0], -1.0)
             result[k] = np.einsum("i,rij,j->r", values, held.take(index, 1).take(index, 2), values)
         return np.maximum(result, 0.0)
+
+    @cached_property
+    def _rests(self) -> list[np.ndarray]:
+        """Whitened products [W y]ᵀ[W y] (p + 1, p + 1) of the samples outside each held-out range of motion."""
+        assert self.regimes is not None
+        weight = 1.0 / (self.std**2 * self.inflation)
+        return [np.tensordot(weight, self.regimes.whole - held, 1) for held in self.regimes.squares]
 
     def _errors(self, columns: np.ndarray, values: list[np.ndarray]) -> np.ndarray:
         """Return the squared errors of parameter values (k,) per block."""
@@ -216,9 +224,21 @@ def _regularised(square: np.ndarray, rows: int, group: np.ndarray, kinds: np.nda
     max_deviation_ratio = 10.0  # largest ratio of the prior deviations of a group's parameters of one unit (our choice)
     size = np.where(group < 0, size, np.maximum(size, seen[kinds] / max_deviation_ratio))
     scale = np.where(size > 0.0, size, 1.0) / np.sqrt(max(rows, 1))
-    scaled = square[:-1, :-1] / (scale[:, None] * scale)
-    scaled[np.diag_indices(len(group))] += np.where(group < 0, 1e-9 * rows, 0.0)  # free, without data: stays at zero
-    data = Gram(scaled, square[:-1, -1] / scale, float(square[-1, -1]), rows)
-    iterations = 12
-    found = relevance(data, group, np.ones(len(group)), iterations)
-    return found.values / scale, np.where(np.isfinite(found.ridge), found.ridge / scale, np.inf)
+    exact_residual = 1e-7  # of ‖y‖, what rounding leaves at most of a perfect fit
+    least = exact_residual**2 * float(square[-1, -1])
+    scaled = square / np.outer(np.append(scale, 1.0), np.append(scale, 1.0))
+    free, ridged = np.flatnonzero(group < 0), np.append(np.flatnonzero(group >= 0), len(group))
+    inside = scaled[np.ix_(free, free)]
+    inside[np.diag_indices(len(free))] += 1e-9 * rows  # without data: stays at zero
+    root = np.linalg.cholesky(inside)
+    across = scipy.linalg.solve_triangular(root, scaled[np.ix_(free, ridged)], lower=True, check_finite=False)
+    left = scaled[np.ix_(ridged, ridged)] - across.T @ across  # what the columns without a ridge leave
+    data = Gram(left[:-1, :-1], left[:-1, -1], float(left[-1, -1]) + least, rows - len(free))
+    values, ridge = np.zeros(len(group)), np.full(len(group), np.inf)
+    if len(ridged) > 1:
+        iterations, alone = 12, np.diag(scaled)[ridged[:-1]]
+        found = relevance(data, group[ridged[:-1]], np.ones(len(alone)), iterations, information=alone)
+        values[ridged[:-1]], ridge[ridged[:-1]] = found.values, found.ridge / scale[ridged[:-1]]
+    rest = across[:, -1] - across[:, :-1] @ values[ridged[:-1]]
+    values[free] = scipy.linalg.solve_triangular(root, rest, lower=True, trans=1, check_finite=False)
+    return values / scale, ridge

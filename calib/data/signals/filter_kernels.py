@@ -15,9 +15,8 @@ def both_ways(sections, values):
     for row in values:
         for start, step in ((0, 1), (last, -1)):
             for k in range(count):
-                b0, b1, b2, a1, a2 = sections[k]
-                state[k, 1] = (b2 - a2) * row[start]
-                state[k, 0] = (b1 - a1) * row[start] + state[k, 1]
+                state[k, 1] = (sections[k, 2] - sections[k, 4]) * row[start]
+                state[k, 0] = (sections[k, 1] - sections[k, 3]) * row[start] + state[k, 1]
             for i in range(last + 1):
                 x = row[start + i * step]
                 for k in range(count):
