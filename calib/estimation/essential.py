@@ -99,18 +99,19 @@ def eliminate(
     _check_lists(data.names, keep, drop)
     sigma = settled_std(data) if std is None else np.asarray(std, dtype=float)
     base = current = wls(data, sigma, inflation)
-    kept, gone, steps = list(range(data.parameters)), [], []
+    kept, gone, steps, rest = list(range(data.parameters)), [], [], data
     while True:
         worst = _next(current, keep, drop)
         if worst is None or len(kept) == 1:
             return Elimination(base, current, np.array(kept), tuple(steps), None)
-        smaller = wls(data.select(np.delete(kept, worst)), sigma, inflation)
+        less = rest.select(np.delete(np.arange(len(kept)), worst))
+        smaller = wls(less, sigma, inflation)
         step = _step(base, current, smaller, worst, [*gone, kept[worst]], current.estimate.names[worst] in drop)
         if not step.listed and _refused(step, rule, ratio, level):
             return Elimination(base, current, np.array(kept), tuple(steps), step)
         gone.append(kept.pop(worst))
         steps.append(step)
-        current = smaller
+        current, rest = smaller, less
 
 
 def nested_test(base: LinearFit, gone: Sequence[int]) -> tuple[float, float]:

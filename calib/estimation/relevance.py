@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
 from scipy.linalg.lapack import dpotrf, dtrtri  # type: ignore[attr-defined]
 
 from calib.errors import Unidentifiable
 
+RAISED = (1e-12, 1e-10, 1e-8, 1e-6, 1e-4, 1e-2, 1.0)  # share of a diagonal that keeps it regular, one after another
 SETTLED = 0.02  # share of the parameters' sigmas that a search among many may leave open (our choice)
 
 
@@ -191,7 +191,7 @@ def _posterior(
     """
     if not len(cross):
         return cross, penalty
-    for raised in 10.0 ** np.arange(-12.0, 1.0, 2.0):
+    for raised in RAISED:
         system = square.copy()
         diagonal = system.flat[:: len(penalty) + 1]
         system.flat[:: len(penalty) + 1] = np.maximum((diagonal + penalty / beta) * (1.0 + raised), 1e-280)
@@ -202,6 +202,5 @@ def _posterior(
         raise Unidentifiable(
             "the measurements cannot distinguish the model's terms. Are rows repeated? Measure more poses"
         )
-    solution = scipy.linalg.cho_solve((factor, True), cross, check_finite=False)
     inverse, _ = dtrtri(factor, lower=1, overwrite_c=1)  # of the triangle: the variances need no more
-    return solution, np.einsum("ij,ij->j", inverse, inverse) / beta
+    return (inverse @ cross) @ inverse, np.einsum("ij,ij->j", inverse, inverse) / beta

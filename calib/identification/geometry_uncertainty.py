@@ -46,7 +46,7 @@ from calib.estimation.triangles import retriangulate
 from calib.extensions import needed
 from calib.identification.identify import Identification, common_decimator
 from calib.identification.rows import Case, ObservationRows, observe, segments, thinned
-from calib.identification.settings import make_model
+from calib.identification.settings import make_bodies, make_model
 from calib.records import Frozen, frozen
 from calib.robot.calibrated import CalibratedChain, as_calibrated
 from calib.robot.chain import Chain
@@ -290,11 +290,11 @@ def _neighbours(found: Identification, chain: Chain) -> list[tuple[Bodies, Bodie
     """Return pairs of bodies with one geometric element or one tilt of gravity changed by `STEP` up and down."""
 
     def moved(step: np.ndarray) -> Bodies:
-        return make_model(chain.with_values(np.array(chain.values) + step), found.settings).bodies
+        return make_bodies(chain.with_values(np.array(chain.values) + step), found.settings)
 
     def tilted(turn: np.ndarray) -> Bodies:
         gravity = Rotation.from_rotvec(turn).apply(np.array(found.dynamics.model.bodies.gravity))
-        return make_model(chain, replace(found.settings, gravity=tuple(gravity.tolist()))).bodies
+        return make_bodies(chain, replace(found.settings, gravity=tuple(gravity.tolist())))
 
     elements, tilts = STEP * np.eye(len(chain.elements)), STEP * np.eye(3)[:2]
     return [*((moved(one), moved(-one)) for one in elements), *((tilted(one), tilted(-one)) for one in tilts)]
