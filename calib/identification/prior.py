@@ -318,14 +318,15 @@ def _posterior(factor: np.ndarray, columns: np.ndarray, deviations: np.ndarray) 
 def _most_probable(factor: np.ndarray, columns: np.ndarray, sizes: _Sizes, start: np.ndarray) -> np.ndarray:
     """Return the logarithms of the sizes (k,) that maximise evidence times their prior."""
     b = len(columns)
+    unscaled, target = factor[:b, :b] @ columns, factor[:b, b]
 
     def lost(t: np.ndarray) -> tuple[float, np.ndarray]:
-        own = factor[:b, :b] @ (columns * sizes.deviations(t))
+        own = unscaled * sizes.deviations(t)
         inverse, _ = dtrtri(np.linalg.cholesky(own @ own.T + np.eye(b)), lower=1)  # of the root of y's covariance
-        seen, target = inverse @ own, inverse @ factor[:b, b]
+        seen, whitened = inverse @ own, inverse @ target
         away = (t - sizes.centre) / sizes.width
-        value = 0.5 * float(target @ target + away @ away) - float(np.log(np.diag(inverse)).sum())
-        slope = (target @ seen) ** 2 - np.einsum("ij,ij->j", seen, seen)  # of the evidence by each log deviation
+        value = 0.5 * float(whitened @ whitened + away @ away) - float(np.log(np.diag(inverse)).sum())
+        slope = (whitened @ seen) ** 2 - np.einsum("ij,ij->j", seen, seen)  # of the evidence by each log deviation
         return value, away / sizes.width - np.bincount(sizes.member, slope, len(t))
 
     found = scipy.optimize.minimize(

@@ -218,7 +218,8 @@ class _WaveCrossValidation:
             return 0.0, RIDGES[-1]
         left = (whole - np.array(squares)) + (np.array(RIDGES) * unit)[:, None, None, None] * np.eye(len(whole))
         x = np.linalg.solve(left, (cross - np.array(crosses))[..., None])[..., 0]
-        gained = 2.0 * np.einsum("rfk,fk->r", x, crosses) - np.einsum("rfk,fkl,rfl->r", x, squares, x, optimize=True)
+        explained = 2.0 * np.array(crosses) - (np.array(squares) @ x[..., None])[..., 0]
+        gained = (x * explained).sum(axis=(1, 2))
         result = gained / power
         best = int(np.argmax(result))
         return float(result[best]), RIDGES[best]
@@ -240,7 +241,7 @@ def _columns(track: GearTravel, wave: Wave, nodes: Sequence[float]) -> np.ndarra
 
 
 def coherence(track: GearTravel, source: int, residual: np.ndarray, orders: np.ndarray | None = None) -> np.ndarray:
-    """Return the coherence S(k) of a gear's integer orders (k,), None: all from 0 on, (cells / 2 + 1,); see the module."""
+    """Return the coherence S(k) of a gear's integer orders (k,); None: of all from 0 on, (cells / 2 + 1,)."""
     q, v = track.q[:, source], track.v[:, source]
     speed = np.abs(v)
     speed_bins = 4  # of the speed, per direction
