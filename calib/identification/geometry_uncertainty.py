@@ -342,13 +342,15 @@ def _differences(
     felt = replace(torque_rows, projection=None).fold(felt, (BODIES,))[:, :, 0]
     change = np.empty((len(moved), model.bodies.n, len(q)))
     pulled = np.zeros((bodies, len(moved)))
-    block = 512  # samples at a time: the regressor of so many stays in the processor's cache
+    block = 256  # samples at a time: the regressor of so many stays in the processor's cache
     for start in range(0, len(q), block):
         part = slice(start, min(start + block, len(q)))
         weights = np.ascontiguousarray(felt[part].T).ravel()
+        out = np.zeros((bodies, model.bodies.n, min(block, len(q) - start)))  # what is zero is so in all of them
+        regressor = out.reshape(bodies, -1)
         for k, (above, below) in enumerate(moved):
             for sign, one in ((1.0, above), (-1.0, below)):
-                regressor = rigid_body.regressor(one, q[part], v[part], a[part]).transpose(2, 1, 0).reshape(bodies, -1)
+                rigid_body.fill_regressor(one, q[part], v[part], a[part], out)
                 torque = (parameters @ regressor).reshape(model.bodies.n, -1)
                 change[k, :, part] = torque if sign > 0 else (change[k, :, part] - torque) / (2.0 * STEP)
                 pulled[:, k] += sign / (2.0 * STEP) * (regressor @ weights)

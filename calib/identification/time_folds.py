@@ -263,7 +263,8 @@ class _Ridgeless:
         Args:
             group, kinds: (c,) of the columns; -1 for those without a ridge.
         """
-        own, group, kinds = (x[group >= 0] for x in (columns, group, kinds))
+        ridged = group >= 0
+        own, group, kinds = (x[ridged] for x in (columns, group, kinds))
         values, deviations = np.zeros(len(columns)), np.full(len(columns), np.inf)
         if len(own):
             squares = np.diag(self.square)[own]
@@ -280,10 +281,7 @@ class _Ridgeless:
             data = Gram(left[:-1, :-1], left[:-1, -1], total, self.rows - len(self.free))
             iterations = 12
             found = relevance(data, group, np.ones(len(own)), iterations, information=squares / scale**2)
-            ridged = np.isin(columns, own)
             values[ridged], deviations[ridged] = found.values / scale, found.ridge / scale
-        rest = self.across[:, -1] - self.across[:, own] @ values[np.isin(columns, own)]
-        values[np.isin(columns, self.free)] = (
-            scipy.linalg.solve_triangular(self.root, rest, lower=True, trans=1) / self.scale
-        )
+        rest = self.across[:, -1] - self.across[:, own] @ values[ridged]
+        values[~ridged] = scipy.linalg.solve_triangular(self.root, rest, lower=True, trans=1) / self.scale
         return values, deviations
