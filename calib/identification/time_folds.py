@@ -14,7 +14,7 @@ import numpy as np
 import scipy.linalg
 
 from calib.data.signals.filtering import Decimator, kept
-from calib.estimation.relevance import Gram, relevance
+from calib.estimation.relevance import Gram, relevances
 from calib.estimation.triangles import Triangles
 from calib.identification.rows import Case, ObservationRows, pool
 
@@ -119,22 +119,28 @@ class CrossValidation:
         assert self.regimes is not None
         index = np.append(columns, self.data.parameters)
         result = np.zeros((len(self.regimes.squares), self.rows))
-        for k, held in enumerate(self.regimes.squares):
-            values = np.append(self._fold(-1 - k, columns), -1.0)
+        found = self._ridged([self._fold(-1 - k, columns) for k in range(len(result))], columns)
+        for k, (held, own) in enumerate(zip(self.regimes.squares, found)):
+            values = np.append(own, -1.0)
             result[k] = np.einsum("i,rij,j->r", values, held.take(index, 1).take(index, 2), values)
         return np.maximum(result, 0.0)
 
-    def _fold(self, number: int, columns: np.ndarray, run: np.ndarray | None = None) -> np.ndarray:
-        """Return the ridge estimate of columns from all blocks but a run of them, or all rows but a range of motion.
+    def _ridged(self, folds: Sequence["_Ridgeless"], columns: np.ndarray) -> list[np.ndarray]:
+        """Return the ridge estimates of columns from folds' rows."""
+        return [values for values, _ in _ridged(folds, columns, self.group[columns], self._kinds[columns])]
+
+    def _fold(self, number: int, columns: np.ndarray, run: np.ndarray | None = None) -> "_Ridgeless":
+        """Return the rows of all blocks but a run of them, or of all but a range of motion.
 
         Args:
             number: of the fold, by which it is kept; of a range -1, -2, ...
+            columns: of the model, of which those without a ridge are eliminated.
         """
         free = columns[self.group[columns] < 0]
         key = number.to_bytes(4, "little", signed=True) + free.tobytes()
         if key not in self._kept:
             self._kept[key] = _Ridgeless.of(*(self._outside(-1 - number) if run is None else self._others(run)), free)
-        return self._kept[key].ridged(columns, self.group[columns], self._kinds[columns])[0]
+        return self._kept[key]
 
     def _outside(self, k: int) -> tuple[np.ndarray, int]:
         """Return the whitened products [W y]ᵀ[W y] and number of rows outside a held-out range of motion."""
@@ -176,7 +182,8 @@ class CrossValidation:
 
     def _regularised(self, columns: np.ndarray, runs: list[np.ndarray]) -> list[np.ndarray]:
         """Return for each run of blocks the ridge estimate from all other blocks."""
-        return [self._fold(len(runs) * self.blocks + k, columns, run) for k, run in enumerate(runs)]
+        folds = [self._fold(len(runs) * self.blocks + k, columns, run) for k, run in enumerate(runs)]
+        return self._ridged(folds, columns)
 
     @cached_property
     def _kinds(self) -> np.ndarray:
@@ -213,7 +220,7 @@ def estimate(
         found = np.linalg.lstsq(stacked[:, :-1] / scale, stacked[:, -1], rcond=1e-10)[0]
         return found / scale, np.full(len(group), np.inf)
     whole = _Ridgeless.of(stacked.T @ stacked, int(np.sum(data.rows / inflation)), np.flatnonzero(group < 0))
-    return whole.ridged(np.arange(len(group)), group, _kinds(group, data.units))
+    return _ridged([whole], np.arange(len(group)), group, _kinds(group, data.units))[0]
 
 
 def _kinds(group: np.ndarray, units: Sequence[str]) -> np.ndarray:
@@ -252,36 +259,48 @@ class _Ridgeless:
         across = scipy.linalg.solve_triangular(root, square[free] / scale[:, None], lower=True)
         return cls(square, rows, free, scale, root, across, square - across.T @ across)
 
-    def ridged(self, columns: np.ndarray, group: np.ndarray, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return values and prior standard deviations (c,) of a model with these columns: `free`, and some with ridges.
+    def beside(self, own: np.ndarray, kinds: np.ndarray) -> tuple[Gram, np.ndarray, np.ndarray]:
+        """Return the statistics of columns (k,) in units of what each explains, those units, and the information.
 
-        A group's ridge is in units of what each column explains, so that one is enough for different units; but
-        parameters of one kind are about equally large. What the motion hardly shows (Stribeck's torque of a joint that
-        never slows down) has a prior deviation of `max_deviation_ratio` times that of the best shown at most, not one
-        without end.
-
-        Args:
-            group, kinds: (c,) of the columns; -1 for those without a ridge.
+        So one ridge is enough for different units; but parameters of one kind are about equally large. What the motion
+        hardly shows (Stribeck's torque of a joint that never slows down) has a prior deviation of `max_deviation_ratio`
+        times that of the best shown at most, not one without end.
         """
-        ridged = group >= 0
-        own, group, kinds = (x[ridged] for x in (columns, group, kinds))
-        values, deviations = np.zeros(len(columns)), np.full(len(columns), np.inf)
-        if len(own):
-            squares = np.diag(self.square)[own]
-            seen = np.zeros(kinds.max() + 1)
-            np.maximum.at(seen, kinds, np.sqrt(squares))
-            # largest ratio of the prior deviations of a group's parameters of one unit (our choice)
-            max_deviation_ratio = 10.0
-            size = np.maximum(np.sqrt(squares), seen[kinds] / max_deviation_ratio)
-            scale = np.where(size > 0.0, size, 1.0) / np.sqrt(max(self.rows, 1))
-            index, units = np.append(own, len(self.square) - 1), np.append(scale, 1.0)
-            left = self.left.take(index, 0).take(index, 1) / (units[:, None] * units)
-            exact_residual = 1e-7  # of ‖y‖, what rounding leaves at most of a perfect fit
-            total = float(left[-1, -1]) + exact_residual**2 * float(self.square[-1, -1])
-            data = Gram(left[:-1, :-1], left[:-1, -1], total, self.rows - len(self.free))
-            iterations = 12
-            found = relevance(data, group, np.ones(len(own)), iterations, information=squares / scale**2)
-            values[ridged], deviations[ridged] = found.values / scale, found.ridge / scale
-        rest = self.across[:, -1] - self.across[:, own] @ values[ridged]
-        values[~ridged] = scipy.linalg.solve_triangular(self.root, rest, lower=True, trans=1) / self.scale
-        return values, deviations
+        squares = np.diag(self.square)[own]
+        seen = np.zeros(kinds.max() + 1)
+        np.maximum.at(seen, kinds, np.sqrt(squares))
+        max_deviation_ratio = (
+            10.0  # largest ratio of the prior deviations of a group's parameters of one unit (our choice)
+        )
+        size = np.maximum(np.sqrt(squares), seen[kinds] / max_deviation_ratio)
+        scale = np.where(size > 0.0, size, 1.0) / np.sqrt(max(self.rows, 1))
+        index, units = np.append(own, len(self.square) - 1), np.append(scale, 1.0)
+        left = self.left.take(index, 0).take(index, 1) / (units[:, None] * units)
+        exact_residual = 1e-7  # of ‖y‖, what rounding leaves at most of a perfect fit
+        total = float(left[-1, -1]) + exact_residual**2 * float(self.square[-1, -1])
+        return Gram(left[:-1, :-1], left[:-1, -1], total, self.rows - len(self.free)), scale, squares / scale**2
+
+    def freed(self, own: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Return the parameters of the columns without a ridge, given those (k,) of columns with one."""
+        rest = self.across[:, -1] - self.across[:, own] @ values
+        return np.asarray(scipy.linalg.solve_triangular(self.root, rest, lower=True, trans=1)) / self.scale
+
+
+def _ridged(
+    folds: Sequence[_Ridgeless], columns: np.ndarray, group: np.ndarray, kinds: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return values and prior standard deviations (c,) of a model with these columns, from the rows of each fold.
+
+    Args:
+        group, kinds: (c,) of the columns; -1 for those without a ridge, which are the folds' `free`.
+    """
+    ridged = group >= 0
+    own, result = columns[ridged], [(np.zeros(len(columns)), np.full(len(columns), np.inf)) for _ in folds]
+    if len(own):
+        data, scales, information = zip(*(fold.beside(own, kinds[ridged]) for fold in folds))
+        found = relevances(data, group[ridged], np.ones(len(own)), 12, information=np.array(information))
+        for (values, deviations), one, scale in zip(result, found, scales):
+            values[ridged], deviations[ridged] = one.values / scale, one.ridge / scale
+    for (values, _), fold in zip(result, folds):
+        values[~ridged] = fold.freed(own, values[ridged])
+    return result
