@@ -210,10 +210,8 @@ def _posteriors(
     """Return means and variances (f, p) of f problems in the columns `used` (f, p); 0 and 1 for others."""
     solution, variance = np.zeros(cross.shape), np.ones(cross.shape)
     for k, own in enumerate(used):
-        if own.all():
-            solution[k], variance[k] = _posterior(square[k], cross[k], penalty[k], beta[k])
-        elif own.any():
-            part = square[k].compress(own, 0).compress(own, 1)
+        if own.any():
+            part = square[k] if own.all() else square[k].compress(own, 0).compress(own, 1)
             solution[k, own], variance[k, own] = _posterior(part, cross[k, own], penalty[k, own], beta[k])
     return solution, variance
 
