@@ -161,7 +161,7 @@ def relevances(
     ridged = groups >= 0
     count = int(groups.max(initial=-1)) + 1
     family = np.where(ridged, groups, count)  # columns without a ridge form the last family, with precision 0
-    member = (family[:, None] == np.arange(count + 1)).astype(float)
+    member = np.equal(family[:, None], np.arange(count + 1)).astype(float)
     members = np.maximum(counts @ member, 1.0)
     lam = np.tile((counts * np.where(ridged, start, np.inf) ** -2.0) @ member / members, (len(data), 1))
     # a group is out once its prior is this many times as precise as the data on its columns (our choice)
@@ -170,12 +170,8 @@ def relevances(
     exact_residual = 1e-7  # ‖y - W x‖ relative to ‖y‖ below which a fit counts as perfect: WᵀW knows no better
     least = exact_residual**2 * np.maximum(total, 1e-300)  # what rounding leaves of a perfect fit
     beta, alive, last = np.ones(len(data)), np.ones(lam.shape, dtype=bool), np.full(cross.shape, np.inf)
-    index, solution, used, effective = (
-        np.arange(len(groups)),
-        np.zeros(cross.shape),
-        alive[:, family],
-        np.zeros(len(data)),
-    )
+    index, used = np.arange(len(groups)), alive[:, family]
+    solution, effective = np.zeros(cross.shape), np.zeros(len(data))
     for _ in range(iterations):
         if not (inside := alive.any(axis=0)[family[index]]).all():
             index, cross, member = index[inside], cross[:, inside], member[inside]

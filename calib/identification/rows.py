@@ -9,7 +9,6 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Protocol, runtime_checkable
-from weakref import WeakKeyDictionary, ref
 
 import numpy as np
 
@@ -259,11 +258,8 @@ def with_blocks(all_rows: Sequence[ObservationRows], count: int) -> list[Observa
 def triangulate(all_rows: Sequence[ObservationRows]) -> Triangles:
     """Return the R factors of all rows, one group per time block and torque row: group = block · rows + row.
 
-    The last block holds the samples beside cuts. As long as the rows are there, their factors are kept.
+    The last block holds the samples beside cuts.
     """
-    parts, known = _KEPT.get(all_rows[0], ((), None))
-    if known is not None and [part() for part in parts] == list(all_rows):
-        return known
     rows = all_rows[0].target.shape[1]
     blocks = 1 + max((int(part.block.max(initial=-1)) for part in all_rows), default=-1)
     result = empty(all_rows[0].names, all_rows[0].units, (blocks + 1) * rows)
@@ -272,11 +268,7 @@ def triangulate(all_rows: Sequence[ObservationRows]) -> Triangles:
         for row in range(rows):
             used = part.present[:, row]
             result = absorb(result, part.matrix[used, row], part.target[used, row], block[used] * rows + row)
-    _KEPT[all_rows[0]] = [ref(part) for part in all_rows], result
     return result
-
-
-_KEPT: WeakKeyDictionary[ObservationRows, tuple[list[ref[ObservationRows]], Triangles]] = WeakKeyDictionary()
 
 
 def pool(data: Triangles, rows: int, blocks: Sequence[int] | None = None) -> Triangles:

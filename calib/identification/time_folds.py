@@ -93,7 +93,7 @@ class CrossValidation:
     prior: np.ndarray | None = None
     regimes: Regimes | None = None
     _known: dict[bytes, np.ndarray] = field(default_factory=dict, init=False)
-    _kept: dict[bytes, "_Ridgeless"] = field(default_factory=dict, init=False)
+    _kept: dict[int, list["_Ridgeless"]] = field(default_factory=dict, init=False)
 
     def errors(self, columns: np.ndarray, folds: int | None = None) -> np.ndarray:
         """Return the squared errors (blocks, rows) on each held-out block of a model with these columns.
@@ -108,7 +108,7 @@ class CrossValidation:
         runs = np.array_split(np.arange(self.blocks), folds or self.blocks)
         key = len(runs).to_bytes(4, "little") + columns.tobytes()
         if key not in self._known:
-            fitted = self._fitted if (self.group[columns] < 0).all() else self._regularised
+            fitted = self._fitted if (self.group[columns] < 0).all() else self._ridged
             values = fitted(columns, runs)
             each = [own for run, own in zip(runs, values) for _ in run]
             self._known[key] = self._errors(columns, each)
@@ -119,28 +119,23 @@ class CrossValidation:
         assert self.regimes is not None
         index = np.append(columns, self.data.parameters)
         result = np.zeros((len(self.regimes.squares), self.rows))
-        found = self._ridged([self._fold(-1 - k, columns) for k in range(len(result))], columns)
-        for k, (held, own) in enumerate(zip(self.regimes.squares, found)):
+        for k, (held, own) in enumerate(zip(self.regimes.squares, self._ridged(columns))):
             values = np.append(own, -1.0)
             result[k] = np.einsum("i,rij,j->r", values, held.take(index, 1).take(index, 2), values)
         return np.maximum(result, 0.0)
 
-    def _ridged(self, folds: Sequence["_Ridgeless"], columns: np.ndarray) -> list[np.ndarray]:
-        """Return the ridge estimates of columns from folds' rows."""
-        return [values for values, _ in _ridged(folds, columns, self.group[columns], self._kinds[columns])]
-
-    def _fold(self, number: int, columns: np.ndarray, run: np.ndarray | None = None) -> "_Ridgeless":
-        """Return the rows of all blocks but a run of them, or of all but a range of motion.
+    def _ridged(self, columns: np.ndarray, runs: Sequence[np.ndarray] | None = None) -> list[np.ndarray]:
+        """Return the ridge estimates from all rows outside each run of blocks, or each range of motion (None).
 
         Args:
-            number: of the fold, by which it is kept; of a range -1, -2, ...
-            columns: of the model, of which those without a ridge are eliminated.
+            columns: all that have no ridge, and some with one.
         """
-        free = columns[self.group[columns] < 0]
-        key = number.to_bytes(4, "little", signed=True) + free.tobytes()
+        key = 0 if runs is None else len(runs)
         if key not in self._kept:
-            self._kept[key] = _Ridgeless.of(*(self._outside(-1 - number) if run is None else self._others(run)), free)
-        return self._kept[key]
+            assert self.regimes is not None
+            wholes = map(self._outside, range(len(self.regimes.squares))) if runs is None else map(self._others, runs)
+            self._kept[key] = [_Ridgeless.of(*whole, np.flatnonzero(self.group < 0)) for whole in wholes]
+        return [own for own, _ in _ridged(self._kept[key], columns, self.group[columns], self._kinds[columns])]
 
     def _outside(self, k: int) -> tuple[np.ndarray, int]:
         """Return the whitened products [W y]ᵀ[W y] and number of rows outside a held-out range of motion."""
@@ -179,11 +174,6 @@ class CrossValidation:
         folds = [[other for other in range(self.blocks) if other not in run] for run in runs]
         pooled = (pool(chosen, self.rows, others) for others in folds)
         return [estimate(data, self.std, self.inflation, group, prior)[0] for data in pooled]
-
-    def _regularised(self, columns: np.ndarray, runs: list[np.ndarray]) -> list[np.ndarray]:
-        """Return for each run of blocks the ridge estimate from all other blocks."""
-        folds = [self._fold(len(runs) * self.blocks + k, columns, run) for k, run in enumerate(runs)]
-        return self._ridged(folds, columns)
 
     @cached_property
     def _kinds(self) -> np.ndarray:
@@ -235,8 +225,8 @@ class _Ridgeless:
 
     Attributes:
         square, rows: (p + 1, p + 1) of all columns, and the number of rows.
-        free, scale: (k,) indices of the columns without a ridge, and the sizes of their parameters.
-        root: (k, k) of their products in units of the sizes, lower.
+        free: (k,) indices of the columns without a ridge.
+        root: (k, k) of their products, lower.
         across, left: (k, p + 1) and (p + 1, p + 1): R⁻ᵀ WᵀW of them with all columns, and what they leave of the
             products.
     """
@@ -244,20 +234,16 @@ class _Ridgeless:
     square: np.ndarray
     rows: int
     free: np.ndarray
-    scale: np.ndarray
     root: np.ndarray
     across: np.ndarray
     left: np.ndarray
 
     @classmethod
     def of(cls, square: np.ndarray, rows: int, free: np.ndarray) -> "_Ridgeless":
-        size = np.sqrt(np.diag(square)[free])
-        scale = np.where(size > 0.0, size, 1.0) / np.sqrt(max(rows, 1))
-        inside = square[np.ix_(free, free)] / np.outer(scale, scale)
-        inside[np.diag_indices(len(free))] += 1e-9 * rows  # without data: stays at zero
-        root = np.linalg.cholesky(inside)
-        across = scipy.linalg.solve_triangular(root, square[free] / scale[:, None], lower=True)
-        return cls(square, rows, free, scale, root, across, square - across.T @ across)
+        size = np.diag(square)[free]
+        root = np.linalg.cholesky(square[np.ix_(free, free)] + 1e-9 * np.diag(np.where(size > 0.0, size, 1.0)))
+        across = scipy.linalg.solve_triangular(root, square[free], lower=True)
+        return cls(square, rows, free, root, across, square - across.T @ across)
 
     def beside(self, own: np.ndarray, kinds: np.ndarray) -> tuple[Gram, np.ndarray, np.ndarray]:
         """Return the statistics of columns (k,) in units of what each explains, those units, and the information.
@@ -269,9 +255,7 @@ class _Ridgeless:
         squares = np.diag(self.square)[own]
         seen = np.zeros(kinds.max() + 1)
         np.maximum.at(seen, kinds, np.sqrt(squares))
-        max_deviation_ratio = (
-            10.0  # largest ratio of the prior deviations of a group's parameters of one unit (our choice)
-        )
+        max_deviation_ratio = 10.0  # largest of a group's prior deviations of one unit (our choice)
         size = np.maximum(np.sqrt(squares), seen[kinds] / max_deviation_ratio)
         scale = np.where(size > 0.0, size, 1.0) / np.sqrt(max(self.rows, 1))
         index, units = np.append(own, len(self.square) - 1), np.append(scale, 1.0)
@@ -283,7 +267,7 @@ class _Ridgeless:
     def freed(self, own: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Return the parameters of the columns without a ridge, given those (k,) of columns with one."""
         rest = self.across[:, -1] - self.across[:, own] @ values
-        return np.asarray(scipy.linalg.solve_triangular(self.root, rest, lower=True, trans=1)) / self.scale
+        return np.asarray(scipy.linalg.solve_triangular(self.root, rest, lower=True, trans=1))
 
 
 def _ridged(

@@ -11,17 +11,16 @@ def both_ways(sections, values):
     Each pass begins in the steady state of its first value (transposed direct form II).
     """
     count, last = len(sections), values.shape[1] - 1
-    state = np.empty((count, 2))
+    state = np.zeros((count, 2))
     for row in values:
         for start, step in ((0, 1), (last, -1)):
-            for k in range(count):
-                state[k, 1] = (sections[k, 2] - sections[k, 4]) * row[start]
-                state[k, 0] = (sections[k, 1] - sections[k, 3]) * row[start] + state[k, 1]
+            first = row[start]
+            state[:] = 0.0
             for i in range(last + 1):
-                x = row[start + i * step]
+                x = row[start + i * step] - first
                 for k in range(count):
                     y = sections[k, 0] * x + state[k, 0]
                     state[k, 0] = sections[k, 1] * x - sections[k, 3] * y + state[k, 1]
                     state[k, 1] = sections[k, 2] * x - sections[k, 4] * y
                     x = y
-                row[start + i * step] = x
+                row[start + i * step] = x + first

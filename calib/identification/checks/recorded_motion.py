@@ -228,12 +228,10 @@ def _smooth(values: np.ndarray, order: int = 0, half_width: int = 10) -> np.ndar
     slopes = np.zeros_like(powers)  # of the powers, at each place
     for k in range(order, powers.shape[1]):
         slopes[:, k] = math.perm(k, order) * place ** (k - order) / STEP**order
-    ends = [
-        slopes[own] @ (fit @ values[near])
-        for own, near in ((slice(half), slice(len(place))), (slice(half + 1, None), slice(-len(place), None)))
-    ]
-    inner = np.apply_along_axis(np.convolve, 0, values, (slopes[half] @ fit)[::-1], "valid")
-    return np.concatenate([ends[0], inner, ends[1]])
+    weights, last = slopes @ fit, len(values) - half
+    result = np.stack([np.convolve(column, weights[half, ::-1], "same") for column in values.T], axis=1)
+    result[:half], result[last:] = weights[:half] @ values[: len(place)], weights[half + 1 :] @ values[-len(place) :]
+    return result
 
 
 @dataclass(frozen=True, eq=False)

@@ -144,7 +144,7 @@ def _shares(samples: MotionSamples) -> Callable[[np.ndarray], np.ndarray]:
     positive /= np.maximum(np.abs(positive).max(axis=0), 1e-12)
     part, among = np.column_stack([positive, each]), spanning(free.T @ free)
     part -= free @ (among @ (among.T @ (free.T @ part)))
-    triangle, p = np.linalg.qr(part, mode="r"), positive.shape[1]
+    triangle, p = np.asarray(np.linalg.qr(part, mode="r")), positive.shape[1]
     positive, each = part[:, :p], part[:, p:]
 
     def left(signs: np.ndarray) -> np.ndarray:
