@@ -1,16 +1,15 @@
 """Elimination of base parameters down to essential ones: drop parameters that the data do not identify, one by one."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 from scipy.special import fdtrc
 
 from calib.errors import Unidentifiable, require
-from calib.estimation.estimate import Estimate
-from calib.estimation.linear import LinearFit, leverage, settled_std, wls
-from calib.estimation.triangles import Triangles, combine, solve_triangle
+from calib.estimation.linear import LinearFit, settled_std, wls
+from calib.estimation.triangles import Triangles
 from calib.records import Number
 
 
@@ -99,98 +98,49 @@ def eliminate(
     """
     _check_lists(data.names, keep, drop)
     sigma = settled_std(data) if std is None else np.asarray(std, dtype=float)
-    base = wls(data, sigma, inflation)
-    current, kept, gone, steps = _Left.of(data, base, sigma, inflation), list(range(data.parameters)), [], []
-    step = refused = None
-    while len(kept) > 1 and (worst := _next(current.estimate, keep, drop)) is not None:
-        smaller = current.without(worst)
-        listed = current.estimate.names[worst] in drop
-        step = _step(base.estimate, current.estimate, smaller.estimate, worst, [*gone, kept[worst]], listed)
+    base = current = wls(data, sigma, inflation)
+    kept, gone, steps = list(range(data.parameters)), [], []
+    while True:
+        worst = _next(current, keep, drop)
+        if worst is None or len(kept) == 1:
+            return Elimination(base, current, np.array(kept), tuple(steps), None)
+        smaller = wls(data.select(np.delete(kept, worst)), sigma, inflation)
+        step = _step(base, current, smaller, worst, [*gone, kept[worst]], current.estimate.names[worst] in drop)
         if not step.listed and _refused(step, rule, ratio, level):
-            refused = step
-            break
+            return Elimination(base, current, np.array(kept), tuple(steps), step)
         gone.append(kept.pop(worst))
         steps.append(step)
         current = smaller
-    essential = wls(data.select(np.array(kept)), sigma, inflation) if gone else base
-    return Elimination(base, essential, np.array(kept), tuple(steps), refused)
 
 
-@dataclass(frozen=True, eq=False)
-class _Left:
-    """Weighted least squares of the columns that are left of a problem.
-
-    Attributes:
-        data, std, inflation: the problem's triangles, and its groups' weights (g,).
-        kept: (k,) indices of the columns.
-        inverse: (k, k) (Wᵀ R⁻¹ W)⁻¹.
-        leverage: (g,) of the groups.
-        estimate: of the columns.
-    """
-
-    data: Triangles
-    std: np.ndarray
-    inflation: np.ndarray
-    kept: np.ndarray
-    inverse: np.ndarray
-    leverage: np.ndarray
-    estimate: Estimate
-
-    @classmethod
-    def of(cls, data: Triangles, fit: LinearFit, std: np.ndarray, inflation: np.ndarray | None) -> "_Left":
-        """Return the problem with all columns, of which there is a fit."""
-        root = solve_triangle(combine(data, std), data.names)[1]
-        tau = np.ones(data.groups) if inflation is None else inflation
-        kept = np.arange(data.parameters)
-        return cls(data, std, tau, kept, root @ root.T, leverage(data, std, root), fit.estimate)
-
-    def without(self, k: int) -> "_Left":
-        """Return the fit with one column less: least squares under x_k = 0."""
-        own, left = self.estimate, np.delete(np.arange(len(self.kept)), k)
-        by = self.inverse[:, k] / self.inverse[k, k]  # how the others give way
-        kept, values = self.kept[left], (own.values - by * own.values[k])[left]
-        inverse = (self.inverse - np.outer(by, self.inverse[k]))[np.ix_(left, left)]
-        cross = np.outer(own.covariance[:, k], by)
-        covariance = own.covariance - cross - cross.T + own.covariance[k, k] * np.outer(by, by)
-        seen = self.data.factors[:, :, self.kept] @ by
-        taken = self.leverage - np.sum(seen**2, axis=1) / self.std**2 * self.inverse[k, k]
-        whole = np.zeros(self.data.parameters)
-        whole[kept] = values
-        rows = self.data.rows - self.inflation * taken
-        residual_std = float(np.sqrt(np.sum(self.data.residual_squares(whole) / self.std**2) / rows.sum()))
-        names, units = (tuple(np.delete(x, k).tolist()) for x in (own.names, own.units))
-        dof = int(np.round(np.sum(rows / self.inflation), 6))
-        estimate = Estimate(names, units, values, covariance[np.ix_(left, left)], residual_std, dof)
-        return replace(self, kept=kept, inverse=inverse, leverage=taken, estimate=estimate)
-
-
-def nested_test(base: Estimate, gone: Sequence[int]) -> tuple[float, float]:
+def nested_test(base: LinearFit, gone: Sequence[int]) -> tuple[float, float]:
     """Return F and its p-value for the hypothesis that the parameters with these indices are all zero.
 
     Equal to the F-test of the two residual sums; F uses the residual variance of the base fit.
     """
-    x = base.values[list(gone)]
-    covariance = base.covariance[np.ix_(gone, gone)] * base.residual_std**2
+    x = base.estimate.values[list(gone)]
+    covariance = base.estimate.covariance[np.ix_(gone, gone)] * base.estimate.residual_std**2
     scale = np.sqrt(np.diag(covariance))
     y = x / scale
     f = float(y @ np.linalg.solve(covariance / np.outer(scale, scale), y)) / len(x)
-    return f, float(fdtrc(len(x), base.dof, f))
+    return f, float(fdtrc(len(x), base.estimate.dof, f))
 
 
 def _step(
-    base: Estimate, current: Estimate, smaller: Estimate, worst: int, gone: list[int], listed: bool
+    base: LinearFit, current: LinearFit, smaller: LinearFit, worst: int, gone: list[int], listed: bool
 ) -> EliminationStep:
-    rsd = current.rsd
+    rsd = current.estimate.rsd
     f, p = nested_test(current, [worst])
     spread = float(rsd.max() / rsd.min()) if rsd.min() > 0.0 else np.inf
     return EliminationStep(
-        current.names[worst], float(rsd[worst]), spread, f, p, nested_test(base, gone)[1], smaller.residual_std, listed,
+        current.estimate.names[worst], float(rsd[worst]), spread, f, p, nested_test(base, gone)[1],
+        smaller.estimate.residual_std, listed,
     )  # fmt: skip
 
 
-def _next(current: Estimate, keep: Sequence[str], drop: Sequence[str]) -> int | None:
+def _next(current: LinearFit, keep: Sequence[str], drop: Sequence[str]) -> int | None:
     """Return the index of the next parameter to drop: listed ones first, then the largest RSD."""
-    names, rsd = current.names, current.rsd
+    names, rsd = current.estimate.names, current.estimate.rsd
     listed = [k for k, name in enumerate(names) if name in drop]
     candidates = listed or [k for k, name in enumerate(names) if name not in keep]
     return max(candidates, key=lambda k: rsd[k]) if candidates else None

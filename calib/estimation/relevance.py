@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -123,20 +122,8 @@ def relevance(
     iterations: int = 15,
     settled: float = 0.0,
     counts: np.ndarray | None = None,
-) -> Relevance:
-    """Return the ridge regression of one set of statistics, see `relevances`."""
-    return relevances([data], groups, start, iterations, settled, counts)[0]
-
-
-def relevances(
-    data: Sequence[Gram],
-    groups: np.ndarray,
-    start: np.ndarray,
-    iterations: int = 15,
-    settled: float = 0.0,
-    counts: np.ndarray | None = None,
     information: np.ndarray | None = None,
-) -> list[Relevance]:
+) -> Relevance:
     """Estimate x with prior x_g ~ N(0, 1/λ_g) per group, every λ and the noise at their most probable values.
 
     MacKay's fixed point (1992; Tipping 2001, eq. 16–18): λ_g = γ_g / ‖x_g‖² with γ_g = Σ_{i in g} (1 - λ_g Σ_ii), and
@@ -144,7 +131,7 @@ def relevances(
     must be independent.
 
     Args:
-        data: statistics of all rows, of f problems with the same columns.
+        data: statistics of all rows.
         groups: (p,) group of each column; -1 for no ridge.
         start: (p,) first guess of each column's prior standard deviation, one per group (`condensed` for others); read
             where there is a ridge.
@@ -152,64 +139,48 @@ def relevances(
         settled: the search ends when values change by less than this share of their standard deviations, rms
             (`SETTLED`); 0: never early.
         counts: (p,) how many columns each stands for (`Condensed`); None for one.
-        information: (f, p) in the data on each column alone; None: the diagonal of WᵀW.
+        information: (p,) in the data on each column alone; None: the diagonal of WᵀW.
     """
-    square, cross = np.array([one.square for one in data]), np.array([one.cross for one in data])
-    total, rows = (np.array([getattr(one, name) for one in data], dtype=float) for name in ("total", "rows"))
-    information = np.diagonal(square, axis1=1, axis2=2) if information is None else information
     counts = np.ones(len(groups)) if counts is None else counts
     ridged = groups >= 0
     count = int(groups.max(initial=-1)) + 1
     family = np.where(ridged, groups, count)  # columns without a ridge form the last family, with precision 0
-    member = np.equal(family[:, None], np.arange(count + 1)).astype(float)
-    members = np.maximum(counts @ member, 1.0)
-    lam = np.tile((counts * np.where(ridged, start, np.inf) ** -2.0) @ member / members, (len(data), 1))
+    members = np.maximum(np.bincount(family, counts, count + 1), 1.0)
+    lam = np.bincount(family, counts * np.where(ridged, start, np.inf) ** -2.0, count + 1) / members
+    alone = np.diag(data.square) if information is None else information
+    information = np.bincount(family, alone, count + 1) / members
+    beta, alive = 1.0, np.ones(count + 1, dtype=bool)
+    index, solution, effective = np.arange(len(groups)), np.zeros(len(groups)), 0.0
+    square, last = data.square, np.full(len(groups), np.inf)
+    exact_residual = 1e-7  # ‖y - W x‖ relative to ‖y‖ below which a fit counts as perfect: WᵀW knows no better
     # a group is out once its prior is this many times as precise as the data on its columns (our choice)
     max_prior_weight = 2.0
-    most = max_prior_weight * np.maximum(information @ member / members, 1e-300)
-    exact_residual = 1e-7  # ‖y - W x‖ relative to ‖y‖ below which a fit counts as perfect: WᵀW knows no better
-    least = exact_residual**2 * np.maximum(total, 1e-300)  # what rounding leaves of a perfect fit
-    beta, alive, last = np.ones(len(data)), np.ones(lam.shape, dtype=bool), np.full(cross.shape, np.inf)
-    index, used = np.arange(len(groups)), alive[:, family]
-    solution, effective = np.zeros(cross.shape), np.zeros(len(data))
     for _ in range(iterations):
-        if not (inside := alive.any(axis=0)[family[index]]).all():
-            index, cross, member = index[inside], cross[:, inside], member[inside]
-            square = square.compress(inside, 1).compress(inside, 2)
-        own = family[index]
-        used, penalty = alive[:, own], lam[:, own]
-        solution, variance = _posteriors(square, cross, penalty, beta, used)
-        determined = np.where(used & (own < count), 1.0 - penalty * variance, 0.0)
-        gamma, size = determined @ member, solution**2 @ member
-        again = np.where(alive, np.maximum(gamma, 1e-12) / np.maximum(size, 1e-300), lam)
-        lam[:, :count] = again[:, :count]
-        alive[:, :count] &= (lam < beta[:, None] * most)[:, :count]
-        effective = gamma.sum(axis=1)
-        misfit = total + np.sum(solution * ((square @ solution[:, :, None])[:, :, 0] - 2.0 * cross), axis=1)
-        beta = np.maximum(rows - effective - int((~ridged).sum()), 1.0) / np.maximum(misfit, least)
-        change = np.sum((solution - last[:, index]) ** 2 / variance, axis=1)
-        if settled > 0.0 and (change < settled**2 * counts[index].sum()).all():
+        inside = np.flatnonzero(alive[family[index]])
+        if not len(inside):
             break
-        last[:, index] = solution
-    values, ridge = np.zeros((len(data), len(groups))), np.tile(np.where(ridged, 0.0, np.inf), (len(data), 1))
-    values[:, index] = solution
-    kept = ridged[index]
-    precision = np.where(used & kept, lam[:, family[index]], np.inf)
-    ridge[:, index[kept]] = 1.0 / np.sqrt(precision[:, kept])
-    found = zip(values, ridge, effective, 1.0 / np.sqrt(beta))
-    return [Relevance(each, own, float(few), float(noise)) for each, own, few, noise in found]
-
-
-def _posteriors(
-    square: np.ndarray, cross: np.ndarray, penalty: np.ndarray, beta: np.ndarray, used: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return means and variances (f, p) of f problems in the columns `used` (f, p); 0 and 1 for others."""
-    solution, variance = np.zeros(cross.shape), np.ones(cross.shape)
-    for k, own in enumerate(used):
-        if own.any():
-            part = square[k] if own.all() else square[k].compress(own, 0).compress(own, 1)
-            solution[k, own], variance[k, own] = _posterior(part, cross[k, own], penalty[k, own], beta[k])
-    return solution, variance
+        if len(inside) < len(index):
+            index, square = index[inside], square.take(inside, 0).take(inside, 1)
+        own = family[index]
+        solution, variance = _posterior(square, data.cross[index], lam[own], beta)
+        determined = np.where(own < count, 1.0 - lam[own] * variance, 0.0)
+        gamma = np.bincount(own, determined, count + 1)
+        size = np.bincount(own, solution**2, count + 1)
+        lam[:count] = np.where(alive, np.maximum(gamma, 1e-12) / np.maximum(size, 1e-300), lam)[:count]
+        alive[:count] &= (lam < max_prior_weight * beta * np.maximum(information, 1e-300))[:count]
+        effective = float(gamma.sum())
+        misfit = data.total - 2.0 * solution @ data.cross[index]
+        misfit += solution @ square @ solution
+        least = exact_residual**2 * max(data.total, 1e-300)  # what rounding leaves of a perfect fit
+        beta = max(data.rows - effective - int((~ridged).sum()), 1.0) / max(float(misfit), least)
+        if settled > 0.0 and np.sum((solution - last[index]) ** 2 / variance) < settled**2 * counts[index].sum():
+            break
+        last[index] = solution
+    values, ridge = np.zeros(len(groups)), np.where(ridged, 0.0, np.inf)
+    values[index] = solution
+    kept = index[ridged[index]]
+    ridge[kept] = 1.0 / np.sqrt(lam[groups[kept]])
+    return Relevance(values, ridge, effective, float(1.0 / np.sqrt(beta)))
 
 
 def _posterior(

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.linalg
 
 from calib.data.signals.filtering import Decimator, kept
-from calib.estimation.relevance import Gram, relevances
+from calib.estimation.relevance import Gram, relevance
 from calib.estimation.triangles import Triangles
 from calib.identification.rows import Case, ObservationRows, pool
 
@@ -135,7 +135,7 @@ class CrossValidation:
             assert self.regimes is not None
             wholes = map(self._outside, range(len(self.regimes.squares))) if runs is None else map(self._others, runs)
             self._kept[key] = [_Ridgeless.of(*whole, np.flatnonzero(self.group < 0)) for whole in wholes]
-        return [own for own, _ in _ridged(self._kept[key], columns, self.group[columns], self._kinds[columns])]
+        return [fold.ridged(columns, self.group[columns], self._kinds[columns])[0] for fold in self._kept[key]]
 
     def _outside(self, k: int) -> tuple[np.ndarray, int]:
         """Return the whitened products [W y]ᵀ[W y] and number of rows outside a held-out range of motion."""
@@ -210,7 +210,7 @@ def estimate(
         found = np.linalg.lstsq(stacked[:, :-1] / scale, stacked[:, -1], rcond=1e-10)[0]
         return found / scale, np.full(len(group), np.inf)
     whole = _Ridgeless.of(stacked.T @ stacked, int(np.sum(data.rows / inflation)), np.flatnonzero(group < 0))
-    return _ridged([whole], np.arange(len(group)), group, _kinds(group, data.units))[0]
+    return whole.ridged(np.arange(len(group)), group, _kinds(group, data.units))
 
 
 def _kinds(group: np.ndarray, units: Sequence[str]) -> np.ndarray:
@@ -245,46 +245,31 @@ class _Ridgeless:
         across = scipy.linalg.solve_triangular(root, square[free], lower=True)
         return cls(square, rows, free, root, across, square - across.T @ across)
 
-    def beside(self, own: np.ndarray, kinds: np.ndarray) -> tuple[Gram, np.ndarray, np.ndarray]:
-        """Return the statistics of columns (k,) in units of what each explains, those units, and the information.
+    def ridged(self, columns: np.ndarray, group: np.ndarray, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return values and prior standard deviations (c,) of a model with these columns: `free`, and some with ridges.
 
-        So one ridge is enough for different units; but parameters of one kind are about equally large. What the motion
-        hardly shows (Stribeck's torque of a joint that never slows down) has a prior deviation of `max_deviation_ratio`
-        times that of the best shown at most, not one without end.
+        A ridge is in units of what each column explains, so that one is enough for different units; but parameters of
+        one kind are about equally large. What the motion hardly shows (Stribeck's torque of a joint that never slows
+        down) has a prior deviation of `max_deviation_ratio` times that of the best shown at most, not one without end.
+
+        Args:
+            group, kinds: (c,) of the columns; -1 for those without a ridge.
         """
-        squares = np.diag(self.square)[own]
-        seen = np.zeros(kinds.max() + 1)
-        np.maximum.at(seen, kinds, np.sqrt(squares))
-        max_deviation_ratio = 10.0  # largest of a group's prior deviations of one unit (our choice)
-        size = np.maximum(np.sqrt(squares), seen[kinds] / max_deviation_ratio)
-        scale = np.where(size > 0.0, size, 1.0) / np.sqrt(max(self.rows, 1))
-        index, units = np.append(own, len(self.square) - 1), np.append(scale, 1.0)
-        left = self.left.take(index, 0).take(index, 1) / (units[:, None] * units)
-        exact_residual = 1e-7  # of ‖y‖, what rounding leaves at most of a perfect fit
-        total = float(left[-1, -1]) + exact_residual**2 * float(self.square[-1, -1])
-        return Gram(left[:-1, :-1], left[:-1, -1], total, self.rows - len(self.free)), scale, squares / scale**2
-
-    def freed(self, own: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Return the parameters of the columns without a ridge, given those (k,) of columns with one."""
-        rest = self.across[:, -1] - self.across[:, own] @ values
-        return np.asarray(scipy.linalg.solve_triangular(self.root, rest, lower=True, trans=1))
-
-
-def _ridged(
-    folds: Sequence[_Ridgeless], columns: np.ndarray, group: np.ndarray, kinds: np.ndarray
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return values and prior standard deviations (c,) of a model with these columns, from the rows of each fold.
-
-    Args:
-        group, kinds: (c,) of the columns; -1 for those without a ridge, which are the folds' `free`.
-    """
-    ridged = group >= 0
-    own, result = columns[ridged], [(np.zeros(len(columns)), np.full(len(columns), np.inf)) for _ in folds]
-    if len(own):
-        data, scales, information = zip(*(fold.beside(own, kinds[ridged]) for fold in folds))
-        found = relevances(data, group[ridged], np.ones(len(own)), 12, information=np.array(information))
-        for (values, deviations), one, scale in zip(result, found, scales):
-            values[ridged], deviations[ridged] = one.values / scale, one.ridge / scale
-    for (values, _), fold in zip(result, folds):
-        values[~ridged] = fold.freed(own, values[ridged])
-    return result
+        ridged, values, deviations = group >= 0, np.zeros(len(columns)), np.full(len(columns), np.inf)
+        own, kinds = columns[ridged], kinds[ridged]
+        if len(own):
+            squares, seen = np.diag(self.square)[own], np.zeros(kinds.max() + 1)
+            np.maximum.at(seen, kinds, np.sqrt(squares))
+            max_deviation_ratio = 10.0  # largest of a group's prior deviations of one unit (our choice)
+            size = np.maximum(np.sqrt(squares), seen[kinds] / max_deviation_ratio)
+            scale = np.where(size > 0.0, size, 1.0) / np.sqrt(max(self.rows, 1))
+            index, units = np.append(own, len(self.square) - 1), np.append(scale, 1.0)
+            left = self.left.take(index, 0).take(index, 1) / (units[:, None] * units)
+            exact_residual = 1e-7  # of ‖y‖, what rounding leaves at most of a perfect fit
+            total = float(left[-1, -1]) + exact_residual**2 * float(self.square[-1, -1])
+            data = Gram(left[:-1, :-1], left[:-1, -1], total, self.rows - len(self.free))
+            found = relevance(data, group[ridged], np.ones(len(own)), 12, information=squares / scale**2)
+            values[ridged], deviations[ridged] = found.values / scale, found.ridge / scale
+        rest = self.across[:, -1] - self.across[:, own] @ values[ridged]
+        values[~ridged] = scipy.linalg.solve_triangular(self.root, rest, lower=True, trans=1)
+        return values, deviations

@@ -69,7 +69,7 @@ def test_the_statistic_is_the_f_test_of_two_residual_sums():
     after = smaller.residual_squares(ols(smaller).estimate.values).sum()
     expected = (after - before) / 3 / (before / 390)
     # the covariance of wls is stated, so a unit residual is planted
-    f, p = nested_test(wls(data, np.full(2, base.estimate.residual_std)).estimate, gone)
+    f, p = nested_test(wls(data, np.full(2, base.estimate.residual_std)), gone)
     assert f == pytest.approx(expected, rel=1e-8)
     assert p == pytest.approx(scipy.stats.f.sf(expected, 3, 390), rel=1e-6)
 
