@@ -104,7 +104,6 @@ def identify_dynamics(
             recordings that have none (methods with a [loop])
     """
     from calib.api.dynamic import identify_dynamics as identified
-    from calib.procedure.excitation import prediction
     from calib.procedure.report.dynamics_section import read_lines
 
     check_destination("identify", robot, out, [options, *recordings, *(validate or [])])
@@ -121,8 +120,11 @@ def identify_dynamics(
         show("writing")
         found.save(out, plots=plots)
     compared = []
-    if excitation is not None and (excitation / prediction.NAME).is_file():
-        compared = [prediction.compared_with_identification(excitation, found)]
+    if excitation is not None:
+        from calib.procedure.excitation import prediction  # slow to load
+
+        if (excitation / prediction.NAME).is_file():
+            compared = [prediction.compared_with_identification(excitation, found)]
     say_written([*found.renderables(), *compared], out, found.verdict.level)
 
 

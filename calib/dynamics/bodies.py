@@ -11,12 +11,13 @@ without a coordinate is fixed to its parent (a payload).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache, lru_cache
 
 import numpy as np
 
 from calib.errors import RobotError
 from calib.records import frozen, shaped
-from calib.robot.chain import AXES, Chain, Element, check_gravity
+from calib.robot.chain import AXES, Chain, check_gravity
 from calib.transforms import pose
 
 FIXED, REVOLUTE, PRISMATIC = 0, 1, 2
@@ -93,7 +94,7 @@ def bodies_of(chain: Chain) -> Bodies:
     labels: list[str] = []
     for k, element in enumerate(chain.elements):
         pending = pending if element.placement is None else pending @ element.placement
-        pending = pending @ _elementary(element)
+        pending = pending @ _elementary(element.axis, element.sign * element.value)
         if element.joint is not None:
             placements.append(pending)
             pending = np.eye(4)
@@ -155,16 +156,17 @@ def standard_parameters(chain: Chain) -> np.ndarray:
     return result.ravel()
 
 
-def _elementary(element: Element) -> np.ndarray:
-    """Return the constant transform of an element (4, 4), exp(sign · axis · value)."""
-    axis, amount = AXES.index(element.axis) % 3, element.sign * element.value
-    if element.axis[0] == "t":
-        return pose(position=amount * np.eye(3)[axis])
-    turn = np.eye(3)
-    one, two = (axis + 1) % 3, (axis + 2) % 3
-    turn[one, one] = turn[two, two] = np.cos(amount)
-    turn[two, one], turn[one, two] = np.sin(amount), -np.sin(amount)
-    return pose(turn)
+@lru_cache(maxsize=1024)  # chains differ from their neighbours by one element
+def _elementary(axis: str, amount: float) -> np.ndarray:
+    """Return the constant transform of an element (4, 4), exp(axis · amount)."""
+    result, along = np.eye(4), AXES.index(axis) % 3
+    if axis[0] == "t":
+        result[along, 3] = amount
+    else:
+        one, two = (along + 1) % 3, (along + 2) % 3
+        result[one, one] = result[two, two] = np.cos(amount)
+        result[two, one], result[one, two] = np.sin(amount), -np.sin(amount)
+    return frozen(result)
 
 
 def _assemble(labels, parents, kinds, axes, scales, coordinates, placements, gravity, n) -> Bodies:
@@ -204,9 +206,10 @@ _PERMUTED = tuple(
 )
 
 
+@cache
 def upright_turn(axis: int) -> np.ndarray:
     """Return the rotation (4, 4) from a body's frame to the kernels', with the joint axis (0, 1, 2: x, y, z) as z."""
-    return pose(np.eye(3)[:, _TURNS[axis]])
+    return frozen(pose(np.eye(3)[:, _TURNS[axis]]))
 
 
 def _upright(parents, axes, placements) -> list[np.ndarray]:

@@ -46,7 +46,7 @@ from calib.estimation.triangles import retriangulate
 from calib.extensions import needed
 from calib.identification.identify import Identification, common_decimator
 from calib.identification.rows import Case, ObservationRows, observe, segments, thinned
-from calib.identification.settings import make_model
+from calib.identification.settings import make_bodies, make_model
 from calib.records import Frozen, frozen
 from calib.robot.calibrated import CalibratedChain, as_calibrated
 from calib.robot.chain import Chain
@@ -290,11 +290,11 @@ def _neighbours(found: Identification, chain: Chain) -> list[tuple[Bodies, Bodie
     """Return pairs of bodies with one geometric element or one tilt of gravity changed by `STEP` up and down."""
 
     def moved(step: np.ndarray) -> Bodies:
-        return make_model(chain.with_values(np.array(chain.values) + step), found.settings).bodies
+        return make_bodies(chain.with_values(np.array(chain.values) + step), found.settings)
 
     def tilted(turn: np.ndarray) -> Bodies:
         gravity = Rotation.from_rotvec(turn).apply(np.array(found.dynamics.model.bodies.gravity))
-        return make_model(chain, replace(found.settings, gravity=tuple(gravity.tolist()))).bodies
+        return make_bodies(chain, replace(found.settings, gravity=tuple(gravity.tolist())))
 
     elements, tilts = STEP * np.eye(len(chain.elements)), STEP * np.eye(3)[:2]
     return [*((moved(one), moved(-one)) for one in elements), *((tilted(one), tilted(-one)) for one in tilts)]
@@ -342,13 +342,15 @@ def _differences(
     felt = replace(torque_rows, projection=None).fold(felt, (BODIES,))[:, :, 0]
     change = np.empty((len(moved), model.bodies.n, len(q)))
     pulled = np.zeros((bodies, len(moved)))
-    block = 512  # samples at a time: the regressor of so many stays in the processor's cache
+    block = 256  # samples at a time: the regressor of so many stays in the processor's cache
     for start in range(0, len(q), block):
         part = slice(start, min(start + block, len(q)))
         weights = np.ascontiguousarray(felt[part].T).ravel()
+        out = np.zeros((bodies, model.bodies.n, min(block, len(q) - start)))  # what is zero is so in all of them
+        regressor = out.reshape(bodies, -1)
         for k, (above, below) in enumerate(moved):
             for sign, one in ((1.0, above), (-1.0, below)):
-                regressor = rigid_body.regressor(one, q[part], v[part], a[part]).transpose(2, 1, 0).reshape(bodies, -1)
+                rigid_body.fill_regressor(one, q[part], v[part], a[part], out)
                 torque = (parameters @ regressor).reshape(model.bodies.n, -1)
                 change[k, :, part] = torque if sign > 0 else (change[k, :, part] - torque) / (2.0 * STEP)
                 pulled[:, k] += sign / (2.0 * STEP) * (regressor @ weights)

@@ -36,6 +36,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 import scipy.optimize
+from scipy.linalg.lapack import dtrtri  # type: ignore[attr-defined]
 
 from calib.dynamics import pseudo_inertia
 from calib.dynamics.base import Base
@@ -305,34 +306,27 @@ def _sizes(model: RegressorModel, data: Triangles, columns: np.ndarray, shared: 
 
 def _posterior(factor: np.ndarray, columns: np.ndarray, deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return posterior values (b,) and their covariance (b, b)."""
-    _, solution, inverse, _ = _whitened(factor, columns, deviations)
-    root = columns * deviations @ inverse
-    return columns * deviations @ solution, root @ root.T
-
-
-def _whitened(
-    factor: np.ndarray, columns: np.ndarray, deviations: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Return R, the solution, the inverse root of the information, and log det, in units of the prior's deviations."""
-    b, p = columns.shape
-    own = factor[:b, :b] @ (columns * deviations)
+    (b, p), whitened = columns.shape, columns * deviations
     stacked = np.zeros((b + p, p + 1))
-    stacked[:b, :p], stacked[:b, p], stacked[b:, :p] = own, factor[:b, b], np.eye(p)
-    upper = np.asarray(np.linalg.qr(stacked, mode="r"))[:p]
-    inverse = np.asarray(scipy.linalg.solve_triangular(upper[:, :p], np.eye(p)))
-    return own, inverse @ upper[:, p], inverse, float(np.log(np.abs(np.diag(upper))).sum())
+    stacked[:b, :p], stacked[:b, p], stacked[b:, :p] = factor[:b, :b] @ whitened, factor[:b, b], np.eye(p)
+    upper = retriangulate(stacked, overwrite=True)
+    inverse = np.asarray(scipy.linalg.solve_triangular(upper[:p, :p], np.eye(p)))
+    root = whitened @ inverse
+    return root @ upper[:p, p], root @ root.T
 
 
 def _most_probable(factor: np.ndarray, columns: np.ndarray, sizes: _Sizes, start: np.ndarray) -> np.ndarray:
     """Return the logarithms of the sizes (k,) that maximise evidence times their prior."""
     b = len(columns)
+    unscaled, target = factor[:b, :b] @ columns, factor[:b, b]
 
     def lost(t: np.ndarray) -> tuple[float, np.ndarray]:
-        deviations = sizes.deviations(t)
-        own, solution, inverse, log_det = _whitened(factor, columns, deviations)
-        rest, away = factor[:b, b] - own @ solution, (t - sizes.centre) / sizes.width
-        value = 0.5 * float(rest @ rest + solution @ solution + away @ away) + log_det
-        slope = solution**2 + np.sum(inverse**2, axis=1) - 1.0  # slope of the evidence by each log deviation
+        own = unscaled * sizes.deviations(t)
+        inverse, _ = dtrtri(np.linalg.cholesky(own @ own.T + np.eye(b)), lower=1)  # of the root of y's covariance
+        seen, whitened = inverse @ own, inverse @ target
+        away = (t - sizes.centre) / sizes.width
+        value = 0.5 * float(whitened @ whitened + away @ away) - float(np.log(np.diag(inverse)).sum())
+        slope = (whitened @ seen) ** 2 - np.einsum("ij,ij->j", seen, seen)  # of the evidence by each log deviation
         return value, away / sizes.width - np.bincount(sizes.member, slope, len(t))
 
     found = scipy.optimize.minimize(

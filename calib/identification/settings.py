@@ -9,7 +9,7 @@ import numpy as np
 from calib.config import strict
 from calib.config_types import Checked, Expect, Flag, JointNumber, Names, OneOf, Positive, Real, Spread, Text, Whole
 from calib.dynamics import drives
-from calib.dynamics.bodies import bodies_of, with_payload
+from calib.dynamics.bodies import Bodies, bodies_of, with_payload
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.shapes import V0
@@ -127,11 +127,6 @@ class IdentificationSettings(Choices):
 def make_model(chain: Chain, settings: IdentificationSettings) -> IdentificationModel:
     """Return the model of a chain: bodies, payloads at the tip, and standard drive terms."""
     require(not (settings.passive or settings.identical_legs), "passive, identical_legs: arms have no legs", UsageError)
-    bodies = bodies_of(chain)
-    if settings.gravity is not None:
-        bodies = bodies.with_gravity(np.array(settings.gravity))
-    for label in settings.payloads:
-        bodies = with_payload(bodies, np.asarray(chain.tail), label, on=chain.n - 1)
     _check_joints(chain.n, settings)
     linear = [joint.kind == "prismatic" for joint in chain.joints]
     sets = per_joint(settings.sets or (settings.torque_rows.drives,), chain.n, "drives")
@@ -144,7 +139,17 @@ def make_model(chain: Chain, settings: IdentificationSettings) -> Identification
             raise UsageError(f'coupling: parameter {name} is a joint\'s own; add another label: label = "{other}"')
         own += made
     own += [replace(one, linear=linear[one.acts[0][0]]) if one.acts else one for one in settings.terms]
-    return IdentificationModel(bodies, tuple(own), settings.torque_rows)
+    return IdentificationModel(make_bodies(chain, settings), tuple(own), settings.torque_rows)
+
+
+def make_bodies(chain: Chain, settings: IdentificationSettings) -> Bodies:
+    """Return the bodies of a chain under the stated gravity, with payloads at the tip."""
+    bodies = bodies_of(chain)
+    if settings.gravity is not None:
+        bodies = bodies.with_gravity(np.array(settings.gravity))
+    for label in settings.payloads:
+        bodies = with_payload(bodies, np.asarray(chain.tail), label, on=chain.n - 1)
+    return bodies
 
 
 def _check_joints(n: int, settings: IdentificationSettings) -> None:

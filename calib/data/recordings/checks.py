@@ -96,11 +96,12 @@ def _drop_spikes(recording: Recording, joints: Joints | None) -> Recording:
     few = max(LIMITS.max_spikes, int(LIMITS.max_spike_share * count))
     beyond = np.abs(recording.effort) > LIMITS.max_effort * _effort_limits(recording, joints)
     size = np.abs(recording.effort - np.median(recording.effort, axis=0))
-    ordered = np.sort(size, axis=0)
-    usual = ordered[count - few - 1]
+    narrow, wide = count - few - 1, count - int(LIMITS.max_unit_share * count) - 1
+    ordered = np.partition(size, (narrow, wide), axis=0)
+    usual = ordered[narrow]
     wild = ((size > LIMITS.min_spike * usual) | ((size > LIMITS.min_spike_beyond * usual) & beyond)) & (usual > 0.0)
     if not 0 < wild.any(axis=1).sum() <= few:
-        usual = ordered[count - int(LIMITS.max_unit_share * count) - 1]
+        usual = ordered[wide]
         wild = (size > LIMITS.min_spike * usual) & beyond
     rows = wild.any(axis=1)
     if not rows.any():
@@ -203,18 +204,22 @@ def _jumps(recording: Recording, joints: Joints | None) -> list[str]:
     if len(recording) < 5:
         return []
     step = np.diff(recording.t)
-    slope = np.diff(recording.q, axis=0) / step[:, None]
-    low, high = np.minimum(slope[:-1], slope[1:]), np.maximum(slope[:-1], slope[1:])
-    around = (np.maximum(low[:-3], low[3:]) + np.minimum(high[:-3], high[3:])) / 2  # median of two before, two after
-    off = np.abs(slope[2:-2] - around) * step[2:-2, None]
-    usual = np.maximum(np.median(off, axis=0), 1e-9)
-    apart = (step[2:-2] < 3 * np.median(step))[:, None]  # not over a gap
+    apart = step[2:-2] < 3 * np.median(step)  # not over a gap
     kinds = joints.kinds if joints is not None else ("revolute",) * recording.n
     least = np.where(np.array(kinds) == "prismatic", LIMITS.max_jump / 10, LIMITS.max_jump)
     notes = []
-    for j in np.flatnonzero(((off > least) & (off > 20 * usual) & apart).any(axis=0)):
-        row = int(np.argmax(off[:, j] * apart[:, 0]))
-        size = f"{1e3 * off[row, j]:.3g} {'mm' if kinds[j] == 'prismatic' else 'mrad'}"
+    for j, q in enumerate(recording.q.T):
+        slope = np.diff(q) / step
+        low, high = np.minimum(slope[:-1], slope[1:]), np.maximum(slope[:-1], slope[1:])
+        around = (
+            np.maximum(low[:-3], low[3:]) + np.minimum(high[:-3], high[3:])
+        ) / 2  # median of two before, two after
+        off = np.abs(slope[2:-2] - around) * step[2:-2]
+        wild = (off > least[j]) & apart
+        if not wild.any() or not (off[wild] > 20 * max(float(np.median(off)), 1e-9)).any():
+            continue
+        row = int(np.argmax(off * apart))
+        size = f"{1e3 * off[row]:.3g} {'mm' if kinds[j] == 'prismatic' else 'mrad'}"
         notes.append(
             f"{recording.joint_names[j]} jumps by {size} between rows {recording.rows[row + 2]} and "
             f"{recording.rows[row + 3]}: an encoder error, or two joined logs? Cut the file there"

@@ -266,7 +266,7 @@ def _velocity_cutoff(cutoffs: Cutoffs, cutoff: np.ndarray, a: np.ndarray, rate: 
 
 def _smooth(sampled: Resampled, cutoff: np.ndarray, order: int) -> np.ndarray:
     """Return the positions (N, n) low-passed at each joint's cut-off (n,) [Hz], segment by segment."""
-    result = np.array(sampled.series["q"])
+    result = np.array(sampled.series["q"], order="F")  # by joints, as all that follows reads them
     for own, (j, f) in product(filtering.segments(sampled.segment), enumerate(cutoff)):
         result[own, j] = filtering.low_pass(result[own, j], sampled.rate, float(f), order)
     return result

@@ -31,6 +31,7 @@ from calib.identification.checks.recorded_motion import (
     bodies_under,
     drive_columns,
     share_of_nominal,
+    spanning,
     take_samples,
 )
 from calib.identification.checks.torque_lag import Lag, lag_of
@@ -138,15 +139,17 @@ def _shares(samples: MotionSamples) -> Callable[[np.ndarray], np.ndarray]:
         return (columns * scale[:, None]).transpose(1, 0, 2).reshape(n * m, -1)
 
     drives = samples.drives.reshape(m, n, n, 4)
-    free = basis(rows(np.concatenate([samples.inertial, drives[..., 3]], axis=2)))
+    free = rows(np.concatenate([samples.inertial, drives[..., 3]], axis=2))
     positive, each = rows(drives[..., :3].reshape(m, n, -1)), rows(samples.torque[:, :, None] * np.eye(n))
     positive /= np.maximum(np.abs(positive).max(axis=0), 1e-12)
-    positive, each = (x - free @ (free.T @ x) for x in (positive, each))
-    across, triangle = np.linalg.qr(positive)
+    part, among = np.column_stack([positive, each]), spanning(free.T @ free)
+    part -= free @ (among @ (among.T @ (free.T @ part)))
+    triangle, p = np.asarray(np.linalg.qr(part, mode="r")), positive.shape[1]
+    positive, each = part[:, :p], part[:, p:]
 
     def left(signs: np.ndarray) -> np.ndarray:
         torque = each @ signs
-        residual = torque - positive @ nnls(triangle, across.T @ torque)[0]
+        residual = torque - positive @ nnls(triangle[:p, :p], triangle[:p, p:] @ signs)[0]
         return np.maximum((residual.reshape(n, m) ** 2).mean(axis=1), 1e-9)
 
     return left

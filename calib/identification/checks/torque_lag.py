@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.identification.checks.recorded_motion import CREEP, MotionSamples, basis
+from calib.identification.checks.recorded_motion import CREEP, MotionSamples, spanning
 
 LAGS = 0.25  # largest lag that is tried [s], in steps of
 STEP = 0.005
@@ -65,8 +65,10 @@ def lag_of(samples: MotionSamples, rate: float) -> Lag | None:
     min_time = 2.0  # time with samples below which no lag is estimated: bodies make up for it [s]
     if m * float(np.median(np.diff(samples.index))) < min_time * rate:
         return None
-    whole = _lag_in(samples, rate)
-    halves = [_lag_in(_part(samples, half), rate) for half in (slice(0, m // 2), slice(m // 2, m))]
+    rows = _rows(samples, rate)
+    parts = [_Rows.of(rows[0][:, half], rows[1][:, :, half]) for half in (slice(0, m // 2), slice(m // 2, m))]
+    sums = (getattr(parts[0], name) + getattr(parts[1], name) for name in ("square", "cross", "power"))
+    whole, *halves = (_lag_in(each) for each in (_Rows(*rows, *sums), *parts))
     apart = abs(halves[0].seconds - halves[1].seconds) / 2.0
     return replace(whole, sigma=float(np.hypot(whole.sigma, apart)), joint=_alone(whole, halves))
 
@@ -87,27 +89,53 @@ def _alone(whole: Lag, halves: Sequence[Lag], max_lag_difference: float = 0.5) -
     )
 
 
-def _part(samples: MotionSamples, part: slice) -> MotionSamples:
-    return replace(samples, **{name: getattr(samples, name)[part] for name in ("index", "q", "v", "a")})
+SHIFTS = np.arange(-LAGS, LAGS + STEP / 2, STEP)
 
 
-def _lag_in(samples: MotionSamples, rate: float, rounds: int = 4, lag_sigma: float = 0.005) -> Lag:
-    """Return the least-squares lag of the samples, with its sigma from the spread between joints.
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Rows of a fit of n joints' torques at S lags, and their products by joint, which add up over parts of a motion.
+
+    Attributes:
+        columns, torque: (n, m, p) and (n, S, m).
+        square, cross, power: (n, p, p), (n, p, S) and (n, S): WᵀW, Wᵀτ and τᵀτ.
+    """
+
+    columns: np.ndarray
+    torque: np.ndarray
+    square: np.ndarray
+    cross: np.ndarray
+    power: np.ndarray
+
+    @classmethod
+    def of(cls, columns: np.ndarray, torque: np.ndarray) -> "_Rows":
+        """Return the rows of columns and torques with their products."""
+        across = columns.transpose(0, 2, 1)
+        cross = across @ torque.transpose(0, 2, 1)
+        return cls(columns, torque, across @ columns, cross, np.einsum("jsm,jsm->js", torque, torque))
+
+
+def _rows(samples: MotionSamples, rate: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the columns (n, m, p) of all joints, and their torques (n, S, m) at the lags `SHIFTS`."""
+    places, times = samples.index + SHIFTS[:, None] * rate, np.arange(len(samples.effort))
+    torque = np.stack([np.interp(places, times, own) for own in samples.effort.T])
+    columns = np.concatenate([samples.inertial, samples.drives, *_turning(samples, rate)], axis=2)
+    return np.ascontiguousarray(columns.transpose(1, 0, 2)), torque
+
+
+def _lag_in(rows: _Rows, rounds: int = 4, lag_sigma: float = 0.005) -> Lag:
+    """Return the least-squares lag of the rows, with its sigma from the spread between joints.
 
     `rounds`: of weighing joints by what is left of them.
 
     `lag_sigma`: sigma that a friction of another form brings [s]: real recordings as they are show lags of 4 ms rms.
     """
-    n = samples.q.shape[1]
-    shifts = np.arange(-LAGS, LAGS + STEP / 2, STEP)
-    recorded = np.full(n, len(shifts) // 2)
-    places, times = samples.index + shifts[:, None] * rate, np.arange(len(samples.effort))
-    torque = np.stack([np.interp(places, times, own) for own in samples.effort.T])
-    columns = np.concatenate([samples.inertial, samples.drives, *_turning(samples, rate)], axis=2).transpose(1, 0, 2)
-    fit = _Fit(columns, torque, 1.0 / np.maximum(torque[:, recorded[0]].std(axis=1), 1e-12))
+    n, torque = len(rows.torque), rows.torque
+    recorded = np.full(n, len(SHIFTS) // 2)
+    fit = _Fit(rows, 1.0 / np.maximum(torque[:, recorded[0]].std(axis=1), 1e-12))
     for _ in range(rounds):
         left = fit.left(np.full(n, fit.common.argmin()))
-        fit = _Fit(columns, torque, fit.weight / np.maximum(left.std(axis=1), 1e-12))
+        fit = _Fit(rows, fit.weight / np.maximum(left.std(axis=1), 1e-12))
     at = int(fit.common.argmin())
     common, alone = np.full(n, at), fit.own(np.full(n, at))
     spread = torque[:, recorded[0]].std(axis=1)
@@ -116,12 +144,12 @@ def _lag_in(samples: MotionSamples, rate: float, rounds: int = 4, lag_sigma: flo
         return float(np.sqrt(np.mean((fit.left(places).std(axis=1) / fit.weight / np.maximum(spread, 1e-12)) ** 2)))
 
     return Lag(
-        seconds=float(shifts[at] + STEP * _least(fit.common, at)),
+        seconds=float(SHIFTS[at] + STEP * _least(fit.common, at)),
         sigma=float(np.hypot(fit.sigma(at), lag_sigma)),
         before=share(recorded),
         after=share(common),
         factor=float(np.sqrt(fit.common[recorded[0]] / max(fit.common[at], 1e-300))),
-        own=shifts[alone],
+        own=SHIFTS[alone],
         gains=np.array([fit.gain(alone, j, at) for j in range(n)]),
         joint=None,
     )
@@ -130,20 +158,24 @@ def _lag_in(samples: MotionSamples, rate: float, rounds: int = 4, lag_sigma: flo
 class _Fit:
     """Least squares of the joints' torques at any lags: projections at every lag are computed once."""
 
-    def __init__(self, columns: np.ndarray, torque: np.ndarray, weight: np.ndarray) -> None:
-        """Project torques (n, shifts, m), weighted (n,), onto the columns (n, m, p) of all joints."""
-        n, m, p = columns.shape
-        self.weight, self.torque = weight, torque * weight[:, None, None]
-        self.basis = basis((columns * weight[:, None, None]).reshape(n * m, p)).reshape(n, m, -1)
-        self.parts = np.matmul(self.torque, self.basis)  # (n, shifts, k)
-        self.power = (self.torque**2).sum(axis=2)
+    def __init__(self, rows: _Rows, weight: np.ndarray) -> None:
+        """Project torques, weighted (n,), onto the columns of all joints."""
+        self.rows, self.weight = rows, weight
+        weights = weight**2
+        self.spanning = spanning(np.tensordot(weights, rows.square, 1))
+        self.parts = np.matmul(rows.cross.transpose(0, 2, 1), self.spanning) * weights[:, None, None]  # (n, shifts, k)
+        self.power = rows.power * weights[:, None]
         self.common = self.power.sum(axis=0) - (self.parts.sum(axis=0) ** 2).sum(axis=1)
         """(shifts,) squared residual where all joints have the same lag."""
 
     def left(self, places: np.ndarray) -> np.ndarray:
         """Return the residuals (n, m) of the weighted torques at the joints' lags (n,)."""
-        rows = np.arange(len(places))
-        return self.torque[rows, places] - self.basis @ self.parts[rows, places].sum(axis=0)
+        joints = np.arange(len(places))
+        return self._unexplained(self.rows.torque[joints, places], self.parts[joints, places].sum(axis=0))
+
+    def _unexplained(self, torque: np.ndarray, parts: np.ndarray) -> np.ndarray:
+        """Return torques (n, m) without their projections (k,), weighted."""
+        return self.weight[:, None] * (torque - self.rows.columns @ (self.spanning @ parts))
 
     def along(self, places: np.ndarray, joint: int) -> np.ndarray:
         """Return the squared residual of all joints (shifts,) over one joint's lag; the other lags (n,) stay fixed."""
@@ -171,9 +203,11 @@ class _Fit:
 
     def sigma(self, at: int) -> float:
         """Return the sigma of the common lag at index `at` [s], each joint counted as one independent sample."""
-        inner = int(np.clip(at, 1, self.torque.shape[1] - 2))
-        slope = (self.torque[:, inner + 1] - self.torque[:, inner - 1]) / (2.0 * STEP)
-        slope = slope - self.basis @ np.einsum("jm,jmk->k", slope, self.basis)
+        inner = int(np.clip(at, 1, len(SHIFTS) - 2))
+        torque, parts = (
+            (x[:, inner + 1] - x[:, inner - 1]) / (2.0 * STEP) for x in (self.rows.torque, self.parts)
+        )  # fmt: skip
+        slope = self._unexplained(torque, parts.sum(axis=0))
         votes, power = (self.left(np.full(len(slope), inner)) * slope).sum(axis=1), float((slope**2).sum())
         few = len(votes) / max(len(votes) - 1, 1)
         return float(np.sqrt(few * ((votes - votes.mean()) ** 2).sum()) / max(power, 1e-300))

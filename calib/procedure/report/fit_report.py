@@ -22,13 +22,13 @@ from calib.procedure.kinematic_stage.folder import metrics
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import FitMetrics, ImageCoverage, ValidationMetrics
 from calib.procedure.kinematic_stage.tables import estimate_table
+from calib.procedure.report.page import FileRow
 from calib.records import read_json
 from calib.transforms import invert
 
 SCHEMA = 2
 READ = (1, SCHEMA)  # 1 kept the findings here, too
 NATURES = ("position", "orientation", "distance")
-FileRow = tuple[str, str, str, str]  # name, what it is, bytes, SHA-256
 
 
 class FittedParameter(NamedTuple):

@@ -7,17 +7,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from calib.extensions import offered
-from calib.procedure.kinematic_stage.fit import Outcome
-from calib.procedure.kinematic_stage.folder import FitFolder
-from calib.procedure.report import fit_report
-from calib.procedure.report.page import Picture
 
 if TYPE_CHECKING:
     from calib.procedure.dynamic_stage.identify import IdentificationOutcome
+    from calib.procedure.kinematic_stage.fit import Outcome
+    from calib.procedure.report.page import Picture
 
 
 def write_fit(outcome: Outcome, folder: Path, plots: bool = True, pages: bool = True) -> None:
     """Write ``report.json``, figures (if `plots`) and, outside sessions, the certificate of a fit into its folder."""
+    from calib.procedure.kinematic_stage.folder import FitFolder
+    from calib.procedure.report import fit_report
+
     report = fit_report.collect(outcome)
     fit_report.write(report, FitFolder(folder).report)
     drawn: Mapping[str, Picture] = {}

@@ -14,6 +14,7 @@ from rich.text import Text as RichText
 
 from calib.procedure.findings import LEVELS, Warned
 
+FileRow = tuple[str, str, str, str]  # name, what it is, bytes, SHA-256
 COLOURS: dict[str, str] = dict(zip(LEVELS, ("green", "green", "yellow", "red")))
 
 

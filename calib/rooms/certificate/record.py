@@ -11,8 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 from calib.config import described
-from calib.procedure.report.fit_report import FileRow
-from calib.procedure.report.page import Block, KeyFigure, Section, Table, Text, shortened
+from calib.procedure.report.page import Block, FileRow, KeyFigure, Section, Table, Text, shortened
 from calib.procedure.report.templates import issued
 from calib.procedure.session.answers import CertificateSection
 

@@ -9,21 +9,17 @@ from typing import TYPE_CHECKING
 
 from calib.errors import UsageError, command_line, require
 from calib.folders import SESSION
-from calib.procedure.kinematic_stage.fit import Outcome
-from calib.procedure.kinematic_stage.folder import FitFolder
-from calib.procedure.kinematic_stage.metrics import FitMetrics
-from calib.procedure.kinematic_stage.validation import ARM
-from calib.procedure.report import fit_report
-from calib.procedure.report.fit_report import Report
 from calib.procedure.report.page import Picture
 from calib.procedure.report.templates import versions
 from calib.procedure.session.answers import CertificateSection
-from calib.rooms.certificate import geometry, rendering
+from calib.rooms.certificate import rendering
 from calib.rooms.certificate.record import NO_DETAILS, Certificate, Entry, Page, records, report
 
 if TYPE_CHECKING:
     from calib.api.rendering import Judged
+    from calib.procedure.kinematic_stage.metrics import FitMetrics
     from calib.procedure.report.dynamics_section import DynamicReport
+    from calib.procedure.report.fit_report import Report
 
 
 def write_fit(found: Report, drawn: Mapping[str, Picture], folder: Path) -> None:
@@ -42,6 +38,8 @@ def read(folder: Path, plots: bool, details: CertificateSection) -> tuple[Certif
         UsageError: where there is none, or it is a session's, which has a certificate of its own.
     """
     from calib.procedure.dynamic_stage.folder import IdentificationFolder
+    from calib.procedure.kinematic_stage.folder import FitFolder
+    from calib.procedure.report import fit_report
 
     redo = command_line("redo", folder.parent, "certificate")
     words = f"{folder} belongs to a session, which has the certificate: {redo}"
@@ -62,6 +60,8 @@ def of_fit(
     found: Report, drawn: Mapping[str, Picture], details: CertificateSection = NO_DETAILS
 ) -> tuple[Certificate, Page]:
     """Return certificate and report of a fit."""
+    from calib.rooms.certificate import geometry  # slow to load, as all that belongs to a fit
+
     metrics, title = found.metrics, f"Calibration of {found.robot}"
     measured = ", ".join(name for name, role, *_ in found.files if role != "nominal robot")
     setup = [
@@ -76,6 +76,8 @@ def of_fit(
 
 def tolerance(millimetres: float | None, found: FitMetrics) -> str:
     """Return a text on the condition for verdict pass, and on the deliverable to which it applies."""
+    from calib.procedure.kinematic_stage.validation import ARM
+
     of = f"; judged: {ARM[found.deliverable]}" if len(found.deliverables) > 1 else ""
     if not millimetres:
         return f"none given: pass means better than the nominal robot on unseen poses, or no improvement possible{of}"
@@ -123,6 +125,9 @@ def of_model(
 
 def notebook(result: Judged) -> str:
     """Return a result as a page for a notebook: the first page of a fit's certificate, else its section of a report."""
+    from calib.procedure.kinematic_stage.fit import Outcome
+    from calib.procedure.report import fit_report
+
     if isinstance(result, Outcome):
         return rendering.html(replace(of_fit(fit_report.collect(result), {})[0], sections=()))
     return rendering.html(report(repr(result).strip("<>"), "", (), [result.section()]))

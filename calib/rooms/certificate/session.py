@@ -14,8 +14,8 @@ from calib.procedure.export.delivery import prediction
 from calib.procedure.kinematic_stage.folder import SCHEMA, URDF
 from calib.procedure.kinematic_stage.metrics import FitMetrics
 from calib.procedure.report import fit_report
-from calib.procedure.report.fit_report import FileRow, RowErrors, file_row, unseen_role
-from calib.procedure.report.page import Text
+from calib.procedure.report.fit_report import RowErrors, file_row, unseen_role
+from calib.procedure.report.page import FileRow, Text
 from calib.procedure.report.templates import versions
 from calib.procedure.session.folder import (
     CHECKED,
