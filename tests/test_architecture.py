@@ -20,7 +20,6 @@ HOMES = {
     "pinocchio": ["calib.robot.collision", "calib.robot.formats.simulators", "calib.rooms.parallel.export"],
     "coal": ["calib.robot.collision"],
     "numba": [
-        "calib.data.signals.filter_kernels",
         "calib.dynamics.gradient_kernels",
         "calib.dynamics.kernels",
         "calib.dynamics.shape_kernels",

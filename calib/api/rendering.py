@@ -91,7 +91,9 @@ class Drawn(Shown, ABC):
         from calib.procedure.report import charts
 
         found = self.charts()
-        return charts.figures(found) if name is None else charts.figure(found[one_of(name, found, "plot", UsageError)])
+        if name is None:
+            return {each: charts.figure(chart) for each, chart in found.items()}
+        return charts.figure(found[one_of(name, found, "plot", UsageError)])
 
 
 class Judged(Shown, ABC):

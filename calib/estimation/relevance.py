@@ -11,7 +11,6 @@ from scipy.linalg.lapack import dpotrf, dtrtri  # type: ignore[attr-defined]
 
 from calib.errors import Unidentifiable
 
-RAISED = (1e-12, 1e-10, 1e-8, 1e-6, 1e-4, 1e-2, 1.0)  # share of a diagonal that keeps it regular, one after another
 SETTLED = 0.02  # share of the parameters' sigmas that a search among many may leave open (our choice)
 
 
@@ -129,7 +128,6 @@ def relevance(
     iterations: int = 15,
     settled: float = 0.0,
     counts: np.ndarray | None = None,
-    information: np.ndarray | None = None,
 ) -> Relevance:
     """Estimate x with prior x_g ~ N(0, 1/λ_g) per group, every λ and the noise at their most probable values.
 
@@ -146,7 +144,6 @@ def relevance(
         settled: the search ends when values change by less than this share of their standard deviations, rms
             (`SETTLED`); 0: never early.
         counts: (p,) how many columns each stands for (`Condensed`); None for one.
-        information: (p,) in the data on each column alone; None: the diagonal of WᵀW.
     """
     counts = np.ones(len(groups)) if counts is None else counts
     ridged = groups >= 0
@@ -154,8 +151,7 @@ def relevance(
     family = np.where(ridged, groups, count)  # columns without a ridge form the last family, with precision 0
     members = np.maximum(np.bincount(family, counts, count + 1), 1.0)
     lam = np.bincount(family, counts * np.where(ridged, start, np.inf) ** -2.0, count + 1) / members
-    alone = np.diag(data.square) if information is None else information
-    information = np.bincount(family, alone, count + 1) / members
+    information = np.bincount(family, np.diag(data.square), count + 1) / members
     beta, alive = 1.0, np.ones(count + 1, dtype=bool)
     index, solution, effective = np.arange(len(groups)), np.zeros(len(groups)), 0.0
     square, last = data.square, np.full(len(groups), np.inf)
@@ -164,8 +160,6 @@ def relevance(
     max_prior_weight = 2.0
     for _ in range(iterations):
         inside = np.flatnonzero(alive[family[index]])
-        if not len(inside):
-            break
         if len(inside) < len(index):
             index, square = index[inside], square.take(inside, 0).take(inside, 1)
         own = family[index]
@@ -198,7 +192,7 @@ def _posterior(
     A diagonal raised by 1e-12, or by as much more as it takes, keeps it regular to rounding: rows that repeat each
     other leave columns that no two poses distinguish.
     """
-    for raised in RAISED:
+    for raised in 10.0 ** np.arange(-12.0, 1.0, 2.0):
         system = square.copy()
         diagonal = system.flat[:: len(penalty) + 1]
         system.flat[:: len(penalty) + 1] = np.maximum((diagonal + penalty / beta) * (1.0 + raised), 1e-280)

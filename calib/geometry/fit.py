@@ -221,11 +221,9 @@ def _identifiable_columns(found: GeometricFit, plausible: np.ndarray) -> np.ndar
     Backward elimination: the worst identified parameter goes back to its nominal, which changes the covariance C of the
     others to C - c cᵀ / c_k (c its column), until all that remain are identified.
     """
-    left = found.estimate.covariance.copy()
-    if found.prior is not None:
-        factor = found.data().factor
-        norms = np.linalg.norm(factor, axis=0)
-        left = covariance(factor / norms, found.estimate.residual_std**2) / np.outer(norms, norms)
+    factor = found.data().factor
+    norms = np.linalg.norm(factor, axis=0)
+    left = covariance(factor / norms, found.estimate.residual_std**2) / np.outer(norms, norms)
     kept = np.ones(len(plausible), dtype=bool)
     while True:
         ratio = np.where(kept, np.sqrt(np.clip(np.diag(left), 0.0, None)) / plausible, 0.0)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.measurements import PoseMeasurements, Positions
 from calib.estimation.relevance import Gram
 from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, layout_counts, observe, pieces, predict, rows_of, target_jacobian
@@ -21,10 +21,15 @@ from calib.robot.calibrated import target_elements
 MANY = 30  # corrections of one element from which on it pays to multiply elements first (our choice)
 
 
+def separable(measured: PoseMeasurements) -> bool:
+    """Return whether rows are positions or poses without errors that all of them share."""
+    return isinstance(measured, Positions) and measured.late is None
+
+
 def squares(
     cell: Installation, block: Block, free: np.ndarray, scales: Iterable[np.ndarray]
 ) -> Iterator[tuple[Part, Gram]]:
-    """Yield the residual parts of a block of positions or poses, piece by piece, with their rows' statistics.
+    """Yield the residual parts of a `separable` block, piece by piece, with their rows' statistics.
 
     Args:
         cell, block, free: as of `calib.geometry.observation.observe`.

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from calib.data.poses.measurements import Positions
 from calib.errors import UsageError, one_of, refuse_data
 from calib.estimation import robust
 from calib.estimation.base_columns import ColumnSplit
@@ -19,7 +18,7 @@ from calib.estimation.relevance import Gram
 from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, layout, observe, parameter_values, whitened
 from calib.geometry.residuals import Part
-from calib.geometry.squares import squares
+from calib.geometry.squares import separable, squares
 from calib.records import frozen
 from calib.robot.calibrated import CalibratedChain, CorrectedChain
 from calib.robot.chain import Chain
@@ -254,9 +253,9 @@ class Weigher:
 
     @property
     def _many(self) -> bool:
-        """Whether W is large and all its rows are positions or poses, whose statistics come cheaper than rows."""
+        """Whether W is large and its rows are of a kind whose statistics come cheaper than rows."""
         count = sum(piece.sigma.size for piece in self.pieces) * len(self.free)
-        return count > MOST_NUMBERS and all(isinstance(block.measured, Positions) for block in self.blocks)
+        return count > MOST_NUMBERS and all(separable(block.measured) for block in self.blocks)
 
     def result(self, solution: Solution) -> GeometricFit:
         state = solution.state

@@ -20,8 +20,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.linalg
-from scipy.linalg.lapack import dtrcon  # type: ignore[attr-defined]
 
 from calib.errors import NotConverged, Unidentifiable
 from calib.estimation.triangles import Triangles, retriangulate
@@ -143,19 +141,18 @@ def identify_gains(
         torque = body @ x + load
         residual = torque / gain[:, None] - current
         std = np.sqrt(np.sum(residual**2, axis=1) / currents.rows)
-        by_gain = np.zeros((n, factors.shape[1], len(moving)))
-        by_gain[moving, :, np.arange(len(moving))] = -torque[moving] / gain[moving, None]  # by log K_j
+        by_gain = np.zeros((n, factors.shape[1], n))
+        by_gain[moving, :, moving] = -torque[moving] / gain[moving, None]  # by log K_j
         rows = np.concatenate([body / gain[:, None, None], by_gain, residual[:, :, None]], axis=2)
         rows = rows / (std * np.sqrt(tau))[:, None, None]
         stacked = retriangulate(rows.reshape(-1, rows.shape[2]))
-        step, by_log = -_solution(stacked), np.zeros(n)
-        by_log[moving] = step[len(free) :]
-        size = min(1.0, 0.7 / max(float(np.abs(by_log).max()), 1e-12))
-        x, gain = x + size * step[: len(free)], gain * np.exp(size * by_log)
-        if np.abs(by_log).max() < 1e-7:
-            inverse = np.linalg.pinv(stacked[:-1, :-1], rcond=1e-12)[len(free) :]
-            covariance = np.zeros((n, n))
-            covariance[np.ix_(moving, moving)] = inverse @ inverse.T * np.outer(gain[moving], gain[moving])
+        upper = stacked[:-1, :-1]
+        step = -np.linalg.lstsq(upper, stacked[:-1, -1], rcond=1e-12)[0]
+        size = min(1.0, 0.7 / max(float(np.abs(step[len(free) :]).max()), 1e-12))
+        x, gain = x + size * step[: len(free)], gain * np.exp(size * step[len(free) :])
+        if np.abs(step[len(free) :]).max() < 1e-7:
+            inverse = np.linalg.pinv(upper, rcond=1e-12)
+            covariance = (inverse @ inverse.T)[len(free) :, len(free) :] * np.outer(gain, gain)
             values = np.zeros(len(names))
             values[free], values[fixed] = x / norms, given
             scale = ", ".join(f"{name} = {value:g}" for name, value in known.items())
@@ -244,13 +241,5 @@ def _start(body: np.ndarray, load: np.ndarray, current: np.ndarray) -> np.ndarra
 
 
 def _parameters(body: np.ndarray, load: np.ndarray, current: np.ndarray, gain: np.ndarray) -> np.ndarray:
-    rows = np.concatenate([body / gain[:, None, None], (current - load / gain[:, None])[:, :, None]], axis=2)
-    return _solution(retriangulate(rows.reshape(-1, rows.shape[2])))
-
-
-def _solution(triangle: np.ndarray) -> np.ndarray:
-    """Return the x (p,) of least norm with R x = z from an R factor [R z; 0 ρ]."""
-    upper, target = triangle[:-1, :-1], triangle[:-1, -1]
-    if dtrcon(upper)[0] > 1e-8:  # regular
-        return np.asarray(scipy.linalg.solve_triangular(upper, target, check_finite=False))
-    return np.linalg.lstsq(upper, target, rcond=1e-12)[0]
+    matrix, target = body / gain[:, None, None], current - load / gain[:, None]
+    return np.linalg.lstsq(matrix.reshape(-1, body.shape[2]), target.ravel(), rcond=1e-12)[0]

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-import scipy.linalg
 
 from calib.data.signals.filtering import Decimator, kept
 from calib.estimation.relevance import Gram, relevance
@@ -93,7 +92,6 @@ class CrossValidation:
     prior: np.ndarray | None = None
     regimes: Regimes | None = None
     _known: dict[bytes, np.ndarray] = field(default_factory=dict, init=False)
-    _kept: dict[int, list["_Ridgeless"]] = field(default_factory=dict, init=False)
 
     def errors(self, columns: np.ndarray, folds: int | None = None) -> np.ndarray:
         """Return the squared errors (blocks, rows) on each held-out block of a model with these columns.
@@ -108,7 +106,7 @@ class CrossValidation:
         runs = np.array_split(np.arange(self.blocks), folds or self.blocks)
         key = len(runs).to_bytes(4, "little") + columns.tobytes()
         if key not in self._known:
-            fitted = self._fitted if (self.group[columns] < 0).all() else self._ridged
+            fitted = self._fitted if (self.group[columns] < 0).all() else self._regularised
             values = fitted(columns, runs)
             each = [own for run, own in zip(runs, values) for _ in run]
             self._known[key] = self._errors(columns, each)
@@ -117,45 +115,18 @@ class CrossValidation:
     def extrapolated(self, columns: np.ndarray) -> np.ndarray:
         """Return the squared errors (ranges, rows) in each held-out range of motion of a model with these columns."""
         assert self.regimes is not None
-        index = np.append(columns, self.data.parameters)
+        index, weight = np.append(columns, self.data.parameters), 1.0 / (self.std**2 * self.inflation)
+        known = 0.0 if self.prior is None else self.prior[:, index].T @ self.prior[:, index]
+        rounding = 1e-9 * (weight @ self.regimes.whole.diagonal(axis1=1, axis2=2))[index]
         result = np.zeros((len(self.regimes.squares), self.rows))
-        for k, (held, own) in enumerate(zip(self.regimes.squares, self._ridged(columns))):
-            values = np.append(own, -1.0)
+        for k, (held, counts) in enumerate(zip(self.regimes.squares, self.regimes.counts)):
+            rest = np.tensordot(weight, self.regimes.whole - held, 1).take(index, 0).take(index, 1)
+            rest.flat[:: len(index) + 1] += rounding  # differences are positive definite but for that
+            rest += known
+            rows = int(np.sum((self.regimes.total - counts) / self.inflation))
+            values = np.append(_regularised(rest, rows, self.group[columns], self._kinds[columns])[0], -1.0)
             result[k] = np.einsum("i,rij,j->r", values, held.take(index, 1).take(index, 2), values)
         return np.maximum(result, 0.0)
-
-    def _ridged(self, columns: np.ndarray, runs: Sequence[np.ndarray] | None = None) -> list[np.ndarray]:
-        """Return the ridge estimates from all rows outside each run of blocks, or each range of motion (None).
-
-        Args:
-            columns: all that have no ridge, and some with one.
-        """
-        key = 0 if runs is None else len(runs)
-        if key not in self._kept:
-            assert self.regimes is not None
-            wholes = map(self._outside, range(len(self.regimes.squares))) if runs is None else map(self._others, runs)
-            self._kept[key] = [_Ridgeless.of(*whole, np.flatnonzero(self.group < 0)) for whole in wholes]
-        return [fold.ridged(columns, self.group[columns], self._kinds[columns])[0] for fold in self._kept[key]]
-
-    def _outside(self, k: int) -> tuple[np.ndarray, int]:
-        """Return the whitened products [W y]ᵀ[W y] and number of rows outside a held-out range of motion."""
-        assert self.regimes is not None
-        weight = 1.0 / (self.std**2 * self.inflation)
-        rest = np.tensordot(weight, self.regimes.whole - self.regimes.squares[k], 1)
-        rounding = 1e-9 * (weight @ self.regimes.whole.diagonal(axis1=1, axis2=2))
-        rest.flat[:: len(rest) + 1] += rounding  # differences are positive definite but for that
-        rows = np.sum((self.regimes.total - self.regimes.counts[k]) / self.inflation)
-        return rest + self._beforehand, int(rows)
-
-    def _others(self, run: np.ndarray) -> tuple[np.ndarray, int]:
-        """Return the whitened products [W y]ᵀ[W y] and number of rows of all blocks but a run of them."""
-        others = ~np.isin(np.arange(self.blocks), run)
-        rows = np.sum(self.counts()[others].sum(axis=0) / self.inflation)
-        return self._squares[others].sum(axis=0) + self._beforehand, int(rows)
-
-    @cached_property
-    def _beforehand(self) -> np.ndarray | float:
-        return 0.0 if self.prior is None else self.prior.T @ self.prior
 
     def _errors(self, columns: np.ndarray, values: list[np.ndarray]) -> np.ndarray:
         """Return the squared errors of parameter values (k,) per block."""
@@ -174,6 +145,20 @@ class CrossValidation:
         folds = [[other for other in range(self.blocks) if other not in run] for run in runs]
         pooled = (pool(chosen, self.rows, others) for others in folds)
         return [estimate(data, self.std, self.inflation, group, prior)[0] for data in pooled]
+
+    def _regularised(self, columns: np.ndarray, runs: list[np.ndarray]) -> list[np.ndarray]:
+        """Return for each run of blocks the ridge estimate from all other blocks."""
+        index, blocks = np.append(columns, self.data.parameters), np.arange(self.blocks)
+        squares = self._squares.take(index, 1).take(index, 2)
+        known = 0.0 if self.prior is None else self.prior[:, index].T @ self.prior[:, index]
+        samples = self.counts()
+        found = []
+        for run in runs:
+            others = ~np.isin(blocks, run)
+            whole = squares[others].sum(axis=0) + known
+            rows = int(np.sum(samples[others].sum(axis=0) / self.inflation))
+            found.append(_regularised(whole, rows, self.group[columns], self._kinds[columns])[0])
+        return found
 
     @cached_property
     def _kinds(self) -> np.ndarray:
@@ -209,8 +194,7 @@ def estimate(
         scale = np.where(size > 0.0, size, 1.0)
         found = np.linalg.lstsq(stacked[:, :-1] / scale, stacked[:, -1], rcond=1e-10)[0]
         return found / scale, np.full(len(group), np.inf)
-    whole = _Ridgeless.of(stacked.T @ stacked, int(np.sum(data.rows / inflation)), np.flatnonzero(group < 0))
-    return whole.ridged(np.arange(len(group)), group, _kinds(group, data.units))
+    return _regularised(stacked.T @ stacked, int(np.sum(data.rows / inflation)), group, _kinds(group, data.units))
 
 
 def _kinds(group: np.ndarray, units: Sequence[str]) -> np.ndarray:
@@ -219,57 +203,22 @@ def _kinds(group: np.ndarray, units: Sequence[str]) -> np.ndarray:
     return np.where(group < 0, -1, group * len(found) + unit)
 
 
-@dataclass(frozen=True, eq=False)
-class _Ridgeless:
-    """Products [W y]ᵀ[W y] with the columns eliminated that have no ridge: what those leave, and how to get them back.
+def _regularised(square: np.ndarray, rows: int, group: np.ndarray, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return values and prior standard deviations (p,) from [W y]ᵀ[W y] (p + 1, p + 1) and its number of rows.
 
-    Attributes:
-        square, rows: (p + 1, p + 1) of all columns, and the number of rows.
-        free: (k,) indices of the columns without a ridge.
-        root: (k, k) of their products, lower.
-        across, left: (k, p + 1) and (p + 1, p + 1): R⁻ᵀ WᵀW of them with all columns, and what they leave of the
-            products.
+    A group's ridge is in units of what each column explains, so that one is enough for different units; but parameters
+    of one kind are about equally large. What the motion hardly shows (Stribeck's torque of a joint that never slows
+    down) has a prior deviation of `max_deviation_ratio` times that of the best shown at most, not one without end.
     """
-
-    square: np.ndarray
-    rows: int
-    free: np.ndarray
-    root: np.ndarray
-    across: np.ndarray
-    left: np.ndarray
-
-    @classmethod
-    def of(cls, square: np.ndarray, rows: int, free: np.ndarray) -> "_Ridgeless":
-        size = np.diag(square)[free]
-        root = np.linalg.cholesky(square[np.ix_(free, free)] + 1e-9 * np.diag(np.where(size > 0.0, size, 1.0)))
-        across = scipy.linalg.solve_triangular(root, square[free], lower=True)
-        return cls(square, rows, free, root, across, square - across.T @ across)
-
-    def ridged(self, columns: np.ndarray, group: np.ndarray, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return values and prior standard deviations (c,) of a model with these columns: `free`, and some with ridges.
-
-        A ridge is in units of what each column explains, so that one is enough for different units; but parameters of
-        one kind are about equally large. What the motion hardly shows (Stribeck's torque of a joint that never slows
-        down) has a prior deviation of `max_deviation_ratio` times that of the best shown at most, not one without end.
-
-        Args:
-            group, kinds: (c,) of the columns; -1 for those without a ridge.
-        """
-        ridged, values, deviations = group >= 0, np.zeros(len(columns)), np.full(len(columns), np.inf)
-        own, kinds = columns[ridged], kinds[ridged]
-        if len(own):
-            squares, seen = np.diag(self.square)[own], np.zeros(kinds.max() + 1)
-            np.maximum.at(seen, kinds, np.sqrt(squares))
-            max_deviation_ratio = 10.0  # largest of a group's prior deviations of one unit (our choice)
-            size = np.maximum(np.sqrt(squares), seen[kinds] / max_deviation_ratio)
-            scale = np.where(size > 0.0, size, 1.0) / np.sqrt(max(self.rows, 1))
-            index, units = np.append(own, len(self.square) - 1), np.append(scale, 1.0)
-            left = self.left.take(index, 0).take(index, 1) / (units[:, None] * units)
-            exact_residual = 1e-7  # of ‖y‖, what rounding leaves at most of a perfect fit
-            total = float(left[-1, -1]) + exact_residual**2 * float(self.square[-1, -1])
-            data = Gram(left[:-1, :-1], left[:-1, -1], total, self.rows - len(self.free))
-            found = relevance(data, group[ridged], np.ones(len(own)), 12, information=squares / scale**2)
-            values[ridged], deviations[ridged] = found.values / scale, found.ridge / scale
-        rest = self.across[:, -1] - self.across[:, own] @ values[ridged]
-        values[~ridged] = scipy.linalg.solve_triangular(self.root, rest, lower=True, trans=1)
-        return values, deviations
+    size = np.sqrt(np.diag(square)[:-1])
+    seen = np.zeros(kinds.max(initial=-1) + 2)  # the last for -1
+    np.maximum.at(seen, kinds, size)
+    max_deviation_ratio = 10.0  # largest ratio of the prior deviations of a group's parameters of one unit (our choice)
+    size = np.where(group < 0, size, np.maximum(size, seen[kinds] / max_deviation_ratio))
+    scale = np.where(size > 0.0, size, 1.0) / np.sqrt(max(rows, 1))
+    scaled = square[:-1, :-1] / (scale[:, None] * scale)
+    scaled[np.diag_indices(len(group))] += np.where(group < 0, 1e-9 * rows, 0.0)  # free, without data: stays at zero
+    data = Gram(scaled, square[:-1, -1] / scale, float(square[-1, -1]), rows)
+    iterations = 12
+    found = relevance(data, group, np.ones(len(group)), iterations)
+    return found.values / scale, np.where(np.isfinite(found.ridge), found.ridge / scale, np.inf)

@@ -199,9 +199,7 @@ class Layout:
     def used(self) -> frozenset[str]:
         """The file's names of all columns that are read."""
         families = (*self.positions, *self.sigmas, self.orientation, self.sigma_rotation, self.distance, self.group)
-        return frozenset(
-            name for names in (*families, self.joints, self.base, self.late, (self.tool,)) for name in names
-        )
+        return frozenset().union(*families, self.joints, self.base, self.late, (self.tool,))
 
 
 def find_layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
@@ -238,9 +236,7 @@ def _layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
     if not positions:
         sheet.table.index("x")
     tool, base = sheet.find("tool"), sheet.family(BASE.names)
-    late = sheet.family(LATE.names)
-    if late:
-        late = (*late, *TIME.names)
+    late = (*moving, *TIME.names) if (moving := sheet.family(LATE.names)) else ()
     found = Layout(kind, columns, positions, sigmas, tool=tool, base=base, late=late, notes=notes)
     if kind == "position":
         return found

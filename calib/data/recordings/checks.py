@@ -211,9 +211,8 @@ def _jumps(recording: Recording, joints: Joints | None) -> list[str]:
     for j, q in enumerate(recording.q.T):
         slope = np.diff(q) / step
         low, high = np.minimum(slope[:-1], slope[1:]), np.maximum(slope[:-1], slope[1:])
-        around = (
-            np.maximum(low[:-3], low[3:]) + np.minimum(high[:-3], high[3:])
-        ) / 2  # median of two before, two after
+        # median of two before, two after
+        around = (np.maximum(low[:-3], low[3:]) + np.minimum(high[:-3], high[3:])) / 2
         off = np.abs(slope[2:-2] - around) * step[2:-2]
         wild = (off > least[j]) & apart
         if not wild.any() or not (off[wild] > 20 * max(float(np.median(off)), 1e-9)).any():

@@ -9,8 +9,9 @@ frequency below which 95 % of a joint's acceleration power lies, the floor of no
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
-from calib.data.signals.filtering import factor_for, moving_average, segments
+from calib.data.signals.filtering import factor_for, segments
 from calib.data.signals.resampling import Resampled
 from calib.errors import refuse_data
 from calib.records import frozen
@@ -53,12 +54,14 @@ def propose_cutoffs(sampled: Resampled, dynamics: float | None = None) -> Cutoff
     Args:
         dynamics: f_dyn if known [Hz] (the bandwidth of the position loop); else estimated from the data.
     """
+    from scipy.signal import welch  # slow to load
+
     window_length = 4.0  # length of the spectra's windows [s]
     parts = segments(sampled.segment)
     size = min(max(own.stop - own.start for own in parts), max(64, int(window_length * sampled.rate)))
     long = [sampled.series["q"][own] for own in parts if own.stop - own.start >= size]
-    f = np.fft.rfftfreq(size, 1.0 / sampled.rate)
-    power = np.average([_spectrum(q, sampled.rate, size) for q in long], axis=0, weights=[len(q) for q in long])
+    spectra = [welch(q, sampled.rate, "hann", size, size - size // 2, detrend="linear", axis=0) for q in long]
+    f, power = spectra[0][0], np.average([one for _, one in spectra], axis=0, weights=[len(q) for q in long])
     floor = np.median(power[int(0.6 * len(f)) : int(0.9 * len(f))], axis=0)
     active = _active(np.concatenate([np.diff(q, axis=0) for q in long]))
     read = [_joint_dynamics(f, power[:, j], floor[j]) if active[j] else (0.0, np.nan) for j in range(len(active))]
@@ -74,21 +77,6 @@ def propose_cutoffs(sampled: Resampled, dynamics: float | None = None) -> Cutoff
     band = USABLE * sampled.rate / (2 * factor)
     reasons += [why, f"f_p = {band:.3g} Hz (2 f_dyn, rounded to a whole decimation factor n_d = {factor})"]
     return Cutoffs(dynamics, position, band, factor, frozen(np.sqrt(floor * sampled.rate / 2)), tuple(reasons))
-
-
-def _spectrum(q: np.ndarray, rate: float, size: int) -> np.ndarray:
-    """Return the power densities (size // 2 + 1, n) of series (N, n) [per Hz], by Welch's method.
-
-    `size`: of the windows (Hann's), of which each begins in the middle of the one before and has its trend taken off.
-    """
-    place, window = np.arange(size) - 0.5 * (size - 1), 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(size) / size)
-    starts, total = range(0, len(q) - size + 1, size // 2), np.zeros((size // 2 + 1, q.shape[1]))
-    for start in starts:
-        part = q[start : start + size]
-        part = part - part.mean(axis=0) - np.outer(place, place @ part / (place @ place))
-        total += np.abs(np.fft.rfft(window[:, None] * part, axis=0)) ** 2
-    total[1 : (size + 1) // 2] *= 2.0  # of negative frequencies as well
-    return total / (len(starts) * rate * (window @ window))
 
 
 def check_cutoff(cutoff: float, rate: float, file: str = "") -> None:
@@ -159,7 +147,7 @@ def _joint_dynamics(f: np.ndarray, power: np.ndarray, floor: float, min_rise: fl
 
     `min_rise`: a power that rises this far again above the motion is a resonance, not a gap between two lines.
     """
-    smooth = moving_average(power, 5)
+    smooth = uniform_filter1d(power, 5, mode="nearest")
     min_above_floor = 10.0  # a power that stands this far above the floor is seen
     peak = int(np.argmax(f**2 * np.maximum(smooth - min_above_floor * floor, 0)))
     sunk = smooth[peak:] < min_above_floor * floor

@@ -201,37 +201,10 @@ def low_pass(values: np.ndarray, rate: float, cutoff: float, order: int = ORDER)
     if not 0 < cutoff < rate / 2:
         message = f"a cut-off of {cutoff:g} Hz is not between 0 and the Nyquist frequency {rate / 2:g} Hz: lower it"
         raise MeasurementError(message + " below 0.8 of that, or sample faster")
-    from calib.data.signals import filter_kernels
+    from scipy.signal import butter, sosfiltfilt  # slow to load
 
     pad = min(len(values) - 1, int(3 * rate / cutoff) + 1)
-    before, after = 2 * values[:1] - values[pad:0:-1], 2 * values[-1:] - values[-2 : -pad - 2 : -1]
-    series = np.concatenate([before, values, after], dtype=float)
-    rows = np.ascontiguousarray(series.reshape(len(series), -1).T)
-    filter_kernels.both_ways(_butterworth(order, cutoff / rate), rows)
-    return np.ascontiguousarray(rows[:, pad : pad + len(values)].T).reshape(values.shape)
-
-
-def _butterworth(order: int, cutoff: float) -> np.ndarray:
-    """Return the sections (k, 5) of a digital Butterworth low-pass, b0, b1, b2, a1, a2, most damped poles first.
-
-    `cutoff`: of the sampling rate. By the bilinear transform with the cut-off kept; each section has gain 1 at rest.
-    """
-    angles = np.pi * (0.5 + (2 * np.arange((order + 1) // 2) + 1) / (2 * order))[::-1]
-    poles = np.tan(np.pi * cutoff) * np.exp(1j * angles)
-    poles = (1.0 + poles) / (1.0 - poles)
-    sections = np.stack(
-        [np.ones(len(poles)), np.full(len(poles), 2.0), np.ones(len(poles)), -2.0 * poles.real, abs(poles) ** 2], axis=1
-    )
-    if order % 2:  # the most damped pole is real
-        sections[0] = 1.0, 1.0, 0.0, -poles[0].real, 0.0
-    sections[:, :3] *= (1.0 + sections[:, 3:].sum(axis=1, keepdims=True)) / sections[:, :3].sum(axis=1, keepdims=True)
-    return sections
-
-
-def moving_average(values: np.ndarray, size: int) -> np.ndarray:
-    """Return `values` (N, ...) averaged over `size` samples, an odd number, about each; the ends are continued."""
-    half = [(size // 2, size // 2), *((0, 0) for _ in values.shape[1:])]
-    return np.apply_along_axis(np.convolve, 0, np.pad(values, half, "edge"), np.full(size, 1.0 / size), "valid")
+    return sosfiltfilt(butter(order, 2.0 * cutoff / rate, output="sos"), values, axis=0, padlen=pad)
 
 
 def border(rate: float, cutoff: float) -> int:

@@ -23,9 +23,9 @@ from itertools import pairwise
 
 import numpy as np
 from scipy.interpolate import CubicSpline
+from scipy.ndimage import uniform_filter1d
 
 from calib.data.recordings.recording import SERIES, Recording, settled
-from calib.data.signals.filtering import moving_average
 from calib.errors import UsageError, refuse_data, require
 from calib.records import frozen
 
@@ -88,7 +88,7 @@ def _even_times(t: np.ndarray, drift_samples: int = 101) -> tuple[np.ndarray, np
     k = np.arange(len(t)) + np.concatenate([[0], np.cumsum(_lost(t, step))])
     period, start = np.polyfit(k, t, 1)
     late = t - (start + period * k)
-    even = start + period * k + moving_average(late, drift_samples)
+    even = start + period * k + uniform_filter1d(late, drift_samples, mode="nearest")
     if not (np.diff(even) > 0.5 * period).all():
         return None
     return even, np.ones(len(t), dtype=bool), float(period)

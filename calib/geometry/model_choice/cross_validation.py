@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from calib.data.poses.measurements import PoseMeasurements, Positions, take
+from calib.data.poses.measurements import PoseMeasurements, take
 from calib.estimation.relevance import SETTLED, Condensed, Gram, Relevance, condensed, gram, relevance
 from calib.geometry.fit import plausible_deviation
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.folds import Folds
 from calib.geometry.observation import layout, observe, prepare, sampled
-from calib.geometry.squares import squares
+from calib.geometry.squares import separable, squares
 from calib.geometry.weighing import GeometricFit
 from calib.robot.calibrated import Deflection, Term
 from calib.robot.chain import Chain
@@ -260,7 +260,7 @@ class _Rows:
             pieces = np.array_split(rows, max(1, len(rows) // chunk)) if block.has_instrument else [rows]
             for piece in filter(len, pieces):
                 ready, weights = prepare(self.cell, [take(block, piece)])[0], self.weights[number][piece]
-                if isinstance(block, Positions) and not apart:
+                if separable(block) and not apart:
                     for part, own in squares(self.cell, ready, self.free, repeat(1.0 / np.sqrt(weights[None]))):
                         found.append((own, scales[part.label] ** -2.0, float(part.label in METRES)))
                     count += float(weights.sum())  # each has one position

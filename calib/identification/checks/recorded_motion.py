@@ -4,7 +4,6 @@ Everything is looked at on a coarse common grid; `trajectories.recall` finds the
 looks at torques share stands here, too: a few samples of a recording, and how much columns explain of its torques.
 """
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,7 +13,6 @@ import numpy as np
 
 from calib.column_changes import Change, assigned, best_changes, coupling, couplings
 from calib.data.recordings.recording import Recording
-from calib.data.signals.filtering import moving_average
 from calib.dynamics.bodies import Bodies, bodies_of, standard_parameters
 from calib.dynamics.rigid_body import inverse_dynamics, regressor
 from calib.identification.rows import Case, segments
@@ -221,17 +219,10 @@ def _smooth(values: np.ndarray, order: int = 0, half_width: int = 10) -> np.ndar
 
     `half_width`: half width of the window for derivatives, in steps of the coarse grid.
     """
-    half = min(half_width, (len(values) - 1) // 2)
-    place = np.arange(-half, half + 1)
-    powers = place[:, None] ** np.arange(min(3, 2 * half) + 1.0)
-    fit = np.linalg.pinv(powers)  # of a window's values to its polynomial's coefficients (Savitzky & Golay 1964)
-    slopes = np.zeros_like(powers)  # of the powers, at each place
-    for k in range(order, powers.shape[1]):
-        slopes[:, k] = math.perm(k, order) * place ** (k - order) / STEP**order
-    weights, last = slopes @ fit, len(values) - half
-    result = np.stack([np.convolve(column, weights[half, ::-1], "same") for column in values.T], axis=1)
-    result[:half], result[last:] = weights[:half] @ values[: len(place)], weights[half + 1 :] @ values[-len(place) :]
-    return result
+    from scipy.signal import savgol_filter  # slow to load
+
+    size = 2 * min(half_width, (len(values) - 1) // 2) + 1
+    return np.asarray(savgol_filter(values, size, min(3, size - 1), order, STEP, axis=0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,6 +271,8 @@ class MotionSamples:
 
 def take_samples(case: Case, bodies: Bodies, count: int) -> MotionSamples | None:
     """Return about `count` samples of a recording of motor torques; None if too few are usable."""
+    from scipy.ndimage import uniform_filter1d  # slow to load
+
     motion, n = case.motion, case.motion.n
     # left out at both ends of a segment [s], so that shifted torques are still recorded ones (our choice)
     edge_time = 0.3
@@ -291,7 +284,7 @@ def take_samples(case: Case, bodies: Bodies, count: int) -> MotionSamples | None
     # window of a moving average of the torques [s]: else a shift between samples smooths, and seems to help
     window = 0.02
     size = 2 * max(1, round(window * motion.rate) // 2) + 1  # odd
-    effort = moving_average(case.target, size)
+    effort = uniform_filter1d(np.array(case.target), size, axis=0, mode="nearest")
     q, v, a = (np.ascontiguousarray(x[index]) for x in (motion.q, motion.v, motion.a))
     return MotionSamples(index, q, v, a, effort, motion.v, bodies)
 

@@ -124,8 +124,7 @@ def find_turns(track: GearTravel, residuals: np.ndarray) -> dict[int, int]:
     Args:
         residuals: (N, n) fast parts.
     """
-    lobes = _lobes(np.array(TURNS))
-    scores = {j: coherence(track, j, residuals[:, j])[lobes].clip(0.0).sum(axis=0) for j in track.moving}
+    scores = {j: _lobes(coherence(track, j, residuals[:, j])) for j in track.moving}
     every = sum(score / max(float(score.max()), 1e-300) for score in scores.values())
     found = {j: int(np.argmax(score)) for j, score in scores.items()}
     offered = sorted({*found.values(), int(np.argmax(every))}, key=lambda k: -float(np.asarray(every)[k]))
@@ -146,7 +145,7 @@ def find(joint: int, track: GearTravel, residual: np.ndarray, turns: Mapping[int
     if not residual.any():
         return None
     bench = _WaveCrossValidation(track, residual)
-    others = {j: coherence(track, j, residual, _lobes(turns[j])).clip(0.0).sum() for j in turns if j != joint}
+    others = {j: _lobes(coherence(track, j, residual))[turns[j] - TURNS[0]] for j in turns if j != joint}
     sources = [joint, *sorted(others, key=lambda j: -others[j])[:1]]
     offers = [tuple((j, order) for order in one) for j in sources for one in _family(turns[j])]
     min_gain = 0.015  # of the fast residual's power on left-out blocks, per step of the search in families
@@ -218,8 +217,7 @@ class _WaveCrossValidation:
             return 0.0, RIDGES[-1]
         left = (whole - np.array(squares)) + (np.array(RIDGES) * unit)[:, None, None, None] * np.eye(len(whole))
         x = np.linalg.solve(left, (cross - np.array(crosses))[..., None])[..., 0]
-        explained = 2.0 * np.array(crosses) - (np.array(squares) @ x[..., None])[..., 0]
-        gained = (x * explained).sum(axis=(1, 2))
+        gained = 2.0 * np.einsum("rfk,fk->r", x, crosses) - np.einsum("rfk,fkl,rfl->r", x, squares, x, optimize=True)
         result = gained / power
         best = int(np.argmax(result))
         return float(result[best]), RIDGES[best]
@@ -240,8 +238,8 @@ def _columns(track: GearTravel, wave: Wave, nodes: Sequence[float]) -> np.ndarra
     return np.stack([one.values(seen) for one in _terms(wave[0], (wave,), nodes, None)], axis=1)
 
 
-def coherence(track: GearTravel, source: int, residual: np.ndarray, orders: np.ndarray | None = None) -> np.ndarray:
-    """Return the coherence S(k) of a gear's integer orders (k,); None: of all from 0 on, (cells / 2 + 1,)."""
+def coherence(track: GearTravel, source: int, residual: np.ndarray) -> np.ndarray:
+    """Return the coherence S(k) of a gear's integer orders k = 0, 1, ..., (cells / 2 + 1,); see the module."""
     q, v = track.q[:, source], track.v[:, source]
     speed = np.abs(v)
     speed_bins = 4  # of the speed, per direction
@@ -250,24 +248,21 @@ def coherence(track: GearTravel, source: int, residual: np.ndarray, orders: np.n
     cells = 8192  # of a turn, for the search
     cell = np.floor(q / (2.0 * np.pi) * cells).astype(int) % cells
     numbers, place = np.unique(track.block, return_inverse=True)
-    result = np.zeros(cells // 2 + 1 if orders is None else len(orders))
+    result = np.zeros(cells // 2 + 1)
     for b in np.unique(bins[bins != 0]):
         own = bins == b
-        if orders is None:
-            index = place[own] * cells + cell[own]
-            waves = np.bincount(index, residual[own], len(numbers) * cells).reshape(len(numbers), cells)
-            spectrum = np.fft.rfft(waves, axis=1)
-        else:
-            spectrum = np.zeros((len(numbers), len(orders)), dtype=complex)
-            waves = np.exp(-2j * np.pi / cells * np.outer(cell[own], orders))
-            np.add.at(spectrum, place[own], residual[own, None] * waves)
+        index = place[own] * cells + cell[own]
+        waves = np.bincount(index, residual[own], len(numbers) * cells).reshape(len(numbers), cells)
+        spectrum = np.fft.rfft(waves, axis=1)
         result += (np.abs(spectrum.sum(axis=0)) ** 2 - (np.abs(spectrum) ** 2).sum(axis=0)) / own.sum()
     return result
 
 
-def _lobes(turns: int | np.ndarray) -> np.ndarray:
-    """Return the orders N, 2 N and 2 N + 2 (3, ...) at which a gear of N motor turns per turn shows."""
-    return np.stack([turns, 2 * turns, 2 * turns + 2])
+def _lobes(power: np.ndarray) -> np.ndarray:
+    """Return the sum of the coherence S at N, 2 N and 2 N + 2, for every N of `TURNS`."""
+    turns = np.array(TURNS)
+    seen = np.maximum(power, 0.0)
+    return seen[turns] + seen[2 * turns] + seen[2 * turns + 2]
 
 
 def _climb(

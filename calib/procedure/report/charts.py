@@ -256,11 +256,6 @@ def figure(chart: Chart) -> Figure:
     return result
 
 
-def figures(charts: Mapping[str, Chart]) -> dict[str, Figure]:
-    """Return the matplotlib figures of charts, by name."""
-    return {name: figure(chart) for name, chart in charts.items()}
-
-
 def picture(chart: Chart, caption: str) -> Picture:
     """Return a chart with a caption as a picture for a page, from the cache if it was drawn before."""
     return Picture(_drawn(pickle.dumps(chart)), caption, chart.width > style.HALF_WIDTH, chart)
@@ -279,6 +274,12 @@ def vector(chart: Chart, caption: str) -> Picture:
 @lru_cache(maxsize=32)
 def _drawn(chart: bytes) -> bytes:
     return style.png(figure(pickle.loads(chart)))
+
+
+def saved(charts: Mapping[str, Captioned], folder: Path) -> dict[str, Picture]:
+    """Write charts into a folder, as ``plot_<name>.png``; return them as pictures, by name."""
+    save_all({name: chart for name, (chart, _) in charts.items()}, folder)
+    return pictures(charts)
 
 
 def save_all(charts: Mapping[str, Chart], folder: Path) -> None:

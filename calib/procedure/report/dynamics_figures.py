@@ -10,7 +10,7 @@ from calib.estimation.whiteness import Whiteness
 from calib.procedure.dynamic_stage.geometry_tables import GEOMETRIES, MIN_SHIFT, GeometricEffect, TwoGeometries
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.metrics import TorqueCurves, UnseenReport
-from calib.procedure.report.charts import Captioned, Chart, Panel, bars, level, line, pictures, save_all, text
+from calib.procedure.report.charts import Captioned, Chart, Panel, bars, level, line, save_all, saved, text
 from calib.procedure.report.dynamics_section import DynamicReport, IdentifiedParameter, percent, proof_of
 from calib.procedure.report.page import Picture
 from calib.procedure.report.style import AFTER, BEFORE, HALF_WIDTH, MARK, PAGE_WIDTH, QUIET, thinned
@@ -41,10 +41,9 @@ def captioned(found: DynamicReport, folder: Path | None = None) -> dict[str, Cap
 
 def write(outcome: IdentificationOutcome, found: DynamicReport, folder: Path) -> dict[str, Picture]:
     """Write ``plot_<name>.png`` of all a report shows and of friction; return the report's pictures by name."""
-    shown = captioned(found, folder)
-    friction = {} if isinstance(outcome.inputs.robot, Mechanism) else {"friction": _friction(outcome)}
-    save_all({name: chart for name, (chart, _) in shown.items()} | friction, folder)
-    return pictures(shown)
+    if not isinstance(outcome.inputs.robot, Mechanism):
+        save_all({"friction": _friction(outcome)}, folder)
+    return saved(captioned(found, folder), folder)
 
 
 def figures(outcome: IdentificationOutcome) -> dict[str, Chart]:

@@ -23,12 +23,10 @@ def write_fit(outcome: Outcome, folder: Path, plots: bool = True, pages: bool = 
     fit_report.write(report, FitFolder(folder).report)
     drawn: Mapping[str, Picture] = {}
     if plots:
-        from calib.procedure.report.charts import pictures, save_all
+        from calib.procedure.report.charts import saved
         from calib.procedure.report.geometry_figures import captioned
 
-        shown = captioned(report)
-        save_all({name: chart for name, (chart, _) in shown.items()}, folder)
-        drawn = pictures(shown)
+        drawn = saved(captioned(report), folder)
     for write in offered("fit_pages") if pages else ():
         write(report, drawn, folder)
 

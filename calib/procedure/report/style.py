@@ -1,6 +1,6 @@
 """Common style of all figures: one palette that is legible in greyscale, light axes, PNG with a palette.
 
-Margins are as wide as their labels; text is never read as mathematics, so that a ``$`` in a name is a ``$``.
+Margins are matplotlib's constrained layout; text is never read as mathematics, so that a ``$`` in a name is a ``$``.
 """
 
 import io
@@ -16,7 +16,6 @@ from matplotlib.axis import XAxis, YAxis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import LayoutEngine
 from matplotlib.ticker import LogLocator, NullLocator
 from PIL import Image
 
@@ -27,7 +26,6 @@ BROWN = "#a8622a"  # BEFORE, dark enough for letters
 PAGE_WIDTH, HALF_WIDTH = 7.4, 3.6  # a page's line and half of it [in]
 DPI = 200  # of print
 COLOURS = 256  # of a PNG with a palette, a third as large as one without
-PAD, MOST = 0.04, 0.9  # around panels with their labels [in]; share of a figure that margins may take
 POINTS = 700  # stretches of a curve, of which each keeps its smallest and its largest value
 STYLE: Any = {
     "font.family": "DejaVu Sans",
@@ -66,51 +64,6 @@ def styled(quiet_titles: bool = False) -> Iterator[None]:
         yield
 
 
-class Margins(LayoutEngine):
-    """Places panels of one size with margins as wide as their labels.
-
-    Labels are measured once; matplotlib's constrained layout measures them twice, which takes as long as all drawing.
-
-    Args:
-        head: what is kept free at the top of the figure [in].
-    """
-
-    _adjust_compatible, _colorbar_gridspec = True, True
-
-    def __init__(self, head: float) -> None:
-        super().__init__()
-        self.head = head
-
-    def execute(self, fig: Figure) -> None:
-        """Place the panels of a figure."""
-        places: list[Any] = [axes.get_subplotspec().get_topmost_subplotspec() for axes in fig.axes]  # type: ignore[union-attr]
-        grid, size = places[0].get_gridspec(), np.array(fig.bbox.size)
-        low, high = np.zeros((2, grid.nrows, grid.ncols, 2))  # labels left of and below a panel, right of it and above
-        for axes, place in zip(fig.axes, places):
-            labels, panel = axes.get_tightbbox(for_layout_only=True), place.get_position(fig)
-            if labels is not None:
-                at = place.rowspan.start, place.colspan.start
-                low[at] = np.maximum(low[at], panel.min - labels.min / size)
-                high[at] = np.maximum(high[at], labels.max / size - panel.max)
-        (pad_x, pad_y), head = PAD * fig.dpi / size, self.head * fig.dpi / fig.bbox.height
-        left, right, wspace = _shared(low[..., 0].max(axis=0) + pad_x, high[..., 0].max(axis=0) + pad_x)
-        top, bottom, hspace = _shared(high[..., 1].max(axis=1) + pad_y, low[..., 1].max(axis=1) + pad_y, head)
-        fig.subplots_adjust(left, bottom, 1.0 - right, 1.0 - top, wspace, hspace)
-
-
-def _shared(before: np.ndarray, after: np.ndarray, head: float = 0.0) -> tuple[float, float, float]:
-    """Return margins before and after a row of panels, and the gap between two, as a share of a panel's width.
-
-    Args:
-        before, after: (k,) what labels need on both sides of each panel, as shares of the figure; `head` before all.
-    """
-    gap, k = (after[:-1] + before[1:]).max(initial=0.0), len(before)
-    margins = np.array([head + before[0], after[-1], gap])
-    margins *= min(1.0, MOST / (margins[0] + margins[1] + (k - 1) * gap))
-    panel = (1.0 - margins[0] - margins[1] - (k - 1) * margins[2]) / k
-    return margins[0], margins[1], margins[2] / panel
-
-
 class ShownFigure(Figure):
     """A figure that a notebook shows without pyplot."""
 
@@ -128,7 +81,9 @@ def sheet(
         width, height: of the figure [in].
         head: what is kept free at the top for `legend` [in].
     """
-    figure = ShownFigure(figsize=(width, height), layout=Margins(head))
+    figure = ShownFigure(figsize=(width, height), layout="constrained")
+    engine: Any = figure.get_layout_engine()
+    engine.set(rect=(0.0, 0.0, 1.0, 1.0 - head / height), w_pad=0.04, h_pad=0.04, wspace=0.0, hspace=0.0)
     return figure, list(figure.subplots(rows, columns, squeeze=False).flat)
 
 
