@@ -60,7 +60,7 @@ def recorded(curves: TorqueCurves, report: UnseenReport) -> Captioned:
     """Return the chart of one recording's torques, measured and predicted."""
     raw = {**report.fit, **report.validation}[curves.name].raw
     seen = "fitted" if curves.name in report.fit else "unseen" if curves.name in report.proofs else "repeat"
-    title = f"{curves.name} ({seen}): {percent(raw.total)} unexplained"
+    title = f"{curves.name}: {percent(raw.total)} unexplained"
     sides = curves.measured.T, curves.predicted.T
     chart = torques(curves.t, *sides, report.rows, report.units, title, raw.joints, curves.band)
     return chart, f"Torques on {curves.name}, {seen}: measured, predicted, and the residual."
