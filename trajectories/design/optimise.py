@@ -5,7 +5,7 @@ repaired (the squared excess is minimised), then searched from (`trajectories.de
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from itertools import takewhile
@@ -17,8 +17,7 @@ from trajectories.design.problem import ExcitationProblem, exact_values, stretch
 from trajectories.design.search import STAGES, Method, SearchResult, Stage, Stuck, one_start
 from trajectories.errors import BadInput, NotExciting, NothingFeasible, require
 
-KEPT = 1 / 2  # of the starts, which the next round is for (our choice)
-ROUNDS = (STAGES[:1], STAGES[1:2], STAGES[2:])  # of a search: the first one tells most of what a start is worth
+KEPT = 1 / 3  # of the starts, which the last stages are for (our choice)
 
 
 def design(
@@ -33,10 +32,6 @@ def design(
     report: Callable[[int, int, str], None] | None = None,
 ) -> SearchResult:
     """Return the best motion over several starts.
-
-    The first stage of the search is for all starts, the second for the best half of them, the others for the best half
-    of those. A stage ends where a step improves the merit by less than its tolerance (0.001, later 0.0001: 0.01 % of
-    condition numbers), or at its share of the evaluations.
 
     Args:
         problem: must pickle where `map` runs in other processes.
@@ -54,44 +49,42 @@ def design(
     if method not in get_args(Method):
         raise BadInput(f"method '{method}' is not one of {', '.join(get_args(Method))}")
     began = time.perf_counter()
-    tasks: Sequence[int | np.ndarray] = [*guesses, *range(starts)]
+    tasks: list[int | np.ndarray] = [*guesses, *range(starts)]
     require(tasks, "no starts: ask for at least one, or give an initial guess")
-    search = _Starts(problem, evaluations, method, seed, map, report, len(tasks))
+    search, polished = _Starts(problem, evaluations, method, seed, map, report, len(tasks)), list[SearchResult]()
     try:
-        for stages in ROUNDS:
-            if not search.interrupted:
-                tasks = search.run(tasks, stages)
+        search.run(tasks, STAGES[:2])
+        if not search.interrupted:
+            polished = search.run(search.promising(), STAGES[2:])
     except KeyboardInterrupt:
-        if not search.last:
+        if not search.found:
             raise
         search.interrupted = True
-    if not search.last:
+    if not search.found:
         raise _nothing(problem, search.stuck, len(tasks))
-    best = min(search.last, key=lambda one: one.merit)
+    best = min(polished or search.found, key=lambda one: one.merit)
+    share = sum(one.feasible * one.evaluations for one in search.found) / search.spent
     return replace(
-        best, evaluations=search.spent, feasible=search.feasible / search.spent, seconds=time.perf_counter() - began,
+        best, evaluations=search.spent, feasible=share, seconds=time.perf_counter() - began,
         interrupted=search.interrupted,
     )  # fmt: skip
 
 
 class _Starts:
-    """Searches from several starts, in rounds: the best half of one goes into the next."""
+    """Searches from several starts, in rounds."""
 
     def __init__(
         self, problem: ExcitationProblem, evaluations: int, method: Method, seed: int, map: Callable,
         report: Callable[[int, int, str], None] | None, starts: int,
     ):  # fmt: skip
         self.problem, self.arguments, self.map, self.report = problem, (evaluations, method, seed), map, report
-        self.last, self.stuck = list[SearchResult](), list[Stuck]()
-        self.done, self.total = 0, starts + _kept(starts) + _kept(_kept(starts))
-        self.spent, self.feasible, self.interrupted = 0, 0.0, False
+        self.found, self.stuck = list[SearchResult](), list[Stuck]()
+        self.done, self.total = 0, starts + _kept(starts)
+        self.spent, self.interrupted = 0, False
 
-    def run(self, tasks: Sequence[int | np.ndarray], stages: tuple[Stage, ...]) -> list[np.ndarray]:
-        """Run the given stages of the search for each task; return the variables of the best motions.
-
-        Infeasible ones come last, by constraint violation; `last` are the feasible ones of the last round with any.
-        """
-        fresh, stuck = list[SearchResult](), list[Stuck]()
+    def run(self, tasks: list[int | np.ndarray], stages: tuple[Stage, ...]) -> list[SearchResult]:
+        """Run the given stages of the search for each task; return the results."""
+        fresh = list[SearchResult]()
         # a map in other processes may still hand back what it has
         wanted = takewhile(lambda _: not self.interrupted, tasks)
         for run in self.map(partial(one_start, self.problem, *self.arguments, stages=stages), wanted):
@@ -99,22 +92,25 @@ class _Starts:
             self.done += 1
             if isinstance(run, SearchResult):
                 fresh.append(run)
-                self.last, self.interrupted = fresh, self.interrupted or run.interrupted
-                self.feasible += run.feasible * run.evaluations
+                self.found.append(run)
+                self.interrupted |= run.interrupted
             else:
-                stuck.append(run)
                 self.stuck.append(run)
             if self.report:
-                best = min((one.merit for one in self.last), default=np.inf)
-                words = f"best so far {best:.4g}" if self.last else "nothing feasible yet"
+                best = min((one.merit for one in self.found), default=np.inf)
+                words = f"best so far {best:.4g}" if self.found else "nothing feasible yet"
                 self.report(self.done, self.total, words)
-        ranked = sorted(fresh, key=lambda one: one.merit) + sorted(stuck, key=lambda one: one.excess)
+        return fresh
+
+    def promising(self) -> list[int | np.ndarray]:
+        """Return the variables of the best motions so far; infeasible ones last, by constraint violation."""
+        ranked = sorted(self.found, key=lambda one: one.merit) + sorted(self.stuck, key=lambda one: one.excess)
         chosen = ranked[: _kept(len(ranked))]
         return [np.append(one.x, one.factor) if self.problem.free_period else one.x for one in chosen]
 
 
 def _kept(starts: int) -> int:
-    """Return the number of starts that the next round is for."""
+    """Return the number of starts to search to the end."""
     return max(1, round(KEPT * starts))
 
 

@@ -1,8 +1,8 @@
 """One start's search: sequential quadratic programming on the smoothed problem, sharper from stage to stage.
 
-The first stages look at half of the samples, and the first one at motions of few harmonics where the problem names a
-coarser family: most of the way costs a fraction there. A stage ends where a step gains less than its tolerance. The
-best motion that kept all constraints at the samples is returned, not the last one.
+The first stage looks at half of the samples, and at motions of few harmonics where the problem names a coarser family:
+most of the way costs a fraction there. The best motion that kept all constraints at the samples is returned, not the
+last one.
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ class Stage(NamedTuple):
 
 
 STAGES = (
-    Stage(4.0, 100.0, 1e-3, 0.2, rough=True, coarse=True),
-    Stage(10.0, 200.0, 1e-4, 0.35, rough=True),
-    Stage(30.0, 500.0, 1e-4, 0.25),
-    Stage(100.0, 2000.0, 1e-4, 0.2),
+    Stage(4.0, 100.0, 1e-4, 0.2, rough=True, coarse=True),
+    Stage(10.0, 200.0, 1e-5, 0.35, rough=True),
+    Stage(30.0, 500.0, 1e-5, 0.25),
+    Stage(100.0, 2000.0, 1e-6, 0.2),
 )
 """Our choice."""
 S_RANGE = (-4.0, 12.0)

@@ -6,20 +6,17 @@ coefficients (*proved*); for torques, places and distances it is estimated as tw
 (*estimated*: our choice; a jump between two instants, as of Coulomb friction, needs no allowance beyond it).
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from trajectories.basis import Family, SampledMotion
 from trajectories.constraints import BoxLimit, MotionConstraint
-from trajectories.design.problem import ExcitationProblem, critical_times, exact_values, merit
+from trajectories.design.problem import ExcitationProblem, critical_times
 from trajectories.design.search import STAGES, SearchResult, one_start
 from trajectories.design.starts import shrunk
 from trajectories.errors import NothingFeasible
-
-WORTH = 0.01  # of the merit, so 1 % of condition numbers, which a motion may lose without a new search (our choice)
-SMALLER = (0.998, 0.995, 0.99, 0.98)  # shares to which it is made smaller before (our choice)
 
 
 @dataclass(frozen=True)
@@ -103,9 +100,8 @@ def ensured(
 ) -> tuple[SearchResult, Verification]:
     """Return a motion that passes `verify_motion`.
 
-    One that does not is made a little smaller about its pose that is furthest inside. Where that does not help, or
-    costs more than `WORTH`, it is searched again from there, with the instants near what it breaks, and further inside
-    the limits that it breaks; at last it is made as small as needed.
+    One that does not is searched again from there, with the instants near what it breaks, and further inside the limits
+    that it breaks. Where that does not help, it is made smaller about its pose that is furthest inside.
 
     Args:
         constraints: to verify against, one for each of the problem's; default these.
@@ -114,45 +110,33 @@ def ensured(
     Raises:
         NothingFeasible: where none of that helps.
     """
-    checked, tighter = constraints or problem.constraints, problem
+    checked, tighter, original = constraints or problem.constraints, problem, found
 
     def verified(x: np.ndarray) -> Verification:
         return verify_motion(problem.family, x, checked, factor=found.factor, instants=instants)
 
-    def merit_of(one: SearchResult) -> float:
-        motion = dense_motion(problem.family, one.x, problem.basis().times[: problem.samples] * one.factor, one.factor)
-        return merit(problem, exact_values(problem, motion, problem.regressor(motion.q, motion.v, motion.a)))
-
-    def shrunk_to(shares: Iterable[float]) -> tuple[SearchResult, Verification] | None:
-        for share in shares:
-            small = shrunk(problem, found.x, share)
-            if (proof := verified(small)).feasible:
-                return replace(found, x=small), proof
-        return None
-
-    report, original = verified(found.x), found
-    max_evaluations = 500  # of a search that goes on from a motion, if all its stages are gone through
+    report = verified(found.x)
+    max_evaluations = 240  # of a search that goes on from a motion, if all its stages are gone through
     for _ in range(rounds):
         if report.feasible:
             return found, report
-        small = shrunk_to(SMALLER)
-        if small is not None and merit_of(small[0]) <= merit_of(original) + WORTH:
-            return small
         y = np.append(found.x, found.factor) if problem.free_period else found.x
         lacking = np.array([max(-report.worst[one.name].share, 0.0) for one in checked])
         further = np.where(lacking > 0.0, np.minimum(1.2 * lacking, 0.01) + 1e-4, 0.0)  # our choice
         extra = np.union1d(tighter.extra, critical_times(problem, y, 0.0, checked, instants))
         tighter = replace(tighter, extra=extra, tightening=tighter.tightening + further)
-        run = one_start(tighter, max_evaluations, "slsqp", found.seed, y, STAGES[-1:])
-        found = replace(found, evaluations=found.evaluations + run.evaluations)
-        if isinstance(run, SearchResult):
+        again = one_start(tighter, max_evaluations, "slsqp", found.seed, y, STAGES[2:])
+        found = replace(found, evaluations=found.evaluations + again.evaluations)
+        if isinstance(again, SearchResult):
             found = replace(
-                run, history=original.history, evaluations=found.evaluations, seconds=found.seconds + run.seconds,
-                interrupted=found.interrupted or run.interrupted,
+                again, history=original.history, evaluations=found.evaluations, seconds=found.seconds + again.seconds,
+                interrupted=found.interrupted or again.interrupted,
             )  # fmt: skip
             report = verified(found.x)
-    if (small := shrunk_to((1.0, *SMALLER, *0.8 ** np.arange(1, 21)))) is not None:
-        return small
+    for share in 0.8 ** np.arange(21):
+        small = shrunk(problem, found.x, share)
+        if (proof := verified(small)).feasible:
+            return replace(found, x=small), proof
     worst = min(report.margins, key=lambda one: one.share)
     raise NothingFeasible(
         f"feasible at the samples, but between them the {worst.name} limit ({worst.label}) is broken by "

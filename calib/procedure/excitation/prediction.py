@@ -258,19 +258,17 @@ def _shortened(
     period: float,
     evaluations: int,
 ) -> tuple[Family, SearchResult] | None:
-    """Return a motion of a shorter period, or None; the search starts from the same path, scaled to keep its speeds.
-
-    Motions of few harmonics are searched, as in the first stage of a design.
-    """
+    """Return a motion of a shorter period, or None; the search starts from the same path, scaled to keep its speeds."""
     try:
-        other = problem_of(period)
-        other = replace(other, family=other.coarse or other.family, stretch=(1.0, 1.0))
+        other = replace(problem_of(period), stretch=(1.0, 1.0))
     except ValueError:  # as many harmonics of a short period are beyond the resonance, or it is no whole sample
         return None
     basis, full = other.basis(), problem.family.period * found.factor
     path = problem.family.basis(basis.times * problem.family.period / period).motion(found.x).q
     middle = path.mean(axis=0)
-    run = one_start(other, evaluations, "slsqp", 0, basis.nearest(middle + period / full * (path - middle)), STAGES[:1])
+    run = one_start(
+        other, evaluations, "slsqp", 0, basis.nearest(middle + period / full * (path - middle)), STAGES[1:3]
+    )
     return (other.family, run) if isinstance(run, SearchResult) else None
 
 

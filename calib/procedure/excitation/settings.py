@@ -104,7 +104,7 @@ class ExcitationSettings:
     rate: Rate = 1000.0
     samples: Annotated[int, Whole(10, 100_000)] = 200
     starts: Starts = 4
-    evaluations: Evaluations = 1050
+    evaluations: Evaluations = 1500
     solver: Annotated[Solver, OneOf(get_args(Solver))] = "slsqp"
     seed: Seed = 0
     front: Annotated[int, Whole(0, 1000)] = 0
