@@ -24,11 +24,11 @@ from calib.estimation.relevance import SETTLED, Gram, condensed, gram, relevance
 from calib.geometry.fit import plausible_deviation
 from calib.geometry.installation import Installation
 from calib.geometry.left_out import LeftOut, Profile, unevenness
+from calib.geometry.many_corrections import position_variances
 from calib.geometry.model_choice.cross_validation import project_out, term_groups, term_sizes
 from calib.geometry.model_choice.folds import Folds, random_folds
 from calib.geometry.model_choice.ladder import MAX_RESIDUAL, ModelSelection
 from calib.geometry.observation import layout, observe, prepare
-from calib.geometry.squares import position_variances
 from calib.records import evenly
 from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain

@@ -16,9 +16,9 @@ from calib.estimation.estimate import Estimate
 from calib.estimation.nonlinear import MOST_NUMBERS, Reduced, Rows, Solution, covariance, reduced
 from calib.estimation.relevance import Gram
 from calib.geometry.installation import Installation
+from calib.geometry.many_corrections import row_statistics, separable
 from calib.geometry.observation import Block, layout, observe, parameter_values, whitened
 from calib.geometry.residuals import Part
-from calib.geometry.squares import separable, squares
 from calib.records import frozen
 from calib.robot.calibrated import CalibratedChain, CorrectedChain
 from calib.robot.chain import Chain
@@ -247,7 +247,7 @@ class Weigher:
             each.append(Gram(np.diag(self.prior**-2.0), pull / self.prior, float(pull @ pull), int(held.sum())))
         if self._many:
             for number, block in enumerate(self.blocks):
-                each += [own for _, own in squares(state, block, self.free, _scales(self.pieces, number))]
+                each += [own for _, own in row_statistics(state, block, self.free, _scales(self.pieces, number))]
             total = sum(each[1:], each[0])
         return reduced(lambda: chain(_rows(state, self.free, self.blocks, self.pieces), known), total)
 

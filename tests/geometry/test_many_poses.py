@@ -6,14 +6,17 @@ import numpy as np
 import pytest
 from planted import cell, load, measure, perturb
 
+from calib.data.poses.measurements import Poses
 from calib.dynamics.rigid_body import gravity_torques
 from calib.estimation import nonlinear
+from calib.estimation.relevance import gram
 from calib.geometry import fit as fitting
-from calib.geometry import observation
+from calib.geometry import observation, weighing
 from calib.geometry.accuracy import errors, pair_errors
 from calib.geometry.first_guess import install
-from calib.geometry.model_choice.ladder import ModelSelection, select_model
-from calib.geometry.observation import rows_of
+from calib.geometry.many_corrections import MANY, position_variances, row_statistics, separable
+from calib.geometry.model_choice.ladder import EFFECTS, ModelSelection, select_model
+from calib.geometry.observation import layout, observe, pose_sigmas, prepare, rows_of
 from calib.geometry.weighing import Settings
 from calib.robot.calibrated import Deflection, Term
 
@@ -39,7 +42,8 @@ def test_pieces_and_a_warm_start_change_nothing(kind, loss, sigmas, monkeypatch)
     whole = climbed(measured, loss)
     sizes, pairs = errors(whole.fit.cell, [measured]), pair_errors(whole.fit.cell, [measured])
     monkeypatch.setattr(observation, "PIECE", 40)
-    monkeypatch.setattr(nonlinear, "MOST_NUMBERS", 2000)
+    for place in (nonlinear, weighing):
+        monkeypatch.setattr(place, "MOST_NUMBERS", 2000)
     monkeypatch.setattr(fitting, "WARM_POSES", 30)
     counts = []
     monkeypatch.setattr(
@@ -55,3 +59,33 @@ def test_pieces_and_a_warm_start_change_nothing(kind, loss, sigmas, monkeypatch)
     assert found.fit.row_weights()[0] == pytest.approx(whole.fit.row_weights()[0], abs=0.03)
     assert errors(whole.fit.cell, [measured]).position == pytest.approx(sizes.position, rel=1e-9)
     assert pair_errors(whole.fit.cell, [measured]) == pytest.approx(pairs, rel=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["position", "pose"])
+def test_statistics_element_by_element_are_those_of_the_rows(kind, monkeypatch):
+    """Beside frames and lengths: harmonics of every joint, by far more than `MANY` corrections of an element."""
+    arm = load("ur5")
+    terms = tuple(EFFECTS["harmonics"](arm, False))
+    assert len(terms) > MANY * arm.n
+    found = replace(cell(arm, 2), deflection=Deflection(terms, np.zeros(len(terms)), arm))
+    measured = measure(found, kind, 90, 3, sigma=4e-5, sigma_rotation=1e-4)
+    table, random = layout(found), np.random.default_rng(4)
+    free = np.concatenate([table.rigid_index, table.index("deflection")])
+    monkeypatch.setattr(observation, "PIECE", 40)
+    (block,) = prepare(found, [measured])
+    parts = observe(found, block, free)
+    scales = [random.uniform(1e-5, 1e-4, (len(part.value), len(measured))) for part in parts]
+    for part, scale in zip(parts, scales):
+        wanted = gram(*part.whitened(scale))
+        own = [one for piece, one in row_statistics(found, block, free, scales) if piece.label == part.label]
+        assert len(own) == 3 and sum(one.rows for one in own) == part.value.size
+        for name in ("square", "cross", "total"):
+            whole = getattr(wanted, name)
+            summed = sum(getattr(one, name) for one in own)
+            assert summed == pytest.approx(whole, rel=1e-9, abs=1e-9 * np.abs(whole).max())
+    root = random.standard_normal((len(free), len(free))) * 1e-6
+    covariance = root @ root.T
+    sigma = pose_sigmas(found, measured, free, covariance, 0, 0)[:, 0]
+    assert position_variances(found, measured, free, covariance, 0, 0) == pytest.approx(sigma**2, rel=1e-8)
+    moving = replace(measured, late=np.ones((len(measured), 1, 3)))
+    assert separable(measured) and not separable(moving) and isinstance(measured, Poses) == (kind == "pose")

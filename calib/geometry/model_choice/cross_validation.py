@@ -18,9 +18,9 @@ from calib.data.poses.measurements import PoseMeasurements, take
 from calib.estimation.relevance import SETTLED, Condensed, Gram, Relevance, condensed, gram, relevance
 from calib.geometry.fit import plausible_deviation
 from calib.geometry.installation import Installation
+from calib.geometry.many_corrections import row_statistics, separable
 from calib.geometry.model_choice.folds import Folds
 from calib.geometry.observation import layout, observe, prepare, sampled
-from calib.geometry.squares import separable, squares
 from calib.geometry.weighing import GeometricFit
 from calib.robot.calibrated import Deflection, Term
 from calib.robot.chain import Chain
@@ -261,7 +261,8 @@ class _Rows:
             for piece in filter(len, pieces):
                 ready, weights = prepare(self.cell, [take(block, piece)])[0], self.weights[number][piece]
                 if separable(block) and not apart:
-                    for part, own in squares(self.cell, ready, self.free, repeat(1.0 / np.sqrt(weights[None]))):
+                    divisors = repeat(1.0 / np.sqrt(weights[None]))
+                    for part, own in row_statistics(self.cell, ready, self.free, divisors):
                         found.append((own, scales[part.label] ** -2.0, float(part.label in METRES)))
                     count += float(weights.sum())  # each has one position
                     continue

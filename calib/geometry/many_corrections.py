@@ -26,7 +26,7 @@ def separable(measured: PoseMeasurements) -> bool:
     return isinstance(measured, Positions) and measured.late is None
 
 
-def squares(
+def row_statistics(
     cell: Installation, block: Block, free: np.ndarray, scales: Iterable[np.ndarray]
 ) -> Iterator[tuple[Part, Gram]]:
     """Yield the residual parts of a `separable` block, piece by piece, with their rows' statistics.
