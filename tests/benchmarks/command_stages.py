@@ -86,9 +86,8 @@ def staged(words: Sequence[str]) -> None:
     waiting = {f"calib.procedure.{one}": stage for stage, names in STAGES.items() for one in names}
 
     def imported(name: str, *given: Any, **options: Any) -> Any:
-        found = timed_import(name, *given, **options) if clock.stack[-1] != "imports" else plain_import(
-            name, *given, **options
-        )  # fmt: skip
+        load = plain_import if clock.stack[-1] == "imports" else timed_import
+        found = load(name, *given, **options)
         for one in [one for one in waiting if one.partition(":")[0] in sys.modules]:
             place, _, function = one.partition(":")
             if hasattr(module := sys.modules[place], function):
