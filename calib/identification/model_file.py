@@ -37,8 +37,9 @@ read, too). No number: null.
 Figures: those of the report, as ``plot_torque_N.png`` of every unseen recording in the order given, of those to learn
 from where none is unseen (measured, predicted, residual, low-passed to the identification band), ``plot_errors.png``,
 ``plot_residuals.png`` (autocorrelation; dashed: white noise), ``plot_significance.png``, and, where the geometry's
-uncertainty is known, what it adds to sigma; ``plot_friction.png`` (over velocity). Recordings to learn from are drawn
-by ``model.plot("torque_N")``, where N counts on after the unseen ones.
+uncertainty is known, what it adds to sigma; ``plot_friction.png`` (over velocity), in a session that
+alone: its report has the others. Recordings to learn from are drawn by ``model.plot("torque_N")``, where N counts on
+after the unseen ones.
 """
 
 import json

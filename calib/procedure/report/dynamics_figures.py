@@ -10,9 +10,8 @@ from calib.estimation.whiteness import Whiteness
 from calib.procedure.dynamic_stage.geometry_tables import GEOMETRIES, MIN_SHIFT, GeometricEffect, TwoGeometries
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.metrics import TorqueCurves, UnseenReport
-from calib.procedure.report.charts import Captioned, Chart, Panel, bars, level, line, save_all, saved, text
+from calib.procedure.report.charts import Captioned, Chart, Panel, bars, level, line, text
 from calib.procedure.report.dynamics_section import DynamicReport, IdentifiedParameter, percent, proof_of
-from calib.procedure.report.page import Picture
 from calib.procedure.report.style import AFTER, BEFORE, HALF_WIDTH, MARK, PAGE_WIDTH, QUIET, thinned
 from calib.procedure.robot_kinds import Mechanism
 from calib.records import read_rows
@@ -39,21 +38,13 @@ def captioned(found: DynamicReport, folder: Path | None = None) -> dict[str, Cap
     return result
 
 
-def write(outcome: IdentificationOutcome, found: DynamicReport, folder: Path) -> dict[str, Picture]:
-    """Write ``plot_<name>.png`` of all a report shows and of friction; return the report's pictures by name."""
-    if not isinstance(outcome.inputs.robot, Mechanism):
-        save_all({"friction": _friction(outcome)}, folder)
-    return saved(captioned(found, folder), folder)
-
-
 def figures(outcome: IdentificationOutcome) -> dict[str, Chart]:
     """Return the charts of an identification by name: torques of every recording, residuals, friction."""
     report = UnseenReport.of(outcome.inputs, outcome)
     cases = (*outcome.inputs.unseen, *outcome.inputs.cases)
     curves = (TorqueCurves.of(case, outcome.predictions[case.name]) for case in cases)
     drawn = {f"torque_{number}": recorded(one, report)[0] for number, one in enumerate(curves, 1)}
-    drawn |= {name: chart for name, (chart, _) in _errors(report).items()}
-    return drawn if isinstance(outcome.inputs.robot, Mechanism) else drawn | {"friction": _friction(outcome)}
+    return drawn | {name: chart for name, (chart, _) in _errors(report).items()} | friction(outcome)
 
 
 def recorded(curves: TorqueCurves, report: UnseenReport) -> Captioned:
@@ -66,8 +57,13 @@ def recorded(curves: TorqueCurves, report: UnseenReport) -> Captioned:
     return chart, f"Torques on {curves.name}, {seen}: measured, predicted, and the residual."
 
 
-def _friction(outcome: IdentificationOutcome) -> Chart:
-    """Return the chart of friction over velocity: model, and torques of the first file minus the rigid-body model."""
+def friction(outcome: IdentificationOutcome) -> dict[str, Chart]:
+    """Return the chart of friction over velocity, by its name; of mechanisms none.
+
+    It shows the model, and the torques of the first file minus the rigid-body model.
+    """
+    if isinstance(outcome.inputs.robot, Mechanism):
+        return {}
     found, case = outcome.found, outcome.inputs.cases[0]
     model = found.dynamics.model
     terms = list(zip(model.columns, found.dynamics.values[model.inertial :]))
@@ -90,7 +86,7 @@ def _friction(outcome: IdentificationOutcome) -> Chart:
         speed = f"velocity [{'m/s' if joint.kind == 'prismatic' else 'rad/s'}]"
         panels.append(Panel([cloud, line(grid, curve, width=1.2, label="model")], joint.name, speed, words))
     title = f"friction over velocity on {case.name}"
-    return Chart(panels, 0.5 + 1.55 * -(-len(joints) // columns), columns, title=title)
+    return {"friction": Chart(panels, 0.5 + 1.55 * -(-len(joints) // columns), columns, title=title)}
 
 
 def torques(

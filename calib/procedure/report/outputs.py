@@ -32,17 +32,23 @@ def write_fit(outcome: Outcome, folder: Path, plots: bool = True, pages: bool = 
 
 
 def write_model(outcome: IdentificationOutcome, folder: Path, plots: bool = True, pages: bool = True) -> None:
-    """Write figures (if `plots`) and, outside sessions, ``report.json`` and certificate of an identification."""
+    """Write the figure of friction (if `plots`) and, outside sessions, ``report.json``, figures and certificate.
+
+    A session's certificate draws the other figures, with the unseen recordings.
+    """
     from calib.procedure.dynamic_stage.folder import UnseenFolder
     from calib.procedure.report import dynamics_section
 
-    if pages:
-        UnseenFolder(folder).write_report(outcome.inputs, outcome)
-    report = dynamics_section.read(folder) if pages else dynamics_section.of_outcome(outcome)
     drawn: Mapping[str, Picture] = {}
     if plots:
-        from calib.procedure.report import dynamics_figures
+        from calib.procedure.report import charts, dynamics_figures
 
-        drawn = dynamics_figures.write(outcome, report, folder)
-    for write in offered("model_pages") if pages else ():
+        charts.save_all(dynamics_figures.friction(outcome), folder)
+    if not pages:
+        return
+    UnseenFolder(folder).write_report(outcome.inputs, outcome)
+    report = dynamics_section.read(folder)
+    if plots:
+        drawn = charts.saved(dynamics_figures.captioned(report, folder), folder)
+    for write in offered("model_pages"):
         write(report, drawn, folder)
