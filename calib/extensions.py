@@ -45,7 +45,7 @@ A room is a package of `calib.rooms` with a table ``OFFERS``: what it adds, and 
     as_described           function: controller's name, joints as it shows them → the description's joints;
     motors_as_described    the same of motors' torques and currents
     notebook               function: a result → HTML
-    geometry_spread        function: see `calib.procedure.excitation.inputs.GeometrySpread`
+    geometry_spread        function: see `calib.procedure.excitation.prior_motions.GeometrySpread`
 
 A room that is deleted takes its commands, methods and robots along; the rest works without.
 """

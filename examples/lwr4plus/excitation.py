@@ -53,7 +53,8 @@ from calib.geometry.fit import fit
 from calib.geometry.weighing import calibrated_chain
 from calib.procedure.excitation import coefficients
 from calib.procedure.excitation.design import Designed, search_motion
-from calib.procedure.excitation.inputs import ExcitationInputs, IdentifiableColumns, excited_model
+from calib.procedure.excitation.excited_model import excited_model
+from calib.procedure.excitation.inputs import ExcitationInputs, IdentifiableColumns
 from calib.procedure.excitation.limits import read_motion_limits
 from calib.procedure.excitation.settings import ExcitationSettings
 from calib.procedure.report.style import save

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.errors import UsageError, require
-from calib.procedure.excitation.inputs import ExcitationInputs, ExcitedModel
+from calib.procedure.excitation.excited_model import ExcitedModel
+from calib.procedure.excitation.inputs import ExcitationInputs
 from calib.procedure.excitation.limits import DEFAULT_RISE, MotionLimits
 from calib.procedure.excitation.settings import ExcitationSettings
 from calib.records import evenly

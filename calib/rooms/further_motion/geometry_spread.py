@@ -9,7 +9,7 @@ from calib.data import csv_table
 from calib.dynamics.base import places
 from calib.dynamics.load_cases import LoadCases
 from calib.procedure.dynamic_stage.geometry_tables import SENSITIVITY, TORQUE_COVARIANCE
-from calib.procedure.excitation.inputs import ExcitedModel, moved_to
+from calib.procedure.excitation.excited_model import ExcitedModel, moved_to
 from calib.robot import calibrated
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
@@ -17,7 +17,7 @@ from calib.robot.chain import Chain
 
 @dataclass(frozen=True, eq=False)
 class GeometrySpread:
-    """Errors of a geometry, see `calib.procedure.excitation.inputs.GeometrySpread`.
+    """Errors of a geometry, see `calib.procedure.excitation.prior_motions.GeometrySpread`.
 
     Attributes:
         moved: r pairs of models, on the geometry with +g_i and with -g_i.

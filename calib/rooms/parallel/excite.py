@@ -15,7 +15,8 @@ from calib.folders import METRICS, check_target, write_staged
 from calib.identification.identify_options import IdentifySettings
 from calib.procedure.excitation import coefficients, folder, prediction
 from calib.procedure.excitation.coefficients import PLANNED
-from calib.procedure.excitation.design import GUARD, INSTANTS, search_motion
+from calib.procedure.excitation.design import INSTANTS, search_motion
+from calib.procedure.excitation.goals import GUARD
 from calib.procedure.excitation.inputs import ExcitationInputs
 from calib.procedure.excitation.limits import MotionBounds, MotionLimits
 from calib.procedure.excitation.settings import COARSE, DEFAULT_DESIGN, ExcitationSettings

@@ -18,18 +18,11 @@ from calib.folders import read_covariance
 from calib.identification.identify_options import IdentifySettings, options_of, read_options
 from calib.identification.model_file import MODEL, read_table, refuse_currents
 from calib.procedure.excitation.design import INSTANTS
-from calib.procedure.excitation.inputs import (
-    SMOOTH,
-    ExcitedModel,
-    IdentifiableColumns,
-    PriorMotions,
-    loads_of,
-    read_prior,
-    selected_columns,
-    stated_payloads,
-)
+from calib.procedure.excitation.excited_model import SMOOTH, ExcitedModel, loads_of, stated_payloads
+from calib.procedure.excitation.inputs import IdentifiableColumns, selected_columns
 from calib.procedure.excitation.limits import DEFAULT_RISE
 from calib.procedure.excitation.prediction import MotionOutlook, MotionPrediction, PredictedSigma
+from calib.procedure.excitation.prior_motions import PriorMotions, read_prior
 from calib.procedure.excitation.settings import DRIVES, ExcitationSettings
 from calib.rooms.parallel.identification import model_of, refuse_options_of_arms
 from calib.rooms.parallel.mechanism.parallel_model import (

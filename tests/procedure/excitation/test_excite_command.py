@@ -22,10 +22,12 @@ from calib.folders import write_covariance
 from calib.identification.identify_options import parse_options
 from calib.procedure.excitation import coefficients, design
 from calib.procedure.excitation import folder as motion_folder
-from calib.procedure.excitation.inputs import identifiable, read_inputs, read_model, read_prior
+from calib.procedure.excitation.excited_model import read_model
+from calib.procedure.excitation.inputs import identifiable, read_inputs
 from calib.procedure.excitation.limits import Points, read_motion_limits
 from calib.procedure.excitation.planning import plan
 from calib.procedure.excitation.prediction import foretell
+from calib.procedure.excitation.prior_motions import read_prior
 from calib.procedure.excitation.settings import ExcitationSettings
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.kinematics import forward
