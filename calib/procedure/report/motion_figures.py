@@ -8,12 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calib.folders import METRICS
-from calib.procedure.excitation import coefficients
-from calib.procedure.report.charts import Captioned, Chart, Panel, level, line, save_all, text
+from calib.procedure.report.charts import Chart, Panel, level, line, save_all, text
 from calib.procedure.report.geometry_figures import outlook_figure
 from calib.procedure.report.style import AFTER, BEFORE, HALF_WIDTH, MARK, QUIET
-from calib.records import read_json
 from calib.robot.chain import Chain, Joint
 from calib.robot.kinematics import sweep
 from calib.units import motion_units
@@ -26,12 +23,11 @@ if TYPE_CHECKING:
     from calib.procedure.excitation.planning import Planned
 
 POINTS = 800
-DRAWN = 300  # points per curve of a certificate
 Limited = tuple[np.ndarray, np.ndarray, np.ndarray]  # values, lower and upper limit
 TITLES = ("position", "velocity", "acceleration", "torque")
 
 
-def _motion_sheet(times: np.ndarray, series: Sequence[Limited], joints: Sequence[Joint]) -> Chart:
+def motion_sheet(times: np.ndarray, series: Sequence[Limited], joints: Sequence[Joint]) -> Chart:
     """Return the chart of series of every joint, a row per joint and a column per series, limits dashed.
 
     Args:
@@ -68,7 +64,7 @@ def _motion_figure(designed: Designed) -> Chart:
     if model.values is not None:
         torque = model.exact.largest_torques(model.values, motion.q, motion.v, motion.a)
         rows.append((torque, -limits.torque, limits.torque))
-    return _motion_sheet(motion.times, rows, designed.inputs.chain.joints)
+    return motion_sheet(motion.times, rows, designed.inputs.chain.joints)
 
 
 def _path_figure(designed: Designed) -> Chart:
@@ -151,7 +147,7 @@ def _plan_figure(planned: Planned) -> Chart:
     rows.append((track.a, -limits.acceleration, limits.acceleration))
     if track.tau is not None:
         rows.append((track.tau, -limits.torque, limits.torque))
-    return _motion_sheet(track.times, rows, planned.chain.joints)
+    return motion_sheet(track.times, rows, planned.chain.joints)
 
 
 def _profile_figure(planned: Planned) -> Chart:
@@ -170,22 +166,3 @@ def _profile_figure(planned: Planned) -> Chart:
         Panel(above, x="time [s]", y="speed along the path", xlim=(0.0, start)),
     ]
     return Chart(panels, 3.8, title=f"{start:.3g} s, close to a limit for {planned.active_share:.0%} of the time")
-
-
-def trained_on(folder: Path, joints: Sequence[Joint]) -> Captioned:
-    """Return the chart of a designed motion from its folder, with its condition number in the caption."""
-    from calib.procedure.excitation.design import DesignMetrics
-
-    motion = coefficients.read(folder)
-    t = np.linspace(0.0, motion.period, DRAWN)
-    q, v, _ = motion.orders(t)
-    made = read_json(folder / METRICS, "design the motion again", DesignMetrics)
-    margins = ", ".join(f"{name} {one.share:.1%} of its scale" for name, one in made.margins.items())
-    words = (
-        f"The training motion, one period of {made.setting.period:g} s: condition number "
-        f"{made.condition_number.raw:.3g} raw, {made.condition_number.normalised:.3g} with unit columns, of "
-        f"{len(made.setting.columns)} columns. All limits are kept, at and between {made.setting.instants_verified} "
-        f"instants; smallest margins: {margins}."
-    )
-    none = np.full(q.shape[1], np.inf)
-    return _motion_sheet(t, [(q, -none, none), (v, -none, none)], joints), words

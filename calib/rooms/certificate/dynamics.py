@@ -1,17 +1,29 @@
 """The certificate's page on the dynamics: torque errors in N·m and of the limits, torques, uncertainty."""
 
-from collections.abc import Iterator
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calib.folders import METRICS
+from calib.procedure.excitation import coefficients
 from calib.procedure.findings import sentence
 from calib.procedure.report.dynamics_section import DynamicReport, percent, proof_of, rms_words, warnings_of
 from calib.procedure.report.page import Picture, Pictures, Section, Table, Text
+from calib.records import read_json
+from calib.robot.chain import Joint
 from calib.rooms.certificate.record import Stage
+
+if TYPE_CHECKING:
+    from calib.procedure.report.charts import Captioned
 
 UNCERTAINTY = ("torque-interval-coverage", "outside-training-range")
 MAX_ROWS = 14  # torques in the table
 MAX_CURVES = 4  # torques drawn
+POINTS = 300  # of each curve of a motion
 NOTE = (
     "rms error: of the torque as recorded; of limit: of the torque that the robot's description allows; in band: both "
     "torques low-passed to the band of the motion; 95 % interval: half width (median), and share of errors within it."
@@ -103,3 +115,23 @@ def _uncertainty(found: DynamicReport) -> Iterator[str]:
     )
     if metrics.geometry is not None:
         yield metrics.geometry.summary
+
+
+def trained_on(folder: Path, joints: Sequence[Joint]) -> Captioned:
+    """Return the chart of a designed motion from its folder, with its condition number in the caption."""
+    from calib.procedure.excitation.design import DesignMetrics
+    from calib.procedure.report.motion_figures import motion_sheet
+
+    motion = coefficients.read(folder)
+    t = np.linspace(0.0, motion.period, POINTS)
+    q, v, _ = motion.orders(t)
+    made = read_json(folder / METRICS, "design the motion again", DesignMetrics)
+    margins = ", ".join(f"{name} {one.share:.1%} of its scale" for name, one in made.margins.items())
+    words = (
+        f"The training motion, one period of {made.setting.period:g} s: condition number "
+        f"{made.condition_number.raw:.3g} raw, {made.condition_number.normalised:.3g} with unit columns, of "
+        f"{len(made.setting.columns)} columns. All limits are kept, at and between {made.setting.instants_verified} "
+        f"instants; smallest margins: {margins}."
+    )
+    none = np.full(q.shape[1], np.inf)
+    return motion_sheet(t, [(q, -none, none), (v, -none, none)], joints), words

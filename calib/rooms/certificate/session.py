@@ -87,12 +87,11 @@ def _dynamics(session: Session) -> Stage:
     if session.plots:
         from calib.procedure.report.charts import picture, pictures
         from calib.procedure.report.dynamics_figures import captioned
-        from calib.procedure.report.motion_figures import trained_on
 
         drawn = pictures(captioned(found, session.identification.path))
         training = session.path("6-excitation") / "training"
         if session.settings.dynamics.plan and (training / coefficients.NAME).exists():
-            drawn["excitation"] = picture(*trained_on(training, chain_of(session).joints))
+            drawn["excitation"] = picture(*dynamics.trained_on(training, chain_of(session).joints))
     allowed, exported = session.settings.dynamics.tolerance_percent, read_state(session).notes("export")
     known = prediction(session.path(session.export))
     section = dynamics_section.report_section(found, drawn, exported, allowed, known and known.exported)
