@@ -324,27 +324,14 @@ def run_study(
             place = store.settle()
             kept = list(store.rows.values())
             settled = f"{place.name} holds {len(kept)} rows"
-    digests = {condition.digest for condition in study.conditions}
-    own = [row for row in kept if row.digest in digests]
-    others, changed = len(kept) - len(own), Counter(row.method for row in own if not row.current)
-    own = [row for row in own if row.current]
-    if others:
-        notes.append(f"{others} rows belong to conditions outside this study: kept, but not counted")
-    if changed:
-        named_rows = ", ".join(f"{count} of {name}" for name, count in changed.items())
-        words = "rows of methods changed since their run do not count until they are run again"
-        notes.append(f"{words}: {named_rows}")
+    own, more = _counted(study, kept)
+    notes += more
     if not progress.lost and not own:
-        there = f"{len(kept)} rows, none of them of this study's conditions" if kept else "no rows"
-        there = f"{len(kept)} rows; {notes[-1]}" if changed else there
-        raise UsageError(
-            f"nothing to report: {out} holds {there}; "
-            + (
-                "run the study first, or name its folder (--out)"
-                if report_only
-                else "ask for 1 run or more (--runs, runs)"
-            )
+        there = "; ".join([f"{len(kept)} rows" if kept else "no rows", *more])
+        try_next = (
+            "run the study first, or name its folder (--out)" if report_only else "ask for 1 run or more (--runs)"
         )
+        raise UsageError(f"nothing to report: {out} holds {there}; {try_next}")
     if len(versions := sorted({row.toolkit for row in own})) > 1:
         notes.append(f"rows were made by several versions: {', '.join(versions)}")
     if progress.lost:
@@ -354,6 +341,19 @@ def run_study(
     files.write_table(out / SUMMARY, *summary_table(conditions))
     files.write(out / REPORT, make_page(study, conditions, own, notes, plots))
     return StudyOutcome(conditions, progress, tuple(notes), out, settled)
+
+
+def _counted(study: Study, kept: Sequence[TrialRow]) -> tuple[list[TrialRow], list[str]]:
+    """Return the rows that count for a study, and notes on those that do not."""
+    digests = {condition.digest for condition in study.conditions}
+    own = [row for row in kept if row.digest in digests]
+    notes, changed = [], Counter(row.method for row in own if not row.current)
+    if others := len(kept) - len(own):
+        notes.append(f"{others} rows belong to conditions outside this study: kept, but not counted")
+    if changed:
+        named = ", ".join(f"{count} of {name}" for name, count in changed.items())
+        notes.append(f"rows of methods changed since their run do not count until they are run again: {named}")
+    return [row for row in own if row.current], notes
 
 
 def _check_folder(out: Path, named: Sequence[str | Path]) -> None:
