@@ -1,6 +1,6 @@
 """Designing exciting motions: the package `trajectories` gets a robot's regressor and limits."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -50,31 +50,6 @@ class DesignCondition:
     def table(self) -> dict[str, float]:
         """Return the values as the entry ``condition_number`` of ``metrics.json``."""
         return {name: value for name, value in asdict(self).items() if value is not None}
-
-
-@dataclass(frozen=True)
-class _DesignSetting:
-    """Settings of a design: period [s], columns to identify, and number of verified instants."""
-
-    period: float
-    columns: tuple[str, ...]
-    instants_verified: int
-
-
-@dataclass(frozen=True)
-class _LimitMargin:
-    """Distance of a motion from a limit, as a share of the limit."""
-
-    share: float
-
-
-@dataclass(frozen=True)
-class DesignMetrics:
-    """The content of ``metrics.json``: condition number, settings, and the smallest margin of each limit."""
-
-    condition_number: DesignCondition
-    setting: _DesignSetting
-    margins: Mapping[str, _LimitMargin]
 
 
 INSTANTS = 1000  # over the period, at which condition numbers are reported

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -117,19 +118,44 @@ def _uncertainty(found: DynamicReport) -> Iterator[str]:
         yield metrics.geometry.summary
 
 
+@dataclass(frozen=True)
+class _DesignSetting:
+    """Settings of a design: period [s], columns to identify, and number of verified instants."""
+
+    period: float
+    columns: tuple[str, ...]
+    instants_verified: int
+
+
+@dataclass(frozen=True)
+class _LimitMargin:
+    """Distance of a motion from a limit, as a share of the limit."""
+
+    share: float
+
+
+@dataclass(frozen=True)
+class _DesignMetrics:
+    """What is read of the ``metrics.json`` of a designed motion: condition number, settings, smallest margins."""
+
+    condition_number: Mapping[str, float]
+    setting: _DesignSetting
+    margins: Mapping[str, _LimitMargin]
+
+
 def trained_on(folder: Path, joints: Sequence[Joint]) -> Captioned:
     """Return the chart of a designed motion from its folder, with its condition number in the caption."""
-    from calib.procedure.excitation.design import DesignMetrics
     from calib.procedure.report.motion_figures import motion_sheet
 
     motion = coefficients.read(folder)
     t = np.linspace(0.0, motion.period, POINTS)
     q, v, _ = motion.orders(t)
-    made = read_json(folder / METRICS, "design the motion again", DesignMetrics)
+    made = read_json(folder / METRICS, "design the motion again", _DesignMetrics)
+    raw, unit = (made.condition_number[scaling] for scaling in ("raw", "normalised"))
     margins = ", ".join(f"{name} {one.share:.1%} of its scale" for name, one in made.margins.items())
     words = (
         f"The training motion, one period of {made.setting.period:g} s: condition number "
-        f"{made.condition_number.raw:.3g} raw, {made.condition_number.normalised:.3g} with unit columns, of "
+        f"{raw:.3g} raw, {unit:.3g} with unit columns, of "
         f"{len(made.setting.columns)} columns. All limits are kept, at and between {made.setting.instants_verified} "
         f"instants; smallest margins: {margins}."
     )
