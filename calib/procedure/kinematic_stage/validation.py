@@ -69,7 +69,8 @@ def judge(
     6. ``rigid-misfit`` or ``gross-rows`` of the fit, ``refuted``, ``no-transfer``, ``intervals-too-narrow``,
        ``small-gain``, ``many-outliers``; none of them: pass.
 
-    The fit's other findings, those of `calib.procedure.kinematic_stage.plausibility`, count in every group.
+    The fit's other findings, those of `calib.procedure.kinematic_stage.plausibility`, and ``gross-unseen-rows`` count
+    in every group; with the latter there is no ``refuted``.
 
     Args:
         fit: both arms on the fit's rows.
@@ -88,7 +89,8 @@ def judge(
     if not found and cross_validated is not None:
         found = [_Proof(nominal, cross_validated, "by cross-validation only")]
     worst = max(found, key=lambda proof: proof.after, default=None)
-    others = [one for one in findings.noticed if one.code not in RIGID]
+    gross = [one for proof in found for one in _gross(proof, findings.reach) if level_of(one)]
+    others = [*gross, *(one for one in findings.noticed if one.code not in RIGID)]
     for rules in (
         _far_off(found, {"the fitted poses": fit, **proofs}, tolerance, findings.reach),
         [finding("frames-only", rms=own)] if findings.model == asked == "frames" else [],
@@ -101,7 +103,8 @@ def judge(
             return Verdict.of("" if worst is None else _figures(worst, arm), [*others, *group])
     if worst is None:
         return Verdict.of("", [finding("no-unseen-poses"), *others])
-    rules = [*findings.noticed, *_doubts(worst, own, cross_validated, proofs, findings)]
+    promised = None if gross else cross_validated
+    rules = [*gross, *findings.noticed, *_doubts(worst, own, promised, proofs, findings)]
     verdict = Verdict.of(_figures(worst, arm), rules)
     return Verdict("pass", _figures(worst, arm, tolerance)) if verdict.level == "pass" else verdict
 
@@ -128,6 +131,28 @@ def _far_off(
     if tolerance is not None:
         for proof in found:
             yield finding("above-tolerance", tolerance=tolerance, times=proof.after / tolerance)
+
+
+def _gross(proof: _Proof, reach: float) -> Iterator[Finding]:
+    """Yield the finding that rows far off for both arms alike, probably measured wrongly, make most of the error."""
+    if proof.rows is not None:
+        before, after = (found.main for found in proof.rows.errors)
+        if rows := _rows_off(proof.rows, far := _far(before) & _far(after)):
+            left = float(np.sqrt(np.mean(after[~far] ** 2)))
+            share = min(proof.before, proof.after) / reach
+            yield finding("gross-unseen-rows", rows=rows, without=left, times=proof.after / left, share=share)
+
+
+def _far(sizes: np.ndarray) -> np.ndarray:
+    return sizes > OUTLIER_SIGMAS * np.median(sizes)
+
+
+def _rows_off(rows: Comparison, far: np.ndarray) -> list[str]:
+    """Return number and error of the rows (m,) that are far off; none where errors are not of single rows."""
+    numbers, sizes = [int(row) for block in rows.blocks for row in block.rows], rows.errors[1].main
+    if len(numbers) != len(far):
+        return []
+    return [f"row {numbers[k]} ({1e3 * sizes[k]:.3g} mm)" for k in np.flatnonzero(far)]
 
 
 def _nothing_gained(found: Sequence[_Proof], findings: Findings) -> list[Finding]:
@@ -309,14 +334,11 @@ def _noticed(name: str, each: Comparison, usual: float) -> Iterator[Finding]:
     before, sizes = (found.main for found in each.errors)
     if np.median(before) > ELSEWHERE * usual:
         yield finding("validation-elsewhere", file=name, rms=float(np.median(before)))
-    rows = [int(row) for block in each.blocks for row in block.rows]
-    far = np.flatnonzero(sizes > OUTLIER_SIGMAS * np.median(sizes)) if len(sizes) == len(rows) else []
-    if len(far):
+    if rows := _rows_off(each, far := _far(sizes)):
         beyond = np.zeros(len(sizes), bool) if each.intervals is None else each.intervals.beyond
         yield finding(
-            "doubtful-rows", file=name, rows=[f"row {rows[k]} ({1e3 * sizes[k]:.3g} mm)" for k in far],
-            median=np.median(sizes), without=float(np.sqrt(np.mean(np.delete(sizes, far) ** 2))),
-            outside=int(np.count_nonzero(beyond[far])),
+            "doubtful-rows", file=name, rows=rows, median=np.median(sizes),
+            without=float(np.sqrt(np.mean(sizes[~far] ** 2))), outside=int(np.count_nonzero(beyond[far])),
         )  # fmt: skip
     if not each.settled:
         yield finding("placement-unsettled", file=name)

@@ -1,6 +1,7 @@
 """The verdict's rules, one by one."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,6 +23,14 @@ def rows(nominal, calibrated, proves=True, turned=None, alone=None, shares_frame
     return Comparison(
         (), (None, None), (sizes[0], sizes[1]), nothing, 50, "", proves, bare, shares_frames  # type: ignore[arg-type]
     )  # fmt: skip
+
+
+def with_row_off(nominal, calibrated, nominal_off, calibrated_off) -> Comparison:
+    """Return the comparison with other errors [mm] of row 7."""
+    found = rows(nominal, calibrated)
+    for each, off in zip(found.errors, (nominal_off, calibrated_off)):
+        each.main[7] = 1e-3 * off
+    return replace(found, blocks=(SimpleNamespace(rows=np.arange(50)),))
 
 
 FITTED = Findings("geometry", 1e-4, None, 0.0, np.inf)
@@ -60,6 +69,12 @@ SCALE = finding("lengths-grew", factor=1.01, sigma=1e-4, explained=0.9, off=0.01
         ({"a": rows(150.0, 149.0)}, {"reach": 1.0}, "fail", "placed-elsewhere"),
         ({"a": rows(150.0, 149.0, shares_frames=False)}, {"reach": 1.0}, "fail", "far-off"),
         ({"a": rows(150.0, 0.1)}, {"reach": 1.0}, "pass", ""),
+        # a row that is far off with both arms was measured wrongly; with one of them it is the arm's
+        ({"a": with_row_off(1.0, 0.1, 30.0, 30.0)}, {}, "marginal", "gross-unseen-rows"),
+        ({"a": with_row_off(1.0, 0.1, 3e3, 3e3)}, {"reach": 1.0}, "fail", "gross-unseen-rows"),
+        ({"a": with_row_off(1.0, 0.1, 30.0, 30.0)}, {"tolerance": 1e-3}, "fail", "above-tolerance"),
+        ({"a": with_row_off(1.0, 0.1, 1.0, 30.0)}, {}, "fail", "worse-than-nominal"),
+        ({"a": with_row_off(1.0, 0.1, 30.0, 0.1)}, {}, "pass", ""),
         # nothing to gain, like beside like
         ({"a": rows(0.3, 0.3)}, {"model": "frames", "reach": 1.0}, "pass", ""),
         ({"a": rows(0.3, 0.3)}, {"model": "frames", "reach": 1.0, "blind": ("b",)}, "marginal", "transfer-untested"),
