@@ -48,19 +48,8 @@ from calib.procedure.measuring.run import same_turn, write_run
 from calib.procedure.report import fit_report
 from calib.procedure.report.geometry_section import error_words, outlier_sentences, parameter_words
 from calib.procedure.report.outputs import write_fit
-from calib.procedure.session.folder import (
-    MASSES,
-    POSES,
-    POSES_CHECKED,
-    PREDICTED,
-    SELECTION,
-    SUMMARY,
-    UNSEEN,
-    VERDICT,
-    WAYS,
-    Say,
-    Session,
-)
+from calib.procedure.session import folder
+from calib.procedure.session.folder import Say, Session
 from calib.robot import calibrated
 from calib.robot.chain import Chain, joint_kinds
 from calib.robot.formats.urdf_tree import is_urdf
@@ -97,23 +86,23 @@ def _choose(session: Session, chain: Chain, say: Say) -> list[str]:
         f"random sets, {100 * found.efficiency:.1f} % of the convex bound ({selection.bound_words(found)})"
     )
     unseen = _unseen(session, robot_file, chain, section.validation)
-    sets = {POSES: q, UNSEEN: unseen} if section.validation else {POSES: q}
+    sets = {folder.POSES: q, folder.UNSEEN: unseen} if section.validation else {folder.POSES: q}
     for name, joints in sets.items():
         path = write_poses(session.path(f"2-poses/{name}"), joints, chain.joint_names, joint_kinds(chain))
         if settings.robot.controller:
             needed("write_program")(path, path.with_suffix(""), settings.robot.controller)
-    write_run(session.path(f"2-poses/{WAYS}"), chosen.run, chain)
+    write_run(session.path(f"2-poses/{folder.WAYS}"), chosen.run, chain)
     if chosen.prediction is not None:
-        write_prediction(chosen.prediction, session.path(f"2-poses/{POSES}"))
+        write_prediction(chosen.prediction, session.path(f"2-poses/{folder.POSES}"))
     outlook = chosen.outlook.poses
     if session.plots and np.isfinite(outlook.rms):
         from calib.procedure.report.charts import picture
         from calib.procedure.report.geometry_figures import predicted_map
 
         chart = predicted_map(outlook.points, outlook.spread)
-        files.write(session.path(PREDICTED), picture(chart, "").image)
+        files.write(session.path(folder.PREDICTED), picture(chart, "").image)
     record = {"words": words, **selection.record(chosen), "seed": settings.seed}
-    files.write_json(session.path(SELECTION), record)
+    files.write_json(session.path(folder.SELECTION), record)
     notes = [f"{len(q)} poses for the fit: {words}"]
     notes += [f"{len(unseen)} random poses for validation"] if section.validation else []
     numbers = (f"{words}: {number}" for words, number in selection.predicted_rows(chosen))
@@ -162,7 +151,7 @@ def _options_of(session: Session, paths: Sequence[Path] = ()) -> FitOptions:
             sigma = replace(sigma, orientation=(turn,) * 3)
         return replace(each, sigma=sigma)
 
-    lists = {path: session.path(f"2-poses/{UNSEEN if path in unseen else POSES}") for path in paths}
+    lists = {path: session.path(f"2-poses/{folder.UNSEEN if path in unseen else folder.POSES}") for path in paths}
     there = {path: plan for path, plan in lists.items() if session.settings.poses.plan and plan.exists()}
     own = {path.name: replace(options.for_file(path), planned=str(plan)) for path, plan in there.items()}
     files = {name: stated(each) for name, each in {**options.files, **own}.items()}
@@ -178,7 +167,7 @@ def describe(session: Session, say: Say) -> list[str]:
         lines.append(f"{joint.name}: {joint.kind}, {factor * joint.lower:g} to {factor * joint.upper:g} {unit}")
     lines += ["", "elements, base to tip [m, rad]"]
     lines += [f"  {element.name:<24} {element.axis}  {element.value:.9g}" for element in chain.elements]
-    files.write(session.path(SUMMARY), "\n".join(lines) + "\n")
+    files.write(session.path(folder.SUMMARY), "\n".join(lines) + "\n")
     if session.geometric:
         return [lines[0]]
     known = load_calibrated(session.robot_file, **session.links)
@@ -190,7 +179,7 @@ def describe(session: Session, say: Say) -> list[str]:
 def select(session: Session, say: Say) -> list[str]:
     """Choose poses for the fit, and random ones for validation, and return notes."""
     chain = chain_of(session)
-    for path in (session.path(f"2-poses/{name}") for name in (POSES, UNSEEN)):
+    for path in (session.path(f"2-poses/{name}") for name in (folder.POSES, folder.UNSEEN)):
         if path.exists() and filled_in(path, chain.n):
             raise UsageError(
                 f"{path} contains more than the planned poses and would be overwritten: move measurements to "
@@ -204,10 +193,10 @@ def arrive(session: Session, say: Say) -> list[str]:
     """Check the measured files for the fit, and return notes."""
     chain = chain_of(session)
     blocks, again = (read_measured(session, chain, session.brought(kind)) for kind in ("measured", "drift"))
-    notes = notes_on(session, chain, blocks, POSES)
+    notes = notes_on(session, chain, blocks, folder.POSES)
     for drift in offered("drift"):
         notes += lines_of(drift(session, chain, *([block for _, block in own] for own in (blocks, again))))
-    files.write(session.path(POSES_CHECKED), "\n".join(notes) + "\n")
+    files.write(session.path(folder.POSES_CHECKED), "\n".join(notes) + "\n")
     return notes
 
 
@@ -260,7 +249,7 @@ def readback(plan: np.ndarray, measured: PoseMeasurements) -> list[Finding]:
 
 def _fit_settings(session: Session) -> FitSettings:
     """Return the fit settings of ``session.toml``; a value ``auto`` leaves the choice to the options file."""
-    section, masses = session.settings.fit, session.path(MASSES)
+    section, masses = session.settings.fit, session.path(folder.MASSES)
     model, loss = (None if value == "auto" else value for value in (section.model, section.loss))
     return FitSettings(
         model=model, loss=loss, stations=section.stations, tolerance=1e-3 * section.tolerance_mm or None,
@@ -282,7 +271,7 @@ def _gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
 
 def fit(session: Session, say: Say) -> list[str]:
     """Fit the geometry to the measured files; validation files are not used."""
-    poses = session.path(f"2-poses/{POSES}")
+    poses = session.path(f"2-poses/{folder.POSES}")
     selection = read_prediction(poses) if session.settings.poses.plan and beside(poses).exists() else None
     outcome = fitting.run(_gathered(session), _options_of(session), _fit_settings(session), say, selection)
     outcome = replace(outcome, assessment=replace(outcome.assessment, verdict=UNJUDGED, deliverables={}))
@@ -300,7 +289,7 @@ def validate(session: Session, say: Say) -> list[str]:
     chain, unseen, fit, out = chain_of(session), session.brought("validation"), session.fit, session.validation
     before, report = fit.metrics(), fit_report.read(fit.report)
     like = _gathered(session).fit if any(path.is_dir() for path in unseen) else ()
-    notes = notes_on(session, chain, read_measured(session, chain, unseen, like), UNSEEN)
+    notes = notes_on(session, chain, read_measured(session, chain, unseen, like), folder.UNSEEN)
     say("comparing on unseen poses")
     given, options, wanted = _gathered(session, unseen), _options_of(session), _fit_settings(session)
     settings = Settings(wanted.loss or options.loss, options.loss_scale)
@@ -323,7 +312,7 @@ def export(session: Session, say: Say) -> list[str]:
     judged = {name: one.table() for name, one in by_file(out, found).items() if one.level}
     whole = {"schema": 1, **found.table(), "deliverable": session.settings.fit.deliverable, "files": judged}
     known = prediction(out)
-    files.write_json(session.path(VERDICT), whole | {"exported_prediction": known and asdict(known)})
+    files.write_json(session.path(folder.VERDICT), whole | {"exported_prediction": known and asdict(known)})
     return [*mark(out, found), *lines]
 
 

@@ -22,30 +22,8 @@ from calib.files import fingerprint
 from calib.procedure.excitation.coefficients import NAME as MOTION
 from calib.procedure.findings import Warned
 from calib.procedure.report.templates import versions
-from calib.procedure.session import dynamics_steps, geometry_steps
-from calib.procedure.session.folder import (
-    AS_GIVEN,
-    BROUGHT,
-    CUTS,
-    EXPORT,
-    MASSES,
-    MOTION_CHECKED,
-    POSES,
-    POSES_CHECKED,
-    PREDICTED,
-    PREDICTION,
-    SELECTION,
-    SETTINGS,
-    SUMMARY,
-    UNSEEN,
-    VERDICT,
-    WAYS,
-    Say,
-    Session,
-    StateFile,
-    StepRecord,
-    read_state,
-)
+from calib.procedure.session import dynamics_steps, folder, geometry_steps
+from calib.procedure.session.folder import Say, Session, StateFile, StepRecord, read_state
 from calib.procedure.session.geometry_steps import clear_staging
 from calib.procedure.session.settings import default_keys
 
@@ -100,7 +78,7 @@ def _paths(session: Session, name: str) -> Iterator[Path]:
     """Yield the paths of the files that a name in `SessionStep.reads` denotes."""
     left_out = () if session.geometric else FOLDERS["geometry"]
     left_out += () if session.dynamic else FOLDERS["dynamics"]
-    if name in BROUGHT:
+    if name in folder.BROUGHT:
         yield from session.files_brought(name)
     elif name.startswith("fit/"):
         yield session.fit.path / name.removeprefix("fit/")
@@ -108,34 +86,36 @@ def _paths(session: Session, name: str) -> Iterator[Path]:
         section, key = name.split(":")
         if named := getattr(getattr(session.settings, section), key):
             yield session.path(named)
-    elif not name.startswith(left_out) and not (name == VERDICT and session.geometric):
+    elif not name.startswith(left_out) and not (name == folder.VERDICT and session.geometric):
         yield session.path(name.replace("export/", f"{session.export}/"))
 
 
 MODEL = "torques,friction,method,options,payloads,holdout"
 STEPS = (
     SessionStep(
-        "describe", "read the robot", geometry_steps.describe, "robot:file", f"{SUMMARY} {AS_GIVEN}/*", "robot"
+        "describe", "read the robot", geometry_steps.describe, "robot:file",
+        f"{folder.SUMMARY} {folder.AS_GIVEN}/*", "robot"
     ),
     SessionStep(
         "select", "choose the poses to measure", geometry_steps.select, "robot:file poses:constraints",
-        f"2-poses/{POSES} 2-poses/{WAYS} 2-poses/{UNSEEN} {SELECTION} {PREDICTED} {PREDICTION}",
+        f"2-poses/{folder.POSES} 2-poses/{folder.WAYS} 2-poses/{folder.UNSEEN} "
+        f"{folder.SELECTION} {folder.PREDICTED} {folder.PREDICTION}",
         "robot instrument poses seed", "geometry",
         kept=(("measured",), "these poses were already measured; `calib redo select` chooses new ones"),
     ),
     SessionStep(
         "measure", "check what was measured", geometry_steps.arrive,
-        f"robot:file 2-poses/{POSES}? fit:options measured drift", POSES_CHECKED, "robot instrument poses fit",
-        "geometry", ("measured", "a file of measured poses"),
+        f"robot:file 2-poses/{folder.POSES}? fit:options measured drift", folder.POSES_CHECKED,
+        "robot instrument poses fit", "geometry", ("measured", "a file of measured poses"),
     ),
     SessionStep(
-        "fit", "fit the geometry", geometry_steps.fit, f"robot:file fit:options measured {MASSES}/dynamics.json?",
-        "4-fit/*",
+        "fit", "fit the geometry", geometry_steps.fit,
+        f"robot:file fit:options measured {folder.MASSES}/dynamics.json?", "4-fit/*",
         "robot instrument fit seed", "geometry",
     ),
     SessionStep(
         "validate", "validate the geometry on unseen poses", geometry_steps.validate,
-        f"fit/robot.toml fit/report.json 2-poses/{UNSEEN}? fit:options validation", "5-validation/*",
+        f"fit/robot.toml fit/report.json 2-poses/{folder.UNSEEN}? fit:options validation", "5-validation/*",
         "robot instrument poses fit seed", "geometry", ("validation", "a file of measured validation poses"),
     ),
     SessionStep(
@@ -146,18 +126,19 @@ STEPS = (
     ),
     SessionStep(
         "record", "check what was recorded", dynamics_steps.record,
-        f"fit/robot.toml 6-excitation/training/{MOTION}? dynamics:options training", f"{MOTION_CHECKED} {CUTS}",
+        f"fit/robot.toml 6-excitation/training/{MOTION}? dynamics:options training",
+        f"{folder.MOTION_CHECKED} {folder.CUTS}",
         "dynamics.plan,repeats,torques,options,payloads,holdout", "dynamics",
         ("training", "a recording of the training motion"),
     ),
     SessionStep(
         "identify", "identify the dynamics", dynamics_steps.identify,
-        f"fit/robot.toml {CUTS} dynamics:options training", "8-dynamics/*", f"dynamics.{MODEL} seed", "dynamics",
+        f"fit/robot.toml {folder.CUTS} dynamics:options training", "8-dynamics/*", f"dynamics.{MODEL} seed", "dynamics",
     ),
     SessionStep(
         "predict", "validate the dynamics on unseen motion", dynamics_steps.predict,
         "8-dynamics/robot.toml 8-dynamics/dynamics.json 8-dynamics/metrics.json "
-        f"6-excitation/validation/{MOTION}? {CUTS} dynamics:options training unseen",
+        f"6-excitation/validation/{MOTION}? {folder.CUTS} dynamics:options training unseen",
         "8-dynamics/unseen/*", f"dynamics.plan,validation,repeats,tolerance_percent,{MODEL} seed", "dynamics",
         ("unseen", "a recording of the validation motion"),
     ),
@@ -165,7 +146,7 @@ STEPS = (
         "export", "write the calibrated robot", geometry_steps.export,
         "robot:file fit/robot.toml 4-fit/robot.urdf 5-validation/metrics.json 8-dynamics/dynamics.json "
         "8-dynamics/estimate.csv 8-dynamics/covariance.csv 8-dynamics/unseen/report.json",
-        f"6-export/* 9-export/* {VERDICT}", "robot",
+        f"6-export/* 9-export/* {folder.VERDICT}", "robot",
     ),
 )  # fmt: skip
 
@@ -256,7 +237,7 @@ def _inputs(session: Session, step: SessionStep) -> dict[str, str]:
         section, _, keys = setting.partition(".")
         for key in keys.split(",") if session.dynamic or section != "dynamics" else ():
             values = settings[section]
-            place = f"{SETTINGS} [{section}] {key}".rstrip()
+            place = f"{folder.SETTINGS} [{section}] {key}".rstrip()
             marks[place] = json.dumps(values[key] if key else values, sort_keys=True)
     return marks
 
@@ -270,9 +251,9 @@ def changed_inputs(before: Mapping[str, str], now: Mapping[str, str]) -> str:
 
 def _value(name: str, mark: str) -> Any:
     """Return a fingerprint in comparable form: settings as values (3 equals 3.0), missing keys as their defaults."""
-    if not name.startswith(SETTINGS):
+    if not name.startswith(folder.SETTINGS):
         return mark
-    section, _, key = name.removeprefix(f"{SETTINGS} [").partition("]")
+    section, _, key = name.removeprefix(f"{folder.SETTINGS} [").partition("]")
     value = json.loads(mark)
     if key and mark != "{}":
         value = {key.strip(): value}
@@ -286,7 +267,7 @@ def run_next(session: Session, say: Say, progress: Say, command: str = "calib ne
     """
     clear_staging(session)
     with suppress(OSError):  # the folder of a session with the other stages is missing, or this one has files
-        os.replace(session.path(EXPORT[not session.dynamic]), session.path(session.export))
+        os.replace(session.path(folder.EXPORT[not session.dynamic]), session.path(session.export))
     while True:
         state = next((each for each in states(session) if each.kind not in (DONE, KEPT)), None)
         if state is None or state.kind == WAITING:
