@@ -122,7 +122,7 @@ def test_answers_that_cannot_be(answers, words):
 
 
 def test_a_selection_is_drawn_beside_its_poses_never_onto_what_is_read(tmp_path, capsys):
-    given = ["select", "lwr4plus", "-m", "8", "--candidates", "60", "--out"]
+    given = ["select", "lwr4plus", "-m", "12", "--candidates", "150", "--out"]
     assert run([*given, str(tmp_path / "a.csv")]) == 0
     written = {path.name for path in tmp_path.iterdir() if not path.name.startswith(".")}
     assert written == {"a.csv", "a_prediction.json", "a_predicted.png", "a_outlook.png"}

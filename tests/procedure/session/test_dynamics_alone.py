@@ -31,7 +31,7 @@ def recorded(folder: Path, what: str) -> Session:
     """
     robot = description.write(folder / "planted.toml", planted.arm())
     session = begin(folder / "cell", str(robot), "none", **MOTION)
-    one, two = planted.motion(0, 10.0), planted.motion(1, 10.0)
+    one, two = planted.motion(0), planted.motion(1)
     t = np.concatenate([one[0], one[0][-1] + 1.0 + two[0]])
     q, v, a = (np.concatenate(pair) for pair in zip(one[1:], two[1:]))
     tau = planted.torques(q, v, a) + 0.02 * np.random.default_rng(0).normal(size=q.shape)
