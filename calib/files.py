@@ -234,7 +234,7 @@ def check_not_input(targets: Iterable[Path], inputs: Iterable[str | Path | None]
     read = (one for path in inputs if path is not None for one in (path, str(path).rpartition("@")[0] or path))
     known = [path for path in map(Path, read) if os.path.exists(path)]  # False for names that no file can have
     for target in targets:
-        if any(same_file(target, path) for path in known):
+        if known and (place := target.resolve()).exists() and any(place.samefile(path) for path in known):
             raise UsageError(f"{target} is an input and would be overwritten; write elsewhere (--out)")
 
 

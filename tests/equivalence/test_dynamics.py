@@ -126,7 +126,7 @@ def by_session(session: Session) -> Judgement:
 def test_command_and_session_agree(
     session: Session, tmp_path: Path, change: Callable[[Series, Series], None], verdict: str
 ) -> None:
-    training, unseen = planted.series(0, noise=0.02), planted.series(7, noise=0.02)
+    training, unseen = (planted.series(seed, noise=0.02, duration=10.0) for seed in (0, 7))
     change(training, unseen)
     for name, series in (("training", training), ("validation", unseen)):
         np.savez(session.path(f"7-recorded/{name}.npz"), allow_pickle=False, **series)

@@ -22,11 +22,11 @@ from calib.robot.calibrated import Deflection, Term
 
 
 def measured_arm(kind: str, loss: str):
-    """Return the LWR4+ with a joint that gives way, measured 700 times; with a robust loss one row is 5 mm off."""
+    """Return the LWR4+ with a joint that gives way, measured 250 times; with a robust loss one row is 5 mm off."""
     arm = perturb(load("lwr4plus"), 1, 0.5e-3, 1e-3)
     truth = replace(cell(arm, 1), deflection=Deflection((Term("theta2", "torque", 1),), np.array([4e-5]), arm))
     pulled = lambda q: gravity_torques(load("lwr4plus"), q)  # noqa: E731
-    rows = measure(truth, kind, 700, 1, sigma=4e-5, sigma_rotation=1e-4, stated=False, torque=pulled)
+    rows = measure(truth, kind, 250, 1, sigma=4e-5, sigma_rotation=1e-4, stated=False, torque=pulled)
     position = rows.position.copy()
     position[70] += 5e-3 * (loss != "none")
     return replace(rows, position=position)

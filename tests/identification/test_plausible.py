@@ -49,8 +49,8 @@ def coded(found: list[Finding], *codes: str) -> list[Finding]:
 
 
 def test_a_sound_recording_is_not_remarked_upon() -> None:
-    assert found(recorded()) == []
     sizes = compare_sizes(case_of(recorded()), ARM)
+    assert findings([sizes], NAMES) == []
     assert sizes.masses[1] == pytest.approx(1.0, abs=0.15) and sizes.speed == pytest.approx(1.0, abs=1e-3)
 
 
@@ -102,9 +102,9 @@ def test_velocities_that_are_no_slopes_are_told(clock: float, level: str | None)
 
 @pytest.mark.parametrize("late", [0.0, 0.005, 0.02, 0.05, -0.05, 0.1, 0.2])
 def test_a_lag_of_all_torques_is_found_and_taken_back(late: float) -> None:
-    lag = compare_sizes(case_of(recorded(late)), ARM).lag
+    sizes = compare_sizes(case_of(recorded(late)), ARM)
+    lag, told = sizes.lag, coded(findings([sizes], NAMES), "torques-late")
     assert lag is not None and lag.seconds == pytest.approx(late, abs=0.001) and lag.certain == (abs(late) > 0.015)
-    told = coded(found(recorded(late)), "torques-late")
     assert [level_of(one) for one in told] == ([] if not lag.certain else ["fail" if abs(late) > 0.04 else "marginal"])
     if lag.certain:
         assert told[0].values["by"] == pytest.approx(abs(late), abs=5e-4)
@@ -143,9 +143,10 @@ def test_halves_that_disagree_and_short_motion_tell_no_lag() -> None:
 def test_one_joint_that_comes_late_is_no_clock_and_named() -> None:
     tau = recorded().effort.copy()
     tau[:, 2] = recorded(0.05).effort[:, 2]
-    lag = compare_sizes(case_of(recorded(tau=tau)), ARM).lag
+    sizes = compare_sizes(case_of(recorded(tau=tau)), ARM)
+    lag = sizes.lag
     assert lag is not None and not lag.certain and lag.joint == 2
-    (one,) = coded(found(recorded(tau=tau)), "torques-late", "joint-late")
+    (one,) = coded(findings([sizes], NAMES), "torques-late", "joint-late")
     assert (one.code, level_of(one), one.values["joint"]) == ("joint-late", "marginal", "joint3")
     assert one.values["way"] == "later" and one.values["by"] == pytest.approx(0.049, abs=5e-4)
 

@@ -41,7 +41,7 @@ def refitted(found: ParallelDynamics, known: ClosedRobot) -> np.ndarray:
 def test_sensitivities_are_those_of_identifications_on_other_geometries(name, rows):
     """On platform, motor and power rows, with a prior; constants that are choices of frames have none."""
     robot = fitted(find(name).known)
-    logs = [recorded(robot.known, load, seed=k, samples=600) for k, load in enumerate(((), ("5",)))]
+    logs = [recorded(robot.known, load, seed=k, samples=200) for k, load in enumerate(((), ("5",)))]
     found = identify_parallel(robot, logs, options=parse_options(LOADED | {"rows": rows}))
     carried, parameters = found.carried, robot.covariance.of(robot.known)
     directions = visible_directions(robot.known, parameters)

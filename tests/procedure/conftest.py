@@ -1,6 +1,7 @@
 """A small cell with a known truth: a UR5 whose parameters are a little off, seen by a tracker."""
 
 import csv
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -47,15 +48,21 @@ class Cell:
         return path
 
 
-@pytest.fixture
-def cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Cell:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("CALIB_DEBUG", raising=False)
+@pytest.fixture(scope="session")
+def cell_in() -> Callable[[Path], Cell]:
+    """Return a function that gives the cell whose files lie in a folder."""
     nominal = load("ur5")
     generator = np.random.default_rng(7)
     moved = [5e-4 if element.axis[0] == "t" else 2e-3 for element in nominal.elements]
     truth = nominal.with_values(nominal.values + np.array(moved) * generator.uniform(-1, 1, len(moved)))
-    return Cell(tmp_path, nominal, truth)
+    return lambda folder: Cell(folder, nominal, truth)
+
+
+@pytest.fixture
+def cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cell_in: Callable[[Path], Cell]) -> Cell:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("CALIB_DEBUG", raising=False)
+    return cell_in(tmp_path)
 
 
 @pytest.fixture

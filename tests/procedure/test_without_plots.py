@@ -14,11 +14,17 @@ def figures() -> bool:
     return True
 
 
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make figures as ever, but do not draw them: for what asks which are made."""
+    monkeypatch.setattr(style, "png", lambda figure, dpi=style.DPI: b"\x89PNG")
+
+
 def names(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
-def test_a_fit_without_plots_has_its_certificate_and_all_else(cell, calib):
+def test_a_fit_without_plots_has_its_certificate_and_all_else(cell, calib, undrawn):
     measured = cell.write("m.csv", cell.measure())
     arguments = ("fit", "ur5", measured, "--holdout", 0.25, "--model", "geometry")
     assert calib(*arguments, "--out", "with")[0] == calib(*arguments, "--out", "without", "--no-plots")[0] == 0
@@ -36,7 +42,7 @@ def test_a_fit_without_plots_loads_no_matplotlib(loaded):
     assert "matplotlib" not in loaded["fit without plots"]
 
 
-def test_ctrl_c_while_figures_are_drawn_leaves_nothing_half_made(cell, calib, monkeypatch):
+def test_ctrl_c_while_figures_are_drawn_leaves_nothing_half_made(cell, calib, monkeypatch, undrawn):
     measured = cell.write("m.csv", cell.measure(40))
     arguments = ("fit", "ur5", measured, "--model", "geometry", "--out", "o")
     drawn = []
@@ -55,7 +61,7 @@ def test_ctrl_c_while_figures_are_drawn_leaves_nothing_half_made(cell, calib, mo
     assert calib(*arguments)[0] == 0 and "plot_position.png" in names(cell.folder / "o")
 
 
-def test_an_identification_draws_each_figure_once_and_none_without_plots(tmp_path, calib, monkeypatch):
+def test_an_identification_draws_each_figure_once_and_none_without_plots(tmp_path, calib, monkeypatch, undrawn):
     import numpy as np
 
     monkeypatch.chdir(tmp_path)

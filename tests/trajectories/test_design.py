@@ -47,7 +47,7 @@ def problem(**options) -> ExcitationProblem:
 @cache
 def designed() -> tuple[ExcitationProblem, SearchResult]:
     spot = problem()
-    return spot, design(spot, starts=1, evaluations=150, seed=1)
+    return spot, design(spot, starts=1, evaluations=60, seed=1)
 
 
 def test_the_motion_found_keeps_every_limit_everywhere_by_pinocchio_too():

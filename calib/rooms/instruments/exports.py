@@ -119,8 +119,9 @@ def _grid(lines: Sequence[str]) -> Grid | None:
         for mark in ".," if separator != "," else ".":
             counts = [sum(bool(_NUMBER[mark].fullmatch(cell)) for cell in row) for _, row in cells]
             for k, (i, row) in enumerate(cells):
-                alike = [len(other) == len(row) and count >= 3 for (_, other), count in zip(cells[k:], counts[k:])]
-                if all(alike[:ROWS]) and counts[k] >= 0.3 * len(row):
+                near = zip(cells[k : k + ROWS], counts[k:])
+                alike = all(len(other) == len(row) and count >= 3 for (_, other), count in near)
+                if alike and counts[k] >= 0.3 * len(row):
                     if counts[k] > most:
                         above = [other for _, other in cells[max(k - STACK, 0) : k]]
                         wide = [(*other, *[""] * (len(row) - len(other))) for other in above if len(other) <= len(row)]

@@ -12,9 +12,11 @@ from without_figures import run
 from calib.column_changes import coupling
 from calib.identification.checks.recording_sizes import compare_sizes, signs_of
 from calib.identification.identify_options import parse_options
+from calib.identification.rows import Case
 from calib.procedure.dynamic_stage import plausibility
 from calib.procedure.dynamic_stage.gains import find_gains
 from calib.procedure.dynamic_stage.inputs import gather, read_motion
+from calib.robot.chain import Chain
 from calib.robot.library import load
 
 
@@ -343,23 +345,29 @@ def test_no_sign_and_no_order_of_a_sound_recording_is_called_wrong(data, log):
         assert not {"columns-exchanged", "zero-elsewhere"} & {one.code for one in plausibility.findings([sizes], names)}
 
 
-@pytest.mark.parametrize(("joint", "way"), [(1, 1.0), (2, 1.0), (2, -1.0), (4, -1.0)])
-def test_a_joint_of_a_panda_that_counts_from_the_one_before_it_is_named(data, joint, way):
+@pytest.fixture(scope="module")
+def panda(data) -> tuple[Chain, Case]:
+    """Return the arm and 8.5 s of its recording."""
     robot = data / "franka_panda_inria" / "model.urdf"
     (case,) = gather(robot, [f"{robot.parent / 'traj1_first60pct.npz'}@0:8.5"]).cases
+    return load(robot), case
+
+
+@pytest.mark.parametrize(("joint", "way"), [(1, 1.0), (2, 1.0), (2, -1.0), (4, -1.0)])
+def test_a_joint_of_a_panda_that_counts_from_the_one_before_it_is_named(panda, joint, way):
+    robot, case = panda
     matrix = coupling(7, joint, joint - 1, -way)
     motion = replace(case.motion, **{name: getattr(case.motion, name) @ matrix.T for name in "qva"})
-    found = signs_of(replace(case, motion=motion), load(robot))
+    found = signs_of(replace(case, motion=motion), robot)
     assert found is not None and (found.code, found.joints) == ("axis-coupled", (joint, joint - 1))
     assert found.changes[0].values["way"] == ("+" if way > 0 else "-") and found.factor < 0.4
 
 
 @pytest.mark.parametrize("joint", range(7))
-def test_a_reversed_sign_of_a_panda_is_named(data, joint):
-    robot = data / "franka_panda_inria" / "model.urdf"
-    (case,) = gather(robot, [f"{robot.parent / 'traj1_first60pct.npz'}@0:8.5"]).cases
+def test_a_reversed_sign_of_a_panda_is_named(panda, joint):
+    robot, case = panda
     signs = np.where(np.arange(7) == joint, -1.0, 1.0)
-    found = signs_of(replace(case, target=case.target * signs), load(robot))
+    found = signs_of(replace(case, target=case.target * signs), robot)
     assert found is not None and found.joints == (joint,)
     assert found.before[joint] > 4.0 * found.after[joint], "mean squares"
 

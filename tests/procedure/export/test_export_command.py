@@ -2,11 +2,14 @@
 
 import csv
 import re
+import shutil
+from contextlib import chdir
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from without_figures import run
 
 from calib import export
 from calib.procedure.export.geometry import export_offsets
@@ -18,15 +21,23 @@ from calib.robot.library import load
 from calib.transforms import from_xyz_rpy, to_xyz_rpy
 
 
-@pytest.fixture
-def fitted(cell, calib) -> Path:
-    """A source URDF with things that have to stay, and a fit of it."""
+@pytest.fixture(scope="module")
+def fitted_folder(cell_in, tmp_path_factory) -> Path:
+    """A folder with a source URDF with things that have to stay, and a fit of it."""
+    cell = cell_in(tmp_path_factory.mktemp("fitted"))
     text = write_new(cell.nominal)
     text = text.replace("</robot>", '  <!-- mine -->\n  <transmission name="t"><type>x</type></transmission>\n</robot>')
-    Path("source.urdf").write_text(text)
+    (cell.folder / "source.urdf").write_text(text)
     file = cell.write("a.csv", cell.measure(60))
-    code, _, err = calib("fit", "source.urdf", file, "--model", "geometry", "--out", "done")
-    assert code == 0, err
+    with chdir(cell.folder):
+        assert run("fit", "source.urdf", file, "--model", "geometry", "--out", "done") == 0
+    return cell.folder
+
+
+@pytest.fixture
+def fitted(cell, fitted_folder) -> Path:
+    """The fit, in a copy of that folder which is the working folder."""
+    shutil.copytree(fitted_folder, cell.folder, dirs_exist_ok=True)
     return Path("done")
 
 

@@ -143,11 +143,11 @@ def test_a_pose_file_from_another_station_needs_refitted_frames(cell, calib):
 
 def test_two_files_have_two_stations_unless_one_is_asked_for(cell, calib):
     file, other = cell.write("a.csv", cell.measure(40)), cell.write("b.csv", cell.measure(40, 1))
-    assert calib("fit", "ur5", file, other, "--model", "geometry", "--out", "each")[0] == 0
+    assert calib("fit", "ur5", file, other, "--model", "frames", "--out", "each")[0] == 0
     assert installation.read("each").station_names == ("a", "b")
-    assert calib("fit", "ur5", file, other, "--stations", "one", "--model", "geometry", "--out", "one")[0] == 0
+    assert calib("fit", "ur5", file, other, "--stations", "one", "--model", "frames", "--out", "one")[0] == 0
     assert installation.read("one").station_names == ("station",)
-    assert calib("fit", "ur5", file, other, "--tools", "each", "--model", "geometry", "--out", "tools")[0] == 0
+    assert calib("fit", "ur5", file, other, "--tools", "each", "--model", "frames", "--out", "tools")[0] == 0
     assert installation.read("tools").tool_names == ("a tool", "b tool")
 
 
@@ -175,10 +175,10 @@ def test_validation_files_may_follow_one_option_or_each_its_own(cell, calib):
     file = cell.write("a.csv", cell.measure(40))
     for name, seed in (("b.csv", 1), ("c.csv", 2)):
         cell.write(name, cell.measure(30, seed))
-    start = ("fit", "ur5", file, "--model", "geometry")
+    start = ("fit", "ur5", file, "--model", "frames")
     assert calib(*start, "--validate", "b.csv", "c.csv", "--out", "one")[0] == 0
     assert calib(*start, "--out", "two", "--validate", "b.csv", "--validate", "c.csv")[0] == 0
-    assert calib("fit", "--validate", "b.csv", "--out", "three", "ur5", file, "--model", "geometry")[0] == 0
+    assert calib("fit", "--validate", "b.csv", "--out", "three", "ur5", file, "--model", "frames")[0] == 0
     found = {name: json.loads(Path(name, "metrics.json").read_text()) for name in ("one", "two", "three")}
     assert found["one"] == found["two"]
     assert set(found["one"]["validation"]) == {"b.csv", "c.csv"}

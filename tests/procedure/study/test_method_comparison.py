@@ -14,10 +14,10 @@ from calib.procedure.dynamic_stage.inputs import gather
 from calib.rooms.studies.method_comparison import FAST_SECONDS, caveats, compare_methods
 
 
-def recorded(folder: Path) -> tuple[Path, Path]:
-    """Write two recordings with noise on the torques."""
+def recorded(folder: Path, duration: float = 10.0) -> tuple[Path, Path]:
+    """Write two recordings [s] with noise on the torques."""
     for name, seed in (("a.npz", 0), ("b.npz", 7)):
-        np.savez(folder / name, **planted.series(seed, noise=0.05))
+        np.savez(folder / name, **planted.series(seed, noise=0.05, duration=duration))
     return folder / "a.npz", folder / "b.npz"
 
 
@@ -39,7 +39,7 @@ def test_methods_are_ranked_by_unseen_motion(robot: Path, tmp_path: Path):
 
 def test_motion_that_was_learnt_from_ranks_nothing(robot: Path, tmp_path: Path):
     """Samples in both are refused; a copy of the motion under another name, here of other noise, is no evidence."""
-    train, other = recorded(tmp_path)
+    train, other = recorded(tmp_path, 20.0)
     end = float(np.load(train)["t"][-1])
     shared, apart = (
         gather(robot, [f"{train}@0:{part * end:.2f}"], [f"{train}@{0.5 * end:.2f}:"]) for part in (0.6, 0.5)
