@@ -86,8 +86,8 @@ class DriveTerm:
 
     def values(self, seen: Joined) -> np.ndarray:
         """Return the term's column (N,) for a motion, per unit of the parameter."""
-        if self.shape == "acceleration":
-            return seen.a
+        if self.shape in ("acceleration", "velocity"):
+            return seen.a if self.shape == "acceleration" else seen.v
         found = self._evaluated(seen, 1)[0]
         return found * np.abs(seen.load) if self.form.loaded and seen.load is not None else found
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dpotrf, dtrtri  # type: ignore[attr-defined]
 
 from calib.errors import Unidentifiable
@@ -153,8 +154,13 @@ def relevance(
     lam = np.bincount(family, counts * np.where(ridged, start, np.inf) ** -2.0, count + 1) / members
     information = np.bincount(family, np.diag(data.square), count + 1) / members
     beta, alive = 1.0, np.ones(count + 1, dtype=bool)
-    index, solution, effective = np.arange(len(groups)), np.zeros(len(groups)), 0.0
-    square, last = data.square, np.full(len(groups), np.inf)
+    # columns without a ridge are eliminated once, but where a search ends early, which looks at all columns
+    free = np.flatnonzero(~ridged & (settled == 0.0))
+    index = np.setdiff1d(np.arange(len(groups)), free)
+    root = _root(data.square[np.ix_(free, free)])
+    half, known = (solve_triangular(root, x[free], lower=True) for x in (data.square, data.cross))
+    square, cross = (data.square - half.T @ half)[np.ix_(index, index)], data.cross - half.T @ known
+    solution, effective, last = np.zeros(len(index)), 0.0, np.full(len(groups), np.inf)
     exact_residual = 1e-7  # ‖y - W x‖ relative to ‖y‖ below which a fit counts as perfect: WᵀW knows no better
     # a group is out once its prior is this many times as precise as the data on its columns (our choice)
     max_prior_weight = 2.0
@@ -163,14 +169,14 @@ def relevance(
         if len(inside) < len(index):
             index, square = index[inside], square.take(inside, 0).take(inside, 1)
         own = family[index]
-        solution, variance = _posterior(square, data.cross[index], lam[own], beta)
+        solution, variance = _posterior(square, cross[index], lam[own], beta)
         determined = np.where(own < count, 1.0 - lam[own] * variance, 0.0)
         gamma = np.bincount(own, determined, count + 1)
         size = np.bincount(own, solution**2, count + 1)
         lam[:count] = np.where(alive, np.maximum(gamma, 1e-12) / np.maximum(size, 1e-300), lam)[:count]
         alive[:count] &= (lam < max_prior_weight * beta * np.maximum(information, 1e-300))[:count]
         effective = float(gamma.sum())
-        misfit = data.total - 2.0 * solution @ data.cross[index]
+        misfit = data.total - known @ known - 2.0 * solution @ cross[index]
         misfit += solution @ square @ solution
         least = exact_residual**2 * max(data.total, 1e-300)  # what rounding leaves of a perfect fit
         beta = max(data.rows - effective - int((~ridged).sum()), 1.0) / max(float(misfit), least)
@@ -179,6 +185,7 @@ def relevance(
         last[index] = solution
     values, ridge = np.zeros(len(groups)), np.where(ridged, 0.0, np.inf)
     values[index] = solution
+    values[free] = solve_triangular(root, known - half @ values, trans=1, lower=True)
     kept = index[ridged[index]]
     ridge[kept] = 1.0 / np.sqrt(lam[groups[kept]])
     return Relevance(values, ridge, effective, float(1.0 / np.sqrt(beta)))
@@ -187,21 +194,24 @@ def relevance(
 def _posterior(
     square: np.ndarray, cross: np.ndarray, penalty: np.ndarray, beta: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and variances of x from WᵀW and Wᵀy.
+    """Return mean and variances of x from WᵀW and Wᵀy."""
+    if not len(cross):
+        return cross, cross
+    inverse, _ = dtrtri(_root(square, penalty / beta), lower=1, overwrite_c=1)  # the variances need no more
+    return (inverse @ cross) @ inverse, np.einsum("ij,ij->j", inverse, inverse) / beta
+
+
+def _root(square: np.ndarray, penalty: np.ndarray | float = 0.0) -> np.ndarray:
+    """Return the lower root of WᵀW with a penalty on its diagonal.
 
     A diagonal raised by 1e-12, or by as much more as it takes, keeps it regular to rounding: rows that repeat each
     other leave columns that no two poses distinguish.
     """
     for raised in 10.0 ** np.arange(-12.0, 1.0, 2.0):
         system = square.copy()
-        diagonal = system.flat[:: len(penalty) + 1]
-        system.flat[:: len(penalty) + 1] = np.maximum((diagonal + penalty / beta) * (1.0 + raised), 1e-280)
+        diagonal = system.flat[:: len(square) + 1]
+        system.flat[:: len(square) + 1] = np.maximum((diagonal + penalty) * (1.0 + raised), 1e-280)
         factor, failed = dpotrf(system.T, lower=1, overwrite_a=1)
         if not failed:
-            break
-    else:
-        raise Unidentifiable(
-            "the measurements cannot distinguish the model's terms. Are rows repeated? Measure more poses"
-        )
-    inverse, _ = dtrtri(factor, lower=1, overwrite_c=1)  # of the triangle: the variances need no more
-    return (inverse @ cross) @ inverse, np.einsum("ij,ij->j", inverse, inverse) / beta
+            return factor
+    raise Unidentifiable("the measurements cannot distinguish the model's terms. Are rows repeated? Measure more poses")

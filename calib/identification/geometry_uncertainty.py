@@ -340,7 +340,7 @@ def _differences(
     if torque_rows.projection is not None:  # which no geometry changes
         felt = np.einsum("nrk,nrc->nkc", torque_rows.projection.torques(q, v), felt)
     felt = replace(torque_rows, projection=None).fold(felt, (BODIES,))[:, :, 0]
-    change = np.empty((len(moved), model.bodies.n, len(q)))
+    change = np.zeros((len(moved), model.bodies.n, len(q)))
     pulled = np.zeros((bodies, len(moved)))
     block = 256  # samples at a time: the regressor of so many stays in the processor's cache
     for start in range(0, len(q), block):
@@ -348,12 +348,11 @@ def _differences(
         weights = np.ascontiguousarray(felt[part].T).ravel()
         out = np.zeros((bodies, model.bodies.n, min(block, len(q) - start)))  # what is zero is so in all of them
         regressor = out.reshape(bodies, -1)
-        for k, (above, below) in enumerate(moved):
-            for sign, one in ((1.0, above), (-1.0, below)):
+        for k, both in enumerate(moved):
+            for one, factor in zip(both, (0.5 / STEP, -0.5 / STEP)):
                 rigid_body.fill_regressor(one, q[part], v[part], a[part], out)
-                torque = (parameters @ regressor).reshape(model.bodies.n, -1)
-                change[k, :, part] = torque if sign > 0 else (change[k, :, part] - torque) / (2.0 * STEP)
-                pulled[:, k] += sign / (2.0 * STEP) * (regressor @ weights)
+                change[k, :, part] += factor * (parameters @ regressor).reshape(model.bodies.n, -1)
+                pulled[:, k] += factor * (regressor @ weights)
     rows = model.torque_rows.observe(change.transpose(2, 1, 0), (BODIES,) * len(moved), q, v)
     inertial = found.base.kept < bodies
     result = np.zeros((b, len(moved)))

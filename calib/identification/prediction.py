@@ -12,11 +12,12 @@ from typing import Generic
 import numpy as np
 from typing_extensions import TypeVar
 
+from calib.data.signals.filtering import longest
 from calib.data.signals.motion import moving
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.regressor_model import RegressorModel
 from calib.estimation.whiteness import Whiteness, examine, r_squared
-from calib.identification.rows import BLOCK, Case, segmented_states, segments
+from calib.identification.rows import BLOCK, Case, segmented_states
 from calib.records import Array, Frozen, Number
 
 
@@ -189,10 +190,8 @@ def _together(sums: Sequence[np.ndarray], apart: Sequence[int]) -> PredictionErr
 
 def _whiteness(residual: np.ndarray, segment: np.ndarray) -> tuple[Whiteness | None, ...]:
     """Return the whiteness tests of the longest segment of the decimated residuals (M, rows)."""
-    spans = segments(segment)
-    first, last = max(spans, key=lambda span: span[1] - span[0]) if spans else (0, 0)
     found: list[Whiteness | None] = []
-    for column in residual[first:last].T:
+    for column in residual[longest(segment)].T:
         enough = len(column) > 40 and np.ptp(column) > 0.0
         found.append(examine(column, min(30, len(column) // 2)) if enough else None)
     return tuple(found)

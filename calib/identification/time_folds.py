@@ -15,7 +15,7 @@ import numpy as np
 from calib.data.signals.filtering import Decimator, kept
 from calib.estimation.relevance import Gram, relevance
 from calib.estimation.triangles import Triangles
-from calib.identification.rows import Case, ObservationRows, pool
+from calib.identification.rows import Case, ObservationRows
 
 FAST_SHARE, END_SHARE = 0.1, 0.15  # of the rows: a joint's fastest, its hardest accelerated; at each end (our choice)
 
@@ -106,15 +106,15 @@ class CrossValidation:
         runs = np.array_split(np.arange(self.blocks), folds or self.blocks)
         key = len(runs).to_bytes(4, "little") + columns.tobytes()
         if key not in self._known:
-            fitted = self._fitted if (self.group[columns] < 0).all() else self._regularised
-            values = fitted(columns, runs)
-            each = [own for run, own in zip(runs, values) for _ in run]
+            each = [own for run, own in zip(runs, self._regularised(columns, runs)) for _ in run]
             self._known[key] = self._errors(columns, each)
         return self._known[key].copy()
 
     def extrapolated(self, columns: np.ndarray) -> np.ndarray:
         """Return the squared errors (ranges, rows) in each held-out range of motion of a model with these columns."""
         assert self.regimes is not None
+        if (key := b"ranges" + np.asarray(columns, dtype=int).tobytes()) in self._known:
+            return self._known[key]
         index, weight = np.append(columns, self.data.parameters), 1.0 / (self.std**2 * self.inflation)
         known = 0.0 if self.prior is None else self.prior[:, index].T @ self.prior[:, index]
         rounding = 1e-9 * (weight @ self.regimes.whole.diagonal(axis1=1, axis2=2))[index]
@@ -126,7 +126,7 @@ class CrossValidation:
             rows = int(np.sum((self.regimes.total - counts) / self.inflation))
             values = np.append(_regularised(rest, rows, self.group[columns], self._kinds[columns])[0], -1.0)
             result[k] = np.einsum("i,rij,j->r", values, held.take(index, 1).take(index, 2), values)
-        return np.maximum(result, 0.0)
+        return self._known.setdefault(key, np.maximum(result, 0.0))
 
     def _errors(self, columns: np.ndarray, values: list[np.ndarray]) -> np.ndarray:
         """Return the squared errors of parameter values (k,) per block."""
@@ -138,20 +138,12 @@ class CrossValidation:
             result[block] = np.sum((factors @ np.append(x, -1.0)) ** 2, axis=1)
         return result
 
-    def _fitted(self, columns: np.ndarray, runs: list[np.ndarray]) -> list[np.ndarray]:
-        """Return, for each run of blocks, the least-squares fit to all other blocks."""
-        chosen, group = self.data.select(columns), self.group[columns]
-        prior = None if self.prior is None else self.prior[:, np.append(columns, -1)]
-        folds = [[other for other in range(self.blocks) if other not in run] for run in runs]
-        pooled = (pool(chosen, self.rows, others) for others in folds)
-        return [estimate(data, self.std, self.inflation, group, prior)[0] for data in pooled]
-
     def _regularised(self, columns: np.ndarray, runs: list[np.ndarray]) -> list[np.ndarray]:
         """Return for each run of blocks the ridge estimate from all other blocks."""
         index, blocks = np.append(columns, self.data.parameters), np.arange(self.blocks)
         squares = self._squares.take(index, 1).take(index, 2)
         known = 0.0 if self.prior is None else self.prior[:, index].T @ self.prior[:, index]
-        samples = self.counts()
+        samples = self.data.rows.reshape(-1, self.rows)[: self.blocks]
         found = []
         for run in runs:
             others = ~np.isin(blocks, run)
@@ -171,10 +163,6 @@ class CrossValidation:
         weight = np.tile(1.0 / (self.std**2 * self.inflation), self.blocks)
         squares = (factors.transpose(0, 2, 1) * weight[:, None, None]) @ factors
         return squares.reshape(self.blocks, self.rows, *squares.shape[1:]).sum(axis=1)
-
-    def counts(self) -> np.ndarray:
-        """Return the number of samples (blocks, rows)."""
-        return self.data.rows.reshape(-1, self.rows)[: self.blocks]
 
 
 def estimate(

@@ -161,6 +161,7 @@ def rearranged(samples: MotionSamples, chain: Chain) -> Explanation | None:
     The torques are those of the robot's own masses, and what is left of each joint's is a share of its variance.
     """
     n, masses = chain.n, standard_parameters(chain)
+    samples = replace(samples, index=np.arange(len(samples.index)), effort=samples.torque)
 
     def exchanged(pair: tuple[int, int]) -> Callable[[MotionSamples], MotionSamples]:
         return lambda data: replace(_changed(data, exchange(n, *pair)), effort=data.effort @ exchange(n, *pair))

@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+import scipy.linalg
 
 from calib.data.signals.filtering import Decimator, kept
 from calib.dynamics import drives
@@ -150,8 +151,7 @@ def select_friction(
     say("friction: columns")
     sensed = candidates.torque_rows.sensed
     steps_tried = [name for name in NAMES[2:-1] if wanted == name or (wanted == "auto" and (sensed or name != "cable"))]
-    offered = {name: _terms(candidates, name) for name in steps_tried}
-    offered = {name: terms for name, terms in offered.items() if terms or name == wanted}
+    offered = {name: terms for name, terms in _terms(candidates, steps_tried).items() if terms or name == wanted}
     every = [one for terms in offered.values() for one in terms]
     validation, place = _cross_validation(candidates, offered, every)
     bench = _Bench(candidates, validation, every, wanted != "auto")
@@ -288,17 +288,15 @@ def _pays(before: np.ndarray, after: np.ndarray, min_blocks_won: float = 0.6) ->
     return bool(after.sum() < (1.0 - MIN_GAIN) ** 2 * before.sum() and lower >= min_blocks_won)
 
 
-def _terms(candidates: FrictionCandidates, name: str) -> list[DriveTerm]:
-    """Return the candidate terms of a step for all joints."""
-    found: list[DriveTerm] = []
-    if name == "coupling":
-        return _couplings(candidates)
+def _terms(candidates: FrictionCandidates, names: Sequence[str]) -> dict[str, list[DriveTerm]]:
+    """Return the candidate terms of steps for all joints."""
+    found = {name: _couplings(candidates) if name == "coupling" else [] for name in names}
     for j in range(candidates.n):
         v = np.concatenate([np.abs(case.motion.v[:, j]) for case in candidates.cases])
         travel = float(np.ptp(np.concatenate([case.motion.q[:, j] for case in candidates.cases])))
         seen = JointRange(float(candidates.v0[j]), float(np.quantile(v, 0.98)), float(v.max()), travel)
-        if seen.peak > 0.0:
-            found += drives.offered(name, j, seen, bool(candidates.linear[j]))
+        for name in found.keys() & STEPS.keys() if seen.peak > 0.0 else ():
+            found[name] += drives.offered(name, j, seen, bool(candidates.linear[j]))
     return found
 
 
@@ -313,7 +311,8 @@ def _couplings(candidates: FrictionCandidates, min_explained: float = 0.05) -> l
     if not candidates.torque_rows.motors_alone:
         return []
     matrix, target, motion = _sampled(candidates)
-    basis = np.linalg.qr((matrix / candidates.std[:, None]).reshape(-1, matrix.shape[2]))[0]
+    rows = (matrix / candidates.std[:, None]).reshape(-1, matrix.shape[2])
+    basis = np.asarray(scipy.linalg.qr(rows, mode="economic")[0])
     y = (target / candidates.std).ravel()
     left = y - basis @ (basis.T @ y)
     size = np.sum(left.reshape(-1, n) ** 2, axis=0)

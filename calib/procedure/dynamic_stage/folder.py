@@ -115,10 +115,6 @@ class UnseenFolder:
         for number, case in enumerate(inputs.unseen, 1):
             predicted, expected = found.predictions[case.name], found.intervals.get(case.name)
             _write_torques(inputs, case, predicted, expected, self.path / f"torques_{number}.csv")
-        self.write_report(inputs, found)
-
-    def write_report(self, inputs: IdentificationInputs, found: Assessment) -> None:
-        """Write the report alone."""
         files.write_json(self.report, UnseenReport.of(inputs, found))
 
     def read(self) -> UnseenReport:

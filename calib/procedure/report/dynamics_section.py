@@ -4,6 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -94,6 +95,9 @@ class DynamicReport:
     unseen: UnseenReport
 
 
+_UNSEEN: WeakKeyDictionary[IdentificationOutcome, UnseenReport] = WeakKeyDictionary()  # for console and folder
+
+
 def read(folder: Path) -> DynamicReport:
     """Read the results of the steps identify and predict.
 
@@ -130,10 +134,17 @@ def read_lines(inputs: IdentificationInputs) -> list[str]:
     return [*lines, *(f"  {note}".replace(":: ", ": ") for note in inputs.notes)]
 
 
-def of_outcome(outcome: IdentificationOutcome) -> DynamicReport:
-    """Return the report of an identification without its parameters."""
+def of_outcome(outcome: IdentificationOutcome, folder: Path | None = None) -> DynamicReport:
+    """Return the report of an identification.
+
+    Args:
+        folder: written for it, of which its parameters are read; None: without them.
+    """
     effects = () if outcome.carried is None else geometry_tables.effects(outcome.carried)
-    return DynamicReport(record_of(outcome), (), tuple(effects), UnseenReport.of(outcome.inputs, outcome))
+    estimate = () if folder is None else read_estimate(folder, IdentifiedParameter)
+    if outcome not in _UNSEEN:
+        _UNSEEN[outcome] = UnseenReport.of(outcome.inputs, outcome)
+    return DynamicReport(record_of(outcome), estimate, tuple(effects), _UNSEEN[outcome])
 
 
 def outcome_section(outcome: IdentificationOutcome) -> page.Section:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from calib.extensions import offered
+from calib.files import write_json
 
 if TYPE_CHECKING:
     from calib.procedure.dynamic_stage.identify import IdentificationOutcome
@@ -46,8 +47,8 @@ def write_model(outcome: IdentificationOutcome, folder: Path, plots: bool = True
         charts.save_all(dynamics_figures.friction(outcome), folder)
     if not pages:
         return
-    UnseenFolder(folder).write_report(outcome.inputs, outcome)
-    report = dynamics_section.read(folder)
+    report = dynamics_section.of_outcome(outcome, folder)
+    write_json(UnseenFolder(folder).report, report.unseen)
     if plots:
         drawn = charts.saved(dynamics_figures.captioned(report, folder), folder)
     for write in offered("model_pages"):

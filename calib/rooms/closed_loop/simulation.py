@@ -341,8 +341,8 @@ def feed_forward(believed: Plant, reference: Reference) -> np.ndarray:
     model = IdentificationModel(believed.bodies, believed.terms)
     block = 4096  # instants at a time
     parts = [slice(k, k + block) for k in range(0, len(reference.t), block)]
-    regressors = (model.regressor(reference.q[part], reference.v[part], reference.a[part]) for part in parts)
-    return np.concatenate([regressor @ believed.parameters for regressor in regressors])
+    states = ((reference.q[part], reference.v[part], reference.a[part]) for part in parts)
+    return np.concatenate([model.torque(believed.parameters, *each) for each in states])
 
 
 def tracking_error(
