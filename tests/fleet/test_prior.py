@@ -97,3 +97,21 @@ def test_a_bent_and_a_loose_tool_are_named() -> None:
     assert named["T2"]["times"] is None and named["T2"]["moved"] == pytest.approx(2e-3, rel=0.2)
     assert named["T4"]["moved"] is None and 2.0 < named["T4"]["times"] < 4.5
     assert not [one for one in tools({name: row for name, row in used.items() if row[0] == "T2"}) if one.findings()]
+
+
+def test_few_arms_that_happen_to_agree_accuse_no_tool() -> None:
+    """Of three arms with each of two equal tools, 3 σ are exceeded as seldom as said, in distance and in error."""
+    random, sigmas = np.random.default_rng(3), []
+    for _ in range(500):
+        rows = [(1e-4 * random.standard_normal(3), np.exp(0.2 * random.standard_normal())) for _ in range(6)]
+        found = tools({f"arm{k}": (f"T{k % 2}", *row) for k, row in enumerate(rows)})
+        sigmas += [(one.moved_sigmas, one.times_sigmas) for one in found]
+    beyond = (np.abs(np.array(sigmas, dtype=float)) > 3.0).mean(axis=0)
+    assert (beyond < 0.01).all(), beyond
+
+
+def test_three_arms_show_a_tool_that_is_far_off() -> None:
+    random = np.random.default_rng(4)
+    noise = 3e-5 * random.standard_normal((6, 3))
+    used = {f"arm{k}": (f"T{k % 2}", np.array([4e-3 * (k % 2), 0.0, 0.1]) + noise[k], 5e-5) for k in range(6)}
+    assert all(one.findings() for one in tools(used))
