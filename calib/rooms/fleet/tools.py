@@ -9,7 +9,7 @@ from scipy import stats
 from calib.errors import Finding, finding
 
 MIN_ARMS = 2, 3  # with the tool, and with others, that a comparison needs (our choice)
-SIGMAS = 3.0  # between medians, above it a tool is named (our choice)
+SIGMAS = 2.6  # between medians, above it a tool is named: 99 %, as of other findings
 MIN_TIMES = 1.5  # of the others' error, below it a tool is not called loose (our choice)
 
 
@@ -68,17 +68,21 @@ def _use(name: str, used: Mapping[str, tuple[str, np.ndarray, float]]) -> ToolUs
 
 
 def _sigmas(step: np.ndarray, groups: Sequence[np.ndarray]) -> float:
-    """Return how unlikely the difference (k,) of the medians of two groups is, as deviation of a normal variable.
+    """Return how unlikely the difference `step` (k,) of two groups' medians is, as deviation of a normal variable.
 
-    The scatter is that of the arms (n, k) about their own group's median, by the median of their distances; one arm
-    of each group counts for its median. The ratio of the two follows about an F distribution, as of few arms.
+    The scatter is that of the arms (n, k) about the median of their own group, as if all of it were along the
+    difference: a tool's position scatters most along the last axis, where it cannot be told from the arm's last link.
     """
-    of_median = np.sqrt(np.pi / 2.0)  # σ of a median, in that of a mean (normal distribution)
-    min_scatter, min_p = 1e-6, 1e-300  # [m, or of a logarithm]
-    worth = 0.7  # degrees of freedom of a coordinate's deviation (ours: simulated, 3 σ are exceeded in 0.3 % at most)
-    size = len(step)
-    away = np.concatenate([np.sort(np.linalg.norm(one - np.median(one, axis=0), axis=1))[1:] for one in groups])
-    scatter = max(np.median(away) / np.sqrt(stats.chi2.median(size)), min_scatter)
-    square = float(step @ step) / (of_median * scatter) ** 2 / sum(1.0 / len(one) for one in groups)
-    p = stats.f.sf(square / size, size, worth * size * len(away))
-    return float(stats.norm.isf(max(p, min_p) / 2.0))
+    far, worth, min_scatter, min_p = (
+        3.0,
+        0.8,
+        1e-6,
+        1e-300,
+    )  # of typical distances; share of the degrees of freedom (ours)
+    away = [np.sort(np.linalg.norm(one - np.median(one, axis=0), axis=1)) for one in groups]
+    typical = np.median(np.concatenate([one[1:] for one in away]))  # without the arm that is the median itself
+    freedom = sum(len(one) - 1 for one in groups)
+    variance = np.sum(np.minimum(np.concatenate(away), far * typical) ** 2) / freedom
+    of_medians = sum(np.pi / (2.0 * (len(one) - 1) + np.pi) for one in groups)  # in variances of one arm, if normal
+    square = float(step @ step) / max(variance, min_scatter**2) / of_medians
+    return float(stats.norm.isf(max(stats.f.sf(square, 1, worth * freedom), min_p) / 2.0))
