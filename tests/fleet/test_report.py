@@ -78,6 +78,9 @@ def test_a_failed_fit_is_no_part_of_the_distribution(fits: Path, tmp_path: Path)
     named = {(one.code, one.values["reason"]) for one in found.noticed if "reason" in one.values}
     assert {("arm-failed", "two's reason"), ("arm-failed", "odd's reason"), ("arm-marginal", "one's reason")} <= named
     assert "arms-without-serial" in [one.code for one in found.noticed] and "2 failed" in found.verdict.reason
+    five = report.report_fleet([fits / "two", *(tmp_path / name for name in ("one", "two", "three", "odd"))])
+    (unnamed,) = [one for one in five.noticed if one.code == "tools-unnamed"]
+    assert unnamed.values["tool"] == "tool" and unnamed.values["away"] < 5e-3
     alone = report.report_fleet(tmp_path / "two")
     assert alone.verdict == "fail" and not alone.types[0].parameters
     alone.save(tmp_path / "out")
