@@ -97,3 +97,29 @@ def test_a_bent_and_a_loose_tool_are_named() -> None:
     assert named["T2"]["times"] is None and named["T2"]["moved"] == pytest.approx(2e-3, rel=0.2)
     assert named["T4"]["moved"] is None and 2.0 < named["T4"]["times"] < 4.5
     assert not [one for one in tools({name: row for name, row in used.items() if row[0] == "T2"}) if one.findings()]
+
+
+def test_few_arms_that_happen_to_agree_accuse_no_tool() -> None:
+    """Of three arms with each of two equal tools, 2.6 σ are exceeded as seldom as said, in distance and in error.
+
+    The tool's position scatters along one axis, as it does where that is also the last link's.
+    """
+    random, sigmas = np.random.default_rng(3), []
+    for _ in range(500):
+        rows = [
+            ([3e-5, 3e-5, 1e-3] * random.standard_normal(3), np.exp(0.2 * random.standard_normal())) for _ in range(6)
+        ]
+        found = tools({f"arm{k}": (f"T{k % 2}", *row) for k, row in enumerate(rows)})
+        sigmas += [(one.moved_sigmas, one.times_sigmas) for one in found]
+    beyond = (np.abs(np.array(sigmas, dtype=float)) > 2.6).mean(axis=0)
+    assert (beyond < 0.02).all(), beyond
+
+
+def test_three_arms_show_a_tool_that_is_far_off() -> None:
+    """Heights [mm] of six simulated arms' tools, one 4 mm longer; with the names exchanged, none is accused."""
+    heights = {"A": (99.426, 100.962, 100.204), "B": (104.099, 104.56, 103.478)}
+    used = {f"{tool}{z}": (tool, np.array([0.05, 0.02, 1e-3 * z]), 5e-5) for tool, own in heights.items() for z in own}
+    assert all(one.findings() for one in tools(used))
+    mixed = {arm: (("A" if number < 4 else "B"), *row[1:]) for number, (arm, row) in enumerate(used.items())}
+    exchanged = {arm: (f"T{number % 2}", *row[1:]) for number, (arm, row) in enumerate(used.items())}
+    assert not [one for each in (mixed, exchanged) for one in tools(each) if one.findings()]

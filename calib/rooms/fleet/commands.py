@@ -52,10 +52,16 @@ def fleet(calibrations: list[Path], out: Path | None = None) -> None:
     With --out, each type gets a prior for its next arm, which then needs fewer poses:
     calib fit fleet/prior/ur5 measured.csv --options fleet/prior/ur5/options.toml
 
+    Arms whose fit failed are named, and left out of the prior; so are sessions without a verdict.
+
+    Tools are compared by their names, which the options of each fit give (tool = "ball B"); without one, all are called
+    'tool'. A comparison needs two arms with the tool, and three with others.
+
     Example: calib fleet cell1 cell2 cell3 --out fleet
 
     Args:
-        calibrations: folders of fits or sessions; those of one robot (serial number) in order of time
+        calibrations: folders of fits or sessions; those of one robot (serial number) in order of time: by measured_on,
+            else by the day the session was made, else as given
         out: folder for the report and the priors. Default: nothing is written
     """
     from calib.rooms.fleet.report import report_fleet

@@ -13,7 +13,7 @@ from rich.text import Text
 
 from calib import bug_reports, files
 from calib.arguments import checked
-from calib.errors import CalibError, TaskLost, complaint
+from calib.errors import CalibError, SessionError, TaskLost, complaint
 from calib.procedure.findings import LEVELS
 from calib.procedure.session.commands import COLOURS, go_on
 from calib.procedure.session.folder import SETTINGS, Say
@@ -26,7 +26,7 @@ from calib.workers import Workers
 from calib.workers import workers as opened
 
 LOG = "run.log"
-WAITS, FAILED = "waits", "failed"  # what a session comes to, or `DONE`
+WAITS, BUSY, FAILED = "waits", "busy", "failed"  # what a session comes to, or `DONE`
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class FleetRow:
 
     Attributes:
         folder: of the session.
-        state: `DONE`, `WAITS` or `FAILED`.
+        state: `DONE`, `WAITS`, `BUSY` (another command works on it) or `FAILED`.
         verdict: of a session that is done.
         words: what it waits for, or what went wrong.
         asks: what to do at the robot now, in lines.
@@ -85,7 +85,8 @@ def run_sessions(
         command: for the sessions' records.
 
     Returns:
-        Rows as sessions end: ``folder``, ``state`` (done, waits or failed), ``verdict``; ``print`` says what to do now.
+        Rows as sessions end: ``folder``, ``state`` (done, waits, busy or failed), ``verdict``; ``print`` says what to
+        do now.
 
     Raises:
         UsageError: for a session that is named twice, or where none is.
@@ -126,7 +127,8 @@ def run_one(folder: Path | str, command: str = "calib run", plots: bool = True, 
         with stores.held(folder, lease) as copy:
             outcome = _run_here(copy, command, plots)
     except CalibError as error:
-        outcome = FleetRow(folder, FAILED, words=str(error), code=2)
+        state = BUSY if isinstance(error, stores.Busy) else FAILED
+        outcome = FleetRow(folder, state, words=str(error), code=2)
     return replace(outcome, folder=folder, seconds=time.perf_counter() - started)
 
 
@@ -138,8 +140,9 @@ def _run_here(folder: Path, command: str, plots: bool) -> FleetRow:
         foreseen = complaint(error)
         words, code = foreseen or (bug_reports.report(error, command.split()[1:], folder), bug_reports.CODE)
         said.append(f"failed: {words}")
-        outcome = FleetRow(str(folder), FAILED, words=words, code=code)
-    if (folder / SETTINGS).exists():
+        busy = isinstance(error, SessionError) and words.startswith((f"{folder} is busy", f"{folder} was busy"))
+        outcome = FleetRow(str(folder), BUSY if busy else FAILED, words=words, code=code)
+    if (folder / SETTINGS).exists() and outcome.state != BUSY:  # the log is of the command that works on it
         with suppress(CalibError):  # a full disk, a folder that cannot be written: said already
             files.write(folder / LOG, "\n".join(said) + "\n")
     return replace(outcome, seconds=time.perf_counter() - started)
@@ -164,7 +167,7 @@ def table(outcomes: Sequence[FleetRow]) -> RenderableType:
         found.add_column(name, justify="right", no_wrap=True)
     names = [Path(one.folder).resolve().name for one in outcomes]
     for one, name in zip(outcomes, names):
-        state, verdict = (Text(x, COLOURS[x]) if x else "" for x in (one.state, one.verdict))
+        state, verdict = (Text(x, COLOURS.get(x, "yellow")) if x else "" for x in (one.state, one.verdict))
         numbers = ["" if x is None else f"{x:.3g}" for x in (one.nominal, one.calibrated, one.torque)]
         shown = name if names.count(name) == 1 else one.folder
         found.add_row(Text(shown), state, verdict, *numbers, f"{one.seconds:.1f}")
@@ -175,14 +178,16 @@ def remarks(outcomes: Sequence[FleetRow]) -> Iterator[str]:
     """Yield a line for each incomplete session: the missing file, or the error."""
     for one in outcomes:
         if one.state != DONE:
-            yield f"{one.folder} {one.state}{' for ' if one.state == WAITS else ': '}{one.words}"
+            said = {WAITS: f"{one.folder} waits for ", FAILED: f"{one.folder} failed: "}.get(one.state, "")
+            yield f"{said}{one.words}"
 
 
 def summary(outcomes: Sequence[FleetRow], seconds: float) -> str:
     """Return one line with the number of sessions for each state and verdict."""
-    counts = {state: sum(one.state == state for one in outcomes) for state in (DONE, WAITS, FAILED)}
+    counts = {state: sum(one.state == state for one in outcomes) for state in (DONE, WAITS, BUSY, FAILED)}
     judged = {level: sum(one.verdict == level for one in outcomes) for level in LEVELS}
     words = ", ".join(f"{count} {level}" for level, count in judged.items() if count)
     parts = [f"{counts[DONE]} of {len(outcomes)} done" + (f" ({words})" if words else "")]
-    parts += [f"{counts[state]} {words}" for state, words in ((WAITS, "waiting"), (FAILED, "failed")) if counts[state]]
+    shown = {WAITS: "waiting", BUSY: BUSY, FAILED: FAILED}
+    parts += [f"{counts[state]} {words}" for state, words in shown.items() if counts[state]]
     return f"{', '.join(parts)}; {seconds:.1f} s"

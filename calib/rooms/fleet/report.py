@@ -14,18 +14,18 @@ import numpy as np
 from calib import files, folders
 from calib.api.rendering import Judged
 from calib.arguments import checked
-from calib.errors import Finding, RobotError, UsageError, finding, require
+from calib.errors import Finding, RobotError, counted, finding
 from calib.geometry.fit import PLAUSIBLE
 from calib.procedure.findings import Verdict, lines_of, settle
 from calib.procedure.report.page import Block, Column, Section, Text, table
-from calib.procedure.session.results import folders_of
 from calib.records import plain
 from calib.rooms.fleet import prior
 from calib.rooms.fleet.prior import ParameterSpread
-from calib.rooms.fleet.tools import ToolUse, tools
-from calib.rooms.over_time.comparison.calibrations import Calibration, read_fit
+from calib.rooms.fleet.tools import MIN_ARMS, MIN_TIMES, ToolUse, tools
+from calib.rooms.fleet.visits import visits
+from calib.rooms.over_time.comparison.calibrations import Calibration
 from calib.rooms.over_time.comparison.geometry_change import ToolMotion
-from calib.rooms.over_time.comparison.places import check_same_robot, place_of
+from calib.rooms.over_time.comparison.places import check_same_robot
 from calib.rooms.over_time.comparison.robot_change import RobotChange, diff
 from calib.units import small
 
@@ -40,13 +40,15 @@ class ArmType:
     Attributes:
         name: of the description, with a number where several descriptions have one name.
         arms: their calibrations.
-        odd: names of those whose geometry is not plausible for this type: no part of `parameters`.
+        failed: names of those whose fit's verdict is fail: no part of `parameters`.
+        odd: names of others whose geometry is not plausible for this type: no part of `parameters`, either.
         parameters: their distribution.
         tools: of all arms.
     """
 
     name: str
     arms: tuple[Calibration, ...]
+    failed: tuple[str, ...]
     odd: tuple[str, ...]
     parameters: tuple[ParameterSpread, ...]
     tools: tuple[ToolUse, ...]
@@ -54,7 +56,7 @@ class ArmType:
     @property
     def plausible(self) -> list[Calibration]:
         """The arms that `parameters` are of."""
-        return [one for one in self.arms if one.name not in self.odd]
+        return [one for one in self.arms if one.name not in (*self.failed, *self.odd)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +67,8 @@ class FleetReport(Judged):
         types: the arms by their nominal description.
         changes: (serial number, comparison of two consecutive calibrations of that arm).
         noticed: findings, worst first.
-        verdict: marginal where an arm drifted, a tool is bad, or an arm is unlike its type.
+        verdict: marginal where a fit failed, an arm drifted, a tool is bad, or an arm is unlike its type; fail where
+            all arms of a type failed.
     """
 
     types: tuple[ArmType, ...]
@@ -115,8 +118,8 @@ class FleetReport(Judged):
         """Return the numbers as in ``metrics.json`` [SI]."""
         types = {
             one.name: {
-                "arms": [each.name for each in one.arms], "odd": one.odd, "parameters": one.parameters,
-                "tools": one.tools,
+                "arms": [each.name for each in one.arms], "failed": one.failed, "odd": one.odd,
+                "parameters": one.parameters, "tools": one.tools,
             }
             for one in self.types
         }  # fmt: skip
@@ -136,7 +139,8 @@ def _tables(one: ArmType) -> list[Block]:
     used = [
         Column("tool", "{0.tool}", number=False), Column("arms", lambda row: f"{len(row.arms)}"),
         Column("from the others' mm", lambda row: f"{1e3 * row.moved:.3g}"), Column("σ", "{0.moved_sigmas:.1f}"),
-        Column("error, times the others'", "{0.times:.2g}"), Column("σ ", "{0.times_sigmas:.1f}"),
+        Column("error, times the others'", "{0.times:.3g}"),
+        Column("σ ", lambda row: f"{row.times_sigmas:.1f}" if row.times > MIN_TIMES else ""),
     ]  # fmt: skip
     arms = [
         Column("arm", lambda row: row.serial or row.name, number=False), Column("calibrated", "{0.name}", number=False),
@@ -155,22 +159,21 @@ def report_fleet(calibrations: str | Path | Sequence[str | Path]) -> FleetReport
     """Compare the calibrations of many arms.
 
     Args:
-        calibrations: folders of fits or sessions. Sessions that state one serial number are of one arm, the earliest
-            first; a fit states none and counts as an arm of its own.
+        calibrations: folders of fits or sessions. Sessions that state one serial number are of one arm, in order of
+            their dates; a fit states none and counts as an arm of its own. Sessions without a verdict are left out.
 
     Returns:
         ``types`` with the distribution of each parameter, ``changes``, ``noticed``, `save`.
 
     Raises:
-        UsageError: for a folder that holds no fit, or one given twice.
+        UsageError: for a folder that holds no fit, or one given twice; where unfinished sessions leave one or none.
     """
-    found = [_fit_of(folder) for folder in folders_of(calibrations)]
-    visits: dict[str, list[Calibration]] = {}
-    for one in found:
-        visits.setdefault(one.serial or one.name, []).append(one)
-    changes = [(arm, diff(one.name, two.name)) for arm, own in visits.items() for one, two in pairwise(own)]
+    given = visits(calibrations)
+    by_arm = given.by_arm
+    usable = {arm: [one for one in own if not _failed(one)] for arm, own in by_arm.items()}
+    changes = [(arm, diff(one.name, two.name)) for arm, own in usable.items() for one, two in pairwise(own)]
     types: list[list[Calibration]] = []
-    for own in visits.values():
+    for own in by_arm.values():
         alike = next((each for each in types if _same(each[0], own[-1])), None)
         if alike is None:
             types.append(alike := [])
@@ -178,15 +181,21 @@ def report_fleet(calibrations: str | Path | Sequence[str | Path]) -> FleetReport
     names = [each[0].chain.name for each in types]
     labels = [name if names.count(name) == 1 else f"{name}_{k + 1}" for k, name in enumerate(names)]
     made = tuple(_arm_type(label, each) for label, each in zip(labels, types))
-    noticed = settle(_findings(made, changes))
-    words = f"{len(visits)} arms of {len(made)} type{'s' * (len(made) > 1)}, {len(changes)} calibrated again"
+    earlier = [_failure(one, 0.0) for own in by_arm.values() for one in own[:-1] if _failed(one)]
+    noticed = settle([*given.noticed, *_findings(made, changes), *earlier])
+    failed = sum(len(one.failed) for one in made)
+    parts = [f"{counted(len(by_arm), 'arm')} of {counted(len(made), 'type')}", failed and f"{failed} failed"]
+    words = ", ".join(filter(None, [*parts, f"{len(changes)} calibrated again"]))
     return FleetReport(made, tuple(changes), noticed, Verdict.of(words, noticed))
 
 
-def _fit_of(folder: str | Path) -> Calibration:
-    place = place_of(folder)
-    require(place.fit, f"a fleet's report takes fitted geometries, but {place.words}", UsageError)
-    return read_fit(place)
+def _failed(one: Calibration) -> bool:
+    return one.judged[0] == "fail"
+
+
+def _failure(one: Calibration, share: float) -> Finding:
+    """Return that a fit failed, and why; `share`: of the arms of its type whose fits did."""
+    return finding("arm-failed", arm=one.name, reason=one.judged[1], share=share)
 
 
 def _same(one: Calibration, two: Calibration) -> bool:
@@ -197,10 +206,11 @@ def _same(one: Calibration, two: Calibration) -> bool:
 
 
 def _arm_type(name: str, arms: Sequence[Calibration]) -> ArmType:
-    odd = tuple(one.name for one in arms if _farthest(one)[1] > 1.0)
-    fitted = [one.robot for one in arms if one.name not in odd and one.robot.covariance is not None]
+    failed = tuple(one.name for one in arms if _failed(one))
+    odd = tuple(one.name for one in arms if one.name not in failed and _farthest(one)[1] > 1.0)
+    sound = [one.robot for one in arms if one.name not in (*failed, *odd) and one.robot.covariance is not None]
     used = {one.name: (one.cell.tool_names[0], one.cell.tools[0][:3, 3], one.left) for one in arms}
-    return ArmType(name, tuple(arms), odd, prior.spread(fitted) if fitted else (), tuple(tools(used)))
+    return ArmType(name, tuple(arms), failed, odd, prior.spread(sound) if sound else (), tuple(tools(used)))
 
 
 def _farthest(one: Calibration) -> tuple[str, float]:
@@ -222,6 +232,13 @@ def _findings(types: Sequence[ArmType], changes: Sequence[tuple[str, RobotChange
         for arm, one in changes if one.verdict.level in ("marginal", "fail")
     ]  # fmt: skip
     for one in types:
+        found += [_failure(arm, len(one.failed) / len(one.arms)) for arm in one.arms if arm.name in one.failed]
+        found += [finding("arm-marginal", arm=arm.name, reason=arm.judged[1]) for arm in one.arms
+                  if arm.judged[0] == "marginal"]  # fmt: skip
+        if len(one.tools) == 1 and len(one.arms) >= sum(MIN_ARMS):
+            at = np.array([arm.cell.tools[0][:3, 3] for arm in one.plausible or one.arms])
+            away = np.linalg.norm(at - np.median(at, axis=0), axis=1).max()
+            found.append(finding("tools-unnamed", type=one.name, tool=one.tools[0].tool, away=away))
         found += [finding("unlike-its-type", arm=arm.name, name=_farthest(arm)[0]) for arm in one.arms
                   if arm.name in one.odd]  # fmt: skip
         found += [each for tool in one.tools for each in tool.findings()]

@@ -51,7 +51,7 @@ def held(address: str, lease: float = LEASE) -> Iterator[Path]:
     """Yield a copy of the folder at an address, held for this process; what changes in it is put back.
 
     Raises:
-        UsageError: while another process works on it; where no storage is.
+        UsageError: while another process works on it (`Busy`); where no storage is.
         CalibError: where it cannot be read or written (another process took over; the storage is full). What was put
             back before stays.
     """
@@ -83,6 +83,10 @@ def _opened(address: str) -> tuple[Any, str]:
     return files, root
 
 
+class Busy(UsageError):
+    """Another process works on the folder."""
+
+
 class _Claim:
     """The file that says who works on a folder; made by taking it."""
 
@@ -95,9 +99,7 @@ class _Claim:
             before = self._read()
             time.sleep(lease)
             if (now := self._read()) and now != before:
-                raise UsageError(
-                    f"{address} is busy: {now.partition(' (')[0]} works on it; wait for it to end"
-                ) from None
+                raise Busy(f"{address} is busy: {now.partition(' (')[0]} works on it; wait for it to end") from None
             self._write("overwrite")
 
     def _write(self, mode: str) -> None:

@@ -4,12 +4,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import stats
 
 from calib.errors import Finding, finding
-from calib.estimation import robust
 
 MIN_ARMS = 2, 3  # with the tool, and with others, that a comparison needs (our choice)
-SIGMAS = 3.0  # between medians, above it a tool is named (our choice)
+SIGMAS = 2.6  # between medians, above it a tool is named: 99 %, as of other findings
 MIN_TIMES = 1.5  # of the others' error, below it a tool is not called loose (our choice)
 
 
@@ -21,9 +21,9 @@ class ToolUse:
         tool: its name in the measurements (``tool`` of the options file).
         arms: their names.
         moved: distance of its median position from that of the others [m].
-        moved_sigmas: the same in standard deviations of such a difference.
+        moved_sigmas: deviation of a normal variable that is as unlikely, as arms with one tool differ among themselves.
         times: median rms error, divided by that of the others.
-        times_sigmas: its logarithm in standard deviations; all four are None where too few arms are compared.
+        times_sigmas: of its logarithm, the same; all four are None where too few arms are compared.
     """
 
     tool: str
@@ -57,19 +57,32 @@ def _use(name: str, used: Mapping[str, tuple[str, np.ndarray, float]]) -> ToolUs
     others = [arm for arm in used if arm not in arms]
     if len(arms) < MIN_ARMS[0] or len(others) < MIN_ARMS[1]:
         return ToolUse(name, arms)
-    (own, rest), errors = (
+    positions, errors = (
         [np.array([used[arm][1] for arm in group]) for group in (arms, others)],
-        [np.log([max(used[arm][2], 1e-9) for arm in group]) for group in (arms, others)],
+        [np.log([[max(used[arm][2], 1e-9)] for arm in group]) for group in (arms, others)],
     )
-    moved = float(np.linalg.norm(np.median(own, axis=0) - np.median(rest, axis=0)))
-    times = float(np.median(errors[0]) - np.median(errors[1]))
-    scatter = [_scatter(each - np.median(each, axis=0), len(arms)) for each in (rest, errors[1])]
-    return ToolUse(name, arms, moved, moved / scatter[0], float(np.exp(times)), times / scatter[1])
+    moved, times = (np.median(own, axis=0) - np.median(rest, axis=0) for own, rest in (positions, errors))
+    sigmas = [_sigmas(step, groups) for step, groups in ((moved, positions), (times, errors))]
+    factor, signed = float(np.exp(times[0])), float(np.copysign(sigmas[1], times[0]))
+    return ToolUse(name, arms, float(np.linalg.norm(moved)), sigmas[0], factor, signed)
 
 
-def _scatter(left: Sequence[np.ndarray] | np.ndarray, count: int) -> float:
-    """Return the standard deviation of the difference between the medians of `count` arms and of those of `left`."""
-    of_median = np.sqrt(np.pi / 2.0)  # σ of a median, in that of a mean (normal distribution)
-    min_scatter = 1e-6  # [m, or of a logarithm]
-    own = max(robust.spread(np.asarray(left)), min_scatter)
-    return float(of_median * own * np.sqrt(1.0 / count + 1.0 / len(left)))
+def _sigmas(step: np.ndarray, groups: Sequence[np.ndarray]) -> float:
+    """Return how unlikely the difference `step` (k,) of two groups' medians is, as deviation of a normal variable.
+
+    The scatter is that of the arms (n, k) about the median of their own group, as if all of it were along the
+    difference: a tool's position scatters most along the last axis, where it cannot be told from the arm's last link.
+    """
+    far, worth, min_scatter, min_p = (
+        3.0,
+        0.8,
+        1e-6,
+        1e-300,
+    )  # of typical distances; share of the degrees of freedom (ours)
+    away = [np.sort(np.linalg.norm(one - np.median(one, axis=0), axis=1)) for one in groups]
+    typical = np.median(np.concatenate([one[1:] for one in away]))  # without the arm that is the median itself
+    freedom = sum(len(one) - 1 for one in groups)
+    variance = np.sum(np.minimum(np.concatenate(away), far * typical) ** 2) / freedom
+    of_medians = sum(np.pi / (2.0 * (len(one) - 1) + np.pi) for one in groups)  # in variances of one arm, if normal
+    square = float(step @ step) / max(variance, min_scatter**2) / of_medians
+    return float(stats.norm.isf(max(stats.f.sf(square, 1, worth * freedom), min_p) / 2.0))

@@ -14,6 +14,7 @@ from without_figures import run
 
 from calib.errors import MeasurementError, NotConverged, TaskLost, Unidentifiable, UsageError, exit_code
 from calib.procedure.session import steps
+from calib.procedure.session.folder import locked, open_session
 from calib.rooms.fleet import fleet
 from calib.workers import Workers
 
@@ -38,6 +39,15 @@ def test_one_that_fails_stops_none(cells: Path, capsys: pytest.CaptureFixture) -
     assert not list((cells / "d").iterdir())
     assert run("run", cells / "a/session.toml") == 0
     assert run("run", cells / "a", cells / "a/session.toml") == 2
+
+
+def test_a_session_that_another_command_works_on_is_busy(cells: Path, capsys: pytest.CaptureFixture) -> None:
+    """It has not failed, and its log is left to that command."""
+    with locked(open_session(cells / "c"), lambda words: None):
+        assert run("run", cells / "a", cells / "c") == 2
+    said = capsys.readouterr().out
+    assert "1 of 2 done" in said and "1 busy" in said and "failed" not in said
+    assert f"\n{cells / 'c'} is busy: process" in said and not (cells / "c/run.log").exists()
 
 
 def test_a_failing_verdict_is_code_1(cells: Path) -> None:
