@@ -1,9 +1,9 @@
 """CSV tables: headers with units, columns converted to SI, errors with row and column.
 
 Separator tab, semicolon, comma or bar (the first of these that the header has), or blanks, where the first row of
-numbers has as many cells by them as the header; UTF-8 with or without a byte order mark; lines that begin with ``#``
-are comments; the decimal mark is a point. Where no line but a comment names the columns (numpy's savetxt), the last
-comment before the numbers is the header.
+numbers has as many cells by them as the header; UTF-8 with or without a byte order mark; lines that begin with ``#``,
+but not with a spreadsheet's error (``#REF!``), are comments; the decimal mark is a point. Where no line but a comment
+names the columns (numpy's savetxt), the last comment before the numbers is the header.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from calib.units import ANGLES, LENGTHS, QUANTITIES, TIMES, is_number
 
 _HEADING = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
 _UNIT_APART = re.compile(r"[ ]+([\[(])")  # q1 [deg], where blanks part the names
+_ERROR = re.compile(r"#(REF!|N/A|NUM!|DIV/0!|VALUE!|NAME\?|NULL!)", re.I)  # a cell of a spreadsheet, not a comment
 _DECIMAL_COMMA = re.compile(r"^[+-]?\d*,\d+([eE][+-]?\d+)?$")
 _CHUNK = 20_000
 LONGEST = 1 << 20  # letters of a line (our choice)
@@ -266,7 +267,7 @@ def split_units(cells: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]
 def _read_columns(lines: IO[str], separator: str, names: tuple[str, ...], path: str | Path) -> tuple[np.ndarray, ...]:
     """Return the columns below the header. Blocks of nothing but numbers, one in each cell, are read by numpy, some
     five times as fast; from the first block on that is anything else, cell by cell."""
-    body = (line for line in lines if (text := line.lstrip()) and text[0] != "#")
+    body = (line for line in lines if (text := line.lstrip()) and (text[0] != "#" or _ERROR.match(text)))
     blocks: list[np.ndarray] = []
     try:
         while block := list(islice(body, _CHUNK)):
@@ -364,7 +365,7 @@ def _not_a_number(cell: str | float) -> str:
     if _DECIMAL_COMMA.match(text):
         return f"found '{text}', with a decimal comma: save the table with decimal points (1.5, not 1,5)"
     found = "an empty or NaN cell" if text.lower() in ("", "nan") else f"'{text}'"
-    advice = "leave such rows out, or measure them again (rows are counted without the header)"
+    advice = "rows are counted without the header; leave such rows out, or measure them again"
     return f"found {found} where a number is needed; {advice}"
 
 

@@ -79,22 +79,25 @@ def _check_finite(recording: Recording, most: float = np.inf) -> None:
     series = {name: values for name in NEEDED if (values := getattr(recording, name)) is not None}
     if (wrong := np.column_stack([~(np.abs(values) < most) for values in series.values()])).any():
         columns = [label for name in series for label in (["t"] if name == "t" else _columns(recording, name))]
-        values, part = np.column_stack(list(series.values())), _sound_part(recording, wrong.any(axis=1))
+        values, part = np.column_stack(list(series.values())), _sound_part(recording, wrong)
         refuse(recording, wrong, columns, lambda row, k: f"found {values[row, k]:g}; cut this part out{part}")
 
 
 def _sound_part(recording: Recording, bad: np.ndarray) -> str:
-    """Return words on the cut to the longest part of rising stamps without a row marked in `bad` (N,); "" for pieces.
+    """Return words on the cut to the longest part of rising stamps without a row marked in `bad` (N,) or (N, k).
 
-    A cut goes by the latest stamp up to each row.
+    A cut goes by the latest stamp up to each row. "" where that part is too short, and where pieces were read: what
+    lies between them is not known.
     """
-    if np.ptp(recording.rows) + 1 > len(recording):  # what lies between them is not known
+    if np.ptp(recording.rows) + 1 > len(recording):
         return ""
-    stays = np.diff(np.fmax.accumulate(recording.t), prepend=-np.inf) <= 0
-    breaks = np.flatnonzero(np.concatenate([[True], stays | bad, [True]]))
+    latest = np.fmax.accumulate(recording.t)
+    faulty = np.append(False, ~(latest[1:] > latest[:-1])) | bad.reshape(len(bad), -1).any(axis=1)
+    breaks = np.flatnonzero(np.concatenate([[True], faulty, [True]]))
     longest = int(np.argmax(np.diff(breaks)))
-    start, stop = recording.t[[breaks[longest], breaks[longest + 1] - 2]]
-    return f"; the longest part without such rows is @{start:.9g}:{stop:.9g}"
+    first, last = int(breaks[longest]), int(breaks[longest + 1]) - 2
+    words = f"; the longest part without such rows is @{recording.t[first]:.9g}:{recording.t[last]:.9g}"
+    return words if last - first >= LIMITS.min_samples else ""
 
 
 def _drop_spikes(recording: Recording, joints: Joints | None) -> Recording:
