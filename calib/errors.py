@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 import errno
 import os
+import re
 import shlex
 import sys
 import warnings
@@ -222,19 +223,32 @@ def as_ours() -> Iterator[None]:
         raise (Unidentifiable if code == 3 else UsageError)(str(error)) from error
 
 
-def complaint(error: Exception) -> tuple[str, int] | None:
+def complaint(error: Exception, words: Iterable[str] = ()) -> tuple[str, int] | None:
     """Return message and exit code of an expected error; None for an internal error.
 
     Expected are this toolkit's errors, the operating system's for a named file or a full disk, and lack of memory.
+
+    Args:
+        words: of the command; the largest file among them is named where memory is lacking.
     """
     if (code := exit_code(error)) is not None:
         return str(error), code
+    if lack := _lack_of_memory(error):
+        files = filter(os.path.isfile, (word.partition("@")[0] for word in words))
+        said = filter(None, [max(files, key=os.path.getsize, default=""), "not enough memory", brief(lack)])
+        remedy = "of a long recording use fewer samples ([recording] samples = 100000 in the options); otherwise check"
+        return f"{': '.join(said)}; {remedy} whether a number or a file is larger than intended", 2
     if isinstance(error, OSError) and (error.filename is not None or error.errno in NO_ROOM):
         place = "" if error.filename is None else f"{error.filename}: "
         return f"{place}{error.strerror or error}", 2
-    if isinstance(error, MemoryError):
-        return f"not enough memory ({error}): check whether a number or a file is larger than intended", 2
     return None
+
+
+def _lack_of_memory(error: BaseException | None) -> BaseException | None:
+    """Return the error itself or the one behind it that says that memory was lacking, be it to load a library."""
+    while error and not (isinstance(error, MemoryError) or re.search("map segment|allocate memory", str(error))):
+        error = error.__cause__ or error.__context__
+    return error
 
 
 @contextmanager

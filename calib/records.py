@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calib.errors import CalibError, UsageError
+from calib.units import is_number
 
 T = TypeVar("T")
 _FORMULA = ("=", "+", "-", "@", "\t", "\r", "'")  # what a spreadsheet's formula begins with, and our own mark
@@ -33,13 +34,7 @@ def shielded(text: str) -> str:
 
     Numbers stay as they are.
     """
-    if text[:1] not in _FORMULA:
-        return text
-    try:
-        float(text)
-    except ValueError:
-        return f"'{text}"
-    return text
+    return text if text[:1] not in _FORMULA or is_number(text) else f"'{text}"
 
 
 def plain_text(cell: str) -> str:
@@ -201,9 +196,13 @@ def evenly(count: int, most: int) -> np.ndarray:
 
 def frozen(values: ArrayLike, dtype: type = float) -> np.ndarray:
     """Return a read-only, C-contiguous copy of `values`."""
-    array = np.array(values, dtype=dtype, order="C")
-    array.flags.writeable = False
-    return array
+    return read_only(np.array(values, dtype=dtype, order="C"))
+
+
+def read_only(values: np.ndarray) -> np.ndarray:
+    """Return `values`, made read-only; the caller must own the array."""
+    values.flags.writeable = False
+    return values
 
 
 class Frozen:

@@ -96,3 +96,12 @@ def plain_number(text: str) -> float:
     if "_" in text or not text.isascii():
         raise ValueError(text)
     return float(text)
+
+
+def is_number(text: str) -> bool:
+    """Return whether `plain_number` takes the text."""
+    try:
+        plain_number(text)
+    except ValueError:
+        return False
+    return True

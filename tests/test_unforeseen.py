@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from calib import bug_reports, cli
+from calib.errors import complaint
 
 ROOT = Path(__file__).parents[1]
 
@@ -29,7 +30,9 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (KeyError("axis"), 4, "internal error: KeyError: 'axis'; a bug report was written: calib-bug-"),
         (PermissionError(13, "Permission denied", "/x/y.csv"), 2, "/x/y.csv: Permission denied"),
         (OSError(28, "No space left on device"), 2, "No space left"),
-        (MemoryError("Unable to allocate 373. GiB"), 2, "Unable to allocate 373. GiB"),
+        (MemoryError("Unable to allocate 373. GiB"), 2, "Unable to allocate 373. GiB; of a long recording use fewer"),
+        (MemoryError(), 2, "calib: not enough memory; of a long recording use fewer samples ([recording] samples = "),
+        (OSError(12, "Cannot allocate memory"), 2, "not enough memory: [Errno 12] Cannot allocate memory; of"),
         (BrokenPipeError(32, "Broken pipe"), 141, ""),
     ],
 )
@@ -44,6 +47,19 @@ def test_whatever_happens_is_one_line_and_a_code(error, code, words, monkeypatch
         text = reports[0].read_text()
         assert text.startswith(f"calib formats mdh\nfor {bug_reports.TRACKER}\nPython ")
         assert "in describe" in text and "numpy " in text
+
+
+def test_lack_of_memory_behind_a_library_that_cannot_be_loaded_names_the_largest_file(tmp_path) -> None:
+    (tmp_path / "log.npz").write_bytes(b"x" * 900)
+    (tmp_path / "arm.urdf").write_bytes(b"x" * 90)
+    try:
+        try:
+            raise OSError("libllvmlite.so: failed to map segment from shared object")
+        except OSError as error:
+            raise OSError("Could not find/load shared object file 'libllvmlite.so'") from error
+    except OSError as error:
+        words, code = complaint(error, ["identify", "arm.urdf", "log.npz@0:9.4", "--out", "x"])  # type: ignore[misc]
+    assert code == 2 and words.startswith("log.npz: not enough memory: libllvmlite.so: failed to map segment")
 
 
 def test_reports_readme_and_project_name_one_tracker() -> None:

@@ -119,7 +119,7 @@ def _failed(error: Exception, given: list[str]) -> int:
     from calib import bug_reports
     from calib.errors import complaint
 
-    if (foreseen := complaint(error)) is not None:
+    if (foreseen := complaint(error, given)) is not None:
         return _complain(*foreseen)
 
     return _complain(bug_reports.report(error, given), bug_reports.CODE)

@@ -1,9 +1,9 @@
 """CSV tables: headers with units, columns converted to SI, errors with row and column.
 
 Separator tab, semicolon, comma or bar (the first of these that the header has), or blanks, where the first row of
-numbers has as many cells by them as the header; UTF-8 with or without a byte order mark; lines that begin with ``#``
-are comments; the decimal mark is a point. Where no line but a comment names the columns (numpy's savetxt), the last
-comment before the numbers is the header.
+numbers has as many cells by them as the header; UTF-8 with or without a byte order mark; lines that begin with ``#``,
+but not with a spreadsheet's error (``#REF!``), are comments; the decimal mark is a point. Where no line but a comment
+names the columns (numpy's savetxt), the last comment before the numbers is the header.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -21,14 +21,16 @@ from typing import IO, NoReturn
 
 import numpy as np
 
+from calib.data.schema import refuse
 from calib.errors import MeasurementError, refuse_data, require, suggestion
 from calib.extensions import offered
 from calib.files import check_regular
-from calib.records import frozen, plain_text
-from calib.units import ANGLES, LENGTHS, QUANTITIES, TIMES, plain_number
+from calib.records import frozen, plain_text, read_only
+from calib.units import ANGLES, LENGTHS, QUANTITIES, TIMES, is_number
 
 _HEADING = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
 _UNIT_APART = re.compile(r"[ ]+([\[(])")  # q1 [deg], where blanks part the names
+_ERROR = re.compile(r"#(REF!|N/A|NUM!|DIV/0!|VALUE!|NAME\?|NULL!)", re.I)  # a cell of a spreadsheet, not a comment
 _DECIMAL_COMMA = re.compile(r"^[+-]?\d*,\d+([eE][+-]?\d+)?$")
 _CHUNK = 20_000
 LONGEST = 1 << 20  # letters of a line (our choice)
@@ -94,21 +96,28 @@ class Table:
             MeasurementError: at the first cell that is no number, or not finite; at a unit of another dimension.
         """
         column = self.index(name)
-        cells = self.cells[column]
-        if cells.dtype != float:
-            bad = [i for i, cell in enumerate(cells) if not _is_number(cell)]
-            self.fail(_not_a_number(cells[bad[0]]) + _more(len(bad)), name, bad[0])
-        wrong = np.isinf(cells) if gaps else ~np.isfinite(cells)
-        if wrong.any():
-            row = int(np.argmax(wrong))
-            found = "an empty or NaN cell" if np.isnan(cells[row]) else f"{cells[row]}"
-            message = f"found {found} where a number is needed{_more(wrong.sum())}"
-            self.fail(f"{message}; leave the row out, or measure it again", name, row)
+        (cells,) = self.check((name,), (name,) if gaps else ())
         if dimension is None:
             return cells
         known = {"angle": ANGLES, "length": LENGTHS, "joint": ANGLES | LENGTHS, "": {"1": 1.0, "-": 1.0}}
         known |= {"speed": QUANTITIES["speed"], "time": TIMES}
         return cells * self.factor(column, known[dimension], unit)
+
+    def check(self, names: Sequence[str], gaps: Collection[str] = ()) -> list[np.ndarray]:
+        """Return columns (m,) as floats, as they are; refuse the table where a cell of them is no finite number.
+
+        Args:
+            names: of the columns.
+            gaps: names of columns whose cells may be empty or NaN.
+
+        Raises:
+            MeasurementError: at the first such row of the file, with the number of such rows, in all and by column.
+        """
+        cells = [self.cells[self.index(name)] for name in names]
+        values = [own if own.dtype == float else _as_floats(own) for own in cells]
+        bad = [np.isinf(own) if name in gaps else ~np.isfinite(own) for name, own in zip(names, values)]
+        refuse(self, np.column_stack(bad), names, lambda row, k: _not_a_number(cells[k][row]))
+        return values
 
     def factor(self, column: int, known: Mapping[str, float], unit: str) -> float:
         """Return the factor to SI of a column; the unit is in its header or in `unit`, and one of `known`."""
@@ -211,7 +220,7 @@ def _headless(cells: Sequence[str], path: str | Path) -> bool:
     """Return whether a first line contains numbers only."""
     if sum(bool(_DECIMAL_COMMA.match(cell)) for cell in cells) > len(cells) / 2:
         refuse_data(path, _not_a_number(cells[0]), row=1)
-    return sum(_is_number(cell) for cell in cells) > len(cells) / 2
+    return sum(is_number(cell) for cell in cells) > len(cells) / 2
 
 
 def _separator(line: str, ahead: Callable[[], str]) -> str:
@@ -219,10 +228,10 @@ def _separator(line: str, ahead: Callable[[], str]) -> str:
     line = re.sub(r'"[^"]*"', "", line)
     if mark := next((mark for mark in "\t;,|" if mark in line), ""):
         return mark
-    if all(_is_number(cell) for cell in line.split()):
+    if all(is_number(cell) for cell in line.split()):
         return " "  # numpy's savetxt
     names, numbers = _UNIT_APART.sub(r"\1", line).split(), ahead().split()
-    return " " if 1 < len(names) == len(numbers) and all(_is_number(cell) for cell in numbers) else ","
+    return " " if 1 < len(names) == len(numbers) and all(is_number(cell) for cell in numbers) else ","
 
 
 def _ahead(file: IO[str]) -> str:
@@ -236,7 +245,7 @@ def _ahead(file: IO[str]) -> str:
 
 def _comment_header(comment: str, separator: str, width: int, path: str | Path) -> list[str]:
     names = [name.strip() for name in comment.lstrip("# ").split(separator)]
-    if len(names) == width and not any(_is_number(name) for name in names if name):
+    if len(names) == width and not any(is_number(name) for name in names if name):
         return names
     message = (
         f"has no header: its first line contains only numbers ({width} cells). Add a line with the column names "
@@ -258,7 +267,7 @@ def split_units(cells: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]
 def _read_columns(lines: IO[str], separator: str, names: tuple[str, ...], path: str | Path) -> tuple[np.ndarray, ...]:
     """Return the columns below the header. Blocks of nothing but numbers, one in each cell, are read by numpy, some
     five times as fast; from the first block on that is anything else, cell by cell."""
-    body = (line for line in lines if (text := line.lstrip()) and text[0] != "#")
+    body = (line for line in lines if (text := line.lstrip()) and (text[0] != "#" or _ERROR.match(text)))
     blocks: list[np.ndarray] = []
     try:
         while block := list(islice(body, _CHUNK)):
@@ -295,8 +304,7 @@ def _transposed(blocks: list[np.ndarray], width: int) -> np.ndarray:
         block = blocks.pop()
         table[:, place : place + len(block)] = block.T
         place += len(block)
-    table.flags.writeable = False
-    return table
+    return read_only(table)
 
 
 def _read_cells(
@@ -309,7 +317,8 @@ def _read_cells(
         while chunk := list(islice(rows, _CHUNK)):
             ragged = next((i for i, row in enumerate(chunk) if len(row) != len(names)), None)
             if ragged is not None:
-                refuse_data(path, _ragged(chunk[ragged], names, separator), row=done + ragged + 1)
+                last = ragged == len(chunk) - 1 and next(rows, None) is None
+                refuse_data(path, _ragged(chunk[ragged], names, separator, last), row=done + ragged + 1)
             for part, column in zip(parts, zip(*chunk)):
                 part.append(_convert(column))
             done += len(chunk)
@@ -326,7 +335,7 @@ def _convert(column: Sequence[str]) -> np.ndarray:
             raise ValueError("digits that Python alone takes for such")
         return np.array(column, dtype=float)
     except ValueError:
-        if all(not cell.strip() or _is_number(cell) for cell in column):
+        if all(not cell.strip() or is_number(cell) for cell in column):
             return np.array([float(cell) if cell.strip() else math.nan for cell in column])
         return np.array([cell.strip() for cell in column], dtype=object)
 
@@ -335,9 +344,7 @@ def _join(parts: Sequence[np.ndarray]) -> np.ndarray:
     if all(part.dtype == float for part in parts):
         return frozen(np.concatenate(parts)) if parts else frozen([])
     texts = [part if part.dtype == object else _as_texts(part) for part in parts]
-    joined = np.concatenate(texts)
-    joined.flags.writeable = False
-    return joined
+    return read_only(np.concatenate(texts))
 
 
 def _as_texts(part: np.ndarray) -> np.ndarray:
@@ -348,26 +355,24 @@ def _filled(cells: np.ndarray) -> bool:
     return cells.dtype != float or not np.isnan(cells).all()
 
 
-def _more(count: int) -> str:
-    return f" (and in {count - 1} more rows)" if count > 1 else ""
+def _as_floats(texts: np.ndarray) -> np.ndarray:
+    """Return texts (m,) as floats: NaN where they are empty, infinite where they are no numbers."""
+    return np.array([math.nan if not text else float(text) if is_number(text) else math.inf for text in texts])
 
 
-def _is_number(cell: str) -> bool:
-    try:
-        plain_number(cell)
-    except ValueError:
-        return False
-    return True
+def _not_a_number(cell: str | float) -> str:
+    text = str(cell)
+    if _DECIMAL_COMMA.match(text):
+        return f"found '{text}', with a decimal comma: save the table with decimal points (1.5, not 1,5)"
+    found = "an empty or NaN cell" if text.lower() in ("", "nan") else f"'{text}'"
+    advice = "rows are counted without the header; leave such rows out, or measure them again"
+    return f"found {found} where a number is needed; {advice}"
 
 
-def _not_a_number(cell: str) -> str:
-    if _DECIMAL_COMMA.match(cell):
-        return f"found '{cell}', with a decimal comma: save the table with decimal points (1.5, not 1,5)"
-    return f"found '{cell}' where a number is needed"
-
-
-def _ragged(row: Sequence[str], names: Sequence[str], separator: str) -> str:
+def _ragged(row: Sequence[str], names: Sequence[str], separator: str, last: bool) -> str:
     message = f"has {len(row)} cells, the header has {len(names)} columns"
+    if last and len(row) < len(names):
+        return f"{message}: the file ends here, in the middle of a line (power lost, disk full?); delete its last line"
     if separator == "," and len(row) > 1.5 * len(names):
         message += "; if these are decimal commas, save the table with decimal points and commas between columns"
     return message

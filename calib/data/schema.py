@@ -1,7 +1,8 @@
 """Declarations of table columns (names, dimension, bounds), and the error about a cell beyond them.
 
 Poses, targets, waypoints and recordings read their tables by these declarations. An impossible value is refused by
-`refuse`: the value first, what to do last, then how many more rows are like it; the error carries file, row and column.
+`refuse`: the value first, what to do last, then how many more rows are like it, by column where they are of several;
+the error carries file, row and column.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Protocol
 
 import numpy as np
 
-from calib.errors import MeasurementError, refuse_option
+from calib.errors import MeasurementError, counted, listing, refuse_option
 from calib.records import frozen
 from calib.units import DEG
 
@@ -98,15 +99,27 @@ def refuse(source: Rows, bad: np.ndarray, columns: Sequence[str], says: Callable
         says: returns the message for the first bad cell from its row and column (from 0).
 
     Raises:
-        MeasurementError: with file, row and column of the first bad cell, and the number of further rows.
+        MeasurementError: with file, row and column of the first bad cell, and the number of further rows among those
+            read, with the number of bad rows in each column where there are several.
     """
     bad = np.reshape(bad, (len(bad), -1))
     if not bad.any():
         return
     row, column = (int(i) for i in np.argwhere(bad)[0])
+    message = says(row, column) + more_rows(source, bad, columns)
+    raise MeasurementError(message, source.file, int(source.rows[row]), columns[column])
+
+
+def more_rows(source: Rows, bad: np.ndarray, columns: Sequence[str]) -> str:
+    """Return words on the rows marked in `bad` (m, k) after the first: how many they are, and of all, in each column.
+
+    Where not all rows of a file were read, the words say of how many.
+    """
     others = int(bad.any(axis=1).sum()) - 1
-    more = f" (and in {others} more rows)" if others else ""
-    raise MeasurementError(says(row, column) + more, source.file, int(source.rows[row]), columns[column])
+    read = "" if np.ptp(source.rows) + 1 == len(bad) else f" of the {len(bad)} read"
+    each = listing(f"{count} in {name}" for name, count in zip(columns, bad.sum(axis=0)) if count)
+    of_each = f"; of all, {each}" if bad.shape[1] > 1 else ""
+    return f" (and in {counted(others, 'more row')}{read}{of_each})" if others else ""
 
 
 @dataclass(frozen=True)

@@ -168,7 +168,7 @@ def test_measurements_in_memory_get_the_checks_of_files(fitted, cell):
     odd[2, 1] = np.nan
     for wrong, words in (
         (replace(block, q=np.rad2deg(10.0 * block.q)), r"measured\.csv, row 1, .*outside the limits"),
-        (replace(block, position=odd), r"row 3, column 'y': found nan"),
+        (replace(block, position=odd), r"row 3, column 'y': found an empty or NaN cell"),
         (replace(block, position=1e3 * block.position), "if it is in mm"),
         (replace(block, q=block.q[:, :5]), r"q has shape \(60, 5\)"),
     ):

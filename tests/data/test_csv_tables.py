@@ -84,6 +84,34 @@ def test_text_and_ragged_rows_far_down_keep_their_numbers(write):
     assert error.value.row == 40_003
 
 
+def test_damaged_cells_are_told_over_all_columns_from_the_first_row(write):
+    rows = [["1", "2", "3"] for _ in range(45_000)]
+    rows[30_000][0], rows[700][1], rows[700][2], rows[44_000][2] = "ERR", "", "nan", "n/a"
+    table = read_table(write("a,b,c", "\n".join(map(",".join, rows))))
+    with pytest.raises(MeasurementError, match=r"an empty or NaN cell .*; leave such rows out") as error:
+        table.check(("a", "b", "c"))
+    assert (error.value.row, error.value.column) == (701, "b")
+    assert str(error.value).endswith("(and in 2 more rows; of all, 1 in a, 1 in b, 2 in c)")
+    with pytest.raises(MeasurementError, match=r"'ERR' .* 1 more row; of all, 1 in a, 1 in c") as error:
+        table.check(("a", "b", "c"), ("b", "c"))
+    assert error.value.row == 30_001
+    keep = np.isin(np.arange(45_000), [700, 30_000, 44_000], invert=True)
+    assert sum(column.sum() for column in table.where(keep).check(("a", "b", "c"))) == 6 * 44_997
+
+
+def test_a_file_that_ends_within_a_line_says_so(write):
+    with pytest.raises(MeasurementError, match=r"ends here, in the middle of a line .* delete its last line") as error:
+        read_table(write("a,b,c", "1,2,3\n" * 100 + "4,5"))
+    assert error.value.row == 101
+    with pytest.raises(MeasurementError, match=r"2 cells, the header has 3 columns$"):
+        read_table(write("a,b,c", "1,2,3\n4,5\n6,7,8\n"))
+
+
+def test_a_spreadsheets_error_is_a_cell_and_no_comment(write):
+    table = read_table(write("a,b", "1,2\n#REF!,3\n# note, 4\n5,6"))
+    assert table.texts("a") == ["1", "#REF!", "5"]
+
+
 @pytest.mark.parametrize(
     ("text", "words", "row", "column"),
     [

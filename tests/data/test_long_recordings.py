@@ -1,6 +1,7 @@
 """A recording longer than what is used is read in pieces: which rows, from every file, and what the user is told."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from calib.data.recordings.recording_files import read_recording
 from calib.data.recordings.recording_options import RecordingOptions
 from calib.data.signals.motion import make_motion
 from calib.data.signals.resampling import resample
+from calib.errors import MeasurementError
 
 RATE, SECONDS = 100.0, 1800
 OPTIONS = RecordingOptions(samples=20_000)
@@ -24,7 +26,7 @@ def recording() -> Recording:
 
 
 def test_pieces_are_spread_over_the_recording_and_as_many_as_asked_for():
-    rows, notes = rows_in_pieces(1000, 181_000, 20_000)
+    rows, notes = rows_in_pieces(np.arange(181_000.0), 1000, 181_000, 20_000)
     parts = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
     assert len(rows) == 20_000 and len(parts) == 20 and "20000 of 180000" in notes[0]
     for number, part in enumerate(parts):
@@ -32,10 +34,37 @@ def test_pieces_are_spread_over_the_recording_and_as_many_as_asked_for():
     assert len({int(part[0] - 1000) % 9000 for part in parts}) > 15  # no phase of a motion is met each time
 
 
+def test_faults_of_the_time_are_counted_over_the_whole_log_and_the_cut_leads_around_all_of_them(recording, tmp_path):
+    t = recording.t.copy()
+    back = np.random.default_rng(1).choice(len(t) // 2, 150, replace=False)
+    t[back] -= 0.5
+    path = tmp_path / "log.npz"
+    np.savez(path, t=t, q=recording.q, tau=recording.effort)
+    with pytest.raises(MeasurementError, match="time goes back") as error:
+        read_recording(path, options=OPTIONS)
+    steps = int((np.diff(t) < 0).sum())
+    assert f"(and in {steps - 1} more rows)" in str(error.value)
+    (cut,) = re.findall(r"@[\d.]+:[\d.]+", str(error.value))
+    part = read_recording(f"{path}{cut}", options=OPTIONS)
+    assert part.t[-1] - part.t[0] > 800.0
+
+
+def test_faults_of_values_are_counted_among_the_rows_that_were_read(recording, tmp_path):
+    q = recording.q.copy()
+    q[::1000, 1] = np.nan
+    np.savez(tmp_path / "log.npz", t=recording.t, q=q, tau=recording.effort)
+    with pytest.raises(MeasurementError, match=r"found nan; cut this part out \(and in 19 more rows of the 20000 read"):
+        read_recording(tmp_path / "log.npz", options=OPTIONS)
+    with pytest.raises(
+        MeasurementError, match=r"longest part .* is @0.01:9.99 \(and in 179 more rows; of all, 180 in q"
+    ):
+        read_recording(tmp_path / "log.npz")
+
+
 def test_a_short_recording_is_used_whole(recording):
     assert all(in_pieces(recording, most) is recording for most in (10**6, 150_000, None))
     assert len(in_pieces(recording, 140_000)) == 140_000
-    rows, notes = rows_in_pieces(3, 50, 47)
+    rows, notes = rows_in_pieces(np.arange(50.0), 3, 50, 47)
     np.testing.assert_array_equal(rows, np.arange(3, 50))
     assert notes == []
 

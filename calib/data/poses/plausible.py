@@ -90,21 +90,16 @@ def check_block(block: PoseMeasurements, options: FileOptions, robot: Joints) ->
     message = f"q has shape {q.shape}, expected (rows, joints) with {len(joints)} joints"
     require(len(block) and q.ndim == 2 and q.shape[1] == len(joints), message, MeasurementError, place)
     table = Table(place, joints, ("",) * len(joints), tuple(q.T), block.rows)
-    _check_finite(q, table, joints)
+    table.check(joints)
     notes = check_joints(q, Sheet(table, replace(options, units={}, columns={})), joints, replace(robot, names=joints))
     if isinstance(block, Positions):
-        _check_finite(block.position, table, POSITION.names)
+        replace(table, header=POSITION.names, cells=tuple(block.position.T)).check(POSITION.names)
         POSITION.check(block.position, table, POSITION.names)
         if block.sigma is not None:
             SIGMA.check(block.sigma, table, SIGMA.names)
     if isinstance(block, Poses):
         unit_quaternions(block.quaternion, table, QUATERNION.names)
     return replace(block, notes=tuple(dict.fromkeys((*block.notes, *notes))))
-
-
-def _check_finite(values: np.ndarray, source: Rows, columns: Sequence[str]) -> None:
-    """Refuse values (m, k) that are not finite."""
-    refuse(source, ~np.isfinite(values), columns, lambda row, k: f"found {values[row, k]:g} where a number is needed")
 
 
 def unit_quaternions(values: np.ndarray, source: Rows, columns: Sequence[str]) -> np.ndarray:

@@ -228,6 +228,9 @@ def read_measurements(
         options = replace(options, columns=maps)
     sheet = _select_rows(Sheet(table, options))
     layout = find_layout(sheet, robot.names)
+    numbers = [name for name in sheet.table.header if name in layout.used.difference(layout.group, [layout.tool])]
+    several = (*layout.positions, *layout.sigmas) if len(layout.positions) > 1 else ()
+    sheet.table.check(numbers, set().union(*several))
     q, _ = sheet.joints(robot.names)
     notes = (*sheet.table.notes, *notes, *layout.notes, *plausible.check_joints(q, sheet, layout.joints, robot))
     block = (_read_targets if layout.positions else read_groups)(sheet, layout, q)

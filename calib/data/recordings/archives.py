@@ -23,7 +23,7 @@ from typing import IO, NoReturn
 import numpy as np
 from numpy.lib import format as npy
 
-from calib.data.recordings.recording import Ends, Recording, read_only, rows_in_pieces, rows_used
+from calib.data.recordings.recording import Ends, Recording, rows_in_pieces, rows_used
 from calib.data.recordings.recording_options import (
     KEYS_BESIDE_SERIES,
     RATES,
@@ -35,6 +35,7 @@ from calib.data.recordings.recording_options import (
 )
 from calib.data.schema import Joints
 from calib.errors import MeasurementError, refuse_data, refused_as, require
+from calib.records import read_only
 
 MAX_MEMBERS, MAX_BYTES = 1000, 8_000_000_000  # of an archive, and of a member (our choices)
 TOGETHER = 1 << 16  # rows read at a time
@@ -223,7 +224,7 @@ def _used(archive: _Archive, t: np.ndarray, options: RecordingOptions, ends: End
     first, end = (int(value) for value in np.clip(stated, -1, len(t) + 1))
     if not 0 <= first < end <= len(t):
         archive.fail(f"is {first} to {end}, the file has {len(t)} samples", "use_range")
-    rows, notes = rows_in_pieces(first, end, options.samples)
+    rows, notes = rows_in_pieces(t, first, end, options.samples)
     if (first, end) != (0, len(t)):
         notes.append(f"rows {first + 1} to {end} of {len(t)} are used, as its use_range states")
     return rows, notes

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.data.recordings.recording import Recording
-from calib.data.schema import BOUNDS, Joints, check_travel, max_travel, refuse
+from calib.data.schema import BOUNDS, Joints, check_travel, max_travel, more_rows, refuse
 from calib.errors import MeasurementError, refuse_data, require
 from calib.units import DEG
 
@@ -76,11 +76,28 @@ def check_recording(recording: Recording, joints: Joints | None = None) -> Recor
 
 def _check_finite(recording: Recording, most: float = np.inf) -> None:
     """Refuse NaN, infinities and values beyond `most`; NaN in `q_link` means: no second encoder."""
-    for name in NEEDED:
-        if (values := getattr(recording, name)) is not None and (bad := ~(np.abs(values) < most)).any():
-            columns = ["t"] if name == "t" else _columns(recording, name)
-            worst = values[bad][0]
-            refuse(recording, bad, columns, lambda *_: f"found {worst:g}; cut this part out")  # noqa: B023
+    series = {name: values for name in NEEDED if (values := getattr(recording, name)) is not None}
+    if (wrong := np.column_stack([~(np.abs(values) < most) for values in series.values()])).any():
+        columns = [label for name in series for label in (["t"] if name == "t" else _columns(recording, name))]
+        values, part = np.column_stack(list(series.values())), _sound_part(recording, wrong)
+        refuse(recording, wrong, columns, lambda row, k: f"found {values[row, k]:g}; cut this part out{part}")
+
+
+def _sound_part(recording: Recording, bad: np.ndarray) -> str:
+    """Return words on the cut to the longest part of rising stamps without a row marked in `bad` (N,) or (N, k).
+
+    A cut goes by the latest stamp up to each row. "" where that part is too short, and where pieces were read: what
+    lies between them is not known.
+    """
+    if np.ptp(recording.rows) + 1 > len(recording):
+        return ""
+    latest = np.fmax.accumulate(recording.t)
+    faulty = np.append(False, ~(latest[1:] > latest[:-1])) | bad.reshape(len(bad), -1).any(axis=1)
+    breaks = np.flatnonzero(np.concatenate([[True], faulty, [True]]))
+    longest = int(np.argmax(np.diff(breaks)))
+    first, last = int(breaks[longest]), int(breaks[longest + 1]) - 2
+    words = f"; the longest part without such rows is @{recording.t[first]:.9g}:{recording.t[last]:.9g}"
+    return words if last - first >= LIMITS.min_samples else ""
 
 
 def _drop_spikes(recording: Recording, joints: Joints | None) -> Recording:
@@ -113,12 +130,10 @@ def _drop_spikes(recording: Recording, joints: Joints | None) -> Recording:
             lambda row, j: f"is {recording.effort[row, j]:.4g} at {recording.t[row]:.6g} s, {median} {usual[j]:.4g} of "
             "its median: spikes of the log? They are too many to ignore; cut those parts out",
         )  # fmt: skip
-    row = int(np.argmax(rows))
-    j = int(np.argmax(wild[row]))
-    more = f" (and in {int(rows.sum()) - 1} more rows)" if rows.sum() > 1 else ""
+    row, j = np.argwhere(wild)[0]
     note = (
         f"row {recording.rows[row]}: the {columns[j]} is {recording.effort[row, j]:.4g} at {recording.t[row]:.6g} s"
-        f"{more}, the other rows are within "
+        f"{more_rows(recording, wild, columns)}, the other rows are within "
         f"{size[~rows, j].max():.4g} of its median: taken as a spike of the log and not used"
     )
     return _noted(recording.take(~rows), note)
@@ -153,7 +168,7 @@ def _check_time(recording: Recording) -> None:
     refuse(
         recording, back, ["t"],
         lambda i, _: f"time goes back from {t[i - 1]:.6g} s to {t[i]:.6g} s: were two logs joined, or was the clock "
-        f"set? Cut the file there (@{t[0]:g}:{t[i - 1]:g})",
+        f"set? Cut the file there{_sound_part(recording, back)}",
     )  # fmt: skip
     refuse(
         recording, stands, ["t"],

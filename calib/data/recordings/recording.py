@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.errors import MeasurementError, UsageError, one_of, refuse_data, refuse_option
+from calib.errors import MeasurementError, UsageError, one_of, refuse_data, refuse_option, refused_as
 from calib.records import frozen
 
 KINDS = ("torque", "current")
 SERIES = ("q", "v", "effort", "tau_link", "tau_motor", "q_link", "q_ref", "tau_ff")
 LATE = ("effort", "tau_link", "tau_motor")  # what may come late: they have a path of their own to the log
 Ends = tuple[float | None, float | None]
+PIECES = 20
 _CUT = re.compile(r"^(?P<file>.+)@(?P<start>[^@:/\\]*):(?P<stop>[^@:/\\]*)$")
 
 
@@ -132,34 +133,38 @@ class Recording:
         return replace(self, t=self.t[index], rows=self.rows[index], **picked)
 
 
-def rows_in_pieces(first: int, stop: int, most: int | None, pieces: int = 20) -> tuple[np.ndarray, list[str]]:
+def rows_in_pieces(t: np.ndarray, first: int, stop: int, most: int | None) -> tuple[np.ndarray, list[str]]:
     """Return the rows to use of a recording's rows `first` to `stop`, and notes: all, or at most `most` in pieces.
 
-    A piece lies at a random place in each of `pieces` equal parts: the whole time takes part, and no period of the
-    motion meets the same phase each time. Up to a quarter more rows are used whole.
+    A piece lies at a random place in each of `PIECES` equal parts: the whole time takes part, and no period of the
+    motion meets the same phase each time. Up to a quarter more rows are used whole; so are all rows where the stamps
+    t (N,) of pieces run backwards, which is refused later: only the whole tells where to cut.
     """
     count = stop - first
     if most is None or count <= 1.25 * most:
         return np.arange(first, stop), []
-    edges, length = np.linspace(first, stop, pieces + 1).astype(int), most // pieces
+    edges, length = np.linspace(first, stop, PIECES + 1).astype(int), most // PIECES
     starts = edges[:-1] + np.random.default_rng(0).integers(np.diff(edges) - length + 1)
+    rows = (starts[:, None] + np.arange(length)).ravel()
+    if (np.diff(t[rows]) < 0).any():
+        return np.arange(first, stop), []
     note = (
-        f"{pieces * length} of {count} samples are used, in {pieces} pieces spread over the recording "
+        f"{PIECES * length} of {count} samples are used, in {PIECES} pieces spread over the recording "
         "([recording] samples = … for more)"
     )
-    return (starts[:, None] + np.arange(length)).ravel(), [note]
+    return rows, [note]
 
 
 def rows_used(t: np.ndarray, ends: Ends, most: int | None, file: str | Path) -> tuple[np.ndarray, list[str]]:
     """Return the rows of a file with stamps `t` (N,) [s] that a cut leaves, at most `most` in pieces, and notes."""
     ordered = np.maximum.accumulate(np.nan_to_num(t, nan=-np.inf))  # time that runs back is refused later
     cut = slice(0, len(t)) if ends == (None, None) else rows_of_cut(ordered, *ends, file)
-    return rows_in_pieces(cut.start, cut.stop, most)
+    return rows_in_pieces(t, cut.start, cut.stop, most)
 
 
 def in_pieces(recording: Recording, most: int | None) -> Recording:
     """Return a recording of at most `most` samples: itself, or pieces spread over it (`rows_in_pieces`)."""
-    rows, notes = rows_in_pieces(0, len(recording), most)
+    rows, notes = rows_in_pieces(recording.t, 0, len(recording), most)
     return replace(recording.take(rows), notes=(*recording.notes, *notes)) if notes else recording
 
 
@@ -168,12 +173,6 @@ def settled(values: np.ndarray) -> np.ndarray:
     owner = values.base if isinstance(values, np.ndarray) and values.base is not None else values
     fixed = isinstance(owner, np.ndarray) and not owner.flags.writeable and values.dtype == float
     return values if fixed else frozen(values)
-
-
-def read_only(values: np.ndarray) -> np.ndarray:
-    """Return `values`, made read-only; the caller must own the array."""
-    values.flags.writeable = False
-    return values
 
 
 def earlier(recording: Recording, lag: float) -> Recording:
@@ -223,11 +222,9 @@ def parse_cut(text: str) -> tuple[str, float | None, float | None]:
         return text, None, None
     ends: list[float | None] = []
     for part in (match["start"], match["stop"]):
-        try:
+        words = f"{text}: '{part}' is not a time in seconds; to use a part of a recording, write log.npz@0:9.4"
+        with refused_as(UsageError, ValueError, words):
             ends.append(float(part) if part.strip() else None)
-        except ValueError as error:
-            message = f"{text}: '{part}' is not a time in seconds; to use a part of a recording, write log.npz@0:9.4"
-            raise UsageError(message) from error
     start, stop = ends
     if start is not None and start < 0.0:
         refuse_option(text, f"the cut starts at {start:g} s, before the recording; seconds count from its start")

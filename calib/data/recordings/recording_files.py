@@ -48,13 +48,14 @@ def read_log(path: Path, joints: Joints | None, options: RecordingOptions, ends:
     t = _stamps(table, found, options)
     used, spread = rows_used(t, ends, options.samples, path)
     table = table.where(used)
+    taken = {place for columns in found.values() for place in columns}
+    table.check(names := _called(table, sorted(taken)), names)
     kind = "current" if "current" in found else "torque"
     series: dict[str, Any] = {
         "effort" if ours == kind else ours: np.column_stack([_values(table, c, ours, options) for c in columns])
         for ours, columns in found.items()
         if ours not in ("t", "q")
     }
-    taken = {place for columns in found.values() for place in columns}
     unused = [name for place, name in enumerate(table.header) if place not in taken]
     notes = [*table.notes, *spread, *([f"not read: {', '.join(unused)}"] if unused else [])]
     for ours, columns in found.items():
@@ -153,9 +154,9 @@ def _joint_names(table: Table, places: Sequence[int]) -> list[str]:
 
 def _values(table: Table, place: int, ours: str, options: RecordingOptions) -> np.ndarray:
     """Return a column in SI; NaN is kept and refused later, if it is within the cut."""
-    if table.cells[place].dtype != float:
-        table.numbers(table.header[place])  # refuses, with the row
-    return table.cells[place] * table.factor(place, SCALES[ours], options.units.get(ours, ""))
+    return table.numbers(table.header[place], None, gaps=True) * table.factor(
+        place, SCALES[ours], options.units.get(ours, "")
+    )
 
 
 def _stamps(table: Table, found: dict[str, list[int]], options: RecordingOptions) -> np.ndarray:

@@ -17,7 +17,7 @@ from scipy.interpolate import CubicSpline
 from calib.config import strict
 from calib.config_types import OneOf, OneOrMany, Positive, Real, Whole
 from calib.data.recordings.archives import read_archived_positions
-from calib.data.recordings.recording import Recording, read_only
+from calib.data.recordings.recording import Recording
 from calib.data.recordings.recording_files import read_positions
 from calib.data.recordings.recording_options import RecordingOptions
 from calib.data.schema import Joints
@@ -26,7 +26,7 @@ from calib.data.signals.bandwidth import USABLE, Cutoffs, check_cutoff, propose_
 from calib.data.signals.resampling import CLOCKS, GAP, Resampled, SamplingReport, resample
 from calib.errors import MeasurementError, UsageError, refuse_data, refused_as, require
 from calib.files import check_regular
-from calib.records import frozen
+from calib.records import frozen, read_only
 
 # of a joint's peak speed: below it stands, for friction (the TX40's own thresholds are this share)
 STANDSTILL_SHARE = 0.01

@@ -27,7 +27,7 @@ from scipy.ndimage import uniform_filter1d
 
 from calib.data.recordings.recording import SERIES, Recording, settled
 from calib.errors import UsageError, refuse_data, require
-from calib.records import frozen
+from calib.records import frozen, read_only
 
 GAP = 0.05  # the longest time without a sample that is bridged [s]; our choice
 CLOCKS = ("stamps", "even", "counted")
@@ -301,8 +301,7 @@ def _interpolate(values: np.ndarray, t: np.ndarray, used: list[tuple[int, int]],
             new = own if same else CubicSpline(t[a:b], own)(grid) if finite else np.full(len(grid), np.nan)
             out[place : place + len(grid), j] = new
         place += len(grid)
-    out.flags.writeable = False
-    return out
+    return read_only(out)
 
 
 def _on_grid(t: np.ndarray, grid: np.ndarray) -> bool:

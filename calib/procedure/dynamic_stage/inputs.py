@@ -16,7 +16,7 @@ from calib.data.schema import Joints
 from calib.data.signals.filtering import SHARE
 from calib.data.signals.motion import FilterOptions, Motion, make_motion, with_reference
 from calib.data.signals.resampling import Resampled, resample
-from calib.errors import MeasurementError, NoPosture, UsageError, refuse_data, suggestion
+from calib.errors import MeasurementError, NoPosture, UsageError, refuse_data, refused_as, suggestion
 from calib.extensions import offered
 from calib.identification.checks.recorded_motion import DesignedMotion, locate
 from calib.identification.friction.friction_ladder import NAMES
@@ -208,13 +208,11 @@ def _read_case(
     """Return the case of one recording: payload, gains, and the links' motion where joints have corrections."""
     own = options.file_settings(path)
     slow = (options.slow if options.slow is not None else 0.01) if options.cut_slow else None
-    try:
+    with refused_as(MeasurementError, NoPosture, "{}", name):
         case = make_case(
             name, motion, options.settings.torque_rows, gains=found.for_motion(motion, own),
             carried=own.payload, slow=slow,
         )  # fmt: skip
-    except NoPosture as error:
-        raise MeasurementError(f"{error}", name) from error
     for moved in offered("link_motion") if getattr(robot, "corrections", None) is not None else ():
         case = moved(robot, case, options.settings)
     return case

@@ -43,7 +43,7 @@ from calib.data.recordings.recording import Recording
 from calib.data.recordings.recording_files import read_recording
 from calib.data.schema import Joints
 from calib.data.signals.resampling import resample
-from calib.errors import MeasurementError, UsageError, require
+from calib.errors import MeasurementError, UsageError, refused_as, require
 from calib.folders import METRICS
 from calib.units import headings, motion_units
 from trajectories.bspline import bspline_family
@@ -152,10 +152,9 @@ def read(folder: Path) -> Periodic:
         tuple(joint.name for joint in table.joint), tuple(joint.kind for joint in table.joint), table.period,
         table.rate, table.repeat, table.family, tuple(coefficients), table.degree,
     )  # fmt: skip
-    try:
+    damage, words = (ValueError, IndexError, BadInput), f"{path} is damaged ({{}}); write it again with calib excite"
+    with refused_as(UsageError, damage, words):
         found.orders(np.zeros(1))
-    except (ValueError, IndexError, BadInput) as error:
-        raise UsageError(f"{path} is damaged ({error}); write it again with calib excite") from error
     return found
 
 
@@ -206,11 +205,9 @@ def find(folder: Path, log: str, skip: int = 0) -> AveragedMotion:
     rate, series = _longest(recording, motion.period)
     count = round(motion.period * rate)
     reference = motion.orders(np.arange(count) / rate)[0]
-    try:
+    with refused_as(MeasurementError, BadInput, "{}", recording.file):
         found = find_periods(series["q"], reference, skip)
         averages = {name: average(values, found) for name, values in series.items() if np.isfinite(values).all()}
-    except BadInput as error:
-        raise MeasurementError(str(error), recording.file) from error
     error = averages["q"].mean - reference
     return AveragedMotion(
         motion, recording.file, found, averages, recording.kind, rate, np.sqrt(np.mean(error**2, axis=0))

@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.config import Tables
 from calib.dynamics.base import columns_at_rest, standard_name
-from calib.errors import UsageError, one_of, require
+from calib.errors import UsageError, one_of, refused_as, require
 from calib.extensions import offered
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
@@ -144,10 +144,8 @@ def _read_locked(texts: Sequence[str], chain: Chain, limits: BoxLimit) -> dict[i
         if name not in known:
             raise UsageError(f"lock {text}: '{name}' is not a joint; joints: {', '.join(chain.joint_names)}")
         j = known[name]
-        try:
+        with refused_as(UsageError, ValueError, f"lock {text}: '{amount}' is not a number"):
             value = float(amount) if amount else None
-        except ValueError:
-            raise UsageError(f"lock {text}: '{amount}' is not a number") from None
         lower, upper = limits.lower[j], limits.upper[j]
         if value is not None and not lower <= value <= upper:
             raise UsageError(

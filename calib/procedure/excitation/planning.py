@@ -24,7 +24,7 @@ from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.drives import standard
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.path_dynamics import PathDynamics, of_standard
-from calib.errors import RobotError, UsageError, require
+from calib.errors import RobotError, UsageError, refused_as, require
 from calib.geometry import inverse
 from calib.geometry.installation import Installation
 from calib.geometry.inverse import Goal
@@ -268,7 +268,7 @@ def _law(
         require(drives is None, "model and drives both state drive parameters; leave one of them out", UsageError)
         law, unsure = _identified(chain, folder, payloads)
         return law, () if unsure else ("the model states no covariance: torques have no margin for it",), unsure
-    try:
+    with refused_as(UsageError, RobotError, "{}"):
         stated = _read_drives(drives, chain)
         if known.friction is not None and not stated:
             stated = {"Fv": known.friction[0], "Fc": known.friction[1]}
@@ -276,8 +276,6 @@ def _law(
             return None, (), None
         check_bodies(chain, known.torque)
         values = np.column_stack([stated.get(key, np.zeros(chain.n)) for key in DRIVES])
-    except RobotError as error:
-        raise UsageError(str(error)) from error
     linear = [joint.kind == "prismatic" for joint in chain.joints]
     model = IdentificationModel(bodies_of(chain), standard([" ".join(DRIVES)] * chain.n, linear=linear))
     missing = [what for what, key in (("motor inertia", "Ia"), ("friction", "Fc")) if key not in stated]

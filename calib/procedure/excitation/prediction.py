@@ -24,7 +24,7 @@ import numpy as np
 
 from calib import files
 from calib.data.signals.bandwidth import LOWEST, SHARE
-from calib.errors import UsageError, require
+from calib.errors import UsageError, refused_as, require
 from calib.folders import METRICS
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.excitation.inputs import ExcitationInputs
@@ -318,10 +318,8 @@ def compared_with_identification(folder: Path, outcome: IdentificationOutcome) -
     """
     check_folder(folder)
     outlook = read_json(folder / METRICS, "give the folder that calib excite wrote", _Predicted).prediction
-    try:
+    with refused_as(UsageError, ValueError, "{}; give the folder that calib excite wrote"):
         predicted = {row.name: row.sigma for row in read_rows(PredictedSigma, folder / NAME)}
-    except ValueError as error:
-        raise UsageError(f"{error}; give the folder that calib excite wrote") from error
     limits = np.array([joint.effort for joint in outcome.inputs.chain.joints])
     rms = next(iter(outcome.fit.values())).filtered.rms[-len(limits) :]  # the motors' rows come last
     known = len(rms) == len(limits) and np.isfinite(rms / limits).all()

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from calib.arguments import checked
 from calib.config_types import Checked, Flag, OneOf, Real, Seed, Text, Typed, Whole
-from calib.errors import UsageError
+from calib.errors import UsageError, refused_as
 
 HARMONICS = 12  # per joint: cond falls by a fifth from 5 to 12, by a tenth more to 20 at twice the cost (our choice)
 DRIVES = ("Ia", "Fv", "Fc", "off")  # terms that a description may state
@@ -23,10 +23,9 @@ def split_goal(text: str) -> tuple[str, float]:
         UsageError: for an unknown name, or a missing number.
     """
     name, _, amount = text.partition("=")
-    try:
+    expected = f"goal '{text}': expected NAME=NUMBER, e.g. wrist=0.1, or {', '.join(AIMS)}"
+    with refused_as(UsageError, ValueError, expected):
         value = float(amount)
-    except ValueError:
-        raise UsageError(f"goal '{text}': expected NAME=NUMBER, e.g. wrist=0.1, or {', '.join(AIMS)}") from None
     if name not in GOALS and not re.fullmatch(r"joint[1-9]\d*", name):
         words = f"use {', '.join(GOALS)}, joint1 …, each with its number, or {' or '.join(AIMS)}"
         raise UsageError(f"goal '{text}': '{name}' is unknown; {words}")

@@ -99,6 +99,10 @@ def half_seen(rows):
         (POSE, put(7, 4, ""), "empty or NaN", 8, "y", {}),
         (POSE, put(7, 4, "beam lost"), "'beam lost' where a number is needed", 8, "y", {}),
         (
+            POSE, lambda rows: put(2, 5, "")(put(7, 4, "beam lost")(put(8, 0, "ERR")(rows))),
+            "an empty or NaN cell .*and in 2 more rows; of all, 1 in q1, 1 in y, 1 in z", 3, "z", {},
+        ),
+        (
             POSE, lambda rows: [[*rows[0][:3], *row[3:]] for row in rows],
             "all 10 rows have the same joint values", 10, "q1", {},
         ),

@@ -1,5 +1,6 @@
 """Recordings read from archives, tables and bags, cut, and refused with the row and the reason."""
 
+import re
 import zipfile
 from pathlib import Path
 
@@ -206,6 +207,9 @@ def test_time_that_cannot_be(archive, series):
     t[500:] -= 1.0
     error = refused(archive(t=t), r"time goes back from 2.495 s to 1.5 s")
     assert (error.row, error.column) == (501, "t")
+    cut = re.findall(r"@[\d.]+:[\d.]+", str(error))
+    assert cut == ["@2.5:10.995"]  # where the clock has caught up
+    assert len(read_recording(f"{archive(t=t)}{cut[0]}")) == 1699
     t = series["t"].copy()
     t[500] = t[499]
     assert refused(archive(t=t), "two samples have the stamp").row == 501
@@ -227,8 +231,13 @@ def test_rows_written_twice_are_left_out(archive, series):
 def test_values_that_cannot_be(archive, series):
     tau = series["tau"].copy()
     tau[12, 1] = tau[80, 2] = np.nan
-    error = refused(archive(tau=tau), r"found nan; .* \(and in 1 more rows\)")
+    error = refused(archive(tau=tau), r"found nan; .* is @0.405:11.995 \(and in 1 more row; of all, 1 in torque of b")
     assert (error.row, error.column) == (13, "torque of b (joint 2)")
+    tau[::50] = np.nan
+    assert "longest" not in str(refused(archive(tau=tau), r"found nan; cut this part out \(and in"))
+    t = series["t"].copy()
+    t[800] = np.inf
+    refused(archive(t=t), "found inf; cut this part out; the longest part without such rows is @0:3.995")
     refused(archive(q=np.degrees(series["q"])), r"looks like deg; if so, state the unit \(header 'q1 \[deg\]'")
     refused(archive(dq=np.degrees(series["dq"])), "the velocities look like deg/s")
     refused(archive(q=np.degrees(series["q"]), dq=series["dq"]), "deg", None)
