@@ -1,4 +1,4 @@
-"""A step of a clock inside a stream, which a line through the offsets would pass for drift.
+"""A step of a clock inside a stream, or its wandering, which a line through the offsets would pass for drift.
 
 About the fit of clock and arm (`calib.rooms.instruments.clocks.fitted`) the offset is let change at a time T by a size
 that is free, with all that was fitted, and backlash, free beside it: what least squares then say of the size, in its σ,
@@ -19,9 +19,9 @@ from calib.rooms.instruments.stream_files import Stream
 BACKLASH = 1e-4  # by which a joint comes to rest before where it was sent, from either side [rad or m]
 KNOTS = 6  # of the polygon, ends included
 TRIED, CLOSER = 120, 40  # times at which a step is tried, evenly, then between the neighbours of the best
-MIN_STEP = 2e-3  # size of a step that is said [s]
+MIN_STEP = 3e-3  # size of a step that is said [s]
 CERTAIN = 5.0, 7.0  # its size in σ, alone and beside the polygon
-STAMPED = 0.3  # share of the size by which the stamps may differ from it
+STAMPED = 0.5  # share of the size by which the stamps may differ from it
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,19 +71,27 @@ class Step:
         return f"{Path(stream.file).name}: t = {self.time:.2f} s, {Path(log.file).name}: t = {log_time:.2f} s, about"
 
 
-def find_step(seen: Equations) -> Step | None:
-    """Return the step that stands out most, or None where the clock is even, or wanders smoothly."""
+def find_step(seen: Equations) -> tuple[Step | None, float]:
+    """Return the step that stands out most, None where there is none, and by how much the clock leaves its line [s].
+
+    The second is 0 where a line is as good as a polygon.
+    """
     begin, end = float(seen.t.min()), float(seen.t.max())
     knots = np.linspace(begin, end, KNOTS)
     hats = np.array([np.interp(seen.t, knots, row) for row in np.eye(KNOTS)[1:-1]])
-    for beside, certain in zip((hats[:0], hats), CERTAIN):
+    left, *columns = _projected(seen, list(hats))
+    bends, _, _, _ = np.linalg.lstsq(np.array(columns).T, left)
+    rest = float(np.sum((left - bends @ columns) ** 2))
+    smooth, corners = float(left @ left) - rest, np.array([0.0, *bends, 0.0])
+    away = float(np.abs(corners - np.polyval(np.polyfit(knots - begin, corners, 1), knots - begin)).max())
+    certain = smooth > CERTAIN[1] ** 2 * rest / (len(seen.late) - seen.matrix.shape[1])
+    for beside, sigmas in zip((hats[:0], hats), CERTAIN):
         times, apart = np.linspace(begin, end, TRIED + 2, retstep=True)
         best = _best(seen, times[1:-1], beside)[0]
         step, explained = _best(seen, np.linspace(best.time - apart, best.time + apart, CLOSER), beside)
-        smooth = 0.0 if len(beside) else _explained(seen, hats)
-        if abs(step.size) > max(MIN_STEP, certain * step.sigma) and explained > smooth:
-            return step
-    return None
+        if abs(step.size) > max(MIN_STEP, sigmas * step.sigma) and (len(beside) or explained > smooth):
+            return step, away
+    return None, away if certain else 0.0
 
 
 def _best(seen: Equations, times: np.ndarray, beside: np.ndarray) -> tuple[Step, float]:
@@ -104,13 +112,6 @@ def _best(seen: Equations, times: np.ndarray, beside: np.ndarray) -> tuple[Step,
     free = len(seen.late) - seen.matrix.shape[1] - seen.play.shape[1] - len(beside) - 1
     rest = float(left @ left - explained[k]) / max(free, 1)
     return Step(float(times[k]), float(size[k]), float(np.sqrt(rest / power[k]))), float(explained[k])
-
-
-def _explained(seen: Equations, changes: np.ndarray) -> float:
-    """Return the sum of squares that changes (n, rows) of the offset explain."""
-    left, *columns = _projected(seen, list(changes))
-    base = np.linalg.qr(np.array(columns).T)[0]
-    return float(np.sum((base.T @ left) ** 2))
 
 
 def _projected(seen: Equations, changes: list[np.ndarray]) -> np.ndarray:

@@ -41,6 +41,7 @@ FITTED = 1500  # rows that clock and geometry are fitted to first
 OUTLIER = 6.0  # robust sigmas
 MIN_ROWS, MAX_ROWS = 20, 20_000  # of the table
 MOVED = 1e-3  # by which a joint moves at least between two rows of the table [rad or m]
+MAX_WANDER = 5e-3  # by which a clock may leave a line of offset and drift [s]
 WORTH_SAYING = 1.05  # times that σ of a fit to all rows would be too small
 
 
@@ -84,8 +85,9 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
     run = Run(log, stream, PoseMeasurements.of(q, stream.values[:, :3], turn, joint_names=names, file=str(file)))
     nominal, clock, rivals = begin(chain, run)
     cell, clock, seen = fitted(nominal, run, run.known(clock, FITTED), clock)
-    if step := find_step(seen):
-        _refuse(step, run, clock)
+    step, wander = find_step(seen)
+    if step or wander > MAX_WANDER:
+        _refuse(step, wander, run, clock)
     kept, left, velocity, said = _usable(cell, run, clock)
     tau, sigma = max(inflation(row) for row in left), robust.spread(left[:3])
     chosen, apart = _thinned(stream.t[kept], run.joints(clock, kept), stream.step * (1.0 + 1.5 * (tau - 1.0)))
@@ -112,6 +114,7 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
     )
     require(late < sigma, words, MeasurementError, file)
     said += [finding("stream-repeats", offsets=rivals)] if rivals else []
+    said += [finding("stream-wanders", away=wander)] if wander else []
     first = stream.t[0] - float(clock.controller(stream.t[:1])[0])
     ppm = {"ppm": 1e6 * clock.drift, "ppm_sigma": 1e6 * clock.drift_sigma}
     said += [finding("stream-clock", first=first, **vars(clock) | ppm)]
@@ -120,8 +123,11 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
     return Streamed(table, stream.rows[rows] - 1, notes, clock, **found)
 
 
-def _refuse(step: Step, run: Run, clock: Clock) -> NoReturn:
-    """Refuse recordings in which a clock steps."""
+def _refuse(step: Step | None, wander: float, run: Run, clock: Clock) -> NoReturn:
+    """Refuse recordings in which a clock steps, or wanders."""
+    if step is None:
+        words = f"the clocks' offset leaves a line of offset and drift by {1e3 * wander:.2g} ms"
+        refuse_data(run.stream.file, f"{words}: cut the file into shorter parts, and join each part on its own")
     size = f"{1e3 * step.size:+.3g} ± {1e3 * step.sigma:.2g} ms"
     words = f"the instrument's clock steps by {size} against the controller's"
     place = step.place(run.log, run.stream, float(clock.controller(np.array(step.time))))
