@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,15 +14,16 @@ from scipy.signal import lfilter
 import calib
 from calib.cli import run
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
-from calib.errors import CalibError, MeasurementError, UsageError
+from calib.errors import CalibError, MeasurementError, UsageError, finding
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit
 from calib.geometry.observation import observe, predict, prepare, target_jacobian
+from calib.procedure.findings import lines_of
 from calib.robot.chain import Chain
 from calib.robot.library import load
 from calib.rooms.cells.cell import Cell, true_poses
 from calib.rooms.cells.virtual_cells import perturbed_cell, rigid, virtual_cell
-from calib.rooms.instruments import joining, stream_files
+from calib.rooms.instruments import joining, stream_files, streams
 from calib.rooms.instruments.streams import Streamed
 from calib.transforms import to_quaternion
 
@@ -231,6 +233,94 @@ def test_of_a_motion_that_repeats_itself_the_offset_is_said_to_be_ambiguous(tmp_
     assert again.clock.offset == pytest.approx(OFFSET, abs=3.0 * again.clock.sigma)
 
 
+def stepped(source: Path, path: Path, at: float, size: float) -> tuple[Path, int]:
+    """Write a stream whose clock steps by a size [s] at a share of its rows; return it and the row of the step."""
+    row = int(at * (len(source.read_text().splitlines()) - 1)) + 1
+    late = np.arange(1, 1_000_000) >= row
+    return changed(
+        source, path, lambda rows: rows + np.outer(late[: len(rows)], [size, *[0] * (rows.shape[1] - 1)])
+    ), row
+
+
+def check_step(log: Path, stream: Path, robot: str, size: float, file: str, row: int) -> None:
+    with pytest.raises(MeasurementError, match=r"clock steps by .*cut the file there, and join each part") as refused:
+        joined(log, stream, robot)
+    said = re.search(r"steps by (\S+) ± (\S+) ms.* \((\S+): row (\d+), t = ", str(refused.value))
+    assert said and said[3] == file
+    assert float(said[1]) == pytest.approx(1e3 * size, abs=max(5.0 * float(said[2]), 1e1 * abs(size)))
+    assert abs(int(said[4]) - row) <= 2
+
+
+@pytest.mark.parametrize("size", [5e-3, -0.02, 0.2])
+def test_a_step_of_the_instruments_clock_is_refused_with_its_size_and_row(tmp_path, files, size):
+    stream, row = stepped(files[1], tmp_path / "s.csv", 0.4, size)
+    check_step(files[0], stream, "ur5", size, "s.csv", row)
+
+
+def test_a_step_of_the_logs_clock_is_found_in_the_log(tmp_path, files):
+    log, row = stepped(files[0], tmp_path / "l.csv", 0.6, 0.05)
+    check_step(log, files[1], "ur5", -0.05, "l.csv", row)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", ["ur5", "tx40"])
+def test_steps_are_found_in_arms_with_backlash_and_none_where_there_are_none(tmp_path, robot):
+    for seed in range(4):
+        log, stream = recorded(tmp_path, virtual_cell(robot, seed), seed, 160.0, drift=40e-6)
+        assert abs(joined(log, stream, robot).clock.drift - 40e-6) < 2e-5
+        for size in (5e-3, -0.02, 0.05, 0.2):
+            path, row = stepped(stream, tmp_path / "s.csv", 0.3 + 0.1 * seed, size)
+            check_step(log, path, robot, size, "s.csv", row)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("period", [240.0, 60.0])
+def test_a_clock_that_wanders_by_a_millisecond_is_no_step(tmp_path, period):
+    for seed in range(3):
+        log, stream = recorded(tmp_path, rigid(perturbed_cell(load("ur5"), seed)), seed, 240.0)
+        wander = changed(stream, tmp_path / "w.csv", lambda rows: rows + np.outer(
+            1e-3 * np.sin(2.0 * np.pi / period * rows[:, 0]), [1, 0, 0, 0]))  # fmt: skip
+        one = joined(log, wander)
+        assert one.clock.offset == pytest.approx(OFFSET, abs=1e-3)
+        if period == 240.0:
+            assert any("ms: by so much the clocks' offset leaves the line" in note for note in one.notes)
+    far = changed(wander, tmp_path / "f.csv", lambda rows: rows + np.outer(
+        0.015 * np.sin(2.0 * np.pi / 240.0 * rows[:, 0]), [1, 0, 0, 0]))  # fmt: skip
+    with pytest.raises(MeasurementError, match=r"shorter parts|clock steps by"):
+        joined(log, far)
+
+
+@pytest.mark.slow
+def test_a_step_there_and_back_is_no_drift_either(tmp_path):
+    log, stream = recorded(tmp_path, rigid(perturbed_cell(load("ur5"), 1)), 1, 240.0)
+    there, first = stepped(stream, tmp_path / "a.csv", 0.33, 0.03)
+    back, last = stepped(there, tmp_path / "b.csv", 0.67, -0.03)
+    with pytest.raises(MeasurementError, match=rf"clock steps by .*b.csv: row ({first}|{last}), "):
+        joined(log, back)
+
+
+def test_what_thins_rows_is_said():
+    t = 0.01 * np.arange(1000)
+    for times, q, apart, wanted in (
+        (t, t, 0.05, {"apart": 0.05, "most": None, "moved": None}),
+        (t, t / 200.0, 0.05, {"apart": 0.21, "most": None, "moved": 1.0}),
+        (np.linspace(0.0, 5.0, 100_000), np.linspace(0.0, 500.0, 100_000), 1e-4,
+         {"apart": 2.5e-4, "most": 20_000, "moved": None}),
+    ):  # fmt: skip
+        said = streams._thinned(times, q[:, None], apart)[1]
+        assert said["apart"] == pytest.approx(wanted["apart"], rel=0.25)
+        assert (said["most"], said["moved"]) == (wanted["most"], wanted["moved"])
+    known = {"taken": 3, "of": 9, "step": 0.01, "apart": 0.03, "sigma": 1e-5, "correlation": 0.01, "left": 0.0}
+    (line,) = lines_of([finding("stream-thinned", **known, most=None, moved=None, factor=None)])
+    assert "since" not in line and "too small" not in line
+
+
+def test_the_offset_is_said_with_its_time(found):
+    line = next(note for note in found.notes if "minus the controller's" in note)
+    first = found.clock.offset + found.clock.drift * (2.0 + OFFSET - found.clock.middle)
+    assert f" at {found.clock.middle:.2f} s of its own, {first:+.5f} s at its first row: " in line
+
+
 REFUSED = {
     "no times": (lambda rows: rows[:, 1:], "x [mm],y [mm],z [mm]", "no column of times.*joined by name, time or row"),
     "stops": (lambda rows: rows[::500], "", "rows are 5 s apart, a stream's 0.2 s at most. Is t in ms"),
@@ -244,6 +334,8 @@ REFUSED = {
                   "only 1 of .* rows can be used .*a time not after the row before"),
     "a jump of the clock": (lambda rows: rows + (rows[:, :1] > 60.0) * [7.0, 0, 0, 0], "",
                             "at no offset of the clocks.*did no clock jump|did a clock jump"),
+    "a clock that restarts": (lambda rows: rows - (rows[:, :1] > 60.0) * [58.0, 0, 0, 0], "",
+                              r"row 5.*go back from (59\.9|60\.0)\d* to 2\.\d* s and run on .*restarted. Split"),
     "too short": (lambda rows: rows[:400], "", "offset of its clock is known to .* ms only|independent"),
     "nothing seen": (lambda rows: rows * [1, 0, 0, 0], "", "only 0 of .* rows can be used"),
 }  # fmt: skip

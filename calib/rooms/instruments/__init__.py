@@ -5,7 +5,7 @@ OFFERS = {
     "topics": ":TOPICS", "pose_forms": "robodk:FORMS",
 }  # fmt: skip
 TOPICS = {
-    "join": ("joints and points in separate files, for calib join", "calib.rooms.instruments.joining"),
+    "join": ("joints and points in separate files, or two streams, for calib join", "calib.rooms.instruments.joining"),
     "robodk": ("CSV of RoboDK, and of three reflectors without a header", "calib.rooms.instruments.robodk"),
     "instruments": ("text exports of trackers, CMMs and motion capture", "calib.rooms.instruments.exports"),
 }

@@ -33,6 +33,7 @@ from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 from calib.rooms.instruments.order import MAX_MISFIT
+from calib.rooms.instruments.steps import BACKLASH, Equations
 from calib.rooms.instruments.stream_files import Stream
 from calib.transforms import invert, rotation_vector
 
@@ -49,7 +50,6 @@ BESIDE = 1e-3  # difference of times by which speeds are computed [s]
 ORDERS = 6  # of the harmonics that are fitted
 ROUNDS = 12  # of Gauss-Newton
 SETTLED = 1e-6  # change of the offset after which it ends [s]
-BACKLASH = 1e-4  # by which a joint comes to rest before where it was sent, from either side [rad or m]
 TERM_SIZES = (1e-3, 5.0)  # times their guessed size that terms are, at least and at most
 _NONE = np.array([], dtype=int)
 
@@ -124,7 +124,7 @@ def begin(chain: Chain, run: Run) -> tuple[Installation, Clock, tuple[float, ...
         clock = Clock(offset, middle=middle)
         if len(rows := run.known(clock, PLACED)) < PLACED / 3:
             continue
-        cell, clock = fitted(install(chain, [run.at(clock, rows)]), run, rows, clock, arm=False)
+        cell, clock, _ = fitted(install(chain, [run.at(clock, rows)]), run, rows, clock, arm=False)
         sizes = np.sort(np.linalg.norm(residuals(cell, run, rows, clock)[:3], axis=0))
         found.append((float(np.sqrt(np.mean(sizes[: TRIMMED * len(rows) // 100] ** 2))), clock, cell))
     least = min((each[0] for each in found), default=np.inf)
@@ -194,8 +194,8 @@ def velocities(cell: Installation, run: Run, rows: np.ndarray, clock: Clock) -> 
 
 def fitted(
     cell: Installation, run: Run, rows: np.ndarray, clock: Clock, arm: bool = True, play: bool = False
-) -> tuple[Installation, Clock]:
-    """Return the installation and the clock that fit some rows best; σ is that of independent rows.
+) -> tuple[Installation, Clock, Equations]:
+    """Return the installation and the clock that fit some rows best, and the last equations; σ is of independent rows.
 
     Args:
         cell, clock: where to start: the nominal arm, about which its parameters have a wide prior.
@@ -210,10 +210,11 @@ def fitted(
     start, table, t = cell, layout(cell), run.stream.t[rows] - clock.middle
     free = table.rigid_index if arm else table.frame_index
     free = free[base_columns(cell, prepare(cell, [run.at(clock, rows)]), free).kept]
-    moving, loss = (cell.chain.moving, "none") if play else (_NONE, "huber")
-    sizes = (plausible_deviation(cell, free), term_sizes(terms), np.full(len(moving), BACKLASH), [np.inf, MAX_DRIFT])
+    moving, loss = cell.chain.moving, "none" if play else "huber"
+    played = len(moving) if play else 0
+    sizes = (plausible_deviation(cell, free), term_sizes(terms), np.full(played, BACKLASH), [np.inf, MAX_DRIFT])
     guess = np.concatenate(sizes)
-    group = np.repeat([-1, *range(len(families) + 1), -1], [len(free), *map(len, families), len(moving), 2])
+    group = np.repeat([-1, *range(len(families) + 1), -1], [len(free), *map(len, families), played, 2])
     free = np.concatenate([free, table.index("deflection")])
     known, spread = np.isfinite(guess), np.full(len(guess), np.inf)
     for _ in range(ROUNDS):
@@ -221,14 +222,17 @@ def fitted(
         now, turned = observe(cell, block, free), observe(cell, block, moving)
         pulled = np.zeros(len(guess))
         pulled[: len(free)], pulled[-1] = (parameter_values(start) - parameter_values(cell))[free], -clock.drift
-        side = np.sign(run.joints(clock, rows, 1).T)[:, None] if play else 0.0
-        left, slopes = list[np.ndarray](), list[np.ndarray]()
+        side = np.sign(run.joints(clock, rows, 1).T)[:, None]
+        left, slopes, plays, lates = list[np.ndarray](), list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
         for part, joints, speed in zip(now, turned, np.split(velocities(cell, run, rows, clock), len(now))):
             sigma = max(robust.spread(part.value), 1e-9)
             weight = np.sqrt(robust.weights(np.sqrt(np.mean(part.value**2, axis=0)) / sigma, loss)) / sigma
             left.append((weight * part.value).ravel())
-            columns = np.concatenate([part.jacobian, side * joints.jacobian, [-speed, -t * speed]])
-            slopes.append((weight * columns).reshape(len(guess), -1).T)
+            plays.append((weight * side * joints.jacobian).reshape(len(moving), -1).T)
+            lates.append((weight * -speed).ravel())
+            columns = np.concatenate([part.jacobian, [-speed, -t * speed]])
+            columns = (weight * columns).reshape(len(columns), -1).T
+            slopes.append(np.hstack([columns[:, :-2], plays[-1][:, :played], columns[:, -2:]]))
         prior = _sized(np.concatenate(slopes), np.concatenate(left), pulled, guess, group) if arm else guess
         matrix = np.concatenate([*slopes, np.diag(1.0 / prior)[known]])
         wanted = np.concatenate([*left, (pulled / prior)[known]])
@@ -243,7 +247,10 @@ def fitted(
         clock = replace(clock, offset=clock.offset + change[-2], drift=clock.drift + change[-1])
         if abs(change[-2]) < SETTLED:
             break
-    return cell, replace(clock, sigma=float(spread[-2]), drift_sigma=float(spread[-1]))
+    late = np.concatenate(lates)
+    times = np.tile(run.stream.t[rows], len(late) // len(rows))
+    seen = Equations(matrix, wanted, late, np.concatenate(plays), times)
+    return cell, replace(clock, sigma=float(spread[-2]), drift_sigma=float(spread[-1])), seen
 
 
 def _sized(

@@ -1,8 +1,9 @@
 """Files of rows over time (a tracker's stream, a controller's log): read in pieces, and what cannot be used counted.
 
 A row is left out where a cell that is needed is no number or beyond what it can be, where all are zero (a tracker that
-saw nothing), where its cells are too few or too many, and where its time is not after all times before. Of the rest
-only as many are held as the resolution asks for, and `HELD` at most, so that memory is bounded.
+saw nothing), where its cells are too few or too many, and where its time is not after all times before. A clock that
+goes back and runs on from there was restarted: refused, since half of the rows would be left out. Of the rest only as
+many are held as the resolution asks for, and `HELD` at most, so that memory is bounded.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,7 @@ PIECE = 50_000  # rows read at once (our choice)
 HELD = 500_000  # rows held, at most: beyond them every second one (our choice)
 SLOWEST = 0.2  # time between two rows of a stream, at most [s] (our choice)
 MIN_ROWS = 200  # of a stream (our choice)
+RESTART = 1.0  # by which a clock that was restarted goes back, at least [s] (our choice)
 DAMAGED, LATE = "damaged, empty or not seen", "with a time not after the row before"
 
 
@@ -91,16 +93,21 @@ def read_stream(path: Path, kind: Kind) -> Stream:
     """Return the rows of the file at `path` that can be used.
 
     Raises:
-        MeasurementError: for a file without times, one that was measured at stops, and one of which most rows cannot
-            be used.
+        MeasurementError: for a file without times, one that was measured at stops, one whose clock was restarted, and
+            one of which most rows cannot be used.
     """
     parts, dropped, last, every, read = list[tuple[np.ndarray, ...]](), Counter[str](), -np.inf, 0, 0
+    jumps, latest = list[tuple[int, float, float]](), np.nan
     for table in _pieces(path):
         t, values, whole = _piece(table, kind)
         before = np.maximum.accumulate(np.concatenate([[last], np.where(whole, t, -np.inf)]))
         ahead = whole & (t > before[:-1])
         dropped.update({DAMAGED: int((~whole).sum()), LATE: int((whole & ~ahead).sum())})
         last, read = before[-1], read + len(t)
+        own = np.concatenate([[latest], t[whole]])
+        far = np.flatnonzero(np.abs(np.diff(own)) > RESTART)
+        jumps += zip(table.rows[whole][far].tolist(), own[far].tolist(), own[far + 1].tolist())
+        latest = own[-1]
         if not every and ahead.sum() > 1:
             every = max(int(kind.resolution / _step(t[ahead], table) + 0.01), 1)
         held = ahead & ((table.rows - 1) % max(every, 1) == 0)
@@ -108,12 +115,25 @@ def read_stream(path: Path, kind: Kind) -> Stream:
         if sum(len(part[0]) for part in parts) > HELD:
             every *= 2
             parts = [tuple(own[(part[2] - 1) % every == 0] for own in part) for part in parts]
+    _refuse_restart(path, [*jumps, (read + 1, np.nan, -np.inf)])
     if read - sum(dropped.values()) < max(MIN_ROWS, read / 2):
         said = ", ".join(f"{count} {why}" for why, count in dropped.items() if count)
         words = f"only {read - sum(dropped.values())} of {read} rows can be used{said and f' ({said})'}"
         refuse_data(path, f"{words}: is it a stream, and one recording?")
     t, values, rows = (np.concatenate(each) for each in zip(*(part for part in parts if len(part[0]))))
     return Stream(str(path), t, values, rows, float(np.median(np.diff(t))), read, dropped)
+
+
+def _refuse_restart(path: Path, jumps: Sequence[tuple[int, float, float]]) -> None:
+    """Refuse a file whose times go back and do not return: those of a copied block of rows do.
+
+    Args:
+        jumps: row, time before it and its own [s] of each jump by more than `RESTART`; the file's end as the last one.
+    """
+    for (row, before, after), (end, _, then) in pairwise(jumps):
+        if after < before and then < before - RESTART and end - row >= MIN_ROWS:
+            words = f"its times go back from {before:.3f} to {after:.3f} s and run on from there: the clock restarted"
+            refuse_data(path, f"{words}. Split the file there, and join each part on its own", row=row)
 
 
 def _piece(table: Table, kind: Kind) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -31,6 +31,7 @@ from calib.records import evenly
 from calib.robot.chain import Chain, joint_kinds
 from calib.rooms.instruments.clocks import Clock, Run, begin, fitted, residuals, velocities
 from calib.rooms.instruments.joined import Joined
+from calib.rooms.instruments.steps import Step, find_step
 from calib.rooms.instruments.stream_files import Kind, Stream, read_stream
 from calib.units import JOINT
 
@@ -40,6 +41,8 @@ FITTED = 1500  # rows that clock and geometry are fitted to first
 OUTLIER = 6.0  # robust sigmas
 MIN_ROWS, MAX_ROWS = 20, 20_000  # of the table
 MOVED = 1e-3  # by which a joint moves at least between two rows of the table [rad or m]
+MAX_WANDER = 5e-3  # by which a clock may leave a line of offset and drift [s]
+WORTH_SAYING = 1.05  # times that σ of a fit to all rows would be too small
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,10 +84,13 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
     q, names = np.zeros((len(stream.t), chain.n)), chain.joint_names
     run = Run(log, stream, PoseMeasurements.of(q, stream.values[:, :3], turn, joint_names=names, file=str(file)))
     nominal, clock, rivals = begin(chain, run)
-    cell, clock = fitted(nominal, run, run.known(clock, FITTED), clock)
+    cell, clock, seen = fitted(nominal, run, run.known(clock, FITTED), clock)
+    step, wander = find_step(seen)
+    if step or wander > MAX_WANDER:
+        _refuse(step, wander, run, clock)
     kept, left, velocity, said = _usable(cell, run, clock)
     tau, sigma = max(inflation(row) for row in left), robust.spread(left[:3])
-    chosen = _thinned(stream.t[kept], run.joints(clock, kept), stream.step * (1.0 + 1.5 * (tau - 1.0)))
+    chosen, apart = _thinned(stream.t[kept], run.joints(clock, kept), stream.step * (1.0 + 1.5 * (tau - 1.0)))
     rows, rest = kept[chosen], max(float(autocorrelation(row, 1)[0]) for row in left[:, chosen])
     found: dict[str, Any] = {
         "sigma": sigma,
@@ -92,12 +98,13 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
         "factor": float(np.sqrt(tau)),
         "left": rest,
     }
-    thinned = finding("stream-thinned", taken=len(rows), of=len(kept), step=stream.step, **found)
+    known = apart | found | {"factor": found["factor"] if found["factor"] > WORTH_SAYING else None}
+    thinned = finding("stream-thinned", taken=len(rows), of=len(kept), step=stream.step, **known)
     if len(rows) < MIN_ROWS:
         words = "too few rows are independent: did a clock jump, or instrument or target move? Else measure for longer"
         refuse_data(file, f"{words}, over more of the workspace ({'; '.join([*run.lines(), *lines_of([thinned])])})")
     few = rows[evenly(len(rows), FITTED)]
-    _, clock = fitted(nominal, run, few, clock, play=True)
+    _, clock, _ = fitted(nominal, run, few, clock, play=True)
     alike = float(np.sqrt((1.0 + max(rest, 0.0)) / (1.0 - max(rest, 0.0))))  # of neighbours, for what changes slowly
     clock = replace(clock, sigma=alike * clock.sigma, drift_sigma=alike * clock.drift_sigma)
     late = clock.sigma * float(np.sqrt(np.mean(np.sum(velocity**2, axis=0))))
@@ -107,10 +114,24 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
     )
     require(late < sigma, words, MeasurementError, file)
     said += [finding("stream-repeats", offsets=rivals)] if rivals else []
-    said += [finding("stream-clock", **vars(clock) | {"ppm": 1e6 * clock.drift, "ppm_sigma": 1e6 * clock.drift_sigma})]
+    said += [finding("stream-wanders", away=wander)] if wander else []
+    first = stream.t[0] - float(clock.controller(stream.t[:1])[0])
+    ppm = {"ppm": 1e6 * clock.drift, "ppm_sigma": 1e6 * clock.drift_sigma}
+    said += [finding("stream-clock", first=first, **vars(clock) | ppm)]
     notes = (*run.lines(), *lines_of([*said, thinned]))
     table = _table(chain, run.joints(clock, rows), stream, rows, velocities(cell, run, rows, clock)[:3])
     return Streamed(table, stream.rows[rows] - 1, notes, clock, **found)
+
+
+def _refuse(step: Step | None, wander: float, run: Run, clock: Clock) -> NoReturn:
+    """Refuse recordings in which a clock steps, or wanders."""
+    if step is None:
+        words = f"the clocks' offset leaves a line of offset and drift by {1e3 * wander:.2g} ms"
+        refuse_data(run.stream.file, f"{words}: cut the file into shorter parts, and join each part on its own")
+    size = f"{1e3 * step.size:+.3g} ± {1e3 * step.sigma:.2g} ms"
+    words = f"the instrument's clock steps by {size} against the controller's"
+    place = step.place(run.log, run.stream, float(clock.controller(np.array(step.time))))
+    refuse_data(run.stream.file, f"{words} ({place}): cut the file there, and join each part on its own")
 
 
 def _usable(cell: Installation, run: Run, clock: Clock) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Finding]]:
@@ -185,14 +206,22 @@ def _fresh(stream: Stream) -> Stream:
     return replace(stream, t=stream.t[new], values=stream.values[new], rows=stream.rows[new])
 
 
-def _thinned(t: np.ndarray, q: np.ndarray, apart: float) -> np.ndarray:
-    """Return the indices of times t (m,) at least `apart` [s], between which one of the joints q (m, n) moves."""
-    apart, found, after, ahead = max(0.999 * apart, (t[-1] - t[0]) / MAX_ROWS), [0], 0, 64
+def _thinned(t: np.ndarray, q: np.ndarray, apart: float) -> tuple[np.ndarray, dict[str, float | None]]:
+    """Return the indices of times t (m,) at least `apart` [s], between which one of the joints q (m, n) moves.
+
+    Second: `apart`, the median time between them [s], and what made it longer: `most` rows, or that a joint `moved`.
+    """
+    step, full = float(np.median(np.diff(t))), float(t[-1] - t[0]) / MAX_ROWS
+    capped, apart, found, after, ahead = full > 0.999 * apart, max(0.999 * apart, full), [0], 0, 64
     while (after := max(after, int(np.searchsorted(t, t[found[-1]] + apart)))) < len(t):
         moved = np.flatnonzero(np.abs(q[after : after + ahead] - q[found[-1]]).max(axis=1) > MOVED)
         found += (after + moved[:1]).tolist()
         after += 0 if len(moved) else ahead
-    return np.array(found)
+    rows = np.array(found)
+    taken = float(np.median(np.diff(t[rows]))) if len(rows) > 1 else apart
+    still = taken > apart + 1.5 * step
+    most, moved = MAX_ROWS if capped and not still else None, 1e3 * MOVED if still else None
+    return rows, {"apart": taken, "most": most, "moved": moved}
 
 
 def _table(chain: Chain, q: np.ndarray, stream: Stream, rows: np.ndarray, velocity: np.ndarray) -> Table:
