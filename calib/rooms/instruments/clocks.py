@@ -32,8 +32,8 @@ from calib.records import evenly
 from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
+from calib.rooms.instruments.clock_steps import BACKLASH, Equations
 from calib.rooms.instruments.order import MAX_MISFIT
-from calib.rooms.instruments.steps import BACKLASH, Equations
 from calib.rooms.instruments.stream_files import Stream
 from calib.transforms import invert, rotation_vector
 

@@ -29,9 +29,9 @@ from calib.procedure.findings import lines_of
 from calib.procedure.robot_kinds import joints_of
 from calib.records import evenly
 from calib.robot.chain import Chain, joint_kinds
+from calib.rooms.instruments.clock_steps import Step, find_step
 from calib.rooms.instruments.clocks import Clock, Run, begin, fitted, residuals, velocities
 from calib.rooms.instruments.joined import Joined
-from calib.rooms.instruments.steps import Step, find_step
 from calib.rooms.instruments.stream_files import Kind, Stream, read_stream
 from calib.units import JOINT
 
