@@ -19,8 +19,9 @@ has at least five degrees of freedom and the file states no sigma. A pose whose 
 By motion, both files have a column of times (seconds, or ``t [ms]``; 5 Hz or more), each by its own clock, and run
 while the arm moves slowly. Offset and drift of the clocks are found from the motion; rows that cannot be used are left
 out and counted; the rest is thinned to rows whose errors are independent. Notes above the table's header say all of it.
-A clock that steps (by 5 ms or more), wanders or restarts on the way is refused, with the row: cut the file there, and
-give `calib fit` the parts, each joined on its own (`--stations one`).
+A clock that steps (by 5 ms or more, as far as that stands out from noise and backlash: not in each short stream),
+wanders or restarts on the way is refused, with the row: cut the file there, and give `calib fit` the parts, each joined
+on its own (`--stations one`).
 """
 
 from __future__ import annotations
