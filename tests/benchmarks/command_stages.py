@@ -23,7 +23,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from growth_work import UNIT, command_fit, command_identify, command_select
+from growth_work import UNIT, made
 
 from calib.files import write
 
@@ -36,11 +36,11 @@ STAGES = {
 }
 COLUMNS = ("imports", *STAGES, "other", "all", "MB")
 COMMANDS: dict[str, Callable[[], list[str]]] = {
-    "calib fit, 800 poses": lambda: command_fit(800).words,
-    "calib fit, 10,000 poses": lambda: command_fit(10_000).words,
-    "calib identify, 30 s": lambda: command_identify(30_000).words,
-    "calib identify, 10 min": lambda: command_identify(600_000).words,
-    "calib select, 40 of 2,000": lambda: command_select(2_000).words,
+    "calib fit, 800 poses": lambda: made("command_fit", 800).words,
+    "calib fit, 10,000 poses": lambda: made("command_fit", 10_000).words,
+    "calib identify, 30 s": lambda: made("command_identify", 30_000).words,
+    "calib identify, 10 min": lambda: made("command_identify", 600_000).words,
+    "calib select, 40 of 2,000": lambda: made("command_select", 2_000).words,
     "calib excite, 10 s": lambda: ["excite", "tx40", "--period", "10", "--out", "motion"],
     "calib demo": lambda: ["demo", "--out", "demo"],
 }
