@@ -137,6 +137,10 @@ class SessionError(CalibError):
     """A session folder that is busy, damaged, or in the wrong state for a command."""
 
 
+class Busy(SessionError):
+    """A session folder that another command works on."""
+
+
 def require(holds: object, message: str, kind: type[Exception] = CalibError, *details: Any) -> None:
     """Raise `kind(message, *details)` unless `holds` is true."""
     if not holds:

@@ -10,7 +10,7 @@ import fsspec
 import pytest
 from worker_tasks import SECONDS, STEPS, step_by_step
 
-from calib.errors import CalibError, UsageError
+from calib.errors import Busy, CalibError, UsageError
 from calib.rooms.fleet import stores
 from calib.rooms.fleet.throughput import Throughput
 from calib.workers import workers
@@ -82,7 +82,7 @@ def test_a_full_disk_in_the_middle_leaves_the_state_of_before(place: str, tmp_pa
 
 
 def test_two_clients_on_one_session(place: str) -> None:
-    with stores.held(place, QUICK), pytest.raises(stores.Busy, match="is busy: process"), stores.held(place, QUICK):
+    with stores.held(place, QUICK), pytest.raises(Busy, match="is busy: process"), stores.held(place, QUICK):
         pass
     with stores.held(place, QUICK):
         pass

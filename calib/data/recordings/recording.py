@@ -18,7 +18,7 @@ KINDS = ("torque", "current")
 SERIES = ("q", "v", "effort", "tau_link", "tau_motor", "q_link", "q_ref", "tau_ff")
 LATE = ("effort", "tau_link", "tau_motor")  # what may come late: they have a path of their own to the log
 Ends = tuple[float | None, float | None]
-PIECES = 20
+PIECES = 20  # of a recording of which not all is used (our choice)
 _CUT = re.compile(r"^(?P<file>.+)@(?P<start>[^@:/\\]*):(?P<stop>[^@:/\\]*)$")
 
 

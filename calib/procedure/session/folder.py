@@ -42,7 +42,7 @@ from calib import files
 from calib.config import parse
 from calib.config_types import Text
 from calib.data.poses import CORNERS, is_image_folder
-from calib.errors import SessionError, command_line, refused_as
+from calib.errors import Busy, SessionError, command_line, refused_as
 from calib.folders import CERTIFICATE, METRICS, PARAMETERS, STATE, write_staged
 from calib.folders import SESSION as SETTINGS
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
@@ -292,7 +292,7 @@ def locked(session: Session, say: Say = print) -> Iterator[None]:
     The lock is the kernel's (flock), so that it ends with the process; the file says whose it is.
 
     Raises:
-        SessionError: while another command works on it.
+        Busy: while another command works on it.
     """
     import fcntl
 
@@ -306,9 +306,9 @@ def locked(session: Session, say: Say = print) -> Iterator[None]:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             words = f"{holder or 'another command'} works on it; wait for it to end"
-            raise SessionError(f"{session.folder} is busy: {words}") from None
+            raise Busy(f"{session.folder} is busy: {words}") from None
         if not path.exists() or not os.path.samestat(path.stat(), os.fstat(file.fileno())):
-            raise SessionError(f"{session.folder} was busy a moment ago; try again")
+            raise Busy(f"{session.folder} was busy a moment ago; try again")
         if holder:
             say(f"the last command ({holder}) was interrupted; continuing from there")
         file.truncate(0)

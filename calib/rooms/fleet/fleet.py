@@ -13,7 +13,7 @@ from rich.text import Text
 
 from calib import bug_reports, files
 from calib.arguments import checked
-from calib.errors import CalibError, SessionError, TaskLost, complaint
+from calib.errors import Busy, CalibError, TaskLost, complaint
 from calib.procedure.findings import LEVELS
 from calib.procedure.session.commands import COLOURS, go_on
 from calib.procedure.session.folder import SETTINGS, Say
@@ -127,7 +127,7 @@ def run_one(folder: Path | str, command: str = "calib run", plots: bool = True, 
         with stores.held(folder, lease) as copy:
             outcome = _run_here(copy, command, plots)
     except CalibError as error:
-        state = BUSY if isinstance(error, stores.Busy) else FAILED
+        state = BUSY if isinstance(error, Busy) else FAILED
         outcome = FleetRow(folder, state, words=str(error), code=2)
     return replace(outcome, folder=folder, seconds=time.perf_counter() - started)
 
@@ -140,8 +140,7 @@ def _run_here(folder: Path, command: str, plots: bool) -> FleetRow:
         foreseen = complaint(error)
         words, code = foreseen or (bug_reports.report(error, command.split()[1:], folder), bug_reports.CODE)
         said.append(f"failed: {words}")
-        busy = isinstance(error, SessionError) and words.startswith((f"{folder} is busy", f"{folder} was busy"))
-        outcome = FleetRow(str(folder), BUSY if busy else FAILED, words=words, code=code)
+        outcome = FleetRow(str(folder), BUSY if isinstance(error, Busy) else FAILED, words=words, code=code)
     if (folder / SETTINGS).exists() and outcome.state != BUSY:  # the log is of the command that works on it
         with suppress(CalibError):  # a full disk, a folder that cannot be written: said already
             files.write(folder / LOG, "\n".join(said) + "\n")

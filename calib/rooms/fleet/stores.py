@@ -21,7 +21,7 @@ from tempfile import TemporaryDirectory
 from threading import Event, Thread
 from typing import Any
 
-from calib.errors import CalibError, UsageError, refused_as, require
+from calib.errors import Busy, CalibError, UsageError, refused_as, require
 from calib.folders import SESSION, STATE
 
 CLAIM = "calib.claim"
@@ -51,7 +51,8 @@ def held(address: str, lease: float = LEASE) -> Iterator[Path]:
     """Yield a copy of the folder at an address, held for this process; what changes in it is put back.
 
     Raises:
-        UsageError: while another process works on it (`Busy`); where no storage is.
+        UsageError: where no storage is.
+        Busy: while another process works on it.
         CalibError: where it cannot be read or written (another process took over; the storage is full). What was put
             back before stays.
     """
@@ -81,10 +82,6 @@ def _opened(address: str) -> tuple[Any, str]:
 
         files, root = url_to_fs(address.rstrip("/"))
     return files, root
-
-
-class Busy(UsageError):
-    """Another process works on the folder."""
 
 
 class _Claim:

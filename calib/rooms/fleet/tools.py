@@ -10,6 +10,9 @@ from calib.errors import Finding, finding
 
 MIN_ARMS = 2, 3  # with the tool, and with others, that a comparison needs (our choice)
 SIGMAS = 2.6  # between medians, above it a tool is named: 99 %, as of other findings
+FAR = 3.0  # times the typical distance from the median, which larger ones count as (our choice)
+WORTH = 0.8  # share of the degrees of freedom that is left by that (our choice)
+MIN_SCATTER = 1e-6  # [m, or of a logarithm]
 MIN_TIMES = 1.5  # of the others' error, below it a tool is not called loose (our choice)
 
 
@@ -73,16 +76,10 @@ def _sigmas(step: np.ndarray, groups: Sequence[np.ndarray]) -> float:
     The scatter is that of the arms (n, k) about the median of their own group, as if all of it were along the
     difference: a tool's position scatters most along the last axis, where it cannot be told from the arm's last link.
     """
-    far, worth, min_scatter, min_p = (
-        3.0,
-        0.8,
-        1e-6,
-        1e-300,
-    )  # of typical distances; share of the degrees of freedom (ours)
     away = [np.sort(np.linalg.norm(one - np.median(one, axis=0), axis=1)) for one in groups]
     typical = np.median(np.concatenate([one[1:] for one in away]))  # without the arm that is the median itself
     freedom = sum(len(one) - 1 for one in groups)
-    variance = np.sum(np.minimum(np.concatenate(away), far * typical) ** 2) / freedom
+    variance = np.sum(np.minimum(np.concatenate(away), FAR * typical) ** 2) / freedom
     of_medians = sum(np.pi / (2.0 * (len(one) - 1) + np.pi) for one in groups)  # in variances of one arm, if normal
-    square = float(step @ step) / max(variance, min_scatter**2) / of_medians
-    return float(stats.norm.isf(max(stats.f.sf(square, 1, worth * freedom), min_p) / 2.0))
+    square = float(step @ step) / max(variance, MIN_SCATTER**2) / of_medians
+    return float(stats.norm.isf(max(stats.f.sf(square, 1, WORTH * freedom), 1e-300) / 2.0))
