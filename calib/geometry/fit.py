@@ -9,7 +9,7 @@ import numpy as np
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import Unidentifiable, refuse_data
 from calib.estimation.base_columns import ColumnSplit
-from calib.estimation.nonlinear import covariance, solve
+from calib.estimation.nonlinear import solve
 from calib.estimation.relevance import relevance
 from calib.geometry.first_guess import install
 from calib.geometry.installation import Installation
@@ -29,8 +29,12 @@ from calib.geometry.weighing import GeometricFit, Settings, Weigher
 from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain, element_length
 
-PLAUSIBLE = {"m": 0.01, "rad": 0.05}  # how far a real arm may be from its nominal (our choice)
-WARM_POSES = 2000  # of which the fit of many more begins (our choice)
+# How far a parameter of a real arm may be from its nominal by making: one standard deviation (our choice)
+PLAUSIBLE = {"m": 0.01, "rad": 0.05}
+MIN_WIDTH = 1e-6  # [m, rad] estimated widths of making end here: no arm is made better
+WIDTH_UPDATES = 3  # of the widths of making, which then change by less than their uncertainty
+MERGED = 0.1  # share of its largest coefficient from which a parameter counts as merged with another
+WARM_POSES = 2000  # poses with which the fit of many more begins, and that widths are estimated from (our choice)
 CRAWLS = 60  # linearisations after which a placement that has not settled does not tell itself (our choice)
 
 
@@ -40,60 +44,58 @@ def fit(
     candidates: np.ndarray | None = None,
     *,
     settings: Settings | None = None,
-    regularised: bool = False,
     prior: np.ndarray | None = None,
+    widths: bool = True,
 ) -> GeometricFit:
-    """Return the fit of the identifiable parameters among `candidates`; the others keep their nominal values.
+    """Return the most probable geometry: all candidate parameters of the arm, each with a prior of making.
 
-    Minimises Σ ‖(y - f(x)) / σ‖². Three passes: columns that are linear combinations of others are set aside; the rest
-    is fitted with a wide prior (`PLAUSIBLE`), which settles the sigmas; then every parameter that the data do not
-    identify better than half of what is plausible goes back to its nominal, and the others are fitted without any
-    prior.
+    Minimises Σ ‖(y - f(x)) / σ‖² + Σ ((x - x_nominal) / w)². Nothing of the arm is selected: parameters that merge
+    share what the measurements say of them, and those that the measurements do not determine stay near nominal. The
+    widths w of making, one for joint offsets, one for other angles and one for lengths, maximise the evidence (MacKay
+    1992). Placements have no prior: of them the base columns are fitted. What is identifiable is read off afterwards
+    (`GeometricFit.split`, `GeometricFit.base_covariance`).
 
     Args:
         cell: where to start; frames placed (`calib.geometry.first_guess`).
         measured: blocks of measurements.
         candidates: (c,) positions in the parameter vector; None for all.
         settings: see `Settings`.
-        regularised: keep all independent parameters, pulled towards nominal with the most probable strength
-            (`_shrunk_fit`), instead of fixing the unidentified ones at nominal.
-        prior: prior standard deviations of the whole parameter vector about its present values; infinite without a
-            prior. Parameters with a prior are always fitted.
+        prior: stated standard deviations of the whole parameter vector about its present values; infinite for those of
+            making.
+        widths: estimate the widths of making; False for `PLAUSIBLE`.
 
     Raises:
-        MeasurementError: fewer rows than unknowns.
+        MeasurementError: fewer rows than identifiable parameters.
+        Unidentifiable: the rows determine no parameter.
     """
     settings = settings or Settings()
     table = layout(cell)
     candidates = np.arange(len(table.names)) if candidates is None else np.asarray(candidates, dtype=int)
     blocks = prepare(cell, measured)
     split = base_columns(cell, blocks, candidates, settings.tolerance)
-    free = candidates[split.kept]
-    if split is not None and not len(free):
+    if not split.rank:
         raise Unidentifiable(
             "these rows determine no parameter of the robot: each socket, bar, plane or pair needs several "
             "rows at different joint values; measure more rows of each"
         )
     stated = np.full(len(table.names), np.inf) if prior is None else prior
-    _enough(cell, blocks, int(np.isinf(stated[free]).sum()))
-    if regularised:
+    _enough(cell, blocks, int(np.isinf(stated[candidates[split.kept]]).sum()))
+    free = _estimated(cell, split, candidates)
+    if not all(block.has_instrument for block in measured):
         free = np.setdiff1d(free, _scale_reference(cell, split, candidates))
-        return replace(_shrunk_fit(cell, blocks, free, settings, stated[free]), split=split, candidates=candidates)
-    start, found, max_retries = cell, None, 4
-    for attempt in range(1 + max_retries):
-        plausible = np.where(np.isfinite(stated[free]), np.inf, plausible_deviation(cell, free))
-        if attempt == 0 and not np.isfinite(plausible).any():
-            continue
-        wide = attempt == 0  # sigmas settle without the wide prior
-        own = np.minimum(stated[free], plausible) if wide else stated[free]
-        once = replace(settings, passes=1) if wide else settings
-        found = fit_with_prior(start, blocks, free, own, settings=once, nominal=cell)
-        clear = _identifiable_columns(found, plausible)
-        if not wide and len(clear) == len(free):
-            break
-        start, free = _back_to_nominal(found.cell, cell, candidates, free[clear]), free[clear]
-    assert found is not None
-    return replace(found, start=cell, split=split, candidates=candidates)
+    making = np.where(np.isfinite(stated[free]), stated[free], plausible_deviation(cell, free))
+    start = cell
+    if widths and np.isfinite(making).any():
+        start, making = _making(cell, blocks, free, making, np.isfinite(stated[free]), settings)
+    result = fit_with_prior(start, blocks, free, making, settings=settings, nominal=cell)
+    return replace(result, start=cell, split=split, candidates=candidates)
+
+
+def _estimated(cell: Installation, split: ColumnSplit, candidates: np.ndarray) -> np.ndarray:
+    """Return the parameters to estimate: those of the arm that have an effect, and the base columns of the others."""
+    arm = layout(cell).index("arm")
+    effective = np.setdiff1d(candidates, candidates[split.without_effect])
+    return np.union1d(np.intersect1d(effective, arm), candidates[split.kept])
 
 
 def _enough(cell: Installation, blocks: list[Block], unknowns: int, min_numbers: float = 1.5) -> None:
@@ -115,53 +117,73 @@ def _enough(cell: Installation, blocks: list[Block], unknowns: int, min_numbers:
 
 
 def _scale_reference(cell: Installation, split: ColumnSplit, candidates: np.ndarray) -> np.ndarray:
-    """Return the index of the arm's longest length among the base columns (an array of one element, or empty).
+    """Return the arm's longest length and the parameters that merge with it; empty for an arm without lengths.
 
     Sockets and planes are as well explained by a smaller arm, in the limit by none at all, so that the scale has to
     come from the nominal: this length stays. What others merge with a column counts with it.
     """
+    elements = cell.chain.elements
     lengths = np.zeros(len(candidates))
-    for place, k in enumerate(candidates):
-        if k < len(cell.chain.elements):
-            lengths[place] = element_length(cell.chain, int(k))
+    translates = np.zeros(len(candidates), dtype=bool)
+    for column, parameter in enumerate(candidates):
+        if parameter < len(elements):
+            lengths[column] = element_length(cell.chain, int(parameter))
+            translates[column] = elements[parameter].axis[0] == "t"
     total = lengths[split.kept] + split.coefficients @ lengths[split.dropped]
-    own = np.array([k < len(cell.chain.elements) and cell.chain.elements[k].axis[0] == "t" for k in candidates])
-    total = np.where(own[split.kept], np.abs(total), 0.0)
-    return candidates[split.kept[[int(np.argmax(total))]]] if total.max(initial=0.0) > 0.0 else candidates[:0]
+    total = np.where(translates[split.kept], np.abs(total), 0.0)
+    if total.max(initial=0.0) == 0.0:
+        return candidates[:0]
+    longest = int(np.argmax(total))
+    share = np.abs(split.coefficients)
+    merged = share[longest] > MERGED * share.max(axis=0, initial=0.0)
+    return np.append(candidates[split.dropped[merged]], candidates[split.kept[longest]])
 
 
-def _shrunk_fit(
-    cell: Installation, blocks: list[Block], free: np.ndarray, settings: Settings, stated: np.ndarray
-) -> GeometricFit:
-    """Return a fit regularised towards nominal values; the prior's widths maximise the evidence (MacKay 1992).
+def _making(
+    cell: Installation,
+    blocks: list[Block],
+    free: np.ndarray,
+    prior: np.ndarray,
+    stated: np.ndarray,
+    settings: Settings,
+) -> tuple[Installation, np.ndarray]:
+    """Return a first fit and the prior (f,) with the most probable widths of making, from a sample of many poses.
 
-    One width for joint offsets, one for other angles, one for lengths. Where measurements come from a few places only
-    (sockets, a plane), directions they hardly see would otherwise move the arm by centimetres to explain micrometres.
+    Args:
+        cell: the nominal installation.
+        blocks: measurements prepared for it.
+        free: (f,) positions in the parameter vector.
+        prior: (f,) standard deviations to begin with; infinite for none.
+        stated: (f,) mask of those that stay.
+        settings: see `Settings`.
     """
-    kind = [{"offset": 0, "rad": 1, "m": 2}.get(each, -1) for each in families(cell)[free].tolist()]
-    _, family = np.unique(kind, return_inverse=True)
-    family = family - int(min(kind) < 0)
-    prior = plausible_deviation(cell, free)
+    rows = sampled([block.measured for block in blocks], max(WARM_POSES, 4 * len(free)))
+    sample = [rows_of(cell, block, chosen) for block, chosen in zip(blocks, rows)]
+    family = _making_families(cell, free, stated)
+    estimated = family >= 0
     nominal = parameter_values(cell)[free]
-    found = fit_with_prior(cell, blocks, free, prior, settings=settings)
-    min_width = 1e-6  # [m, rad]
-    width_updates = 3  # updates of a regularised fit's widths
-    for _ in range(width_updates):
-        moved = np.where(family >= 0, parameter_values(found.cell)[free] - nominal, 0.0)
-        widths = relevance(found.data().moved(moved).gram(), family, prior).ridge
-        prior = np.where(family >= 0, np.clip(widths, min_width, plausible_deviation(cell, free)), np.inf)
-        prior = np.minimum(prior, stated)
-        found = fit_with_prior(cell, blocks, free, prior, settings=settings)
-    return found
+    widest = plausible_deviation(cell, free)
+    state = cell
+    for _ in range(WIDTH_UPDATES):
+        trial = fit_with_prior(state, sample, free, prior, settings=settings, nominal=cell)
+        state = trial.cell
+        moved = np.where(np.isfinite(prior), parameter_values(state)[free] - nominal, 0.0)
+        data = trial.data().moved(moved).gram()
+        held = np.flatnonzero(~estimated & np.isfinite(prior))
+        data.square[held, held] += prior[held] ** -2.0
+        width = relevance(data, family, prior).ridge
+        prior = np.where(estimated, np.clip(width, MIN_WIDTH, widest), prior)
+    return state, prior
 
 
-def _back_to_nominal(
-    cell: Installation, nominal: Installation, candidates: np.ndarray, free: np.ndarray
-) -> Installation:
-    """Return `cell` with the arm's candidate parameters reset to nominal unless they are free."""
-    arm = np.intersect1d(candidates, layout(cell).index("arm"))
-    back = np.setdiff1d(arm, free)
-    return step(cell, back, nominal.chain.values[back] - cell.chain.values[back])
+def _making_families(cell: Installation, free: np.ndarray, stated: np.ndarray) -> np.ndarray:
+    """Return the family (f,) of each parameter: joint offsets, other angles, lengths, numbered; -1 for no width."""
+    kinds = np.where(stated, "", families(cell)[free])
+    family = np.full(len(free), -1)
+    present = [kind for kind in ("offset", "rad", "m") if kind in kinds]
+    for number, kind in enumerate(present):
+        family[kinds == kind] = number
+    return family
 
 
 def fit_with_prior(
@@ -213,25 +235,6 @@ def plausible_deviation(cell: Installation, columns: np.ndarray) -> np.ndarray:
     """Return how far each parameter may plausibly be from nominal (c,); infinite for frames and deflections."""
     table = layout(cell)
     return np.array([PLAUSIBLE[table.units[k]] if table.kinds[k] == "arm" else np.inf for k in columns])
-
-
-def _identifiable_columns(found: GeometricFit, plausible: np.ndarray) -> np.ndarray:
-    """Return the indices of fitted parameters with σ below half the plausible deviation, hence identifiable.
-
-    Backward elimination: the worst identified parameter goes back to its nominal, which changes the covariance C of the
-    others to C - c cᵀ / c_k (c its column), until all that remain are identified.
-    """
-    factor = found.data().factor
-    norms = np.linalg.norm(factor, axis=0)
-    left = covariance(factor / norms, found.estimate.residual_std**2) / np.outer(norms, norms)
-    kept = np.ones(len(plausible), dtype=bool)
-    while True:
-        ratio = np.where(kept, np.sqrt(np.clip(np.diag(left), 0.0, None)) / plausible, 0.0)
-        worst = int(np.argmax(ratio))
-        if ratio[worst] <= 0.5:
-            return np.flatnonzero(kept)
-        kept[worst] = False
-        left = left - np.outer(left[:, worst], left[worst]) / left[worst, worst]
 
 
 def polish_frames(

@@ -74,6 +74,36 @@ class GeometricFit:
         """Return the whitened rows at the solution, reduced, without the prior."""
         return reduced(lambda: _rows(self.cell, self.free, self.blocks, self.pieces))
 
+    @property
+    def identified(self) -> int:
+        """Number of identifiable parameters: base columns of the rigid geometry and frames, and joint corrections."""
+        if self.split is None:
+            return len(self.free)
+        corrections = np.setdiff1d(self.free, self.candidates)
+        return self.split.rank + len(corrections)
+
+    def regrouping(self) -> np.ndarray:
+        """Return the base parameters as combinations (b, f) of the fitted parameters, by rows of ``split.kept``.
+
+        A base parameter is its own column and, by the split's coefficients, those that merge with it.
+        """
+        if self.split is None:
+            return np.eye(len(self.free))
+        column = {int(parameter): number for number, parameter in enumerate(self.free)}
+        result = np.zeros((self.split.rank, len(self.free)))
+        for row, index in enumerate(self.split.kept):
+            if (number := column.get(int(self.candidates[index]))) is not None:
+                result[row, number] = 1.0
+        for index, coefficients in zip(self.split.dropped, self.split.coefficients.T):
+            if (number := column.get(int(self.candidates[index]))) is not None:
+                result[:, number] = coefficients
+        return result
+
+    def base_sigma(self) -> np.ndarray:
+        """Return the posterior standard deviations (b,) of the base parameters."""
+        combinations = self.regrouping()
+        return np.sqrt(np.einsum("bf,fg,bg->b", combinations, self.estimate.covariance, combinations))
+
     def outliers(self, threshold: float = 4.0) -> list[tuple[str, int, str, float, float]]:
         """Return the outlier rows, worst first: file, row, label, size in robust sigmas, size [m or rad].
 

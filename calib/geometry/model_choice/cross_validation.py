@@ -80,6 +80,7 @@ class FoldStatistics:
 
     Attributes:
         rigid: number of geometry columns, which come first.
+        identified: how many of their combinations the rows identify.
         groups: (E,) ridge group of each term.
         sizes: (E,) first guess of each coefficient.
         coordinates: of geometry and terms, in which the statistics are.
@@ -92,6 +93,7 @@ class FoldStatistics:
     """
 
     rigid: int
+    identified: int
     groups: np.ndarray
     sizes: np.ndarray
     coordinates: Condensed
@@ -183,7 +185,7 @@ def fold_statistics(
     training = [total - own for own in each] if pooled else [coordinates.gram(_sum(own)) for own in outside]
     wide = plausible_deviation(found.cell, found.free) if found.prior is None else found.prior
     plausible = np.where(np.isfinite(wide), wide, 10.0)
-    return FoldStatistics(rigid, groups, sizes, coordinates, plausible, training, held_out, np.array(rows), total)
+    return FoldStatistics(rigid, found.identified, groups, sizes, coordinates, plausible, training, held_out, np.array(rows), total)
 
 
 def blind_folds(nominal: GeometricFit, measured: Sequence[PoseMeasurements], folds: Folds) -> np.ndarray:

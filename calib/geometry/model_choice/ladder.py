@@ -1,11 +1,11 @@
-"""Model selection: nested models, each with one more effect, as long as errors on held-out rows decrease.
+"""Model selection: which joint corrections are added to the geometry, judged on rows that were not fitted.
 
-    frames → offsets → geometry → + stiffness → + bending → + coupling → + harmonics → + wobble
+    geometry → + stiffness → + bending → + coupling → + harmonics → + wobble
 
-Every rung is judged on rows it was not fitted to (`calib.geometry.model_choice.folds`). Of the effects, the one that
-lowers that error most is taken up, then the one that pays most beside it, until none pays: sag may show only once gear
-errors are gone. Without an instrument (sockets, planes, distances) the geometry is regularised towards its nominal as
-strongly as the data say (`calib.geometry.fit`).
+The rigid geometry is not selected: it is the most probable one under priors of making (`calib.geometry.fit`), or the
+frames or joint offsets alone where the user asks for these. Of the effects on top of it, the one that lowers the error
+on held-out rows (`calib.geometry.model_choice.folds`) most is taken up, then the one that pays most beside it, until
+none pays: sag may show only once gear errors are gone.
 
 The effects a ladder of models may add to the geometry, each a family of deflection terms.
 """
@@ -75,6 +75,7 @@ def _turning(chain: Chain, places: list[tuple[str, int]], max_order: int) -> lis
 
 
 MODELS = CHOICES[1:]
+RIGID_MODELS = ("frames", "offsets", "geometry")
 NONE = np.array([], dtype=int)
 FAMILIES = (_stiffness, _bending, _coupling, _harmonics, _wobble)
 # by name: from a chain, and whether gravity torques are known, to terms
@@ -146,13 +147,21 @@ class ModelSelection:
         """The error of the chosen model on held-out rows [m]: that of the last step kept."""
         return ([rung.cross_validated for rung in self.rungs if rung.kept] or [np.inf])[-1]
 
-    def rigid_fit(self, measured: Sequence[PoseMeasurements], settings: Settings) -> GeometricFit:
-        """Return the best fit without any joint corrections (for a URDF), not even those of the given robot."""
-        if not self.rigid.cell.known.terms:
+    def rigid_fit(self, measured: Sequence[PoseMeasurements], settings: Settings, bare: Chain | None) -> GeometricFit:
+        """Return the best fit without any joint corrections (for a URDF), not even those of the robot as it came.
+
+        Args:
+            measured: the blocks that were fitted.
+            settings: of the fit.
+            bare: the geometry of the robot as it came that is valid without its corrections; None if it has none.
+        """
+        if bare is None:
             return self.rigid
-        bare = polish_frames(replace(self.nominal.cell, known=Deflection()), measured, settings).cell
-        regularised = not all(block.has_instrument for block in measured)
-        return fit(bare, measured, layout(bare).rigid_index, settings=settings, regularised=regularised)
+        nominal = replace(self.nominal.cell, chain=bare, known=Deflection())
+        placed = polish_frames(nominal, measured, settings)
+        if self.chosen == "frames":
+            return placed
+        return fit(placed.cell, measured, layout(placed.cell).rigid_index, settings=settings)
 
 
 def select_model(
@@ -226,73 +235,69 @@ class _Climber:
                 self.folds = divide(self.folds, blind, self.measured, self.seed, scattered)
 
     def rigid(self, model: str) -> None:
-        """Try the rigid models: frames, joint offsets and full geometry."""
-        cell, table = self.nominal.cell, layout(self.nominal.cell)
-        choices = {
-            "frames": table.frame_index,
-            "offsets": np.concatenate([cell.chain.driven, table.frame_index]),
-            "geometry": table.rigid_index,
-        }
-        regularised = not all(block.has_instrument for block in self.measured)
-        error, last = np.inf, model if model in choices else "geometry"
-        for name, candidates in choices.items():
-            self._tick(name)
-            found = self.nominal if name == "frames" else fit(
-                cell, self.measured, np.setdiff1d(candidates, self.fixed), settings=self.settings,
-                regularised=regularised, prior=self.prior,
-            )  # fmt: skip
-            unseen = self._statistics(found, ()).error(NONE).rms
-            better = unseen < error * (1.0 - MIN_GAIN)
-            kept = better if model == "auto" else name == last
-            note = "" if better else "no better on held-out rows"
-            self.rungs.append(ModelStep(name, len(found.free), 1e3 * unseen, kept, note))
-            self.full = found if name == "geometry" else None
-            if kept:
-                self.best, self.chosen, error = found, name, unseen
-            elif model != "auto":
-                error = min(error, unseen)
-            if name == last:
-                break
-        self.stiff, self.error = self.best, error
+        """Fit the rigid geometry, or the frames or joint offsets alone where the user asks for these."""
+        table = layout(self.nominal.cell)
+        chosen = model if model in RIGID_MODELS else "geometry"
+        nominal_error = self._statistics(self.nominal, ()).error(NONE).rms
+        self.rungs.append(ModelStep("frames", self.nominal.identified, 1e3 * nominal_error, chosen == "frames"))
+        self.best, self.chosen, self.error = self.nominal, "frames", nominal_error
+        self.full = None
+        if chosen != "frames":
+            self._tick(chosen)
+            candidates = table.rigid_index
+            if chosen == "offsets":
+                candidates = np.concatenate([self.nominal.cell.chain.driven, table.frame_index])
+            result = fit(
+                self.nominal.cell,
+                self.measured,
+                np.setdiff1d(candidates, self.fixed),
+                settings=self.settings,
+                prior=self.prior,
+            )
+            self.best, self.chosen = result, chosen
+            self.error = self._statistics(result, ()).error(NONE).rms
+            self.rungs.append(ModelStep(chosen, result.identified, 1e3 * self.error, True))
+        if chosen == "geometry":
+            self.full = self.best
+        self.stiff = self.best
 
     def effects(self, model: str) -> None:
-        """Add effects to the geometry one by one; given an effect's name, use it and all before it.
+        """Add effects to the geometry one by one; for an effect's name, use it and all before it.
 
-        The geometry need not pay alone: gear errors may hide what it brings. Then both together have to. Effects whose
-        fit does not come to an end, though nobody asked for them, are left out again.
+        Effects whose fit does not come to an end, though the user did not ask for them, are left out again.
         """
-        if self.full is None or (model != "auto" and self.chosen != "geometry"):
+        if self.full is None:
             return
-        offered = {name: self._terms(name) for name in EFFECTS}
-        every = tuple(term for terms in offered.values() for term in terms)
+        terms_of = {name: self._terms(name) for name in EFFECTS}
+        terms = tuple(term for family in terms_of.values() for term in family)
         self._tick("observation matrix")
-        statistics = self._statistics(self.full, every)
-        edges = np.cumsum([0, *map(len, offered.values())])
-        place = {name: np.arange(*edges[k : k + 2]) for k, name in enumerate(offered)}
-        rigid, names = tuple(self.rungs), list(EFFECTS)
+        statistics = self._statistics(self.full, terms)
+        edges = np.cumsum([0, *map(len, terms_of.values())])
+        columns = {name: np.arange(*edges[k : k + 2]) for k, name in enumerate(terms_of)}
+        rigid_rungs, names = tuple(self.rungs), list(EFFECTS)
         if model == "auto":
-            kept = self._greedy(statistics, {name: place[name] for name in names if offered[name]})
-            if kept and self.chosen != "geometry":
-                kept = self._both(kept, len(rigid))
+            effects = self._greedy(statistics, {name: columns[name] for name in names if terms_of[name]})
         else:
-            kept = names[: names.index(model) + 1]
-            where = np.concatenate([place[name] for name in kept])
+            effects = names[: names.index(model) + 1]
+            selected = np.concatenate([columns[name] for name in effects])
             self._tick(model)
-            self.rungs.append(_rung(statistics, model, where, statistics.error(where).rms))
-        if not kept:
+            self.rungs.append(_rung(statistics, model, selected, statistics.error(selected).rms))
+        if not effects:
             return
         self._tick("final fit")
-        where = np.concatenate([place[name] for name in kept])
-        found = self._final(self.full, statistics, every, where)
-        status = found.solution.status
+        selected = np.concatenate([columns[name] for name in effects])
+        corrected = self._final(self.full, statistics, terms, selected)
+        status = corrected.solution.status
         if model == "auto" and not status.good and self.best.solution.status.good:
             note = f"did not converge ({status.name.lower()}): not used"
-            self.rungs = [*rigid, *(replace(rung, kept=False, note=note) for rung in self.rungs[len(rigid) :])]
+            tried = self.rungs[len(rigid_rungs) :]
+            self.rungs = [*rigid_rungs, *(replace(rung, kept=False, note=note) for rung in tried)]
             return
-        self.best, self.chosen, self.offered = found, " + ".join(["geometry", *kept]), tuple(every[k] for k in where)
+        self.best, self.chosen = corrected, " + ".join(["geometry", *effects])
+        self.offered = tuple(terms[k] for k in selected)
         last = max(k for k, rung in enumerate(self.rungs) if rung.kept)
-        corrections = len(found.cell.deflection.terms)
-        self.rungs[last] = replace(self.rungs[last], parameters=len(found.free), corrections=corrections)
+        corrections = len(corrected.cell.deflection.terms)
+        self.rungs[last] = replace(self.rungs[last], parameters=corrected.identified, corrections=corrections)
 
     def _greedy(self, statistics: FoldStatistics, place: dict[str, np.ndarray]) -> list[str]:
         """Return the effects that reduce the cross-validation error, best first (greedy selection).
@@ -319,19 +324,6 @@ class _Climber:
             kept.append(best)
             error = tried[best]
         return kept
-
-    def _both(self, kept: list[str], climbed: int) -> list[str]:
-        """Return `kept` if geometry and effects together reduce the cross-validation error; else an empty list.
-
-        Args:
-            kept: effects that improve the geometry model.
-            climbed: number of steps tried before them, the geometry last.
-        """
-        pays = min(rung.cross_validated for rung in self.rungs[climbed:] if rung.kept) < self.error * (1.0 - MIN_GAIN)
-        note = "better together with the next effects" if pays else "no better on held-out rows than without geometry"
-        for k in range(climbed - 1, climbed if pays else len(self.rungs)):
-            self.rungs[k] = replace(self.rungs[k], kept=pays, note=note)
-        return kept if pays else []
 
     def _final(
         self, rigid: GeometricFit, statistics: FoldStatistics, terms: tuple[Term, ...], where: np.ndarray
@@ -377,4 +369,4 @@ class _Climber:
 def _rung(statistics: FoldStatistics, effect: str, where: np.ndarray, rms: float, note: str = "") -> ModelStep:
     """Return the ladder step of an effect from its cross-validation error `rms` [m]; kept if `note` is empty."""
     shrunk = int(np.sum(statistics.ridges(where) > 0.0))  # terms that the data do not switch off
-    return ModelStep(f"+ {effect}", statistics.rigid + shrunk, 1e3 * rms, not note, note, shrunk)
+    return ModelStep(f"+ {effect}", statistics.identified + shrunk, 1e3 * rms, not note, note, shrunk)

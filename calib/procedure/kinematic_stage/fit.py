@@ -146,7 +146,7 @@ def run(
         rigid_misfit = gross_rows(found, robust, long) or rigid_misfit
     say("comparing on unseen poses")
     settings = replace(settings, loss=found.loss)
-    rigid = found.rigid_fit(inputs.fit, settings)
+    rigid = found.rigid_fit(inputs.fit, settings, inputs.bare)
     named = named_outliers(found.fit)
     notes = [
         *([rigid_misfit] if rigid_misfit else []),

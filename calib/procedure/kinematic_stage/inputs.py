@@ -76,6 +76,13 @@ class Inputs:
         return Deflection() if self.earlier is None else self.earlier.deflection
 
     @property
+    def bare(self) -> Chain | None:
+        """Geometry of the robot as it came that is valid without its corrections; None if it has none."""
+        if self.earlier is None or self.earlier.corrections is None:
+            return None
+        return self.earlier.chain
+
+    @property
     def nominal(self) -> Chain:
         """Nominal arm, before any calibration."""
         return self.chain if self.earlier is None or self.earlier.nominal is None else self.earlier.nominal
