@@ -30,6 +30,7 @@ from calib.records import evenly
 from calib.robot.chain import element_length
 from calib.robot.kinematics import forward
 
+MIN_LENGTH = 0.01  # [m] lengths below say nothing of a common factor (our choice)
 MIN_ROWS = 30  # rows below which no pattern is looked for (our choice)
 
 
@@ -171,21 +172,26 @@ def length_factor(fit: GeometricFit) -> Scale | None:
 
     Its sigma follows from the measurements; the explained share of the lengths' change shows whether it is one factor.
     """
-    chain, split, candidates = fit.start.chain, fit.split, fit.candidates
-    if split is None or candidates is None:
+    chain, split = fit.start.chain, fit.split
+    if split is None:
         return None
-    arm = len(chain.elements)
-    own = np.array([element_length(chain, int(k)) if k < arm else 0.0 for k in candidates])
-    total = own[split.kept] + split.coefficients @ own[split.dropped]  # with those that are merged into them
-    place = {int(k): number for number, k in enumerate(fit.free)}
-    used = [(place[int(k)], int(k), size) for k, size in zip(candidates[split.kept], total) if int(k) in place]
-    min_length = 0.01  # [m]: lengths below say nothing of a factor
-    used = [one for one in used if one[1] < arm and chain.elements[one[1]].axis[0] == "t" and abs(one[2]) > min_length]
-    if len(used) < 2:
+    arm, base = len(chain.elements), fit.candidates[split.kept]
+    nominal_length = np.zeros(len(fit.free))
+    change = np.zeros(len(fit.free))
+    for number, parameter in enumerate(fit.free):
+        if parameter < arm:
+            nominal_length[number] = element_length(chain, int(parameter))
+            change[number] = fit.cell.chain.values[parameter] - chain.values[parameter]
+    # base lengths: each with those that merge with it
+    combinations = fit.regrouping()
+    total = combinations @ nominal_length
+    translates = np.array([k < arm and chain.elements[k].axis[0] == "t" for k in base], dtype=bool)
+    index = np.flatnonzero(translates & (np.abs(total) > MIN_LENGTH) & np.isin(base, fit.free))
+    if len(index) < 2:
         return None
-    index, elements, lengths = (np.array(each) for each in zip(*used))
-    grown = fit.cell.chain.values[elements] - chain.values[elements]
-    weight = np.linalg.pinv(fit.estimate.covariance[np.ix_(index, index)], hermitian=True)
+    lengths, grown = total[index], (combinations @ change)[index]
+    covariance = combinations[index] @ fit.estimate.covariance @ combinations[index].T
+    weight = np.linalg.pinv(covariance, hermitian=True)
     power, common = float(lengths @ weight @ lengths), float(lengths @ weight @ grown)
     if not power > 0.0:
         return None

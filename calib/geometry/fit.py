@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements
-from calib.errors import Unidentifiable, refuse_data
+from calib.errors import MeasurementError, Unidentifiable, refuse_data
 from calib.estimation.base_columns import ColumnSplit
 from calib.estimation.nonlinear import solve
 from calib.estimation.relevance import relevance
@@ -91,6 +91,22 @@ def fit(
     return replace(result, start=cell, split=split, candidates=candidates)
 
 
+def plain_fit(cell: Installation, measured: Sequence[PoseMeasurements]) -> GeometricFit | None:
+    """Return the plain reference: all parameters, the widest priors of making, every row with the same weight.
+
+    Nothing is estimated beside the parameters and the noise, nothing selected: what an hour of SciPy gives. Results are
+    held against it. None where the rows are too few.
+
+    Args:
+        cell: nominal arm, frames placed.
+        measured: blocks of measurements.
+    """
+    try:
+        return fit(cell, measured, layout(cell).rigid_index, widths=False)
+    except (MeasurementError, Unidentifiable):
+        return None
+
+
 def _estimated(cell: Installation, split: ColumnSplit, candidates: np.ndarray) -> np.ndarray:
     """Return the parameters to estimate: those of the arm that have an effect, and the base columns of the others."""
     arm = layout(cell).index("arm")
@@ -140,12 +156,7 @@ def _scale_reference(cell: Installation, split: ColumnSplit, candidates: np.ndar
 
 
 def _making(
-    cell: Installation,
-    blocks: list[Block],
-    free: np.ndarray,
-    prior: np.ndarray,
-    stated: np.ndarray,
-    settings: Settings,
+    cell: Installation, blocks: list[Block], free: np.ndarray, prior: np.ndarray, stated: np.ndarray, settings: Settings
 ) -> tuple[Installation, np.ndarray]:
     """Return a first fit and the prior (f,) with the most probable widths of making, from a sample of many poses.
 

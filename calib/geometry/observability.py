@@ -22,6 +22,7 @@ from calib.robot.chain import Chain, random_joints
 from calib.robot.kinematics import element_jacobian, forward, joint_jacobian, twist_product
 from calib.transforms import pose, to_quaternion
 
+NEAR_PRIOR = 0.7  # ratio of a parameter's σ to that of its prior from which the data say little of it (our choice)
 PLACES = {"station": "the placement of the instrument", "tool": "the mounting of the tool"}
 
 
@@ -62,16 +63,18 @@ def _merged(found: GeometricFit, split: ColumnSplit, max_named: int = 4) -> list
 
 
 def _at_nominal(found: GeometricFit, split: ColumnSplit) -> list[Finding]:
-    """Return a finding on arm parameters that the data determine no better than the prior does."""
+    """Return a finding on base parameters of the arm that the data determine hardly better than the prior does."""
+    if found.prior is None:
+        return []
     table = layout(found.start)
-    if found.prior is not None:
-        sigma = found.estimate.sigma
-        loose = np.isfinite(found.prior) & (sigma > 0.7 * found.prior) & np.isin(found.free, table.index("arm"))
-        names, code = [table.names[k] for k in found.free[loose]], "near-prior"
-    else:
-        lost = np.setdiff1d(found.candidates[split.kept], found.free)
-        names, code = [table.names[k] for k in lost if table.kinds[k] == "arm"], "left-nominal"
-    return [finding(code, names=names)] if names else []
+    combinations = found.regrouping()
+    # frames have no prior, and what merges with them is theirs
+    spread = np.where(np.isfinite(found.prior), found.prior, 0.0)
+    prior_sigma = np.sqrt((combinations**2) @ spread**2)
+    base = found.candidates[split.kept]
+    loose = (found.base_sigma() > NEAR_PRIOR * prior_sigma) & np.isin(base, table.index("arm")) & (prior_sigma > 0.0)
+    names = [table.names[k] for k in base[loose]]
+    return [finding("near-prior", names=names)] if names else []
 
 
 def _loose(found: GeometricFit, max_placement_sigma: float = 2e-3) -> list[Finding]:

@@ -227,6 +227,7 @@ class Weigher:
 
     def update(self, state: Installation, first: bool, resting: float = 0.0) -> None:
         """Set sigmas and weights from the residuals at a state; `resting`: parameters that rest on the prior."""
+        determined = max(len(self.free) - round(resting), 0)
         owned = [(number, part) for number, block in enumerate(self.blocks) for part in observe(state, block, _NONE)]
         rows = sum(part.value.size for _, part in owned)
         unknown = len(self.free) + sum(part.nuisances for _, part in owned)
@@ -241,7 +242,7 @@ class Weigher:
         robustly, self.pieces = loss != "none", []
         for number, part in owned:
             sigma = _sigma(part, share, first and not robustly, robustly)
-            noise = part.common_noise(sigma, len(self.free) // len(owned), loss, scale, first and not robustly)
+            noise = part.common_noise(sigma, determined // len(owned), loss, scale, first and not robustly)
             sigma = noise.factor * sigma if noise else sigma
             weight = robust.weights(_size(part, sigma), loss, scale)
             self.pieces.append(Piece(number, replace(part, noise=noise) if noise else part, sigma, weight))

@@ -28,7 +28,8 @@ from calib.units import DEG
 RANKS = ("", "note", "marginal", "fail")
 UNITS = {"mm": 1e3, "µm": 1e6, "mrad": 1e3, "°": 1 / DEG, "%": 100.0, "ms": 1e3}  # SI -> as printed; others as they are
 PREDICTION_ONLY = "pass (prediction only)"  # of a model that predicts well and cannot be exported
-LEVELS = ("pass", PREDICTION_ONLY, "marginal", "fail")
+NOT_JUDGED = "not judged"  # of results for which nobody stated what is good enough
+LEVELS = ("pass", PREDICTION_ONLY, NOT_JUDGED, "marginal", "fail")
 
 
 @dataclass(frozen=True)

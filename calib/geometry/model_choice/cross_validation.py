@@ -185,7 +185,9 @@ def fold_statistics(
     training = [total - own for own in each] if pooled else [coordinates.gram(_sum(own)) for own in outside]
     wide = plausible_deviation(found.cell, found.free) if found.prior is None else found.prior
     plausible = np.where(np.isfinite(wide), wide, 10.0)
-    return FoldStatistics(rigid, found.identified, groups, sizes, coordinates, plausible, training, held_out, np.array(rows), total)
+    return FoldStatistics(
+        rigid, found.identified, groups, sizes, coordinates, plausible, training, held_out, np.array(rows), total
+    )
 
 
 def blind_folds(nominal: GeometricFit, measured: Sequence[PoseMeasurements], folds: Folds) -> np.ndarray:

@@ -20,7 +20,7 @@ from calib.data.poses.measurements import PoseMeasurements, Positions
 from calib.errors import UsageError, one_of
 from calib.geometry.fit import fit, fit_with_prior, polish_frames
 from calib.geometry.installation import Installation
-from calib.geometry.model_choice.cross_validation import FoldStatistics, blind_folds, fold_statistics
+from calib.geometry.model_choice.cross_validation import FoldStatistics, UnseenErrors, blind_folds, fold_statistics
 from calib.geometry.model_choice.folds import Folds, divide, transfer_folds
 from calib.geometry.observation import layout, prepare
 from calib.geometry.weighing import GeometricFit, Settings
@@ -315,10 +315,9 @@ class _Climber:
                 tried[name] = statistics.error(where[name])
             best = min(waiting, key=lambda name: tried[name].rms)
             pays = tried[best].rms < error.rms * (1.0 - MIN_GAIN) and tried[best].wins(error)
-            note = "" if pays else "no better on held-out rows: not used"
-            self.rungs += [
-                _rung(statistics, name, where[name], tried[name].rms, note) for name in ([best] if pays else waiting)
-            ]
+            for name in [best] if pays else waiting:
+                note = "" if pays else _declined(tried[name], error)
+                self.rungs.append(_rung(statistics, name, where[name], tried[name].rms, note))
             if not pays:
                 break
             kept.append(best)
@@ -364,6 +363,15 @@ class _Climber:
             self.best, self.nominal, self.stiff, tuple(self.rungs), self.chosen, self.folds, loss, self.offered,
             None if known else self.error,
         )  # fmt: skip
+
+
+def _declined(tried: UnseenErrors, error: UnseenErrors) -> str:
+    """Return why an effect is not used: by how much it changes the error on held-out rows, and in how many folds."""
+    gain = 1.0 - tried.rms / error.rms
+    if gain <= 0.0:
+        return "no better on held-out rows: not used"
+    folds, better = len(error.squares), int(np.sum(tried.squares < error.squares))
+    return f"{100.0 * gain:.0f} % better on held-out rows, in {better} of {folds} folds: not used"
 
 
 def _rung(statistics: FoldStatistics, effect: str, where: np.ndarray, rms: float, note: str = "") -> ModelStep:

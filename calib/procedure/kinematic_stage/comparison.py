@@ -75,6 +75,7 @@ class Comparison:
         proves: False where the rows were fitted on, or where the placement did not settle or took up the errors.
         alone: errors of the calibrated robot as a URDF holds it, without corrections and with frames fitted for it
             on the same rows as theirs; None where that is all there is.
+        plain: errors of the plain reference, frames likewise; None on the fit's own rows, and where there is none.
         shares_frames: True where another file's base and tool placement was used.
         repeated: what poses that were measured several times say (`calib.procedure.kinematic_stage.comparison`); None
             without any.
@@ -93,6 +94,7 @@ class Comparison:
     frames: str
     proves: bool = True
     alone: Errors | None = None
+    plain: Errors | None = None
     shares_frames: bool = False
     repeated: RepeatedPoses | None = None
     reprojection: tuple[float, float] | None = None
@@ -114,6 +116,7 @@ class Comparison:
             nominal=self.errors[0].summary(),
             calibrated=self.errors[1].summary(),
             urdf_alone=None if self.alone is None else self.alone.summary(),
+            plain=None if self.plain is None else self.plain.summary(),
             pair_distance_mm={arm: statistics(sizes, 1e3) for arm, sizes in zip(ARMS, pairs)},
             iso9283=self.repeated,
             unseen=self.proves,
@@ -138,9 +141,23 @@ def compare(
 
 
 def compare_unseen(
-    cells: Sequence[Installation], unseen: Unseen, settings: Settings, seed: int, expected: ErrorModel | None
+    cells: Sequence[Installation],
+    unseen: Unseen,
+    settings: Settings,
+    seed: int,
+    expected: ErrorModel | None,
+    plain: Installation | None = None,
 ) -> Comparison:
-    """Return the errors of the arms on validation rows; base and tool placement are refitted where needed."""
+    """Return the errors of the arms on validation rows; base and tool placement are refitted where needed.
+
+    Args:
+        cells: nominal and calibrated installation, and that of the URDF alone where it differs.
+        unseen: the rows.
+        settings: of the placement.
+        seed: of the pairs whose distances are compared.
+        expected: what errors the fit expects; None without an error model.
+        plain: the plain reference.
+    """
     block, settled, thin = unseen.block, True, None
     if unseen.own_frames:
         placed = [placed_on(cell, block, settings) for cell in cells]
@@ -164,7 +181,12 @@ def compare_unseen(
         names = tuple(name for name, out in zip(block.joint_names, np.any(beyond, axis=0)) if out)
         intervals = Intervals(sigma, expected.discrepancy.radius * sigma, sizes, np.any(beyond, axis=1), names)
     shares = not (unseen.own_frames or unseen.held_out)
-    return replace(found, settled=settled, placed_by=thin, intervals=intervals, shares_frames=shares)
+    reference = None
+    if plain is not None and settled:
+        if unseen.own_frames:
+            plain = placed_on(plain, block, settings).cell
+        reference = errors(plain, [block])
+    return replace(found, settled=settled, placed_by=thin, intervals=intervals, shares_frames=shares, plain=reference)
 
 
 def interval_cells(found: Comparison) -> np.ndarray:

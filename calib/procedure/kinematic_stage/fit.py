@@ -23,7 +23,7 @@ from calib.geometry.weighing import GeometricFit, Settings, calibrated_chain
 from calib.procedure.findings import Verdict, level_of, sentence, settle
 from calib.procedure.kinematic_stage import plausibility
 from calib.procedure.kinematic_stage.comparison import Comparison
-from calib.procedure.kinematic_stage.inputs import Inputs
+from calib.procedure.kinematic_stage.inputs import Inputs, plain_reference
 from calib.procedure.kinematic_stage.metrics import Findings, Outlier
 from calib.procedure.kinematic_stage.plausibility import gross_rows, misfit, named_outliers
 from calib.procedure.kinematic_stage.settings import FitSettings
@@ -160,7 +160,8 @@ def run(
     say("estimating the expected errors")
     expected = learn_errors(found, inputs.fit, seed)
     findings = replace(findings, discrepancy=None if expected is None else expected.discrepancy)
-    arms = Arms(found.nominal.cell, found.fit.cell, rigid.cell.chain, expected)
+    plain = plain_reference(found.nominal.cell, inputs)
+    arms = Arms(found.nominal.cell, found.fit.cell, rigid.cell.chain, expected, plain)
     result = assess(arms, inputs, findings, settings, replace(wanted, model=asked))
     unclear = tuple(unidentified(found.fit))
     return Outcome(inputs, found, rigid, named, unclear, findings, result, wanted, options, expected)
@@ -170,7 +171,8 @@ def assessed(outcome: T, inputs: Inputs) -> T:
     """Return the outcome with a new verdict from the validation rows of `inputs`; nothing is fitted."""
     wanted, options, fits = outcome.settings, outcome.options, outcome.selection
     settings = Settings(wanted.loss or options.loss, options.loss_scale)
-    arms = Arms(fits.nominal.cell, fits.fit.cell, outcome.rigid.cell.chain, outcome.expected)
+    plain = plain_reference(fits.nominal.cell, outcome.inputs)
+    arms = Arms(fits.nominal.cell, fits.fit.cell, outcome.rigid.cell.chain, outcome.expected, plain)
     result = assess(arms, inputs, outcome.findings, settings, replace(wanted, model=wanted.model or options.model))
     return replace(outcome, inputs=inputs, assessment=result)
 

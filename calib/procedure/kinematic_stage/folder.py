@@ -22,7 +22,7 @@ from calib.geometry.weighing import Settings
 from calib.procedure.findings import lines_of
 from calib.procedure.kinematic_stage import tables
 from calib.procedure.kinematic_stage.fit import Outcome
-from calib.procedure.kinematic_stage.inputs import Inputs
+from calib.procedure.kinematic_stage.inputs import Inputs, plain_reference
 from calib.procedure.kinematic_stage.metrics import SCHEMA, Findings, FitMetrics, ValidationMetrics
 from calib.procedure.kinematic_stage.validation import Arms, Assessment
 from calib.records import read_json, read_record, shielded
@@ -86,7 +86,7 @@ class FitFolder:
             expected = ErrorModel(cell, *tables.read_covariance(self.path, cell), learnt, found.discrepancy)
         start = install(inputs.chain, inputs.fit, inputs.known)
         nominal = polish_frames(start, inputs.fit, chosen).cell
-        return Arms(nominal, cell, calibrated.read(self.path).chain, expected)
+        return Arms(nominal, cell, calibrated.read(self.path).chain, expected, plain_reference(nominal, inputs))
 
     def learnt_joints(self, joints: Sequence[Joint]) -> np.ndarray | None:
         """Read the joint values (m, n) [rad or m] of the fitted rows; None without a file of residuals."""
@@ -189,7 +189,7 @@ def metrics(outcome: Outcome) -> FitMetrics:
     tolerance = outcome.settings.tolerance
     return FitMetrics(
         **vars(outcome.assessment.record),
-        fit=outcome.fit.record(len(outcome.selection.fit.free)),
+        fit=outcome.fit.record(outcome.selection.fit.identified),
         model=outcome.selection.chosen,
         ladder=outcome.selection.rungs,
         seed=outcome.settings.seed,

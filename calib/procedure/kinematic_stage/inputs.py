@@ -14,6 +14,8 @@ from calib.data.poses.pose_files import joint_columns, read_measurements
 from calib.errors import CalibError, MeasurementError, UsageError, require
 from calib.extensions import needed, offered
 from calib.geometry.first_guess import check_orientations, check_scale
+from calib.geometry.fit import plain_fit
+from calib.geometry.installation import Installation
 from calib.geometry.repeatability import repeated, repeated_rows
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.robot_kinds import joints_of
@@ -166,6 +168,20 @@ def with_unseen(
         name: replace(each, seen=each.seen or (name in copied and not each.held_out)) for name, each in unseen.items()
     }
     return replace(given, unseen=unseen, notes=(*given.notes, *notes, *remarks))
+
+
+def plain_reference(nominal: Installation, inputs: Inputs) -> Installation | None:
+    """Return the arm by plain least squares, without joint corrections; None where the rows are too few for it.
+
+    Args:
+        nominal: the arm as it was, placed.
+        inputs: the rows to fit.
+    """
+    bare = inputs.bare
+    if bare is not None:
+        nominal = replace(nominal, chain=bare, known=Deflection())
+    reference = plain_fit(nominal, inputs.fit)
+    return None if reference is None else reference.cell
 
 
 def load_robot(

@@ -35,6 +35,7 @@ class ComparedRows:
         frames: whose base and tool placement was used, in words.
         nominal, calibrated: their errors.
         urdf_alone: those of the calibrated geometry without joint corrections.
+        plain: those of plain least squares, the reference; None on the fit's own rows.
         pair_distance_mm: arm → errors of the distances between pairs of positions.
         iso9283: of repeated poses.
         unseen: False where rows are none that the fit had not seen.
@@ -48,6 +49,7 @@ class ComparedRows:
     nominal: ArmErrors
     calibrated: ArmErrors
     urdf_alone: ArmErrors | None = None
+    plain: ArmErrors | None = None
     pair_distance_mm: Mapping[str, ErrorStatistics | None] = field(default_factory=dict)
     iso9283: RepeatedPoses | None = None
     unseen: bool = True

@@ -40,22 +40,23 @@ def named_outliers(found: GeometricFit) -> list[Outlier]:
 def misfit(found: ModelSelection, reach: float) -> Finding | None:
     """Return a finding if no rigid geometry explains the measurements: the error exceeds `FLOOR` of the reach.
 
-    Cross-validated, and on the fitted rows, degrees of freedom counted: few poses predict each other badly under any
-    model, which says nothing against this one. Where the chosen model, joint corrections included, leaves less than
+    Both on the fitted rows, degrees of freedom counted, and cross-validated: few poses predict each other badly under
+    any model, which says nothing against this one. Where the chosen model, joint corrections included, leaves less than
     `FLOOR`, it is a note.
 
     Args:
         found: the selection of models by cross-validation.
         reach: of the arm [m].
     """
-    rigid = [rung for rung in found.rungs if rung.model in ("frames", "offsets", "geometry")]
-    if not rigid or rigid[-1].model != "geometry":
+    rigid = next((rung for rung in found.rungs if rung.model == "geometry"), None)
+    if rigid is None:
         return None
-    best = min(rung.cross_validated for rung in rigid)
-    if min(best, _left(found.rigid)) <= FLOOR * reach:
+    fitted = _left(found.rigid)
+    if min(rigid.cross_validated, fitted) <= FLOOR * reach:
         return None
+    left = min(found.cross_validated, _left(found.fit)) / (FLOOR * reach)
     return finding(
-        "rigid-misfit", rms=best, reach=reach, healthy=FLOOR * reach, left=found.cross_validated / (FLOOR * reach)
+        "rigid-misfit", rms=fitted, folds=rigid.cross_validated, reach=reach, healthy=FLOOR * reach, left=left
     )
 
 
@@ -81,7 +82,7 @@ def _left(found: GeometricFit) -> float:
     """Return the rms position error of a fit on the fitted rows [m], corrected for degrees of freedom."""
     parts = [piece.part for piece in found.pieces]
     sizes = [part.sizes() for part in parts if NATURE[part.label] == "position"]
-    rows, used = sum(part.height for part in parts), len(found.free) + sum(part.nuisances for part in parts)
+    rows, used = sum(part.height for part in parts), found.identified + sum(part.nuisances for part in parts)
     if not sizes or rows <= used:
         return np.inf
     return float(np.sqrt(np.mean(np.concatenate(sizes) ** 2) * rows / (rows - used)))
@@ -104,7 +105,7 @@ def findings(
         reach: of the arm [m].
     """
     before, after = (errors(cell, blocks).rms for cell in (nominal, fit.cell))
-    remains = after if left is None else left
+    remains = after if left is None else min(left, max(after, _left(fit)))
     shown = [_as_positions(take(block, rows)) for block, rows in zip(blocks, sampled(blocks, JUDGED_POSES))]
     result = _wrong_way(nominal, shown, before, reach) or _moved(fit, reach)
     result.append(finding("unexplained", rms=remains, reach=reach, share=remains / reach))

@@ -16,8 +16,9 @@ from calib.errors import Finding, finding
 from calib.geometry.error_model import ErrorModel
 from calib.geometry.fit import without_corrections
 from calib.geometry.installation import Installation
+from calib.geometry.model_choice.ladder import MIN_GAIN
 from calib.geometry.weighing import Settings
-from calib.procedure.findings import Verdict, catalogue, level_of, lines_of, sentence
+from calib.procedure.findings import NOT_JUDGED, Verdict, catalogue, level_of, limit, lines_of, sentence
 from calib.procedure.kinematic_stage.comparison import MARGIN, Comparison, compare, compare_unseen
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import Findings, ValidationMetrics
@@ -25,6 +26,7 @@ from calib.procedure.kinematic_stage.plausibility import FLOOR, TOO_GOOD
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.robot.chain import Chain
 
+WORSE = limit("worse-than-nominal", "times")  # ratio of errors from which the calibrated arm is the worse one
 RIGID = ("rigid-misfit", "gross-rows", "earlier-misfit")  # no rigid geometry explains the measurements
 
 
@@ -58,11 +60,10 @@ def judge(
     Rules, the first group that says something; inside a group the worst finding decides:
 
     1. ``placed-elsewhere``, ``far-off``; ``orientations-off``; ``above-tolerance``;
-    2. ``frames-only``, where no more was asked for;
-    3. frames were chosen: no model of the arm is better than the nominal one. ``nothing-to-gain`` (pass) where what
+    2. where only frames were asked for: the tolerance, or ``frames-only`` (not judged) without one;
+    3. the calibrated arm is as good as the nominal one (within `MIN_GAIN`). ``nothing-to-gain`` (pass) where what
        remains is below `FLOOR` of the reach, ``transfer-untested`` where stations could not be left out as a whole,
-       else ``no-better-model``. With any model a pass where the nominal arm leaves less than any instrument
-       (`TOO_GOOD`);
+       else ``no-better-model``. A pass, too, where the nominal arm leaves less than any instrument (`TOO_GOOD`);
     4. ``worse-than-nominal``; by cross-validation alone, where both leave less than `FLOOR` of the reach,
        ``keep-nominal``, since the nominal arm may have been fitted to these very rows;
     5. ``no-unseen-poses``;
@@ -93,20 +94,32 @@ def judge(
     others = [*gross, *(one for one in findings.noticed if one.code not in RIGID)]
     for rules in (
         _far_off(found, {"the fitted poses": fit, **proofs}, tolerance, findings.reach),
-        [finding("frames-only", rms=own)] if findings.model == asked == "frames" else [],
-        _nothing_gained(found, findings),
+        () if findings.model == asked == "frames" else _nothing_gained(found, findings),
         _worse(found, findings.reach),
     ):
         if group := list(filter(level_of, rules)):
             if level_of(group[0]) == "note":  # it stands for the figures
                 return Verdict.of(sentence(group[0]), others)
             return Verdict.of("" if worst is None else _figures(worst, arm), [*others, *group])
+    if findings.model == asked == "frames":
+        return _frames_verdict(worst, own, tolerance, arm, others)
     if worst is None:
         return Verdict.of("", [finding("no-unseen-poses"), *others])
     promised = None if gross else cross_validated
     rules = [*gross, *findings.noticed, *_doubts(worst, own, promised, proofs, findings)]
     verdict = Verdict.of(_figures(worst, arm), rules)
     return Verdict("pass", _figures(worst, arm, tolerance)) if verdict.level == "pass" else verdict
+
+
+def _frames_verdict(
+    worst: _Proof | None, own: float, tolerance: float | None, arm: str, others: Sequence[Finding]
+) -> Verdict:
+    """Return the verdict where only frames were fitted and the arm errs within the tolerance, if there is one."""
+    if tolerance is not None and worst is not None:
+        return Verdict.of(_figures(worst, arm, tolerance), others)
+    rms, where = (own, "on the fitted poses") if worst is None else (worst.after, worst.where)
+    verdict = Verdict.of(sentence(finding("frames-only", rms=rms, where=where)), others)
+    return replace(verdict, level=NOT_JUDGED) if verdict.level == "pass" else verdict
 
 
 def _figures(worst: _Proof, arm: str, tolerance: float | None = None) -> str:
@@ -156,10 +169,15 @@ def _rows_off(rows: Comparison, far: np.ndarray) -> list[str]:
 
 
 def _nothing_gained(found: Sequence[_Proof], findings: Findings) -> list[Finding]:
-    proof = max(found, key=lambda one: one.before, default=_Proof(np.inf, np.inf, ""))
+    """Return a finding where the calibrated arm is as good as the nominal one: nothing to gain, or no model helps."""
+    if not found:
+        return []
+    proof = max(found, key=lambda proof: proof.before)
     nothing = [finding("nothing-to-gain", before=proof.before, where=proof.where)]
-    if findings.model != "frames":
-        return nothing if proof.before < TOO_GOOD else []
+    if proof.before < TOO_GOOD:
+        return nothing
+    if any(not 1.0 - MIN_GAIN < proof.left <= WORSE for proof in found):
+        return []
     if not proof.before <= FLOOR * findings.reach < np.inf:
         return [finding("no-better-model")]
     return [finding("transfer-untested", stations=findings.blind)] if findings.blind else nothing
@@ -203,13 +221,14 @@ ARM = {"urdf": "URDF alone", "corrections": "with joint corrections"}
 class Arms:
     """Nominal and calibrated installation (frames fitted to the fitted rows), and the best rigid geometry.
 
-    With the error model of the calibrated one, where there is one.
+    With the error model of the calibrated one, and the plain reference, where there are such.
     """
 
     nominal: Installation
     calibrated: Installation
     rigid: Chain
     expected: ErrorModel | None = None
+    plain: Installation | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,7 +289,7 @@ def assess(arms: Arms, inputs: Inputs, findings: Findings, settings: Settings, w
     cells = [each for each in (arms.nominal, arms.calibrated, alone) if each is not None]
     fitted = compare(cells, inputs.fit, "fitted on these rows", False, wanted.seed)
     validation = {
-        name: compare_unseen(cells, unseen, settings, wanted.seed, arms.expected)
+        name: compare_unseen(cells, unseen, settings, wanted.seed, arms.expected, arms.plain)
         for name, unseen in inputs.unseen.items()
     }
     judged = judge_deliverables(fitted, validation, findings, wanted)
@@ -281,13 +300,24 @@ def assess(arms: Arms, inputs: Inputs, findings: Findings, settings: Settings, w
     ]
     copies = _copies(inputs)
     usual = float(np.median(fitted.errors[0].main)) if len(fitted.errors[0].main) else np.inf
+    references = [one for name, rows in validation.items() for one in _references(name, rows, chosen) if level_of(one)]
     noticed = (
-        *others, *findings.noticed, *([finding("not-unseen", files=copies)] if copies else []),
+        *others, *references, *findings.noticed, *([finding("not-unseen", files=copies)] if copies else []),
         *(one for name, each in validation.items() for one in _noticed(name, each, usual)),
     )  # fmt: skip
     blocks = (*inputs.fit, *(unseen.block for unseen in inputs.unseen.values()))
     notes = (*inputs.notes, *(note for block in blocks for note in block.notes))
     return Assessment(fitted, validation, judged[chosen], noticed, notes, judged, chosen)
+
+
+def _references(name: str, rows: Comparison, deliverable: str) -> Iterator[Finding]:
+    """Yield the nominal arm's, the plain fit's and the delivered arm's error on validation rows, and what is worse."""
+    if rows.plain is None or not rows.proves:
+        return
+    delivered = (rows.of_urdf if deliverable == "urdf" else rows).errors[1].rms
+    values = {"where": name, "plain": rows.plain.rms, "delivered": delivered}
+    yield finding("plain-reference", nominal=rows.errors[0].rms, **values)
+    yield finding("worse-than-plain", times=delivered / max(rows.plain.rms, 1e-300), **values)
 
 
 def judge_deliverables(

@@ -15,7 +15,7 @@ from rich.text import Text as RichText
 from calib.procedure.findings import LEVELS, Warned
 
 FileRow = tuple[str, str, str, str]  # name, what it is, bytes, SHA-256
-COLOURS: dict[str, str] = dict(zip(LEVELS, ("green", "green", "yellow", "red")))
+COLOURS: dict[str, str] = dict(zip(LEVELS, ("green", "green", "yellow", "yellow", "red")))
 
 
 @dataclass(frozen=True)
