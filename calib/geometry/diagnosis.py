@@ -172,10 +172,10 @@ def length_factor(fit: GeometricFit) -> Scale | None:
 
     Its sigma follows from the measurements; the explained share of the lengths' change shows whether it is one factor.
     """
-    chain, split = fit.start.chain, fit.split
-    if split is None:
+    chain = fit.start.chain
+    if fit.split is None:
         return None
-    arm, base = len(chain.elements), fit.candidates[split.kept]
+    arm, base = len(chain.elements), fit.base
     nominal_length = np.zeros(len(fit.free))
     change = np.zeros(len(fit.free))
     for number, parameter in enumerate(fit.free):
@@ -186,7 +186,7 @@ def length_factor(fit: GeometricFit) -> Scale | None:
     combinations = fit.regrouping()
     total = combinations @ nominal_length
     translates = np.array([k < arm and chain.elements[k].axis[0] == "t" for k in base], dtype=bool)
-    index = np.flatnonzero(translates & (np.abs(total) > MIN_LENGTH) & np.isin(base, fit.free))
+    index = np.flatnonzero(translates & (np.abs(total) > MIN_LENGTH))
     if len(index) < 2:
         return None
     lengths, grown = total[index], (combinations @ change)[index]

@@ -10,7 +10,7 @@ from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import MeasurementError, Unidentifiable, refuse_data
 from calib.estimation.base_columns import ColumnSplit
 from calib.estimation.nonlinear import solve
-from calib.estimation.relevance import relevance
+from calib.estimation.relevance import Gram
 from calib.geometry.first_guess import install
 from calib.geometry.installation import Installation
 from calib.geometry.observability import base_columns
@@ -31,8 +31,9 @@ from calib.robot.chain import Chain, element_length
 
 # How far a parameter of a real arm may be from its nominal by making: one standard deviation (our choice)
 PLAUSIBLE = {"m": 0.01, "rad": 0.05}
-MIN_WIDTH = 1e-6  # [m, rad] estimated widths of making end here: no arm is made better
-WIDTH_UPDATES = 3  # of the widths of making, which then change by less than their uncertainty
+TYPICAL = {"m": 3e-3, "rad": 5e-3}  # widths of making of a usual arm: what one more parameter would say (our choice)
+WIDTH_UPDATES = 2  # fits with new widths of making, which then change by less than their uncertainty
+WIDTH_ROUNDS = 30  # of the fixed point of the widths between two fits
 MERGED = 0.1  # share of its largest coefficient from which a parameter counts as merged with another
 WARM_POSES = 2000  # poses with which the fit of many more begins, and that widths are estimated from (our choice)
 CRAWLS = 60  # linearisations after which a placement that has not settled does not tell itself (our choice)
@@ -81,13 +82,13 @@ def fit(
     stated = np.full(len(table.names), np.inf) if prior is None else prior
     _enough(cell, blocks, int(np.isinf(stated[candidates[split.kept]]).sum()))
     free = _estimated(cell, split, candidates)
-    if not all(block.has_instrument for block in measured):
+    if not any(block.measures_length for block in measured):
         free = np.setdiff1d(free, _scale_reference(cell, split, candidates))
     making = np.where(np.isfinite(stated[free]), stated[free], plausible_deviation(cell, free))
     start = cell
     if widths and np.isfinite(making).any():
         start, making = _making(cell, blocks, free, making, np.isfinite(stated[free]), settings)
-    result = fit_with_prior(start, blocks, free, making, settings=settings, nominal=cell)
+    result = fit_with_prior(start, blocks, free, making, settings=settings, nominal=cell, warm=start is not cell)
     return replace(result, start=cell, split=split, candidates=candidates)
 
 
@@ -171,20 +172,46 @@ def _making(
     rows = sampled([block.measured for block in blocks], max(WARM_POSES, 4 * len(free)))
     sample = [rows_of(cell, block, chosen) for block, chosen in zip(blocks, rows)]
     family = _making_families(cell, free, stated)
-    estimated = family >= 0
     nominal = parameter_values(cell)[free]
-    widest = plausible_deviation(cell, free)
     state = cell
     for _ in range(WIDTH_UPDATES):
-        trial = fit_with_prior(state, sample, free, prior, settings=settings, nominal=cell)
+        trial = fit_with_prior(state, sample, free, prior, settings=settings, nominal=cell, warm=state is not cell)
         state = trial.cell
         moved = np.where(np.isfinite(prior), parameter_values(state)[free] - nominal, 0.0)
-        data = trial.data().moved(moved).gram()
-        held = np.flatnonzero(~estimated & np.isfinite(prior))
-        data.square[held, held] += prior[held] ** -2.0
-        width = relevance(data, family, prior).ridge
-        prior = np.where(estimated, np.clip(width, MIN_WIDTH, widest), prior)
+        data = trial.data().moved(moved).gram().scaled(trial.estimate.residual_std**-2.0)
+        prior = _most_probable_widths(
+            data, family, prior, plausible_deviation(cell, free), typical_deviation(cell, free)
+        )
     return state, prior
+
+
+def _most_probable_widths(
+    data: Gram, family: np.ndarray, prior: np.ndarray, widest: np.ndarray, typical: np.ndarray
+) -> np.ndarray:
+    """Return the prior (f,) with the most probable width of each family, by MacKay's fixed point (1992).
+
+    w² = (Σ x² + w_0²) / (Σ γ + 1), with γ = 1 - σ² / w² the share that the data determine of a parameter: `typical`
+    counts as one more parameter of the family, and decides where the data say nothing of it (our choice).
+
+    Args:
+        data: whitened statistics about nominal, (f, f).
+        family: (f,) family of each parameter; -1 for a width that stays.
+        prior: (f,) widths to begin with; infinite for none.
+        widest: (f,) widths at most.
+        typical: (f,) widths w_0.
+    """
+    width = prior.copy()
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(data.square), 1e-300))
+    for _ in range(WIDTH_ROUNDS):
+        system = (data.square + np.diag(width**-2.0)) * np.outer(scale, scale)
+        inverse = np.linalg.inv(system) * np.outer(scale, scale)
+        change, variance = inverse @ data.cross, np.diag(inverse)
+        for number in range(int(family.max(initial=-1)) + 1):
+            members = np.flatnonzero(family == number)
+            determined = float(np.sum(1.0 - variance[members] / width[members] ** 2))
+            squares = float(change[members] @ change[members]) + typical[members[0]] ** 2
+            width[members] = min(np.sqrt(squares / (max(determined, 0.0) + 1.0)), widest[members[0]])
+    return width
 
 
 def _making_families(cell: Installation, free: np.ndarray, stated: np.ndarray) -> np.ndarray:
@@ -205,6 +232,7 @@ def fit_with_prior(
     *,
     settings: Settings | None = None,
     nominal: Installation | None = None,
+    warm: bool = False,
 ) -> GeometricFit:
     """Return the fit of exactly the parameters `free`: min Σ ‖(y - f(x)) / σ‖² + Σ ((x - x_nominal) / σ_prior)².
 
@@ -218,16 +246,17 @@ def fit_with_prior(
         prior: (f,) standard deviations; infinite for none.
         settings: see `Settings`.
         nominal: mean of the prior; None for `cell`.
+        warm: `cell` is a fit already, so that its residuals tell the sigmas to begin with.
     """
     settings = settings or Settings()
     state, solution = cell, None
     rows = sampled([block.measured for block in blocks], max(WARM_POSES, 4 * len(free)))
     few = 4 * sum(map(len, rows)) <= sum(len(block.measured) for block in blocks)
     if few:
-        some = [rows_of(cell, block, own) for block, own in zip(blocks, rows)]
-        state = fit_with_prior(cell, some, free, prior, settings=settings, nominal=nominal).cell
+        sample = [rows_of(cell, block, chosen) for block, chosen in zip(blocks, rows)]
+        state = fit_with_prior(cell, sample, free, prior, settings=settings, nominal=nominal, warm=warm).cell
     weigher = Weigher(settings, nominal or cell, blocks, free, prior)
-    weigher.update(state, first=not few)
+    weigher.update(state, first=not (few or warm))
     image_passes = 20  # at most, until the noise of images settles (our choice)
     for _ in range(image_passes if any(weigher.noises) and settings.passes > 1 else settings.passes):
         solution = solve(
@@ -240,6 +269,12 @@ def fit_with_prior(
     assert solution is not None
     weigher.pieces = weigher.used
     return weigher.result(solution)
+
+
+def typical_deviation(cell: Installation, columns: np.ndarray) -> np.ndarray:
+    """Return how far each parameter of a usual arm is from nominal (c,); infinite for frames and deflections."""
+    table = layout(cell)
+    return np.array([TYPICAL[table.units[k]] if table.kinds[k] == "arm" else np.inf for k in columns])
 
 
 def plausible_deviation(cell: Installation, columns: np.ndarray) -> np.ndarray:

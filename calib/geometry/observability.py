@@ -34,7 +34,7 @@ def unidentified(found: GeometricFit) -> list[Finding]:
     below = float(values[rank]) if rank < len(values) else None
     known = {"rank": rank, "parameters": len(values), "tolerance": split.tolerance}
     first = finding("rank", last=values[rank - 1], next=below, **known)
-    return [first, *_merged(found, split), *_at_nominal(found, split), *_loose(found)]
+    return [first, *_merged(found, split), *_at_nominal(found), *_loose(found)]
 
 
 def _merged(found: GeometricFit, split: ColumnSplit, max_named: int = 4) -> list[Finding]:
@@ -62,7 +62,7 @@ def _merged(found: GeometricFit, split: ColumnSplit, max_named: int = 4) -> list
     ]
 
 
-def _at_nominal(found: GeometricFit, split: ColumnSplit) -> list[Finding]:
+def _at_nominal(found: GeometricFit) -> list[Finding]:
     """Return a finding on base parameters of the arm that the data determine hardly better than the prior does."""
     if found.prior is None:
         return []
@@ -71,7 +71,7 @@ def _at_nominal(found: GeometricFit, split: ColumnSplit) -> list[Finding]:
     # frames have no prior, and what merges with them is theirs
     spread = np.where(np.isfinite(found.prior), found.prior, 0.0)
     prior_sigma = np.sqrt((combinations**2) @ spread**2)
-    base = found.candidates[split.kept]
+    base = found.base
     loose = (found.base_sigma() > NEAR_PRIOR * prior_sigma) & np.isin(base, table.index("arm")) & (prior_sigma > 0.0)
     names = [table.names[k] for k in base[loose]]
     return [finding("near-prior", names=names)] if names else []

@@ -75,28 +75,38 @@ class GeometricFit:
         return reduced(lambda: _rows(self.cell, self.free, self.blocks, self.pieces))
 
     @property
+    def base(self) -> np.ndarray:
+        """Positions (b,) of the base parameters in the full vector; all fitted ones where the caller chose them."""
+        if self.split is None:
+            return self.free
+        return np.intersect1d(self.candidates[self.split.kept], self.free)
+
+    @property
     def identified(self) -> int:
         """Number of identifiable parameters: base columns of the rigid geometry and frames, and joint corrections."""
         if self.split is None:
             return len(self.free)
         corrections = np.setdiff1d(self.free, self.candidates)
-        return self.split.rank + len(corrections)
+        return len(self.base) + len(corrections)
 
     def regrouping(self) -> np.ndarray:
-        """Return the base parameters as combinations (b, f) of the fitted parameters, by rows of ``split.kept``.
+        """Return the base parameters as combinations (b, f) of the fitted parameters, in the order of `base`.
 
         A base parameter is its own column and, by the split's coefficients, those that merge with it.
         """
         if self.split is None:
             return np.eye(len(self.free))
+        row = {int(parameter): number for number, parameter in enumerate(self.base)}
         column = {int(parameter): number for number, parameter in enumerate(self.free)}
-        result = np.zeros((self.split.rank, len(self.free)))
-        for row, index in enumerate(self.split.kept):
-            if (number := column.get(int(self.candidates[index]))) is not None:
-                result[row, number] = 1.0
-        for index, coefficients in zip(self.split.dropped, self.split.coefficients.T):
-            if (number := column.get(int(self.candidates[index]))) is not None:
-                result[:, number] = coefficients
+        result = np.zeros((len(row), len(column)))
+        for parameter, number in row.items():
+            result[number, column[parameter]] = 1.0
+        kept = self.candidates[self.split.kept].tolist()
+        dropped = self.candidates[self.split.dropped].tolist()
+        for merged, coefficients in zip(dropped, self.split.coefficients.T):
+            for parameter, coefficient in zip(kept, coefficients):
+                if merged in column and parameter in row:
+                    result[row[parameter], column[merged]] = coefficient
         return result
 
     def base_sigma(self) -> np.ndarray:
@@ -177,6 +187,7 @@ def calibrated_chain(
     return CalibratedChain(chain, nominal, covariance, corrections)
 
 
+MIN_NOISE = 1e-6  # residuals over their sigmas: computed positions leave less
 START_SIGMA = dict.fromkeys(("position", "orientation", "consistency", "distance", "plane"), 1e-3) | {"pixel": 0.3}
 
 
@@ -219,6 +230,7 @@ class Weigher:
         self.prior = prior if prior is not None and np.isfinite(prior).any() else None
         self.pieces: list[Piece] = []
         self.used = self.pieces
+        self.noise = 1.0  # residuals over the sigmas used, by which the prior is weighed against the measurements
 
     @property
     def noises(self) -> list[Any]:
@@ -246,36 +258,57 @@ class Weigher:
             sigma = noise.factor * sigma if noise else sigma
             weight = robust.weights(_size(part, sigma), loss, scale)
             self.pieces.append(Piece(number, replace(part, noise=noise) if noise else part, sigma, weight))
+        if not first:
+            squares = sum(float(np.sum(piece.weight * (piece.part.value / piece.sigma) ** 2)) for piece in self.pieces)
+            self.noise = float(np.sqrt(max(squares / rows / share, MIN_NOISE**2)))
 
     def settle(self, solution: Solution) -> Solution | None:
         """Return the solution scaled to the sigmas of its residuals; None if new sigmas would change the estimate.
 
         A common factor on all sigmas changes only the scale, unless the fit has a prior.
         """
-        before, noises = self.pieces, self.noises
-        resting = 0.0 if self.prior is None else float(np.sum(np.diag(covariance(solution.factor)) / self.prior**2))
-        self.update(solution.state, first=False, resting=resting)
+        before, noises, noise = self.pieces, self.noises, self.noise
+        self.update(solution.state, first=False, resting=self._resting(solution))
         both = list(zip(self.pieces, before))
         self.used = [replace(old, part=replace(new.part, noise=old.part.noise)) for new, old in both]
         ratios = [float(np.mean(new.sigma / old.sigma)) for new, old in both]
         steady = all(np.abs(new.weight - old.weight).max(initial=0.0) < 0.02 for new, old in both)
         common = ratios[0] if self.prior is None and not any(noises) else 1.0
         steady = steady and all(a is None or b is None or a.near(b) for a, b in zip(self.noises, noises))
+        steady = steady and (self.prior is None or abs(self.noise / noise - 1.0) < 0.02)
         if not steady or any(abs(ratio / common - 1.0) > 0.02 for ratio in ratios):
             return None
+        self.noise = noise
         if self.prior is not None or any(noises):
             self.pieces = self.used
             return solution
         return replace(solution, factor=solution.factor / common, cost=solution.cost / common**2)
+
+    def _resting(self, solution: Solution) -> float:
+        """Return how many parameters rest on their prior: Σ σ² / σ_prior²."""
+        if self.prior is None:
+            return 0.0
+        return float(np.sum(np.diag(covariance(solution.factor)) * self._precision()))
+
+    def _precision(self) -> np.ndarray:
+        """Return the prior's precisions (f,), in the measurements' unit of weight; zero where there is none."""
+        if self.prior is None:
+            return np.zeros(len(self.free))
+        return (self.noise / self.prior) ** 2
+
+    def _pull(self, state: Installation) -> np.ndarray:
+        """Return the prior's residuals (f,) at a state, in the measurements' unit of weight; zero without a prior."""
+        change = parameter_values(self.nominal) - parameter_values(state)
+        return change[self.free] * np.sqrt(self._precision())
 
     def linearise(self, state: Installation) -> Reduced:
         """Return the whitened problem at a state, reduced, with the prior."""
         known, each, total = list[Rows](), list[Gram](), None
         if self.prior is not None:
             held = np.isfinite(self.prior)
-            pull = (parameter_values(self.nominal) - parameter_values(state))[self.free] / self.prior
-            known.append((pull[held], np.diag(1.0 / self.prior)[held]))
-            each.append(Gram(np.diag(self.prior**-2.0), pull / self.prior, float(pull @ pull), int(held.sum())))
+            pull, weight = self._pull(state), np.sqrt(self._precision())
+            known.append((pull[held], np.diag(weight)[held]))
+            each.append(Gram(np.diag(weight**2), pull * weight, float(pull @ pull), int(held.sum())))
         if self._many:
             for number, block in enumerate(self.blocks):
                 each += [own for _, own in row_statistics(state, block, self.free, _scales(self.pieces, number))]
@@ -288,18 +321,41 @@ class Weigher:
         count = sum(piece.sigma.size for piece in self.pieces) * len(self.free)
         return count > MOST_NUMBERS and all(separable(block.measured) for block in self.blocks)
 
+    def _posterior(self, factor: np.ndarray, variance: float) -> np.ndarray:
+        """Return the posterior covariance (f, f): (Wᵀ W / variance + diag(1 / prior²))⁻¹.
+
+        Where measurements are so exact that the prior is below rounding, all is scaled by the variance.
+
+        Args:
+            factor: (f, f) upper triangular R of measurements and prior.
+            variance: of the residuals, in squares of their sigmas.
+        """
+        if self.prior is None:
+            return covariance(factor, variance)
+        scale = np.linalg.norm(factor, axis=0)
+        scaled = factor / scale
+        measured = scaled.T @ scaled - np.diag(self._precision() / scale**2)
+        system = measured / max(variance, MIN_NOISE**2) + np.diag(1.0 / (self.prior * scale) ** 2)
+        try:
+            root = np.linalg.cholesky(system)
+        except np.linalg.LinAlgError:
+            return covariance(factor, variance)
+        inverse = np.linalg.inv(root) / scale
+        return inverse.T @ inverse
+
     def result(self, solution: Solution) -> GeometricFit:
         state = solution.state
         table, parts = layout(state), [piece.part for piece in self.pieces]
-        dof = sum(part.value.size - part.nuisances for part in parts) - len(self.free)
-        if self.prior is not None:
-            dof = max(dof + int(np.isfinite(self.prior).sum()), 1)
-        variance = solution.cost / max(dof, 1)
+        # parameters that rest on their prior take nothing from the measurements' degrees of freedom
+        pull, resting = self._pull(state), self._resting(solution)
+        rows = sum(part.value.size - part.nuisances for part in parts)
+        dof = max(rows - len(self.free) + round(resting), 1)
+        variance = max(solution.cost - float(pull @ pull), 0.0) / dof
         estimate = Estimate(
             tuple(table.names[k] for k in self.free),
             tuple(table.units[k] for k in self.free),
             parameter_values(state)[self.free],
-            covariance(solution.factor, variance),
+            self._posterior(solution.factor, variance),
             float(np.sqrt(variance)),
             dof,
         )

@@ -12,6 +12,7 @@ from calib.estimation import robust
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit, polish_frames
 from calib.geometry.installation import Installation, see
+from calib.geometry.observability import unidentified
 from calib.geometry.observation import layout
 from calib.geometry.weighing import Settings
 
@@ -80,7 +81,7 @@ def test_errors_are_what_the_stated_covariance_says(name):
         assert found.solution.status.good
         size, rest = deviation(found, exact)
         assert rest < 0.02, f"seed {seed}: {rest:.3f} of the error is in no fitted parameter"
-        p, dof = len(found.free), found.estimate.dof
+        p, dof = found.identified, found.estimate.dof
         scores.append(scipy.stats.norm.ppf(scipy.stats.f(p, dof).cdf(size / p)))
         squares += dof * found.estimate.residual_std**2
         freedom += dof
@@ -100,7 +101,7 @@ def test_predictions_at_unseen_joints_are_better_than_one_measurement(robot, kin
         found = fit(start.cell, [measured])
         q = random_joints(nominal, 300, 77)
         error = np.sqrt(np.mean(position_error(found.cell, truth, q) ** 2))
-        expected = SIGMA * np.sqrt(len(found.free) / 100)
+        expected = SIGMA * np.sqrt(found.identified / 100)
         assert error < 1.6 * expected
         assert np.sqrt(np.mean(position_error(start.cell, truth, q) ** 2)) > 10 * error
 
@@ -111,7 +112,6 @@ def test_without_noise_the_truth_is_found_to_rounding(name):
     nominal = load("lwr4plus")
     measured = scene(cell(perturb(nominal, 5, 1e-3, 2e-3), 1), 1, 0.0, 1)
     found = calibrate(nominal, measured)
-    assert found.solution.cost < 1e-6 * len(measured[0]) or found.estimate.residual_std < 1e-3
     assert max(np.abs(part.value).max() for part in (piece.part for piece in found.pieces)) < 1e-8
 
 
@@ -135,19 +135,38 @@ def test_sigmas_that_are_not_stated_are_estimated(name, seeds):
     assert np.mean(ratios, axis=0) == pytest.approx(1.0, abs=4 * 0.05 / np.sqrt(seeds))
 
 
-def test_what_poses_cannot_tell_stays_exactly_at_its_nominal():
-    nominal, _, measured, _ = planted("pose", 3)
+def test_merging_parameters_share_what_is_identified():
+    """All parameters with an effect are estimated; their base combinations are as many as ever, and near the truth."""
+    nominal, truth, measured, _ = planted("pose", 3)
     found = calibrate(nominal, measured)
     table = layout(found.cell)
-    fixed = np.setdiff1d(table.index("arm"), found.free)
-    assert len(fixed) == len(nominal.elements) - (30 - 12)
-    assert np.array_equal(found.cell.chain.values[fixed], nominal.values[fixed])
-    moved = np.intersect1d(table.index("arm"), found.free)
-    assert np.all(found.cell.chain.values[moved] != nominal.values[moved])
-    assert len(found.estimate.names) == len(found.free) == 30
+    assert np.isin(table.index("arm"), found.free).all()
+    assert found.identified == found.split.rank == 30
+    base = found.candidates[found.split.kept]
+    merged = np.setdiff1d(table.index("arm"), base)
+    assert len(merged) == len(nominal.elements) - (30 - 12)
+    sigma = dict(zip(found.free.tolist(), found.estimate.sigma))
+    least = max(found.base_sigma())
+    assert all(sigma[int(parameter)] > 3 * least for parameter in merged), "what merges is not known alone"
+    q = random_joints(nominal, 50, 9)
+    assert position_error(found.cell, truth, q).max() < 3 * SIGMA
 
 
-def test_what_few_poses_hardly_tell_goes_back_to_its_nominal():
+def test_the_robot_does_not_depend_on_which_of_merging_parameters_comes_first():
+    """Axis 5 is displaced along itself by a hair: joint 4's offset then moves the tool over that lever."""
+    tips = []
+    for lever in (0.0, 1e-4, 5e-4, 1e-2):
+        nominal = load("ur5")
+        values = nominal.values.copy()
+        values[list(nominal.names).index("r5")] += lever
+        nominal = nominal.with_values(values)
+        truth = cell(perturb(nominal, 7, 0.5e-3, 1e-3), 7)
+        found = calibrate(nominal, [measure(truth, "position", 60, 7, sigma=SIGMA)])
+        tips.append(np.sqrt(np.mean(position_error(found.cell, truth, random_joints(nominal, 200, 9)) ** 2)))
+    assert max(tips) < 1.5 * SIGMA, tips
+
+
+def test_what_few_poses_hardly_tell_stays_near_its_nominal():
     """The wrist turns by a degree only: its offsets are determined on paper, with sigmas beyond what is plausible."""
     nominal = load("ur5")
     truth = cell(perturb(nominal, 1, 0.5e-3, 1e-3), 1)
@@ -158,11 +177,11 @@ def test_what_few_poses_hardly_tell_goes_back_to_its_nominal():
     found = calibrate(nominal, [measured])
     table = layout(found.cell)
     arm = np.isin(found.free, table.index("arm"))
-    plausible = np.where(np.array(found.estimate.units)[arm] == "m", 0.01, 0.05)
-    assert np.all(found.estimate.sigma[arm] <= 0.5 * plausible)
-    assert len(found.free) < found.split.rank
-    back = np.setdiff1d(table.index("arm"), found.free)
-    assert np.array_equal(found.cell.chain.values[back], nominal.values[back])
+    assert np.all(found.estimate.sigma[arm] <= 1.001 * found.prior[arm])
+    change = found.cell.chain.values - nominal.values
+    assert np.all(np.abs(change[found.free[arm]]) < 4 * found.prior[arm])
+    near = next(one for one in unidentified(found) if one.code == "near-prior")
+    assert near.values["names"]
 
 
 def test_equation_11_and_levenberg_marquardt_end_at_the_same_arm():
@@ -242,4 +261,5 @@ def test_a_prior_holds_where_it_is_tight_and_is_not_felt_where_it_is_loose():
     loose = fit(start, [measured], prior=prior)
     assert abs(free.cell.chain.values[place] - nominal.values[place]) > 1e-4
     assert abs(held.cell.chain.values[place] - nominal.values[place]) < 1e-8
-    np.testing.assert_allclose(loose.cell.chain.values, free.cell.chain.values, atol=1e-7)
+    q = random_joints(nominal, 50, 9)
+    assert position_error(loose.cell, free.cell, q).max() < 0.1 * SIGMA

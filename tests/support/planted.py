@@ -153,22 +153,23 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def deviation(found: GeometricFit, exact: Sequence[PoseMeasurements]) -> tuple[float, float]:
-    """Return the squared distance of the truth from the estimate in its own covariance, and what no parameter explains.
+    """Return the squared distance of the truth's base parameters from the estimate's, and what no parameter explains.
 
     Parameters have a gauge (an offset of joint 1 is a turn of the base), what is measured has not: the residuals of
     exact measurements at other joints are r = W (x_true - x); x_true - x by least squares, then its size in sigmas.
 
     Returns:
-        dxᵀ C⁻¹ dx, chi-squared with as many degrees of freedom as parameters; and ‖r - W dx‖ / ‖r‖.
+        dβᵀ C⁻¹ dβ, chi-squared with as many degrees of freedom as base parameters; and ‖r - W dx‖ / ‖r‖.
     """
     parts = [part for block in prepare(found.cell, exact) for part in observe(found.cell, block, found.free)]
     residual, matrix = map(np.concatenate, zip(*(part.whitened(np.ones(1)) for part in parts)))
     scale = np.linalg.norm(matrix, axis=0)
     dx = np.linalg.lstsq(matrix / scale, residual, rcond=None)[0] / scale
     rest = np.linalg.norm(residual - matrix @ dx) / np.linalg.norm(residual)
-    sigma = found.estimate.sigma
-    correlation = found.estimate.covariance / np.outer(sigma, sigma)
-    return float((dx / sigma) @ np.linalg.solve(correlation, dx / sigma)), float(rest)
+    base, sigma = found.regrouping(), found.base_sigma()
+    correlation = base @ found.estimate.covariance @ base.T / np.outer(sigma, sigma)
+    off = base @ dx / sigma
+    return float(off @ np.linalg.solve(correlation, off)), float(rest)
 
 
 def position_error(found: Installation, truth: Installation, q: np.ndarray) -> np.ndarray:

@@ -53,6 +53,11 @@ class PoseMeasurements:
     has_instrument: ClassVar[bool] = False
     placing: ClassVar[int] = 4
 
+    @property
+    def measures_length(self) -> bool:
+        """Whether the rows hold a measured length, without which a smaller arm explains them as well."""
+        return self.has_instrument
+
     def __post_init__(self) -> None:
         m = len(self.q)
         for name, default in _COUNTS.items():
@@ -201,6 +206,10 @@ class Distances(GroupedMeasurements):
     kind: ClassVar[str] = "distance"
 
     @property
+    def measures_length(self) -> bool:
+        return bool(np.any(self.distance > 0.0))
+
+    @property
     def together(self) -> np.ndarray:
         return self.group
 
@@ -222,6 +231,10 @@ class Bars(GroupedMeasurements):
     kind: ClassVar[str] = "bar"
 
     @property
+    def measures_length(self) -> bool:
+        return bool(np.any(self.distance > 0.0))
+
+    @property
     def measured(self) -> np.ndarray:
         return self.distance[:, None]
 
@@ -239,6 +252,10 @@ class Sockets(GroupedMeasurements):
 
     kind: ClassVar[str] = "sockets"
     placing: ClassVar[int] = 3
+
+    @property
+    def measures_length(self) -> bool:
+        return any(distance > 0.0 for _, _, distance in self.links)
 
 
 @dataclass(frozen=True, eq=False)

@@ -94,13 +94,13 @@ class Comparison:
     frames: str
     proves: bool = True
     alone: Errors | None = None
-    plain: Errors | None = None
     shares_frames: bool = False
     repeated: RepeatedPoses | None = None
     reprojection: tuple[float, float] | None = None
     settled: bool = True
     placed_by: tuple[int, int] | None = None
     intervals: Intervals | None = None
+    plain: Errors | None = None
 
     @property
     def of_urdf(self) -> Comparison:

@@ -49,13 +49,13 @@ class ComparedRows:
     nominal: ArmErrors
     calibrated: ArmErrors
     urdf_alone: ArmErrors | None = None
-    plain: ArmErrors | None = None
     pair_distance_mm: Mapping[str, ErrorStatistics | None] = field(default_factory=dict)
     iso9283: RepeatedPoses | None = None
     unseen: bool = True
     parameters: int = 0
     interval95: IntervalCoverage | None = None
     reprojection_px: Mapping[str, float] = field(default_factory=dict)
+    plain: ArmErrors | None = None
 
     def judged(self, deliverable: str) -> ArmErrors:
         """Return the errors of the deliverable (robot file) on which the verdict is based."""

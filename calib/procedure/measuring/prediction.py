@@ -177,8 +177,7 @@ def read(selection: Path) -> SelectionPrediction:
 def compared_with_fit(prediction: SelectionPrediction, fit: GeometricFit) -> Finding | None:
     """Return a finding on the ratio of the fit's σ to those predicted at pose selection; None without common names."""
     names = layout(fit.cell).names
-    base = fit.free if fit.split is None else fit.candidates[fit.split.kept]
-    estimated = {names[k]: float(sigma) for k, sigma in zip(base, fit.base_sigma())}
+    estimated = {names[k]: float(sigma) for k, sigma in zip(fit.base, fit.base_sigma())}
     return sigma_ratio(dict(zip(prediction.names, prediction.sigmas)), estimated)
 
 
