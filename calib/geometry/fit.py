@@ -33,6 +33,7 @@ from calib.robot.chain import Chain, element_length
 PLAUSIBLE = {"m": 0.01, "rad": 0.05}
 TYPICAL = {"m": 3e-3, "rad": 5e-3}  # widths of making of a usual arm: what one more parameter would say (our choice)
 WIDTH_UPDATES = 2  # fits with new widths of making, which then change by less than their uncertainty
+ROUNDING = 1e-12  # of WᵀW with its diagonal scaled to 1
 WIDTH_ROUNDS = 30  # of the fixed point of the widths between two fits
 MERGED = 0.1  # share of its largest coefficient from which a parameter counts as merged with another
 WARM_POSES = 2000  # poses with which the fit of many more begins, and that widths are estimated from (our choice)
@@ -204,6 +205,7 @@ def _most_probable_widths(
     scale = 1.0 / np.sqrt(np.maximum(np.diag(data.square), 1e-300))
     for _ in range(WIDTH_ROUNDS):
         system = (data.square + np.diag(width**-2.0)) * np.outer(scale, scale)
+        np.fill_diagonal(system, np.diag(system) + ROUNDING)
         inverse = np.linalg.inv(system) * np.outer(scale, scale)
         change, variance = inverse @ data.cross, np.diag(inverse)
         for number in range(int(family.max(initial=-1)) + 1):

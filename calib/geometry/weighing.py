@@ -187,6 +187,7 @@ def calibrated_chain(
     return CalibratedChain(chain, nominal, covariance, corrections)
 
 
+MIN_SIGMA = 1e-9  # [m, rad, px] of estimated sigmas: computed positions are no more exact, nor is a fit of them
 MIN_NOISE = 1e-6  # residuals over their sigmas: computed positions leave less
 START_SIGMA = dict.fromkeys(("position", "orientation", "consistency", "distance", "plane"), 1e-3) | {"pixel": 0.3}
 
@@ -383,7 +384,7 @@ def _sigma(part: Part, share: float, start: bool, robustly: bool) -> np.ndarray:
     if start:
         return np.full(part.value.shape, START_SIGMA[part.label])
     found = robust.spread(part.value) if robustly else float(np.sqrt(np.mean(part.value**2)))
-    return np.full(part.value.shape, max(found / np.sqrt(share), 1e-12))
+    return np.full(part.value.shape, max(found / np.sqrt(share), MIN_SIGMA))
 
 
 def _size(part: Part, sigma: np.ndarray) -> np.ndarray:

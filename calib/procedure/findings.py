@@ -216,7 +216,7 @@ def _filled(template: str, values: Mapping[str, Any]) -> str:
 
     def kept(part: re.Match[str]) -> str:
         needed = [name for _, name, _, _ in Formatter().parse(part[1]) if name]
-        return "" if any(values[name] in (None, "", (), [], False) for name in needed) else part[1]
+        return "" if any(values.get(name) in (None, "", (), [], False) for name in needed) else part[1]
 
     return _Printer().vformat(re.sub(r"<([^<>]*)>", kept, template), (), values)
 

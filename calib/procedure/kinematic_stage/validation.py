@@ -178,7 +178,9 @@ def _nothing_gained(found: Sequence[_Proof], findings: Findings) -> list[Finding
         return nothing
     if any(not 1.0 - MIN_GAIN < proof.left <= WORSE for proof in found):
         return []
-    if not proof.before <= FLOOR * findings.reach < np.inf:
+    if not np.isfinite(findings.reach):
+        return []
+    if proof.before > FLOOR * findings.reach:
         return [finding("no-better-model")]
     return [finding("transfer-untested", stations=findings.blind)] if findings.blind else nothing
 
