@@ -4,12 +4,16 @@
 # clarabel is a compiled extension without stubs
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
 
 from calib.errors import NotConverged
 from calib.estimation.triangles import require_rank
+
+if TYPE_CHECKING:
+    import clarabel
 
 ACCURACIES = 1e-10, 1e-8, 1e-6  # of the scaled problem; the others where rounding forbids the first
 
@@ -65,9 +69,11 @@ def minimise(
     system = sparse.csc_matrix(np.hstack([system, -np.eye(len(system), m)]))
     for accuracy in ACCURACIES:
         settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = accuracy
-        found = clarabel.DefaultSolver(cost, np.zeros(p + m), system, right, cones, settings).solve()
-        if str(found.status) in ("Solved", "AlmostSolved", "PrimalInfeasible"):
+        found = _solved(clarabel.DefaultSolver(cost, np.zeros(p + m), system, right, cones, settings))
+        if found is not None and str(found.status) in ("Solved", "AlmostSolved", "PrimalInfeasible"):
             break
+    if found is None:
+        raise NotConverged("the constraints are not solvable to any accuracy: Clarabel's eigenvalues do not converge")
     b, dual = np.array(found.x)[:p], np.array(found.z)
     if str(found.status) not in ("Solved", "AlmostSolved"):
         raise NotConverged(f"the constraints may contradict each other: Clarabel reports {found.status}", b)
@@ -75,6 +81,19 @@ def minimise(
     pushes[:, i, j] = dual[ends[2] :].reshape(size, len(i)) / weight
     pushes[:, j, i] = pushes[:, i, j]
     return ConeOptimum(b, dual[ends[1] : ends[2]], pushes, -dual[ends[0] : ends[1]])
+
+
+def _solved(solver: "clarabel.DefaultSolver") -> "clarabel.DefaultSolution | None":
+    """Return Clarabel's solution; None where its step breaks down in LAPACK's eigenvalues, which it ends by a panic.
+
+    Whether an extreme step does depends on the processor's kernels of LAPACK.
+    """
+    try:
+        return solver.solve()
+    except BaseException as error:  # a panic of Rust is no Exception
+        if type(error).__name__ != "PanicException":
+            raise
+        return None
 
 
 def from_free(factor: np.ndarray, free: np.ndarray, normals: np.ndarray, held: np.ndarray) -> np.ndarray:

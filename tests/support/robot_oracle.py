@@ -1,6 +1,7 @@
 """Pinocchio as the judge of kinematics, and small URDFs to judge by."""
 
 import re
+from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
@@ -8,17 +9,23 @@ import pinocchio as pin
 from calib.robot.chain import Chain
 
 
-def pinocchio_poses(source: str, chain: Chain, q: np.ndarray, mimic: bool = False) -> np.ndarray:
-    """Return the poses (m, 4, 4) of the chain's tip in its base after Pinocchio; other joints at zero."""
-    model = pin.buildModelFromXML(source, mimic)
+def pinocchio_poses(source: str, chain: Chain, q: np.ndarray) -> np.ndarray:
+    """Return the poses (m, 4, 4) of the chain's tip in its base after Pinocchio; joints beside it at zero.
+
+    Pinocchio reads mimic joints as joints of their own, since it refuses those that mimic a later one (IRB 6640); they
+    are moved after the file's numbers. Base and tip are links: a joint may share their name (Sawyer).
+    """
+    model = pin.buildModelFromXML(source)
     data = model.createData()
-    base, tip = model.getFrameId(chain.base), model.getFrameId(chain.tip)
+    base, tip = (model.getFrameId(link, pin.FrameType.BODY) for link in (chain.base, chain.tip))
     assert base < model.nframes and tip < model.nframes
+    followers = mimic_joints(source)
     poses = []
     for row in q:
         configuration = pin.neutral(model)
-        for name, value in zip(chain.joint_names, row, strict=True):
-            joint = model.joints[model.getJointId(name)]
+        positions = dict(zip(chain.joint_names, row, strict=True))
+        for name in model.names[1:]:
+            joint, value = model.joints[model.getJointId(name)], position_of(name, positions, followers)
             if joint.nq == 2:
                 configuration[joint.idx_q : joint.idx_q + 2] = np.cos(value), np.sin(value)
             else:
@@ -26,6 +33,25 @@ def pinocchio_poses(source: str, chain: Chain, q: np.ndarray, mimic: bool = Fals
         pin.framesForwardKinematics(model, data, configuration)
         poses.append(data.oMf[base].actInv(data.oMf[tip]).homogeneous)
     return np.array(poses)
+
+
+def mimic_joints(source: str) -> dict[str, tuple[str, float, float]]:
+    """Return leader, multiplier and offset of each mimic joint of a URDF text."""
+    result = {}
+    for element in ElementTree.fromstring(source).iterfind("joint"):
+        mimic = element.find("mimic")
+        if mimic is not None:
+            multiplier, offset = float(mimic.get("multiplier", 1.0)), float(mimic.get("offset", 0.0))
+            result[element.attrib["name"]] = mimic.attrib["joint"], multiplier, offset
+    return result
+
+
+def position_of(name: str, positions: dict[str, float], followers: dict[str, tuple[str, float, float]]) -> float:
+    """Return the position of a joint: driven, or after the joint that it mimics, or zero."""
+    if name in followers:
+        leader, multiplier, offset = followers[name]
+        return multiplier * position_of(leader, positions, followers) + offset
+    return positions.get(name, 0.0)
 
 
 def pinocchio_inertias(source: str, chain: Chain) -> np.ndarray:

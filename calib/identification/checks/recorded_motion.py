@@ -167,17 +167,17 @@ def share_of_nominal(
     t: np.ndarray, q: np.ndarray, effort: np.ndarray, chain: Chain, gravity: Sequence[float] | None = None,
     static: bool = False,
 ) -> np.ndarray:  # fmt: skip
-    """Return the ratios (n,) of recorded torques to those of the nominal masses, with friction estimated as well.
+    """Return the ratios (n,) of recorded torques to those of the nominal masses, with the drives estimated as well.
 
-    Least squares of τ_j on [τ_nominal,j, v_j, tanh(v_j / v0), 1] on the coarse grid. A joint counts where its
-    rigid-body torque is more than `min_torque` of its limit and the partial correlation of both torques is above
-    `min_sign_correlation`.
+    Least squares of τ_j on [τ_nominal,j, a_j, v_j, tanh(v_j / v0), 1] on the coarse grid: without the rotor's inertia
+    (a_j) it is taken for mass. A joint counts where its rigid-body torque is more than `min_torque` of its limit and
+    the partial correlation of both torques is above `min_sign_correlation`.
 
     Args:
         t: (N,) [s]; q, effort: (N, n).
         chain: the arm with its nominal masses.
         gravity: [m/s²], where it is not the robot's own.
-        static: compare torques of gravity alone, the others left free like friction.
+        static: compare torques of gravity alone, the others left free like the drives'.
 
     Returns:
         (n,) factors on τ_nominal: 1 for right masses, below 0 for a reversed sign; NaN for joints that do not count.
@@ -199,8 +199,8 @@ def share_of_nominal(
     # partial correlation with the torque of the nominal masses from which on its sign counts
     min_sign_correlation = 0.8
     for j in np.flatnonzero(heavy):
-        friction = np.column_stack([v[:, j], np.tanh(v[:, j] / CREEP), np.ones(len(q))])
-        free = friction if other is None else np.column_stack([friction, other[:, j]])
+        drive = drive_columns(v[:, j], a[:, j])
+        free = drive if other is None else np.column_stack([drive, other[:, j]])
         own, seen = (x - free @ np.linalg.lstsq(free, x, rcond=None)[0] for x in (rigid[:, j], torque[:, j]))
         common, power = own @ seen, own @ own
         if abs(common) / max(np.sqrt(power * (seen @ seen)), 1e-12) > min_sign_correlation:

@@ -13,10 +13,10 @@ from calib.robot.kinematics import forward
 Z, MIMIC = axis("0 0 1"), '<mimic joint="a" multiplier="-0.7" offset="0.2"/>'
 
 
-def agrees(source: str, base: str | None = None, tip: str | None = None, mimic: bool = False) -> urdf.Chain:
+def agrees(source: str, base: str | None = None, tip: str | None = None) -> urdf.Chain:
     chain = urdf.parse(source, "synthetic", base, tip)
     q = random_joints(chain, 20)
-    assert np.abs(pinocchio_poses(source, chain, q, mimic) - forward(chain, q)).max() < 1e-12
+    assert np.abs(pinocchio_poses(source, chain, q) - forward(chain, q)).max() < 1e-12
     return chain
 
 
@@ -72,7 +72,7 @@ def test_mimic_on_the_path():
     follower = chain.elements[11]
     assert (follower.name, follower.joint, follower.ratio, follower.value) == ("b.offset", 0, -0.7, 0.2)
     assert [chain.names[k] for k in chain.moving] == ["a.offset", "c.offset"]
-    agrees(source, mimic=True)
+    agrees(source)
     again = joint("d", "revolute", "three", "four", Z + '<mimic joint="b" multiplier="3" offset="0.2"/>')
     element = urdf.parse(source.replace("</robot>", '<link name="four"/>' + again + "</robot>")).elements[-1]
     assert (element.joint, element.ratio, element.value) == (0, pytest.approx(-2.1), pytest.approx(0.8))
