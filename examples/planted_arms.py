@@ -94,10 +94,14 @@ def move_origin(joint: ET.Element, shift: np.ndarray, turn: np.ndarray) -> None:
         origin.set("rpy", " ".join(map(repr, turned.as_euler("xyz").tolist())))
 
 
+def pinocchio_model(arm: Arm) -> pin.Model:
+    """Return Pinocchio's model of a description, in which mimic joints follow."""
+    return pin.buildModelFromXML(re.sub(r"<\?xml[^>]*\?>", "", arm.text), True)
+
+
 def pinocchio_poses(arm: Arm, q: np.ndarray) -> np.ndarray:
     """Return the poses (m, 4, 4) of the tip in the base frame after Pinocchio; joints outside the arm at zero."""
-    text = re.sub(r"<\?xml[^>]*\?>", "", arm.text)
-    model = pin.buildModelFromXML(text, True)  # True: mimic joints follow
+    model = pinocchio_model(arm)
     data = model.createData()
     base = model.getFrameId(arm.base, pin.FrameType.BODY)
     tip = model.getFrameId(arm.tip, pin.FrameType.BODY)
