@@ -8,11 +8,11 @@ import pinocchio as pin
 from calib.robot.chain import Chain
 
 
-def pinocchio_poses(source: str, chain: Chain, q: np.ndarray, mimic: bool = False) -> np.ndarray:
+def pinocchio_poses(source: str, chain: Chain, q: np.ndarray) -> np.ndarray:
     """Return the poses (m, 4, 4) of the chain's tip in its base after Pinocchio; other joints at zero."""
-    model = pin.buildModelFromXML(source, mimic)
+    model = pin.buildModelFromXML(source, len(chain.driven) > chain.n)  # which moves followers where there are any
     data = model.createData()
-    base, tip = model.getFrameId(chain.base), model.getFrameId(chain.tip)
+    base, tip = (model.getFrameId(link, pin.FrameType.BODY) for link in (chain.base, chain.tip))
     assert base < model.nframes and tip < model.nframes
     poses = []
     for row in q:
