@@ -328,7 +328,8 @@ def _frame(tree: UrdfTree, body: str) -> tuple[str, str]:
         return _leaves(tree, ends)[0], "its end-effector frame"
     leaves = _leaves(tree, counted)
     if len(leaves) == 1:
-        return leaves[0], "the last link" if len(counted) == len(links) else "the last link that is no gripper or sensor"
+        alone = len(counted) == len(links)
+        return leaves[0], "the last link" if alone else "the last link that is no gripper or sensor"
     return body, f"the last moving link ({listing(leaves, 4)} hang on it; --tip takes one of them)"
 
 
