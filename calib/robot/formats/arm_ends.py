@@ -95,7 +95,7 @@ class _Axes:
             refuse_robot(tree.where, "no actuated joint (revolute, continuous or prismatic) found")
         if not self._last_bodies():
             refuse_robot(tree.where, f"no actuated joint follows '{base}'; choose another base (--base)")
-        for rule in (self._mimicking, self._named_jaws, self._behind_flange, self._forked):
+        for rule in (self._mimicking, self._named_jaws, self._behind_flange, self._beside_axis, self._forked):
             marked = rule()
             before = self.aside
             self.aside = {**marked, **before}
@@ -252,6 +252,23 @@ class _Axes:
         single = max(heights) == 1
         return max(heights) < self.depth(body) and (single or self._is_hand(body, branches))
 
+    def _beside_axis(self) -> dict[str, str]:
+        """Return short branches beside the only one that continues the arm: by its name, or up to a flange."""
+        found: dict[str, str] = {}
+        for body in self._bodies():
+            branches = [joint for joint in self.departing(body) if self.height(joint)]
+            axes = [joint for joint in branches if self._in_series(joint) or self._is_flanged(joint)]
+            for joint in branches:
+                if len(axes) == 1 and joint is not axes[0] and self.height(joint) < ARM_AXES:
+                    found |= dict.fromkeys(self._behind(joint), f"beside {axes[0].name}")
+        return found
+
+    def _is_flanged(self, joint: JointTag) -> bool:
+        """Return whether a tool0 or a flange hangs on a joint or on what follows it."""
+        bodies = [self.tree.joints[name].child for name in self._behind(joint)]
+        links = [link for body in bodies for link, _ in self.tree.rigid(body)]
+        return any(TOOL0.search(link) or FLANGE.search(link) for link in links)
+
     def _forked(self) -> dict[str, str]:
         """Return the joints of hands: equally short branches at the end of a chain, nearest to the base first."""
         found: dict[str, str] = {}
@@ -274,10 +291,8 @@ class _Axes:
         even = difference == 0 or (len(heights) > 2 and difference == 1)
         if not even or heights[-1] >= self.depth(body):
             return False
-        inner = [self.tree.joints[name] for joint in branches for name in self._behind(joint)]
-        ends = [link for joint in inner for link, _ in self.tree.rigid(joint.child)]
-        flanged = any(TOOL0.search(link) or FLANGE.search(link) for link in ends)
         axes = [joint for joint in branches if self._in_series(joint) or self._is_named_axis(joint)]
+        flanged = [joint for joint in branches if self._is_flanged(joint)]
         return not flanged and not axes
 
     def _bodies(self) -> list[str]:
