@@ -1,8 +1,9 @@
 """Search for a small change of columns (sign, order, coupling) that explains the data far better.
 
 Columns of poses or recordings may not be what they are said to be: a sign, an exchange, a zero, a unit, the hand of the
-axes, a joint that counts from the horizontal instead of from the link before it. Each `Change` of a table is made,
-what the data leave unexplained then is compared with what they leave as recorded, and the best change counts.
+axes, a joint that counts from the horizontal instead of from the link before it, or that moves nothing measured. Each
+`Change` of a table is made, what the data leave unexplained then is compared with what they leave as recorded, and the
+best change counts.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -114,6 +115,11 @@ def best_changes(
 def reversal(n: int, joint: int) -> np.ndarray:
     """Return the matrix (n, n) that reverses the sign of one of n columns."""
     return np.diag(np.where(np.arange(n) == joint, -1.0, 1.0))
+
+
+def standing(n: int, joint: int) -> np.ndarray:
+    """Return the matrix (n, n) that holds one of n columns at zero."""
+    return np.diag(np.where(np.arange(n) == joint, 0.0, 1.0))
 
 
 def exchange(n: int, one: int, other: int) -> np.ndarray:

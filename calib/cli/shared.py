@@ -1,5 +1,6 @@
 """Shared parts of the commands: function signatures as options, the console, progress, checks of the output folder."""
 
+import logging
 import os
 import re
 import sys
@@ -106,14 +107,35 @@ class _Output:
 _OUTPUT: ContextVar[_Output | None] = ContextVar("output", default=None)
 
 
+class _Logged(logging.Handler):
+    """Prints what the package logs for the user, each text once."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.INFO)
+        self.printed: set[str] = set()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        words = record.getMessage()
+        if words not in self.printed:
+            self.printed.add(words)
+            say(words)
+
+
 @contextmanager
 def printing(verbose: bool) -> Iterator[None]:
-    """Print the lines that the block gives to `say`: all if `verbose`, otherwise the most important ones."""
-    output = _Output(verbose)
-    token = _OUTPUT.set(output)
+    """Print the lines that the block gives to `say`: all if `verbose`, otherwise the most important ones.
+
+    What the package logs is printed among them.
+    """
+    output, log, logged = _Output(verbose), logging.getLogger("calib"), _Logged()
+    token, level = _OUTPUT.set(output), log.level
+    log.addHandler(logged)
+    log.setLevel(logging.INFO)
     try:
         yield
     finally:
+        log.removeHandler(logged)
+        log.setLevel(level)
         _OUTPUT.reset(token)
         output.end()
 

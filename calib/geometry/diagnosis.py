@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from calib.column_changes import Change, Explanation, best_changes, coupling, couplings, exchange, reversal
+from calib.column_changes import Change, Explanation, best_changes, coupling, couplings, exchange, reversal, standing
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions, take
 from calib.data.poses.plausible import from_angles, to_angles
 from calib.errors import CalibError, Finding, finding
@@ -27,7 +27,7 @@ from calib.geometry.observation import Block, layout, observe, prepare
 from calib.geometry.residuals import Part
 from calib.geometry.weighing import GeometricFit, Settings
 from calib.records import evenly
-from calib.robot.chain import element_length
+from calib.robot.chain import Chain, element_length
 from calib.robot.kinematics import forward
 
 MIN_LENGTH = 0.01  # [m] lengths below say nothing of a common factor (our choice)
@@ -219,6 +219,12 @@ def wrong_columns(nominal: Installation, blocks: Blocks, mirrored: bool = False)
     surely = 1.0 / 3.0  # share of the error that may be left where no second change goes with it (our choice)
     table = [Change("joint-sign", _of_joints(reversal(n, j)), (j,), max_left=0.8) for j in range(n)]
     table += [
+        Change(
+            "joint-without-effect", _of_joints(standing(n, j)), (j,), {"end": _end_without(nominal.chain, j)}, surely
+        )
+        for j in range(n)
+    ]
+    table += [
         Change("joint-coupled", _of_joints(coupling(n, j, k, way)), (j, k), {"way": "+" if way > 0 else "-"}, surely)
         for j, k, way in couplings(n)
     ]
@@ -232,6 +238,14 @@ def wrong_columns(nominal: Installation, blocks: Blocks, mirrored: bool = False)
             Change("angle-convention", partial(_read_as, euler), (), {"convention": euler}, surely) for euler in others
         ]
     return best_changes(few, table, partial(_left, nominal), partial(_least, nominal), n)
+
+
+def _end_without(chain: Chain, joint: int) -> str | None:
+    """Return the option that ends the chain of a URDF before its last joint, or begins it behind its first one."""
+    if not chain.links or chain.n == 1:
+        return None
+    options = {0: f"--base {chain.links[0]}", chain.n - 1: f"--tip {chain.links[-2]}"}
+    return options.get(joint)
 
 
 def _of_joints(matrix: np.ndarray) -> Callable[[Blocks], Blocks]:

@@ -35,6 +35,7 @@ Every effect is linear in its coefficients and adds to the displacement of one e
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -51,6 +52,7 @@ from calib.robot.chain import Chain
 from calib.robot.kinematics import forward, joint_frames, sweep, tip_jacobian
 from calib.robot.tables import check_keys, number, vector
 
+LOG = logging.getLogger(__name__)
 BASES = ("torque", "lever", "joint", "cos", "sin")
 
 
@@ -222,7 +224,8 @@ class CalibratedChain:
             rows.append((joint.name, f"{joint.kind} [{joint.unit}]", *(f"{number:.4g}" for number in numbers)))
         widths = [max(map(len, column)) for column in zip(*rows)]
         table = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in rows]
-        return "\n".join([f"{self.chain.name}: {self.chain.base} to {self.chain.tip}, {self._state}", *table])
+        ends = [f"the arm ends at {self.chain.ends}"] if self.chain.ends else []
+        return "\n".join([f"{self.chain.name}: {self.chain.base} to {self.chain.tip}, {self._state}", *ends, *table])
 
     @property
     def _state(self) -> str:
@@ -284,6 +287,8 @@ def read_whole(path: str | Path) -> tuple[CalibratedChain, dict[str, Any]]:
     path = Path(path) / ROBOT if Path(path).is_dir() else Path(path)
     complete, extra = description.read_whole(path)
     where = str(path)
+    if complete.links:  # of a URDF, which leaves the choice
+        LOG.info("%s: the arm ends at %s, as robot.toml says", complete.name, complete.tip)
     known = extra.get("provenance", {})
 
     def valued(key: str) -> Chain | None:

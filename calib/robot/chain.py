@@ -120,6 +120,7 @@ class Chain:
         links: names of the n links after the joints (URDF), for messages and export.
         floor: height of the floor under the arm, in the base frame [m]; the default for collision tests.
         remarks: suspicious values in its description, found by the reader.
+        ends: how the tip was chosen, where a description left the choice (URDF), and joints that are not in the arm.
     """
 
     name: str
@@ -133,6 +134,7 @@ class Chain:
     links: tuple[str, ...] = ()
     floor: float = 0.0
     remarks: tuple[str, ...] = ()
+    ends: str = ""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "tail", frozen(self.tail))

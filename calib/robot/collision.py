@@ -23,7 +23,7 @@ from calib.records import shaped
 from calib.robot.capsules import SAMPLES, TARGET_RADIUS, Obstacle, Wall, closing, inseparable
 from calib.robot.chain import Chain, random_joints
 from calib.robot.formats import urdf
-from calib.robot.formats.simulators import configurations, driven_joints
+from calib.robot.formats.simulators import configurations, driven_joints, link_frame
 from calib.robot.formats.urdf_tree import Node, is_urdf, numbers, origin, parse, text
 from calib.robot.kinematics import sweep
 from calib.transforms import pose
@@ -74,7 +74,7 @@ class Collision:
         """Return the links' distances from lines of sight; see `calib.robot.capsules.Capsules.beam`."""
         pin, coal = _libraries()
         data, placed = self._model.createData(), pin.GeometryData(self._geometry)
-        tip = self._model.frames[self._model.getFrameId(self._chain.tip)].parentJoint
+        tip = self._model.frames[link_frame(self._model, self._chain.tip)].parentJoint
         shapes = self._geometry.geometryObjects
         links = [k for k in range(self._links) if shapes[k].parentJoint != tip]
         distances, shares = np.empty((2, len(q), len(links)))
@@ -145,7 +145,7 @@ def from_urdf(
 
     Args:
         path: the URDF.
-        base, tip: see `calib.robot.formats.urdf.ends`.
+        base, tip: see `calib.robot.formats.arm_ends`.
         floor: height of a floor in the base frame [m]; None for no floor.
         obstacles: in the base frame.
         mesh_folders: where ``package://name/...`` is looked for, besides the URDF's folder and the ones above it.
@@ -220,7 +220,7 @@ def _names(geometry: Any) -> tuple[tuple[str, str], ...]:
 def _attach(model: Any, geometry: Any, link: str, name: str, placed: np.ndarray, shape: Any) -> None:
     """Add a shape to `geometry`, attached to a link's frame."""
     pin, _ = _libraries()
-    index = model.getFrameId(link)
+    index = link_frame(model, link)
     frame = model.frames[index]
     placement = frame.placement * pin.SE3(placed[:3, :3], placed[:3, 3])
     geometry.addGeometryObject(pin.GeometryObject(name, frame.parentJoint, index, placement, shape))
@@ -248,7 +248,7 @@ def _stand(model: Any, base: str) -> Any:
     pin, _ = _libraries()
     data = model.createData()
     pin.framesForwardKinematics(model, data, pin.neutral(model))
-    return data.oMf[model.getFrameId(base)].copy()
+    return data.oMf[link_frame(model, base)].copy()
 
 
 def _shape(node: Node | None, folders: Sequence[Path], missing: list[str], place: str) -> Any | None:

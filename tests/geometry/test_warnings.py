@@ -149,6 +149,22 @@ def test_a_reversal_that_no_placement_makes_good_is_not_searched_for(monkeypatch
     assert len(placed) <= most
 
 
+@pytest.mark.parametrize(("joint", "end"), [(5, "--tip "), (0, "--base "), (2, None)])
+def test_a_joint_that_moves_nothing_measured_is_named(joint, end):
+    """A gripper's column beside the arm's, a track that carries the instrument, too."""
+    cell = perturbed_cell(load("ur5"), seed=2)
+    q = random_joints(cell.nominal, 60, 0)
+    still = q.copy()
+    still[:, joint] = 0.3
+    block = replace(measured_by(cell, still, 1), q=q)
+    found = diagnosis.wrong_columns(install(cell.nominal, [block]), [block])
+    assert found is not None and (found.code, found.joints) == ("joint-without-effect", (joint,))
+    named = replace(cell.nominal, links=tuple(f"l{k}" for k in range(6)))
+    cure = diagnosis.wrong_columns(install(named, [block]), [block])
+    assert cure is not None and (cure.changes[0].values["end"] or "").startswith(end or "")
+    assert (end is None) == (cure.changes[0].values["end"] is None)
+
+
 REAL = {
     "ur5_gts3800": ("model.urdf", "grid_800.csv"),
     "ur10_ipa": ("model.urdf", "A_grid_2500.csv"),

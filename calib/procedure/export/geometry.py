@@ -66,7 +66,7 @@ def edited_urdf(robot: CalibratedChain, source: Path, for_corrections: bool = Fa
 def chain_in(tree: UrdfTree, chain: Chain, base: str | None = None) -> Chain:
     """Return the chain of a URDF with another chain's joints and tip, if the URDF has these names."""
     named = chain.joint_names if chain.joint_names[0] in tree.joints else None
-    return urdf.build(tree, *urdf.ends(tree, base, chain.tip if chain.tip in tree.bodies else None, named))
+    return urdf.build(tree, urdf.ends(tree, base, chain.tip if chain.tip in tree.bodies else None, named))
 
 
 def check_readback(edited: str, where: str, chain: Chain) -> str:

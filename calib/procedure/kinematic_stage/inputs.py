@@ -23,6 +23,7 @@ from calib.robot import calibrated, description
 from calib.robot.calibrated import CalibratedChain, Deflection
 from calib.robot.chain import Chain
 from calib.robot.description import remarks
+from calib.robot.formats import urdf
 from calib.robot.formats.urdf_tree import is_urdf, text
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.library import load, resolve
@@ -229,7 +230,7 @@ def load_rigid(
 def _check_whole(chain: Chain, source: Path, measured: Path, base: str | None) -> None:
     """Refuse a table without columns of some revolute joints of the arm, since their positions would be unknown."""
     try:
-        whole = load(source, base)
+        whole = urdf.read(source, base)
     except CalibError:  # the URDF does not say by itself where its arm ends
         return
     missing = [one.name for one in whole.joints if one.name not in chain.joint_names and one.kind != "prismatic"]

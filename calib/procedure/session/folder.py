@@ -50,8 +50,9 @@ from calib.procedure.findings import Verdict, Verdicts
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.session.settings import NOTHING, SCHEMA, SessionSettings, check_schema, read_settings, written
 from calib.records import plain
+from calib.robot import tables
 from calib.robot.calibrated import ROBOT
-from calib.robot.formats.urdf_tree import converter, text
+from calib.robot.formats.urdf_tree import converter, is_urdf, text
 
 Say = Callable[[str], None]
 FOLDERS = ("1-robot", "2-poses", "3-measured", "4-fit", "5-validation")
@@ -124,8 +125,12 @@ class Session:
 
     @property
     def links(self) -> dict[str, Any]:
-        """The arm's first and last link as given to `calib new`; None for the links of the robot's file."""
-        return {"base": self.settings.robot.base or None, "tip": self.settings.robot.tip or None}
+        """The arm's first and last link: as given to `calib new`, else as its fit has them; None: to be chosen."""
+        links = {"base": self.settings.robot.base or None, "tip": self.settings.robot.tip or None}
+        fitted = self.fit.path / ROBOT
+        if links["tip"] is None and is_urdf(self.robot_file) and fitted.is_file():
+            links["tip"] = tables.load(fitted).get("tip")
+        return links
 
     @property
     def robot_file(self) -> Path:

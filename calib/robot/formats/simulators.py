@@ -93,12 +93,20 @@ def tip_poses(source: str, chain: Chain, q: np.ndarray) -> np.ndarray:
     pin: Any = pinocchio
     model = pinocchio_model(source)
     data = model.createData()
-    base, tip = model.getFrameId(chain.base), model.getFrameId(chain.tip)
+    base, tip = link_frame(model, chain.base), link_frame(model, chain.tip)
     result = np.empty((len(q), 4, 4))
     for pose, configuration in zip(result, configurations(model, chain, q), strict=True):
         pin.framesForwardKinematics(model, data, configuration)
         pose[:] = (data.oMf[base].inverse() * data.oMf[tip]).homogeneous
     return result
+
+
+def link_frame(model: Any, link: str) -> int:
+    """Return the number of a link's frame in Pinocchio's model; a joint may have the same name."""
+    import pinocchio
+
+    pin: Any = pinocchio
+    return model.getFrameId(link, pin.FrameType.BODY)
 
 
 def driven_joints(model: Any, chain: Chain) -> list[Any]:

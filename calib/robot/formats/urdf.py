@@ -18,8 +18,10 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.errors import RobotError, refuse_robot, require, suggestion
+from calib.errors import refuse_robot, suggestion
 from calib.robot.chain import AXES, Chain, Element
+from calib.robot.formats import arm_ends
+from calib.robot.formats.arm_ends import ArmEnds
 from calib.robot.formats.urdf_tree import JointTag, Mimic, UrdfTree, text, transform_body
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.transforms import invert, pose
@@ -36,8 +38,8 @@ def read(
     Args:
         path: the file.
         base: a link; default the root.
-        tip: a link; default see `ends`.
-        joint_names: the joints a measurement file names; the chain has to hold exactly these.
+        tip: a link; default see `calib.robot.formats.arm_ends`.
+        joint_names: the joints a measurement file names; the chain holds no others.
 
     Raises:
         RobotError: saying what was found, where, and what to try.
@@ -54,18 +56,15 @@ def parse(
 ) -> Chain:
     """Return the chain from `base` to `tip` of a URDF text; `where` names it in messages."""
     tree = read_tree(source, where)
-    return build(tree, *ends(tree, base, tip, joint_names))
+    return build(tree, ends(tree, base, tip, joint_names))
 
 
 def ends(
     tree: UrdfTree, base: str | None = None, tip: str | None = None, joint_names: Sequence[str] | None = None
-) -> tuple[str, str]:
-    """Return the base and tip links of the chain, by default chosen from the tree.
+) -> ArmEnds:
+    """Return the base and tip links of the chain, by default chosen from the tree (`calib.robot.formats.arm_ends`).
 
-    The base defaults to the root. The tip defaults to the end of the chain that holds the joints named, or else of
-    the one with most actuated joints, where a last joint that others mimic in another branch (a gripper's) does not
-    count. Behind the
-    last moving link the tip is the leaf that hangs on it by fixed joints where there is exactly one, else the link.
+    The base defaults to the root.
 
     Raises:
         RobotError: where the choice is not clear, listing the candidates.
@@ -76,17 +75,16 @@ def ends(
         base = tree.roots[0]
     tree.link(base, "base")
     if tip is None:
-        last = _last_named(tree, base, joint_names) if joint_names else _longest(tree, base)
-        leaves = [name for name, _ in tree.rigid(last) if not any(one.kind == "fixed" for one in tree.below[name])]
-        tip = leaves[0] if len(leaves) == 1 else last
-    path = tree.path(base, tree.link(tip, "tip"))
-    _check_path(tree, path, base, tip, joint_names)
-    return base, tip
+        chosen = arm_ends.choose(tree, base, joint_names)
+    else:
+        chosen = ArmEnds(base, tree.link(tip, "tip"), "as stated")
+    _check_path(tree, tree.path(base, chosen.tip), base, chosen.tip, joint_names)
+    return chosen
 
 
-def build(tree: UrdfTree, base: str, tip: str) -> Chain:
+def build(tree: UrdfTree, between: ArmEnds) -> Chain:
     """Return the chain between two links of a checked tree."""
-    path = tree.path(base, tip)
+    path = tree.path(between.base, between.tip)
     actuated = [joint for joint in path if joint.actuated]
     index = {joint.name: j for j, joint in enumerate(actuated)}
     elements: list[Element] = []
@@ -104,13 +102,21 @@ def build(tree: UrdfTree, base: str, tip: str) -> Chain:
         name=tree.name,
         joints=tuple(joint.as_joint() for joint in actuated),
         elements=tuple(elements),
-        base=base,
-        tip=tip,
+        base=between.base,
+        tip=between.tip,
         tail=pending,
         inertias=_inertias(tree, path),
         links=tuple(joint.child for joint in actuated),
-        remarks=tree.remarks,
+        remarks=(*tree.remarks, *_unused_faults(tree, path)),
+        ends=between.words,
     )
+
+
+def _unused_faults(tree: UrdfTree, path: list[JointTag]) -> list[str]:
+    """Return remarks on joints outside the chain whose limits are wrong."""
+    used = {joint.name for joint in path}
+    faults = [joint.fault for joint in tree.joints.values() if joint.fault and joint.name not in used]
+    return [f"{fault} (this joint is not in the arm)" for fault in faults]
 
 
 def align(axis: np.ndarray) -> np.ndarray:
@@ -183,63 +189,6 @@ def _check_path(tree: UrdfTree, path: list[JointTag], base: str, tip: str, joint
             f"between '{base}' and '{tip}' some joints are not in the measurements: "
             f"{', '.join(extra)}; choose base and tip (--base, --tip), or make them fixed at their value",
         )
-    if joint_names and (absent := [name for name in joint_names if name not in actuated]):
-        there = f"{suggestion(absent[0], actuated)} (found there: {', '.join(actuated)})"
-        refuse_robot(tree.where, f"joint '{absent[0]}' is not between '{base}' and '{tip}'{there}")
-
-
-def _longest(tree: UrdfTree, base: str) -> str:
-    """Return the last moving link of the chain with the most actuated joints."""
-    if not any(joint.actuated for joint in tree.joints.values()):
-        refuse_robot(tree.where, "no actuated joint (revolute, continuous or prismatic) found")
-    grippers = _gripper_joints(tree)
-    best: dict[str, int] = {}
-    todo = [(base, base, 0)]
-    while todo:
-        link, last, count = todo.pop(0)
-        best[last] = count
-        todo += [
-            (joint.child, joint.child if joint.moves else last, count + joint.actuated)
-            for joint in tree.below[link]
-            if joint.name not in grippers
-        ]
-    most = max(best.values())
-    require(most != 0, f"{tree.where}: no actuated joint follows '{base}'; choose another base (--base)", RobotError)
-    found = [link for link, count in best.items() if count == most]
-    found = [link for link in found if not any(_hangs(tree, other, link) for other in found if other != link)]
-    if len(found) > 1:
-        refuse_robot(
-            tree.where,
-            f"several chains with {most} actuated joints, to the links {', '.join(found)}; "
-            f"choose one as tip (--tip), or a base (--base)",
-        )
-    return found[0]
-
-
-def _gripper_joints(tree: UrdfTree) -> set[str]:
-    """Return mimic joints whose leader is in another branch, and leaders that no actuated joint follows."""
-    found: set[str] = set()
-    for joint in tree.joints.values():
-        leader = tree.joints.get(joint.mimic.leader) if joint.mimic else None
-        if leader is None or _hangs(tree, joint.child, leader.child) or _hangs(tree, leader.child, joint.child):
-            continue
-        found.add(joint.name)
-        if not any(other.actuated and _hangs(tree, other.child, leader.child) for other in tree.joints.values()):
-            found.add(leader.name)
-    return found
-
-
-def _hangs(tree: UrdfTree, link: str, on: str) -> bool:
-    return any(joint.parent == on for joint in tree.ancestry(link))
-
-
-def _last_named(tree: UrdfTree, base: str, joint_names: Sequence[str]) -> str:
-    """Return the child link of the named joint farthest from the base."""
-    for name in joint_names:
-        if name not in tree.joints:
-            known = ", ".join(joint.name for joint in tree.joints.values() if joint.actuated)
-            refuse_robot(tree.where, f"no joint '{name}'{suggestion(name, tree.joints)} (joints: {known})")
-    return max((tree.joints[name].child for name in joint_names), key=lambda link: len(tree.ancestry(link)))
 
 
 def _inertias(tree: UrdfTree, path: list[JointTag]) -> np.ndarray | None:

@@ -174,7 +174,10 @@ class Mimic:
 
 @dataclass(frozen=True, eq=False)
 class JointTag:
-    """Joint of a URDF: origin (4, 4) in its parent link, unit axis (3,) in its frame, limits as in `_limits`."""
+    """Joint of a URDF: origin (4, 4) in its parent link, unit axis (3,) in its frame, limits as in `_limits`.
+
+    `fault` says what is wrong with the limits: an error only where the joint is part of the arm.
+    """
 
     name: str
     kind: str
@@ -185,6 +188,7 @@ class JointTag:
     mimic: Mimic | None
     limits: tuple[float, float, float, float, tuple[str, ...]]
     node: Node
+    fault: str = ""
 
     @property
     def moves(self) -> bool:
@@ -195,7 +199,12 @@ class JointTag:
         return self.moves and self.mimic is None
 
     def as_joint(self) -> Joint:
-        """Return the `Joint` of a chain for this joint."""
+        """Return the `Joint` of a chain for this joint.
+
+        Raises:
+            RobotError: for wrong limits.
+        """
+        require(not self.fault, self.fault, RobotError)
         return Joint(self.name, "prismatic" if self.kind == "prismatic" else "revolute", *self.limits)
 
 
@@ -357,8 +366,12 @@ def _joint(node: Node, links: Iterable[str], where: str) -> JointTag:
     if kind not in KINDS:
         refuse_robot(place, f"type '{kind}' is not one of {', '.join(KINDS)}{suggestion(kind, KINDS)}")
     parent, child = (_end(node, role, links, place) for role in ("parent", "child"))
-    axis, limits = _axis(node, kind, place), _limits(node, kind, place)
-    return JointTag(name, kind, parent, child, origin(node, place), axis, _mimic(node, place), limits, node)
+    axis, mimic, fault = _axis(node, kind, place), _mimic(node, place), ""
+    try:
+        limits = _limits(node, kind, place)
+    except RobotError as error:
+        limits, fault = (-np.inf, np.inf, np.inf, np.inf, ()), str(error)
+    return JointTag(name, kind, parent, child, origin(node, place), axis, mimic, limits, node, fault)
 
 
 def _end(node: Node, role: str, links: Iterable[str], place: str) -> str:

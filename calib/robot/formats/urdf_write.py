@@ -256,7 +256,7 @@ def _matching_path(tree: UrdfTree, nominal: Chain) -> list[JointTag]:
     named = any(name in tree.joints for name in names)
     tip = nominal.tip if nominal.tip in tree.bodies else None
     if tip is None:
-        tip = ends(tree, tree.roots[0], None, names)[1] if named else ends(tree)[1]
+        tip = ends(tree, tree.roots[0], None, names).tip if named else ends(tree).tip
     path = tree.ancestry(tip)
     if named and names[0] in tree.joints:
         behind = [joint.name for joint in path]

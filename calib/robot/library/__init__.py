@@ -1,5 +1,6 @@
 """Robots by what a user names: one of the library (a TOML file each), a file, or a folder with a ``robot.toml``."""
 
+import logging
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
@@ -10,6 +11,8 @@ from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
 from calib.robot.formats import urdf
 from calib.robot.formats.urdf_tree import converter, is_urdf
+
+LOG = logging.getLogger(__name__)
 
 
 def names() -> tuple[str, ...]:
@@ -28,7 +31,7 @@ def path(name: str) -> Path:
 def load(
     robot: str | Path, base: str | None = None, tip: str | None = None, joint_names: Sequence[str] | None = None
 ) -> Chain:
-    """Return the chain of a robot given by name or path.
+    """Return the chain of a robot given by name or path; the log says where a URDF's arm ends, and why.
 
     Args:
         robot: a library name, the path of a ``.urdf``, ``.urdf.xacro``, MJCF or ``.toml`` file, or a folder that holds
@@ -41,7 +44,9 @@ def load(
     """
     path = resolve(robot)
     if is_urdf(path):
-        return urdf.read(path, base, tip, joint_names)
+        chain = urdf.read(path, base, tip, joint_names)
+        LOG.info("%s: the arm ends at %s", chain.name, chain.ends)
+        return chain
     return _check_ends(path, description.read(path), base, tip)
 
 

@@ -91,7 +91,7 @@ def gripper(*arm: str, leader: str = "finger1") -> str:
 
 def test_default_tip_stops_before_a_gripper():
     chain = urdf.parse(gripper())
-    assert (chain.joint_names, chain.tip) == (("a",), "hand")
+    assert (chain.joint_names, chain.tip) == (("a",), "one")  # the hand holds the fingers: it is the gripper's
     assert urdf.parse(gripper(), tip="left").joint_names == ("a", "finger1")
     with pytest.raises(RobotError, match=r"joint 'finger2': the joint it mimics, 'finger1', is not between"):
         urdf.parse(gripper(), tip="right")
@@ -102,7 +102,7 @@ def test_default_tip_stops_before_a_gripper():
     [
         ([joint("rod", "revolute", "base", "rods", Z + '<mimic joint="a"/>'), joint("b", "revolute", "one", "two", Z)],
          ("a", "b"), "two"),
-        ([joint("f", "fixed", "one", "flange"), joint("g", "fixed", "one", "camera")], ("a",), "one"),
+        ([joint("f", "fixed", "one", "flange"), joint("g", "fixed", "one", "camera")], ("a",), "flange"),
     ],
 )  # fmt: skip
 def test_default_tip_beside_a_driven_linkage_or_several_leaves(more, joints, tip):
@@ -129,9 +129,9 @@ def test_joint_names_choose_the_chain():
 @pytest.mark.parametrize(
     "options, message",
     [
-        ({}, r"several chains with 3 actuated joints, to the links left2, right2; choose one as tip"),
+        ({}, r"two arms: choose one by its last link, --tip left2 or right2$"),
         ({"joint_names": ["l1", "l2"]}, r"some joints are not in the measurements: torso; choose base and tip"),
-        ({"joint_names": ["torso", "l1", "r1"]}, r"joint '[lr]1' is not between 'base' and '(left|right)1'"),
+        ({"joint_names": ["torso", "l1", "r1"]}, r"two arms: .*--tip left1 or right1; the table has"),
         ({"joint_names": ["torso", "l11"]}, r"no joint 'l11' \(did you mean 'l[12]'\?\) \(joints: torso, l1, l2, r1"),
         ({"tip": "left_2"}, r"no link 'left_2' for the tip .did you mean 'left2'"),
         ({"base": "bass", "tip": "left2"}, r"no link 'bass' for the base .did you mean 'base'"),
@@ -147,6 +147,10 @@ def test_wrong_choices(options, message):
 
 def three(*joints: str) -> str:
     return "".join(['<robot name="x"><link name="a"/><link name="b"/><link name="c"/>\n', *joints, "</robot>"])
+
+
+def arm_with(limit: str) -> str:
+    return three(joint("j", "revolute", "a", "b", limit), joint("k", "fixed", "b", "c"))
 
 
 @pytest.mark.parametrize(
@@ -176,8 +180,8 @@ def three(*joints: str) -> str:
         (three(joint("j", "fixed", "a", "b", rpy="0 x 0")), r'rpy="0 x 0" of <origin>'),
         (three(joint("j", "fixed", "a", "b", xyz="0 0 ${h}")), r"this is a xacro file; name it so"),
         ("<robot xmlns:xacro='x'><xacro:include filename='f'/></robot>", r"found <xacro:include>: this is a xacro"),
-        (three(joint("j", "revolute", "a", "b", '<limit lower="1" upper="1"/>')), r"'j': lower limit 1 is not below"),
-        (three(joint("j", "revolute", "a", "b", '<limit lower="one" upper="1"/>')), r'lower="one" of <limit> in line'),
+        (arm_with('<limit lower="1" upper="1"/>'), r"'j': lower limit 1 is not below"),
+        (arm_with('<limit lower="one" upper="1"/>'), r'lower="one" of <limit> in line'),
     ],
 )
 def test_bad_files(source, message):

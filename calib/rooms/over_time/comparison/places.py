@@ -89,6 +89,8 @@ def check_same_robot(names: tuple[str, str], robots: tuple[CalibratedChain, Cali
     away = np.maximum(away, [np.abs(_placed(a) - _placed(b)).max() for a, b in zip(first.elements, second.elements)])
     moved = [name for name, size in zip(first.names, away) if size > SAME]
     tail = np.abs(first.tail - second.tail).max()
+    ends = f"{both}: one ends at {first.tip}, the other at {second.tip}; fit one of them again with --tip"
+    require(moved or tail <= SAME or first.tip == second.tip, ends, RobotError)
     words = f"{both}: the nominal {listing(moved or ['tip'], 5)} differ; fit both from one description"
     require(not moved and tail <= SAME, words, RobotError)
 

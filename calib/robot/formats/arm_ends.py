@@ -1,0 +1,376 @@
+"""Where the arm of a URDF begins and ends: the root, and the flange.
+
+A number typed into a controller relates to the frame at the flange, so the chain ends there, however many links hang on
+the last axis. Three questions are answered one after the other:
+
+1. Which joints are no axes of an arm? Jaws and fingers, told by structure: a mimic joint and its leader in different
+   branches; what hangs beside a tool0 or a flange; a fork of equally short branches. Where structure tells nothing (one
+   jaw alone), by name. A joint whose name continues a series (``joint_6`` behind ``joint_5``) is an axis.
+2. Which body ends the arm? The last of the longest chain of axes. Another chain with nearly as many axes of its own is
+   another arm, and the user chooses.
+3. Which of the links fixed to that body? ``tool0``, else ``flange`` (REP 199), else an end effector's frame, else the
+   only link that nothing is fixed to, grippers and sensors not counted, else the body's own link.
+
+The rules are our choice, judged on public descriptions of real arms (``tests/robot/formats/test_arm_ends.py``).
+"""
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from calib.errors import listing, refuse_robot, suggestion
+from calib.robot.formats.urdf_tree import JointTag, UrdfTree
+
+TOOL0 = re.compile(r"(^|[^a-z0-9])tool_?0(_(link|frame))?$", re.IGNORECASE)
+FLANGE = re.compile(r"(^|[^a-z0-9])flange(_(link|frame))?$", re.IGNORECASE)
+END_WORDS = frozenset(("ee", "eef", "tcp", "tool", "effector", "endeffector"))
+SENSOR_WORDS = frozenset(
+    ("camera", "cam", "optical", "depth", "lidar", "laser", "imu", "ft", "sensor", "led", "light", "marker")
+)
+FINGER_WORDS = ("finger", "jaw", "claw", "knuckle", "thumb")
+GRIPPER_WORDS = (*FINGER_WORDS, "grip")
+AXIS_WORDS = frozenset(
+    ("wrist", "elbow", "shoulder", "roll", "pitch", "yaw", "rotate", "rotation", "pan", "tilt", "flex")
+)
+ARM_AXES, ARM_SHARE = 4, 0.75
+"""A second chain is another arm from this many axes of its own, and this share of the longest one's (our choice)."""
+
+
+@dataclass(frozen=True)
+class ArmEnds:
+    """Base and tip links of an arm, and how they were chosen.
+
+    Attributes:
+        base, tip: links.
+        why: the tip was taken, as words that follow its name.
+        unused: remarks on joints that are not in the arm, columns that are not used, frames that are not taken.
+    """
+
+    base: str
+    tip: str
+    why: str = ""
+    unused: tuple[str, ...] = ()
+
+    @property
+    def words(self) -> str:
+        """The tip and why it was taken; what is not part of the arm."""
+        return "; ".join([f"{self.tip}, {self.why}", *self.unused])
+
+
+def choose(tree: UrdfTree, base: str, joint_names: Sequence[str] | None = None) -> ArmEnds:
+    """Return the ends of the arm that begins at `base`.
+
+    Args:
+        tree: a checked URDF.
+        base: a link.
+        joint_names: the joints that a table has columns for; the arm ends with the last of them. Jaws do not count.
+
+    Raises:
+        RobotError: where the choice is not clear, listing the candidates.
+    """
+    axes = _Axes(tree, base)
+    ends = axes.chains if joint_names is None else axes.named(joint_names)
+    if len(ends) > 1:
+        tips = [_frame(tree, body)[0] for body in ends]
+        both = "" if joint_names is None else "; the table has columns of several"
+        count = "two arms" if len(ends) == 2 else f"{len(ends)} chains of joints"
+        refuse_robot(tree.where, f"{count}: choose one by its last link, --tip {' or '.join(tips)}{both}")
+    body = ends[0]
+    tip, why = _frame(tree, body)
+    return ArmEnds(base, tip, why, axes.remarks(body, joint_names))
+
+
+class _Axes:
+    """The axes of the arms that a tree holds below a link, and the joints that are none.
+
+    Attributes:
+        aside: actuated joints that are no axes, by name, each with the reason.
+        chains: last bodies of the longest chains of axes: one, or one per arm.
+    """
+
+    def __init__(self, tree: UrdfTree, base: str) -> None:
+        self.tree, self.base = tree, base
+        self.aside: dict[str, str] = {}
+        if not any(joint.actuated for joint in tree.joints.values()):
+            refuse_robot(tree.where, "no actuated joint (revolute, continuous or prismatic) found")
+        if not self._last_bodies():
+            refuse_robot(tree.where, f"no actuated joint follows '{base}'; choose another base (--base)")
+        for rule in (self._mimicking, self._named_jaws, self._behind_flange, self._beside_axis, self._forked):
+            marked = rule()
+            before = self.aside
+            self.aside = {**marked, **before}
+            if not self._last_bodies():  # a gripper alone is an arm
+                self.aside = before
+        self.chains = self._rivals(self._last_bodies())
+
+    def depth(self, link: str) -> int:
+        """Return how many actuated joints stand between the base and a link."""
+        return sum(joint.actuated for joint in self.tree.path(self.base, link))
+
+    def height(self, joint: JointTag) -> int:
+        """Return the number of axes on the longest chain that begins with a joint; 0 if it is none itself."""
+        if joint.name in self.aside:
+            return 0
+        behind = [self.height(child) for child in self.tree.below[joint.child]]
+        return joint.actuated + max(behind, default=0)
+
+    def departing(self, body: str) -> list[JointTag]:
+        """Return the moving joints whose parent link is fixed to a body's link."""
+        links = [link for link, _ in self.tree.rigid(body)]
+        return [joint for link in links for joint in self.tree.below[link] if joint.moves]
+
+    def named(self, joint_names: Sequence[str]) -> list[str]:
+        """Return the last bodies of the chains that hold the named joints, jaws left out where any joint remains.
+
+        Raises:
+            RobotError: for a joint that does not exist.
+        """
+        joints = self.tree.joints
+        for name in joint_names:
+            if name not in joints:
+                known = ", ".join(joint.name for joint in joints.values() if joint.actuated)
+                refuse_robot(self.tree.where, f"no joint '{name}'{suggestion(name, joints)} (joints: {known})")
+        counted = [name for name in joint_names if name not in self.aside] or list(joint_names)
+        bodies = [joints[name].child for name in counted if _hangs(self.tree, joints[name].child, self.base)]
+        if not bodies:
+            refuse_robot(self.tree.where, f"joint '{counted[0]}' does not follow '{self.base}'; choose another base")
+        last = [body for body in bodies if not any(_hangs(self.tree, other, body) for other in bodies if other != body)]
+        return self._rivals(last)
+
+    def remarks(self, body: str, joint_names: Sequence[str] | None) -> tuple[str, ...]:
+        """Return remarks on jaws, columns of which are not used, and on a tool0 that is not at the end of the arm."""
+        path = {joint.name for joint in self.tree.path(self.base, body)}
+        joints = self.tree.joints
+        jaws = {name: reason for name, reason in self.aside.items() if name not in path and joints[name].actuated}
+        reasons = dict.fromkeys(jaws.values())
+        found: list[str] = []
+        for reason in reasons:
+            names = [name for name, its in jaws.items() if its == reason]
+            found.append(f"not an axis of the arm: {listing(names, 3)} ({reason})")
+        unused = [name for name in joint_names or () if name not in path]
+        if unused:
+            found.append(f"columns not used: {listing(unused, 4)}")
+        links = {link for link, _ in self.tree.rigid(body)}
+        earlier = [joint.child for joint in self.tree.path(self.base, body) if joint.child not in links]
+        for link in earlier:
+            tools = [name for name, _ in self.tree.rigid(link) if TOOL0.search(name) and name not in links]
+            behind = self.depth(body) - self.depth(link)
+            found += [f"{name} is not taken: {behind} axes follow it" for name in tools]
+        return tuple(dict.fromkeys(found))
+
+    def _reached(self) -> list[str]:
+        """Return the links below the base, the base first, without those behind joints that are no axes."""
+        result: list[str] = []
+        todo = [self.base]
+        while todo:
+            link = todo.pop(0)
+            result.append(link)
+            todo += [joint.child for joint in self.tree.below[link] if joint.name not in self.aside]
+        return result
+
+    def _last_bodies(self) -> list[str]:
+        """Return the bodies behind axes that no other axis departs from."""
+        links = self._reached()
+        bodies = [link for link in links if link != self.base and self.tree.above[link].moves]
+        followed = [body for body in bodies if any(self.height(joint) for joint in self.departing(body))]
+        last = [body for body in bodies if body not in followed and self.depth(body) and self._is_driven(body)]
+        return _leaves(self.tree, last)
+
+    def _is_driven(self, body: str) -> bool:
+        """Return whether a body is moved by a joint of its own, or follows the joint before it in the chain."""
+        joint = self.tree.above[body]
+        leader = self.tree.joints.get(joint.mimic.leader) if joint.mimic else None
+        return joint.actuated or (leader is not None and _hangs(self.tree, body, leader.child))
+
+    def _rivals(self, bodies: list[str]) -> list[str]:
+        """Return of several last bodies those of the longest chain and of other arms."""
+        most = max(self.depth(body) for body in bodies)
+        longest = [body for body in bodies if self.depth(body) == most]
+        result = list(longest)
+        for body in bodies:
+            apart = [self._apart(body, other) for other in longest]
+            arms = [own >= ARM_AXES and own >= ARM_SHARE * its for own, its in apart]
+            if body not in longest and all(arms):
+                result.append(body)
+        return result
+
+    def _apart(self, body: str, other: str) -> tuple[int, int]:
+        """Return the numbers of axes of two chains behind the link at which they part."""
+        first, second = (self.tree.path(self.base, link) for link in (body, other))
+        shared = sum(a.actuated for a, b in zip(first, second) if a.name == b.name)
+        return self.depth(body) - shared, self.depth(other) - shared
+
+    def _mimicking(self) -> dict[str, str]:
+        """Return mimic joints whose leader is in another branch, and leaders that no actuated joint follows."""
+        tree, found = self.tree, dict[str, str]()
+        for joint in tree.joints.values():
+            leader = tree.joints.get(joint.mimic.leader) if joint.mimic else None
+            if leader is None or _hangs(tree, joint.child, leader.child) or _hangs(tree, leader.child, joint.child):
+                continue
+            found[joint.name] = "moves with another joint"
+            if not any(other.actuated and _hangs(tree, other.child, leader.child) for other in tree.joints.values()):
+                found[leader.name] = "drives a gripper"
+        return found
+
+    def _named_jaws(self) -> dict[str, str]:
+        """Return joints at the ends of chains that are jaws or fingers by name, with those before them."""
+        found: dict[str, str] = {}
+        jaws = [joint for joint in self.tree.joints.values() if joint.actuated and self._is_jaw(joint)]
+        jaws.sort(key=lambda joint: -len(self.tree.ancestry(joint.child)))
+        for joint in jaws:
+            behind = [other for other in self.tree.joints.values() if _hangs(self.tree, other.child, joint.child)]
+            if all(other.name in found or not other.actuated or other.name in self.aside for other in behind):
+                found[joint.name] = "a gripper by its name"
+        return found
+
+    def _is_jaw(self, joint: JointTag) -> bool:
+        """Return whether a joint's name, or its link's, is that of a jaw; a word that the whole arm has is a prefix."""
+        first = self._first(joint.child)
+        name, link = joint.name.lower(), joint.child.lower()
+        if name == first or self._is_named_axis(joint):
+            return False
+        if any(word in name and word not in first for word in GRIPPER_WORDS):
+            return True
+        return not self._in_series(joint) and any(word in link and word not in first for word in FINGER_WORDS)
+
+    def _behind_flange(self) -> dict[str, str]:
+        """Return the joints behind bodies with a tool0 or a flange, where what is behind them is no arm."""
+        found: dict[str, str] = {}
+        for body in self._bodies():
+            frames = [link for link, _ in self.tree.rigid(body) if TOOL0.search(link) or FLANGE.search(link)]
+            branches = [joint for joint in self.departing(body) if self.height(joint)]
+            if frames and branches and self._is_tool(body, branches):
+                for joint in branches:
+                    found |= dict.fromkeys(self._behind(joint), f"behind {frames[-1]}")
+        return found
+
+    def _is_tool(self, body: str, branches: list[JointTag]) -> bool:
+        """Return whether the joints departing from a body with a flange belong to a tool: one joint each, or a hand."""
+        if any(self._in_series(joint) or self._is_named_axis(joint) for joint in branches):
+            return False
+        heights = [self.height(joint) for joint in branches]
+        single = max(heights) == 1
+        return max(heights) < self.depth(body) and (single or self._is_hand(body, branches))
+
+    def _beside_axis(self) -> dict[str, str]:
+        """Return short branches beside the only one that continues the arm: by its name, or up to a flange."""
+        found: dict[str, str] = {}
+        for body in self._bodies():
+            branches = [joint for joint in self.departing(body) if self.height(joint)]
+            axes = [joint for joint in branches if self._in_series(joint) or self._is_flanged(joint)]
+            for joint in branches:
+                if len(axes) == 1 and joint is not axes[0] and self.height(joint) < ARM_AXES:
+                    found |= dict.fromkeys(self._behind(joint), f"beside {axes[0].name}")
+        return found
+
+    def _is_flanged(self, joint: JointTag) -> bool:
+        """Return whether a tool0 or a flange hangs on a joint or on what follows it."""
+        bodies = [self.tree.joints[name].child for name in self._behind(joint)]
+        links = [link for body in bodies for link, _ in self.tree.rigid(body)]
+        return any(TOOL0.search(link) or FLANGE.search(link) for link in links)
+
+    def _forked(self) -> dict[str, str]:
+        """Return the joints of hands: equally short branches at the end of a chain, nearest to the base first."""
+        found: dict[str, str] = {}
+        for body in self._bodies():
+            branches = [joint for joint in self.departing(body) if self.height(joint) and joint.name not in found]
+            if self._is_hand(body, branches):
+                for joint in branches:
+                    found |= dict.fromkeys(self._behind(joint), "finger of a hand")
+        return found
+
+    def _is_hand(self, body: str, branches: list[JointTag]) -> bool:
+        """Return whether several branches are fingers: shorter than what is before, of one length, not named as axes.
+
+        Three or more may differ by a joint (a thumb).
+        """
+        if len(branches) < 2:
+            return False
+        heights = sorted(self.height(joint) for joint in branches)
+        difference = heights[-1] - heights[-2]
+        even = difference == 0 or (len(heights) > 2 and difference == 1)
+        if not even or heights[-1] >= self.depth(body):
+            return False
+        axes = [joint for joint in branches if self._in_series(joint) or self._is_named_axis(joint)]
+        flanged = [joint for joint in branches if self._is_flanged(joint)]
+        return not flanged and not axes
+
+    def _bodies(self) -> list[str]:
+        """Return the links behind moving joints that are reached, nearest to the base first."""
+        return [link for link in self._reached() if link != self.base and self.tree.above[link].moves]
+
+    def _behind(self, joint: JointTag) -> list[str]:
+        """Return the names of a joint and of all moving joints behind it."""
+        joints = self.tree.joints.values()
+        behind = [one.name for one in joints if one.moves and _hangs(self.tree, one.child, joint.child)]
+        return [joint.name, *behind]
+
+    def _first(self, link: str) -> str:
+        """Return the name of the first actuated joint before a link, in small letters: its words may be a prefix."""
+        return next(joint.name.lower() for joint in self.tree.ancestry(link) if joint.actuated)
+
+    def _is_named_axis(self, joint: JointTag) -> bool:
+        return bool((AXIS_WORDS & _words(joint.name)) - _words(self._first(joint.child)))
+
+    def _in_series(self, joint: JointTag) -> bool:
+        """Return whether a joint's name is that of the actuated joint before it with the next number or letter."""
+        before = [one for one in self.tree.ancestry(joint.child)[:-1] if one.actuated]
+        return bool(before) and _follows(before[-1].name, joint.name)
+
+
+def _follows(before: str, name: str) -> bool:
+    """Return whether two names begin alike up to a number that grows by one: ``joint_1_s``, ``joint_2_l``."""
+    first, second = (re.match(r"(\D*)(\d+)", text.lower()) for text in (before, name))
+    if first is None or second is None:
+        return False
+    return first[1] == second[1] and int(second[2]) == int(first[2]) + 1
+
+
+def _hangs(tree: UrdfTree, link: str, on: str) -> bool:
+    return any(joint.parent == on for joint in tree.ancestry(link))
+
+
+def _frame(tree: UrdfTree, body: str) -> tuple[str, str]:
+    """Return the link of a last body at which the arm ends, and why."""
+    links = [link for link, _ in tree.rigid(body)]
+    for pattern, words in ((TOOL0, "its tool frame (REP 199)"), (FLANGE, "its flange (REP 199)")):
+        found = [link for link in links if pattern.search(link)]
+        if found:
+            return found[0], words
+    counted = _without_tools(tree, body)
+    ends = [link for link in counted if link != body and END_WORDS & _words(link)]
+    if len(_leaves(tree, ends)) == 1:
+        return _leaves(tree, ends)[0], "its end-effector frame"
+    leaves = _leaves(tree, counted)
+    if len(leaves) == 1:
+        alone = len(counted) == len(links)
+        return leaves[0], "the last link" if alone else "the last link that is no gripper or sensor"
+    return body, f"the last moving link ({listing(leaves, 4)} hang on it; --tip takes one of them)"
+
+
+def _without_tools(tree: UrdfTree, body: str) -> list[str]:
+    """Return the links fixed to a body, its own first, without grippers and sensors and what is fixed to them."""
+    prefix = body.lower()
+    result: list[str] = []
+    todo = [body]
+    while todo:
+        link = todo.pop(0)
+        result.append(link)
+        for joint in tree.below[link]:
+            name = joint.child.lower()
+            gripper = any(word in name and word not in prefix for word in GRIPPER_WORDS)
+            holds = any(other.moves for other in tree.below[joint.child]) and not END_WORDS & _words(joint.child)
+            if joint.kind == "fixed" and not (gripper or holds or SENSOR_WORDS & _words(joint.child)):
+                todo.append(joint.child)
+    return result
+
+
+def _leaves(tree: UrdfTree, links: Iterable[str]) -> list[str]:
+    """Return those of some links that no other of them hangs on."""
+    links = list(links)
+    return [link for link in links if not any(_hangs(tree, other, link) for other in links if other != link)]
+
+
+def _words(link: str) -> set[str]:
+    """Return the words of a link's name: runs of letters, in small letters."""
+    return set(re.findall(r"[a-z]+", link.lower()))
