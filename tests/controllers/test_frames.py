@@ -95,7 +95,7 @@ def test_a_stated_world_counts_first(fitted, tmp_path, capsys):
     line = next(line for line in capsys.readouterr().out.split("\n") if "UFRAME[1]" in line)
     expected = invert(shift) @ from_xyz_rpy([0.0, 0.0, AXIS_2], [0.0, 0.0, 0.0]) @ workpiece
     np.testing.assert_allclose(placed(line), expected, atol=2e-6)
-    for statement, said in (("1,2,3,4,5", "frame 5 values"), ("0,0,525", "mm?"), ("0,0,nan", "frame 3 values")):
+    for statement, said in (("1,2,3,4,5", "found 5 values"), ("0,0,525", "mm?"), ("0,0,nan", "found 3 values")):
         assert cli.run(["deliver", str(folder), "--for", "fanuc", "--world", statement]) == 2
         assert said in capsys.readouterr().err
 
