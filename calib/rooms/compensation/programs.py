@@ -2,8 +2,11 @@
 
 The targets in a program (`calib.rooms.controllers.targets`) are replaced by ones that bring the real tool to where
 they are meant; every other byte stays. A joint target becomes the joint command. A pose becomes the pose that the
-nominal robot, the controller's own model, has at the joint command: ``--tool`` is the tool that the program has active,
-``--frame`` where its base frame stands. A pose does not say elbow or wrist: they are those of the solution nearest to
+nominal robot, the controller's own model, has at the joint command.
+
+Tool and user frame of a pose are read from the program (`calib.rooms.controllers.languages`), or stated: ``--tool``,
+``--user-frame``, ``--frames`` with a file of the controller; else the program is refused. Elbow, wrist and turns are
+those of its configuration (`calib.rooms.controllers.configurations`); where it says none, of the solution nearest to
 ``--start``.
 """
 
@@ -16,10 +19,23 @@ import numpy as np
 
 from calib import files
 from calib.data.poses.pose_lists import Targets
-from calib.errors import UsageError
+from calib.errors import UsageError, listing
 from calib.geometry.installation import see
+from calib.geometry.inverse import Goal
 from calib.rooms.compensation.joint_commands import Commands, Fitted, computed, lines, placements
+from calib.rooms.compensation.program_frames import Group, Statements, placed, tool_in_tip, user_poses
+from calib.rooms.controllers.configurations import Configuration, configuration_of, has_spherical_wrist, postures
 from calib.rooms.controllers.targets import Program, pose_values
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Commands of some targets of a program: their indices, and the values [controller's units] they get."""
+
+    indices: tuple[int, ...]
+    commands: Commands
+    values: np.ndarray
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,29 +44,40 @@ class CompensatedProgram:
 
     Attributes:
         program: as it was.
-        commands: of its joint targets and of its poses; only kinds that it has.
-        values: the new numbers of each target in the controller's units; None for a target that is not reached.
+        parts: commands of its joint targets, and of its poses by tool and configuration.
+        notes: which frames its poses stand in.
     """
 
     program: Program
-    commands: tuple[Commands, ...]
-    values: tuple[np.ndarray | None, ...]
+    parts: tuple[Part, ...]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def values(self) -> list[np.ndarray | None]:
+        """The new numbers of each target in the controller's units; None for a target that is not reached."""
+        values: list[np.ndarray | None] = [None] * len(self.program.targets)
+        for part in self.parts:
+            for index, row, reached in zip(part.indices, part.values, part.commands.reached):
+                values[index] = row if reached else None
+        return values
 
     @property
     def lost(self) -> list[str]:
         """Targets that are not reached, each with its line and the reason."""
-        reasons = {
-            place: words
-            for one in self.commands
-            for place, words in zip(self.program.of("pose" if one.targets.q is None else "joints"), one.reason)
-        }
+        reasons = {}
+        for part in self.parts:
+            reasons |= dict(zip(part.indices, part.commands.reason))
         targets = self.program.targets
-        return [f"line {targets[k].line}: {reasons[k]}" for k, value in enumerate(self.values) if value is None]
+        missed = [k for k, value in enumerate(self.values) if value is None]
+        return [f"line {targets[k].line}: {reasons[k]}" for k in missed]
 
     def lines(self) -> list[str]:
         """Return the lines for the user."""
-        met = [one for one in self.commands if one.reached.any()]
-        shown = [line for one in met for line in lines(one) if not line.startswith("not reached")]
+        shown = list(self.notes)
+        for part in self.parts:
+            shown += part.notes
+            if part.commands.reached.any():
+                shown += [line for line in lines(part.commands) if not line.startswith("not reached")]
         kept = ["not reached, left as it was: " + words for words in self.lost]
         return [*dict.fromkeys(shown), *kept, *filter(None, [self.program.unread])]
 
@@ -73,8 +100,9 @@ def compensated(
     program: Program,
     *,
     frame: str = "base",
-    tool: str = "flange",
+    statements: Statements | None = None,
     start: Sequence[float] | None = None,
+    seed: int = 0,
     **options: Any,
 ) -> CompensatedProgram:
     """Return a program's new targets.
@@ -82,35 +110,97 @@ def compensated(
     Args:
         fitted: the calibrated arm.
         program: see `calib.rooms.controllers.targets.read_program`.
-        frame, tool: as for joint commands.
-        start: (n,) near which the joints of poses are sought [rad]; needed where the program has poses.
+        frame: as for joint commands; a station: it is the program's user frame.
+        statements: tool and frames that the program does not say.
+        start: (n,) near which the joints of poses are sought [rad]; needed where they have no configuration.
+        seed: of further starts.
         options: further ones of `joint_commands.computed`.
 
     Raises:
-        UsageError: for a program of another number of axes, and for poses without a start.
+        UsageError: for a program of another number of axes, for frames that are not known, and for poses that say no
+            posture, without a start.
     """
+    statements = statements or Statements()
     joints, poses = program.of("joints"), program.of("pose")
-    n, kind = fitted.nominal.chain.n, program.controller
+    n = fitted.nominal.chain.n
     if joints and len(program.targets[joints[0]].values) != n:
         axes = len(program.targets[joints[0]].values)
         raise UsageError(f"{program.path}: its targets have {axes} axes, the robot has {n} joints")
-    if poses and start is None:
-        line = program.targets[poses[0]].line
-        raise UsageError(
-            f"{program.path}: {len(poses)} targets (the first in line {line}) are poses, which do not say elbow "
-            "or wrist; give joints near them: --start q1,...,qn [rad]"
-        )
-    given: list[tuple[list[int], Targets]] = []
-    if joints:
-        given.append((joints, Targets(program.joints(), file=str(program.path))))
+    groups, notes = (), ()
     if poses:
-        given.append((poses, replace(Targets.of(program.poses()), file=str(program.path))))
-    model, values, done = placements(fitted, frame, tool)[0], [None] * len(program.targets), []
-    for places, targets in given:
-        near = None if targets.q is not None else start
-        found = computed(fitted, targets, frame=frame, tool=tool, start=near, **options)
-        new = kind.shown(found.q) if near is None else pose_values(kind, see(model, found.q).poses())
-        for place, row, reached in zip(places, new, found.reached):
-            values[place] = row if reached else None
-        done.append(found)
-    return CompensatedProgram(program, tuple(done), tuple(values))
+        where = placed(fitted, program, frame, statements)
+        groups, notes = where.groups, where.notes
+    _check_postures(fitted, program, groups, start)
+    options |= {"frame": frame, "seed": seed}
+    parts = []
+    if joints:
+        targets = Targets(program.joints(), file=str(program.path))
+        commands = computed(fitted, targets, tool=tool_in_tip(fitted, program.controller, statements), **options)
+        parts.append(Part(tuple(joints), commands, program.controller.shown(commands.q)))
+    parts += [_compensated_group(fitted, program, group, start, options) for group in groups]
+    return CompensatedProgram(program, tuple(parts), notes)
+
+
+def _check_postures(fitted: Fitted, program: Program, groups: Sequence[Group], start: Sequence[float] | None) -> None:
+    """Refuse poses whose program says no posture, without a start."""
+    if start is not None:
+        return
+    spherical = has_spherical_wrist(fitted.nominal.chain)
+    silent = [index for group in groups if not (group.configuration and spherical) for index in group.indices]
+    if silent:
+        where = f"{len(silent)} targets (the first in line {program.targets[min(silent)].line})"
+        said = "the program does not say elbow or wrist"
+        if not spherical and any(group.configuration for group in groups):
+            said = "configurations are read for arms whose last three axes meet, which this is not"
+        raise UsageError(
+            f"{program.path}: {where} are poses, and {said}; give joints near them: --start q1,...,qn [rad]"
+        )
+
+
+def _compensated_group(
+    fitted: Fitted, program: Program, group: Group, start: Sequence[float] | None, options: dict[str, Any]
+) -> Part:
+    """Return the commands of poses with one tool and configuration."""
+    kind, frame, seed = program.controller, options["frame"], options["seed"]
+    model = placements(fitted, frame, group.tool)[0]
+    chain = model.chain
+    configuration = configuration_of(kind, group.configuration) if has_spherical_wrist(chain) else None
+    targets = replace(Targets.of(group.poses), file=str(program.path))
+    if configuration is None:
+        commands, notes = computed(fitted, targets, tool=group.tool, start=start, **options), ()
+    else:
+        goal = Goal(model, 6, chain.lower, chain.upper)
+        sought = postures(goal, group.poses, configuration, kind, start, seed)
+        commands = computed(fitted, replace(targets, q=sought.q), tool=group.tool, **options)
+        commands = _without(commands, sought.reasons)
+        notes = _posture_notes(program, group, configuration, commands, sought.contradicted)
+    values = pose_values(kind, user_poses(group, see(model, commands.q).poses()))
+    return Part(group.indices, commands, values, notes)
+
+
+def _without(commands: Commands, reasons: Sequence[str]) -> Commands:
+    """Return commands of which those with a reason are not reached, for that reason."""
+    good = np.array([not reason for reason in reasons])
+    merged = tuple(reason or words for reason, words in zip(reasons, commands.reason))
+    return replace(commands, reached=commands.reached & good, reason=merged)
+
+
+def _posture_notes(
+    program: Program, group: Group, configuration: Configuration, commands: Commands, contradicted: np.ndarray
+) -> tuple[str, ...]:
+    """Return notes on poses whose configuration contradicts the start, and on commands that leave it."""
+    notes = []
+    reached = commands.reached
+    lines = np.array([program.targets[index].line for index in group.indices])
+    against = lines[reached & contradicted]
+    if len(against):
+        words = f"the posture nearest to --start is not that of {configuration.words}, which is followed"
+        notes.append(f"line {listing(against.tolist(), 5)}: {words}")
+    chain = commands.fitted.nominal.chain
+    crossing = lines[reached & ~configuration.holds(program.controller, chain, commands.q)]
+    if len(crossing):
+        words = (
+            f"the command crosses the boundary of {configuration.words}, which stays in the program: change it there"
+        )
+        notes.append(f"warning: line {listing(crossing.tolist(), 5)}: {words}")
+    return tuple(notes)

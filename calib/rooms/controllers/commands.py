@@ -65,24 +65,33 @@ def program(
 def deliver(
     folder: Annotated[Path, typer.Argument(metavar="FIT")],
     controller: Annotated[str, typer.Option("--for", metavar="NAME")],
+    world: Annotated[str | None, typer.Option(metavar="POSE")] = None,
+    flange: Annotated[str | None, typer.Option(metavar="POSE")] = None,
     out: Path | None = None,
     overwrite: bool = False,
 ) -> None:
     """State a calibration in a controller's words: tool and base frames, mastering offsets, what it cannot take.
+
+    Frames stand in the controller's base and flange: World of a FANUC at the height of axis 2, Base of a UR turned by
+    180°. The URDF's links base and tool0 say where; where nothing says it, state it.
 
     Example: calib deliver fit --for krl
 
     Args:
         folder: the folder of a fit, or of a session with a fit
         controller: the robot's controller: calib program --list
+        world: x,y,z[,roll,pitch,yaw] [m, rad] of the controller's base frame in the arm's, if the URDF does not say it
+        flange: the same of the controller's flange (its all-zero tool) in the arm's tip
         out: text file; by default it is printed
     """
     from calib import files
     from calib.procedure.export.geometry import results
     from calib.rooms.controllers.delivery import delivery_text
+    from calib.rooms.controllers.frames import stated_frame
     from calib.rooms.controllers.table import controller_named
 
-    text = delivery_text(folder, controller_named(controller))
+    statements = stated_frame(world, "--world"), stated_frame(flange, "--flange")
+    text = delivery_text(folder, controller_named(controller), *statements)
     if out is None:
         say(text, result=True)
         return

@@ -37,6 +37,12 @@ class Controller:
     checked: str
     tool_frame: str = ""
     base_frame: str = ""
+    base: str = ""
+    flange: str = ""
+    base_at: str = ""
+    flange_turn: tuple[float, ...] = ()
+    frames: str = ""
+    language: str = ""
     stream: Mapping[str, str] = field(default_factory=dict)
     cycle: float = 0.0
     keeps: str = ""

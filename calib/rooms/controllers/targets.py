@@ -83,8 +83,7 @@ class Program:
 
     def poses(self) -> np.ndarray:
         """Return the pose targets (m, 4, 4) [m]."""
-        values = np.array([self.targets[k].values for k in self.of("pose")])
-        return pose_of(_rotation(self.controller.turn, values[:, 3:]), values[:, :3] * self.controller.metres)
+        return pose_of_values(self.controller, np.array([self.targets[k].values for k in self.of("pose")]))
 
     def rewritten(self, values: Sequence[np.ndarray | None]) -> bytes:
         """Return the program with other numbers in its targets, in the controller's units; None leaves a target."""
@@ -116,6 +115,11 @@ def pose_values(controller: Controller, poses: np.ndarray) -> np.ndarray:
     return np.concatenate([poses[:, :3, 3] / controller.metres, angles], axis=1)
 
 
+def pose_of_values(controller: Controller, values: np.ndarray) -> np.ndarray:
+    """Return the poses (m, 4, 4) [m] of their numbers (m, 6 or 7) in a controller's programs."""
+    return pose_of(_rotation(controller.turn, values[:, 3:]), values[:, :3] * controller.metres)
+
+
 def _rotation(turn: str, values: np.ndarray) -> Rotation:
     if turn == "wxyz":
         return Rotation.from_quat(values[:, [1, 2, 3, 0]])
@@ -139,6 +143,18 @@ def is_program(path: Path) -> bool:
         return False
 
 
+def text_of(path: Path) -> str:
+    """Return the text of a controller's file, one letter for each byte.
+
+    Raises:
+        MeasurementError: where it cannot be read.
+    """
+    try:
+        return path.read_bytes().decode(ENCODING)
+    except OSError as error:
+        raise MeasurementError(f"cannot be read: {error.strerror or error}", path) from error
+
+
 def read_program(path: Path, controller: str = "") -> Program:
     """Return a program with its targets.
 
@@ -150,10 +166,7 @@ def read_program(path: Path, controller: str = "") -> Program:
         MeasurementError: where the file cannot be read, or has no targets.
     """
     kind = controller_of(path, controller)
-    try:
-        text = path.read_bytes().decode(ENCODING)
-    except OSError as error:
-        raise MeasurementError(f"cannot be read: {error.strerror or error}", path) from error
+    text = text_of(path)
     found = [each for name in ("joints", "pose") for each in _found(text, name, kind)]
     if not found:
         moves = listing(_lines_of_moves(text, kind), 3)

@@ -339,6 +339,7 @@ def test_commands_for_measured_poses_are_the_joints_they_were_measured_at(
     assert rms["compensated"] == pytest.approx(1e3 * fitted.unseen, rel=0.1)
 
 
+AT_FLANGE = ("--tool", "flange", "--user-frame", "0,0,0")  # which the program does not say
 PROGRAM = """DEF part()
 ; PTP {{A1 1, A2 2, A3 3, A4 4, A5 5, A6 6}}
 PTP {{A1 {0:.6f}, A2 {1:.6f}, A3 {2:.6f}, A4 {3:.6f}, A5 {4:.6f}, A6 {5:.6f}}} C_PTP
@@ -355,7 +356,7 @@ def test_targets_inside_a_program_are_rewritten(cell, fitted, here, calib):
     text = PROGRAM.format(*values, more="")
     (here / "part.src").write_text(text)
     near = ",".join(map(str, q[0]))
-    code, _, err = calib("compensate", fitted, "part.src", "--out", "sent.src", "--start", near)
+    code, _, err = calib("compensate", fitted, "part.src", "--out", "sent.src", "--start", near, *AT_FLANGE)
     assert code == 0, err
     found, before = read_program(here / "sent.src"), read_program(here / "part.src")
     assert found.rewritten([np.array(each.values) for each in before.targets]) == text.encode(), "nothing else changed"
@@ -370,9 +371,9 @@ def test_a_target_of_a_program_that_is_not_reached_is_named_with_its_line(cell, 
     q = np.degrees(drawn(cell, 20, 5)[0])
     text = PROGRAM.format(*q, 9e3, 0, 0, 0, 0, 0, more="PTP {A1 400, A2 0, A3 0, A4 0, A5 0, A6 0}\nPTP_REL {A1 5}\n")
     (here / "part.src").write_text(text)
-    code, _, err = calib("compensate", fitted, "part.src", "--out", "sent.src")
+    code, _, err = calib("compensate", fitted, "part.src", "--out", "sent.src", *AT_FLANGE)
     assert code == 2 and "--start" in err and "the first in line 4" in err
-    near = ("--start", "0,-1,1,0,1,0", "--partial")
+    near = ("--start", "0,-1,1,0,1,0", "--partial", *AT_FLANGE)
     code, out, err = calib("compensate", fitted, "part.src", "--out", "sent.src", *near)
     assert "warning: 4 moves, 3 targets" in out
     assert code == 0 and "1 of 3 targets written" in out and "left as it was: line 4: " in out, err
