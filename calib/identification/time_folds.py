@@ -50,7 +50,9 @@ def regimes(all_rows: Sequence[ObservationRows], cases: Sequence[Case], decimato
     low, high = np.quantile(q, [END_SHARE, 1.0 - END_SHARE], axis=0)
     fastest, hardest = (np.abs(x) > np.quantile(np.abs(x), 1.0 - FAST_SHARE, axis=0) for x in (v, a))
     inside = np.stack([fastest, hardest, q < low, q > high, v > 0.0, v < 0.0])[:, :, joint]
-    stacked = [np.concatenate([part.matrix, part.target[:, :, None]], axis=2) for part in all_rows]
+    stacked = [
+        np.concatenate([part.matrix, part.target[:, :, None]], axis=2) * part.weight[:, :, None] for part in all_rows
+    ]
     squares, counts = np.zeros((len(inside), rows, p + 1, p + 1)), np.zeros((len(inside), rows))
     whole, total = np.zeros((rows, p + 1, p + 1)), np.zeros(rows)
     start = 0
@@ -60,11 +62,13 @@ def regimes(all_rows: Sequence[ObservationRows], cases: Sequence[Case], decimato
         for row in range(rows):
             used = part.present[:, row]
             whole[row] += both[used, row].T @ both[used, row]
-            total[row] += used.sum()
+            counted = part.counted[:, row]
+            total[row] += counted.sum()
             for k in range(len(inside)):
-                held = both[used & inside[k, own, row], row]
+                chosen = used & inside[k, own, row]
+                held = both[chosen, row]
                 squares[k, row] += held.T @ held
-                counts[k, row] += len(held)
+                counts[k, row] += counted[chosen].sum()
     return Regimes(squares, counts, whole, total)
 
 
