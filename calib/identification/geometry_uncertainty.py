@@ -105,16 +105,6 @@ def rows_on(found: Identification, chain: Chain, cases: Sequence[Case]) -> list[
     return result
 
 
-def standstill_shift(found: Identification, cases: Sequence[Case]) -> np.ndarray:
-    """Return the change of the estimate (p,) if the rows of nearly standing joints are omitted."""
-    how, decimator = estimator(found), common_decimator(cases, found.settings)
-    faster = [
-        replace(part, present=part.present & thinned(moving(case.motion), case.motion.segment, decimator))
-        for part, case in zip(found.rows, cases)
-    ]
-    return estimate(how, faster)[0] - estimate(how, found.rows)[0]
-
-
 def cut(rows: ObservationRows, own: slice) -> ObservationRows:
     """Return the part of the rows in a slice."""
     return replace(

@@ -13,7 +13,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from calib.data.signals.filtering import Decimator, decimate, decimate_blocks, kept, slope
-from calib.data.signals.motion import Motion, moving
+from calib.data.signals.motion import Motion
 from calib.dynamics import drives
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.regressor_model import RegressorModel
@@ -32,7 +32,7 @@ class Case:
         motion: q, v, a at the full rate.
         target: (N, rows) torques to explain, unfiltered [N m or N; A where no gain is known].
         carried: labels of the mounted payloads.
-        present: (N, rows) which rows may be used: without lost samples, and without slow ones if these are cut.
+        present: (N, rows) which rows may be used: without lost samples.
         noise: (rows,) standard deviation of the targets' samples, as estimated from repeats of the motion; None: not
             known.
         torque_rows: kind of torques in the target.
@@ -70,7 +70,6 @@ def make_case(
     *,
     gains: np.ndarray | None = None,
     carried: Sequence[str] = (),
-    slow: float | Sequence[float] | None = None,
 ) -> Case:
     """Return the case of a motion and its torques.
 
@@ -78,8 +77,6 @@ def make_case(
         rows: which torques the model explains; all but the motors' need joint torque sensors (`Motion.tau_link`).
         gains: (n,) torque per unit of the effort; None: 1.
         carried: labels of payloads.
-        slow: rows of joints slower than this are not used: a share of the peak speed or (n,) speeds; None:
-            all are.
     """
     effort = np.array(motion.effort) if gains is None else motion.effort * gains
     if rows.sensed and motion.tau_link is None:
@@ -90,8 +87,6 @@ def make_case(
         )
     target = rows.target(effort, motion.tau_link, motion.q, motion.v)
     known = np.repeat(motion.weight[:, None] > 0.5, motion.n, axis=1)
-    if slow is not None:
-        known &= moving(motion, slow)
     noise = None
     if motion.effort_variance is not None and rows.motors_alone:
         noise = frozen(np.sqrt(motion.effort_variance) * (1.0 if gains is None else np.abs(gains)))
@@ -191,6 +186,7 @@ class ObservationRows:
             return self
         undecided = np.array([one.form.undecided_at_rest for one in terms])
         coulomb = np.array([one.shape == "sign" for one in terms]) & columns.any(axis=0)
+        coulomb &= self.coulomb.any(axis=1)[:, None]
         columns = np.where((self.standing > 0.0)[:, :, None] & undecided, 0.0, columns)
         return replace(
             self,

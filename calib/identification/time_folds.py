@@ -36,7 +36,10 @@ class Regimes:
 
 
 def regimes(all_rows: Sequence[ObservationRows], cases: Sequence[Case], decimator: Decimator) -> Regimes:
-    """Return the products of cases by range of motion: fast, accelerated, at each end of travel, each direction."""
+    """Return the products of cases by range of motion: fast, accelerated, at each end of travel, each direction.
+
+    Standstills belong to none: no model is judged by friction that nothing decides.
+    """
     motions = [case.motion for case in cases]
     chosen = [kept(motion.segment, decimator) for motion in motions]
     q, v, a = (
@@ -62,10 +65,10 @@ def regimes(all_rows: Sequence[ObservationRows], cases: Sequence[Case], decimato
         for row in range(rows):
             used = part.present[:, row]
             whole[row] += both[used, row].T @ both[used, row]
-            counted = part.counted[:, row]
+            counted, moves = part.counted[:, row], part.standing[:, row] == 0.0
             total[row] += counted.sum()
             for k in range(len(inside)):
-                chosen = used & inside[k, own, row]
+                chosen = used & moves & inside[k, own, row]
                 held = both[chosen, row]
                 squares[k, row] += held.T @ held
                 counts[k, row] += counted[chosen].sum()

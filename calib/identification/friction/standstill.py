@@ -11,8 +11,9 @@ how many neighbouring ones count as one, and
     f² = max(F_c² / 3, mean square of the residuals at rest),
 
 F_c² / 3 being the variance of a value that may be anywhere within ± F_c. Rows of the standstill share this weight
-evenly, so that they still say how the torque changes with what other joints do. Reversals are shorter than
-`MIN_STANDSTILL` and stay rows as others. Torques of sensors behind the gear have no such friction.
+evenly, so that they still say how the torque changes with what other joints do. Reversals pass through zero speed and
+stay rows as others: shorter than `MIN_STANDSTILL`, or, of slow motion, as often at one small speed as at another, where
+a joint that stands is slower than `MAX_MEDIAN` for half of the time. Torques of sensors behind the gear have no such friction.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from calib.identification.rows import Case, ObservationRows, RestWeights, pool, 
 from calib.records import frozen
 
 MIN_STANDSTILL = 0.05  # [s] that a joint stands; shorter ones are reversals (our choice)
+MAX_MEDIAN = 0.25  # of the width of Coulomb's sign; of a speed that passes evenly through zero it is 0.5 (our choice)
 MIN_MOVING = 10  # rows in motion, below which a joint's standing rows count as any others: no friction is identified
 
 
@@ -40,13 +42,14 @@ def standing_joints(case: Case, v0: np.ndarray) -> np.ndarray:
         v0: (n,) width of Coulomb's sign [rad/s or m/s].
     """
     motion = case.motion
-    slow = np.abs(motion.v) < np.maximum(v0, 3.0 * motion.velocity_noise())
+    speed = np.abs(motion.v) / np.maximum(v0, 3.0 * motion.velocity_noise())
     least = max(1, int(np.ceil(MIN_STANDSTILL * motion.rate)))
-    result = np.zeros_like(slow)
+    result = np.zeros(speed.shape, dtype=bool)
     for start, stop in segments(motion.segment):
         for joint in range(motion.n):
-            for first, end in _runs(slow[start:stop, joint]):
-                result[start + first : start + end, joint] = end - first >= least
+            for first, end in _runs(speed[start:stop, joint] < 1.0):
+                rows = slice(start + first, start + end)
+                result[rows, joint] = end - first >= least and np.median(speed[rows, joint]) < MAX_MEDIAN
     return result
 
 
@@ -67,7 +70,8 @@ def with_standstills(
         term = model.columns[column - model.inertial] if column >= model.inertial else None
         if term is not None and term.form.undecided_at_rest:
             coulomb[:, place] = _acted(term.acts, model.torque_rows, term.side, n, rows)
-    held &= coulomb.any(axis=1)
+    coulomb &= held[:, None]
+    held = coulomb.any(axis=1)
     masks = []
     for part, case in zip(all_rows, cases):
         stands = thinned(model.torque_rows.of_joints(standing_joints(case, v0)), case.motion.segment, decimator)
