@@ -7,7 +7,8 @@ Errors are 100 ‖τ - τ̂‖ / ‖τ‖ on the test, measured and predicted to
 *Ridge* is regularised towards zero, positions low-passed at 6 Hz (`extrapolation_ridge.py`); *best ridge* is the best
 on the test of that, of one at 15 Hz, and of both towards the description's masses where it has any. All see the same
 description and files as the toolkit. *Ratio* is the toolkit's error over ridge's, *to best* over that of the best one.
-Results are kept in FOLDER, by the state of `calib` and of these scripts: what is there already is not made again.
+*Plain* is weighted least squares truncated at the data's rank (`extrapolation_plain.py`), *in motion* the errors of the
+joints' samples that are faster than `STANDING`. Results are kept in FOLDER, by the state of `calib` and of these scripts: what is there already is not made again.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 
+import extrapolation_plain as plain
 import extrapolation_ridge as ridge
 import numpy as np
 from extrapolation_pairs import PAIRS, Prepared
@@ -35,6 +37,7 @@ from scipy.signal import butter, filtfilt
 import calib
 
 CUTOFF, RATE, BORDER = 10.0, 100.0, 0.3  # of both sides of the comparison [Hz, Hz, s]
+STANDING = 0.01  # below which a joint counts as standing [rad/s or m/s]
 MAX_SECONDS = 300  # for a pair
 MARK = "<!-- examples/extrapolation.py -->"
 CUTOFFS = (6.0, 15.0)  # of the ridges' positions [Hz]
@@ -47,16 +50,26 @@ def state() -> str:
     return hashlib.sha1(b"".join(path.read_bytes() for path in files)).hexdigest()[:12]
 
 
-def squared_errors(test: list[Path], predicted: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Return Σ (τ - τ̂)² and Σ τ² per joint (n,) of predictions (instants, torques) of recordings."""
+def squared_errors(
+    test: list[Path], predicted: list[tuple[np.ndarray, np.ndarray]], moving: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return Σ (τ - τ̂)² and Σ τ² per joint (n,) of predictions (instants, torques) of recordings.
+
+    Args:
+        moving: of the samples alone in which a joint moves.
+    """
     sums = []
     for path, (t, tau) in zip(test, predicted):
         log = np.load(path)
         grid = np.arange(max(log["t"][0], t[0]), min(log["t"][-1], t[-1]), 1.0 / RATE)
         sides = (np.column_stack([np.interp(grid, s, c) for c in x.T]) for s, x in ((log["t"], log["tau"]), (t, tau)))
         measured, own = (filtfilt(*butter(4, CUTOFF / (RATE / 2)), side, axis=0) for side in sides)
-        inner = (grid >= grid[0] + BORDER) & (grid <= grid[-1] - BORDER)
-        sums.append([((measured - own)[inner] ** 2).sum(axis=0), (measured[inner] ** 2).sum(axis=0)])
+        inner = np.broadcast_to(((grid >= grid[0] + BORDER) & (grid <= grid[-1] - BORDER))[:, None], own.shape)
+        if moving:
+            q = np.column_stack([np.interp(grid, log["t"], c) for c in log["q"].T])
+            speed = np.gradient(filtfilt(*butter(4, CUTOFF / (RATE / 2)), q, axis=0), 1.0 / RATE, axis=0)
+            inner = inner & (np.abs(speed) > STANDING)
+        sums.append([((measured - own) ** 2 * inner).sum(axis=0), (measured**2 * inner).sum(axis=0)])
     left, size = np.sum(sums, axis=0)
     return left, size
 
@@ -73,7 +86,7 @@ def _ours(files: Prepared, folder: Path) -> tuple[list[tuple[np.ndarray, np.ndar
     """Return the toolkit's predictions of the test files, and the share of their samples inside 95 % intervals [%]."""
     outcome = identified_pair(files, folder)
     predicted = [(case.motion.t, np.asarray(outcome.predictions[case.name])) for case in outcome.inputs.unseen]
-    found = getattr(getattr(outcome, "assessment", None), "intervals", {}).values()
+    found = outcome.intervals.values()
     inside = [one.inside[one.known].ravel() for one in found]
     return predicted, 100.0 * float(np.concatenate(inside).mean()) if inside else None
 
@@ -97,13 +110,17 @@ def run(name: str) -> dict:
         folder, start = Path(place), time.process_time()
         files = pair.prepare(folder)
         result: dict = {"pair": name, "across": pair.across, "ridges": _ridges(files)}
+        least = plain.predict(files.robot, files.train, files.test, CUTOFFS[0], files.payload, files.joints)
+        result["plain"] = _percent(*squared_errors(files.test, least), files.apart)
+        result["plain in motion"] = _percent(*squared_errors(files.test, least, moving=True), files.apart)
         ready = time.process_time()
         try:
             predicted, covered = _ours(files, folder)
             ours = _percent(*squared_errors(files.test, predicted), files.apart)
-            result |= {"ours": ours, "coverage": covered, "refused": ""}
+            moved = _percent(*squared_errors(files.test, predicted, moving=True), files.apart)
+            result |= {"ours": ours, "in motion": moved, "coverage": covered, "refused": ""}
         except Exception as error:  # one pair's failure is a row of the table
-            result |= {"ours": None, "coverage": None, "refused": f"{type(error).__name__}: {error}"}
+            result |= {"ours": None, "in motion": None, "coverage": None, "refused": f"{type(error).__name__}: {error}"}
         result |= {"seconds": time.process_time() - ready, "preparing": ready - start}
     signal.alarm(0)
     return result

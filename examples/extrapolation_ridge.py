@@ -69,6 +69,15 @@ def _evidence(rows: np.ndarray, tau: np.ndarray, mean: np.ndarray, scale: np.nda
     return mean + scale * x
 
 
+def chosen(urdf: Path, joints: Sequence[str] = ()) -> pin.Model:
+    """Return the model of a description, of these joints alone where any are named."""
+    model = pin.buildModelFromUrdf(str(urdf))
+    if not joints:
+        return model
+    locked = [model.getJointId(name) for name in list(model.names)[1:] if name not in joints]
+    return pin.buildReducedModel(model, locked, pin.neutral(model))
+
+
 def predict(
     urdf: Path,
     train: Sequence[Path],
@@ -84,10 +93,7 @@ def predict(
         payload: mass [kg] and com [m] in the tip's frame, of the body carried in the tests.
         joints: that were recorded, where the description has others.
     """
-    model = pin.buildModelFromUrdf(str(urdf))
-    if joints:
-        locked = [model.getJointId(name) for name in list(model.names)[1:] if name not in joints]
-        model = pin.buildReducedModel(model, locked, pin.neutral(model))
+    model = chosen(urdf, joints)
     logs, unseen = [Log(model, x, cutoff) for x in train], [Log(model, x, cutoff, payload) for x in test]
     n = model.nv
     scale = np.r_[np.tile(SCALES, n), np.ones(n), np.ones(n), np.full(n, 0.3), np.ones(n)]

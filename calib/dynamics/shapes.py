@@ -63,6 +63,7 @@ class Shape:
         of_velocity: whether it is a function of v alone (a constant is one).
         nonnegative: whether its parameter is above zero in every robot: inertia, viscous and Coulomb friction.
         exact: whether its columns are free of the noise of q, v and a: ones, and signs but for reversals.
+        undecided_at_rest: whether it is friction that a speed, however small, decides: of a standing joint unknown.
     """
 
     unit: str
@@ -76,6 +77,7 @@ class Shape:
     of_velocity: bool = False
     nonnegative: bool = False
     exact: bool = False
+    undecided_at_rest: bool = False
 
 
 BAND = ("order", "left", "middle", "right", "way", "lower", "upper")
@@ -85,16 +87,17 @@ SHAPES: dict[str, Shape] = {
     "velocity": Shape(VISCOUS, VISCOUS_LINEAR, dissipative=True, of_velocity=True, nonnegative=True),
     "one": Shape("N m", "N", friction=False, of_velocity=True, exact=True),
     "position": Shape("N m/rad", "N/m", friction=False),
-    "sign": Shape("N m", "N", ("v0",), dissipative=True, of_velocity=True, nonnegative=True, exact=True),
-    "dead": Shape("N m", "N", ("v0",), dissipative=True),
+    "sign": Shape("N m", "N", ("v0",), dissipative=True, of_velocity=True, nonnegative=True, exact=True,
+                  undecided_at_rest=True),
+    "dead": Shape("N m", "N", ("v0",), dissipative=True, undecided_at_rest=True),
     "speed": Shape(VISCOUS, VISCOUS_LINEAR, ("edge",), dissipative=True, of_velocity=True),
     "cubic": Shape("N m s³/rad³", "N s³/m³", ("edge",), dissipative=True, of_velocity=True),
     "root": Shape("N m (s/rad)^½", "N (s/m)^½", ("edge", "rest"), dissipative=True, of_velocity=True),
-    "stribeck": Shape("N m", "N", ("vs", "exponent", "v0"), dissipative=True, of_velocity=True),
-    "load": Shape("", "", ("v0",), slopes=False, loaded=True, dissipative=True),
+    "stribeck": Shape("N m", "N", ("vs", "exponent", "v0"), dissipative=True, of_velocity=True, undecided_at_rest=True),
+    "load": Shape("", "", ("v0",), slopes=False, loaded=True, dissipative=True, undecided_at_rest=True),
     "load_velocity": Shape("s/rad", "s/m", ("edge",), slopes=False, loaded=True, dissipative=True),
-    "stop": Shape("N m", "N", ("width",), slopes=False, remembers=True, dissipative=True),
-    "presliding": Shape("N m", "N", ("width", "v0"), slopes=False, remembers=True),
+    "stop": Shape("N m", "N", ("width",), slopes=False, remembers=True, dissipative=True, undecided_at_rest=True),
+    "presliding": Shape("N m", "N", ("width", "v0"), slopes=False, remembers=True, undecided_at_rest=True),
     "sine": Shape("N m", "N", ("order", "speed")),
     "cosine": Shape("N m", "N", ("order", "speed")),
     "sine_band": Shape("N m", "N", BAND, slopes=False),

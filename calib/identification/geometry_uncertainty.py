@@ -98,26 +98,19 @@ def rows_on(found: Identification, chain: Chain, cases: Sequence[Case]) -> list[
     result = []
     for part, case in zip(found.rows, cases):
         own = observe(model, found.base.kept, case, decimator)
-        matrix = np.concatenate([own.matrix, part.matrix[:, :, found.base.b :]], axis=2)
+        at_rest = (part.standing > 0.0)[:, :, None] & part.coulomb[:, : found.base.b]
+        bodies = np.where(at_rest, 0.0, own.matrix)
+        matrix = np.concatenate([bodies, part.matrix[:, :, found.base.b :]], axis=2)
         result.append(replace(part, matrix=matrix))
     return result
-
-
-def standstill_shift(found: Identification, cases: Sequence[Case]) -> np.ndarray:
-    """Return the change of the estimate (p,) if the rows of nearly standing joints are omitted."""
-    how, decimator = estimator(found), common_decimator(cases, found.settings)
-    faster = [
-        replace(part, present=part.present & thinned(moving(case.motion), case.motion.segment, decimator))
-        for part, case in zip(found.rows, cases)
-    ]
-    return estimate(how, faster)[0] - estimate(how, found.rows)[0]
 
 
 def cut(rows: ObservationRows, own: slice) -> ObservationRows:
     """Return the part of the rows in a slice."""
     return replace(
-        rows, matrix=rows.matrix[own], target=rows.target[own], present=rows.present[own], block=rows.block[own]
-    )
+        rows, matrix=rows.matrix[own], target=rows.target[own], present=rows.present[own], block=rows.block[own],
+        standing=rows.standing[own],
+    )  # fmt: skip
 
 
 def inverted(upper: np.ndarray) -> np.ndarray:
@@ -132,7 +125,7 @@ def stacked(rows: ObservationRows) -> np.ndarray:
 
 def weights(how: _Estimator, rows: ObservationRows, by: np.ndarray | None = None) -> np.ndarray:
     """Return the weight of each stacked row, 1 / deviation (or 1 / `by`); zero for rows not used in training."""
-    return (rows.present / (how.deviation if by is None else by)).ravel()
+    return (rows.weight / (how.deviation if by is None else by)).ravel()
 
 
 STEP = 1e-5  # of the central differences [m or rad]
@@ -265,7 +258,7 @@ def solve_sensitivity(
             say(f"sensitivity to the geometry: {case.name}, part {number + 1}")
             used.append(cut(part, own))
             residual = used[-1].target - used[-1].matrix @ found.fitted.estimate.values
-            change, pull = differences(case, span, residual * used[-1].present / how.deviation**2, decimator)
+            change, pull = differences(case, span, residual * used[-1].weight**2 / how.deviation**2, decimator)
             all_rows = np.broadcast_to(change, (*residual.shape, change.shape[2]))  # power: rows by recording
             parts.append((all_rows.reshape(-1, change.shape[2]), pull))
             instruments += [] if z is None else [z[own].reshape(-1, p)]

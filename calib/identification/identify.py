@@ -21,7 +21,9 @@ from calib.estimation.triangles import condition_numbers
 from calib.extensions import needed
 from calib.identification.friction.friction_ladder import FrictionCandidates, FrictionSelection, select_friction
 from calib.identification.friction.ripple import Ripple, find_all
+from calib.identification.friction.standstill import with_standstills, with_weights
 from calib.identification.loop import LoopResults, per_joint
+from calib.identification.methods.least_squares import LeastSquares
 from calib.identification.methods.method import IdentificationProblem, Method, MethodEstimate
 from calib.identification.methods.registry import METHODS, method_named
 from calib.identification.prediction import Dynamics, Model, predict
@@ -147,14 +149,20 @@ def identify_model(
     rows = with_blocks([observe(model, base.kept, case, decimator) for case in cases], settings.folds)
     if model.torque_rows is POWER and len(cases) > 1:
         rows = [part.by_recording(k, len(cases)) for k, part in enumerate(rows)]
+    if isinstance(method, LeastSquares):
+        width = np.array(per_joint(settings.v0, cases[0].motion.n, "v0"))
+        rows = with_standstills(rows, cases, decimator, model, base.kept, width)
     _require_enough(rows, base)
     say("first fit")
     whole, source = (shape, "sizes") if cad is None else (cad, "cad")
     prior = None
     found = partial(find_prior, model, base, whole=whole, source=source, noise=noise, effort=effort)
     if _takes_prior(method, model, settings, source):
-        prior = tempered_prior(found, rows, regimes(rows, cases, decimator))
+        prior = found(rows)
+        rows = with_weights(rows, prior.first.rest)
+        prior = tempered_prior(found, prior, rows, regimes(rows, cases, decimator))
     first = first_fit(rows, noise) if prior is None else prior.first
+    rows = with_weights(rows, first.rest)
     friction, loads = _richer_friction(model, base, rows, cases, decimator, first, prior, settings, progress)
     own = [None if k < model.inertial else model.columns[k - model.inertial] for k in base.kept]
     full = tuple(
@@ -164,6 +172,7 @@ def identify_model(
     if prior is not None and friction.terms:
         say("sizes beside richer friction")
         prior = found(full, groups=np.array(friction.groups), start=prior, tempering=prior.tempering)
+        full = tuple(with_weights(full, prior.first.rest))
     problem = IdentificationProblem(
         model, base, cases, decimator, full, (*own, *friction.terms),
         np.concatenate([np.full(base.b, -1), friction.groups]), noise, prior, settings.loop, cad,
@@ -235,7 +244,7 @@ def _richer_friction(
     nothing: list[np.ndarray | None] = [None] * len(cases)
     if not _sees_drives(model):
         return FrictionSelection((), (), ()), nothing
-    std, tau, values = first
+    std, tau, values, _ = first
     plain = Dynamics(model, base.to_standard(values))
     loads = nothing if settings.friction in ("standard", "ripple") else [plain.transmitted(case) for case in cases]
     candidates = FrictionCandidates(

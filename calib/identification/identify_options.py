@@ -20,8 +20,8 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
                                      # or power: one row, the power of all motors (no accelerations)
     gravity = [0, 0, -9.81]          # in the robot's base frame; default the robot's own
     gains = [10.0, 10.7]             # torque per current of each joint, signed; default the file's own
-    slow = 0.01                      # a joint stands below this share of its peak speed; or a speed per joint
-    cut_slow = false                 # learn nothing from rows of joints that stand
+    slow = 0.01                      # errors at rest are those below this share of a joint's peak speed; or a speed
+                                     # per joint (standstills in the training count once: v0)
     essential = "both"               # none, rsd, f, both: the rule of the elimination
     ratio = 20.0                     # r_sigma of the RSD rule
     level = 0.05                     # of the F rule
@@ -100,7 +100,6 @@ from calib.config import check_keys, inherited, own_table, parse, read_toml, str
 from calib.config_types import (  # fmt: skip
     Checked,
     Expect,
-    Flag,
     JointNumber,
     Name,
     Names,
@@ -116,7 +115,7 @@ from calib.data.signals.motion import FilterOptions
 from calib.dynamics.drives import DriveTerm, term
 from calib.dynamics.shapes import SHAPES
 from calib.dynamics.torque_rows import MOTOR, ROWS
-from calib.errors import CalibError, UsageError, refused_as
+from calib.errors import CalibError, UsageError, refuse_option, refused_as
 from calib.identification.settings import Choices, Coupling, IdentificationSettings, Payload
 
 USED = 600_000  # samples of a recording, unless stated: ten minutes at 1 kHz (our choice)
@@ -128,6 +127,11 @@ def _no_zero(value: Any) -> Any:
     return value
 
 
+REMOVED = {
+    "cut_slow": "each standstill of a joint now counts once, its friction unknown within the static friction, so that no "
+    "rows need to be cut: remove the line",
+}
+"""Keys of earlier versions, and what replaced them."""
 FINDINGS = (
     "masses", "limit", "speed", "lag", "clock", "order", "zero", "coupling", "sign", "jump", "bodies", "description",
     "loop",
@@ -184,7 +188,6 @@ class IdentifySettings(Choices):
     term: tuple[TermTable, ...] = ()
     payload: Mapping[str, Payload] = field(default_factory=dict)
     slow: Annotated[float | tuple[float, ...], OneOrMany(Real(above=0))] | None = None
-    cut_slow: Flag = False
     accept: tuple[Annotated[str, OneOf(FINDINGS)], ...] = ()
     gain_identification: GainPair | None = None
     recording: RecordingOptions = field(default_factory=RecordingOptions)
@@ -201,7 +204,6 @@ class IdentifyOptions:
         settings: settings of the identification.
         every, files: settings of all recordings, and of single ones.
         slow: see the module; None: the default share.
-        cut_slow: exclude rows of standing joints from training.
         gain_pair: recordings that identify the drive gains.
         accept: findings that do not affect the verdict on the model, see `FINDINGS`.
         source: the file, for messages.
@@ -211,7 +213,6 @@ class IdentifyOptions:
     every: FileSettings = field(default_factory=FileSettings)
     files: Mapping[str, FileSettings] = field(default_factory=dict)
     slow: float | tuple[float, ...] | None = None
-    cut_slow: bool = False
     gain_pair: GainPair | None = None
     accept: tuple[str, ...] = ()
     source: str = ""
@@ -235,6 +236,8 @@ def read_options(path: str | Path | None = None) -> IdentifyOptions:
 
 def parse_options(table: Mapping[str, Any], source: str = "options") -> IdentifyOptions:
     """Return the options in a parsed TOML table; `source` names the file in messages."""
+    for key in table.keys() & REMOVED.keys():
+        refuse_option(f"{source}: {key}", REMOVED[key])
     own = {key: table[key] for key in ("payload",) if key in table}  # bodies; in [files] their labels: not handed down
     rest = inherited({key: value for key, value in table.items() if key not in own}, FileSettings)
     return options_of(parse(IdentifySettings, rest | own, source), source)
@@ -258,7 +261,7 @@ def options_of(read: IdentifySettings, source: str = "settings") -> IdentifyOpti
         check_keys(dict.fromkeys(file.payload), read.payload, f'{source}: files."{name}".payload')
     every = FileSettings(read.recording, read.filter, gains=read.gains)
     return IdentifyOptions(
-        settings, every, read.files, read.slow, read.cut_slow, read.gain_identification, read.accept, source
+        settings, every, read.files, read.slow, read.gain_identification, read.accept, source
     )
 
 

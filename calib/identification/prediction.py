@@ -6,7 +6,7 @@ Errors of predicted torques: relative errors, moving and standing separately, an
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Generic
 
 import numpy as np
@@ -19,6 +19,9 @@ from calib.dynamics.regressor_model import RegressorModel
 from calib.estimation.whiteness import Whiteness, examine, r_squared
 from calib.identification.rows import BLOCK, Case, segmented_states
 from calib.records import Array, Frozen, Number
+
+
+REST_SHARE = 0.05  # of a recording's rows at rest, above which errors in motion and at rest are told apart (our choice)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,9 +68,10 @@ class IntervalCoverage:
 
     Attributes:
         coverage_percent, joints_percent: of all rows, and of each (rows,).
-        median: (rows,) half width of the intervals in the torque's unit.
+        median: (rows,) half width of the intervals in motion in the torque's unit.
         samples: number of samples compared.
         extrapolated_percent: share of these samples outside the training range.
+        median_at_rest: (rows,) half width at rest, NaN where a joint does not stand; () in earlier versions.
     """
 
     coverage_percent: float
@@ -75,6 +79,7 @@ class IntervalCoverage:
     median: Array
     samples: int
     extrapolated_percent: float
+    median_at_rest: Array = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +111,21 @@ class Score:
     motion_share: float
     evidence: bool = True
     interval95: IntervalCoverage | None = None
+
+    @property
+    def stands(self) -> bool:
+        """Whether joints stand for a noticeable part of the recording, more than in reversals."""
+        return self.motion_share < 1.0 - REST_SHARE and self.moving.samples > 0
+
+    @property
+    def judged(self) -> PredictionErrors:
+        """Errors that a verdict is about: in motion, since friction at rest takes any value; of all where none stands."""
+        return self.moving if self.stands else self.raw
+
+    @property
+    def at_rest(self) -> str:
+        """Error of standing joints as text; empty where none stands."""
+        return f"{self.standing.total:.2f} %" if self.stands else ""
 
 
 def relative_error_sigma(measured: np.ndarray, predicted: np.ndarray, blocks: int = 10) -> float:

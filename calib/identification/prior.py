@@ -45,7 +45,8 @@ from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.regressor_model import RegressorModel
 from calib.estimation.triangles import Triangles, retriangulate
 from calib.estimation.whiteness import inflation
-from calib.identification.rows import ObservationRows, pool, triangulate
+from calib.identification.friction.standstill import divided
+from calib.identification.rows import ObservationRows, RestWeights, triangulate
 from calib.identification.time_folds import CrossValidation, Regimes, estimate
 from calib.records import frozen
 from calib.robot.chain import Chain
@@ -62,11 +63,15 @@ ROTOR = 0.15  # [m]: motor inertias are of the order of the robot's mass times i
 
 
 class FirstFit(NamedTuple):
-    """A first fit of the base parameters for row weights: std and inflation of its residuals (rows,), values (b,)."""
+    """A first fit of the base parameters for row weights.
+
+    std and inflation of its residuals (rows,), values (b,), and the weights of standstills.
+    """
 
     std: np.ndarray
     inflation: np.ndarray
     values: np.ndarray
+    rest: RestWeights
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +156,8 @@ def find_prior(
         tempering: see `Prior`.
     """
     n = rows[0].target.shape[1]
-    data = pool(triangulate(rows), n)
+    parts, rest = divided(rows), rows[0].rest
+    data = parts.joined(rest)
     transform = base.transform
     known = np.zeros(model.p)
     if whole is not None:
@@ -175,6 +181,8 @@ def find_prior(
         t = _most_probable(factor, columns, sizes, t)
         before, (values, covariance) = values, _posterior(factor, columns, sizes.deviations(t))
         last, (std, tau) = std, weighing(rows, data, values, covariance, std, tempered, noise)
+        rest = parts.weights(values, std, tau)
+        data = parts.joined(rest)
         still = np.abs(values - before) < SETTLED * np.sqrt(np.diag(covariance))
         if still.all() and (np.abs(std / last - 1.0) < SETTLED).all():
             break
@@ -186,23 +194,24 @@ def find_prior(
     return Prior(
         frozen(own + whole_part @ whole_part.T), frozen(np.sqrt(np.diag(own))),
         {name: float(np.exp(one)) for name, one in zip(sizes.names, t) if name}, source,
-        FirstFit(frozen(std), frozen(tau), frozen(values[: base.b])), tempering,
+        FirstFit(frozen(std), frozen(tau), frozen(values[: base.b]), rest), tempering,
     )  # fmt: skip
 
 
 def first_fit(rows: Sequence[ObservationRows], noise: np.ndarray | None = None) -> FirstFit:
     """Return a minimum-norm fit: standard deviation and inflation of its residuals (rows,), and values (b,)."""
     count = rows[0].target.shape[1]
-    data = pool(triangulate(rows), count)
+    parts, rest = divided(rows), rows[0].rest
     std, tau = np.ones(count), np.ones(count)
-    values = np.zeros(data.parameters)
+    values = np.zeros(parts.moving.parameters)
     for _ in range(4):
-        values, _ = estimate(data, std, tau, np.full(data.parameters, -1))
-        residuals = np.concatenate([np.where(part.present, part.target - part.matrix @ values, 0.0) for part in rows])
-        used = np.concatenate([part.present for part in rows]).sum(axis=0)
-        std = np.sqrt((residuals**2).sum(axis=0) / np.maximum(used, 1))
-        std = scaled(noise, np.maximum(std, 1e-9 * max(float(std.max()), 1e-300)), used)
-    return FirstFit(std, residual_inflation(rows, values), values)
+        data = parts.joined(rest)
+        values, _ = estimate(data, std, np.ones(count), np.full(data.parameters, -1))
+        std = np.sqrt(data.residual_squares(values) / np.maximum(data.rows, 1))
+        std = scaled(noise, np.maximum(std, 1e-9 * max(float(std.max()), 1e-300)), data.rows)
+        tau = residual_inflation(rows, values)
+        rest = parts.weights(values, std, tau)
+    return FirstFit(std, tau, values, rest)
 
 
 def weighing(
@@ -239,14 +248,16 @@ def scaled(noise: np.ndarray | None, std: np.ndarray, counts: np.ndarray) -> np.
 
 
 def residual_inflation(all_rows: Sequence[ObservationRows], values: np.ndarray) -> np.ndarray:
-    """Return the integrated autocorrelation of each row's residuals (rows,), averaged over cases by length."""
+    """Return the integrated autocorrelation of each row's residuals in motion (rows,), averaged over cases by length."""
     rows = all_rows[0].target.shape[1]
     total, weight = np.zeros(rows), np.zeros(rows)
     for part in all_rows:
         residual, seen = part.target - part.matrix @ values, np.asarray(part.present.any(axis=0))
-        own = [inflation(residual[:, row]) if seen[row] else 0.0 for row in range(rows)]
-        total += len(residual) * np.array(own)
-        weight += len(residual) * seen
+        moves = part.standing == 0.0
+        for row in np.flatnonzero(seen & moves.any(axis=0)):
+            in_motion = residual[moves[:, row], row]
+            total[row] += len(in_motion) * inflation(in_motion)
+            weight[row] += len(in_motion)
     return np.maximum(total / np.maximum(weight, 1.0), 1.0)
 
 
@@ -357,7 +368,9 @@ def rods(chain: Chain, model: IdentificationModel, total: float = 1.0) -> np.nda
 STEPS = (TEMPERING, 2.0 * TEMPERING, 4.0 * TEMPERING)
 
 
-def tempered_prior(find: Callable[..., Prior], rows: Sequence[ObservationRows], regimes: Regimes) -> Prior:
+def tempered_prior(
+    find: Callable[..., Prior], found: Prior, rows: Sequence[ObservationRows], regimes: Regimes
+) -> Prior:  # fmt: skip
     """Return the prior with the tempering that best predicts held-out ranges of motion.
 
     Errors are squares of all rows, each in units of its residuals, and their geometric mean over the regimes: where
@@ -366,11 +379,11 @@ def tempered_prior(find: Callable[..., Prior], rows: Sequence[ObservationRows], 
 
     Args:
         find: `find_prior` of rows, a prior to start from, and a tempering.
+        found: the prior with the least of `STEPS`.
         rows: in the base columns.
         regimes: of these rows.
     """
     data, columns, best = triangulate(rows), np.arange(len(rows[0].names)), None
-    found = find(rows)
     std = found.first.std
     min_gain = 0.08  # in the logarithm of squared errors, by which a stronger prior has to be better (our choice)
     for tempering in STEPS:

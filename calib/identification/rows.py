@@ -13,7 +13,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from calib.data.signals.filtering import Decimator, decimate, decimate_blocks, kept, slope
-from calib.data.signals.motion import Motion, moving
+from calib.data.signals.motion import Motion
 from calib.dynamics import drives
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.regressor_model import RegressorModel
@@ -32,7 +32,7 @@ class Case:
         motion: q, v, a at the full rate.
         target: (N, rows) torques to explain, unfiltered [N m or N; A where no gain is known].
         carried: labels of the mounted payloads.
-        present: (N, rows) which rows may be used: without lost samples, and without slow ones if these are cut.
+        present: (N, rows) which rows may be used: without lost samples.
         noise: (rows,) standard deviation of the targets' samples, as estimated from repeats of the motion; None: not
             known.
         torque_rows: kind of torques in the target.
@@ -70,7 +70,6 @@ def make_case(
     *,
     gains: np.ndarray | None = None,
     carried: Sequence[str] = (),
-    slow: float | Sequence[float] | None = None,
 ) -> Case:
     """Return the case of a motion and its torques.
 
@@ -78,8 +77,6 @@ def make_case(
         rows: which torques the model explains; all but the motors' need joint torque sensors (`Motion.tau_link`).
         gains: (n,) torque per unit of the effort; None: 1.
         carried: labels of payloads.
-        slow: rows of joints slower than this are not used: a share of the peak speed or (n,) speeds; None:
-            all are.
     """
     effort = np.array(motion.effort) if gains is None else motion.effort * gains
     if rows.sensed and motion.tau_link is None:
@@ -90,8 +87,6 @@ def make_case(
         )
     target = rows.target(effort, motion.tau_link, motion.q, motion.v)
     known = np.repeat(motion.weight[:, None] > 0.5, motion.n, axis=1)
-    if slow is not None:
-        known &= moving(motion, slow)
     noise = None
     if motion.effort_variance is not None and rows.motors_alone:
         noise = frozen(np.sqrt(motion.effort_variance) * (1.0 if gains is None else np.abs(gains)))
@@ -123,6 +118,19 @@ BLOCK = 4096  # samples of the full rate at a time
 
 
 @dataclass(frozen=True, eq=False)
+class RestWeights:
+    """Weights of standstills, see `calib.identification.friction.standstill`.
+
+    Attributes:
+        worth: (rows,) how many rows in motion a standstill weighs.
+        count: (rows,) how many rows it counts as where residuals are averaged.
+    """
+
+    worth: np.ndarray
+    count: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class ObservationRows:
     """Observation matrix and torques of M decimated samples of one case.
 
@@ -133,6 +141,9 @@ class ObservationRows:
         present: (M, rows) bool, rows for training.
         block: (M,) number of the time block, for cross-validation; -1 next to a cut.
         rate: sampling rate [Hz].
+        standing: (M, rows) share of its standstill that each row is; 0 in motion.
+        rest: weights of standstills.
+        coulomb: (rows, p) columns that are Coulomb friction of a torque row.
     """
 
     names: tuple[str, ...]
@@ -142,6 +153,20 @@ class ObservationRows:
     present: np.ndarray
     block: np.ndarray
     rate: float
+    standing: np.ndarray
+    rest: RestWeights
+    coulomb: np.ndarray
+
+    @property
+    def weight(self) -> np.ndarray:
+        """Factor (M, rows) that rows are multiplied by in estimates: 1 in motion, less at rest, 0 where not used."""
+        at_rest = np.sqrt(self.standing * self.rest.worth)
+        return np.where(self.standing > 0.0, at_rest, 1.0) * self.present
+
+    @property
+    def counted(self) -> np.ndarray:
+        """How many rows each one counts as (M, rows), where residuals are averaged."""
+        return np.where(self.standing > 0.0, self.standing * self.rest.count, 1.0) * self.present
 
     def by_recording(self, own: int, count: int) -> ObservationRows:
         """Return rows with separate torque rows per recording: those of recording `own` of `count` are filled.
@@ -151,15 +176,21 @@ class ObservationRows:
         place = np.arange(count) == own
         return replace(
             self, matrix=np.where(place[:, None], self.matrix, 0.0), target=np.where(place, self.target, 0.0),
-            present=self.present & place,
+            present=self.present & place, standing=np.repeat(self.standing, count, axis=1),
+            rest=_no_rest(count), coulomb=np.repeat(self.coulomb, count, axis=0),
         )  # fmt: skip
 
     def extend(self, terms: Sequence[DriveTerm], columns: np.ndarray) -> ObservationRows:
         """Return rows with columns (M, rows, k) appended."""
         if not terms:
             return self
+        undecided = np.array([one.form.undecided_at_rest for one in terms])
+        coulomb = np.array([one.shape == "sign" for one in terms]) & columns.any(axis=0)
+        coulomb &= self.coulomb.any(axis=1)[:, None]
+        columns = np.where((self.standing > 0.0)[:, :, None] & undecided, 0.0, columns)
         return replace(
             self,
+            coulomb=np.hstack([self.coulomb, coulomb]),
             names=(*self.names, *(one.name for one in terms)),
             units=(*self.units, *(one.unit for one in terms)),
             matrix=np.concatenate([self.matrix, columns], axis=2),
@@ -198,7 +229,15 @@ def observe(model: RegressorModel, columns: np.ndarray, case: Case, decimator: D
     names, units = (tuple(one[k] for k in columns) for one in (model.names, model.units))
     target, present = decimate(case.target, decimator, motion.segment), thinned(case.present, motion.segment, decimator)
     rate, block = motion.rate / decimator.factor, np.zeros(len(target), dtype=int)
-    return ObservationRows(names, units, matrix, target, present, block, rate)
+    standing, coulomb = np.zeros(target.shape), np.zeros((model.rows, len(columns)), dtype=bool)
+    return ObservationRows(
+        names, units, matrix, target, present, block, rate, standing, _no_rest(model.rows), coulomb
+    )  # fmt: skip
+
+
+def _no_rest(rows: int) -> RestWeights:
+    """Return the weights of standstills before any estimate: each is a row."""
+    return RestWeights(np.ones(rows), np.ones(rows))
 
 
 def observe_terms(
@@ -258,17 +297,24 @@ def with_blocks(all_rows: Sequence[ObservationRows], count: int) -> list[Observa
 def triangulate(all_rows: Sequence[ObservationRows]) -> Triangles:
     """Return the R factors of all rows, one group per time block and torque row: group = block · rows + row.
 
-    The last block holds the samples beside cuts.
+    The last block holds the samples beside cuts. Rows of standstills have their weights.
     """
     rows = all_rows[0].target.shape[1]
     blocks = 1 + max((int(part.block.max(initial=-1)) for part in all_rows), default=-1)
     result = empty(all_rows[0].names, all_rows[0].units, (blocks + 1) * rows)
+    counts = np.zeros(result.groups)
     for part in all_rows:
         block = np.where(part.block < 0, blocks, part.block)
         for row in range(rows):
             used = part.present[:, row]
-            result = absorb(result, part.matrix[used, row], part.target[used, row], block[used] * rows + row)
-    return result
+            group = block[used] * rows + row
+            matrix, target = part.matrix[used, row], part.target[used, row]
+            if part.standing[:, row].any():
+                weight = part.weight[used, row]
+                matrix, target = matrix * weight[:, None], target * weight
+            result = absorb(result, matrix, target, group)
+            counts += np.bincount(group, part.counted[used, row], result.groups)
+    return replace(result, rows=frozen(np.round(counts), int))
 
 
 def pool(data: Triangles, rows: int, blocks: Sequence[int] | None = None) -> Triangles:

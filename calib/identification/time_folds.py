@@ -36,7 +36,10 @@ class Regimes:
 
 
 def regimes(all_rows: Sequence[ObservationRows], cases: Sequence[Case], decimator: Decimator) -> Regimes:
-    """Return the products of cases by range of motion: fast, accelerated, at each end of travel, each direction."""
+    """Return the products of cases by range of motion: fast, accelerated, at each end of travel, each direction.
+
+    Standstills belong to none: no model is judged by friction that nothing decides.
+    """
     motions = [case.motion for case in cases]
     chosen = [kept(motion.segment, decimator) for motion in motions]
     q, v, a = (
@@ -50,7 +53,9 @@ def regimes(all_rows: Sequence[ObservationRows], cases: Sequence[Case], decimato
     low, high = np.quantile(q, [END_SHARE, 1.0 - END_SHARE], axis=0)
     fastest, hardest = (np.abs(x) > np.quantile(np.abs(x), 1.0 - FAST_SHARE, axis=0) for x in (v, a))
     inside = np.stack([fastest, hardest, q < low, q > high, v > 0.0, v < 0.0])[:, :, joint]
-    stacked = [np.concatenate([part.matrix, part.target[:, :, None]], axis=2) for part in all_rows]
+    stacked = [
+        np.concatenate([part.matrix, part.target[:, :, None]], axis=2) * part.weight[:, :, None] for part in all_rows
+    ]
     squares, counts = np.zeros((len(inside), rows, p + 1, p + 1)), np.zeros((len(inside), rows))
     whole, total = np.zeros((rows, p + 1, p + 1)), np.zeros(rows)
     start = 0
@@ -60,11 +65,13 @@ def regimes(all_rows: Sequence[ObservationRows], cases: Sequence[Case], decimato
         for row in range(rows):
             used = part.present[:, row]
             whole[row] += both[used, row].T @ both[used, row]
-            total[row] += used.sum()
+            counted, moves = part.counted[:, row], part.standing[:, row] == 0.0
+            total[row] += counted.sum()
             for k in range(len(inside)):
-                held = both[used & inside[k, own, row], row]
+                chosen = used & moves & inside[k, own, row]
+                held = both[chosen, row]
                 squares[k, row] += held.T @ held
-                counts[k, row] += len(held)
+                counts[k, row] += counted[chosen].sum()
     return Regimes(squares, counts, whole, total)
 
 

@@ -9,7 +9,9 @@ v and u are the most probable ones of errors on time left out: block by block, a
 blocks of one joint identify the three badly, and κ = 0 would deny what the covariance says of itself: each joint's are
 regularised to those of all, and to κ = 1. Such an error is what the model leaves of the torque as recorded, ripple and
 noise above its band included, and what its prediction changes by where the parameters are estimated without that time.
-How much the sizes of these errors differ from one block to another says how far those of other motion may: the stated
+A joint that stands has a floor of its own: errors at rest, each standstill counted once, and the variance F_c² / 3 of a
+friction that may be anything within ± F_c, worth `BORROWED` standstills. How much the sizes of errors in motion differ
+from one block to another says how far those of other motion may: the stated
 sigma is that of which 1.96 hold 95 % where the logarithm of their size has a t distribution.
 
 `Uncertainty` holds the parameters' share alone: standard deviations of torques from the covariance.
@@ -33,6 +35,7 @@ from calib.estimation.whiteness import inflation
 from calib.folders import COVARIANCE, read_covariance
 from calib.identification import time_folds
 from calib.identification.identify import Identification, common_decimator
+from calib.identification.loop import per_joint
 from calib.identification.prediction import Dynamics, IntervalCoverage
 from calib.identification.rows import Case, pool, segmented_states, triangulate
 from calib.records import evenly
@@ -136,6 +139,8 @@ class TorqueDiscrepancy:
         floor: (rows,) v [N² m² or N²], variance of unmodelled effects.
         beyond: (rows,) u, additional variance per log(1 + d²), d the distance from the training data.
         lower, upper, scale: (3, n) least and largest q, v, a of the training data, and their standard deviations.
+        rest: (rows,) in place of v while a joint stands [N² m² or N²]; () in files of earlier versions.
+        standing: (n,) speeds below which a joint stands [rad/s or m/s]; () in files of earlier versions.
     """
 
     parameters: tuple[float, ...]
@@ -144,6 +149,21 @@ class TorqueDiscrepancy:
     lower: tuple[tuple[float, ...], ...]
     upper: tuple[tuple[float, ...], ...]
     scale: tuple[tuple[float, ...], ...]
+    rest: tuple[float, ...] = ()
+    standing: tuple[float, ...] = ()
+
+    def at_rest(self, v: np.ndarray, rows: int) -> np.ndarray:
+        """Return the mask (N, rows) of torque rows whose joint stands, from velocities (N, n)."""
+        if not self.rest:
+            return np.zeros((len(v), rows), dtype=bool)
+        stands = np.abs(v) < np.array(self.standing)
+        times, partial = divmod(rows, stands.shape[1])
+        return np.zeros((len(v), rows), dtype=bool) if partial else np.tile(stands, times)
+
+    def floors(self, v: np.ndarray, rows: int) -> np.ndarray:
+        """Return the variance of unmodelled effects (N, rows) at velocities (N, n) [N² m² or N²]."""
+        moving = np.broadcast_to(np.array(self.floor), (len(v), rows))
+        return np.where(self.at_rest(v, rows), np.array(self.rest), moving) if self.rest else moving
 
     def distance(self, q: np.ndarray, v: np.ndarray, a: np.ndarray, rows: int) -> np.ndarray:
         """Return log(1 + d²) (N, rows) of states q, v, a (N, n) each: of the row's joint, or of all joints."""
@@ -191,7 +211,7 @@ class TorqueErrorModel:
         found = self.discrepancy
         own = parameter_variances(dynamics, self.columns, self.covariance, q, v, a, carried, states)
         far = found.distance(q, v, a, own.shape[1]) * np.array(found.beyond)
-        return np.sqrt(np.array(found.parameters) * own + found.floor + far)
+        return np.sqrt(np.array(found.parameters) * own + found.floors(v, own.shape[1]) + far)
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,6 +223,7 @@ class TorqueIntervals:
         sigma: (M, rows) predicted standard deviations [N m or N].
         inside: (M, rows) whether the actual errors are within 1.96 of them.
         known: (M,) False at lost samples, which are not counted.
+        standing: (M, rows) whether the row's joint stands.
         extrapolated: (3, M, n) whether the motion leaves the training range, by q, v, a and joint.
     """
 
@@ -210,6 +231,7 @@ class TorqueIntervals:
     sigma: np.ndarray
     inside: np.ndarray
     known: np.ndarray
+    standing: np.ndarray
     extrapolated: np.ndarray
 
     @property
@@ -230,8 +252,19 @@ class TorqueIntervals:
 
     @property
     def median(self) -> np.ndarray:
-        """Median half width of the interval (rows,) [N m or N]."""
-        return np.asarray(SIGMAS * np.median(self.sigma, axis=0))
+        """Median half width of the interval in motion (rows,) [N m or N]; at rest, where a joint does not move."""
+        moving = self._median(~self.standing)
+        return np.where(np.isfinite(moving), moving, self._median(self.standing))
+
+    @property
+    def median_at_rest(self) -> np.ndarray:
+        """Median half width of the interval at rest (rows,) [N m or N]; NaN where a joint does not stand."""
+        return self._median(self.standing)
+
+    def _median(self, used: np.ndarray) -> np.ndarray:
+        """Return the median half width (rows,) over some samples (M, rows); NaN without any."""
+        pairs = zip(self.sigma.T, used.T)
+        return np.array([SIGMAS * np.median(sigma[own]) if own.any() else np.nan for sigma, own in pairs])
 
     @property
     def beyond(self) -> np.ndarray:
@@ -242,7 +275,7 @@ class TorqueIntervals:
         """Return the record of the shares of errors within their intervals."""
         return IntervalCoverage(
             100.0 * self.covered, 100.0 * self.joints, self.median, int(self.known.sum()),
-            100.0 * float(self.beyond.mean()),
+            100.0 * float(self.beyond.mean()), self.median_at_rest,
         )  # fmt: skip
 
     def ways(self, joints: Sequence[str]) -> list[str]:
@@ -265,7 +298,8 @@ def intervals(errors: TorqueErrorModel, dynamics: Dynamics, case: Case, predicte
     sigma = errors.sigma(dynamics, q, v, a, case.carried, states)
     inside = np.abs(case.target[index] - predicted[index]) <= SIGMAS * sigma
     known = np.asarray(motion.weight[index] > 0.5)
-    return TorqueIntervals(index, sigma, inside, known, errors.discrepancy.extrapolated(q, v, a))
+    standing = errors.discrepancy.at_rest(v, sigma.shape[1])
+    return TorqueIntervals(index, sigma, inside, known, standing, errors.discrepancy.extrapolated(q, v, a))
 
 
 def learn_torque_errors(
@@ -286,7 +320,10 @@ def learn_torque_errors(
         return None
     count, rest = len(rest), _apart(samples, rest)
     halves = [np.unique(np.concatenate(part)) for part in (rest[: len(rest) // 2], rest[len(rest) // 2 :])]
-    folds = [_left_out(found, samples, run) for run in (*rest, *(one for one in halves if len(one) < count))]
+    friction = _friction(found)
+    slow = _standing_speeds(found, friction)
+    runs = (*rest, *(one for one in halves if len(one) < count))
+    folds = [_left_out(found, samples, run, slow) for run in runs]
     weights = _weights(folds, len(rest))
     logs, sizes = zip(*(_in_units(folds, row, own) for row, own in enumerate(weights)))
     spread = np.array([np.var(own[: len(rest)], ddof=1) for own in logs])
@@ -298,6 +335,8 @@ def learn_torque_errors(
     ]
     parts = weights * (np.array(factors)[:, None] / SIGMAS) ** 2
     known = replace(samples.box(), **dict(zip(("parameters", "floor", "beyond"), map(tuple, parts.T.tolist()))))
+    at_rest = _rest_floors(folds[: len(rest)], friction, parts)
+    known = replace(known, rest=tuple(at_rest.tolist()), standing=tuple(slow.tolist()))
     own = found.fitted.estimate.covariance if covariance is None else covariance
     return TorqueErrorModel(estimated_columns(found.dynamics, found.names), own, known)
 
@@ -396,12 +435,40 @@ def _estimate(found: Identification, data: Triangles, blocks: Sequence[int]) -> 
     return values, root
 
 
-def _left_out(
-    found: Identification, samples: _Samples, run: Sequence[int] | np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return errors (m, rows) on held-out blocks, and the terms of their variance (m, rows, 3).
+@dataclass(frozen=True, eq=False)
+class _Fold:
+    """Errors on held-out time.
+
+    Attributes:
+        error: (m, rows) of the torques [N m or N].
+        shapes: (m, rows, 3) terms of their variance.
+        moves: (m, rows) whether the row's joint moves.
+    """
+
+    error: np.ndarray
+    shapes: np.ndarray
+    moves: np.ndarray
+
+
+def _friction(found: Identification) -> np.ndarray:
+    """Return Coulomb's friction (rows,) of the torque rows that hold a motor's; zero in others [N m or N]."""
+    return np.sum(np.abs(found.fitted.estimate.values) * found.rows[0].coulomb, axis=1)
+
+
+def _standing_speeds(found: Identification, friction: np.ndarray) -> np.ndarray:
+    """Return the speeds (n,) below which joints stand: Coulomb's sign is as wide; zero where no row has friction."""
+    n = found.dynamics.model.n
+    width = np.array(per_joint(found.settings.v0, n, "v0"), dtype=float)
+    return width if friction.any() else np.zeros(n)
+
+
+def _left_out(found: Identification, samples: _Samples, run: Sequence[int] | np.ndarray, slow: np.ndarray) -> _Fold:
+    """Return errors on held-out blocks.
 
     No error counts for more than the torque itself: a fold that fails wholly says nothing of how the whole model errs.
+
+    Args:
+        slow: (n,) speeds below which a joint stands.
     """
     inside, size = np.isin(samples.block, run), np.sqrt(np.mean(samples.torque**2, axis=0))
     others = [k for k in range(samples.triangles.groups // samples.error.shape[1]) if k not in run]
@@ -409,27 +476,53 @@ def _left_out(
     rows, states = samples.matrix[inside], samples.states
     error = samples.error[inside] + rows @ (samples.values - values)
     own = np.sum((rows @ root) ** 2, axis=2)
-    far = samples.box(~inside).distance(*states[:, inside], rows=own.shape[1])
-    return error.clip(-size, size), np.stack([own, np.ones_like(own), far], axis=2)
+    box = samples.box(~inside)
+    far = box.distance(*states[:, inside], rows=own.shape[1])
+    known = replace(box, rest=(0.0,) * own.shape[1], standing=tuple(slow.tolist()))
+    moves = ~known.at_rest(states[1, inside], own.shape[1])
+    return _Fold(error.clip(-size, size), np.stack([own, np.ones_like(own), far], axis=2), moves)
 
 
-def _weights(folds: Sequence[tuple[np.ndarray, np.ndarray]], blocks: int, errors_used: int = 4000) -> np.ndarray:
-    """Return the weights (rows, 3) of the error variance's terms, regularised towards those of all rows.
+def _rest_floors(folds: Sequence[_Fold], friction: np.ndarray, parts: np.ndarray) -> np.ndarray:
+    """Return the variance of unmodelled effects of standing joints (rows,) [N² m² or N²].
+
+    Args:
+        folds: of time.
+        friction: (rows,) Coulomb's.
+        parts: (rows, 3) κ, v and u in motion.
+    """
+    expected = parts[:, 1] + friction**2 / 3.0
+    total, standstills = BORROWED * expected, np.full(len(friction), BORROWED)
+    for fold in folds:
+        for row in range(len(friction)):
+            rests = ~fold.moves[:, row]
+            if rests.any():
+                count = max(1, int(np.sum(rests[1:] & ~rests[:-1]) + rests[0]))
+                total[row] += count * float(np.mean(fold.error[rests, row] ** 2))
+                standstills[row] += count
+    return total / standstills
+
+
+def _weights(folds: Sequence[_Fold], blocks: int, errors_used: int = 4000) -> np.ndarray:
+    """Return the weights (rows, 3) of the error variance's terms in motion, regularised towards those of all rows.
 
     In units of a row's own mean square every row's κ, and its u over v, are of one kind. Behind a row's errors stand
     those of all others, worth `BORROWED` blocks, and what is known beforehand: the covariance is as it says, worth a
     block, and errors grow beyond the training range, which folds hardly leave where motion repeats itself.
 
     Args:
-        folds: errors (m, rows) and shapes (m, rows, 3) of each.
+        folds: of time.
         blocks: of time.
 
     `errors_used`: errors of a joint that its weights are found from, about.
     """
-    errors, shapes = (np.concatenate(each) for each in zip(*folds))
+    errors = np.concatenate([fold.error for fold in folds])
     every = max(1, len(errors) // errors_used)
-    squares, shapes = errors[::every].T ** 2, shapes[::every].transpose(1, 0, 2).copy()
-    size = np.maximum(squares.mean(axis=1), 1e-300)
+    squares = errors[::every].T ** 2
+    shapes = np.concatenate([fold.shapes for fold in folds])[::every].transpose(1, 0, 2).copy()
+    moves = np.concatenate([fold.moves for fold in folds])[::every].T.astype(float)
+    moves[moves.sum(axis=1) < 0.5 * blocks] = 1.0  # a joint that never moves is judged at rest
+    size = np.maximum(np.sum(squares * moves, axis=1) / moves.sum(axis=1), 1e-300)
     squares = np.maximum(squares / size[:, None], MIN_ERROR**2)
     shapes[:, :, 0] /= size[:, None]
     count, known = squares.shape[1], np.array([[1.0, 0.0, 0.0], [0.0, 1.0, DOUBLING]])
@@ -439,8 +532,11 @@ def _weights(folds: Sequence[tuple[np.ndarray, np.ndarray]], blocks: int, errors
         others = np.delete(np.arange(len(size)), row)
         thinned = slice(None, None, max(1, len(others)))
         parts = (
-            (squares[row], shapes[row], 1.0),
-            (squares[others, thinned].ravel(), shapes[others, thinned].reshape(-1, 3), BORROWED / blocks),
+            (squares[row], shapes[row], moves[row]),
+            (
+                squares[others, thinned].ravel(), shapes[others, thinned].reshape(-1, 3),
+                BORROWED / blocks * moves[others, thinned].ravel(),
+            ),
             expected,
         )
         own, by, worth = zip(*((one, shape, np.broadcast_to(counts, len(one))) for one, shape, counts in parts))
@@ -452,11 +548,15 @@ def _weights(folds: Sequence[tuple[np.ndarray, np.ndarray]], blocks: int, errors
     return np.stack(result)
 
 
-def _in_units(
-    folds: Sequence[tuple[np.ndarray, np.ndarray]], row: int, weights: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return for one row the log rms of error over predicted sigma in each fold, and the normalised errors."""
-    each = [(error[:, row] ** 2, shapes[:, row] @ weights) for error, shapes in folds]
+def _in_units(folds: Sequence[_Fold], row: int, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return for one row the log rms of error over predicted sigma in each fold, and the normalised errors.
+
+    In motion; of a fold in which its joint does not move, at rest.
+    """
+    each = []
+    for fold in folds:
+        used = fold.moves[:, row] if fold.moves[:, row].any() else slice(None)
+        each.append((fold.error[used, row] ** 2, fold.shapes[used, row] @ weights))
     least = max(MIN_ERROR**2 * float(np.mean(np.concatenate([square for square, _ in each]))), 1e-30)
     units = [np.sqrt(square / np.maximum(own, least)) for square, own in each]
     logs = np.array([0.5 * np.log(np.mean(np.minimum(one, MAX_ERROR) ** 2) + 1e-12) for one in units])

@@ -310,7 +310,7 @@ def _couplings(candidates: FrictionCandidates, min_explained: float = 0.05) -> l
     n = candidates.n
     if not candidates.torque_rows.motors_alone:
         return []
-    matrix, target, motion = _sampled(candidates)
+    matrix, target, factors, motion = _sampled(candidates)
     rows = (matrix / candidates.std[:, None]).reshape(-1, matrix.shape[2])
     basis = np.asarray(scipy.linalg.qr(rows, mode="economic")[0])
     y = (target / candidates.std).ravel()
@@ -324,7 +324,8 @@ def _couplings(candidates: FrictionCandidates, min_explained: float = 0.05) -> l
             terms = drives.coupled(i, j, float(candidates.v0[j]), f"{i + 1}.{j + 1}", weight)
             columns = np.zeros((len(terms), n, len(target)))
             drives.fill(terms, columns, [*motion, None], np.zeros((0, len(target))))
-            seen = (columns.transpose(2, 1, 0) / candidates.std[:, None]).reshape(-1, len(terms))
+            white = (factors / candidates.std)[:, :, None]
+            seen = (columns.transpose(2, 1, 0) * white).reshape(-1, len(terms))
             seen -= basis @ (basis.T @ seen)
             rest = left - seen @ np.linalg.lstsq(seen, left, rcond=None)[0]
             explained = float((left @ left - rest @ rest) / max(size[[i, j]].sum(), 1e-300))
@@ -337,17 +338,18 @@ def _couplings(candidates: FrictionCandidates, min_explained: float = 0.05) -> l
     return taken
 
 
-def _sampled(candidates: FrictionCandidates) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-    """Return about `coupling_rows` training rows, (M, n, b) and (M, n), and their motion q, v, a, (n, M) each."""
+def _sampled(candidates: FrictionCandidates) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Return about `coupling_rows` training rows, weighed, (M, n, b) and (M, n), their weights, and q, v, a (n, M)."""
     parts = []
     for part, case in zip(candidates.rows, candidates.cases):
         own = kept(case.motion.segment, candidates.decimator)
         used = part.present.all(axis=1)
-        parts.append([x[used] for x in (part.matrix, part.target, *(getattr(case.motion, key)[own] for key in "qva"))])
-    matrix, target, *motion = (np.concatenate(series) for series in zip(*parts))
+        weighed = part.matrix * part.weight[:, :, None], part.target * part.weight, part.weight
+        parts.append([x[used] for x in (*weighed, *(getattr(case.motion, key)[own] for key in "qva"))])
+    matrix, target, weight, *motion = (np.concatenate(series) for series in zip(*parts))
     coupling_rows = 3000  # of the rows that couplings are sought in, about
     every = slice(None, None, max(1, len(target) // coupling_rows))
-    return matrix[every], target[every], [series[every].T for series in motion]
+    return matrix[every], target[every], weight[every], [series[every].T for series in motion]
 
 
 def _cross_validation(

@@ -207,11 +207,10 @@ def _read_case(
 ) -> Case:  # fmt: skip
     """Return the case of one recording: payload, gains, and the links' motion where joints have corrections."""
     own = options.file_settings(path)
-    slow = (options.slow if options.slow is not None else 0.01) if options.cut_slow else None
     with refused_as(MeasurementError, NoPosture, "{}", name):
         case = make_case(
             name, motion, options.settings.torque_rows, gains=found.for_motion(motion, own),
-            carried=own.payload, slow=slow,
+            carried=own.payload,
         )  # fmt: skip
     for moved in offered("link_motion") if getattr(robot, "corrections", None) is not None else ():
         case = moved(robot, case, options.settings)

@@ -1,8 +1,8 @@
 """Verdict on an identified model; its limits and sentences are in the catalogue, chapters 9 to 11.
 
 The verdict of calib identify (exit code 0 for pass and marginal, 1 for fail) judges the raw total of the worst
-validation recording in which the robot moves and which does not repeat the training, beside the training's own error in
-its band; then every joint in the band, and while it moves. `calib explain torque-unexplained` prints the limits, and so
+validation recording in which the robot moves and which does not repeat the training (of joints in motion, where some
+stand: what friction is at rest no model knows), beside the training's own error in its band; then every joint in the band, and while it moves. `calib explain torque-unexplained` prints the limits, and so
 on for each code of chapter 11.
 """
 
@@ -12,10 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from calib.data.signals.motion import moving
 from calib.data.signals.persistency import ExcitationReport
 from calib.errors import Finding, finding
-from calib.identification.geometry_uncertainty import standstill_shift
 from calib.identification.identify import Identification
 from calib.identification.prediction import Score
 from calib.identification.rows import Case
@@ -29,7 +27,6 @@ BEND = 1e-4  # rms of link minus motor position that shows elasticity [rad or m]
 SURELY = 2.0  # sigmas below zero from which on a drive's inertia or friction is called negative
 # neighbouring rows that count as one from which on a residual is unmodelled dynamics, not noise
 MAX_CORRELATED_ROWS = 3.0
-SLOW_SHARE = 0.1  # share of samples near standstill from which on Coulomb friction is biased low
 
 
 @dataclass(frozen=True)
@@ -74,15 +71,15 @@ def judge(
         coordinate: what such a row belongs to, in a word.
     """
     moves = {name: scored for name, scored in validation.items() if scored.motion_share >= MOVES}
-    own = max((found.raw.total for found in fit.values()), default=np.nan)
+    own = max((found.judged.total for found in fit.values()), default=np.nan)
     learnt = max((found.filtered.total for found in fit.values()), default=np.nan)
     training = finding("training-torque-unexplained", share=learnt, poor=limit("training-torque-unexplained", "share"))
     joints = _joints(moves or fit, rows, coordinate)
     if not moves:
         why = "validation-repeats" if repeated else "robot-stands" if validation else "no-unseen-motion"
         return sentence(finding("training-torque-error", own=own)), [*settle([training]), finding(why), *joints]
-    name = max(moves, key=lambda key: moves[key].raw.total)
-    worst = moves[name].raw.total
+    name = max(moves, key=lambda key: moves[key].judged.total)
+    worst, at_rest = moves[name].judged.total, moves[name].at_rest
     totals = [
         *([finding("motion-poor")] if excitation and all(report.poor for report in excitation.values()) else []),
         finding(
@@ -96,7 +93,7 @@ def judge(
             "no-torque-transfer", times=worst / max(own, 1e-300), most=limit("no-torque-transfer", "times", "marginal")
         ),
     ]
-    return sentence(finding("torque-errors", unseen=worst, file=name, own=own)), [*settle(totals)[:1], *joints]
+    return sentence(finding("torque-errors", unseen=worst, file=name, own=own, rest=at_rest)), [*settle(totals)[:1], *joints]
 
 
 def friction_drives(joints: Iterable[object], payload: str = "") -> list[Finding]:
@@ -184,7 +181,7 @@ def excitation_notes(excitation: Mapping[str, ExcitationReport]) -> list[str]:
 def model_findings(cases: Sequence[Case], found: Identification) -> tuple[Finding, ...]:
     """Return the findings on the model and its training motion, independent of unseen motion."""
     own = (*parameter_findings(found), *found.loop.findings)
-    return *own, *_unmodelled(found), *_elastic(cases), *_slow_bias(cases, found)
+    return *own, *_unmodelled(found), *_elastic(cases)
 
 
 def parameter_findings(found: Identification[Any]) -> tuple[Finding, ...]:
@@ -246,28 +243,3 @@ def _elastic(cases: Sequence[Case]) -> Iterable[Finding]:
         bend = np.std(np.asarray(case.motion.q_link - case.motion.q), axis=0)
         if joints := [f"{1e3 * bend[j]:.2g} mrad at joint {j + 1}" for j in np.flatnonzero(bend > BEND)]:
             yield finding("elastic-joints", file=case.name, joints=joints)
-
-
-def _slow_bias(cases: Sequence[Case], found: Identification) -> list[Finding]:
-    """Return the finding that rows near standstill, where friction is undetermined, bias the Coulomb friction.
-
-    Few such rows are remarked upon where they change it by more than its sigma. Where a joint's friction is richer,
-    they are modelled, not cut.
-    """
-    motors, estimate = found.settings.torque_rows.motors_alone, found.fitted.estimate
-    signs = ((one.joint, k) for k, one in enumerate(found.terms) if one and one.shape == "sign" and motors)
-    coulomb = {joint: k for joint, k in signs if joint is not None}
-    if not coulomb:
-        return []
-    still = [(~moving(one.motion) & np.asarray(one.present)[:, : one.motion.n]).sum(axis=0) for one in cases]
-    share = np.sum(still, axis=0) / max(1, sum(len(one.motion) for one in cases))
-    if slow := [j for j in np.flatnonzero(share > SLOW_SHARE) if j in coulomb]:
-        return [finding("slow-samples", joints=[f"{100 * share[j]:.0f} % at joint {j + 1}" for j in slow])]
-    richer = {joint for one in found.friction.terms for joint, _ in one.acts}
-    shift, sigma, percent = standstill_shift(found, cases), estimate.sigma, 0.01 * np.abs(estimate.values)
-    moved = [
-        f"{found.names[k]} {shift[k] / percent[k]:+.1f} % (sigma {sigma[k] / percent[k]:.1f} %)"
-        for j, k in coulomb.items()
-        if j not in richer and abs(shift[k]) > sigma[k] and percent[k] > 0.0
-    ]
-    return [finding("slow-samples-shift", names=moved)] if moved else []

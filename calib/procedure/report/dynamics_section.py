@@ -195,7 +195,7 @@ def proof_of(unseen: UnseenReport) -> tuple[str, Score, str]:
     """Return name, errors and kind of motion of the deciding recording: the worst unseen one, else the fitted one."""
     where = "unseen motion" if unseen.proofs else "the training motion"
     sets = unseen.proofs or unseen.fit
-    name, found = max(sets.items(), key=lambda item: item[1].raw.total)
+    name, found = max(sets.items(), key=lambda item: item[1].judged.total)
     return name, found, where
 
 
@@ -208,15 +208,19 @@ def _key_figures(unseen: UnseenReport, tolerance: float, delivered: float | None
     spread = f"± {sigma:.2g} %" if np.isfinite(sigma) else ""
     shares = ((x, row) for x, row in zip(proof.filtered.joints, unseen.rows) if np.isfinite(x))
     worst, row = max(shares, default=(np.nan, "torque"))
-    left = proof.raw.total if delivered is None else delivered
+    left = proof.judged.total if delivered is None else delivered
     asked = {"allowed": f"{tolerance:g} %" if tolerance else "none", "met": page.met(left, tolerance)}
     error, in_band = "torque unexplained", "torque unexplained in the motion's band"
-    figures = [page.KeyFigure(error, "", percent(proof.raw.total), spread, basis, **asked)]
+    if proof.stands:
+        error += " in motion"
+    figures = [page.KeyFigure(error, "", percent(proof.judged.total), spread, basis, **asked)]
     if delivered is not None:
         figures = [
             page.KeyFigure(f"{error} (exported robot)", "", percent(delivered), "", basis, **asked),
-            page.KeyFigure(f"{error} (identified model)", "", percent(proof.raw.total), spread, basis),
+            page.KeyFigure(f"{error} (identified model)", "", percent(proof.judged.total), spread, basis),
         ]
+    if proof.stands:
+        figures.append(page.KeyFigure("torque unexplained at rest", "", percent(proof.standing.total), "", basis))
     return [
         *figures,
         page.KeyFigure(in_band, "", percent(proof.filtered.total), "", basis),
@@ -272,12 +276,15 @@ def _interval_table(unseen: UnseenReport) -> page.Table:
     groups = {}
     for name, one in unseen.validation.items():
         if (found := one.interval95) is not None:
-            rows = zip(unseen.rows, found.joints_percent, found.median, unseen.units)
-            groups[name] = [
-                ("all", f"{found.coverage_percent:.1f} %", "", f"{found.extrapolated_percent:.0f} %"),
-                *((row, f"{inside:.0f} %", f"± {half:.3g} {unit}", "") for row, inside, half, unit in rows),
-            ]
-    header = ("torque", "errors within the 95 % interval", "median interval", "of the time extrapolated")
+            at_rest = np.resize(found.median_at_rest, len(unseen.rows)) if len(found.median_at_rest) else None
+            groups[name] = [("all", f"{found.coverage_percent:.1f} %", "", "", f"{found.extrapolated_percent:.0f} %")]
+            for k, (row, unit) in enumerate(zip(unseen.rows, unseen.units)):
+                resting = "–" if at_rest is None or not np.isfinite(at_rest[k]) else f"± {at_rest[k]:.3g} {unit}"
+                inside, half = f"{found.joints_percent[k]:.0f} %", f"± {found.median[k]:.3g} {unit}"
+                groups[name].append((row, inside, half, resting, ""))
+    header = (
+        "torque", "errors within the 95 % interval", "median interval in motion", "at rest", "of the time extrapolated",
+    )  # fmt: skip
     return page.grouped("Intervals stated", header, groups, strong=_of_all)
 
 

@@ -295,7 +295,7 @@ def identify(session: Session, say: Say) -> list[str]:
     notes = [
         f"{len(found.names)} parameters by {found.fitted.method}, friction {found.friction.chosen or 'standard'}, "
         "condition "
-        f"number {raw:.3g}, with unit columns {normalised:.3g}; {fitted.raw.total:.2f} % of the torque unexplained"
+        f"number {raw:.3g}, with unit columns {normalised:.3g}; {fitted.judged.total:.2f} % of the torque unexplained"
     ]
     before = f"{ROUND}{int(next_round(session).removeprefix(ROUND)) - 1}"
     designed = session.path(f"6-excitation/{before if before in designed_motions(session) else 'training'}")
@@ -336,7 +336,7 @@ def _as_delivered(session: Session, found: Assessment) -> Verdict:
         known = exported.with_masses and exported.prediction
     except CalibError as error:
         verdict = verdict.for_prediction(f"the dynamics cannot be exported: {error}")
-    worst = max((one.raw.total for one in found.proofs.values()), default=0.0)
+    worst = max((one.judged.total for one in found.proofs.values()), default=0.0)
     left, what = (worst, "identified model") if known is None else (known.exported, "exported robot")
     tolerance = session.settings.dynamics.tolerance_percent
     if not tolerance or left <= tolerance:

@@ -45,4 +45,4 @@ def torque_error(session: Session) -> float | None:
     if not session.dynamic:
         return None
     unseen = session.identification.unseen.read()
-    return max((one.raw.total for one in (unseen.validation or unseen.fit).values()), default=None)
+    return max((one.judged.total for one in (unseen.validation or unseen.fit).values()), default=None)

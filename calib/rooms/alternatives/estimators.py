@@ -184,8 +184,9 @@ def _reweighted(
 def samples_of(problem: IdentificationProblem) -> Samples:
     """Return the rows of all recordings, grouped by sample."""
     rows = problem.rows
-    parts = ([getattr(part, key) for part in rows] for key in ("matrix", "target", "present"))
-    matrix, target, present = (np.concatenate(part) for part in parts)
+    matrix = np.concatenate([part.matrix * part.weight[:, :, None] for part in rows])
+    target = np.concatenate([part.target * part.weight for part in rows])
+    present = np.concatenate([part.present for part in rows])
     return stack(matrix, target, present, rows[0].names, rows[0].units)
 
 

@@ -200,8 +200,6 @@ def refuse_options_of_arms(settings: IdentificationSettings, options: IdentifyOp
     """Raise an error for settings and options that apply to serial arms only."""
     read = {each.name for each in fields(settings)} - OF_ARMS
     refuse_unread(settings, IdentificationSettings(), read, options.source)
-    read = {each.name for each in fields(options)} - {"cut_slow"}
-    refuse_unread(options, IdentifyOptions(), read, options.source)
     if settings.friction not in ("auto", "standard"):
         raise UsageError(f"friction = '{settings.friction}': a parallel robot has standard friction only (Fv Fc off)")
     method = method_named(settings.method)

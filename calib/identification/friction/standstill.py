@@ -1,0 +1,191 @@
+"""Standing joints: each standstill counts once, its friction unknown within the static friction.
+
+While a joint stands, friction takes any value that keeps it there. Of a standstill of K rows the torques are
+
+    y_k = w_k x + f + e_k,    abs(f) <= F_s unknown,
+
+w without the friction that only the direction of motion decides (Coulomb's and its kin). The K rows share one f, so that
+together they say as much as one row of variance τ s² / K + f², where s² is the variance of the residuals in motion, τ
+how many neighbouring ones count as one, and
+
+    f² = max(F_c² / 3, mean square of the residuals at rest),
+
+F_c² / 3 being the variance of a value that may be anywhere within ± F_c. Rows of the standstill share this weight
+evenly, so that they still say how the torque changes with what other joints do. Reversals pass through zero speed and
+stay rows as others: shorter than `MIN_STANDSTILL`, or, of slow motion, as often at one small speed as at another, where
+a joint that stands is slower than `MAX_MEDIAN` for half of the time. Torques of sensors behind the gear have no such friction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.data.signals.filtering import Decimator, kept
+from calib.dynamics.regressor_model import RegressorModel
+from calib.dynamics.torque_rows import TorqueRows
+from calib.estimation.triangles import Triangles, absorb, empty, retriangulate
+from calib.identification.rows import Case, ObservationRows, RestWeights, pool, segments, thinned
+from calib.records import frozen
+
+MIN_STANDSTILL = 0.05  # [s] that a joint stands; shorter ones are reversals (our choice)
+MAX_MEDIAN = 0.25  # of the width of Coulomb's sign; of a speed that passes evenly through zero it is 0.5 (our choice)
+MIN_MOVING = 10  # rows in motion, below which a joint's standing rows count as any others: no friction is identified
+
+
+def standing_joints(case: Case, v0: np.ndarray) -> np.ndarray:
+    """Return the mask (N, n) of joints that stand: slower than Coulomb's sign is wide, for `MIN_STANDSTILL` or more.
+
+    Args:
+        v0: (n,) width of Coulomb's sign [rad/s or m/s].
+    """
+    motion = case.motion
+    speed = np.abs(motion.v) / np.maximum(v0, 3.0 * motion.velocity_noise())
+    least = max(1, int(np.ceil(MIN_STANDSTILL * motion.rate)))
+    result = np.zeros(speed.shape, dtype=bool)
+    for start, stop in segments(motion.segment):
+        for joint in range(motion.n):
+            for first, end in _runs(speed[start:stop, joint] < 1.0):
+                rows = slice(start + first, start + end)
+                result[rows, joint] = end - first >= least and np.median(speed[rows, joint]) < MAX_MEDIAN
+    return result
+
+
+def with_standstills(
+    all_rows: Sequence[ObservationRows], cases: Sequence[Case], decimator: Decimator, model: RegressorModel,
+    columns: np.ndarray, v0: np.ndarray,
+) -> list[ObservationRows]:  # fmt: skip
+    """Return rows with their standstills marked, Coulomb's columns zero there.
+
+    Args:
+        columns: of the model, in the rows.
+        v0: (n,) width of Coulomb's sign [rad/s or m/s].
+    """
+    rows, n = all_rows[0].target.shape[1], cases[0].motion.n
+    held = _held_rows(model, n, rows)
+    coulomb = np.zeros((rows, len(columns)), dtype=bool)
+    for place, column in enumerate(columns):
+        term = model.columns[column - model.inertial] if column >= model.inertial else None
+        if term is not None and term.form.undecided_at_rest:
+            coulomb[:, place] = _acted(term.acts, model.torque_rows, term.side, n, rows)
+    coulomb &= held[:, None]
+    held = coulomb.any(axis=1)
+    masks = []
+    for part, case in zip(all_rows, cases):
+        stands = thinned(model.torque_rows.of_joints(standing_joints(case, v0)), case.motion.segment, decimator)
+        masks.append(stands & part.present & held)
+    moving = np.sum([(part.present & ~mask).sum(axis=0) for part, mask in zip(all_rows, masks)], axis=0)
+    result = []
+    for part, case, mask in zip(all_rows, cases, masks):
+        segment = case.motion.segment[kept(case.motion.segment, decimator)]
+        share = _shares(mask & (moving >= MIN_MOVING), segment)
+        matrix = part.matrix
+        if share.any():
+            undecided = (share > 0.0)[:, :, None] & coulomb
+            matrix = np.where(undecided, 0.0, matrix)
+        result.append(replace(part, matrix=matrix, standing=frozen(share), coulomb=frozen(coulomb, bool)))
+    return result
+
+
+def _held_rows(model: RegressorModel, n: int, rows: int) -> np.ndarray:
+    """Return the torque rows (rows,) bool that hold a motor's friction."""
+    held = np.zeros(rows, dtype=bool)
+    if model.torque_rows.projection is None and rows == model.torque_rows.count(n):
+        for joint in range(n):
+            held[model.torque_rows.of_side("motor", joint, n)] = True
+    return held
+
+
+def _acted(acts: Sequence[tuple[int, object]], torque_rows: TorqueRows, side: str, n: int, rows: int) -> np.ndarray:
+    """Return the torque rows (rows,) bool that a drive term acts on."""
+    result = np.zeros(rows, dtype=bool)
+    if torque_rows.projection is None:
+        for joint, _ in acts:
+            result[torque_rows.of_side(side, joint, n)] = True
+    return result
+
+
+def _runs(mask: np.ndarray) -> list[tuple[int, int]]:
+    """Return (start, stop) of each run of true values."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
+    return [(int(start), int(stop)) for start, stop in edges.reshape(-1, 2)]
+
+
+def _shares(mask: np.ndarray, segment: np.ndarray) -> np.ndarray:
+    """Return the share (M, rows) of its standstill that each row is; 0 in motion."""
+    result = np.zeros(mask.shape)
+    for start, stop in segments(segment):
+        for row in range(mask.shape[1]):
+            for first, end in _runs(mask[start:stop, row]):
+                result[start + first : start + end, row] = 1.0 / (end - first)
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class DividedRows:
+    """R factors of moving rows and of standing ones apart, one group per torque row, so that their weights may change.
+
+    Attributes:
+        moving, standing: the latter's rows scaled by the root of their share of a standstill.
+        standstills: (rows,) how many there are.
+        length: (rows,) their mean number of rows.
+        coulomb: (rows, p) which columns are Coulomb friction of a torque row.
+    """
+
+    moving: Triangles
+    standing: Triangles
+    standstills: np.ndarray
+    length: np.ndarray
+    coulomb: np.ndarray
+
+    def weights(self, values: np.ndarray, std: np.ndarray, tau: np.ndarray) -> RestWeights:
+        """Return the weights of standstills for parameter values (p,), see the module.
+
+        Args:
+            std, tau: (rows,) standard deviation of the residuals in motion, and how many of them count as one.
+        """
+        count = np.maximum(self.standstills, 1.0)
+        friction = np.sum(np.abs(values) * self.coulomb, axis=1)
+        spread = np.maximum(friction**2 / 3.0, self.standing.residual_squares(values) / count)
+        noise = tau * std**2
+        of_mean = np.maximum(noise / self.length + spread, 1e-300)
+        return RestWeights(frozen(noise / of_mean), frozen(tau * (std**2 + spread) / of_mean))
+
+    def joined(self, weights: RestWeights) -> Triangles:
+        """Return the R factors of all rows, standstills with these weights."""
+        if not self.standstills.any():
+            return self.moving
+        scaled = self.standing.factors * np.sqrt(weights.worth)[:, None, None]
+        both = np.concatenate([self.moving.factors, scaled], axis=1)
+        counted = np.round(self.standstills * weights.count)
+        factors = frozen(np.stack([retriangulate(stacked) for stacked in both]))
+        return replace(self.moving, factors=factors, rows=frozen(self.moving.rows + counted, int))
+
+
+def divided(all_rows: Sequence[ObservationRows]) -> DividedRows:
+    """Return the R factors of rows in motion and at rest."""
+    first = all_rows[0]
+    rows = first.target.shape[1]
+    moving, standing = empty(first.names, first.units, rows), empty(first.names, first.units, rows)
+    standstills, length = np.zeros(rows), np.zeros(rows)
+    for part in all_rows:
+        for row in range(rows):
+            share = part.standing[:, row]
+            rests = part.present[:, row] & (share > 0.0)
+            moves = part.present[:, row] & (share == 0.0)
+            moving = absorb(moving, part.matrix[moves, row], part.target[moves, row], row)
+            root = np.sqrt(share[rests])
+            standing = absorb(standing, part.matrix[rests, row] * root[:, None], part.target[rests, row] * root, row)
+            standstills[row] += share[rests].sum()
+            length[row] += rests.sum()
+    return DividedRows(
+        pool(moving, rows), pool(standing, rows), standstills, np.maximum(length, 1.0) / np.maximum(standstills, 1.0),
+        first.coulomb,
+    )  # fmt: skip
+
+
+def with_weights(all_rows: Sequence[ObservationRows], weights: RestWeights) -> list[ObservationRows]:
+    """Return rows whose standstills have these weights."""
+    return [replace(part, rest=weights) for part in all_rows]

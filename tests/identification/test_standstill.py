@@ -1,0 +1,164 @@
+"""Standing joints: a standstill counts once, whatever torque holds the joint there; reversals and sensors do not."""
+
+from dataclasses import replace
+
+import numpy as np
+import planted_motion as planted
+import pytest
+
+from calib.data.recordings.recording import Recording
+from calib.data.signals.motion import FilterOptions, make_motion
+from calib.errors import UsageError
+from calib.identification.friction import standstill
+from calib.identification.friction.standstill import divided, standing_joints, with_standstills
+from calib.identification.identify import Identification, chain_states, common_decimator, find_base, identify
+from calib.identification.identify_options import parse_options
+from calib.identification.prediction import predict, score
+from calib.identification.rows import Case, ObservationRows, make_case, observe, with_blocks
+from calib.identification.settings import IdentificationSettings, make_model
+from calib.identification.torque_errors import intervals, learn_torque_errors
+
+PLAIN = IdentificationSettings(friction="standard", essential="none")
+WIDTH = np.full(planted.N, 0.01)  # of Coulomb's sign [rad/s]
+PAUSES = ((2.0, 4.0), (7.0, 10.0), (13.0, 15.0), (18.0, 22.0))  # [s]
+
+
+def stop_and_go(seed: int, pauses=PAUSES, noise: float = 0.2) -> Case:
+    """Return a case of a motion with pauses, in which each motor holds any torque within its static friction."""
+    period, speed = 1.0 / planted.RATE, np.ones(int(30.0 * planted.RATE))
+    t = period * np.arange(len(speed))
+    for first, end in pauses:
+        speed[(t >= first) & (t < end)] = 0.0
+    smooth = np.hanning(int(0.6 * planted.RATE))
+    speed = np.convolve(speed, smooth / smooth.sum(), mode="same")
+    phase = period * np.cumsum(speed)
+    grid, path, *_ = planted.motion(seed, duration=40.0, harmonics=3)
+    q = np.column_stack([np.interp(phase, grid, column) for column in path.T])
+    recording = Recording(t, q, np.zeros_like(q), "torque", ("joint1", "joint2", "joint3"), file=f"log{seed}")
+    motion = make_motion(recording, FilterOptions(cutoff=10.0, band=8.0))
+    torque = planted.torques(motion.q, motion.v, motion.a)
+    rng = np.random.default_rng(seed)
+    friction = np.array(planted.DRIVES["Fc"])
+    stands = standing_joints(replace(make_case("x", motion)), WIDTH)
+    for first, end in pauses:
+        inside = (motion.t >= first) & (motion.t < end)
+        held = rng.uniform(-1.0, 1.0, planted.N) * friction - np.tanh(motion.v[inside] / 0.01) * friction
+        torque[inside] += np.where(stands[inside], held, 0.0)
+    effort = torque + noise * rng.normal(size=torque.shape)
+    return make_case(f"log{seed}", replace(motion, effort=effort))
+
+
+def rows_of(case: Case, settings: IdentificationSettings = PLAIN) -> list[ObservationRows]:
+    model, decimator = make_model(planted.arm(), settings), common_decimator([case], settings)
+    base = find_base(model, [case], chain_states(planted.arm(), model))
+    plain = with_blocks([observe(model, base.kept, case, decimator)], 6)
+    return with_standstills(plain, [case], decimator, model, base.kept, WIDTH)
+
+
+def wrong_friction(found: Identification) -> float:
+    """Return the rms relative error of Coulomb's friction."""
+    values = dict(zip(found.names, found.fitted.estimate.values))
+    return float(np.sqrt(np.mean([(values[f"Fc{j + 1}"] / size - 1.0) ** 2 for j, size in enumerate(planted.DRIVES["Fc"])])))
+
+
+def test_friction_comes_back_from_a_recording_that_stands_for_a_third(monkeypatch):
+    """With standing rows as any others it is several times as wrong, and so is motion that the fit has not seen."""
+    cases, other = [stop_and_go(seed) for seed in range(3)], stop_and_go(7)
+    counted = [identify(planted.arm(), [case], PLAIN) for case in cases]
+    monkeypatch.setattr(standstill, "MIN_STANDSTILL", 1e6)
+    as_others = [identify(planted.arm(), [case], PLAIN) for case in cases]
+    errors, plain = ([wrong_friction(found) for found in each] for each in (counted, as_others))
+    assert np.mean(errors) < 0.5 * np.mean(plain)
+    unseen, before = ([score(other, predict(one.dynamics, other)).moving.total for one in each] for each in (counted, as_others))
+    assert np.mean(unseen) < np.mean(before)
+
+
+def test_estimates_are_within_their_covariance_where_joints_stand():
+    size = []
+    for seed in range(4):
+        found = identify(planted.arm(), [stop_and_go(seed)], replace(PLAIN, prior="none"))
+
+        values = found.base.transform @ planted.truth()
+        away = (found.fitted.estimate.values - values) / found.fitted.estimate.sigma
+        size.append(np.sqrt(np.mean(away**2)))
+    assert 0.4 < np.mean(size) < 2.0
+
+
+def test_a_standstill_weighs_as_one_row_of_its_friction_however_long_it_lasts():
+    rows = rows_of(stop_and_go(0))
+    parts = divided(rows)
+    np.testing.assert_allclose(parts.standstills, len(PAUSES))
+    values = np.zeros(parts.moving.parameters)
+    values[parts.coulomb.argmax(axis=1)] = planted.DRIVES["Fc"]
+    std, tau = np.full(3, 0.05), np.full(3, 2.0)
+    worth = parts.weights(values, std, tau).worth
+    residual = parts.standing.residual_squares(values) / parts.standstills
+    spread = np.maximum(np.array(planted.DRIVES["Fc"]) ** 2 / 3.0, residual)
+    np.testing.assert_allclose(worth, tau * std**2 / (tau * std**2 / parts.length + spread), rtol=1e-9)
+    assert (worth < 0.1).all()
+    part = replace(rows[0], rest=parts.weights(values, std, tau))
+    total = np.sum(part.weight**2 * (part.standing > 0.0), axis=0)
+    np.testing.assert_allclose(total, len(PAUSES) * worth, rtol=1e-9)
+
+
+def test_without_friction_a_standstill_weighs_as_all_its_rows():
+    parts = divided(rows_of(stop_and_go(0)))
+    standing = replace(parts.standing, factors=np.zeros_like(parts.standing.factors))
+    weights = replace(parts, standing=standing).weights(np.zeros(parts.moving.parameters), np.ones(3), np.full(3, 5.0))
+    np.testing.assert_allclose(weights.worth, parts.length)
+    np.testing.assert_allclose(weights.count, parts.length)
+
+
+def test_motion_without_standstill_keeps_all_its_rows():
+    part = rows_of(planted.case("a", 0))[0]
+    assert not part.standing.any() and (part.weight == part.present).all()
+
+
+def test_coulomb_columns_are_zero_at_rest_and_no_others():
+    case = stop_and_go(0)
+    rows, plain = rows_of(case)[0], observe(*_observed(case))
+    rests = rows.standing > 0.0
+    changed = (rows.matrix != plain.matrix).any(axis=0)
+    assert (changed <= rows.coulomb).all() and changed.any()
+    for row in range(planted.N):
+        assert not rows.matrix[rests[:, row]][:, row][:, rows.coulomb[row]].any()
+
+
+def _observed(case: Case):
+    model, decimator = make_model(planted.arm(), PLAIN), common_decimator([case], PLAIN)
+    return model, find_base(model, [case], chain_states(planted.arm(), model)).kept, case, decimator
+
+
+@pytest.mark.parametrize("drives", ["Ia Fv off", ""])
+def test_drives_without_coulomb_friction_have_no_standstills(drives):
+    """Direct drives, say: at rest their torque is as determined as in motion."""
+    part = rows_of(stop_and_go(0), replace(PLAIN, sets=(drives,)) if drives else PLAIN)[0]
+    assert part.standing.any() == (not drives)
+
+
+def test_a_joint_that_never_moves_keeps_its_rows():
+    case = stop_and_go(0)
+    motion = case.motion
+    frozen = [np.where(np.arange(3) == 1, value, x) for x, value in ((motion.q, motion.q[0]), (motion.v, 0.0), (motion.a, 0.0))]
+    still = replace(case, motion=replace(motion, q=frozen[0], v=frozen[1], a=frozen[2]))
+    standing = rows_of(still)[0].standing
+    assert not standing[:, 1].any() and standing[:, [0, 2]].any(axis=0).all()
+
+
+def test_intervals_have_two_widths_and_hold_in_both():
+    covered = []
+    for seed in range(3):
+        train = [stop_and_go(seed)]
+        found = identify(planted.arm(), train, PLAIN)
+        errors, other = learn_torque_errors(found, train), stop_and_go(seed + 10)
+        assert errors is not None
+        stated = intervals(errors, found.dynamics, other, predict(found.dynamics, other))
+        assert (stated.median_at_rest > 1.5 * stated.median).all()
+        covered.append([stated.inside[~stated.standing].mean(), stated.inside[stated.standing].mean()])
+    moving, resting = np.mean(covered, axis=0)
+    assert 0.92 < moving <= 1.0 and resting > 0.85
+
+
+def test_cut_slow_is_refused_with_what_replaced_it():
+    with pytest.raises(UsageError, match="cut_slow: each standstill of a joint now counts once"):
+        parse_options({"cut_slow": True})
