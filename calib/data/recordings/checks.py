@@ -19,7 +19,7 @@ class RecordingBounds:
     """Bounds on the values of a recording; all of them our choice.
 
     Attributes:
-        min_samples: of a recording; filters at both ends remove about 50.
+        min_samples: of a recording, for filters to begin and to end; whether they suffice for the unknowns is asked later.
         min_rate, max_rate: of sampling [Hz].
         min_travel: smallest travel of a moving joint [rad or m], above encoder noise.
         max_compared: rows searched for two nearly equal poses.
@@ -33,7 +33,7 @@ class RecordingBounds:
         max_jump: off the slope of the rows around it [rad]; real positions are by 7 mrad; in m a tenth.
     """
 
-    min_samples: int = 100
+    min_samples: int = 20
     min_rate: float = 5.0
     max_rate: float = 50e3
     min_travel: float = 1e-3
@@ -61,7 +61,7 @@ def check_recording(recording: Recording, joints: Joints | None = None) -> Recor
             for radians, a torque that is one number while its joint moves.
     """
     few = (
-        f"{len(recording)} samples are too few for filters and identification; at least {LIMITS.min_samples} are needed"
+        f"{len(recording)} samples are too few for filters; at least {LIMITS.min_samples} are needed"
     )
     require(len(recording) >= LIMITS.min_samples, few, MeasurementError, recording.file)
     recording = _without_absent(recording)

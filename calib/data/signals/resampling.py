@@ -280,7 +280,7 @@ def resample(recording: Recording, clock: str = "auto", gap: float = GAP, rate: 
     long = step > max(gap, 5 * found.period)
     edges = np.concatenate([[0], np.flatnonzero(long) + 1, [len(t)]])
     spans = list(pairwise(edges))
-    min_samples = 50  # samples of a segment that is kept
+    min_samples = 20  # samples of a segment that is kept: a filter needs them to begin and to end
     used = [(a, b) for a, b in spans if b - a > min_samples and (t[b - 1] - t[a]) / period > min_samples]
     if not used:
         message = f"has gaps: none of its {len(spans)} parts is longer than {min_samples} samples"
