@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.data.recordings.recording import Recording
+from calib.data.recordings.row_order import goes_far_back, in_order
 from calib.data.schema import BOUNDS, Joints, check_travel, max_travel, more_rows, refuse
 from calib.errors import MeasurementError, refuse_data, require
 from calib.units import DEG
@@ -18,7 +19,7 @@ class RecordingBounds:
     """Bounds on the values of a recording; all of them our choice.
 
     Attributes:
-        min_samples: of a recording; filters at both ends remove about 50.
+        min_samples: of a recording, for filters to begin and to end; whether they suffice for the unknowns is asked later.
         min_rate, max_rate: of sampling [Hz].
         min_travel: smallest travel of a moving joint [rad or m], above encoder noise.
         max_compared: rows searched for two nearly equal poses.
@@ -32,7 +33,7 @@ class RecordingBounds:
         max_jump: off the slope of the rows around it [rad]; real positions are by 7 mrad; in m a tenth.
     """
 
-    min_samples: int = 100
+    min_samples: int = 20
     min_rate: float = 5.0
     max_rate: float = 50e3
     min_travel: float = 1e-3
@@ -60,10 +61,12 @@ def check_recording(recording: Recording, joints: Joints | None = None) -> Recor
             for radians, a torque that is one number while its joint moves.
     """
     few = (
-        f"{len(recording)} samples are too few for filters and identification; at least {LIMITS.min_samples} are needed"
+        f"{len(recording)} samples are too few for filters; at least {LIMITS.min_samples} are needed"
     )
     require(len(recording) >= LIMITS.min_samples, few, MeasurementError, recording.file)
+    recording = _without_absent(recording)
     _check_finite(recording)
+    recording = in_order(recording)
     recording = _drop_spikes(recording, joints)
     _check_finite(recording, LIMITS.max_number)
     recording = _drop_repeats(recording)
@@ -72,6 +75,33 @@ def check_recording(recording: Recording, joints: Joints | None = None) -> Recor
     _check_speed(recording)
     notes = (*_still(recording), *_effort_notes(recording, joints), *_limit_notes(recording, joints))
     return replace(_noted(recording, *notes, *_work_notes(recording)), jumps=tuple(_jumps(recording, joints)))
+
+
+def _without_absent(recording: Recording) -> Recording:
+    """Return the recording without velocities that are NaN in every row: drivers state so what they do not provide.
+
+    Raises:
+        MeasurementError: where positions or torques of a joint are NaN in every row.
+    """
+    absent = {}
+    for name in NEEDED[1:]:
+        values = getattr(recording, name)
+        absent[name] = [] if values is None else np.flatnonzero(np.isnan(values).all(axis=0)).tolist()
+    for name, what in (("q", "position"), ("effort", recording.kind)):
+        if absent[name]:
+            joints = ", ".join(recording.joint_names[j] for j in absent[name])
+            refuse_data(
+                recording.file,
+                f"the {what} of {joints} is NaN in every row: its driver does not provide it. Identification needs "
+                f"positions and torques (or currents) of all joints",
+            )
+    notes = []
+    for name, what in (("v", "velocities"), ("tau_link", "torques behind the gear"), ("tau_motor", "motor torques")):
+        if absent[name]:
+            joints = ", ".join(recording.joint_names[j] for j in absent[name])
+            notes.append(f"{what} of {joints} are NaN in every row: not provided, and not used for any joint")
+    nothing = {name: None for name in absent if absent[name]}
+    return _noted(replace(recording, **nothing), *notes)
 
 
 def _check_finite(recording: Recording, most: float = np.inf) -> None:
@@ -163,7 +193,9 @@ def _check_time(recording: Recording) -> None:
     t = recording.t
     step = np.diff(t)
     back, stands = np.append(False, step < 0), np.append(False, step == 0)
-    if len(step) and back[1:].all():
+    far = goes_far_back(t)
+    back = far if far.any() else back
+    if len(step) and (step < 0).all():
         refuse_data(recording.file, "time runs backwards in every row: reverse the order of the rows")
     refuse(
         recording, back, ["t"],

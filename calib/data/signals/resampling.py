@@ -7,7 +7,8 @@ on by the logger then move every sample by v·δt, which two derivatives make in
 seems noisy is only badly dated. Three clocks are tried; the one with the smoothest positions is used:
 
 ``stamps``  the stamps as recorded;
-``even``    one step, samples lost where a stamp is late by whole steps, a slow drift followed;
+``even``    one step, samples lost where a stamp is late by whole steps, a slow drift followed: a lattice with holes
+            (`calib.data.signals.lattice`), or, of stamps that jitter by more, whole steps by which they stay late;
 ``counted`` the number of steps between two samples from the motion itself, Δk = Δq·v̄ / (T |v̄|²), where that is whole
             numbers (v̄ the mean of the two measured velocities); zero is a sample read twice, which is left out.
 
@@ -26,11 +27,13 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
 
 from calib.data.recordings.recording import SERIES, Recording, settled
+from calib.data.signals.lattice import find_lattice
 from calib.errors import UsageError, refuse_data, require
 from calib.records import frozen, read_only
 
 GAP = 0.05  # the longest time without a sample that is bridged [s]; our choice
 CLOCKS = ("stamps", "even", "counted")
+MAX_REPEATS = 3  # rows in a row that repeat a sample of a moving robot; more are one that stands (our choice)
 APART = 0.01  # share by which the rates of stamps and velocities may differ
 
 
@@ -62,9 +65,12 @@ def find_clock(recording: Recording, kind: str = "auto") -> Clock:
         UsageError: for an unknown clock, or one that this recording does not allow.
     """
     require(kind in ("auto", *CLOCKS), f"clock: expected one of auto, {', '.join(CLOCKS)}, found '{kind}'", UsageError)
-    clocks = {"stamps": (recording.t, np.ones(len(recording), dtype=bool), _step(recording.t))}
-    if (even := _even_times(recording.t)) is not None:
-        clocks["even"] = even
+    fresh = ~_read_twice(recording)
+    clocks = {"stamps": (recording.t, fresh, _step(recording.t[fresh]))}
+    if (even := _even_times(recording.t[fresh])) is not None:
+        dates = np.array(recording.t)
+        dates[fresh] = even[0]
+        clocks["even"] = (dates, fresh, even[1])
     times = np.nan
     if (counted := _counted_times(recording, kind == "counted")) is not None:
         clocks["counted"], times = counted[:3], counted[3]
@@ -79,19 +85,38 @@ def find_clock(recording: Recording, kind: str = "auto") -> Clock:
     return Clock(chosen, frozen(t), frozen(keep, bool), period, times, rough)
 
 
-def _even_times(t: np.ndarray, drift_samples: int = 101) -> tuple[np.ndarray, np.ndarray, float] | None:
-    """Return even times k T + drift (N,), k counting lost samples, a mask of ones, and T [s]; None if uneven.
+def _read_twice(recording: Recording) -> np.ndarray:
+    """Return the mask (N,) of rows that repeat the row before, in positions and torques, while the robot moves.
+
+    Such a row is the last sample read once more, since the next one is late. Rows of a robot that stands may well be
+    equal: only short runs count, between rows whose positions differ.
+    """
+    moved = np.diff(recording.q, axis=0).any(axis=1)
+    same = ~moved & ~np.diff(recording.effort, axis=0).any(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]])))
+    twice = np.zeros(len(recording), dtype=bool)
+    for first, end in edges.reshape(-1, 2).tolist():
+        inner = 0 < first and end < len(same)
+        if inner and end - first <= MAX_REPEATS and moved[first - 1] and moved[end]:
+            twice[first + 1 : end + 1] = True
+    return twice
+
+
+def _even_times(t: np.ndarray, drift_samples: int = 101) -> tuple[np.ndarray, float] | None:
+    """Return even times k T + drift (N,), k counting lost samples, and T [s]; None if uneven.
 
     `drift_samples`: samples over which a drift of the stamps is followed.
     """
-    step = _step(t)
-    k = np.arange(len(t)) + np.concatenate([[0], np.cumsum(_lost(t, step))])
+    lattice = find_lattice(t, drift_samples)
+    # stamps that jitter by more than that show lost samples only where all later ones stay late
+    lost = None if lattice is not None else _lost(t, _step(t))
+    k = np.arange(len(t)) + np.concatenate([[0], np.cumsum(lost)]) if lattice is None else lattice.steps
     period, start = np.polyfit(k, t, 1)
     late = t - (start + period * k)
     even = start + period * k + uniform_filter1d(late, drift_samples, mode="nearest")
     if not (np.diff(even) > 0.5 * period).all():
         return None
-    return even, np.ones(len(t), dtype=bool), float(period)
+    return even, float(period)
 
 
 def _counted_times(recording: Recording, asked: bool) -> tuple[np.ndarray, np.ndarray, float, float] | None:
@@ -255,7 +280,7 @@ def resample(recording: Recording, clock: str = "auto", gap: float = GAP, rate: 
     long = step > max(gap, 5 * found.period)
     edges = np.concatenate([[0], np.flatnonzero(long) + 1, [len(t)]])
     spans = list(pairwise(edges))
-    min_samples = 50  # samples of a segment that is kept
+    min_samples = 20  # samples of a segment that is kept: a filter needs them to begin and to end
     used = [(a, b) for a, b in spans if b - a > min_samples and (t[b - 1] - t[a]) / period > min_samples]
     if not used:
         message = f"has gaps: none of its {len(spans)} parts is longer than {min_samples} samples"

@@ -1,0 +1,51 @@
+"""Rows whose stamps run backwards by a little: put in order. Those of two logs in one file, or of a set clock, are not.
+
+Two things look alike: rows written in another order than they were sampled (several threads or sockets), and stamps of
+rows in the right order that jitter by more than a step. The positions tell: of two orders of the same samples, the
+right one is the shorter way through them.
+"""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from calib.data.recordings.recording import Recording
+
+MAX_BACK = 5  # median steps by which a stamp may be earlier than one before it, to be put in order (our choice)
+
+
+def in_order(recording: Recording) -> Recording:
+    """Return the recording with stamps that run back by up to `MAX_BACK` steps put in order, and a note on it."""
+    t = recording.t
+    if len(t) < 2 or not np.isfinite(t).all() or not (np.diff(t) < 0.0).any():
+        return recording
+    edges = [0, *np.flatnonzero(goes_far_back(t)).tolist(), len(t)]
+    parts = [slice(*ends) for ends in pairwise(edges)]
+    back = np.concatenate([np.maximum.accumulate(t[part]) - t[part] for part in parts])
+    if not 0.0 < back.max() <= MAX_BACK * _usual_step(t):
+        return recording
+    order = np.concatenate([part.start + np.argsort(t[part], kind="stable") for part in parts])
+    largest = f"{int((back > 0.0).sum())} stamps are up to {1e3 * back.max():.3g} ms earlier than one before them"
+    if _way(recording.q[order]) < _way(recording.q):
+        ordered, note = recording.take(order), f"{largest}: the rows are sorted by their stamps"
+    else:
+        ordered, note = replace(recording, t=t[order]), f"{largest}: the rows are in order, their stamps are sorted"
+    return replace(ordered, notes=(*recording.notes, note))
+
+
+def goes_far_back(t: np.ndarray) -> np.ndarray:
+    """Return the mask (N,) of stamps (N,) that are earlier than the one before by more than can be put in order."""
+    return np.append(False, np.diff(t) < -MAX_BACK * _usual_step(t))
+
+
+def _usual_step(t: np.ndarray) -> float:
+    """Return the median distance of neighbouring stamps (N,), whichever comes first."""
+    return float(np.median(np.abs(np.diff(t))))
+
+
+def _way(q: np.ndarray) -> float:
+    """Return the length of the way through positions (N, n), each joint's in units of its travel."""
+    travel = np.ptp(q, axis=0)
+    moves = travel > 0.0
+    return float((np.abs(np.diff(q[:, moves], axis=0)) / travel[moves]).sum())

@@ -1,0 +1,91 @@
+"""Lattice with holes: the steps at which an even clock took samples, from stamps that jitter, some samples lost.
+
+    t_i = T (k_i + d_i) + jitter_i,    k_i whole numbers that rise by 1 or more, d_i a slow drift in steps
+
+Steps between two stamps do not tell k: both stamps jitter, and a wrong step stays wrong for all later samples. The
+phase does, which each sample votes on: exp(2πi t / T) has one direction for all k. Its mean over a few samples gives
+the drift, and its length the jitter (1 without, exp(-2 π² σ² / T²) for one of σ; 0 where stamps are no lattice at all).
+Estimation of a period from sparse, noisy times: Fogel and Gavish (1988), Sidiropoulos, Swami and Sadler (2005), who
+take the largest periodogram as here; a drift that is followed is our addition.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+from scipy.optimize import isotonic_regression
+
+MIN_CONCENTRATION = 0.35  # length of the mean direction: 0.23 of a step of jitter (our choice)
+LONG_STOP = 20  # steps without a sample, from which on the phase begins anew
+MAX_PERIOD_ERROR = 0.12  # of the median step, which jitter and lost samples move
+VOTES = 64  # samples that vote on a period together: longer ones would need it more exactly beforehand
+PERIODS = 193  # that are tried
+MAX_TRIED = 20_000  # samples on which they are tried
+
+
+@dataclass(frozen=True, eq=False)
+class Lattice:
+    """Steps of an even clock.
+
+    Attributes:
+        steps: (N,) whole numbers k, rising.
+        period: T [s].
+        concentration: of the phases about their drift, 0 to 1.
+    """
+
+    steps: np.ndarray
+    period: float
+    concentration: float
+
+
+def find_lattice(t: np.ndarray, drift_samples: int, rounds: int = 3) -> Lattice | None:
+    """Return the lattice of rising stamps t (N,) [s]; None where they jitter by more than about a quarter of a step.
+
+    Args:
+        drift_samples: samples over which a drift of the stamps is followed.
+        rounds: of rounding the stamps to steps, and of fitting the period to them.
+    """
+    period = _likeliest_period(t)
+    steps, concentration = np.arange(len(t)), 0.0
+    for _ in range(rounds):
+        steps, concentration = _rounded(t, period, drift_samples)
+        if concentration < MIN_CONCENTRATION:
+            return None
+        period = float(np.polyfit(steps, t, 1)[0])
+    return Lattice(steps, period, concentration)
+
+
+def _likeliest_period(t: np.ndarray) -> float:
+    """Return the period near the median step for which short runs of stamps agree best on their phase [s]."""
+    median = float(np.median(np.diff(t)))
+    some = t[: max(len(t[:MAX_TRIED]) // VOTES, 1) * VOTES]
+    runs = some.reshape(-1, min(VOTES, len(some)))
+    tried = median * (1.0 + np.linspace(-MAX_PERIOD_ERROR, MAX_PERIOD_ERROR, PERIODS))
+    agreement = [float(np.abs(_directions(runs, period).mean(axis=1)).mean()) for period in tried]
+    return float(tried[int(np.argmax(agreement))])
+
+
+def _rounded(t: np.ndarray, period: float, drift_samples: int) -> tuple[np.ndarray, float]:
+    """Return the steps (N,) nearest to the stamps, their drift allowed for, and the concentration of their phases."""
+    stops = np.flatnonzero(np.diff(t) > LONG_STOP * period) + 1
+    steps, votes = np.zeros(len(t), dtype=int), 0.0
+    for start, end in pairwise([0, *stops.tolist(), len(t)]):
+        own = t[start:end]
+        directions = _directions(own, period)
+        mean = uniform_filter1d(directions.real, drift_samples) + 1j * uniform_filter1d(directions.imag, drift_samples)
+        drift = np.unwrap(np.angle(mean)) / (2.0 * np.pi)
+        exact = (own - own[0]) / period - (drift - drift[0])
+        # steps rise: what is left after one per sample does not fall, and rounding keeps the nearest such numbers
+        lost = isotonic_regression(exact - np.arange(len(own))).x
+        steps[start:end] = np.arange(len(own)) + np.round(lost).astype(int)
+        # the stop before it, in whole steps
+        if start:
+            steps[start:end] += steps[start - 1] + round((own[0] - t[start - 1]) / period) - steps[start]
+        votes += float(np.abs(mean).sum())
+    return steps, votes / len(t)
+
+
+def _directions(t: np.ndarray, period: float) -> np.ndarray:
+    """Return the phases of stamps [s] as complex numbers of length 1."""
+    return np.exp(2j * np.pi * (t / period))
