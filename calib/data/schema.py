@@ -102,9 +102,9 @@ def refuse(source: Rows, bad: np.ndarray, columns: Sequence[str], says: Callable
         MeasurementError: with file, row and column of the first bad cell, and the number of further rows among those
             read, with the number of bad rows in each column where there are several.
     """
-    bad = np.reshape(bad, (len(bad), -1))
-    if not bad.any():
+    if not np.any(bad):
         return
+    bad = np.reshape(bad, (len(bad), -1))
     row, column = (int(i) for i in np.argwhere(bad)[0])
     message = says(row, column) + more_rows(source, bad, columns)
     raise MeasurementError(message, source.file, int(source.rows[row]), columns[column])

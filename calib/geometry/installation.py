@@ -91,7 +91,10 @@ class Installation:
             return self
         terms = (*self.known.terms, *self.deflection.terms)
         values = np.concatenate([np.asarray(self.known.coefficients), np.asarray(self.deflection.coefficients)])
-        reference = self.known.reference if self.deflection.reference is None else self.deflection.reference
+        earlier, reference = self.known.reference, self.deflection.reference or self.known.reference
+        # masses that the known compliance was fitted with stay with it
+        if reference is not None and reference.inertias is None and earlier is not None:
+            reference = replace(reference, inertias=earlier.inertias)
         return replace(self, deflection=Deflection(terms, values, reference), known=Deflection())
 
 
