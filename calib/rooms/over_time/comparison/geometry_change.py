@@ -133,6 +133,7 @@ def compare(before: Calibration, after: Calibration, settings: DiffSettings) -> 
     """
     pair, chain = _pair(before, after, settings), before.chain
     learnt = [each.learnt for each in (before, after) if each.learnt is not None]
+    require(learnt, f"{before.name}, {after.name}: no residuals.csv with fitted rows; fit again", UsageError)
     seen = pair.see(np.concatenate([each[:: max(1, -(-len(each) // MAX_POSES))] for each in learnt]))
     found, combinations = _tested(pair, seen)
     total, sizes = np.add(*pair.covariances), np.linalg.norm(combinations, axis=0)
