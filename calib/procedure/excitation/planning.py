@@ -24,6 +24,7 @@ from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.drives import standard
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.path_dynamics import PathDynamics, of_standard
+from calib.dynamics.torque_rows import MOTOR
 from calib.errors import RobotError, UsageError, refused_as, require
 from calib.geometry import inverse
 from calib.geometry.installation import Installation
@@ -290,6 +291,8 @@ def _identified(chain: Chain, folder: Path, payloads: Sequence[str]) -> tuple[Pa
     refuse_other_arm(folder, chain)
     dynamics = read_dynamics(folder)[1]
     model = dynamics.model
+    if model.torque_rows.projection is not None:  # of power, say: its parameters predict the motors' torques as well
+        model = replace(model, torque_rows=MOTOR)
     known = [label for label, coordinate in zip(model.bodies.labels, model.bodies.coordinates) if coordinate < 0]
     if unknown := sorted(set(payloads) - set(known)):
         raise UsageError(f"{folder}: no payload '{unknown[0]}' was identified; it has {', '.join(known) or 'none'}")
