@@ -349,10 +349,11 @@ def _samples(found: Identification, cases: Sequence[Case]) -> _Samples:
         near = np.searchsorted(index, np.arange(len(motion))[every]).clip(max=len(index) - 1)
         parts.append(rows.block[near])
     triangles = triangulate(found.rows)
+    matrices = [_together(rows.matrix, errors[0].shape[1]) for rows in found.rows]
     everything = range(triangles.groups // len(found.fitted.std))
     return _Samples(
         np.concatenate(states, axis=1), np.concatenate(torques), np.concatenate(errors),
-        np.concatenate([_together(rows.matrix, errors[0].shape[1]) for rows in found.rows]), np.concatenate(blocks), np.concatenate(whole),
+        np.concatenate(matrices), np.concatenate(blocks), np.concatenate(whole),
         np.concatenate(parts), triangles,
         _estimate(found, triangles, everything)[0],
     )  # fmt: skip
