@@ -185,8 +185,8 @@ def read(path: str | Path) -> Installation:
 def read_arms(path: str | Path) -> tuple[Installation, Installation]:
     """Return the calibrated arm of a fit (see `read`), and its nominal arm.
 
-    The nominal one has the frames that let it fit the same measurements best; of a fit that started from an earlier
-    fit's folder they are not known: then it has no stations and no tools.
+    The nominal one has the frames that let it fit the same measurements best. Without them (of an earlier version's fit
+    that started from an earlier fit's folder) it has no stations and no tools.
 
     Raises:
         RobotError: where the file does not say which arm that was.

@@ -172,8 +172,8 @@ def _station(fitted: Fitted, frame: str) -> int:
         raise UsageError(f"frame {frame}: expected base, nominal, or a station of the fit ({', '.join(names)})")
     if not fitted.placed:
         raise UsageError(
-            f"{fitted.folder} does not state the nominal robot's placement (it was fitted from an earlier fit's "
-            "folder, by an earlier version, or without an instrument); use frame 'base'"
+            f"{fitted.folder} does not state the nominal robot's placement (it was fitted by an earlier version, or "
+            "without an instrument): use frame 'base', or fit again"
         )
     return 0 if frame == "nominal" else names.index(frame)
 
