@@ -150,6 +150,7 @@ class Planned:
         sigma: (n,) largest standard deviation of each predicted torque; `limits.torque` leaves as many of them free as
             the limits file says (default 2); None where the model states none.
         notes: what a user should know.
+        source: the robot's description, as named by the user; empty if unknown.
     """
 
     chain: Chain
@@ -166,6 +167,7 @@ class Planned:
     approach: Setpoints | None = None
     rehearsal: Setpoints | None = None
     sigma: np.ndarray | None = None
+    source: str = ""
 
     @property
     def active_share(self) -> float:
@@ -239,6 +241,7 @@ def plan(
     return Planned(
         chain, known.bounds, bounds, lower, upper, timings, motion, (*known.notes, *notes, *remarks), margins,
         deviation, shaped, lead, slowed(motion, settings.slower) if settings.slower != 1 else None, sigma,
+        found.source or str(source),
     )  # fmt: skip
 
 

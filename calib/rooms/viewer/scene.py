@@ -269,8 +269,8 @@ def _arm(folder: Path, robot: str | None) -> tuple[Chain | Drawn | None, Path | 
         return stage.run(), None
     if robot is not None:
         return load(robot), resolve(robot)
-    for place in (folder, folder / IN_SESSION):
-        if (place / calibrated.ROBOT).is_file():
+    for place in (folder / calibrated.ROBOT, folder / IN_SESSION / calibrated.ROBOT, folder / coefficients.ARM):
+        if place.is_file():
             known = calibrated.read(place)
             return known.complete, Path(known.source) if known.source and Path(known.source).is_file() else None
     for place in sorted(folder.glob("1-robot/robot.*")):
