@@ -239,6 +239,10 @@ def _complaint(errors: list[Any], kind: type, place: str) -> str:
     """Return the message for pydantic's first error; an unknown key takes precedence over a missing one."""
     first = next((one for one in errors if one["type"] == UNKNOWN), errors[0])
     loc, name, found = tuple(first["loc"]), first["type"], first["input"]
+    if name in ("missing", "too_long") and (count := _fixed_length(kind, loc, name)):
+        at = loc[:-1] if name == "missing" else loc
+        words = f"a list of {count} values" if count > 1 else "a list of one value"
+        return f"{': '.join(filter(None, (place, located(at))))}: expected {words}, found {shown(found)}"
     table = _type_at(kind, loc[:-1]) if name in (UNKNOWN, "missing") else None
     at = loc if table is None else loc[:-1]
     while (
@@ -258,6 +262,19 @@ def _complaint(errors: list[Any], kind: type, place: str) -> str:
     if name == "tuple_type" and is_dataclass(_type_at(kind, (*loc, 0))):
         words = f"a list of tables, [[{loc[-1]}]]"
     return f"{where}: expected {words}, found {shown(found)}"
+
+
+def _fixed_length(kind: Any, loc: Sequence[Any], name: str) -> int:
+    """Return how many values the list of fixed length at a location has; 0 where there is no such list.
+
+    Args:
+        loc: of an error; ``missing`` is that of the first value that the list lacks.
+    """
+    if name == "missing" and not isinstance(loc[-1], int):
+        return 0
+    listed = _type_at(kind, loc[:-1] if name == "missing" else loc)
+    values = get_args(listed) if get_origin(listed) is tuple else ()
+    return 0 if Ellipsis in values else len(values)
 
 
 def _keys(kind: Any) -> list[str]:

@@ -183,6 +183,7 @@ def refused_as(
         if kinds is Exception and isinstance(error, CalibError):  # said by ourselves
             raise
         said = getattr(error, "strerror", None) or (brief(error) if kinds is Exception else error)
+        said = f"no entry {error}" if isinstance(error, KeyError) else said
         raise kind(words.replace("{}", str(said)), *details) from error
 
 

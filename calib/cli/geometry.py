@@ -156,9 +156,10 @@ def export(
         moveit: with --ros2: SRDF, joint_limits.yaml, or a folder with both, to copy; may be repeated
         ros2_control: with --ros2: write a ros2_control (mock hardware) if the URDF has none
     """
-    from calib.errors import UsageError, require
+    from calib.errors import UsageError, command_line, require
     from calib.files import results
     from calib.procedure.export import delivery, geometry
+    from calib.procedure.export.identified import is_identified
     from calib.procedure.robot_kinds import stage_of
 
     stage_of(folder, "export" if into else "export to single files")
@@ -194,4 +195,7 @@ def export(
         say(f"note: these files do not include the corrections (joint_corrections.csv in {folder})")
     if own.level:
         say(str(own))
+    if urdf and is_identified(folder):
+        whole = command_line("export", folder, "--urdf", urdf, "--into", "FOLDER")
+        say(f"note: {out} has the calibrated geometry with the masses of {urdf}; {whole} writes the identified ones")
     exit_failed(own.level)

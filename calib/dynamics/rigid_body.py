@@ -7,10 +7,8 @@ A static arm's drives show +g(q). numba is imported at the first call, not befor
 
 import numpy as np
 
-from calib.dynamics.bodies import PRISMATIC, REVOLUTE, Bodies, bodies_of, standard_parameters
-from calib.errors import refuse_robot
+from calib.dynamics.bodies import PRISMATIC, REVOLUTE, Bodies
 from calib.records import shaped
-from calib.robot.chain import Chain
 
 
 def regressor(bodies: Bodies, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
@@ -133,22 +131,6 @@ def inverse_dynamics(bodies: Bodies, parameters: np.ndarray, q: np.ndarray, v: n
         bodies.links, bodies.constants, kernel_parameters(bodies, parameters), *_placed(bodies, q), v, a, out
     )
     return out
-
-
-def gravity_torques(chain: Chain, q: np.ndarray) -> np.ndarray:
-    """Return the torques (m, n) [N m or N] that hold an arm of known masses still against gravity, g(q) = ∂U/∂q.
-
-    Args:
-        chain: with `inertias`; without mimic joints.
-        q: (m, n) [rad or m].
-
-    Raises:
-        RobotError: where the masses are unknown, or one joint moves several elements.
-    """
-    if len(chain.driven) != chain.n:
-        refuse_robot(f"robot '{chain.name}'", "gravity torques of mimic joints are not implemented")
-    still = np.zeros(np.shape(q))
-    return inverse_dynamics(bodies_of(chain), standard_parameters(chain), q, still, still)
 
 
 def mass_matrix(bodies: Bodies, parameters: np.ndarray, q: np.ndarray) -> np.ndarray:

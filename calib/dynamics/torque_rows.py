@@ -243,6 +243,12 @@ BOTH = TorqueRows(
 DRIVE = TorqueRows("drive", (_JointBlock("", _MOTOR, motor=1.0, sensor=-1.0),), "Ia Fvm Fcm offm")
 MODELS = {1: LINK, 2: BOTH, 3: DRIVE}  # as the 2019 paper numbers them
 
-POWER = projected("power", Projection(("power",), ("W",), lambda q, v: v[:, None, :]))
+
+def _power_of(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Return the map (N, 1, n) from joint torques to their power."""
+    return v[:, None, :]
+
+
+POWER = projected("power", Projection(("power",), ("W",), _power_of))
 """One row: the power of all torques, vᵀ tau (the power identification model, Gautier 1997)."""
 ROWS = {one.name: one for one in (MOTOR, LINK, BOTH, DRIVE, POWER)}

@@ -91,7 +91,10 @@ class Installation:
             return self
         terms = (*self.known.terms, *self.deflection.terms)
         values = np.concatenate([np.asarray(self.known.coefficients), np.asarray(self.deflection.coefficients)])
-        reference = self.known.reference if self.deflection.reference is None else self.deflection.reference
+        earlier, reference = self.known.reference, self.deflection.reference or self.known.reference
+        # masses that the known compliance was fitted with stay with it
+        if reference is not None and reference.inertias is None and earlier is not None:
+            reference = replace(reference, inertias=earlier.inertias)
         return replace(self, deflection=Deflection(terms, values, reference), known=Deflection())
 
 
@@ -182,8 +185,8 @@ def read(path: str | Path) -> Installation:
 def read_arms(path: str | Path) -> tuple[Installation, Installation]:
     """Return the calibrated arm of a fit (see `read`), and its nominal arm.
 
-    The nominal one has the frames that let it fit the same measurements best; of a fit that started from an earlier
-    fit's folder they are not known: then it has no stations and no tools.
+    The nominal one has the frames that let it fit the same measurements best. Without them (of an earlier version's fit
+    that started from an earlier fit's folder) it has no stations and no tools.
 
     Raises:
         RobotError: where the file does not say which arm that was.

@@ -147,7 +147,7 @@ def identify_model(
     decimator = common_decimator(cases, settings)
     say("observation matrix")
     rows = with_blocks([observe(model, base.kept, case, decimator) for case in cases], settings.folds)
-    if model.torque_rows is POWER and len(cases) > 1:
+    if model.torque_rows == POWER and len(cases) > 1:
         rows = [part.by_recording(k, len(cases)) for k, part in enumerate(rows)]
     if isinstance(method, LeastSquares):
         width = np.array(per_joint(settings.v0, cases[0].motion.n, "v0"))

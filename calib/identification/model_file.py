@@ -76,10 +76,9 @@ def read_dynamics(folder: str | Path) -> tuple[Chain, Dynamics]:
     folder = Path(folder)
     table = read_table(folder)
     chain = description.read(folder / ROBOT)
-    try:
+    words = f"{folder}/dynamics.json is damaged or of another version ({{}}); identify again"
+    with refused_as(RobotError, (KeyError, TypeError, ValueError, IndexError), words):
         return chain, from_table(chain, table)
-    except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise RobotError(f"{folder}/dynamics.json is damaged or of another version: {error!r}") from error
 
 
 def read_table(folder: Path) -> dict[str, Any]:

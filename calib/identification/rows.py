@@ -213,11 +213,11 @@ def observe(model: RegressorModel, columns: np.ndarray, case: Case, decimator: D
     step, place = max(1, BLOCK // decimator.factor) * decimator.factor, 0
     for start, stop in segments(motion.segment):
         spans = [slice(i, min(i + step, stop)) for i in range(start, stop, step)]
-        if len(decimator.taps) == 1 and model.torque_rows is not POWER:
+        if len(decimator.taps) == 1 and model.torque_rows != POWER:
             for part in spans:  # nothing to filter: no need to turn entries into series and back
                 matrix[part] = _regressor(model, case, part, states)[:, :, columns]
             continue
-        if model.torque_rows is POWER:
+        if model.torque_rows == POWER:
             blocks = (power_block(model, seen, case, part, states, slice(start, stop)) for part in spans)
         else:
             entries = (_regressor(model, case, part, states).transpose(2, 1, 0) for part in spans)

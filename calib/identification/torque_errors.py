@@ -388,13 +388,19 @@ def _samples(found: Identification, cases: Sequence[Case]) -> _Samples:
         near = np.searchsorted(index, np.arange(len(motion))[every]).clip(max=len(index) - 1)
         parts.append(rows.block[near])
     triangles = triangulate(found.rows)
-    everything = range(triangles.groups // errors[0].shape[1])
+    matrices = [_together(rows.matrix, errors[0].shape[1]) for rows in found.rows]
+    everything = range(triangles.groups // len(found.fitted.std))
     return _Samples(
         np.concatenate(states, axis=1), np.concatenate(torques), np.concatenate(errors),
-        np.concatenate([rows.matrix for rows in found.rows]), np.concatenate(blocks), np.concatenate(whole),
+        np.concatenate(matrices), np.concatenate(blocks), np.concatenate(whole),
         np.concatenate(parts), triangles,
         _estimate(found, triangles, everything)[0],
     )  # fmt: skip
+
+
+def _together(matrix: np.ndarray, rows: int) -> np.ndarray:
+    """Return columns (M, rows, p) without the zero rows of other recordings (`ObservationRows.by_recording`)."""
+    return matrix if matrix.shape[1] == rows else matrix.sum(axis=1, keepdims=True)
 
 
 def _apart(samples: _Samples, blocks: Sequence[int]) -> list[np.ndarray]:
@@ -471,7 +477,7 @@ def _left_out(found: Identification, samples: _Samples, run: Sequence[int] | np.
         slow: (n,) speeds below which a joint stands.
     """
     inside, size = np.isin(samples.block, run), np.sqrt(np.mean(samples.torque**2, axis=0))
-    others = [k for k in range(samples.triangles.groups // samples.error.shape[1]) if k not in run]
+    others = [k for k in range(samples.triangles.groups // len(found.fitted.std)) if k not in run]
     values, root = _estimate(found, samples.triangles, others)
     rows, states = samples.matrix[inside], samples.states
     error = samples.error[inside] + rows @ (samples.values - values)

@@ -49,7 +49,7 @@ from calib.folders import read_covariance, write_covariance
 from calib.records import frozen, shaped
 from calib.robot import description
 from calib.robot.chain import Chain
-from calib.robot.kinematics import forward, joint_frames, sweep, tip_jacobian
+from calib.robot.kinematics import forward, gravity_torques, joint_frames, sweep, tip_jacobian
 from calib.robot.tables import check_keys, number, vector
 
 LOG = logging.getLogger(__name__)
@@ -109,8 +109,14 @@ def evaluate(deflection: Deflection, q: np.ndarray, torque: np.ndarray | None = 
     Args:
         deflection: the terms, with their reference chain.
         q: (m, n).
-        torque: (m, n) gravity torques [N m], for terms of basis ``torque``.
+        torque: (m, n) gravity torques [N m], for terms of basis ``torque``;
+            None: those of the reference chain (its masses).
+
+    Raises:
+        CalibError: where a term needs gravity torques, and the reference chain has no masses.
     """
+    if torque is None and any(term.basis == "torque" for term in deflection.terms):
+        torque = _reference_torques(deflection, q)
     result = np.empty((len(deflection.terms), len(q)))
     highest: dict[int, int] = {}
     for term in deflection.terms:
@@ -118,9 +124,7 @@ def evaluate(deflection: Deflection, q: np.ndarray, torque: np.ndarray | None = 
             highest[term.source] = max(term.order, highest.get(term.source, 0))
     powers = {j: np.cumprod(np.tile(np.exp(1j * q[:, j]), (order, 1)), axis=0) for j, order in highest.items()}
     for e, term in enumerate(deflection.terms):
-        if term.basis == "torque":
-            if torque is None:
-                raise CalibError("a compliance needs gravity torques: state the robot's masses, or have them fitted")
+        if term.basis == "torque" and torque is not None:
             result[e] = torque[:, term.source]
         elif term.basis == "joint":
             result[e] = q[:, term.source]
@@ -137,6 +141,14 @@ def evaluate(deflection: Deflection, q: np.ndarray, torque: np.ndarray | None = 
             term = deflection.terms[e]
             result[e] = np.einsum("mi,mi->m", across[place[term.element]], links[term.source, :, :3, term.order])
     return result
+
+
+def _reference_torques(deflection: Deflection, q: np.ndarray) -> np.ndarray:
+    """Return the gravity torques (m, n) [N m] of the deflection's reference chain at q (m, n)."""
+    chain = deflection.reference
+    if chain is None or chain.inertias is None:
+        raise CalibError("a compliance needs gravity torques: state the robot's masses, or have them fitted")
+    return gravity_torques(chain, q)
 
 
 def extra_displacements(
@@ -245,10 +257,11 @@ class CalibratedChain:
 
         Args:
             q: joint values, those of one pose (n,) as well.
-            torque: (m, n) gravity torques [N m]; only corrections by compliance need them.
+            torque: (m, n) gravity torques [N m] for corrections by compliance; None: those of the masses that the fit
+                used.
 
         Raises:
-            CalibError: for a shape that does not fit, and for compliances without `torque`.
+            CalibError: for a shape that does not fit, and for compliances of a robot without masses.
         """
         values = shaped(np.atleast_2d(np.asarray(q, dtype=float)), (None, self.chain.n), "q")
         bases = evaluate(self.deflection, values, torque) if self.deflection.terms else None

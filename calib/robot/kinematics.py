@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calib.errors import refuse_robot
 from calib.records import shaped
 from calib.robot.chain import AXES, Chain, Element
 from calib.transforms import pose
@@ -203,6 +204,37 @@ def joint_frames(chain: Chain, q: np.ndarray) -> np.ndarray:
     """Return the frames (n, m, 4, 4) right after each joint's moving element, as used by `Chain.inertias`."""
     frames = moving_frames(chain, q)
     return frames if np.array_equal(chain.driven, chain.moving) else frames[np.searchsorted(chain.driven, chain.moving)]
+
+
+def gravity_torques(chain: Chain, q: np.ndarray) -> np.ndarray:
+    """Return the torques (m, n) [N m or N] that hold an arm of known masses still against gravity, g(q) = ∂U/∂q.
+
+    With m_j and s_j the mass and the first moment of all bodies from joint j on, o_j its origin and z_j its axis:
+    -g · (z_j × (s_j - m_j o_j)) where it turns, -g · z_j m_j where it slides.
+
+    Args:
+        chain: with `inertias`; without mimic joints.
+        q: (m, n) [rad or m].
+
+    Raises:
+        RobotError: where the masses are unknown, or one joint moves several elements.
+    """
+    if len(chain.driven) != chain.n:
+        refuse_robot(f"robot '{chain.name}'", "gravity torques of mimic joints are not implemented")
+    if chain.inertias is None:
+        refuse_robot(f"robot '{chain.name}'", "has no masses; add 'inertia' to its joints")
+    joints = [chain.elements[k].joint for k in chain.driven]
+    turning = np.array([chain.elements[k].axis[0] == "r" for k in chain.driven])
+    masses, moments = chain.inertias[joints, 9], chain.inertias[joints, 6:9]
+    frames, walked = moving_frames(chain, q), sweep(chain, q)
+    axes, origins = walked.directions[chain.driven], walked.origins[chain.driven]
+    # first moments (n, 3, m) of each body about the base, then those of all bodies from each joint on
+    moment = np.einsum("jmik,jk->jim", frames[..., :3, :3], moments)
+    moment += masses[:, None, None] * frames[..., :3, 3].swapaxes(1, 2)
+    carried_moment = np.cumsum(moment[::-1], axis=0)[::-1]
+    carried_mass = np.cumsum(masses[::-1])[::-1][:, None, None]
+    swept = np.where(turning[:, None, None], _cross(axes, carried_moment - carried_mass * origins), carried_mass * axes)
+    return -np.einsum("i,jim->mj", chain.gravity, swept) @ chain.rates
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

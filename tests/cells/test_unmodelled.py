@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.dynamics.rigid_body import gravity_torques
 from calib.geometry.model_choice.ladder import EFFECTS
 from calib.robot.calibrated import Deflection, evaluate
 from calib.robot.chain import random_joints
+from calib.robot.kinematics import gravity_torques
 from calib.rooms.cells.cell import true_poses
 from calib.rooms.cells.unmodelled import PositionErrors, TorqueErrors, displacements, gear_torques, memory
 from calib.rooms.cells.virtual_cells import lwr4plus_cell, virtual_cell

@@ -10,7 +10,6 @@ from without_figures import run
 
 import calib
 from calib.data.poses.measurements import Poses
-from calib.dynamics.rigid_body import gravity_torques
 from calib.errors import UsageError
 from calib.procedure.session.commands import new_session
 from calib.procedure.session.folder import MASSES, open_session, read_state
@@ -18,7 +17,7 @@ from calib.records import read_json
 from calib.robot import calibrated, description
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
-from calib.robot.kinematics import forward
+from calib.robot.kinematics import forward, gravity_torques
 from calib.rooms.deflections.masses import ROUNDS, identified_masses, largest_move
 from calib.transforms import pose, to_quaternion
 

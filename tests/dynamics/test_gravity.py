@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from calib.dynamics.rigid_body import gravity_torques
 from calib.errors import RobotError
 from calib.robot.chain import random_joints
 from calib.robot.formats import urdf
+from calib.robot.kinematics import gravity_torques
 from calib.robot.library import load
 
 ARM = """<robot name="arm"><link name="base"/>{links}

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from differences import check
 
-from calib.dynamics.rigid_body import gravity_torques
 from calib.geometry import inverse
 from calib.geometry.inverse import Goal
+from calib.robot.kinematics import gravity_torques
 from calib.robot.library import load
 from calib.rooms.cells.virtual_cells import lwr4plus_cell, perturbed_cell, rigid
 

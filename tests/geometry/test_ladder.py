@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from planted import cell, load, measure, perturb, random_joints
 
-from calib.dynamics.rigid_body import gravity_torques
 from calib.errors import UsageError
 from calib.geometry.first_guess import install
 from calib.geometry.installation import Installation, see
 from calib.geometry.model_choice.ladder import select_model
 from calib.robot.calibrated import Deflection, Term, evaluate
+from calib.robot.kinematics import gravity_torques
 
 SIGMA = 4e-5
 

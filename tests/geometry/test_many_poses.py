@@ -7,7 +7,6 @@ import pytest
 from planted import cell, load, measure, perturb
 
 from calib.data.poses.measurements import Poses
-from calib.dynamics.rigid_body import gravity_torques
 from calib.estimation import nonlinear
 from calib.estimation.relevance import gram
 from calib.geometry import fit as fitting
@@ -19,6 +18,7 @@ from calib.geometry.model_choice.ladder import EFFECTS, ModelSelection, select_m
 from calib.geometry.observation import layout, observe, pose_sigmas, prepare, rows_of
 from calib.geometry.weighing import Settings
 from calib.robot.calibrated import Deflection, Term
+from calib.robot.kinematics import gravity_torques
 
 
 def measured_arm(kind: str, loss: str):

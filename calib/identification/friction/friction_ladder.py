@@ -167,6 +167,7 @@ def select_friction(
             columns = [k for k in place[name] if k not in taken]
             found, new, at = bench.tried(taken, columns, error)
             note = "" if at else "no improvement on held-out time: not used"
+            note = note if columns else "no joint shows a need for such terms in its residual: none tried"
             shown = new if found else bench.errors([*taken, *columns])
             names = tuple(bench.term(k).name for k in found)
             steps.append(bench.trial(f"+ {name}", [*taken, *(found or columns)], shown, at, note, names))
@@ -208,6 +209,8 @@ class _Bench:
         self, taken: list[int], columns: list[int], error: np.ndarray
     ) -> tuple[list[int], np.ndarray, tuple[int, ...]]:
         """Return the columns that pass the test, the errors of the model with them, and their joints."""
+        if not columns:  # a step asked for by name that has no terms here
+            return [], error, ()
         joints = {k: _joints(self.term(k)) for k in columns}
         everyone, side = tuple(sorted(set(joints.values()))), self.term(columns[0]).side
         if self.forced:

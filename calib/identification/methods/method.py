@@ -226,7 +226,7 @@ class Method(ABC):
 
     def takes(self, rows: TorqueRows) -> bool:
         """Return whether it estimates from these torque rows; who simulates a motion needs the bodies in them."""
-        simulable = rows.has_bodies and rows is not POWER
+        simulable = rows.has_bodies and rows != POWER
         return rows.motors_alone or (self.takes_models and (simulable or not self.needs_simulation))
 
     def __str__(self) -> str:

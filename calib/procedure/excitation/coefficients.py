@@ -19,7 +19,8 @@ With ``family = "bspline"`` a joint has ``points``, control points of a periodic
 
 ``trajectory.csv`` is one period at that rate, ``run.csv`` the whole run with its approach: ``t [s]``, then of every
 joint ``q_joint1 [rad]``, ``v_joint1 [rad/s]``, ``a_joint1 [rad/s^2]`` (of sliding joints m) and, where the model
-predicts them, ``tau_joint1 [N m]``; ``motion.csv`` of `calib plan` likewise.
+predicts them, ``tau_joint1 [N m]``; ``motion.csv`` of `calib plan` likewise. ``arm.toml`` is the robot that it was
+made for, so that `calib view` can draw it.
 
 ``calib recall`` finds the motion in a log, cuts it to whole periods and averages them. It writes a recording of one
 period that `calib identify` reads. A NumPy archive holds besides, per sample and joint, the variance of one sample over
@@ -52,6 +53,7 @@ from trajectories.fourier import evaluate
 from trajectories.recall import Averaged, Recalled, average, find_periods
 
 NAME = "trajectory.toml"
+ARM = "arm.toml"  # the robot that the motion was made for
 SAMPLES, RUN, PLANNED = "trajectory.csv", "run.csv", "motion.csv"
 """Files of setpoints: one period at the controller's rate, the whole run if it is longer, and a planned motion."""
 

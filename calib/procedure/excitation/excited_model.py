@@ -15,7 +15,7 @@ from calib.dynamics.load_cases import LoadCases
 from calib.dynamics.regressor_model import Loads
 from calib.dynamics.shapes import V0
 from calib.dynamics.torque_rows import MOTOR, TorqueRows
-from calib.errors import UsageError, one_of, require
+from calib.errors import UsageError, one_of, refused_as, require
 from calib.folders import COVARIANCE, read_covariance
 from calib.identification.model_file import from_table, read_table, refuse_currents, refuse_other_arm
 from calib.identification.settings import IdentificationSettings, make_model
@@ -166,11 +166,11 @@ def _identified(chain: Chain, folder: Path, texts: Sequence[str], nominal: Chain
     refuse_currents(folder, "an excitation within torque limits")
     refuse_other_arm(folder, chain)
     table = read_table(folder)
-    try:
+    words = f"{folder}/dynamics.json does not fit robot '{chain.name}' ({{}}); identify again"
+    with refused_as(UsageError, (KeyError, TypeError, ValueError, IndexError), words):
         found = from_table(chain, table)
-        require(found.model.torque_rows.has_bodies, "rows 'drive' contain no information on the bodies", ValueError)
-    except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise UsageError(f"{folder}/dynamics.json does not fit robot '{chain.name}': {error!r}") from error
+    words = f"{folder}: rows 'drive' contain no information on the bodies; give an identification of motor torques"
+    require(found.model.torque_rows.has_bodies, words, UsageError)
     loads = loads_of(texts, table.get("payloads", ()), with_payloads=False)
     run = {label for carried in loads for label in carried or ()}
     values = dict(zip(found.model.names, found.values))

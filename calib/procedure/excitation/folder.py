@@ -20,6 +20,8 @@ from calib.procedure.excitation.limits import MotionBounds
 from calib.procedure.excitation.planning import Planned
 from calib.procedure.excitation.playback import Playback
 from calib.records import plain
+from calib.robot import description
+from calib.robot.chain import Chain
 from calib.robot.tables import dumps
 from calib.units import headings, motion_units
 from trajectories.design.verify import dense_motion
@@ -32,7 +34,17 @@ PLAN = (METRICS, coefficients.PLANNED, "trajectory.yaml", "trajectory.json")
 """Files that identify the folder of an earlier run."""
 REHEARSAL = "rehearsal.csv"
 FIGURES = tuple(f"plot_{name}.png" for name in ("motion", "path", "history", "front", "profile", "outlook"))
-ALL = (*DESIGN, *PLAN[1:], coefficients.RUN, prediction.NAME, "front.csv", "approach.csv", REHEARSAL, *FIGURES)
+ALL = (
+    *DESIGN,
+    *PLAN[1:],
+    coefficients.ARM,
+    coefficients.RUN,
+    prediction.NAME,
+    "front.csv",
+    "approach.csv",
+    REHEARSAL,
+    *FIGURES,
+)
 """Files of an earlier run that a new one replaces."""
 KINDS = ("position", "velocity", "acceleration", "torque")  # of limits, as `motion_units` has them
 MESSAGES = 100.0  # points per second of the ROS message, whose controllers interpolate (our choice)
@@ -68,6 +80,7 @@ def write_design(designed: Designed, out: Path, draw: Callable[[Designed, Path],
         files.write(folder / coefficients.NAME, dumps(coefficients.table(motion, chain.name, bounds.lines())))
         if played.approach is not None or played.repeat > 1:
             _write_setpoints(played.run, bounds, folder / coefficients.RUN)
+        _write_arm(chain, designed.inputs.source, folder)
         _write_besides(played, bounds, folder)
         _write_messages(played.run, bounds, folder, max(1, round(period.rate / MESSAGES)))
         if draw is not None:
@@ -92,6 +105,7 @@ def write_plan(planned: Planned, out: Path, draw: Callable[[Planned, Path], None
 
     def write(folder: Path) -> None:
         _write_setpoints(planned.track, planned.bounds, folder / coefficients.PLANNED)
+        _write_arm(planned.chain, planned.source, folder)
         _write_messages(planned.track, planned.bounds, folder)
         _write_besides(planned, planned.bounds, folder)
         if draw is not None:
@@ -99,6 +113,11 @@ def write_plan(planned: Planned, out: Path, draw: Callable[[Planned, Path], None
         files.write_json(folder / METRICS, plan_metrics(planned))
 
     return write_staged(out, ALL, write)
+
+
+def _write_arm(chain: Chain, source: str, folder: Path) -> None:
+    """Write the robot that a motion was made for, and which description it came from."""
+    description.write(folder / coefficients.ARM, chain, {"provenance": {"robot": source}})
 
 
 def _write_setpoints(track: Setpoints, bounds: MotionBounds, path: Path) -> Path:

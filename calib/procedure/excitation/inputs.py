@@ -67,6 +67,7 @@ class ExcitationInputs:
         columns: that the motion can identify.
         prior: motions that count already; None without any.
         geometry: its uncertainty, of a calibrated robot whose torques can be predicted; None elsewhere.
+        source: the robot's description, as named by the user; empty if unknown.
     """
 
     chain: Chain
@@ -76,6 +77,7 @@ class ExcitationInputs:
     columns: IdentifiableColumns
     prior: PriorMotions | None
     geometry: GeometrySpread | None = None
+    source: str = ""
 
     @property
     def errors_known(self) -> bool:
@@ -127,7 +129,7 @@ def read_inputs(
     spread = next(iter(spreads), None)
     prior = read_prior(settings.existing, dynamics, chain, after, noise, spread)
     columns = selected_columns(identifiable(dynamics, chain, locked, prior, noise), dynamics, settings, model)
-    return ExcitationInputs(chain, known, dynamics, locked, columns, prior, spread)
+    return ExcitationInputs(chain, known, dynamics, locked, columns, prior, spread, found.source or str(source))
 
 
 def _read_locked(texts: Sequence[str], chain: Chain, limits: BoxLimit) -> dict[int, float | None]:

@@ -24,6 +24,7 @@ from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.drives import standard
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.path_dynamics import PathDynamics, of_standard
+from calib.dynamics.torque_rows import MOTOR
 from calib.errors import RobotError, UsageError, refused_as, require
 from calib.geometry import inverse
 from calib.geometry.installation import Installation
@@ -149,6 +150,7 @@ class Planned:
         sigma: (n,) largest standard deviation of each predicted torque; `limits.torque` leaves as many of them free as
             the limits file says (default 2); None where the model states none.
         notes: what a user should know.
+        source: the robot's description, as named by the user; empty if unknown.
     """
 
     chain: Chain
@@ -165,6 +167,7 @@ class Planned:
     approach: Setpoints | None = None
     rehearsal: Setpoints | None = None
     sigma: np.ndarray | None = None
+    source: str = ""
 
     @property
     def active_share(self) -> float:
@@ -238,6 +241,7 @@ def plan(
     return Planned(
         chain, known.bounds, bounds, lower, upper, timings, motion, (*known.notes, *notes, *remarks), margins,
         deviation, shaped, lead, slowed(motion, settings.slower) if settings.slower != 1 else None, sigma,
+        found.source or str(source),
     )  # fmt: skip
 
 
@@ -290,6 +294,8 @@ def _identified(chain: Chain, folder: Path, payloads: Sequence[str]) -> tuple[Pa
     refuse_other_arm(folder, chain)
     dynamics = read_dynamics(folder)[1]
     model = dynamics.model
+    if model.torque_rows.projection is not None:  # of power, say: its parameters predict the motors' torques as well
+        model = replace(model, torque_rows=MOTOR)
     known = [label for label, coordinate in zip(model.bodies.labels, model.bodies.coordinates) if coordinate < 0]
     if unknown := sorted(set(payloads) - set(known)):
         raise UsageError(f"{folder}: no payload '{unknown[0]}' was identified; it has {', '.join(known) or 'none'}")

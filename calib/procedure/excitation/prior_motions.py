@@ -91,11 +91,18 @@ def _known(folder: Path, model: ExcitedModel, geometry: GeometrySpread | None) -
     Args:
         geometry: where it is given, its part is not in the information.
     """
-    density, path = IdentificationFolder(folder).metrics().error_density, folder / COVARIANCE
+    metrics, path = IdentificationFolder(folder).metrics(), folder / COVARIANCE
+    density, rows = metrics.error_density, metrics.rows
     path = path if geometry is None else folder / TORQUE_COVARIANCE
     covariance = covariance_of(path, model.exact)
-    if density is None or len(density) != model.exact.model.rows:
+    if density is None:
         raise UsageError(f"{folder}/metrics.json has no error_density of the torque rows; identify again")
+    if len(density) != model.exact.model.rows:
+        designed = model.exact.model.torque_rows.name
+        raise UsageError(
+            f"{folder} states torque errors of {', '.join(rows)}, and a motion is designed for rows = '{designed}': "
+            f"identify again with rows = '{designed}', or name the folder as --model, without --after"
+        )
     if covariance is None:
         raise UsageError(
             f"{path} is missing or lacks columns of the design; if the model has payloads, state each run's load "

@@ -13,7 +13,7 @@ import numpy as np
 from calib.dynamics import pseudo_inertia, rigid_body
 from calib.dynamics.bodies import Bodies, bodies_of
 from calib.dynamics.drives import DriveTerm
-from calib.errors import RobotError, finding
+from calib.errors import RobotError, finding, listing
 from calib.identification.model_file import MODEL, refuse_currents
 from calib.identification.possible.information import Information
 from calib.identification.possible.information import read as read_information
@@ -251,12 +251,25 @@ def _link_bodies(given: IdentifiedRobot, tree: UrdfTree, own: Chain) -> tuple[di
                 "in the URDF the remaining body is not physically consistent"
             )
         if not pseudo_inertia.margin(links[joint.child]) > 0.0:
-            raise RobotError(
-                f"{tree.where}: link '{joint.child}' is not physically consistent, since the attached links "
-                f"({', '.join(loose)}) are heavier than the identified mass: are the drive gains "
-                "right? Correct those masses, or omit --urdf to write all other files"
-            )
+            raise RobotError(_no_room(tree, joint.name, joint.child, whole[9], loose))
     return links, notes
+
+
+def _no_room(tree: UrdfTree, joint: str, link: str, mass: float, loose: Mapping[str, np.ndarray]) -> str:
+    """Return the message for a link whose identified inertia leaves no possible body beside what hangs on it.
+
+    Args:
+        mass: identified for all that the joint moves up to the arm's next joint [kg].
+        loose: links on joints that are not the arm's, by name.
+    """
+    hanging = sum(float(body[9]) for name in loose if (body := tree.bodies[name]) is not None)
+    return (
+        f"{tree.where}: {mass:.3g} kg were identified between {joint} and the arm's next joint, and the file hangs "
+        f"{hanging:.3g} kg on link '{link}' by joints that are not the arm's ({listing(loose, 3)}): no possible body "
+        "remains for the link. Either the motion does not identify that joint's mass (estimate.csv: its sigma), or the "
+        "drive gains or the masses of those links are wrong: correct these and identify again, or omit --urdf: then "
+        "robot.urdf is the arm alone"
+    )
 
 
 def _sum(tree: UrdfTree, placed: Mapping[str, np.ndarray]) -> np.ndarray:

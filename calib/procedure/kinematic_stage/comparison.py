@@ -123,7 +123,18 @@ class Comparison:
             parameters=parameters,
             interval95=None if self.intervals is None else self.intervals.record,
             reprojection_px=dict(zip(ARMS, self.reprojection or ())),
+            position_means=_position_means(self.blocks),
         )
+
+
+MEASURED = {"sockets": "socket scatter", "plane": "plane distance"}
+"""Kind of a block → what its position errors are, where it measures no position."""
+
+
+def _position_means(blocks: Sequence[PoseMeasurements]) -> str:
+    """Return what the position errors of blocks are, in words."""
+    kinds = dict.fromkeys(block.kind for block in blocks if block.kind not in ("distance", "bar"))
+    return " or ".join(dict.fromkeys(MEASURED.get(kind, "position") for kind in kinds)) or "position"
 
 
 def compare(

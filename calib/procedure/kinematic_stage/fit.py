@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import TypeVar
 
 from calib.data.poses.fit_options import FitOptions
@@ -72,6 +72,19 @@ class Outcome:
             bent = replace(found.deflection, reference=reference)
             found = replace(found, corrections=replace(found.corrections, deflection=bent))
         return replace(found, source=str(self.inputs.source))
+
+    @cached_property
+    def nominal_cell(self) -> Installation:
+        """The arm before any calibration, base and tool placed where it fits the rows best.
+
+        A fit of an earlier fit's robot compares with that robot; its nominal arm is placed anew.
+        """
+        compared, nominal = self.selection.nominal.cell, self.inputs.nominal
+        if nominal is self.inputs.chain:
+            return compared
+        loss = self.settings.loss or self.options.loss
+        settings = Settings(self.findings.loss or loss, self.options.loss_scale)
+        return polish_frames(install(nominal, self.inputs.fit), self.inputs.fit, settings).cell
 
     @property
     def fit(self) -> Comparison:

@@ -204,8 +204,7 @@ def metrics(outcome: Outcome) -> FitMetrics:
 def _record(outcome: Outcome) -> dict[str, object]:
     """Return the provenance entries of robot.toml: files, model, seed, verdict and nominal frames."""
     inputs = outcome.inputs
-    again = inputs.earlier is not None and inputs.earlier.nominal is not None
-    frames = {} if again else installation.frame_tables(outcome.selection.nominal.cell)
+    frames = installation.frame_tables(outcome.nominal_cell)
     return {
         **{f"nominal_{kind}": table for kind, table in frames.items()},
         "files": [block.file for block in inputs.fit],

@@ -26,6 +26,7 @@ from calib.robot.description import remarks
 from calib.robot.formats import urdf
 from calib.robot.formats.urdf_tree import is_urdf, text
 from calib.robot.formats.urdf_tree import read as read_tree
+from calib.robot.kinematics import gravity_torques
 from calib.robot.library import load, resolve
 
 
@@ -271,8 +272,6 @@ def gravity_of(chain: Chain, q: np.ndarray) -> np.ndarray | None:
     """Return gravity torques (m, n) [N m] at joint values (m, n); None if the robot's masses are unknown."""
     if chain.inertias is None or len(chain.driven) != chain.n:
         return None
-    from calib.dynamics.rigid_body import gravity_torques
-
     return gravity_torques(chain, q)
 
 

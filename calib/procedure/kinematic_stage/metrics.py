@@ -42,6 +42,8 @@ class ComparedRows:
         parameters: how many were fitted, on the fit's own rows.
         interval95: how the errors that the fit stated held here.
         reprojection_px: arm -> rms distance of seen from predicted corners.
+        position_means: what the errors ``position_mm`` are: ``position`` where positions were measured, else what
+            sockets and planes show of them (`calib.geometry.accuracy`).
     """
 
     poses: int
@@ -56,6 +58,11 @@ class ComparedRows:
     interval95: IntervalCoverage | None = None
     reprojection_px: Mapping[str, float] = field(default_factory=dict)
     plain: ArmErrors | None = None
+    position_means: str = "position"
+
+    def words(self, nature: str) -> str:
+        """Return the name of an error (position, orientation, distance) by what was measured."""
+        return self.position_means if nature == "position" else nature
 
     def judged(self, deliverable: str) -> ArmErrors:
         """Return the errors of the deliverable (robot file) on which the verdict is based."""

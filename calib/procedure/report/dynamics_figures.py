@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.dynamics.shapes import Joined
+from calib.dynamics.torque_rows import MOTOR
 from calib.estimation.whiteness import Whiteness
 from calib.procedure.dynamic_stage.geometry_tables import GEOMETRIES, MIN_SHIFT, GeometricEffect, TwoGeometries
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
@@ -60,17 +61,23 @@ def recorded(curves: TorqueCurves, report: UnseenReport) -> Captioned:
 def friction(outcome: IdentificationOutcome) -> dict[str, Chart]:
     """Return the chart of friction over velocity, by its name; of mechanisms none.
 
-    It shows the model, and the torques of the first file minus the rigid-body model.
+    It shows the model, and the torques of the first file minus the rigid-body model; the model alone where a row is not
+    of one joint (power).
     """
     if isinstance(outcome.inputs.robot, Mechanism):
         return {}
     found, case = outcome.found, outcome.inputs.cases[0]
     model = found.dynamics.model
     terms = list(zip(model.columns, found.dynamics.values[model.inertial :]))
-    joints, rows = outcome.inputs.chain.joints, case.target.shape[1]
-    units = outcome.inputs.row_units[rows - len(joints) :]
+    joints, torque_rows = outcome.inputs.chain.joints, case.torque_rows
+    by_joint = torque_rows.projection is None
+    if by_joint:
+        units = outcome.inputs.row_units[-len(joints) :]
+        observed = np.array(case.target - outcome.predictions[case.name])[:, -len(joints) :]
+    else:
+        units = MOTOR.units([joint.kind == "prismatic" for joint in joints])
+        observed = np.zeros((len(case.target), len(joints)))
     v = np.asarray(case.motion.v)
-    observed = np.array(case.target - outcome.predictions[case.name])[:, rows - len(joints) :]
     columns, step = min(len(joints), 4), max(1, len(v) // 1400)
     panels = []
     for j, joint in enumerate(joints):
@@ -84,7 +91,8 @@ def friction(outcome: IdentificationOutcome) -> dict[str, Chart]:
         cloud = line(v[::step, j], observed[::step, j], ".", BEFORE, size=1.5, label="model + residual")
         words = f"friction [{units[j]}]" if j % columns == 0 or units[j] != units[j - 1] else ""
         speed = f"velocity [{'m/s' if joint.kind == 'prismatic' else 'rad/s'}]"
-        panels.append(Panel([cloud, line(grid, curve, width=1.2, label="model")], joint.name, speed, words))
+        model_line = line(grid, curve, width=1.2, label="model")
+        panels.append(Panel([cloud, model_line] if by_joint else [model_line], joint.name, speed, words))
     title = f"friction over velocity on {case.name}"
     return {"friction": Chart(panels, 0.5 + 1.55 * -(-len(joints) // columns), columns, title=title)}
 

@@ -259,7 +259,8 @@ def captioned(report: Report) -> dict[str, Captioned]:
         if nature in proof.calibrated:
             sizes = [np.array(arm[nature]) for arm in (proof.nominal, proof.calibrated)]
             chart = error_histogram(sizes[0], sizes[1], nature, report.noise.get(nature))
-            result[nature] = chart, f"{nature.capitalize()} errors before and after, {label}; dashed: rms."
+            named = report.metrics.fit.words(nature).capitalize()
+            result[nature] = chart, f"{named} errors before and after, {label}; dashed: rms."
     rungs = [rung for rung in report.metrics.ladder if rung.cross_validated_mm is not None]
     if len(rungs) > 1:
         chart = ladder(rungs, report.noise.get("position"))
@@ -275,7 +276,8 @@ def captioned(report: Report) -> dict[str, Captioned]:
         result["joints"] = chart, f"Errors against each joint, {label}: a trend shows an unmodelled effect."
         chart = error_map(np.array(proof.points), after, expected=np.array(proof.expected))
         below = "; below: radius expected to contain 95 % of the errors." if proof.expected else "."
-        result["map"] = chart, f"Remaining position error over the workspace, {label}{below}"
+        named = report.metrics.fit.words(nature)
+        result["map"] = chart, f"Remaining {named} error over the workspace, {label}{below}"
     for count, seen in enumerate(report.images, 1):
         chart = image_coverage(seen.size, np.array(seen.count), np.array(seen.rms))
         words = f"Number of corners and reprojection error over the image ({seen.file})."

@@ -52,6 +52,10 @@ ISO_NOTE = (
     "too few to state an accuracy (makers use 100 or more): see the errors on unseen poses. "
     "Repeatability is the lower limit of what calibration can reach."
 )
+MEANS = {
+    "socket scatter": "Socket scatter: distance of a predicted point from the mean of its socket's points.",
+    "plane distance": "Plane distance: of a predicted point from the plane through the points of its group.",
+}
 ALONE_NOTE = (
     "A URDF cannot contain the joint corrections of the chosen model: robot.urdf is the best geometry without them "
     "(its errors are listed, too); robot_for_corrections.urdf with joint_corrections.csv describes the calibrated arm."
@@ -140,7 +144,7 @@ def _key_figures(report: Report) -> list[page.KeyFigure]:
         if arm == next(iter(arms)):
             kinds["largest"] = before.max, after.max, "", basis, "", ""
         for kind, (one, two, *rest) in kinds.items():
-            what = f"{label}, {kind}" + (f" ({words})" if words else "")
+            what = f"{proof.words(label)}, {kind}" + (f" ({words})" if words else "")
             result.append(page.KeyFigure(what, _size(one, unit), _size(two, unit), *rest))
     return result
 
@@ -160,7 +164,7 @@ def _left_out(metrics: FitMetrics) -> page.KeyFigure | None:
     if found is None or found.cross_validated is None or nominal is None or len(metrics.ladder) < 2:
         return None
     before = nominal.rms if found.nominal_cross_validated is None else 1e3 * found.nominal_cross_validated
-    label = "position" if metrics.fit.nominal.position_mm else "distance"
+    label = metrics.fit.words("position" if metrics.fit.nominal.position_mm else "distance")
     allowed = f"{metrics.tolerance_mm:g} mm" if metrics.tolerance_mm else "none"
     alone = metrics.fit.judged(metrics.deliverable) is metrics.fit.urdf_alone
     after = 1e3 * ((alone and found.rigid_cross_validated) or found.cross_validated)
@@ -186,10 +190,16 @@ def _sets(metrics: FitMetrics) -> list[tuple[str, ComparedRows]]:
     return [(f"fitted: {metrics.fit.poses} poses", metrics.fit), *unseen]
 
 
+def meanings(found: ComparedRows) -> list[str]:
+    """Return what the position errors of rows are, in sentences; none where positions were measured."""
+    return [sentence for name, sentence in MEANS.items() if name in found.position_means]
+
+
 def error_table(sets: Sequence[tuple[str, ComparedRows]], deliverable: str) -> page.Table:
     """Return the table of errors of all arms on sets of rows, with the one that is judged in bold."""
     notes = ["Distances of pairs do not depend on the placement of instrument and tool."]
     notes += [ALONE_NOTE] * any(found.urdf_alone for _, found in sets)
+    notes += dict.fromkeys(line for _, found in sets for line in meanings(found))
     header = ("error", "arm", "mean", "rms", "95 %", "max")
     groups = {label: list(_error_rows(found)) for label, found in sets}
     judged = lambda row: row[1:2] in (("calibrated",), (ARM[deliverable or "corrections"],))  # noqa: E731
@@ -200,7 +210,8 @@ def error_table(sets: Sequence[tuple[str, ComparedRows]], deliverable: str) -> p
 def _error_rows(found: ComparedRows) -> Iterator[tuple[str, ...]]:
     """Yield error, arm, and the arm's mean, rms, 95 % quantile and maximum, as text."""
     kinds: dict[str, Mapping[str, ErrorStatistics | None]] = {
-        f"{words} [{unit}]": {arm: _errors(found, arm, key) for arm in ARMS} for key, (words, unit) in KINDS.items()
+        f"{found.words(nature)} [{unit}]": {arm: _errors(found, arm, key) for arm in ARMS}
+        for key, (nature, unit) in KINDS.items()
     }
     names = ARMS | ({"calibrated": ARM["corrections"]} if found.urdf_alone else {})
     for words, arms in (*kinds.items(), ("distance of pairs [mm]", found.pair_distance_mm)):

@@ -178,10 +178,14 @@ def pinocchio_model(source: str, mjcf: bool = False) -> Any:
 
     pin: Any = pinocchio  # its names come from C++, where no type checker sees them
     words = f"Pinocchio cannot read the {'MJCF' if mjcf else 'URDF'}: {{}}"
-    with refused_as(RobotError, (ValueError, RuntimeError), words), tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "model.xml"
-        path.write_text(source, encoding="utf-8")
-        return pin.buildModelFromMJCF(str(path)) if mjcf else pin.buildModelFromXML(source)
+    with refused_as(RobotError, (ValueError, RuntimeError), words):
+        if not mjcf:
+            return pin.buildModelFromXML(source)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "model.xml"
+            with refused_as(RobotError, OSError, f"cannot write {path}: {{}}"):
+                path.write_text(source, encoding="utf-8")
+            return pin.buildModelFromMJCF(str(path))
 
 
 def link_poses(source: str, links: Sequence[str], base: str, joints: Sequence[str], q: np.ndarray) -> np.ndarray:

@@ -24,11 +24,11 @@ from calib.data.poses.measurements import Poses, Positions
 from calib.data.poses.pose_lists import read_poses
 from calib.data.recordings.recording import Recording
 from calib.data.schema import Joints
-from calib.dynamics.rigid_body import gravity_torques
 from calib.geometry.installation import Installation, see
 from calib.records import shaped
 from calib.robot.calibrated import evaluate
 from calib.robot.chain import Chain, joint_kinds
+from calib.robot.kinematics import gravity_torques
 from calib.rooms.cells.unmodelled import PositionErrors, displacements, drooping
 from calib.transforms import invert, pose
 

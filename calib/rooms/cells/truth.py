@@ -9,13 +9,14 @@ from calib.data.poses.measurements import Poses
 from calib.dynamics import base as bases
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
-from calib.dynamics.rigid_body import gravity_torques, inverse_dynamics
+from calib.dynamics.rigid_body import inverse_dynamics
 from calib.folders import EstimateRow
 from calib.geometry.accuracy import errors
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation
 from calib.robot.chain import Chain, random_joints
+from calib.robot.kinematics import gravity_torques
 from calib.rooms.cells.cell import Cell, true_poses
 from calib.rooms.cells.known_robots import random_fourier
 from calib.rooms.cells.unmodelled import WARM_TIME

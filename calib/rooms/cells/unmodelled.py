@@ -23,8 +23,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.dynamics.rigid_body import gravity_torques
 from calib.robot.chain import Chain, random_joints
+from calib.robot.kinematics import gravity_torques
 
 WARM_POSES, WARM_TIME = 30.0, 120.0  # i_0 [poses], t_0 [s]
 WIDTHS = (2e-3, 8e-3, 30e-3)  # s_k [rad or m]

@@ -10,7 +10,7 @@ from calib.procedure.kinematic_stage.comparison import iso9283_sentence
 from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics
 from calib.procedure.kinematic_stage.validation import ARM
 from calib.procedure.report.fit_report import Report, RowErrors
-from calib.procedure.report.geometry_section import deciding, error_table, iso9283_tables, report_section
+from calib.procedure.report.geometry_section import deciding, error_table, iso9283_tables, meanings, report_section
 from calib.procedure.report.page import Block, Picture, Pictures, Text
 from calib.rooms.certificate.record import Stage
 from calib.units import ERRORS, JOINT
@@ -37,7 +37,7 @@ def _blocks(report: Report, plots: bool) -> Iterator[Block]:
     proof, own = deciding(report)
     where = "held-out poses" if report.metrics.proofs else "fitted poses: none were held out"
     label = f"{proof.poses} {where}" + (f" ({own.name})" if own is not None and report.metrics.proofs else "")
-    yield replace(error_table([(label, proof)], report.metrics.deliverable), note="")
+    yield replace(error_table([(label, proof)], report.metrics.deliverable), note=" ".join(meanings(proof)))
     if own is not None and own.nominal:
         yield Pictures("Before and after", list(_figures(report, own, label)) if plots else [])
         yield Text("Worst pose", list(_worst(report, own)))
@@ -76,7 +76,8 @@ def _figures(report: Report, own: RowErrors, label: str) -> Iterator[Picture]:
     for nature in left:
         before, after = np.array(own.nominal[nature]), np.array(left[nature])
         chart = error_histogram(before, after, nature, report.noise.get(nature))
-        words = f"{nature.capitalize()} errors, {label}; lines: rms, and the instrument's own error where it is stated."
+        named = report.metrics.fit.words(nature).capitalize()
+        words = f"{named} errors, {label}; lines: rms, and the instrument's own error where it is stated."
         yield vector(replace(chart, height=2.0), words)
     if own.points and own.rows:
         nature = next(iter(left))
@@ -87,7 +88,8 @@ def _figures(report: Report, own: RowErrors, label: str) -> Iterator[Picture]:
             replace(panel, layers=[*panel.layers, text("worst", worst[0], worst[j], colour=MARK)])
             for j, panel in zip((1, 2), chart.panels)
         ]
-        yield vector(replace(chart, panels=panels, height=2.4), f"Position errors that remain, {label}.")
+        named = report.metrics.fit.words(nature).capitalize()
+        yield vector(replace(chart, panels=panels, height=2.4), f"{named} errors that remain, {label}.")
 
 
 def _worst(report: Report, own: RowErrors) -> Iterator[str]:

@@ -224,7 +224,7 @@ def identify_instrumental(
     """
     one_of(method, ROUNDS, "method", UsageError)
     rows = model.torque_rows
-    if not rows.has_bodies or rows is POWER or not cases:
+    if not rows.has_bodies or rows == POWER or not cases:
         raise UsageError(
             "instruments from simulation need a recording with its reference, and rows motor, link or both (of a "
             f"parallel robot motor or platform); found '{rows.name}'"

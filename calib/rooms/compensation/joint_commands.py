@@ -19,7 +19,6 @@ calibrated robot for ``base``; for the other two with its own best placement of 
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -76,15 +75,6 @@ class Fitted:
     def placed(self) -> bool:
         """Whether the fit contains the placement of the nominal robot."""
         return bool(len(self.nominal.stations)) and set(self.cell.station_names) <= set(self.nominal.station_names)
-
-    @property
-    def torques(self) -> Callable[[np.ndarray], np.ndarray] | None:
-        """Gravity torques, as used in the fit; None without deflection terms."""
-        if not any(term.basis == "torque" for term in self.cell.deflection.terms):
-            return None
-        from calib.dynamics.rigid_body import gravity_torques
-
-        return partial(gravity_torques, self.cell.deflection.reference or self.nominal.chain)
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,8 +172,8 @@ def _station(fitted: Fitted, frame: str) -> int:
         raise UsageError(f"frame {frame}: expected base, nominal, or a station of the fit ({', '.join(names)})")
     if not fitted.placed:
         raise UsageError(
-            f"{fitted.folder} does not state the nominal robot's placement (it was fitted from an earlier fit's "
-            "folder, by an earlier version, or without an instrument); use frame 'base'"
+            f"{fitted.folder} does not state the nominal robot's placement (it was fitted by an earlier version, or "
+            "without an instrument): use frame 'base', or fit again"
         )
     return 0 if frame == "nominal" else names.index(frame)
 
@@ -241,7 +231,7 @@ def computed(
     one, two = placements(fitted, frame, tool)
     count, note = _dof(targets, one.chain, dof)
     lower, upper = one.chain.lower, one.chain.upper
-    before, after = Goal(one, count, lower, upper), Goal(two, count, lower, upper, fitted.torques)
+    before, after = Goal(one, count, lower, upper), Goal(two, count, lower, upper)
     if start is not None and not _inside(before, np.asarray(start)):
         raise UsageError(f"start {list(start)}: outside the joints' limits {lower.tolist()} to {upper.tolist()}")
     say("the nominal robot at the targets")

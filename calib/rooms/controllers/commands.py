@@ -28,7 +28,7 @@ def program(
     Example: calib program poses.csv --for krl
 
     Args:
-        poses: CSV of poses to drive, a designed motion (UR, KUKA RSI, ABB EGM), or a program of poses
+        poses: CSV of poses to drive, a motion or its folder (UR, KUKA RSI, ABB EGM), or a program of poses
         controller: the robot's controller; csv: the poses as a table; --list shows all
         source: the controller of a program that is read, if its suffix does not say it
         out: file of the program; by default beside the poses
@@ -36,6 +36,7 @@ def program(
     """
     from calib import files
     from calib.errors import UsageError, require
+    from calib.rooms.controllers.motion import motion_file
     from calib.rooms.controllers.program import program_files
     from calib.rooms.controllers.table import controllers
     from calib.rooms.controllers.targets import is_program, read_program
@@ -53,7 +54,9 @@ def program(
     known = ", ".join((*controllers(), CSV))
     require(poses is not None and controller, f"give a list of poses and its controller: --for {known}", UsageError)
     assert poses is not None
-    target = out or poses.with_suffix(".csv" if controller == CSV else "")
+    poses = motion_file(poses)
+    beside = poses.with_suffix(".csv") if controller == CSV else poses.with_name(poses.name.partition(".")[0])
+    target = out or beside
     texts = program_files(poses, target, controller, settings, source)
     if (source or is_program(poses)) and (words := read_program(poses, source).unread):
         say(words)

@@ -12,10 +12,26 @@ import numpy as np
 
 from calib.data.csv_table import read_header, read_table
 from calib.errors import UsageError, require
+from calib.procedure.excitation.coefficients import PLANNED, RUN, SAMPLES
 from calib.rooms.controllers.table import Controller
 from calib.rooms.controllers.targets import number
 
 PREFIX = "q_"
+
+
+def motion_file(path: Path) -> Path:
+    """Return the file to play of a motion's folder: the whole run if there is one; of a file, that file.
+
+    Raises:
+        UsageError: for a folder without a motion.
+    """
+    if not path.is_dir():
+        return path
+    names = (RUN, PLANNED, SAMPLES)
+    found = [path / name for name in names if (path / name).is_file()]
+    words = f"{path} is a folder without a motion ({', '.join(names)}); give a list of poses, or a program"
+    require(found, words, UsageError)
+    return found[0]
 
 
 def is_motion(path: Path) -> bool:

@@ -78,7 +78,8 @@ def program_files(
 
     Args:
         path: CSV of poses (``joint1 [deg]``) or of a motion (``t [s]``), or a program whose targets are joints.
-        out: its name, without the suffix, is the program's; the suffixes are the controller's.
+        out: its name, without the suffix, is the program's. A program of one file is written there as named; without a
+            suffix, and for programs of several files, the suffixes are the controller's.
         name: of a controller, or ``csv``: the poses as a table.
         settings: how it moves and waits.
         source: see `joints_in`.
@@ -102,8 +103,22 @@ def program_files(
         raise UsageError(f"--output: {controller.title} raises no output; the operator presses a key")
     values = stream_values(controller, q) if moving else {"poses": _poses(controller, q, settings)}
     values |= {"name": stem, "joints": names, "head": _head(controller, names, moving), **vars(settings)}
-    texts = controller.stream if moving else controller.files
-    return {out.with_name(place.format(name=stem)): _template(file).render(values) for file, place in texts.items()}
+    templates = controller.stream if moving else controller.files
+    paths = _targets(out, [place.format(name=stem) for place in templates.values()], controller)
+    return {path: _template(file).render(values) for path, file in zip(paths, templates)}
+
+
+def _targets(out: Path, names: list[str], controller: Controller) -> list[Path]:
+    """Return where the files of a program are written; `names` are the controller's for them."""
+    usual = [out.with_name(name) for name in names]
+    if not out.suffix:
+        return usual
+    if len(names) == 1:
+        return [out]
+    suffixes = [path.suffix for path in usual]
+    words = f"{out}: {controller.title} takes {', '.join(suffixes)}, written together; end the name in {suffixes[0]}"
+    require(out.suffix.lower() in suffixes, words, UsageError)
+    return usual
 
 
 def write_program(path: Path, out: Path, name: str) -> list[Path]:

@@ -39,7 +39,7 @@ SAMPLES = 10_000  # at the full rate; longer recordings are represented by piece
 def with_link_motion(robot: CalibratedChain, case: Case, settings: IdentificationSettings) -> Case:
     """Return a case with its links' motion (`Case.link`) by the robot's joint corrections; unchanged without any."""
     simulated = settings.loop is not None or method_named(settings.method).needs_simulation
-    rigid = simulated or not settings.deflections or settings.torque_rows is POWER
+    rigid = simulated or not settings.deflections or settings.torque_rows == POWER
     chain, terms = robot.complete, joint_terms(robot.complete, robot.deflection)
     if rigid or not terms.terms or len(chain.driven) != chain.n:
         return case

@@ -1,6 +1,5 @@
 """What a motion of a parallel robot is designed for: model, rows and columns, loads, an identification before it."""
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -13,7 +12,7 @@ from calib.dynamics.drives import DriveTerm
 from calib.dynamics.regressor_model import Loads
 from calib.dynamics.shapes import V0
 from calib.dynamics.torque_rows import MOTOR
-from calib.errors import RobotError, UsageError
+from calib.errors import RobotError, UsageError, refused_as
 from calib.folders import read_covariance
 from calib.identification.identify_options import IdentifySettings, options_of, read_options
 from calib.identification.model_file import MODEL, read_table, refuse_currents
@@ -96,8 +95,9 @@ def read_model(robot: ParallelMechanism, folder: Path | None, drives: str = "") 
         model = make_parallel_model(robot.known, (drives,), v0=0.05)
         return model, np.append(file_bodies(robot, model), np.zeros(len(model.terms)))
     path, tree = folder / MODEL, robot.known.robot
-    try:
-        table = json.loads(path.read_text(encoding="utf-8"))
+    table = read_table(folder)
+    unreadable = f"{path} contains no model of a parallel robot ({{}}); give a folder of calib identify"
+    with refused_as(RobotError, (ValueError, KeyError, TypeError, AttributeError), unreadable):
         known = {str(name): float(value) for name, value in table["values"].items()}
         texts = [" ".join(one for one in DRIVES if one + label in known) for label in tree.labels]
         passive = next((text for j, text in enumerate(texts) if j not in tree.actuated and text), "")
@@ -108,10 +108,6 @@ def read_model(robot: ParallelMechanism, folder: Path | None, drives: str = "") 
         model = replace(
             model, identical_legs=bool(table.get("identical_legs")), preload=tuple(map(float, table.get("preload", ())))
         )
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise RobotError(
-            f"{path} contains no model of a parallel robot ({error!r}); give a folder of calib identify"
-        ) from error
     if missing := [name for name in model.names[: model.inertial] if name not in known]:
         raise RobotError(f"{path} is of another robot: parameter {missing[0]} is missing")
     return model, np.array([known.get(name, 0.0) for name in model.names])

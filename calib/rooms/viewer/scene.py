@@ -4,9 +4,10 @@ A folder is that of a fit, an identification, an excitation, a planned motion, o
 All points are in the base of the arm that is drawn; its meshes are those of the URDF's ``<visual>`` elements.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
@@ -123,6 +124,28 @@ class Measured:
 
 
 @dataclass(frozen=True, eq=False)
+class ErrorSizes:
+    """Errors of m measured rows that have no place in the arm's base: their sizes alone.
+
+    Distances, bars, sockets, planes and images measure no position; validation rows with base and tool placement of
+    their own measure it in a frame that the fit's folder does not hold.
+
+    Attributes:
+        kind: ``position`` where the row's residual is one (in the instrument's frame, from a socket's mean point or
+            from a plane), else ``distance``.
+        q: (m, n) [rad or m].
+        nominal, calibrated: (m,) sizes of both arms' errors [m]; NaN where the fit states none.
+        unseen: (m,) whether the row was kept from the fit.
+    """
+
+    kind: str
+    q: np.ndarray
+    nominal: np.ndarray
+    calibrated: np.ndarray
+    unseen: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class Played:
     """A motion: times (N,) [s], joint values, and velocities where they are known (N, n)."""
 
@@ -158,6 +181,7 @@ class Scene:
         chain: the robot that is drawn; None where none is known.
         meshes: of its links.
         measured: poses with their errors.
+        sizes: errors of rows without a measured position in the arm's base.
         chosen: names and joint values of pose plans (m, n), in the order of choice.
         played: motions.
         torques: recordings.
@@ -168,6 +192,7 @@ class Scene:
     chain: Chain | Drawn | None = None
     meshes: tuple[Visual, ...] = ()
     measured: tuple[Measured, ...] = ()
+    sizes: tuple[ErrorSizes, ...] = ()
     chosen: tuple[tuple[str, np.ndarray], ...] = ()
     played: tuple[Played, ...] = ()
     torques: tuple[Torques, ...] = ()
@@ -199,7 +224,8 @@ def read(folder: str | Path, robot: str | None = None) -> Scene:
         folder.resolve().stem if one else folder.resolve().name,
         chain,
         tuple(meshes),
-        tuple(_joined(_measured(place, chain), ValidationFolder(folder / VALIDATED).errors) for place in fits),
+        _nonempty(_joined(_measured(place, chain), ValidationFolder(folder / VALIDATED).errors) for place in fits),
+        _nonempty(sizes for place in fits for sizes in _unplaced(place, chain)),
         tuple(
             (path.stem, read_poses(path, Joints(chain.joint_names, _kinds(chain))))
             for path in plans
@@ -217,11 +243,19 @@ def read(folder: str | Path, robot: str | None = None) -> Scene:
         tuple(notes),
     )
     words = f"{folder} has nothing to show: no residuals.csv, trajectory.csv, motion.csv or torques_1.csv"
-    require(scene.measured or scene.chosen or scene.played or scene.torques, words, UsageError)
+    shown = scene.measured or scene.sizes or scene.chosen or scene.played or scene.torques
+    require(shown, words, UsageError)
     if chain is None:
         words = "no robot is shown: the folder does not name one; give --robot"
         return replace(scene, notes=(*scene.notes, words))
     return scene
+
+
+_Rows = TypeVar("_Rows", Measured, ErrorSizes)
+
+
+def _nonempty(parts: Iterable[_Rows]) -> tuple[_Rows, ...]:
+    return tuple(part for part in parts if len(part.q))
 
 
 def _below(folder: Path, pattern: str) -> list[Path]:
@@ -235,8 +269,8 @@ def _arm(folder: Path, robot: str | None) -> tuple[Chain | Drawn | None, Path | 
         return stage.run(), None
     if robot is not None:
         return load(robot), resolve(robot)
-    for place in (folder, folder / IN_SESSION):
-        if (place / calibrated.ROBOT).is_file():
+    for place in (folder / calibrated.ROBOT, folder / IN_SESSION / calibrated.ROBOT, folder / coefficients.ARM):
+        if place.is_file():
             known = calibrated.read(place)
             return known.complete, Path(known.source) if known.source and Path(known.source).is_file() else None
     for place in sorted(folder.glob("1-robot/robot.*")):
@@ -270,8 +304,7 @@ def _measured(place: Path, chain: Chain | Drawn | None) -> Measured:
         return Measured(*chain.measured(place))
     after, before = installation.read_arms(place)
     table = read_table(FitFolder(place).residuals)
-    positions = ~np.isnan(table.numbers("dx", "length", gaps=True))
-    table = table.where(positions & np.isin(table.texts("station"), after.station_names))
+    table = table.where(_placed(table, after))
     q = np.column_stack([table.numbers(joint.name, "joint") for joint in after.chain.joints])
     miss, turned = _triples(table, "d", "length"), np.full((len(q), 3), np.nan)
     if "drx" in table:
@@ -287,6 +320,29 @@ def _measured(place: Path, chain: Chain | Drawn | None) -> Measured:
         drawn = before if station in before.station_names else replace(after, chain=before.chain)
         nominal[own] = _points(drawn, q[own], s, t) @ base[:3, :3].T + base[:3, 3]
     return Measured(q, seen, nominal, modelled, np.array(table.texts("set")) != "fit", turned)
+
+
+def _placed(table: Table, cell: Installation) -> np.ndarray:
+    """Return which rows (m,) of ``residuals.csv`` have a measured position that a station of the fit places."""
+    positions = ~np.isnan(table.numbers("dx", "length", gaps=True))
+    return positions & np.isin(table.texts("station"), cell.station_names)
+
+
+def _unplaced(place: Path, chain: Chain | Drawn | None) -> list[ErrorSizes]:
+    """Return the errors of the rows of ``residuals.csv`` that `_measured` leaves out, by their kind."""
+    if isinstance(chain, Drawn):
+        return []
+    cell = installation.read(place)
+    table = read_table(FitFolder(place).residuals)
+    left_out = table.where(~_placed(table, cell))
+    measured = ~np.isnan(left_out.numbers("dx", "length", gaps=True))
+    result = []
+    for kind, rows in (("position", measured), ("distance", ~measured)):
+        part = left_out.where(rows)
+        q = np.column_stack([part.numbers(joint.name, "joint") for joint in cell.chain.joints])
+        nominal, calibrated = (part.numbers(name, "length", gaps=True) for name in ("nominal size", "size"))
+        result.append(ErrorSizes(kind, q, nominal, calibrated, np.array(part.texts("set")) != "fit"))
+    return result
 
 
 def _triples(table: Table, head: str, dimension: str) -> np.ndarray:
@@ -327,16 +383,8 @@ def _joined(fitted: Measured, errors: Path) -> Measured:
 
 
 def _points(cell: Installation, q: np.ndarray, station: int, tool: int) -> np.ndarray:
-    """Return the tool's positions (m, 3) in the station's frame, by the arm without its deflections' torques."""
-    from calib.robot.calibrated import evaluate
-
-    terms = cell.deflection.terms
-    torque = None
-    if any(term.basis == "torque" for term in terms):
-        from calib.dynamics.rigid_body import gravity_torques
-
-        torque = gravity_torques(cell.chain, q)
-    return see(cell, q, station, tool, evaluate(cell.deflection, q, torque) if terms else None).point.T
+    """Return the tool's positions (m, 3) in the station's frame, deflections included."""
+    return see(cell, q, station, tool).point.T
 
 
 def _played(path: Path, folder: Path) -> Played:

@@ -7,7 +7,7 @@ one by one, motions, torques; poses last `EACH`, motions as long as they are. Po
 import os
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from calib.errors import CalibError, UsageError, command_line, refused_as
 from calib.robot.chain import Chain
 from calib.robot.kinematics import joint_frames
 from calib.rooms.viewer import scene as viewing
-from calib.rooms.viewer.scene import Drawn, Measured, Played, Scene, Torques
+from calib.rooms.viewer.scene import Drawn, ErrorSizes, Measured, Played, Scene, Torques
 from calib.transforms import to_quaternion
 
 ARM, BEFORE, AFTER, SEEN, LIMIT = (
@@ -103,6 +103,8 @@ def _send(recording: Any, scene: Scene) -> None:
             start = _chosen(recording, scene, scene.chain, name, q, start)
     for measured in scene.measured:
         start = _measured(recording, scene, measured, start)
+    for sizes in scene.sizes:
+        start = _sizes(recording, scene, sizes, start)
     for played in scene.played:
         start = _played(recording, scene, played, start)
     for torques in scene.torques:
@@ -123,12 +125,26 @@ def about(scene: Scene) -> str:
         scale = measured.arrow_scale(scene.chain) if scene.chain else 1.0
         words = "from the target's position by the arm's model to the measured one."
         lines.append(f"**Arrows are {scale:g} times as long as the errors**; {words}")
+    lines += [line for sizes in scene.sizes for line in _size_lines(sizes)]
     lines += [f"pose plan *{name}*: {len(q)} poses" for name, q in scene.chosen]
     lines += [f"motion *{one.name}*: {one.t[-1]:.1f} s" for one in scene.played]
     lines += [
         f"torques *{one.name}*: measured orange, predicted green, and residuals [N·m, N]" for one in scene.torques
     ]
     return "\n\n".join([*lines, *(f"note: {note}" for note in scene.notes)])
+
+
+def _size_lines(sizes: ErrorSizes) -> Iterator[str]:
+    """Yield what the text beside the plots says of rows without a measured position in the arm's base."""
+    for label, rows in (("fitted", ~sizes.unseen), ("unseen", sizes.unseen)):
+        if not rows.any():
+            continue
+        errors = [1e3 * size[rows & np.isfinite(size)] for size in (sizes.nominal, sizes.calibrated)]
+        rms = [f"{float(np.sqrt(np.mean(size**2))):.3f} mm" if len(size) else "not stated" for size in errors]
+        yield (
+            f"{int(rows.sum())} {label} rows without a position in the arm's base: {sizes.kind} errors, "
+            f"{rms[0]} rms nominal (orange), {rms[1]} calibrated (green)"
+        )
 
 
 def _poses(name: str, count: int, start: float, some: np.ndarray | None = None) -> list[Any]:
@@ -171,6 +187,22 @@ def _measured(recording: Any, scene: Scene, measured: Measured, start: float) ->
     recording.send_columns("world/pose", indexes=index, columns=here)
     _arm(recording, scene, index, measured.q)
     return start + EACH * len(measured.q) + GAP
+
+
+def _sizes(recording: Any, scene: Scene, sizes: ErrorSizes, start: float) -> float:
+    """Log the sizes of errors row by row, with the arm at each; return the start time of the next part [s]."""
+    place = "errors" if sizes.kind == "position" else f"errors/{sizes.kind}"
+    for name, size, colour in (("nominal", sizes.nominal, BEFORE), ("calibrated", sizes.calibrated, AFTER)):
+        known = np.flatnonzero(np.isfinite(size))
+        if len(known):
+            index = _poses("row", len(sizes.q), start, known)
+            _series(recording, f"{place}/{name}", index, 1e3 * size[known], f"{name} [mm]", colour)
+    index = _poses("row", len(sizes.q), start)
+    if sizes.unseen.any():
+        kept = np.where(sizes.unseen, 1.0, 0.0)
+        _series(recording, f"{place}/unseen", index, kept, "1: unseen, 0: fitted", SEEN)
+    _arm(recording, scene, index, sizes.q)
+    return start + EACH * len(sizes.q) + GAP
 
 
 def _chosen(recording: Any, scene: Scene, chain: Chain | Drawn, name: str, q: np.ndarray, start: float) -> float:
@@ -290,6 +322,8 @@ def _blueprint(scene: Scene) -> Any:
             sizes.append(rrb.TimeSeriesView(origin="turns", name="orientation error [mrad]"))
             sides.append(rrb.TimeSeriesView(origin="axes/orientation", name="residuals about each axis [mrad]"))
         tabs += [rrb.Vertical(*sizes, name="error of each pose"), rrb.Vertical(*sides, name="error by axis")]
+    elif scene.sizes:
+        tabs.append(rrb.TimeSeriesView(origin="errors", name="error of each row [mm]"))
     if scene.played:
         contents = [[f"+ /motion/{kind}/**", f"+ /limits/{kind}/**"] for kind in ("position", "velocity")]
         views = [

@@ -64,7 +64,12 @@ class ChangeTest:
 
     @property
     def probability(self) -> float:
-        """Of so large a χ², or of one parameter that explains so much of it, where nothing changed (Bonferroni)."""
+        """Of so large a χ², or of one parameter that explains so much of it, where nothing changed (Bonferroni).
+
+        1 where nothing was estimated that could have changed.
+        """
+        if self.freedom == 0:
+            return 1.0
         tried = [each.explained for each in self.parameters if each.explained]
         single = max(len(tried), 1) * chi2.sf(max(tried, default=0.0), 1)
         return min(2.0 * float(min(chi2.sf(self.chi2, self.freedom), single)), 1.0)
@@ -152,7 +157,8 @@ def tested(
             gain = np.linalg.lstsq(beyond.T @ covariances[place] @ beyond, beyond.T @ covariances[place])[0].T
             change = change - gain @ (beyond.T @ change)
             covariances[place] = covariances[place] - gain @ beyond.T @ covariances[place]
-    together, beyond = span(np.hstack(fitted)), np.hstack(extra)
+    nothing = np.zeros((len(change), 0))
+    together, beyond = span(np.hstack([nothing, *fitted])), np.hstack(extra)
     kept = span(together - beyond @ (beyond.T @ together))
     values, vectors = np.linalg.eigh(kept.T @ np.add(*covariances) @ kept)
     whiten = (vectors / np.sqrt(np.maximum(values, 1e-14 * values.max(initial=0.0)))).T @ kept.T

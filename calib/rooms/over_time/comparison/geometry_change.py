@@ -15,7 +15,6 @@ from calib.errors import UsageError, require
 from calib.geometry.installation import Installation, NoOptics, see
 from calib.geometry.model_choice.cross_validation import project_out
 from calib.geometry.observation import layout_counts, target_jacobian
-from calib.procedure.kinematic_stage.inputs import gravity_of
 from calib.robot.calibrated import evaluate
 from calib.robot.chain import random_joints
 from calib.rooms.over_time.comparison.calibrations import Calibration
@@ -114,8 +113,8 @@ class _Pair:
 
     def see(self, q: np.ndarray) -> _Seen:
         """Return the targets at joint values q (m, n) [rad or m]."""
-        cell, torque = self.cells[0], gravity_of(self.cells[0].deflection.reference or self.cells[0].chain, q)
-        bases = [evaluate(each.deflection, q, torque) if each.deflection.terms else None for each in self.cells]
+        cell = self.cells[0]
+        bases = [evaluate(each.deflection, q) if each.deflection.terms else None for each in self.cells]
         one, two = (see(each, q, 0, 0, base) for each, base in zip(self.cells, bases))
         turned = rotation_vector(two.poses()[:, :3, :3] @ np.swapaxes(one.poses()[:, :3, :3], 1, 2))
         change = np.concatenate([two.point - one.point, LEVER * turned.T]).reshape(1, -1)
@@ -134,6 +133,7 @@ def compare(before: Calibration, after: Calibration, settings: DiffSettings) -> 
     """
     pair, chain = _pair(before, after, settings), before.chain
     learnt = [each.learnt for each in (before, after) if each.learnt is not None]
+    require(learnt, f"{before.name}, {after.name}: no residuals.csv with fitted rows; fit again", UsageError)
     seen = pair.see(np.concatenate([each[:: max(1, -(-len(each) // MAX_POSES))] for each in learnt]))
     found, combinations = _tested(pair, seen)
     total, sizes = np.add(*pair.covariances), np.linalg.norm(combinations, axis=0)

@@ -61,6 +61,8 @@ class ToolPart(ChangePart):
             times = np.sqrt(max(wide.rms**2 - wide.expected**2, 0.0)) / self.tolerance
             result.append(finding("outgrown-elsewhere", times=times, moved=wide.rms, expected=wide.expected))
         beyond = moved.rms / max(left, 1e-12)
+        if not found.freedom:
+            result.append(finding("arm-not-tested", names=[one.name, two.name]))
         result.append(finding(
             "arm-changed", sigmas=found.sigmas, beyond=0.0 if self.tolerance else beyond,
             probability=found.probability, left=left if beyond <= 1.0 else None,
@@ -116,10 +118,10 @@ class ToolPart(ChangePart):
             FittedParameter(one.name, one.unit, one.before, one.after, one.sigma, None, "arm")
             for one in sorted(self.found.parameters, key=lambda one: arm[one.name]) if one.sigma
         ]  # fmt: skip
-        return {
-            "map": error_map(motion.points, motion.position, words="the tool moved by up to {}"),
-            "parameters": parameter_changes(rows, of="later - earlier"),
-        }
+        result = {"map": error_map(motion.points, motion.position, words="the tool moved by up to {}")}
+        if rows:
+            result["parameters"] = parameter_changes(rows, of="later - earlier")
+        return result
 
     def numbers(self) -> dict[str, Any]:
         motions = {
