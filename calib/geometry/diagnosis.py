@@ -6,6 +6,7 @@ either.
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
@@ -23,13 +24,14 @@ from calib.geometry.accuracy import errors
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation
-from calib.geometry.observation import Block, layout, observe, prepare
+from calib.geometry.observation import Block, layout, observe, positions, prepare
 from calib.geometry.residuals import Part
 from calib.geometry.weighing import GeometricFit, Settings
 from calib.records import evenly
 from calib.robot.chain import element_length
 from calib.robot.kinematics import forward
 
+MIN_LENGTH = 0.01  # [m]: shorter lengths, and growth that moves targets by less per unit, say nothing of a factor
 MIN_ROWS = 30  # rows below which no pattern is looked for (our choice)
 
 
@@ -136,6 +138,11 @@ class Scale:
 def scale_of(nominal: Installation, blocks: Sequence[PoseMeasurements]) -> Scale | None:
     """Return the instrument's scale factor and its sigma from measured positions; None without positions.
 
+    y - p = (s - 1) (p - mean p), with p the predicted positions, up to what placements explain.
+
+    None, too, where placements explain a growth of all lengths: it moves the targets by less than `MIN_LENGTH` per unit
+    (rms) otherwise.
+
     Args:
         nominal: the arm with base and tool placement fitted for it.
         blocks: of any kinds; those that measure positions count.
@@ -145,25 +152,25 @@ def scale_of(nominal: Installation, blocks: Sequence[PoseMeasurements]) -> Scale
         if not isinstance(block.measured, Positions):
             continue
         part = next(part for part in observe(nominal, block, frames) if part.label == "position")
-        seen = np.asarray(block.measured.position)[part.index]
+        # predicted, since the noise of measured positions is no combination of placements
+        predicted = positions(nominal, block)[:, part.index]
         rows.append(part.value.ravel())
-        away = (seen - seen.mean(axis=0)).T.ravel()
+        away = (predicted - predicted.mean(axis=1, keepdims=True)).ravel()
         columns.append(np.column_stack([part.jacobian.reshape(len(frames), -1).T, away]))
     if not rows:
         return None
     value, matrix = np.concatenate(rows), np.concatenate(columns)
     sizes = np.maximum(np.linalg.norm(matrix, axis=0), 1e-12)
-    matrix, size = matrix / sizes, float(sizes[-1])
-    others, last = matrix[:, :-1], matrix[:, -1]  # of y - p = (1 - 1/s) y the last column has s
-    left, own = (x - others @ np.linalg.lstsq(others, x, rcond=1e-9)[0] for x in (value, last))
-    power, count = float(own @ own), len(value) - matrix.shape[1]
-    if count < 1 or power < 1e-12:
+    placements, growth = matrix[:, :-1] / sizes[:-1], matrix[:, -1]
+    # what placements do not explain: of the residuals, and of a growth of all lengths
+    residual, lever = (x - placements @ np.linalg.lstsq(placements, x, rcond=1e-9)[0] for x in (value, growth))
+    power, count = float(lever @ lever), len(value) - matrix.shape[1]
+    if count < 1 or power < len(value) * MIN_LENGTH**2:
         return None
-    slope = float(own @ left) / power
-    squares = float(left @ left)
-    rest = max(squares - slope**2 * power, 0.0)
-    sigma = float(np.sqrt(rest / count / power)) / size
-    return Scale(1.0 / (1.0 - slope / size), sigma, 1.0 - rest / max(squares, 1e-300))
+    slope, squares = float(lever @ residual) / power, float(residual @ residual)
+    unexplained = max(squares - slope**2 * power, 0.0)
+    sigma = float(np.sqrt(unexplained / count / power))
+    return Scale(1.0 + slope, sigma, 1.0 - unexplained / max(squares, 1e-300))
 
 
 def length_factor(fit: GeometricFit) -> Scale | None:
@@ -179,8 +186,7 @@ def length_factor(fit: GeometricFit) -> Scale | None:
     total = own[split.kept] + split.coefficients @ own[split.dropped]  # with those that are merged into them
     place = {int(k): number for number, k in enumerate(fit.free)}
     used = [(place[int(k)], int(k), size) for k, size in zip(candidates[split.kept], total) if int(k) in place]
-    min_length = 0.01  # [m]: lengths below say nothing of a factor
-    used = [one for one in used if one[1] < arm and chain.elements[one[1]].axis[0] == "t" and abs(one[2]) > min_length]
+    used = [one for one in used if one[1] < arm and chain.elements[one[1]].axis[0] == "t" and abs(one[2]) > MIN_LENGTH]
     if len(used) < 2:
         return None
     index, elements, lengths = (np.array(each) for each in zip(*used))
@@ -204,7 +210,7 @@ def wrong_columns(nominal: Installation, blocks: Blocks, mirrored: bool = False)
     """Return the change of columns that reduces the nominal arm's error most; None if no change helps much.
 
     Args:
-        nominal: the arm as it was.
+        nominal: the arm as it was, placed.
         blocks: the rows.
         mirrored: whether an instrument with left-handed axes is tried, too.
     """
@@ -276,9 +282,11 @@ def _least(nominal: Installation, blocks: Blocks) -> np.ndarray:
 
 
 def _left(nominal: Installation, blocks: Blocks) -> np.ndarray:
-    """Return the mean squared error of the nominal arm [m²] after fitting base and tool placement."""
-    try:
-        placed = polish_frames(install(nominal.chain, blocks, nominal.known), blocks, SHORT).cell
-    except CalibError:
-        return np.array([np.inf])
-    return np.array([np.mean(errors(placed, blocks).main ** 2)])
+    """Return the mean squared error of the nominal arm [m²] after fitting base and tool placement.
+
+    A placement that was found worse than the one that `nominal` has does not count.
+    """
+    placed = [nominal]
+    with suppress(CalibError):
+        placed.append(polish_frames(install(nominal.chain, blocks, nominal.known), blocks, SHORT).cell)
+    return np.array([min(float(np.mean(errors(cell, blocks).main ** 2)) for cell in placed)])

@@ -133,17 +133,18 @@ def run(
         seed=seed,
         progress=lambda done, total, what: say(f"fitting: {what}"),
     )
-    found, long = climb(asked, settings=settings), inputs.chain.stretched_length()
+    found = climb(asked, settings=settings)
+    reach = found.nominal.cell.reach
     status = found.fit.solution.status
     if not status.good:
-        odd = plausibility.findings(found.nominal.cell, found.fit, inputs.fit, None, long)
+        odd = plausibility.findings(found.nominal.cell, found.fit, inputs.fit, None, reach)
         why = [sentence(one) for one in settle(odd, options.accept) if level_of(one) == "fail"]
         words = f"the fit of model '{found.chosen}' did not converge: {status.value}"
         raise NotConverged("; ".join([words, *why]), found.fit)
-    rigid_misfit = misfit(found, long)
+    rigid_misfit = misfit(found, reach)
     if rigid_misfit and settings.loss in HEEDS_ALL:
         robust = climb("geometry", settings=replace(settings, loss="cauchy"))
-        rigid_misfit = gross_rows(found, robust, long) or rigid_misfit
+        rigid_misfit = gross_rows(found, robust, reach) or rigid_misfit
     say("comparing on unseen poses")
     settings = replace(settings, loss=found.loss)
     rigid = found.rigid_fit(inputs.fit, settings)
@@ -179,9 +180,9 @@ def _found_of(
     inputs: Inputs, found: ModelSelection, named: Sequence[Outlier], notes: Sequence[Finding], accepted: Sequence[str]
 ) -> Findings:
     """Return the findings of a fit that do not depend on validation rows; `notes` are findings on its residuals."""
-    long = inputs.chain.stretched_length()
+    reach = found.nominal.cell.reach
     left = found.cross_validated
-    odd = plausibility.findings(found.nominal.cell, found.fit, inputs.fit, left, long)
+    odd = plausibility.findings(found.nominal.cell, found.fit, inputs.fit, left, reach)
     blind = [finding("transfer-by-regions", stations=found.folds.blind)] if found.folds.blind else []
     return Findings(
         model=found.chosen,
@@ -189,7 +190,7 @@ def _found_of(
         cross_validated=left,
         nominal_cross_validated=next((r.cross_validated for r in found.rungs if r.model == "frames"), None),
         outlier_share=len({(each.file, each.row) for each in named}) / sum(len(block) for block in inputs.fit),
-        reach=long,
+        reach=reach,
         noticed=settle([*odd, *notes, *blind], accepted),
         blind=found.folds.blind,
         rigid_cross_validated=found.rigid_cross_validated,
