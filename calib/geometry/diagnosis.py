@@ -21,6 +21,7 @@ from calib.data.poses.measurements import PoseMeasurements, Poses, Positions, ta
 from calib.data.poses.plausible import from_angles, to_angles
 from calib.errors import CalibError, Finding, finding
 from calib.geometry.accuracy import errors
+from calib.geometry.checks.wrong_rows import Blocks, least_error, row_shifts, two_targets
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation
@@ -29,18 +30,17 @@ from calib.geometry.residuals import Part
 from calib.geometry.weighing import GeometricFit, Settings
 from calib.records import evenly
 from calib.robot.chain import element_length
-from calib.robot.kinematics import forward
 
 MIN_LENGTH = 0.01  # [m]: shorter lengths, and growth that moves targets by less per unit, say nothing of a factor
 MIN_ROWS = 30  # rows below which no pattern is looked for (our choice)
 
 
-def diagnose(found: GeometricFit) -> list[Finding]:
-    """Return findings on each block: changes of set-up between rows, and systematic residuals."""
+def diagnose(found: GeometricFit, with_changes: bool = True) -> list[Finding]:
+    """Return findings on each block: systematic residuals, and `with_changes` rows that fit worse than the others."""
     result: list[Finding] = []
     for block, part in _lengths(found):
         if part.value.shape[1] >= MIN_ROWS:  # pairs of rows count once
-            result += [*_setup_change(block, part), *_systematic(block, part)]
+            result += [*(_setup_change(block, part) if with_changes else []), *_systematic(block, part)]
     return result
 
 
@@ -200,10 +200,11 @@ def length_factor(fit: GeometricFit) -> Scale | None:
 
 
 SHORT = Settings(limit=20, passes=1)  # where base and tool settle at all they do so sooner
+ROBUST = Settings(loss="cauchy", limit=40, passes=4)  # angles beyond a convention's range were lost
 # of the makers' angles; others are rare (our choice)
 CONVENTIONS = ("vector", "xyz fixed", "xyz moving", "zyx fixed", "zyx moving", "zyz moving", "zxz moving")
+SURELY = 1.0 / 3.0  # share of the error that may be left where no second change goes with it (our choice)
 FLIP = np.array([1.0, -1.0, 1.0])
-Blocks = Sequence[PoseMeasurements]
 
 
 def wrong_columns(nominal: Installation, blocks: Blocks, mirrored: bool = False) -> Explanation | None:
@@ -214,24 +215,68 @@ def wrong_columns(nominal: Installation, blocks: Blocks, mirrored: bool = False)
         blocks: the rows.
         mirrored: whether an instrument with left-handed axes is tried, too.
     """
-    n, max_rows = nominal.chain.n, 200  # rows of a block (our choice)
-    few = [take(block, evenly(len(block), max_rows)) for block in blocks]
-    surely = 1.0 / 3.0  # share of the error that may be left where no second change goes with it (our choice)
+    n = nominal.chain.n
     table = [Change("joint-sign", _of_joints(reversal(n, j)), (j,), max_left=0.8) for j in range(n)]
     table += [
-        Change("joint-coupled", _of_joints(coupling(n, j, k, way)), (j, k), {"way": "+" if way > 0 else "-"}, surely)
+        Change("joint-coupled", _of_joints(coupling(n, j, k, way)), (j, k), {"way": "+" if way > 0 else "-"}, SURELY)
         for j, k, way in couplings(n)
     ]
     pairs = combinations(range(n), 2)
-    table += [Change("joints-exchanged", _of_joints(exchange(n, *pair)), pair, max_left=surely) for pair in pairs]
+    table += [Change("joints-exchanged", _of_joints(exchange(n, *pair)), pair, max_left=SURELY) for pair in pairs]
     if mirrored and any(isinstance(block, Positions) for block in blocks):
-        table.append(Change("left-handed", _mirrored, max_left=surely))
-    if read_as := {block.euler for block in blocks if isinstance(block, Poses)} - {""}:
-        others = (euler for euler in CONVENTIONS if euler not in read_as)
-        table += [
-            Change("angle-convention", partial(_read_as, euler), (), {"convention": euler}, surely) for euler in others
-        ]
-    return best_changes(few, table, partial(_left, nominal), partial(_least, nominal), n)
+        table.append(Change("left-handed", _mirrored, max_left=SURELY))
+    turning = [j for j in range(n) if nominal.chain.joints[j].kind != "prismatic"]
+    quarters = [(j, angle) for j in turning for angle in (np.pi / 2.0, -np.pi / 2.0, np.pi)]
+    table += [Change("joint-zero", partial(_turned, j, angle), (j,), {"angle": angle}, SURELY) for j, angle in quarters]
+    few = _few(blocks)
+    table += row_shifts(nominal, blocks, SURELY) + two_targets(nominal, few, SURELY)
+    return best_changes(
+        blocks,
+        table,
+        lambda changed: _left(nominal, _few(changed)),
+        lambda changed: least_error(nominal, _few(changed)),
+        n,
+    )
+
+
+def wrong_angles(nominal: Installation, blocks: Blocks) -> Explanation | None:
+    """Return the convention of the orientations' angles that reduces the nominal arm's error most; None if none does.
+
+    Args:
+        nominal: the arm as it was, placed.
+        blocks: the rows.
+    """
+    few = [block for block in _few(blocks) if isinstance(block, Poses) and block.euler]
+    read_as = {block.euler for block in few}
+    others = [euler for euler in CONVENTIONS if read_as and euler not in read_as]
+    table = [
+        Change("angle-convention", partial(_read_as, euler), (), {"convention": euler}, SURELY) for euler in others
+    ]
+    return best_changes(few, table, partial(_turned_by, nominal)) if table else None
+
+
+def _turned_by(nominal: Installation, blocks: Blocks) -> np.ndarray:
+    """Return the median squared orientation error [rad²] (1,) with base and tool placement fitted.
+
+    Of most rows, since angles beyond the range of the stated convention were lost when they were read.
+    """
+    try:
+        placed = polish_frames(install(nominal.chain, blocks, nominal.known), blocks, ROBUST).cell
+    except CalibError:
+        return np.array([np.inf])
+    angle = errors(placed, blocks).orientation
+    return np.array([np.inf if angle is None else float(np.median(angle**2))])
+
+
+def _few(blocks: Blocks, max_rows: int = 200) -> Blocks:
+    """Return at most `max_rows` rows of each block."""
+    return [take(block, evenly(len(block), max_rows)) for block in blocks]
+
+
+def _turned(joint: int, angle: float, blocks: Blocks) -> Blocks:
+    """Return blocks whose zero of a joint is another one."""
+    by = angle * np.eye(blocks[0].q.shape[1])[joint]
+    return [replace(block, q=block.q + by) for block in blocks]
 
 
 def _of_joints(matrix: np.ndarray) -> Callable[[Blocks], Blocks]:
@@ -261,32 +306,15 @@ def _read_as(euler: str, blocks: Blocks) -> Blocks:
     return found
 
 
-def _least(nominal: Installation, blocks: Blocks) -> np.ndarray:
-    """Return the least mean squared error [m²] that any base and tool placement can reach; 0 if not known.
-
-    Positions y = B (R p + t) + b, with R, t the tip's by the joints and B, b, p the placements, are linear in B ⊗ p, B
-    and b: 13 numbers per axis of y, free of each other and of other axes here.
-    """
-    squares, count = 0.0, 0
-    for block in blocks:
-        if nominal.known.terms or not isinstance(block, Positions):
-            return np.zeros(1)
-        tip = forward(nominal.chain, block.q)
-        columns = np.column_stack([tip[:, :3, :3].reshape(-1, 9), tip[:, :3, 3], np.ones(len(tip))])
-        for tool in np.unique(block.tool):
-            rows = block.tool == tool
-            W, y = columns[rows], block.position[rows]
-            squares += float(((y - W @ np.linalg.lstsq(W, y)[0]) ** 2).sum())
-        count += len(block)
-    return np.array([squares / count])
-
-
 def _left(nominal: Installation, blocks: Blocks) -> np.ndarray:
     """Return the mean squared error of the nominal arm [m²] after fitting base and tool placement.
 
     A placement that was found worse than the one that `nominal` has does not count.
     """
-    placed = [nominal]
+    squares = [np.inf]
+    with suppress(CalibError):  # a second target has no placement yet
+        squares.append(float(np.mean(errors(nominal, blocks).main ** 2)))
     with suppress(CalibError):
-        placed.append(polish_frames(install(nominal.chain, blocks, nominal.known), blocks, SHORT).cell)
-    return np.array([min(float(np.mean(errors(cell, blocks).main ** 2)) for cell in placed)])
+        placed = polish_frames(install(nominal.chain, blocks, nominal.known), blocks, ROBUST).cell
+        squares.append(float(np.mean(errors(placed, blocks).main ** 2)))
+    return np.array([min(squares)])

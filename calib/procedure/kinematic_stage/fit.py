@@ -10,6 +10,7 @@ from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import Finding, NotConverged, finding
 from calib.extensions import offered
 from calib.geometry.accuracy import errors
+from calib.geometry.checks.row_changes import row_changes
 from calib.geometry.diagnosis import diagnose
 from calib.geometry.error_model import ErrorModel, learn_errors
 from calib.geometry.first_guess import install
@@ -141,7 +142,9 @@ def run(
         why = [sentence(one) for one in settle(odd, options.accept) if level_of(one) == "fail"]
         words = f"the fit of model '{found.chosen}' did not converge: {status.value}"
         raise NotConverged("; ".join([words, *why]), found.fit)
-    rigid_misfit = misfit(found, reach)
+    changed = row_changes(found.rigid)
+    explained = bool(changed) and changed[-1].values["after"] < plausibility.FLOOR * reach
+    rigid_misfit = None if explained else misfit(found, reach)
     if rigid_misfit and settings.loss in HEEDS_ALL:
         robust = climb("geometry", settings=replace(settings, loss="cauchy"))
         rigid_misfit = gross_rows(found, robust, reach) or rigid_misfit
@@ -150,9 +153,10 @@ def run(
     rigid = found.rigid_fit(inputs.fit, settings)
     named = named_outliers(found.fit)
     notes = [
+        *changed,
         *([rigid_misfit] if rigid_misfit else []),
         *_moved_between(found.nominal.cell, inputs.fit, settings),
-        *diagnose(found.fit),
+        *diagnose(found.fit, with_changes=not changed),
         *(note for notes in offered("fit_notes") for note in notes(found.fit)),
     ]
     if selection is not None and (ratio := compared_with_fit(selection, found.fit)) is not None:
