@@ -6,6 +6,7 @@ either.
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
@@ -20,26 +21,26 @@ from calib.data.poses.measurements import PoseMeasurements, Poses, Positions, ta
 from calib.data.poses.plausible import from_angles, to_angles
 from calib.errors import CalibError, Finding, finding
 from calib.geometry.accuracy import errors
+from calib.geometry.checks.wrong_rows import Blocks, least_error, row_shifts, two_targets
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation
-from calib.geometry.observation import Block, layout, observe, prepare
+from calib.geometry.observation import Block, layout, observe, positions, prepare
 from calib.geometry.residuals import Part
 from calib.geometry.weighing import GeometricFit, Settings
 from calib.records import evenly
 from calib.robot.chain import Chain, element_length
-from calib.robot.kinematics import forward
 
-MIN_LENGTH = 0.01  # [m] lengths below say nothing of a common factor (our choice)
+MIN_LENGTH = 0.01  # [m]: shorter lengths, and growth that moves targets by less per unit, say nothing of a factor
 MIN_ROWS = 30  # rows below which no pattern is looked for (our choice)
 
 
-def diagnose(found: GeometricFit) -> list[Finding]:
-    """Return findings on each block: changes of set-up between rows, and systematic residuals."""
+def diagnose(found: GeometricFit, with_changes: bool = True) -> list[Finding]:
+    """Return findings on each block: systematic residuals, and `with_changes` rows that fit worse than the others."""
     result: list[Finding] = []
     for block, part in _lengths(found):
         if part.value.shape[1] >= MIN_ROWS:  # pairs of rows count once
-            result += [*_setup_change(block, part), *_systematic(block, part)]
+            result += [*(_setup_change(block, part) if with_changes else []), *_systematic(block, part)]
     return result
 
 
@@ -137,6 +138,11 @@ class Scale:
 def scale_of(nominal: Installation, blocks: Sequence[PoseMeasurements]) -> Scale | None:
     """Return the instrument's scale factor and its sigma from measured positions; None without positions.
 
+    y - p = (s - 1) (p - mean p), with p the predicted positions, up to what placements explain.
+
+    None, too, where placements explain a growth of all lengths: it moves the targets by less than `MIN_LENGTH` per unit
+    (rms) otherwise.
+
     Args:
         nominal: the arm with base and tool placement fitted for it.
         blocks: of any kinds; those that measure positions count.
@@ -146,25 +152,25 @@ def scale_of(nominal: Installation, blocks: Sequence[PoseMeasurements]) -> Scale
         if not isinstance(block.measured, Positions):
             continue
         part = next(part for part in observe(nominal, block, frames) if part.label == "position")
-        seen = np.asarray(block.measured.position)[part.index]
+        # predicted, since the noise of measured positions is no combination of placements
+        predicted = positions(nominal, block)[:, part.index]
         rows.append(part.value.ravel())
-        away = (seen - seen.mean(axis=0)).T.ravel()
+        away = (predicted - predicted.mean(axis=1, keepdims=True)).ravel()
         columns.append(np.column_stack([part.jacobian.reshape(len(frames), -1).T, away]))
     if not rows:
         return None
     value, matrix = np.concatenate(rows), np.concatenate(columns)
     sizes = np.maximum(np.linalg.norm(matrix, axis=0), 1e-12)
-    matrix, size = matrix / sizes, float(sizes[-1])
-    others, last = matrix[:, :-1], matrix[:, -1]  # of y - p = (1 - 1/s) y the last column has s
-    left, own = (x - others @ np.linalg.lstsq(others, x, rcond=1e-9)[0] for x in (value, last))
-    power, count = float(own @ own), len(value) - matrix.shape[1]
-    if count < 1 or power < 1e-12:
+    placements, growth = matrix[:, :-1] / sizes[:-1], matrix[:, -1]
+    # what placements do not explain: of the residuals, and of a growth of all lengths
+    residual, lever = (x - placements @ np.linalg.lstsq(placements, x, rcond=1e-9)[0] for x in (value, growth))
+    power, count = float(lever @ lever), len(value) - matrix.shape[1]
+    if count < 1 or power < len(value) * MIN_LENGTH**2:
         return None
-    slope = float(own @ left) / power
-    squares = float(left @ left)
-    rest = max(squares - slope**2 * power, 0.0)
-    sigma = float(np.sqrt(rest / count / power)) / size
-    return Scale(1.0 / (1.0 - slope / size), sigma, 1.0 - rest / max(squares, 1e-300))
+    slope, squares = float(lever @ residual) / power, float(residual @ residual)
+    unexplained = max(squares - slope**2 * power, 0.0)
+    sigma = float(np.sqrt(unexplained / count / power))
+    return Scale(1.0 + slope, sigma, 1.0 - unexplained / max(squares, 1e-300))
 
 
 def length_factor(fit: GeometricFit) -> Scale | None:
@@ -200,44 +206,89 @@ def length_factor(fit: GeometricFit) -> Scale | None:
 
 
 SHORT = Settings(limit=20, passes=1)  # where base and tool settle at all they do so sooner
+ROBUST = Settings(loss="cauchy", limit=40, passes=4)  # angles beyond a convention's range were lost
 # of the makers' angles; others are rare (our choice)
 CONVENTIONS = ("vector", "xyz fixed", "xyz moving", "zyx fixed", "zyx moving", "zyz moving", "zxz moving")
+SURELY = 1.0 / 3.0  # share of the error that may be left where no second change goes with it (our choice)
 FLIP = np.array([1.0, -1.0, 1.0])
-Blocks = Sequence[PoseMeasurements]
 
 
 def wrong_columns(nominal: Installation, blocks: Blocks, mirrored: bool = False) -> Explanation | None:
     """Return the change of columns that reduces the nominal arm's error most; None if no change helps much.
 
     Args:
-        nominal: the arm as it was.
+        nominal: the arm as it was, placed.
         blocks: the rows.
         mirrored: whether an instrument with left-handed axes is tried, too.
     """
-    n, max_rows = nominal.chain.n, 200  # rows of a block (our choice)
-    few = [take(block, evenly(len(block), max_rows)) for block in blocks]
-    surely = 1.0 / 3.0  # share of the error that may be left where no second change goes with it (our choice)
+    n = nominal.chain.n
     table = [Change("joint-sign", _of_joints(reversal(n, j)), (j,), max_left=0.8) for j in range(n)]
     table += [
         Change(
-            "joint-without-effect", _of_joints(standing(n, j)), (j,), {"end": _end_without(nominal.chain, j)}, surely
+            "joint-without-effect", _of_joints(standing(n, j)), (j,), {"end": _end_without(nominal.chain, j)}, SURELY
         )
         for j in range(n)
     ]
     table += [
-        Change("joint-coupled", _of_joints(coupling(n, j, k, way)), (j, k), {"way": "+" if way > 0 else "-"}, surely)
+        Change("joint-coupled", _of_joints(coupling(n, j, k, way)), (j, k), {"way": "+" if way > 0 else "-"}, SURELY)
         for j, k, way in couplings(n)
     ]
     pairs = combinations(range(n), 2)
-    table += [Change("joints-exchanged", _of_joints(exchange(n, *pair)), pair, max_left=surely) for pair in pairs]
+    table += [Change("joints-exchanged", _of_joints(exchange(n, *pair)), pair, max_left=SURELY) for pair in pairs]
     if mirrored and any(isinstance(block, Positions) for block in blocks):
-        table.append(Change("left-handed", _mirrored, max_left=surely))
-    if read_as := {block.euler for block in blocks if isinstance(block, Poses)} - {""}:
-        others = (euler for euler in CONVENTIONS if euler not in read_as)
-        table += [
-            Change("angle-convention", partial(_read_as, euler), (), {"convention": euler}, surely) for euler in others
-        ]
-    return best_changes(few, table, partial(_left, nominal), partial(_least, nominal), n)
+        table.append(Change("left-handed", _mirrored, max_left=SURELY))
+    turning = [j for j in range(n) if nominal.chain.joints[j].kind != "prismatic"]
+    quarters = [(j, angle) for j in turning for angle in (np.pi / 2.0, -np.pi / 2.0, np.pi)]
+    table += [Change("joint-zero", partial(_turned, j, angle), (j,), {"angle": angle}, SURELY) for j, angle in quarters]
+    few = _few(blocks)
+    table += row_shifts(nominal, blocks, SURELY) + two_targets(nominal, few, SURELY)
+    return best_changes(
+        blocks,
+        table,
+        lambda changed: _left(nominal, _few(changed)),
+        lambda changed: least_error(nominal, _few(changed)),
+        n,
+    )
+
+
+def wrong_angles(nominal: Installation, blocks: Blocks) -> Explanation | None:
+    """Return the convention of the orientations' angles that reduces the nominal arm's error most; None if none does.
+
+    Args:
+        nominal: the arm as it was, placed.
+        blocks: the rows.
+    """
+    few = [block for block in _few(blocks) if isinstance(block, Poses) and block.euler]
+    read_as = {block.euler for block in few}
+    others = [euler for euler in CONVENTIONS if read_as and euler not in read_as]
+    table = [
+        Change("angle-convention", partial(_read_as, euler), (), {"convention": euler}, SURELY) for euler in others
+    ]
+    return best_changes(few, table, partial(_turned_by, nominal)) if table else None
+
+
+def _turned_by(nominal: Installation, blocks: Blocks) -> np.ndarray:
+    """Return the median squared orientation error [rad²] (1,) with base and tool placement fitted.
+
+    Of most rows, since angles beyond the range of the stated convention were lost when they were read.
+    """
+    try:
+        placed = polish_frames(install(nominal.chain, blocks, nominal.known), blocks, ROBUST).cell
+    except CalibError:
+        return np.array([np.inf])
+    angle = errors(placed, blocks).orientation
+    return np.array([np.inf if angle is None else float(np.median(angle**2))])
+
+
+def _few(blocks: Blocks, max_rows: int = 200) -> Blocks:
+    """Return at most `max_rows` rows of each block."""
+    return [take(block, evenly(len(block), max_rows)) for block in blocks]
+
+
+def _turned(joint: int, angle: float, blocks: Blocks) -> Blocks:
+    """Return blocks whose zero of a joint is another one."""
+    by = angle * np.eye(blocks[0].q.shape[1])[joint]
+    return [replace(block, q=block.q + by) for block in blocks]
 
 
 def _end_without(chain: Chain, joint: int) -> str | None:
@@ -275,30 +326,15 @@ def _read_as(euler: str, blocks: Blocks) -> Blocks:
     return found
 
 
-def _least(nominal: Installation, blocks: Blocks) -> np.ndarray:
-    """Return the least mean squared error [m²] that any base and tool placement can reach; 0 if not known.
-
-    Positions y = B (R p + t) + b, with R, t the tip's by the joints and B, b, p the placements, are linear in B ⊗ p, B
-    and b: 13 numbers per axis of y, free of each other and of other axes here.
-    """
-    squares, count = 0.0, 0
-    for block in blocks:
-        if nominal.known.terms or not isinstance(block, Positions):
-            return np.zeros(1)
-        tip = forward(nominal.chain, block.q)
-        columns = np.column_stack([tip[:, :3, :3].reshape(-1, 9), tip[:, :3, 3], np.ones(len(tip))])
-        for tool in np.unique(block.tool):
-            rows = block.tool == tool
-            W, y = columns[rows], block.position[rows]
-            squares += float(((y - W @ np.linalg.lstsq(W, y)[0]) ** 2).sum())
-        count += len(block)
-    return np.array([squares / count])
-
-
 def _left(nominal: Installation, blocks: Blocks) -> np.ndarray:
-    """Return the mean squared error of the nominal arm [m²] after fitting base and tool placement."""
-    try:
-        placed = polish_frames(install(nominal.chain, blocks, nominal.known), blocks, SHORT).cell
-    except CalibError:
-        return np.array([np.inf])
-    return np.array([np.mean(errors(placed, blocks).main ** 2)])
+    """Return the mean squared error of the nominal arm [m²] after fitting base and tool placement.
+
+    A placement that was found worse than the one that `nominal` has does not count.
+    """
+    squares = [np.inf]
+    with suppress(CalibError):  # a second target has no placement yet
+        squares.append(float(np.mean(errors(nominal, blocks).main ** 2)))
+    with suppress(CalibError):
+        placed = polish_frames(install(nominal.chain, blocks, nominal.known), blocks, ROBUST).cell
+        squares.append(float(np.mean(errors(placed, blocks).main ** 2)))
+    return np.array([min(squares)])

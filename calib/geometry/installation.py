@@ -85,6 +85,11 @@ class Installation:
         object.__setattr__(self, "stations", frozen(self.stations))
         object.__setattr__(self, "tools", frozen(self.tools))
 
+    @property
+    def reach(self) -> float:
+        """Largest distance of a target from the base of the stretched arm [m], at the joints' zero where they slide."""
+        return self.chain.stretched_length() + float(np.linalg.norm(self.tools[:, :3, 3], axis=1).max(initial=0.0))
+
     def merged(self) -> Installation:
         """Return the installation with known and fitted deflections merged."""
         if not self.known.terms:

@@ -20,7 +20,6 @@ from calib.estimation.whiteness import Whiteness, examine, r_squared
 from calib.identification.rows import BLOCK, Case, segmented_states
 from calib.records import Array, Frozen, Number
 
-
 REST_SHARE = 0.05  # of a recording's rows at rest, above which errors in motion and at rest are told apart (our choice)
 
 

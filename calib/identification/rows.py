@@ -64,12 +64,7 @@ class Case:
 
 
 def make_case(
-    name: str,
-    motion: Motion,
-    rows: TorqueRows = MOTOR,
-    *,
-    gains: np.ndarray | None = None,
-    carried: Sequence[str] = (),
+    name: str, motion: Motion, rows: TorqueRows = MOTOR, *, gains: np.ndarray | None = None, carried: Sequence[str] = ()
 ) -> Case:
     """Return the case of a motion and its torques.
 

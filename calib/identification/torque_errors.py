@@ -540,7 +540,8 @@ def _weights(folds: Sequence[_Fold], blocks: int, errors_used: int = 4000) -> np
         parts = (
             (squares[row], shapes[row], moves[row]),
             (
-                squares[others, thinned].ravel(), shapes[others, thinned].reshape(-1, 3),
+                squares[others, thinned].ravel(),
+                shapes[others, thinned].reshape(-1, 3),
                 BORROWED / blocks * moves[others, thinned].ravel(),
             ),
             expected,

@@ -58,7 +58,9 @@ def rows_of(case: Case, settings: IdentificationSettings = PLAIN) -> list[Observ
 def wrong_friction(found: Identification) -> float:
     """Return the rms relative error of Coulomb's friction."""
     values = dict(zip(found.names, found.fitted.estimate.values))
-    return float(np.sqrt(np.mean([(values[f"Fc{j + 1}"] / size - 1.0) ** 2 for j, size in enumerate(planted.DRIVES["Fc"])])))
+    return float(
+        np.sqrt(np.mean([(values[f"Fc{j + 1}"] / size - 1.0) ** 2 for j, size in enumerate(planted.DRIVES["Fc"])]))
+    )
 
 
 def test_friction_comes_back_from_a_recording_that_stands_for_a_third(monkeypatch):
@@ -69,7 +71,9 @@ def test_friction_comes_back_from_a_recording_that_stands_for_a_third(monkeypatc
     as_others = [identify(planted.arm(), [case], PLAIN) for case in cases]
     errors, plain = ([wrong_friction(found) for found in each] for each in (counted, as_others))
     assert np.mean(errors) < 0.5 * np.mean(plain)
-    unseen, before = ([score(other, predict(one.dynamics, other)).moving.total for one in each] for each in (counted, as_others))
+    unseen, before = (
+        [score(other, predict(one.dynamics, other)).moving.total for one in each] for each in (counted, as_others)
+    )
     assert np.mean(unseen) < np.mean(before)
 
 
@@ -139,7 +143,10 @@ def test_drives_without_coulomb_friction_have_no_standstills(drives):
 def test_a_joint_that_never_moves_keeps_its_rows():
     case = stop_and_go(0)
     motion = case.motion
-    frozen = [np.where(np.arange(3) == 1, value, x) for x, value in ((motion.q, motion.q[0]), (motion.v, 0.0), (motion.a, 0.0))]
+    frozen = [
+        np.where(np.arange(3) == 1, value, x)
+        for x, value in ((motion.q, motion.q[0]), (motion.v, 0.0), (motion.a, 0.0))
+    ]
     still = replace(case, motion=replace(motion, q=frozen[0], v=frozen[1], a=frozen[2]))
     standing = rows_of(still)[0].standing
     assert not standing[:, 1].any() and standing[:, [0, 2]].any(axis=0).all()

@@ -71,7 +71,8 @@ RadiansOrZero = Annotated[float, Real(above=0, least=MIN_SIGMA, most=1.0, unit="
 Each = Spread(3, "a number or three")
 
 
-FINDINGS = ("unexplained", "sign", "coupling", "order", "reflection", "convention", "moved", "scale", "commanded")
+OF_COLUMNS = ("sign", "coupling", "order", "zero", "rows", "targets", "reflection", "convention", "copies")
+FINDINGS = ("unexplained", *OF_COLUMNS, "moved", "scale", "commanded")
 """Names in ``accept``: those of chapter 1 of the catalogue of findings."""
 
 

@@ -60,9 +60,7 @@ def check_recording(recording: Recording, joints: Joints | None = None) -> Recor
         MeasurementError: for too few samples, values that are not finite, time that stands or runs backwards, degrees
             for radians, a torque that is one number while its joint moves.
     """
-    few = (
-        f"{len(recording)} samples are too few for filters; at least {LIMITS.min_samples} are needed"
-    )
+    few = f"{len(recording)} samples are too few for filters; at least {LIMITS.min_samples} are needed"
     require(len(recording) >= LIMITS.min_samples, few, MeasurementError, recording.file)
     recording = _without_absent(recording)
     _check_finite(recording)

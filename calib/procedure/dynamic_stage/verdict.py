@@ -93,7 +93,10 @@ def judge(
             "no-torque-transfer", times=worst / max(own, 1e-300), most=limit("no-torque-transfer", "times", "marginal")
         ),
     ]
-    return sentence(finding("torque-errors", unseen=worst, file=name, own=own, rest=at_rest)), [*settle(totals)[:1], *joints]
+    return sentence(finding("torque-errors", unseen=worst, file=name, own=own, rest=at_rest)), [
+        *settle(totals)[:1],
+        *joints,
+    ]
 
 
 def friction_drives(joints: Iterable[object], payload: str = "") -> list[Finding]:

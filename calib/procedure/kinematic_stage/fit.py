@@ -10,6 +10,7 @@ from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import Finding, NotConverged, finding
 from calib.extensions import offered
 from calib.geometry.accuracy import errors
+from calib.geometry.checks.row_changes import row_changes
 from calib.geometry.diagnosis import diagnose
 from calib.geometry.error_model import ErrorModel, learn_errors
 from calib.geometry.first_guess import install
@@ -146,25 +147,29 @@ def run(
         seed=seed,
         progress=lambda done, total, what: say(f"fitting: {what}"),
     )
-    found, long = climb(asked, settings=settings), inputs.chain.stretched_length()
+    found = climb(asked, settings=settings)
+    reach = found.nominal.cell.reach
     status = found.fit.solution.status
     if not status.good:
-        odd = plausibility.findings(found.nominal.cell, found.fit, inputs.fit, None, long)
+        odd = plausibility.findings(found.nominal.cell, found.fit, inputs.fit, None, reach)
         why = [sentence(one) for one in settle(odd, options.accept) if level_of(one) == "fail"]
         words = f"the fit of model '{found.chosen}' did not converge: {status.value}"
         raise NotConverged("; ".join([words, *why]), found.fit)
-    rigid_misfit = misfit(found, long)
+    changed = row_changes(found.rigid)
+    explained = bool(changed) and changed[-1].values["after"] < plausibility.FLOOR * reach
+    rigid_misfit = None if explained else misfit(found, reach)
     if rigid_misfit and settings.loss in HEEDS_ALL:
         robust = climb("geometry", settings=replace(settings, loss="cauchy"))
-        rigid_misfit = gross_rows(found, robust, long) or rigid_misfit
+        rigid_misfit = gross_rows(found, robust, reach) or rigid_misfit
     say("comparing on unseen poses")
     settings = replace(settings, loss=found.loss)
     rigid = found.rigid_fit(inputs.fit, settings, inputs.bare)
     named = named_outliers(found.fit)
     notes = [
+        *changed,
         *([rigid_misfit] if rigid_misfit else []),
         *_moved_between(found.nominal.cell, inputs.fit, settings),
-        *diagnose(found.fit),
+        *diagnose(found.fit, with_changes=not changed),
         *(note for notes in offered("fit_notes") for note in notes(found.fit)),
     ]
     if selection is not None and (ratio := compared_with_fit(selection, found.fit)) is not None:
@@ -194,9 +199,9 @@ def _found_of(
     inputs: Inputs, found: ModelSelection, named: Sequence[Outlier], notes: Sequence[Finding], accepted: Sequence[str]
 ) -> Findings:
     """Return the findings of a fit that do not depend on validation rows; `notes` are findings on its residuals."""
-    long = inputs.chain.stretched_length()
+    reach = found.nominal.cell.reach
     left = found.cross_validated
-    odd = plausibility.findings(found.nominal.cell, found.fit, inputs.fit, left, long)
+    odd = plausibility.findings(found.nominal.cell, found.fit, inputs.fit, left, reach)
     blind = [finding("transfer-by-regions", stations=found.folds.blind)] if found.folds.blind else []
     return Findings(
         model=found.chosen,
@@ -204,7 +209,7 @@ def _found_of(
         cross_validated=left,
         nominal_cross_validated=next((r.cross_validated for r in found.rungs if r.model == "frames"), None),
         outlier_share=len({(each.file, each.row) for each in named}) / sum(len(block) for block in inputs.fit),
-        reach=long,
+        reach=reach,
         noticed=settle([*odd, *notes, *blind], accepted),
         blind=found.folds.blind,
         rigid_cross_validated=found.rigid_cross_validated,

@@ -7,12 +7,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from calib.column_changes import Explanation
 from calib.data.poses import IMAGES
 from calib.data.poses.measurements import PoseMeasurements, take
 from calib.errors import Finding, finding
 from calib.extensions import needed
 from calib.geometry.accuracy import NATURE, errors
-from calib.geometry.diagnosis import Scale, length_factor, scale_of, wrong_columns
+from calib.geometry.checks.readings import repeated_readings
+from calib.geometry.diagnosis import Scale, length_factor, scale_of, wrong_angles, wrong_columns
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.cross_validation import JUDGED_POSES
 from calib.geometry.model_choice.ladder import MAX_RESIDUAL, ModelSelection
@@ -107,7 +109,8 @@ def findings(
     before, after = (errors(cell, blocks).rms for cell in (nominal, fit.cell))
     remains = after if left is None else min(left, max(after, _left(fit)))
     shown = [_as_positions(take(block, rows)) for block, rows in zip(blocks, sampled(blocks, JUDGED_POSES))]
-    result = _wrong_way(nominal, shown, before, reach) or _moved(fit, reach)
+    wrong = [*_misread(nominal, shown), *_wrong_way(nominal, shown, before, reach)]
+    result = [*repeated_readings(nominal, shown), *(wrong or _moved(fit, reach))]
     result.append(finding("unexplained", rms=remains, reach=reach, share=remains / reach))
     if 0.0 < after < TOO_GOOD:
         arm, rms = ("nominal", before) if before < TOO_GOOD else ("calibrated", after)
@@ -129,12 +132,24 @@ def _as_positions(block: PoseMeasurements) -> PoseMeasurements:
 
 
 def _wrong_way(nominal: Installation, blocks: Sequence[PoseMeasurements], before: float, reach: float) -> list[Finding]:
-    """Return a finding if the nominal arm explains the rows after a change of columns (sign, exchange, coupling)."""
+    """Return a finding if the nominal arm explains the rows once columns or rows are changed."""
     if not before > FLOOR * reach:
         return []
     changed = wrong_columns(nominal, blocks, mirrored=before > limit("unexplained", "share") * reach)
-    if changed is None:
+    return [] if changed is None else _told(changed, nominal)
+
+
+def _misread(nominal: Installation, blocks: Sequence[PoseMeasurements]) -> list[Finding]:
+    """Return a finding if the angles of orientations fit by another convention, and not as stated."""
+    angle = errors(nominal, blocks).orientation
+    if angle is None or not np.sqrt(np.mean(angle**2)) > limit("orientations-off", "angle"):
         return []
+    changed = wrong_angles(nominal, blocks)
+    return [] if changed is None else _told(changed, nominal)
+
+
+def _told(changed: Explanation, nominal: Installation) -> list[Finding]:
+    """Return the finding on a change that explains the rows, if it is serious enough."""
     was, rms = (float(np.sqrt(one[0])) for one in (changed.before, changed.after))
     one = changed.finding(nominal.chain.joint_names, rms=rms, before=was, times=was / max(rms, 1e-300))
     return [one] if level_of(one) else []

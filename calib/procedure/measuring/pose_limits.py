@@ -319,8 +319,7 @@ def _never_act(
         UsageError: for what stands `MAX_REACHES` times as far, and for links thicker than the arm is long.
     """
     slides = sum(max(-joint.lower, joint.upper) for joint in cell.chain.joints if joint.unit == "m")
-    tool = float(np.linalg.norm(cell.tools[:, :3, 3], axis=1).max(initial=0.0))
-    reach = cell.chain.stretched_length() + slides + tool
+    reach = cell.reach + slides
     if table.radius is not None and table.radius > reach:
         words = f"links of radius {table.radius:g} m in an arm of {reach:.3g} m reach; is it in mm?"
         raise UsageError(f"{where}: collision.radius: {words}")

@@ -126,15 +126,87 @@ def test_joints_that_count_from_another_or_are_exchanged_are_named(cell, calib, 
     assert model != "frames" or accepted(calib, out)[0] == 0
 
 
-@pytest.mark.parametrize("degrees, level", [(90, "fail"), (20, "marginal")])
-def test_a_joint_counted_from_another_zero_is_told(cell, calib, degrees, level):
+@pytest.mark.parametrize("degrees", [90, -90, 180])
+def test_a_zero_off_by_quarters_of_a_turn_is_named(cell, calib, degrees):
+    """The full geometry explains it by axes that are turned by 180°, or nearly so."""
     rows = [row | {"q3": row["q3"] + np.radians(degrees)} for row in cell.measure(COUNT)]
+    code, _, err = fitted(cell, calib, rows, "frames")
+    assert (code, *verdict()[:2]) == (1, "fail", "joint-zero"), err
+    found = noticed()["joint-zero"].values
+    assert found["joints"] == ["elbow_joint"] and found["rival"] is None
+    assert abs(np.degrees(found["angle"]) + degrees) % 360 < 1e-6
+
+
+def test_a_joint_counted_from_another_zero_is_told(cell, calib):
+    rows = [row | {"q3": row["q3"] + np.radians(20)} for row in cell.measure(COUNT)]
     code, out, _ = fitted(cell, calib, rows, "geometry")
-    assert (code, *verdict()) == (int(level == "fail"), level, "moved", ["moved"])
-    assert f"-{degrees}°" in str(noticed()["moved"].values["elements"]) and 'accept = ["moved"]' in out
+    assert (code, *verdict()) == (0, "marginal", "moved", ["moved"])
+    assert "-20°" in str(noticed()["moved"].values["elements"]) and 'accept = ["moved"]' in out
     Path("a.toml").write_text('accept = ["moved"]')
     calib("fit", "ur5", "m.csv", "--out", "o", "--model", "geometry", "--options", "a.toml")
     assert verdict()[1] != "moved"
+
+
+@pytest.mark.parametrize(
+    ("first", "way"), [(1, "down"), (1, "up"), pytest.param(20, "down", marks=SLOW), pytest.param(20, "up", marks=SLOW)]
+)
+def test_rows_paired_with_the_joints_of_others_are_named(cell, calib, first, way):
+    """A point that was lost or measured twice moves all later ones against the joints."""
+    rows, by = cell.measure(COUNT), -1 if way == "down" else 1
+    joints = [{name: row[name] for name in row if name[0] == "q" and name[1].isdigit()} for row in rows]
+    for number in range(first - 1, COUNT):
+        if 0 <= number + by < COUNT:
+            rows[number] |= joints[number + by]
+    code, _, err = fitted(cell, calib, rows[1:-1], "frames")
+    assert (code, *verdict()[:2]) == (1, "fail", "rows-shifted"), err
+    found = noticed()["rows-shifted"].values
+    assert (found["by"], found["way"]) == (1, way) and abs(found["first"] - max(first - 1, 1)) <= 1
+
+
+def test_rows_of_two_targets_are_sorted(cell, calib):
+    rows = cell.measure(COUNT)
+    second = [k for k in range(COUNT) if k % 3 == 0]
+    for k in second:
+        turn = Rotation.from_quat([rows[k][name] for name in ("qx", "qy", "qz", "qw")])
+        moved = np.array([rows[k][axis] for axis in "xyz"]) + turn.apply([0.0, 0.03, -0.05])
+        rows[k] |= dict(zip("xyz", moved))
+    positions = [{name: value for name, value in row.items() if name not in ("qx", "qy", "qz", "qw")} for row in rows]
+    code, _, err = fitted(cell, calib, positions, "frames")
+    assert (code, *verdict()[:2]) == (1, "fail", "two-targets"), err
+    found = noticed()["two-targets"].values
+    assert {tuple(found["rows"]), tuple(found["others"])} >= {tuple(str(k + 1) for k in second)}
+    assert found["apart"] == pytest.approx(np.hypot(0.03, 0.05), rel=0.1)
+
+
+def with_targets(rows: list[dict], change) -> None:
+    """Write two targets per row, the readings of the second changed by row number and both readings."""
+    lines = ["q1,q2,q3,q4,q5,q6,x1,y1,z1,x2,y2,z2"]
+    for k, row in enumerate(rows):
+        first = [row[axis] for axis in "xyz"]
+        turn = Rotation.from_quat([row[name] for name in ("qx", "qy", "qz", "qw")])
+        second = change(k, first, (np.array(first) + turn.apply([0.0, 0.03, -0.05])).tolist())
+        lines.append(",".join(repr(float(value)) for value in [*(row[f"q{j}"] for j in range(1, 7)), *first, *second]))
+    Path("m.csv").write_text("\n".join([*lines, ""]))
+
+
+@pytest.mark.parametrize(
+    ("change", "codes"),
+    [
+        (lambda k, first, second: second, set()),
+        (lambda k, first, second: first, {"target-copied"}),
+        (lambda k, first, second: first if k in (3, 9, 21) else second, {"target-copied"}),
+        (lambda k, first, second: [0, 0, 0] if k in (3, 9, 21) else second, {"reading-repeated"}),
+    ],
+)
+def test_copied_and_placeholder_readings_are_named(cell, calib, change, codes):
+    with_targets(cell.measure(COUNT), change)
+    calib("fit", "ur5", "m.csv", "--out", "o", "--model", "frames")
+    found = {code: one for code, one in noticed().items() if code in ("target-copied", "reading-repeated")}
+    assert set(found) == codes
+    if "reading-repeated" in codes:
+        assert found["reading-repeated"].values["rows"] == ["4", "10", "22"]
+    if "target-copied" in codes:
+        assert "2" in found["target-copied"].values["name"] and "1" in found["target-copied"].values["other"]
 
 
 @pytest.mark.parametrize(
