@@ -89,36 +89,37 @@ def judge(
     found = [_Proof(one.errors[0].rms, one.errors[1].rms, f"on {name}, unseen", one) for name, one in proofs.items()]
     if not found and cross_validated is not None:
         found = [_Proof(nominal, cross_validated, "by cross-validation only")]
+    frames_only = findings.model == asked == "frames"
+    if not found and frames_only:
+        # so few parameters leave the errors on the fitted poses as they are
+        found = [_Proof(nominal, own, "on the fitted poses")]
     worst = max(found, key=lambda proof: proof.after, default=None)
     gross = [one for proof in found for one in _gross(proof, findings.reach) if level_of(one)]
     others = [*gross, *(one for one in findings.noticed if one.code not in RIGID)]
     for rules in (
         _far_off(found, {"the fitted poses": fit, **proofs}, tolerance, findings.reach),
-        () if findings.model == asked == "frames" else _nothing_gained(found, findings),
+        () if frames_only else _nothing_gained(found, findings),
         _worse(found, findings.reach),
     ):
         if group := list(filter(level_of, rules)):
             if level_of(group[0]) == "note":  # it stands for the figures
                 return Verdict.of(sentence(group[0]), others)
             return Verdict.of("" if worst is None else _figures(worst, arm), [*others, *group])
-    if findings.model == asked == "frames":
-        return _frames_verdict(worst, own, tolerance, arm, others)
     if worst is None:
         return Verdict.of("", [finding("no-unseen-poses"), *others])
+    if frames_only:
+        return _frames_verdict(worst, tolerance, arm, others)
     promised = None if gross else cross_validated
     rules = [*gross, *findings.noticed, *_doubts(worst, own, promised, proofs, findings)]
     verdict = Verdict.of(_figures(worst, arm), rules)
     return Verdict("pass", _figures(worst, arm, tolerance)) if verdict.level == "pass" else verdict
 
 
-def _frames_verdict(
-    worst: _Proof | None, own: float, tolerance: float | None, arm: str, others: Sequence[Finding]
-) -> Verdict:
+def _frames_verdict(worst: _Proof, tolerance: float | None, arm: str, others: Sequence[Finding]) -> Verdict:
     """Return the verdict where only frames were fitted and the arm errs within the tolerance, if there is one."""
-    if tolerance is not None and worst is not None:
+    if tolerance is not None:
         return Verdict.of(_figures(worst, arm, tolerance), others)
-    rms, where = (own, "on the fitted poses") if worst is None else (worst.after, worst.where)
-    verdict = Verdict.of(sentence(finding("frames-only", rms=rms, where=where)), others)
+    verdict = Verdict.of(sentence(finding("frames-only", rms=worst.after, where=worst.where)), others)
     return replace(verdict, level=NOT_JUDGED) if verdict.level == "pass" else verdict
 
 
@@ -302,7 +303,10 @@ def assess(arms: Arms, inputs: Inputs, findings: Findings, settings: Settings, w
     ]
     copies = _copies(inputs)
     usual = float(np.median(fitted.errors[0].main)) if len(fitted.errors[0].main) else np.inf
-    references = [one for name, rows in validation.items() for one in _references(name, rows, chosen) if level_of(one)]
+    frames_only = findings.model == (wanted.model or "auto") == "frames"
+    references: list[Finding] = []
+    for name, rows in validation.items():
+        references += filter(level_of, _references(name, rows, chosen, frames_only))
     noticed = (
         *others, *references, *findings.noticed, *([finding("not-unseen", files=copies)] if copies else []),
         *(one for name, each in validation.items() for one in _noticed(name, each, usual)),
@@ -312,14 +316,15 @@ def assess(arms: Arms, inputs: Inputs, findings: Findings, settings: Settings, w
     return Assessment(fitted, validation, judged[chosen], noticed, notes, judged, chosen)
 
 
-def _references(name: str, rows: Comparison, deliverable: str) -> Iterator[Finding]:
+def _references(name: str, rows: Comparison, deliverable: str, frames_only: bool) -> Iterator[Finding]:
     """Yield the nominal arm's, the plain fit's and the delivered arm's error on validation rows, and what is worse."""
     if rows.plain is None or not rows.proves:
         return
     delivered = (rows.of_urdf if deliverable == "urdf" else rows).errors[1].rms
     values = {"where": name, "plain": rows.plain.rms, "delivered": delivered}
     yield finding("plain-reference", nominal=rows.errors[0].rms, **values)
-    yield finding("worse-than-plain", times=delivered / max(rows.plain.rms, 1e-300), **values)
+    if not frames_only:
+        yield finding("worse-than-plain", times=delivered / max(rows.plain.rms, 1e-300), **values)
 
 
 def judge_deliverables(
