@@ -20,6 +20,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from calib.workers import caches
+
 if TYPE_CHECKING:
     from calib.api.dynamic import DynamicsModel, identify_dynamics, methods
     from calib.api.exporting import export, validate
@@ -66,6 +68,10 @@ __all__ = [  # noqa: RUF022 (in the order of use)
     "JointCommands", "SelectionSettings", "FitSettings", "ExcitationSettings", "PlanSettings", "IdentifySettings",
     "CalibError",
 ]  # fmt: skip
+
+
+# before any kernel is loaded
+caches.provide()
 
 
 def __getattr__(name: str) -> Any:

@@ -343,10 +343,8 @@ def write_numbers(
         for start in range(0, len(values), many):
             some, text = values[start : start + many], io.StringIO()
             if names:
-                first = csv.writer(text, lineterminator=",")
                 for name, row in zip(names[start:], some.tolist()):
-                    first.writerow([_cell(name)])
-                    text.write(line % tuple(row))
+                    text.write(f"{_quoted(name)},{line % tuple(row)}")
             else:
                 text.write((line * len(some)) % tuple(some.ravel().tolist()))
             yield text.getvalue()
@@ -363,6 +361,13 @@ def _cell(value: Any) -> Any:
     if isinstance(value, float):
         return "" if math.isnan(value) else f"{value:.12g}"
     return shielded(value) if isinstance(value, str) else value
+
+
+def _quoted(name: str) -> str:
+    """Return a text as one cell of a CSV line."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerow([_cell(name)])
+    return text.getvalue().removesuffix("\n")
 
 
 def _headed(header: Sequence[str]) -> io.StringIO:

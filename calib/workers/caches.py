@@ -1,0 +1,79 @@
+"""Folders in which numba and matplotlib keep what they made once, where their usual ones cannot be written.
+
+numba refuses to load a kernel that it cannot keep ("no locator available"); matplotlib complains, and looks for fonts
+anew in every process. As with a package installed by an administrator and a home that is read-only or does not exist
+(containers, CI, services), both then get a folder of the user's own in the temporary folder. What the user sets in the
+environment counts; worker processes inherit it.
+"""
+
+import os
+import stat
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+PACKAGE = Path(__file__).parents[1]
+FOLDER = "calib-cache-{user}"  # in the temporary folder
+
+
+def provide() -> None:
+    """Set NUMBA_CACHE_DIR and MPLCONFIGDIR to a temporary folder, each where its usual folders are not writable."""
+    caches = _user_caches()
+    if not os.environ.get("NUMBA_CACHE_DIR") and not _writable(caches) and not _kernels_writable():
+        with suppress(OSError):
+            os.environ["NUMBA_CACHE_DIR"] = str(_temporary("numba"))
+            # read from the environment when numba is imported, which may have been before
+            if numba := sys.modules.get("numba"):
+                numba.config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"]
+    settings = Path(os.environ.get("XDG_CONFIG_HOME") or _home() / ".config")
+    if not os.environ.get("MPLCONFIGDIR") and not (_writable(settings) and _writable(caches)):
+        with suppress(OSError):
+            os.environ["MPLCONFIGDIR"] = str(_temporary("matplotlib"))
+
+
+def _home() -> Path:
+    """Return the user's home; a path that does not exist for a user without one."""
+    home = Path(os.path.expanduser("~"))
+    return home if home.is_absolute() else Path("/nonexistent")
+
+
+def _user_caches() -> Path:
+    """Return the folder of the user's caches, as numba and matplotlib look for it."""
+    usual = _home() / ("Library/Caches" if sys.platform == "darwin" else ".cache")
+    return Path(os.environ.get("XDG_CACHE_HOME") or usual)
+
+
+def _kernels_writable() -> bool:
+    """Return whether numba can keep every compiled kernel of this package beside its source."""
+    folders = {path.parent / "__pycache__" for path in PACKAGE.rglob("*kernels.py")}
+    return all(_writable(folder) for folder in folders)
+
+
+def _writable(folder: Path) -> bool:
+    """Return whether a folder is writable, or can be made."""
+    existing = next(part for part in (folder, *folder.parents) if part.exists())
+    return existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)
+
+
+def _temporary(name: str) -> Path:
+    """Return a folder of this user alone that stays for later processes; of this process where that is another's.
+
+    Raises:
+        OSError: where no temporary folder is writable.
+    """
+    import atexit
+    import shutil
+    import tempfile  # slow to load
+
+    parent = Path(tempfile.gettempdir()) / FOLDER.format(user=os.getuid())
+    with suppress(FileExistsError):
+        parent.mkdir(mode=0o700)
+    # compiled code is loaded from there: nobody else may have written it
+    status = parent.lstat()
+    private = stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o077
+    if not private:
+        parent = Path(tempfile.mkdtemp(prefix="calib-cache-"))
+        atexit.register(shutil.rmtree, parent, ignore_errors=True)
+    folder = parent / name
+    folder.mkdir(exist_ok=True)
+    return folder
