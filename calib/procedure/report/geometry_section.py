@@ -17,11 +17,8 @@ from calib.procedure.report.fit_report import Report, RowErrors
 from calib.units import ERRORS, SMALL
 
 KINDS = {f"{nature}_{unit}": (nature, unit) for nature, (_, unit) in ERRORS.items()}
-ARMS = {
-    "nominal": "nominal",
-    "urdf_alone": ARM["urdf"],
-    "calibrated": ARM["corrections"],
-}  # fields of the rows, in order
+# fields of `ComparedRows` and their words, in the order of the tables
+ARMS = {"nominal": "nominal", "urdf_alone": ARM["urdf"], "calibrated": ARM["corrections"]}
 MAX_ROWS = 60  # parameters beyond which joint corrections are not listed
 MAX_POSES = 30  # repeated poses that are listed
 MAX_OUTLIERS = 20

@@ -71,5 +71,6 @@ def _torque(session: Session) -> Panel:
     title, y = f"{torque_error(session):.1f} % of torque unexplained", f"{unseen.rows[j]} [{unseen.units[j]}]"
     known = prediction(session.path(session.export))
     if known is not None:
-        title = f"{known.exported:.1f} % ({torque_error(session):.1f} %) unexplained"  # exported robot (identified model)
+        # of the exported robot, in brackets of the identified model
+        title = f"{known.exported:.1f} % ({torque_error(session):.1f} %) unexplained"
     return Panel(layers, title, "unseen motion [s]", y, xlim=(t[0], t[-1]), ylim=(1.1 * low, 1.1 * above))
