@@ -207,14 +207,16 @@ def interval_cells(found: Comparison) -> np.ndarray:
     return np.column_stack([1e3 * each.sigma, 1e3 * each.radius, each.beyond])
 
 
-def iso9283_sentence(found: RepeatedPoses, min_poses: int = 5, min_cycles: int = 30, usual_poses: int = 100) -> str:
-    """Return a sentence with repeatability RP and accuracy AP of repeated poses (ISO 9283)."""
+def iso9283_sentence(
+    found: RepeatedPoses, arm: str, min_poses: int = 5, min_cycles: int = 30, usual_poses: int = 100
+) -> str:
+    """Return a sentence with repeatability RP and accuracy AP of repeated poses (ISO 9283); `arm`: what was fitted."""
     least, most = found.cycles
     cycles = f"{least}" if least == most else f"{least} to {most}"
     nominal, calibrated = (found.accuracy_mm[arm]["mean"] for arm in ARMS)
     words = (
         f"ISO 9283 on {found.poses} poses repeated {cycles} times: RP {found.repeatability_mm['mean']:.3f} mm "
-        f"(at most {found.repeatability_mm['max']:.3f}), AP {nominal:.3f} mm nominal, {calibrated:.3f} mm calibrated"
+        f"(at most {found.repeatability_mm['max']:.3f}), AP {nominal:.3f} mm nominal, {calibrated:.3f} mm {arm}"
     )
     few = [f"{min_poses} poses"] * (found.poses < min_poses) + [f"{min_cycles} cycles"] * (least < min_cycles)
     words += f"; the norm requires {' and '.join(few)}" if few else ""

@@ -217,7 +217,7 @@ def _doubts(
 
 ELSEWHERE = 20.0  # nominal errors this many times the fit's: the instrument must have stood elsewhere (our choice)
 OUTLIER_SIGMAS = 8.0  # our choice
-ARM = {"urdf": "URDF alone", "corrections": "with joint corrections"}
+ARM = {"urdf": "calibrated", "corrections": "with joint corrections"}  # words for what is delivered
 
 
 @dataclass(frozen=True, eq=False)

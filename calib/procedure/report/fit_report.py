@@ -22,6 +22,7 @@ from calib.procedure.kinematic_stage.folder import metrics
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import FitMetrics, ImageCoverage, ValidationMetrics
 from calib.procedure.kinematic_stage.tables import estimate_table
+from calib.procedure.kinematic_stage.validation import ARM
 from calib.procedure.report.page import FileRow
 from calib.records import read_json
 from calib.transforms import invert
@@ -92,6 +93,11 @@ class RowErrors:
     def judged(self, deliverable: str) -> Mapping[str, tuple[float, ...]]:
         """Return the errors of the deliverable on which the verdict is based, by nature."""
         return self.calibrated if deliverable != "urdf" or not self.urdf_alone else self.urdf_alone
+
+    def judged_arm(self, deliverable: str) -> str:
+        """Return the words for that deliverable."""
+        with_corrections = deliverable != "urdf" and self.urdf_alone
+        return ARM["corrections"] if with_corrections else ARM["urdf"]
 
 
 @dataclass(frozen=True)

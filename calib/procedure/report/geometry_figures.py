@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from calib.geometry.model_choice.ladder import ModelStep
+from calib.procedure.kinematic_stage.validation import ARM
 from calib.procedure.report.charts import Captioned, Chart, Panel, bars, dots, heat, histogram, level, line, text
 from calib.procedure.report.fit_report import FittedParameter, Report
 from calib.procedure.report.style import AFTER, BEFORE, BROWN, HALF_WIDTH, INK, MARK, PAGE_WIDTH, number
@@ -18,7 +19,7 @@ PALE = "#c3ccd6"  # of changes below two sigmas
 
 
 def error_histogram(
-    before: np.ndarray, after: np.ndarray, nature: str = "position", noise: float | None = None
+    before: np.ndarray, after: np.ndarray, nature: str = "position", noise: float | None = None, arm: str = ARM["urdf"]
 ) -> Chart:
     """Return the histogram of errors before and after, each with its rms; `noise` marks the instrument's error.
 
@@ -26,6 +27,7 @@ def error_histogram(
         before, after: (m,) [m] or [rad].
         nature: ``position``, ``orientation`` or ``distance``.
         noise: rms of the instrument's own error, in the same unit.
+        arm: whose errors `after` are, in a word or two.
     """
     factor, unit = ERRORS[nature]
     one, two = factor * np.asarray(before), factor * np.asarray(after)
@@ -40,7 +42,7 @@ def error_histogram(
         [
             *(histogram(count, edges, colour) for count, colour in zip(counts, (BEFORE, AFTER))),
             level(rms[0], BROWN, upright=True, words="nominal"),
-            level(rms[1], AFTER, upright=True, words="calibrated", height=0.9),
+            level(rms[1], AFTER, upright=True, words=arm, height=0.9),
             *([level(seen, INK, ":", upright=True, words="instrument", height=0.82)] if noise else []),
         ],
         f"{rms[0]:.3g} {unit} rms before, {rms[1]:.3g} {unit} after", f"{nature} error [{unit}]", "poses",
@@ -56,6 +58,7 @@ def residuals_by_joint(
     joint_names: Sequence[str],
     prismatic: Sequence[bool],
     nature: str = "position",
+    arm: str = ARM["urdf"],
 ) -> Chart:
     """Return the chart of errors over each joint value; a trend in the errors shows an unmodelled effect.
 
@@ -64,7 +67,7 @@ def residuals_by_joint(
         before, after: (m,) sizes of errors [m] or [rad].
         joint_names: (n,).
         prismatic: (n,) which joints are.
-        nature: as in `error_histogram`.
+        nature, arm: as in `error_histogram`.
     """
     factor, unit = ERRORS[nature]
     n = q.shape[1]
@@ -76,7 +79,7 @@ def residuals_by_joint(
         x = q[:, j] if prismatic[j] else np.rad2deg(q[:, j])
         cloud = [
             line(x, factor * errors, ".", colour, size=4.5, label=label)
-            for errors, colour, label in ((before, BEFORE, "nominal"), (after, AFTER, "calibrated"))
+            for errors, colour, label in ((before, BEFORE, "nominal"), (after, AFTER, arm))
         ]
         name = f"{joint_names[j]} [{'m' if prismatic[j] else 'deg'}]"
         panels.append(Panel(cloud, x=name, y=f"error [{unit}]", ylim=limits, log="y", grid="y", ticks=5))
@@ -143,8 +146,8 @@ def image_coverage(size: tuple[int, int], count: np.ndarray, rms: np.ndarray) ->
     return Chart(panels, 0.8 + 0.5 * (PAGE_WIDTH - 2.0) * high / wide, 2)
 
 
-def parameter_changes(rows: Sequence[FittedParameter], most: int = 48, of: str = "calibrated - nominal") -> Chart:
-    """Return the chart of calibrated minus nominal values with bars of two sigmas; lengths in mm, angles in mrad.
+def parameter_changes(rows: Sequence[FittedParameter], most: int = 48, of: str = "fitted - nominal") -> Chart:
+    """Return the chart of fitted minus nominal values with bars of two sigmas; lengths in mm, angles in mrad.
 
     Args:
         rows: fitted parameters; those in other units are left out.
@@ -255,10 +258,11 @@ def captioned(report: Report) -> dict[str, Captioned]:
     result: dict[str, Captioned] = {}
     proof = next((rows for rows in report.sets if rows.unseen), report.sets[0])
     label = f"{proof.poses} {'unseen' if proof.unseen else 'fitted'} poses ({proof.name})"
+    delivered, arm = proof.judged(report.metrics.deliverable), proof.judged_arm(report.metrics.deliverable)
     for nature in ("position", "orientation", "distance"):
-        if nature in proof.calibrated:
-            sizes = [np.array(arm[nature]) for arm in (proof.nominal, proof.calibrated)]
-            chart = error_histogram(sizes[0], sizes[1], nature, report.noise.get(nature))
+        if nature in delivered:
+            before, after = np.array(proof.nominal[nature]), np.array(delivered[nature])
+            chart = error_histogram(before, after, nature, report.noise.get(nature), arm)
             named = report.metrics.fit.words(nature).capitalize()
             result[nature] = chart, f"{named} errors before and after, {label}; dashed: rms."
     rungs = [rung for rung in report.metrics.ladder if rung.cross_validated_mm is not None]
@@ -270,20 +274,22 @@ def captioned(report: Report) -> dict[str, Captioned]:
         words = "Singular values of the scaled observation matrix; filled: identifiable, open: not identifiable."
         result["singular_values"] = chart, words
     if proof.q:
-        nature = "position" if "position" in proof.calibrated else "distance"
-        before, after = (np.array(arm[nature]) for arm in (proof.nominal, proof.calibrated))
-        chart = residuals_by_joint(np.array(proof.q), before, after, report.joints, report.prismatic, nature)
+        nature = "position" if "position" in delivered else "distance"
+        before, after = np.array(proof.nominal[nature]), np.array(delivered[nature])
+        chart = residuals_by_joint(np.array(proof.q), before, after, report.joints, report.prismatic, nature, arm)
         result["joints"] = chart, f"Errors against each joint, {label}: a trend shows an unmodelled effect."
-        chart = error_map(np.array(proof.points), after, expected=np.array(proof.expected))
-        below = "; below: radius expected to contain 95 % of the errors." if proof.expected else "."
+        # intervals hold the joint corrections' errors: they say nothing of the robot without them
+        expected = proof.expected if delivered is proof.calibrated else ()
+        chart = error_map(np.array(proof.points), after, expected=np.array(expected))
+        below = "; below: radius expected to contain 95 % of the errors." if expected else "."
         named = report.metrics.fit.words(nature)
         result["map"] = chart, f"Remaining {named} error over the workspace, {label}{below}"
     for count, seen in enumerate(report.images, 1):
         chart = image_coverage(seen.size, np.array(seen.count), np.array(seen.rms))
         words = f"Number of corners and reprojection error over the image ({seen.file})."
         result["coverage" if count == 1 else f"coverage_{count}"] = chart, words
-    if arm := [row for row in report.parameters if row.group == "arm"]:
-        result["parameters"] = parameter_changes(arm), "Parameter changes by the fit. Grey: less than two sigmas."
+    if moved := [row for row in report.parameters if row.group == "arm"]:
+        result["parameters"] = parameter_changes(moved), "Parameter changes by the fit. Grey: less than two sigmas."
     if len(report.correlated.names) > 1:
         chart = correlation_map(report.correlated.names, np.array(report.correlated.matrix))
         result["correlations"] = chart, "The most strongly correlated parameters."

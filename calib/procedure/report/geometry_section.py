@@ -17,7 +17,8 @@ from calib.procedure.report.fit_report import Report, RowErrors
 from calib.units import ERRORS, SMALL
 
 KINDS = {f"{nature}_{unit}": (nature, unit) for nature, (_, unit) in ERRORS.items()}
-ARMS = {"nominal": "nominal", "calibrated": "calibrated", "urdf_alone": "URDF alone"}
+# fields of `ComparedRows` and their words, in the order of the tables
+ARMS = {"nominal": "nominal", "urdf_alone": ARM["urdf"], "calibrated": ARM["corrections"]}
 MAX_ROWS = 60  # parameters beyond which joint corrections are not listed
 MAX_POSES = 30  # repeated poses that are listed
 MAX_OUTLIERS = 20
@@ -39,8 +40,8 @@ REPEATED = (
     page.Column("pose", "{0[0]}", number=False),
     page.Column("cycles", lambda at: str(len(at[1].rows))),
     page.Column("AP nominal [mm]", lambda at: f"{np.linalg.norm(at[1].nominal_mm):.3f}"),
-    page.Column("AP calibrated [mm]", lambda at: f"{np.linalg.norm(at[1].calibrated_mm):.3f}"),
-    page.Column("AP calibrated x, y, z [mm]", lambda at: ", ".join(f"{value:+.3f}" for value in at[1].calibrated_mm)),
+    page.Column("AP after [mm]", lambda at: f"{np.linalg.norm(at[1].calibrated_mm):.3f}"),
+    page.Column("AP after, x, y, z [mm]", lambda at: ", ".join(f"{value:+.3f}" for value in at[1].calibrated_mm)),
     page.Column("RP [mm]", "{0[1].repeatability_mm:.3f}"),
     page.Column("RP a, b, c [deg]", lambda at: ", ".join(f"{value:.4f}" for value in at[1].repeatability_deg)),
     page.Column("vAP [mm]", lambda at: _numbered(at[1].multidirectional_mm, 3)),
@@ -57,8 +58,8 @@ MEANS = {
     "plane distance": "Plane distance: of a predicted point from the plane through the points of its group.",
 }
 ALONE_NOTE = (
-    "A URDF cannot contain the joint corrections of the chosen model: robot.urdf is the best geometry without them "
-    "(its errors are listed, too); robot_for_corrections.urdf with joint_corrections.csv describes the calibrated arm."
+    "A URDF cannot contain joint corrections. Calibrated: robot.urdf, the best geometry without them; with joint "
+    "corrections: robot_for_corrections.urdf with joint_corrections.csv."
 )
 
 
@@ -80,7 +81,7 @@ def read_lines(inputs: Inputs) -> list[str]:
 def outcome_section(metrics: FitMetrics) -> page.Section:
     """Return the console's section on a fit: ladder, errors, repeated poses, findings, verdict."""
     blocks: list[page.Block] = [_ladder_table(metrics), error_table(_sets(metrics), metrics.deliverable)]
-    sizes = [f"{label}: {_rms_words(found)}" for label, found in _sets(metrics)]
+    sizes = [f"{label}: {_rms_words(found, metrics.deliverable)}" for label, found in _sets(metrics)]
     blocks.append(page.Text("", [f"model {metrics.model}, {parameter_words(metrics)}", *sizes]))
     if metrics.advice and not any(metrics.advice in line for line in metrics.warnings):
         blocks.append(page.Text("", [metrics.advice], "what to do"))
@@ -202,7 +203,9 @@ def error_table(sets: Sequence[tuple[str, ComparedRows]], deliverable: str) -> p
     notes += dict.fromkeys(line for _, found in sets for line in meanings(found))
     header = ("error", "arm", "mean", "rms", "95 %", "max")
     groups = {label: list(_error_rows(found)) for label, found in sets}
-    judged = lambda row: row[1:2] in (("calibrated",), (ARM[deliverable or "corrections"],))  # noqa: E731
+    alone = any(found.urdf_alone for _, found in sets)
+    words = ARM["corrections"] if alone and deliverable != "urdf" else ARM["urdf"]
+    judged = lambda row: row[1:2] == (words,)  # noqa: E731
     title = "Errors of the nominal and the calibrated arm"
     return page.grouped(title, header, groups, " ".join(notes), judged, texts=2)
 
@@ -213,7 +216,7 @@ def _error_rows(found: ComparedRows) -> Iterator[tuple[str, ...]]:
         f"{found.words(nature)} [{unit}]": {arm: _errors(found, arm, key) for arm in ARMS}
         for key, (nature, unit) in KINDS.items()
     }
-    names = ARMS | ({"calibrated": ARM["corrections"]} if found.urdf_alone else {})
+    names = ARMS if found.urdf_alone else ARMS | {"calibrated": ARM["urdf"]}
     for words, arms in (*kinds.items(), ("distance of pairs [mm]", found.pair_distance_mm)):
         for arm in ARMS:
             if numbers := arms.get(arm):
@@ -243,12 +246,21 @@ def parameter_words(metrics: FitMetrics) -> str:
 
 def error_words(metrics: FitMetrics) -> str:
     """Return the rms errors on the fitted poses as text."""
-    return f"{_rms_words(metrics.fit)} on {metrics.fit.poses} fitted poses"
+    return f"{_rms_words(metrics.fit, metrics.deliverable)} on {metrics.fit.poses} fitted poses"
 
 
-def _rms_words(rows: ComparedRows) -> str:
-    arms = {ARMS[arm]: getattr(rows, arm) for arm in ARMS}
-    return f"rms {', '.join(f'{one.main.rms:.3f} mm {arm}' for arm, one in arms.items() if one and one.main)}"
+def _rms_words(rows: ComparedRows, deliverable: str) -> str:
+    """Return the rms errors of the nominal robot and of what is delivered; in brackets those of the alternative."""
+    arms = {"nominal": rows.nominal, ARM["urdf"]: rows.calibrated}
+    alternative = {}
+    if rows.urdf_alone is not None:
+        both = {ARM["urdf"]: rows.urdf_alone, ARM["corrections"]: rows.calibrated}
+        delivered = ARM["urdf"] if deliverable == "urdf" else ARM["corrections"]
+        arms = {"nominal": rows.nominal, delivered: both.pop(delivered)}
+        alternative = both
+    words = [f"{size.main.rms:.3f} mm {name}" for name, size in arms.items() if size.main]
+    bracketed = [f" ({size.main.rms:.3f} mm {name})" for name, size in alternative.items() if size.main]
+    return f"rms {', '.join(words)}{''.join(bracketed)}"
 
 
 def _parameter_table(report: Report) -> page.Table:
@@ -265,7 +277,7 @@ def _parameter_table(report: Report) -> page.Table:
     note = f"{left} joint corrections are listed in joint_corrections.csv." if left else ""
     if report.kept:
         note = f"Not fitted, kept at their nominal values: {', '.join(report.kept)}. {note}"
-    header = ("parameter", "unit", "nominal", "calibrated", "change", "σ", "RSD")
+    header = ("parameter", "unit", "nominal", "fitted", "change", "σ", "RSD")
     return page.Table("Fitted parameters", header, rows, note.strip(), numbers=range(2, 7))
 
 
@@ -304,7 +316,14 @@ def _identifiability(report: Report) -> list[str]:
 def _repeated_sentences(metrics: FitMetrics) -> list[str]:
     """Return a sentence on accuracy and repeatability for each set of rows with repeated poses."""
     sets = {"fitted": metrics.fit, **metrics.validation}
-    return [f"{name}: {iso9283_sentence(found.iso9283)}" for name, found in sets.items() if found.iso9283]
+    return [f"{name}: {iso9283_words(found)}" for name, found in sets.items() if found.iso9283]
+
+
+def iso9283_words(rows: ComparedRows) -> str:
+    """Return the sentence on repeated poses, naming the arm; empty where no pose was repeated."""
+    if rows.iso9283 is None:
+        return ""
+    return iso9283_sentence(rows.iso9283, ARM["corrections"] if rows.urdf_alone else ARM["urdf"])
 
 
 def iso9283_tables(metrics: FitMetrics, most: int = MAX_POSES) -> list[page.Table]:
@@ -312,7 +331,7 @@ def iso9283_tables(metrics: FitMetrics, most: int = MAX_POSES) -> list[page.Tabl
     result = []
     for name, found in {"fitted": metrics.fit, **metrics.validation}.items():
         if iso := found.iso9283:
-            title = f"Accuracy and repeatability, {name} ({iso9283_sentence(iso)})"
+            title = f"Accuracy and repeatability, {name} ({iso9283_words(found)})"
             result.append(page.table(title, REPEATED, [*enumerate(iso.each, 1)], ISO_NOTE, most=most))
     return result
 

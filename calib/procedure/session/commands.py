@@ -22,7 +22,7 @@ from calib.folders import CERTIFICATE, PAGES, SESSION
 from calib.geometry.observability import targets_of
 from calib.procedure.excitation.coefficients import RUN, SAMPLES
 from calib.procedure.excitation.limits import read_motion_limits
-from calib.procedure.kinematic_stage.folder import URDF
+from calib.procedure.kinematic_stage.folder import CORRECTED_URDF, TERMS, URDF
 from calib.procedure.measuring.constraints_file import UNKNOWN, beside
 from calib.procedure.measuring.pose_limits import read_limits, tables_of
 from calib.procedure.report import page
@@ -258,9 +258,15 @@ def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", 
 def _ending(session: Session) -> tuple[str, ...]:
     """Return the closing lines of a complete session: the verdict, where certificate and robot are."""
     first, *others = PAGES
-    page, robot = f"{session.path(first)} ({', '.join(others)})", session.path(f"{session.export}/{URDF}")
+    page = f"{session.path(first)} ({', '.join(others)})"
     found, further = session.verdicts(), [line for ending in offered("endings") for line in ending(session)]
-    use = " (for inspection only, do not use)" if found.level == "fail" else ""
+    robot = session.path(f"{session.export}/{URDF}")
+    corrected = session.path(f"{session.export}/{CORRECTED_URDF}")
+    use = ""
+    if session.settings.fit.deliverable == "corrections" and corrected.exists():
+        robot, use = corrected, f" with {TERMS}"
+    if found.level == "fail":
+        use += " (for inspection only, do not use)"
     made = f"robot: {robot}{use}" if robot.exists() else "no robot was exported"
     return ("", str(found), f"certificate: {page}", made, *further)
 

@@ -336,8 +336,11 @@ def _as_delivered(session: Session, found: Assessment) -> Verdict:
         known = exported.with_masses and exported.prediction
     except CalibError as error:
         verdict = verdict.for_prediction(f"the dynamics cannot be exported: {error}")
-    worst = max((one.judged.total for one in found.proofs.values()), default=0.0)
-    left, what = (worst, "identified model") if known is None else (known.exported, "exported robot")
+    left, what = max((one.judged.total for one in found.proofs.values()), default=0.0), "identified model"
+    if known is not None:
+        left, what = known.exported, "exported robot"
+        figure = f"{left:.2f} % of the torque unexplained by the exported robot"
+        verdict = replace(verdict, reason=f"{figure} (identified model: {verdict.reason})")
     tolerance = session.settings.dynamics.tolerance_percent
     if not tolerance or left <= tolerance:
         return verdict

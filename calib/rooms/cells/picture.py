@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib import files
+from calib.procedure.export.delivery import prediction
 from calib.procedure.report import fit_report
 from calib.procedure.report.charts import Chart, Panel, line, picture, text
 from calib.procedure.report.geometry_figures import error_histogram
@@ -68,4 +69,8 @@ def _torque(session: Session) -> Panel:
         layers.append(line(t, values[:, j], colour=colour, width=width))
         layers.append(text(name, t[0] + at * (t[-1] - t[0]), above, (0, 0), colour))
     title, y = f"{torque_error(session):.1f} % of torque unexplained", f"{unseen.rows[j]} [{unseen.units[j]}]"
+    known = prediction(session.path(session.export))
+    if known is not None:
+        # of the exported robot, in brackets of the identified model
+        title = f"{known.exported:.1f} % ({torque_error(session):.1f} %) unexplained"
     return Panel(layers, title, "unseen motion [s]", y, xlim=(t[0], t[-1]), ylim=(1.1 * low, 1.1 * above))

@@ -6,11 +6,17 @@ from dataclasses import replace
 import numpy as np
 
 from calib.procedure.findings import sentence
-from calib.procedure.kinematic_stage.comparison import iso9283_sentence
 from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics
 from calib.procedure.kinematic_stage.validation import ARM
 from calib.procedure.report.fit_report import Report, RowErrors
-from calib.procedure.report.geometry_section import deciding, error_table, iso9283_tables, meanings, report_section
+from calib.procedure.report.geometry_section import (
+    deciding,
+    error_table,
+    iso9283_tables,
+    iso9283_words,
+    meanings,
+    report_section,
+)
 from calib.procedure.report.page import Block, Picture, Pictures, Text
 from calib.rooms.certificate.record import Stage
 from calib.units import ERRORS, JOINT
@@ -75,7 +81,8 @@ def _figures(report: Report, own: RowErrors, label: str) -> Iterator[Picture]:
     left = own.judged(report.metrics.deliverable)
     for nature in left:
         before, after = np.array(own.nominal[nature]), np.array(left[nature])
-        chart = error_histogram(before, after, nature, report.noise.get(nature))
+        arm = own.judged_arm(report.metrics.deliverable)
+        chart = error_histogram(before, after, nature, report.noise.get(nature), arm)
         named = report.metrics.fit.words(nature).capitalize()
         words = f"{named} errors, {label}; lines: rms, and the instrument's own error where it is stated."
         yield vector(replace(chart, height=2.0), words)
@@ -113,7 +120,7 @@ def _worst(report: Report, own: RowErrors) -> Iterator[str]:
 
 def _iso9283(metrics: FitMetrics) -> list[Block]:
     sets = {"fitted poses": metrics.fit, **metrics.validation}
-    said = [f"{name}: {iso9283_sentence(found.iso9283)}" for name, found in sets.items() if found.iso9283]
+    said = [f"{name}: {iso9283_words(found)}" for name, found in sets.items() if found.iso9283]
     tables = [replace(one, title="") for one in iso9283_tables(metrics, MAX_POSES)[:1]]
     title = "Pose accuracy AP and repeatability RP (ISO 9283)"
     return [Text(title, said or [f"not measured: {NO_ISO.partition(': ')[2]}"]), *tables]

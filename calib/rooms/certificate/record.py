@@ -155,7 +155,7 @@ def judgement(section: Section, most: int | None = None) -> Judgement:
 
 def key_table(sections: Sequence[Section]) -> Table:
     """Return the table of what verdicts rest on: before, after, tolerance asked, and whether it is met."""
-    header = ("quantity", "nominal", "calibrated", "standard error", "on", "tolerance asked", "met")
+    header = ("quantity", "nominal", "after", "standard error", "on", "tolerance asked", "met")
     rows = [row for one in sections if one.figures for row in ((one.title,), *map(_cells, one.figures))]
     judged = frozenset(k for k, row in enumerate(rows) if len(row) > 1 and row[5] != "–")
     return Table("Tolerance asked and met", header, rows, strong=judged, numbers=(1, 2, 3, 5))

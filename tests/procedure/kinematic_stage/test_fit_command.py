@@ -15,6 +15,8 @@ from calib.geometry.weighing import Settings
 from calib.procedure.kinematic_stage import fit, inputs
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.validation import Arms, assess
+from calib.procedure.report import fit_report
+from calib.procedure.report.geometry_figures import captioned
 from calib.robot import calibrated
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.formats import urdf
@@ -212,6 +214,30 @@ def test_a_calibrated_folder_is_a_robot_and_a_worse_arm_fails(cell, calib):
     ) and "verdict: fail" in out
 
 
+@pytest.mark.parametrize("deliverable", ["urdf", "corrections"])
+def test_calibrated_is_robot_urdf_in_console_report_and_certificate(cell, calib, deliverable):
+    """The deliverable's figure comes first in each, the alternative's has its words; plots show the deliverable."""
+    file = cell.write("a.csv", cell.measure(90))
+    asked = ("--model", "coupling", "--holdout", 0.25, "--deliverable", deliverable, "--out", "done")
+    code, said, errors = calib("fit", "ur5", file, *asked)
+    assert code == 0, errors
+    (unseen,) = json.loads(Path("done/metrics.json").read_text())["validation"].values()
+    nominal, alone, corrected = (unseen[arm]["position_mm"]["rms"] for arm in ("nominal", "urdf_alone", "calibrated"))
+    words = [f"{alone:.3f} mm calibrated", f"{corrected:.3f} mm with joint corrections"]
+    judged = alone
+    if deliverable == "corrections":
+        words, judged = words[::-1], corrected
+    assert f"rms {nominal:.3f} mm nominal, {words[0]} ({words[1]})" in said
+    assert f"{judged:.3f} mm rms on a.csv, unseen, {words[0].partition(' mm ')[2]} (nominal" in said
+
+    certificate = Path("done/certificate.html").read_text()
+    first = f"position, rms ({words[0].partition(' mm ')[2]})"
+    second = f"position, rms ({words[1].partition(' mm ')[2]})"
+    assert 0 < certificate.index(first) < certificate.index(second)
+    histogram, _ = captioned(fit_report.read(Path("done/report.json")))["position"]
+    assert f"{nominal:.3g} mm rms before, {judged:.3g} mm after" == histogram.panels[0].title
+
+
 def test_deflections_go_out_as_a_table_with_its_formula_and_come_back(cell, calib):
     file = cell.write("a.csv", cell.measure(90))
     assert calib("fit", "ur5", file, "--model", "coupling", "--out", "done")[0] == 0
@@ -224,11 +250,11 @@ def test_deflections_go_out_as_a_table_with_its_formula_and_come_back(cell, cali
     seen = np.array([[row[axis] for axis in "xyz"] for row in cell.measure(90)])
     size = np.linalg.norm(installation.see(placed, q).point.T - seen, axis=1)
     assert np.isclose(1e3 * np.sqrt(np.mean(size**2)), metrics["fit"]["calibrated"]["position_mm"]["rms"], rtol=1e-6)
-    # a URDF alone is the best rigid geometry, beside the one that the corrections belong to
+    # robot.urdf is the best rigid geometry, beside the one that the corrections belong to
     alone = metrics["fit"]["urdf_alone"]["position_mm"]["rms"]
     assert metrics["fit"]["calibrated"]["position_mm"]["rms"] <= alone < metrics["fit"]["nominal"]["position_mm"]["rms"]
     left = [1e3 * metrics["findings"][f"{head}cross_validated"] for head in ("rigid_", "")]
-    assert metrics["reason"].startswith(f"{left[0]:.3f} mm rms by cross-validation only, URDF alone")
+    assert metrics["reason"].startswith(f"{left[0]:.3f} mm rms by cross-validation only, calibrated")
     (other,) = [one["values"] for one in metrics["noticed"] if one["code"] == "other-deliverable"]
     assert (1e3 * other["rms"], other["level"]) == (pytest.approx(left[1]), "pass")
     some = q[:20] / 2
@@ -238,7 +264,7 @@ def test_deflections_go_out_as_a_table_with_its_formula_and_come_back(cell, cali
     assert np.abs(forward(rigid, some) - forward(calibrated.read("done").chain, some)).max() < 1e-9
     Path("ur5.urdf").write_text(write_new(load("ur5")))
     said = calib("export", "done", "--urdf", "ur5.urdf", "--out", "new.urdf")[1]
-    assert f"{left[0]:.3f} mm rms by cross-validation only, URDF alone" in said
+    assert f"{left[0]:.3f} mm rms by cross-validation only, calibrated" in said
     assert np.abs(forward(urdf.read("new.urdf"), some) - forward(rigid, some)).max() < 1e-9
     assert calib("export", "done", "--urdf", "ur5.urdf", "--out", "new.urdf", "--for-corrections")[0] == 0
     assert np.abs(forward(urdf.read("new.urdf"), some) - with_corrections).max() < 1e-9

@@ -36,7 +36,7 @@ def test_ur5_tracker(data, calib, here):
 
 
 def test_a_tolerance_holds_for_each_file_that_is_delivered(data, calib, here):
-    """0.107 mm by the URDF alone, 0.060 mm with joint corrections."""
+    """0.107 mm calibrated, 0.060 mm with joint corrections."""
     folder = data / "ur5_gts3800"
     given = (folder / "model.urdf", folder / "grid_800.csv", "--holdout", "0.25", "--tolerance", "0.1", "--no-plots")
     for deliverable, level in (("urdf", "fail"), ("corrections", "pass")):
