@@ -25,7 +25,8 @@ def load(robot: str | Path, *, base: str | None = None, tip: str | None = None) 
             or the folder of an earlier fit, whose nominal robot, covariance and joint corrections come along. Of a
             parallel robot (``dualv fivebar stewart``, or a TOML of legs) the result is a
             `calib.procedure.robot_kinds.Mechanism`, which the verbs take likewise.
-        base, tip: links of a URDF between which the arm runs; by default the longest chain without gripper.
+        base, tip: links of a URDF between which the arm runs; by default from the root to
+            the flange (`calib.robot.formats.arm_ends`); ``print`` says which link that is, and why.
 
     Returns:
         The robot; without a fit behind it, its ``nominal``, ``covariance`` and ``corrections`` are None.

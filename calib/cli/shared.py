@@ -221,7 +221,7 @@ class Common:
     Attributes:
         robot: a .urdf, an MDH .toml, a library name, or the folder of an earlier fit.
         base: URDF: the link the arm starts at.
-        tip: URDF: the link the arm ends at.
+        tip: URDF: the link the arm ends at; else its flange (tool0, flange), which is printed with the reason.
         workers: local processes, or the address of a Dask scheduler.
         plots: draw figures, or leave them out.
         verbose: print all details, tables included.

@@ -4,6 +4,7 @@ Path search tests a few postures at a time, thousands of times: NumPy's calls wo
 
     form      (K, 5): axis (0 to 5 as `calib.robot.chain.AXES`), sign, value, ratio, joint (-1: it does not move)
     place     (K + 1, 12): rotation by rows and origin before each element; row K the tail
+    attached  (E, 7): links outside the chain: number of moving elements before them; start and end in the last's frame
     targets   (T, 3) in the tip's frame [m]
     own       (P, 2) capsules compared with each other, radii (C,) [m]
     faces     (W, 5): capsule, normal, offset of a wall
@@ -18,7 +19,7 @@ OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
 
 
 @njit(**OPTIONS)
-def clear(q, form, place, stand, targets, own, radii, faces, margin):
+def clear(q, form, place, stand, attached, targets, own, radii, faces, margin):
     """Return the mask (m,) of joint values q (m, n) with all distances of `own` pairs and `faces` above `margin` [m].
 
     Args:
@@ -27,10 +28,10 @@ def clear(q, form, place, stand, targets, own, radii, faces, margin):
     count, moving = len(form), 0
     for k in range(count):
         moving += form[k, 4] >= 0
-    lines = np.empty((moving + 1 + len(targets), 6))
+    lines = np.empty((moving + 1 + len(attached) + len(targets), 6))
     good = np.ones(len(q), dtype=np.bool_)
     for i in range(len(q)):
-        _lines(q[i], form, place, stand, targets, lines)
+        _lines(q[i], form, place, stand, attached, targets, lines)
         for p in range(len(faces)):
             c = int(faces[p, 0])
             one = faces[p, 1] * lines[c, 0] + faces[p, 2] * lines[c, 1] + faces[p, 3] * lines[c, 2]
@@ -49,13 +50,14 @@ def clear(q, form, place, stand, targets, own, radii, faces, margin):
 
 
 @njit(**OPTIONS)
-def _lines(q, form, place, stand, targets, lines):
-    """Write the lines of all capsules (base, moving bodies, targets) into `lines`."""
+def _lines(q, form, place, stand, attached, targets, lines):
+    """Write the lines of all capsules (base, moving bodies, links outside the chain, targets) into `lines`."""
     r, x, turned = np.zeros((3, 3)), np.zeros(3), np.empty((3, 3))
     r[0, 0] = r[1, 1] = r[2, 2] = 1.0
     lines[0] = 0.0
     lines[0, 2] = stand
-    body = 0
+    body, first = 0, len(lines) - len(attached) - len(targets)
+    _carry(r, x, 0, attached, lines, first)
     for k in range(len(form) + 1):
         fixed = place[k]
         for a in range(3):
@@ -86,13 +88,27 @@ def _lines(q, form, place, stand, targets, lines):
             for a in range(3):
                 u, v = r[a, one], r[a, two]
                 r[a, one], r[a, two] = co * u + si * v, co * v - si * u
+        if joint >= 0:
+            _carry(r, x, body, attached, lines, first)
     _put(x, lines, body, 3)
+    first += len(attached)
     for t in range(len(targets)):
         for a in range(3):
-            lines[body + 1 + t, a] = x[a]
-            lines[body + 1 + t, 3 + a] = (
-                x[a] + r[a, 0] * targets[t, 0] + r[a, 1] * targets[t, 1] + r[a, 2] * targets[t, 2]
-            )
+            lines[first + t, a] = x[a]
+            lines[first + t, 3 + a] = x[a] + r[a, 0] * targets[t, 0] + r[a, 1] * targets[t, 1] + r[a, 2] * targets[t, 2]
+
+
+@njit(**OPTIONS)
+def _carry(r, x, body, attached, lines, first):
+    """Write the lines of the links fixed to a body with rotation r and origin x into `lines`, from row `first` on."""
+    for e in range(len(attached)):
+        if attached[e, 0] == body:
+            for a in range(3):
+                for end in range(2):
+                    b = 1 + 3 * end
+                    lines[first + e, 3 * end + a] = (
+                        x[a] + r[a, 0] * attached[e, b] + r[a, 1] * attached[e, b + 1] + r[a, 2] * attached[e, b + 2]
+                    )
 
 
 @njit(**OPTIONS)

@@ -20,7 +20,7 @@ import numpy as np
 from calib.errors import RobotError, listing, refuse_robot
 from calib.records import shaped
 from calib.robot.chain import AXES, Chain, random_joints
-from calib.robot.kinematics import sweep
+from calib.robot.kinematics import moving_frames, sweep
 
 ALWAYS = 0.95
 SAMPLES = 200
@@ -57,6 +57,21 @@ class Wall:
     name: str
     normal: np.ndarray
     offset: float
+
+
+@dataclass(frozen=True, eq=False)
+class Attached:
+    """Link outside the chain: a capsule fixed to a body of the arm, or to its base; a sphere where it has no length.
+
+    Attributes:
+        body: number of moving elements before it; 0 is the base.
+        start, end: (3,) in the frame of the last of these, or in the base frame [m].
+    """
+
+    name: str
+    body: int
+    start: np.ndarray
+    end: np.ndarray
 
 
 def signed_distance(obstacle: Obstacle, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -168,8 +183,15 @@ TARGET_RADIUS = 0.02
 
 
 def usual_radius(chain: Chain) -> float:
-    """Return the default radius [m] of the capsules that represent an arm's links."""
-    return max(MIN_RADIUS, round(RADIUS_SHARE * chain.stretched_length(), 3))
+    """Return the default radius [m] of the capsules that represent an arm's links.
+
+    A base below the first joint counts as no longer than the longest link: an arm on a pillar is no thicker for it.
+    """
+    lines = _lines_of(chain, np.zeros((1, chain.n)), np.empty((0, 3)))
+    lengths = np.linalg.norm(lines.end - lines.start, axis=2)[0]
+    mount = float(np.linalg.norm(lines.end[0, 0]))
+    length = chain.stretched_length() - max(0.0, mount - float(lengths[1:].max()))
+    return max(MIN_RADIUS, round(RADIUS_SHARE * length, 3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,6 +220,7 @@ class Capsules:
         radii: (C,) [m].
         solid: (S,) capsules with a length; the others are ignored.
         targets: (T, 3) in the tip's frame [m]; their capsules are the last T.
+        beside: links outside the chain; their capsules come before those of the targets.
         own: (P, 2) pairs of capsules to compare.
         world: (W, 2) pairs of capsule and wall or obstacle (walls first) to compare.
         walls: the floor among them.
@@ -217,6 +240,7 @@ class Capsules:
     obstacles: tuple[Obstacle, ...]
     excluded: tuple[tuple[str, str], ...] = ()
     missing: tuple[str, ...] = ()
+    beside: tuple[Attached, ...] = ()
 
     @cached_property
     def pairs(self) -> tuple[tuple[str, str], ...]:
@@ -255,7 +279,7 @@ class Capsules:
         return good
 
     @cached_property
-    def _compiled(self) -> tuple[Any, Any, float, Any, Any, Any, Any]:
+    def _compiled(self) -> tuple[Any, Any, float, Any, Any, Any, Any, Any]:
         """Arguments of `calib.robot.capsule_kernels.clear` between q and margin."""
         form = [
             (AXES.index(e.axis), e.sign, e.value, e.ratio, -1.0 if e.joint is None else e.joint)
@@ -268,9 +292,10 @@ class Capsules:
             for body, thing in self.world
             if thing < len(self.walls)
         ]
+        attached = [np.concatenate([[one.body], one.start, one.end]) for one in self.beside]
         return (
-            np.array(form), np.array(place), min(self.chain.floor, 0.0), self.targets, self.own, self.radii,
-            np.array(faces).reshape(-1, 5),
+            np.array(form), np.array(place), min(self.chain.floor, 0.0), np.array(attached).reshape(-1, 7),
+            self.targets, self.own, self.radii, np.array(faces).reshape(-1, 5),
         )  # fmt: skip
 
     @cached_property
@@ -303,7 +328,7 @@ class Capsules:
 
     def lines_at(self, q: np.ndarray) -> _Lines:
         """Return the lines along the middles of the capsules at postures q (m, n)."""
-        return _lines_of(self.chain, q, self.targets)
+        return _lines_of(self.chain, q, self.targets, self.beside)
 
     def _measured(self, lines: _Lines, rough: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return distances (m, P + W), normals (m, P + W, 3) towards the second body, and the nearest points.
@@ -369,6 +394,7 @@ def from_chain(
     margin: float = 0.0,
     within: bool = True,
     ignored: Collection[frozenset[str]] = (),
+    beside: Sequence[Attached] = (),
     seed: int = 0,
 ) -> Capsules:
     """Return the collision model of an arm with capsules from each joint frame to the next.
@@ -385,30 +411,34 @@ def from_chain(
         margin: the least distance that will be asked for [m]; pairs that never have it are left out.
         within: False: parts of the arm are not compared with each other.
         ignored: pairs of links that are not compared.
+        beside: links outside the chain, compared with all that moves relative to them.
         seed: of the random postures that show which pairs those are.
     """
     size = usual_radius(chain) if radius is None else radius
     places = np.asarray(targets, dtype=float).reshape(-1, 3)
     places = places[np.linalg.norm(places, axis=1) > 1e-6]
-    lines = _lines_of(chain, np.zeros((1, chain.n)), places)
+    lines = _lines_of(chain, np.zeros((1, chain.n)), places, beside)
     length = np.linalg.norm(lines.end - lines.start, axis=2)[0]
     moving, first = [chain.elements[k] for k in chain.driven], set(chain.moving.tolist())
     links = chain.links or tuple(f"{name}_link" for name in chain.joint_names)
     own_names = (
         links[one.joint or 0] if k in first else f"{one.name}_link" for k, one in zip(chain.driven.tolist(), moving)
     )
-    names = [chain.base, *own_names]
+    names = [chain.base, *own_names, *(one.name for one in beside)]
     names += ["target"] if len(places) == 1 else [f"target {k + 1}" for k in range(len(places))]
-    bodies = np.array([*range(len(moving) + 1), *[len(moving)] * len(places)])
-    radii = np.array([*[size] * (len(moving) + 1), *[TARGET_RADIUS] * len(places)])
-    there = np.flatnonzero(length > 1e-6)
-    own = [(i, j) for i in there for j in there if bodies[j] > bodies[i] + 1 and within]
+    others = np.zeros(len(names), dtype=bool)
+    others[len(moving) + 1 : len(moving) + 1 + len(beside)] = True
+    bodies = np.array([*range(len(moving) + 1), *(one.body for one in beside), *[len(moving)] * len(places)])
+    radii = np.array([*[size] * (len(moving) + 1 + len(beside)), *[TARGET_RADIUS] * len(places)])
+    there = np.flatnonzero((length > 1e-6) | others)
+    own = [(i, j) for i in there for j in there if bodies[j] > bodies[i] + (0 if others[i] or others[j] else 1)]
+    own = own if within else []
     own = [(i, j) for i, j in own if frozenset((names[i], names[j])) not in ignored]
     planes = (*([] if floor is None else [Wall("floor", np.array([0.0, 0.0, 1.0]), floor)]), *walls)
     world = [(i, k) for k in range(len(planes) + len(obstacles)) for i in there if bodies[i]]
     found = Capsules(
         chain, tuple(names), bodies, radii, there, places, np.array(own, dtype=int).reshape(-1, 2),
-        np.array(world, dtype=int).reshape(-1, 2), planes, tuple(obstacles),
+        np.array(world, dtype=int).reshape(-1, 2), planes, tuple(obstacles), beside=tuple(beside),
     )  # fmt: skip
     if not found.pairs:
         return found
@@ -418,8 +448,8 @@ def from_chain(
     return replace(found, own=found.own[~gone[: len(own)]], world=found.world[~gone[len(own) :]], excluded=excluded)
 
 
-def _lines_of(chain: Chain, q: np.ndarray, targets: np.ndarray) -> _Lines:
-    """Return the centre lines of base (from its foot), moving bodies and targets at joint values q (m, n)."""
+def _lines_of(chain: Chain, q: np.ndarray, targets: np.ndarray, beside: Sequence[Attached] = ()) -> _Lines:
+    """Return the centre lines of base (from its foot), moving bodies, links beside and targets at q (m, n)."""
     walked = sweep(chain, q)
     axes, places = (part[chain.driven].transpose(2, 0, 1) for part in (walked.directions, walked.origins))
     begins = places.copy()
@@ -429,8 +459,20 @@ def _lines_of(chain: Chain, q: np.ndarray, targets: np.ndarray) -> _Lines:
     m, tip = len(q), walked.position.T[:, None]
     seen = tip + np.einsum("tc,cdm->mtd", targets, walked.rotation)
     stand = np.broadcast_to([0.0, 0.0, min(chain.floor, 0.0)], (m, 1, 3))
-    start = np.concatenate([stand, begins, np.repeat(tip, len(targets), axis=1)], axis=1)
-    return _Lines(start, np.concatenate([places, tip, seen], axis=1), axes, places)
+    first, last = _attached_ends(chain, q, beside)
+    start = np.concatenate([stand, begins, first, np.repeat(tip, len(targets), axis=1)], axis=1)
+    return _Lines(start, np.concatenate([places, tip, last, seen], axis=1), axes, places)
+
+
+def _attached_ends(chain: Chain, q: np.ndarray, beside: Sequence[Attached]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first and last points (m, E, 3) [m] of the links outside the chain at joint values q (m, n)."""
+    if not beside:
+        return np.empty((len(q), 0, 3)), np.empty((len(q), 0, 3))
+    base = np.broadcast_to(np.eye(4), (1, len(q), 4, 4))
+    frames = np.concatenate([base, moving_frames(chain, q)])[[one.body for one in beside]]
+    points = [np.array([getattr(one, end) for one in beside])[:, None, :, None] for end in ("start", "end")]
+    first, last = (((frames[..., :3, :3] @ each)[..., 0] + frames[..., :3, 3]).swapaxes(0, 1) for each in points)
+    return first, last
 
 
 def _nearest(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -49,6 +49,11 @@ class Collision:
     _chain: Chain
     _links: int
 
+    @property
+    def links(self) -> set[str]:
+        """Names of the links that have a shape."""
+        return {self._model.frames[shape.parentFrame].name for shape in self._geometry.geometryObjects[: self._links]}
+
     def distances(self, q: np.ndarray) -> np.ndarray:
         """Return the distances (m, pairs) [m] at joint values q (m, n); negative: depth of penetration."""
         found = [[one.min_distance for one in measured] for measured in self._measured(q)]

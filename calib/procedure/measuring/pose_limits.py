@@ -27,6 +27,7 @@ from calib.robot.chain import Chain
 from calib.robot.description import MAX_TURN, remarks
 from calib.robot.formats.urdf_tree import is_urdf, text
 from calib.robot.formats.urdf_tree import read as read_tree
+from calib.robot.tables import load as load_table
 from calib.robot.tables import placement
 from poses import constraints
 from poses.space import PoseConstraint, SearchSpace
@@ -164,7 +165,7 @@ def limits_of(
     with refused_as(UsageError, RobotError, "{}"):
         margin = 0.0 if "joint-margin" in absent else _joint_margin(stated.joints, where)
         lower, upper, wide = _joints(stated.joints, cell, where, margin)
-        model, checked, notes = _collision(stated, cell, source, where, absent)
+        model, checked, notes, missed = _collision(stated, cell, source, where, absent)
         found = (*_target(stated, cell), *_orientation(stated, cell, where))
         sight = _sight(stated, cell, where, None if "view" in absent else model) if seen else None
     kept = (f"{100 * margin:g} % of each joint's range to its limits", *checked) if margin else checked
@@ -174,7 +175,8 @@ def limits_of(
     clearance = (stated.collision or CollisionTable()).margin
     pairs = None if model is None or not model.pairs else model
     notes = (*notes, *wide, *remarks(cell.chain))
-    return Limits(lower, upper, found, notes, pairs, clearance, sight, kept, _unchecked(stated, absent, seen))
+    unchecked = (*_unchecked(stated, absent, seen), *missed)
+    return Limits(lower, upper, found, notes, pairs, clearance, sight, kept, unchecked)
 
 
 def _unchecked(stated: ConstraintsFile, absent: set[str], seen: bool) -> tuple[str, ...]:
@@ -277,8 +279,8 @@ def _sight(stated: ConstraintsFile, cell: Installation, where: str, model: Any) 
 
 def _collision(
     stated: ConstraintsFile, cell: Installation, source: Path | None, where: str, absent: set[str]
-) -> tuple[Any, tuple[str, ...], tuple[str, ...]]:
-    """Return the collision model, the names of its checks, and notes."""
+) -> tuple[Any, tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
+    """Return the collision model, the names of its checks, notes, and what it does not check."""
     table, chain = stated.collision or CollisionTable(), cell.chain
     floor = (None if "floor" in absent else chain.floor) if table.floor is None else table.floor
     obstacles = [
@@ -290,16 +292,16 @@ def _collision(
     place = partial(_model, cell, source, table, obstacles, walls, within)
     with refused_as(UsageError, RobotError, f"{where}: {{}}"):
         try:
-            model, shapes, notes = place(floor)
+            model, shapes, notes, missed = place(floor)
         except RobotError:
             if floor is None or table.floor is not None:
                 raise
-            model, shapes, notes = place(None)
+            model, shapes, notes, missed = place(None)
             notes = (*notes, f"floor NOT checked: all postures reach below {floor:g} m; set its height in [collision]")
             floor = None
     if model.excluded:
-        pairs = listing((" with ".join(pair) for pair in model.excluded), 3)
-        notes = (*notes, f"collision pairs ignored, since they touch in nearly all postures: {pairs}")
+        pairs = listing((" with ".join(pair) for pair in model.excluded), 4)
+        missed = (*missed, f"collision of {pairs} (their shapes touch in nearly all postures)")
     kept = [*([f"self-collision ({shapes})"] if within else [])]
     kept += [] if floor is None or "floor" in idle else [f"floor at {floor:g} m"]
     kept += ["walls of the cell"] if not {wall.name for wall in walls} <= idle else []
@@ -307,7 +309,7 @@ def _collision(
     notes = (*notes, *far)
     if kept:
         kept[-1] += f", {1e3 * table.margin:g} mm clearance each"
-    return model, tuple(kept), notes
+    return model, tuple(kept), notes, missed if within else ()
 
 
 def _never_act(
@@ -345,9 +347,10 @@ def _model(
     walls: Sequence[Wall],
     within: bool,
     floor: float | None,
-) -> tuple[Any, str, tuple[str, ...]]:
-    """Return the collision model, the name of its link shapes, and notes."""
+) -> tuple[Any, str, tuple[str, ...], tuple[str, ...]]:
+    """Return the collision model, the name of its link shapes, notes, and links that it does not hold."""
     from calib.robot import capsules, collision
+    from calib.robot.beside import links_beside
 
     chain, notes = cell.chain, ()
     known = links_of(chain, source) if table.ignored else ()
@@ -362,13 +365,44 @@ def _model(
             model = collision.from_urdf(source, chain.base, chain.tip, floor, obstacles, **around)
             if model.missing:
                 notes = (f"collision meshes not found, their shapes are not checked: {', '.join(model.missing[:3])}",)
-            return model, "the URDF's collision shapes", notes
+            bare = [
+                one.name for one in links_beside(text(source)[0], str(source), chain) if one.name not in model.links
+            ]
+            missed = (f"{listing(bare, 4)} (not in the arm, without collision shapes)",) if bare else ()
+            return model, "the URDF's collision shapes, links beside the arm at zero of their joints", notes, missed
         except RobotError as error:
             if "no usable <collision> shape" not in str(error):
                 raise
             notes = (f"{error.args[0].partition(';')[0]}: capsules are used as link shapes",)
     radius = capsules.usual_radius(chain) if table.radius is None else table.radius
-    return capsules.from_chain(chain, radius, floor, obstacles, **around), f"capsules of radius {radius:g} m", notes
+    described = _description(source, chain)
+    if described is None:
+        beside, missed = (), ("links beside the arm (the URDF is not at hand)",) if chain.links else ()
+    else:
+        beside, missed = links_beside(text(described)[0], str(described), chain), ()
+    model = capsules.from_chain(chain, radius, floor, obstacles, beside=beside, **around)
+    words = f"capsules of radius {radius:g} m"
+    if beside:
+        names = listing((one.name for one in beside), 4)
+        words += f"; beside the arm, at zero of their joints: {names}"
+    return model, words, notes, missed
+
+
+def _description(source: Path | None, chain: Chain) -> Path | None:
+    """Return the URDF that an arm's file is, or that a fit's ``robot.toml`` was made from; None where it is not found.
+
+    It is sought where the fit found it, and beside a session's fit.
+    """
+    if source is None or is_urdf(source):
+        return source
+    if source.suffix != ".toml" or not source.is_file():
+        return None
+    named = load_table(source).get("provenance", {}).get("robot", "")
+    places = [Path(named), source.parent.parent / "1-robot" / Path(named).name] if named else []
+    for place in places:
+        if place.is_file() and is_urdf(place) and {chain.base, chain.tip} <= set(links_of(chain, place)):
+            return place
+    return None
 
 
 def links_of(chain: Chain, source: Path | None) -> Collection[str]:

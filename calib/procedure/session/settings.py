@@ -85,7 +85,7 @@ class RobotSection:
         file: description of the robot, beside session.toml
         given: name or file as given to calib new
         base: URDF: first link of the arm; empty: the root
-        tip: URDF: last link of the arm; empty: end of the longest chain
+        tip: URDF: last link of the arm; empty: its flange
         controller: whose program of the poses is written beside them, as krl; see `calib program --list`
     """
 

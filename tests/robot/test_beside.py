@@ -1,0 +1,121 @@
+"""Links outside the chain (second arm, torso, gripper) as obstacles of an arm of capsules."""
+
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+from differences import check
+from robot_oracle import axis, inertial, joint, robot
+
+from calib.geometry.installation import Installation
+from calib.procedure.measuring.pose_limits import read_limits
+from calib.robot import calibrated, capsules
+from calib.robot.beside import links_beside
+from calib.robot.calibrated import CalibratedChain
+from calib.robot.chain import random_joints
+from calib.robot.formats import urdf
+
+OBLIQUE = axis("1 2 -2")
+
+
+def dual() -> str:
+    """Return two three-axis arms on a lift, one with fingers, one of oblique axes, and a frame that is no body."""
+    joints = [joint("lift", "prismatic", "world", "torso", axis("0 0 1"), "0 0 1")]
+    for side, y in (("left", 0.3), ("right", -0.3)):
+        joints += [
+            joint(f"{side}_1", "revolute", "torso", f"{side}_a", axis("0 0 1"), f"0 {y} 0.1", "0.1 0.2 0.3"),
+            joint(f"{side}_2", "revolute", f"{side}_a", f"{side}_b", OBLIQUE, "0.1 0 0.3"),
+            joint(f"{side}_3", "revolute", f"{side}_b", f"{side}_c", axis("0 1 0"), "0 0.05 0.4"),
+            joint(f"{side}_hand", "fixed", f"{side}_c", f"{side}_tool0", "", "0 0 0.2"),
+            joint(f"{side}_finger", "prismatic", f"{side}_tool0", f"{side}_jaw", axis("0 1 0"), "0 0.05 0.1"),
+        ]
+    joints.append(joint("mark", "fixed", "right_b", "only_a_frame", "", "5 5 5"))
+    return robot(*joints, bodies={"left_a": inertial(1.0, "0 0 0.1")})
+
+
+def arm(source: str) -> tuple[urdf.Chain, capsules.Capsules]:
+    chain = urdf.parse(source, tip="right_tool0")
+    beside = links_beside(source, "dual", chain)
+    return chain, capsules.from_chain(chain, 0.03, -0.5, targets=[(0.0, 0.02, 0.1)], beside=beside)
+
+
+def test_links_beside_stand_where_pinocchio_puts_them():
+    source = dual()
+    chain, found = arm(source)
+    names = {one.name for one in found.beside}
+    assert names == {"left_a", "left_b", "left_c", "left_tool0", "left_jaw", "right_jaw"}
+    q = random_joints(chain, 10, 1)
+    lines = found.lines_at(q)
+    model = pin.buildModelFromXML(source)
+    data = model.createData()
+    base = model.getFrameId("world", pin.FrameType.BODY)
+    for m, row in enumerate(q):
+        configuration = pin.neutral(model)
+        for name, value in zip(chain.joint_names, row, strict=True):
+            configuration[model.joints[model.getJointId(name)].idx_q] = value
+        pin.framesForwardKinematics(model, data, configuration)
+        for one in found.beside:
+            place = data.oMf[base].actInv(data.oMf[model.getFrameId(one.name, pin.FrameType.BODY)]).translation
+            assert np.abs(lines.end[m, found.names.index(one.name)] - place).max() < 1e-12
+
+
+def test_they_are_kept_away_from_with_exact_gradients_and_in_the_compiled_test():
+    chain, found = arm(dual())
+    assert ("left_c", "right_c") in found.pairs and ("right_jaw", "floor") in found.pairs
+    assert not any(set(pair) == {"left_a", "left_b"} for pair in found.pairs)
+    q = random_joints(chain, 400, 2)
+    distances = found.distances(q)
+    margin = float(np.median(distances.min(axis=1)))
+    assert np.array_equal(found.free(q, margin), (distances > margin).all(axis=1))
+    for row in q[distances.min(axis=1) > 0.01][:3]:
+        check(lambda x: found.distances(x[None])[0], found.gradients(row[None])[0], row, tolerance=1e-5)
+
+
+def test_limits_say_what_stands_beside_the_arm(tmp_path):
+    path = tmp_path / "dual.urdf"
+    path.write_text(dual())
+    chain = urdf.read(path, tip="right_tool0")
+    said = read_limits(None, Installation(chain), path)
+    assert any("at zero of their joints: left_a, left_b" in words for words in said.checked)
+    folder = tmp_path / "fit"
+    folder.mkdir()
+    calibrated.write(folder, CalibratedChain(chain, nominal=chain, source=str(path)))
+    again = read_limits(None, Installation(chain), folder / "robot.toml")
+    assert again.checked == said.checked
+    path.unlink()
+    without = read_limits(None, Installation(chain), folder / "robot.toml")
+    assert any("links beside the arm (the URDF is not at hand)" in words for words in without.unchecked)
+    assert not any("left_a" in words for words in without.checked)
+
+
+def test_links_beside_without_shapes_are_named_where_shapes_are_used(tmp_path):
+    sphere = '<collision><geometry><sphere radius="0.02"/></geometry></collision>'
+    shaped = dual().replace('<link name="right_c"></link>', f'<link name="right_c">{sphere}</link>')
+    path = Path(tmp_path / "shaped.urdf")
+    path.write_text(shaped)
+    chain = urdf.read(path, tip="right_tool0")
+    said = read_limits(None, Installation(chain), path)
+    assert any("left_a" in words and "without collision shapes" in words for words in said.unchecked)
+
+
+def test_pairs_that_touch_in_nearly_all_postures_are_named_as_not_checked():
+    """Axes that meet: the links around a link without length have a point in common."""
+    source = robot(
+        joint("a", "revolute", "base", "one", axis("0 0 1"), "0 0 0.4"),
+        joint("b", "revolute", "one", "two", axis("0 1 0")),
+        joint("c", "revolute", "two", "three", axis("0 1 0"), "0 0 0.4"),
+        joint("d", "fixed", "three", "tool0", "", "0 0 0.3"),
+    )
+    said = read_limits(None, Installation(urdf.parse(source)))
+    assert any(words.startswith("collision of base with two (their shapes touch") for words in said.unchecked)
+
+
+def test_an_arm_on_a_pillar_is_no_thicker_for_it():
+    def radius(height: float) -> float:
+        shoulder = joint("a", "revolute", "base", "one", axis("0 1 0"), f"0 0 {height}")
+        elbow = joint("b", "revolute", "one", "two", axis("0 1 0"), "1 0 0")
+        return capsules.usual_radius(
+            urdf.parse(robot(shoulder, elbow, joint("c", "fixed", "two", "tool0", "", "1 0 0")))
+        )
+
+    assert radius(0.2) == 0.11 and radius(1.0) == radius(4.0) == 0.15
