@@ -41,7 +41,7 @@ A room is a package of `calib.rooms` with a table ``OFFERS``: what it adds, and 
     check_controller       function: controller's name, number of joints; raises where it takes no such arm
     write_program          function: CSV of poses, path, controller's name → files of its program
     joint_origins          function: texts of a nominal and a calibrated URDF, their name → YAML for tesseract
-    ur_kinematics          function: calibrated robot → YAML for ur_description, and a remark
+    ur_kinematics          function: calibrated robot, its URDF → YAML for ur_description, and a remark
     as_described           function: controller's name, joints as it shows them → the description's joints;
     motors_as_described    the same of motors' torques and currents
     notebook               function: a result → HTML

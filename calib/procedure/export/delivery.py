@@ -34,7 +34,6 @@ them, and a note says so. The sign of Coulomb friction was smoothed as tanh(v / 
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -170,7 +169,7 @@ def _offsets(export: Export, path: Path) -> list[str]:
 def _ur_kinematics(export: Export, path: Path) -> list[str]:
     notes = []
     for kinematics in offered("ur_kinematics"):
-        content, flange = kinematics(export.robot)
+        content, flange = kinematics(export.robot, FitFolder(export.fit or Path()).urdf)
         files.write(path, _remarked(content.encode(), export.remark))
         notes.append(f"{path.name}: for kinematics_params_file of ur_description" + (f"; {flange}" if flange else ""))
     return notes
@@ -265,8 +264,10 @@ def deliver(export: Export, out: Path) -> list[str]:
 
     def write(staging: Path) -> None:
         for file in export.files:
-            with suppress(geometry.NoSuchArm):
+            try:
                 notes.extend(file.write(export, staging / file.name))
+            except geometry.NoSuchArm as error:
+                notes.append(f"{file.name}: left out: {error}")
 
     write_staged(out, [file.name for file in export.files], write)
     return notes

@@ -229,10 +229,12 @@ def postures(
         firsts = fitting[k * STARTS : (k + 1) * STARTS]
         if k == 0:
             firsts = np.vstack([middle, firsts, drawn[:STRAY]])
-        for first in firsts:
-            q = inverse.reach(goal, poses[waiting], np.tile(first, (len(waiting), 1)))
-            for index in np.flatnonzero(_met(goal, q, poses[waiting])):
-                solutions[waiting[index]] = np.vstack([solutions[waiting[index]], q[index]])
+        goals = np.repeat(poses[waiting], len(firsts), axis=0)
+        q = inverse.reach(goal, goals, np.tile(firsts, (len(waiting), 1)))
+        met = _met(goal, q, goals).reshape(len(waiting), -1)
+        q = q.reshape(len(waiting), len(firsts), -1)
+        for index, row, reached in zip(waiting, q, met):
+            solutions[index] = np.vstack([solutions[index], row[reached]])
         agreed = [len(_agreeing(goal, configuration, controller, solutions[index], middle)) for index in waiting]
         waiting = waiting[np.array(agreed, int) == 0]
         if not len(waiting):
@@ -270,6 +272,8 @@ def _objection(
     chain: Chain, configuration: Configuration, reached: np.ndarray, agreeing: np.ndarray, started: bool
 ) -> str:
     """Return why the posture of a configuration is none, or not the only one; else an empty text."""
+    if not len(agreeing) and configuration.agrees(chain, reached).any():
+        return f"{configuration.words} has no posture at this pose: its turns are not within the joints' limits"
     if not len(agreeing):
         signs = np.unique(signs_at(chain, reached, np.array(configuration.upright)), axis=0)
         stood = "; ".join(", ".join(_words(row)) for row in signs)

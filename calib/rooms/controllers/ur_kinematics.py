@@ -4,6 +4,7 @@ A nested mapping in block style (`calib.rooms.controllers.joint_origins.block`).
 """
 
 import hashlib
+from pathlib import Path
 
 import numpy as np
 
@@ -13,11 +14,14 @@ from calib.robot.calibrated import CalibratedChain, nominal_of
 from calib.robot.chain import AXES, Chain
 from calib.robot.formats import urdf_write
 from calib.robot.formats.urdf_tree import read as read_tree
+from calib.robot.formats.urdf_tree import text
 from calib.robot.kinematics import forward, joint_frames
 from calib.rooms.controllers.joint_origins import block
 from calib.transforms import invert, to_xyz_rpy
+from calib.transforms import pose as pose_of
 
 ON_AXIS = 1e-3  # [m]
+INERTIA = "base_link_inertia"
 KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
 LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 HEAD = """\
@@ -26,8 +30,12 @@ HEAD = """\
 """
 
 
-def kinematics(robot: CalibratedChain) -> tuple[str, str]:
+def kinematics(robot: CalibratedChain, urdf: Path | None = None) -> tuple[str, str]:
     """Return the kinematics YAML for ur_description, and a remark on the flange.
+
+    Args:
+        robot: the calibrated robot, whatever links it begins and ends at.
+        urdf: of it, which says where ``base_link_inertia`` is; without that link it is where the axes say.
 
     The YAML says x y z roll pitch yaw of the six joint origins [m, rad].
 
@@ -39,7 +47,7 @@ def kinematics(robot: CalibratedChain) -> tuple[str, str]:
         NoSuchArm: for an arm that has not UR's axes.
     """
     with refused_as(NoSuchArm, RobotError, f"'{robot.chain.name}' does not have the axes of a UR arm: {{}}"):
-        source = _template(nominal_of(robot))
+        source = _template(nominal_of(robot), urdf)
         edited = read_tree(urdf_write.edit(source, nominal_of(robot), robot.chain, "UR frames"), "UR frames")
     places = {link: to_xyz_rpy(edited.joints[link].origin) for link in LINKS}
     origins = {link: dict(zip(KEYS, [*xyz.tolist(), *rpy.tolist()])) for link, (xyz, rpy) in places.items()}
@@ -67,7 +75,32 @@ def _wrist_offset(nominal: Chain) -> float:
     return abs(float(across @ (frames[5, :3, 3] - frames[4, :3, 3])))
 
 
-def _template(nominal: Chain) -> str:
+def _inertia_frame(nominal: Chain, urdf: Path | None, up: np.ndarray, ahead: np.ndarray) -> np.ndarray:
+    """Return the pose (4, 4) of UR's base_link_inertia in the arm's base.
+
+    UR's descriptions have a link of that name, turned by 180° about z against base_link. Without it, its z is axis 1,
+    its -x the direction in which the arm lies at q = 0, and its origin the base's.
+
+    Args:
+        nominal: the arm.
+        urdf: of it, or None.
+        up, ahead: (3,) direction of axis 1, and from axis 2 to axis 3 at q = 0, in the arm's base.
+    """
+    if urdf is not None and urdf.is_file():
+        tree = read_tree(text(urdf)[0], str(urdf))
+        for link, pose in tree.rigid(nominal.base):
+            if link.endswith(INERTIA):
+                return pose
+    level = ahead - up * (up @ ahead)
+    if np.linalg.norm(level) < ON_AXIS:
+        raise RobotError("axis 3 stands over axis 2 at q = 0, where a UR is stretched")
+    x = -level / np.linalg.norm(level)
+    turned = pose_of(np.stack([x, np.cross(up, x), up], axis=1))
+    rounded = np.round(turned)
+    return rounded if np.abs(rounded - turned).max() < ON_AXIS else turned
+
+
+def _template(nominal: Chain, urdf: Path | None) -> str:
     """Return a URDF of a nominal arm in UR's frames, with the six lengths of the arm's axes at q = 0.
 
     d1 height of axis 2; a2, a3 distances of axes 2 to 3 and 3 to 4; d4 distance of axis 5 from axis 1; d5 height of
@@ -82,7 +115,8 @@ def _template(nominal: Chain) -> str:
     point, tip = frames[:, :3, 3], forward(nominal, zero)[0, :3, 3]
     up, across = axis[0], axis[1]
     level = [float(up @ (p - point[0])) for p in point]
-    base_height = float(up @ point[0])
+    foot = _inertia_frame(nominal, urdf, up, point[2] - point[1])
+    base_height = float(up @ (point[0] - foot[:3, 3]))
     d1 = level[1] + base_height
     a2, a3 = (_gap(point[k], point[k + 1], across) for k in (1, 2))
     d4, d6 = abs(float(across @ (point[4] - point[0]))), _wrist_offset(nominal)
@@ -97,7 +131,14 @@ def _template(nominal: Chain) -> str:
         "wrist_2": (f"0 {-d5!r} 0", f"{half} 0 0"),
         "wrist_3": (f"0 {d6!r} 0", f"{half} {np.pi!r} {np.pi!r}"),
     }
-    lines, parent = ['<robot name="ur"><link name="base_link_inertia"/>'], "base_link_inertia"
+    xyz, rpy = (" ".join(map(repr, values.tolist())) for values in to_xyz_rpy(foot))
+    lines, parent = (
+        [
+            f'<robot name="ur"><link name="base_link"/><link name="{INERTIA}"/><joint name="foot" type="fixed">'
+            f'<parent link="base_link"/><child link="{INERTIA}"/><origin xyz="{xyz}" rpy="{rpy}"/></joint>'
+        ],
+        INERTIA,
+    )
     for name, (xyz, rpy) in origins.items():
         lines.append(
             f'<link name="{name}_link"/><joint name="{name}" type="revolute"><parent link="{parent}"/>'
