@@ -7,8 +7,9 @@ Errors are 100 ‖τ - τ̂‖ / ‖τ‖ on the test, measured and predicted to
 *Ridge* is regularised towards zero, positions low-passed at 6 Hz (`extrapolation_ridge.py`); *best ridge* is the best
 on the test of that, of one at 15 Hz, and of both towards the description's masses where it has any. All see the same
 description and files as the toolkit. *Ratio* is the toolkit's error over ridge's, *to best* over that of the best one.
-*Plain* is weighted least squares truncated at the data's rank (`extrapolation_plain.py`), *in motion* the errors of the
-joints' samples that are faster than `STANDING`. Results are kept in FOLDER, by the state of `calib` and of these scripts: what is there already is not made again.
+*Plain* is weighted least squares truncated at the data's rank (`extrapolation_plain.py`); *in motion* are errors of the
+samples alone in which a joint is faster than `STANDING`. Results are kept in FOLDER, by the state of `calib` and of
+these scripts: what is there already is not made again.
 """
 
 from __future__ import annotations

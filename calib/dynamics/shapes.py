@@ -87,8 +87,9 @@ SHAPES: dict[str, Shape] = {
     "velocity": Shape(VISCOUS, VISCOUS_LINEAR, dissipative=True, of_velocity=True, nonnegative=True),
     "one": Shape("N m", "N", friction=False, of_velocity=True, exact=True),
     "position": Shape("N m/rad", "N/m", friction=False),
-    "sign": Shape("N m", "N", ("v0",), dissipative=True, of_velocity=True, nonnegative=True, exact=True,
-                  undecided_at_rest=True),
+    "sign": Shape(
+        "N m", "N", ("v0",), dissipative=True, of_velocity=True, nonnegative=True, exact=True, undecided_at_rest=True
+    ),
     "dead": Shape("N m", "N", ("v0",), dissipative=True, undecided_at_rest=True),
     "speed": Shape(VISCOUS, VISCOUS_LINEAR, ("edge",), dissipative=True, of_velocity=True),
     "cubic": Shape("N m s³/rad³", "N s³/m³", ("edge",), dissipative=True, of_velocity=True),

@@ -38,14 +38,13 @@ import scipy.linalg
 from scipy.spatial.transform import Rotation
 
 from calib.data.signals.filtering import Decimator, decimate, kept, spread
-from calib.data.signals.motion import moving
 from calib.dynamics import rigid_body
 from calib.dynamics.bodies import Bodies
 from calib.dynamics.torque_rows import BODIES
 from calib.estimation.triangles import retriangulate
 from calib.extensions import needed
 from calib.identification.identify import Identification, common_decimator
-from calib.identification.rows import Case, ObservationRows, observe, segments, thinned
+from calib.identification.rows import Case, ObservationRows, observe, segments
 from calib.identification.settings import make_bodies, make_model
 from calib.records import Frozen, frozen
 from calib.robot.calibrated import CalibratedChain, as_calibrated
@@ -109,7 +108,7 @@ def cut(rows: ObservationRows, own: slice) -> ObservationRows:
     """Return the part of the rows in a slice."""
     return replace(
         rows, matrix=rows.matrix[own], target=rows.target[own], present=rows.present[own], block=rows.block[own],
-        standing=rows.standing[own],
+        standing=rows.standing[own], swing=rows.swing[own],
     )  # fmt: skip
 
 
@@ -258,7 +257,7 @@ def solve_sensitivity(
             say(f"sensitivity to the geometry: {case.name}, part {number + 1}")
             used.append(cut(part, own))
             residual = used[-1].target - used[-1].matrix @ found.fitted.estimate.values
-            change, pull = differences(case, span, residual * used[-1].weight**2 / how.deviation**2, decimator)
+            change, pull = differences(case, span, residual * used[-1].weight ** 2 / how.deviation**2, decimator)
             all_rows = np.broadcast_to(change, (*residual.shape, change.shape[2]))  # power: rows by recording
             parts.append((all_rows.reshape(-1, change.shape[2]), pull))
             instruments += [] if z is None else [z[own].reshape(-1, p)]

@@ -128,8 +128,8 @@ def _no_zero(value: Any) -> Any:
 
 
 REMOVED = {
-    "cut_slow": "each standstill of a joint now counts once, its friction unknown within the static friction, so that no "
-    "rows need to be cut: remove the line",
+    "cut_slow": "each standstill of a joint now counts once, its friction unknown within the static friction, so that "
+    "no rows need to be cut: remove the line"
 }
 """Keys of earlier versions, and what replaced them."""
 FINDINGS = (
@@ -260,9 +260,7 @@ def options_of(read: IdentifySettings, source: str = "settings") -> IdentifyOpti
     for name, file in read.files.items():
         check_keys(dict.fromkeys(file.payload), read.payload, f'{source}: files."{name}".payload')
     every = FileSettings(read.recording, read.filter, gains=read.gains)
-    return IdentifyOptions(
-        settings, every, read.files, read.slow, read.gain_identification, read.accept, source
-    )
+    return IdentifyOptions(settings, every, read.files, read.slow, read.gain_identification, read.accept, source)
 
 
 def _terms(tables: tuple[TermTable, ...], source: str) -> tuple[DriveTerm, ...]:

@@ -20,7 +20,6 @@ from calib.estimation.whiteness import Whiteness, examine, r_squared
 from calib.identification.rows import BLOCK, Case, segmented_states
 from calib.records import Array, Frozen, Number
 
-
 REST_SHARE = 0.05  # of a recording's rows at rest, above which errors in motion and at rest are told apart (our choice)
 
 
@@ -119,7 +118,7 @@ class Score:
 
     @property
     def judged(self) -> PredictionErrors:
-        """Errors that a verdict is about: in motion, since friction at rest takes any value; of all where none stands."""
+        """Errors that a verdict is about: in motion, as friction at rest takes any value; of all where none stands."""
         return self.moving if self.stands else self.raw
 
     @property
