@@ -5,6 +5,7 @@ import json
 import numpy as np
 import planted_motion as planted
 import pytest
+
 import calib
 from calib.estimation.triangles import collect
 from calib.procedure.dynamic_stage.plain import RANK, PlainReferences, truncated, worse_than_plain
@@ -44,7 +45,7 @@ def test_without_plain_values_nothing_is_compared():
 
 
 def test_an_identification_prints_and_stores_its_references(robot, tmp_path):
-    """The planted arm: rich motion and simple friction, so that plain least squares is as good; nominal lacks friction."""
+    """Of rich motion with simple friction plain least squares is as good; the nominal masses lack friction."""
     train, other = planted.write(tmp_path, "train.npz", 0), planted.write(tmp_path, "other.npz", 1)
     model = calib.identify_dynamics(robot, train, validate=other)
     found = model.references["other.npz"]
