@@ -6,9 +6,11 @@ CALIB_DATA=... python examples/extrapolation.py [--quick] [--only TEXT ...] [--j
 Errors are 100 ‖τ - τ̂‖ / ‖τ‖ on the test, measured and predicted torques low-passed alike, over the joints of one unit.
 *Ridge* is regularised towards zero, positions low-passed at 6 Hz (`extrapolation_ridge.py`); *best ridge* is the best
 on the test of that, of one at 15 Hz, and of both towards the description's masses where it has any. All see the same
-description and files as the toolkit. *Ratio* is the toolkit's error over ridge's, *to best* over that of the best one.
-*Plain* is weighted least squares truncated at the data's rank (`extrapolation_plain.py`), *in motion* the errors of the
-joints' samples that are faster than `STANDING`. Results are kept in FOLDER, by the state of `calib` and of these scripts: what is there already is not made again.
+description and files as the toolkit. *Ratio* is the toolkit's error over the better of ridge and *plain*, *to best*
+over that of the best of all.
+*Plain* is weighted least squares truncated at the data's rank (`extrapolation_plain.py`); *in motion* are errors of the
+samples alone in which a joint is faster than `STANDING`. Results are kept in FOLDER, by the state of `calib` and of
+these scripts: what is there already is not made again.
 """
 
 from __future__ import annotations
@@ -41,6 +43,7 @@ STANDING = 0.01  # below which a joint counts as standing [rad/s or m/s]
 MAX_SECONDS = 300  # for a pair
 MARK = "<!-- examples/extrapolation.py -->"
 CUTOFFS = (6.0, 15.0)  # of the ridges' positions [Hz]
+PLAIN_RIDGE = "6 Hz, zero"  # the ridge that stands beside plain least squares
 
 
 def state() -> str:
@@ -136,37 +139,43 @@ def _percent(left: np.ndarray, size: np.ndarray, apart: tuple[int, ...]) -> dict
     return {"total": float(100.0 * np.sqrt(left[alike].sum() / size[alike].sum())), "joints": joints.tolist()}
 
 
+def reference(one: dict) -> float:
+    """Return the error of the plain reference [%]: the better of ridge and weighted least squares, both at 6 Hz."""
+    return min(one["ridges"][PLAIN_RIDGE]["total"], one["plain"]["total"])
+
+
 def ratios(one: dict) -> tuple[float, float]:
-    """Return the toolkit's error divided by the plain ridge's and by the best ridge's; infinite if it refused."""
+    """Return the toolkit's error over the plain reference's and over the best reference's; infinite if it refused."""
     if one["ours"] is None:
         return np.inf, np.inf
-    plain, best = one["ridges"][f"{CUTOFFS[0]:g} Hz, zero"], min(x["total"] for x in one["ridges"].values())
-    return one["ours"]["total"] / plain["total"], one["ours"]["total"] / best
+    best = min(one["plain"]["total"], *(x["total"] for x in one["ridges"].values()))
+    return one["ours"]["total"] / reference(one), one["ours"]["total"] / best
 
 
 def head(before: dict) -> str:
     """Return the table's head."""
-    names = ["pair", "regime", "ridge", "best ridge", *(["before"] if before else []), "toolkit", "ratio", "to best"]
-    names += ["worst joint (ridge)", "within 95 %", "s"]
+    names = ["pair", "regime", "ridge", "plain", "best ridge", *(["before"] if before else []), "toolkit", "in motion"]
+    names += ["ratio", "to best", "worst joint (ridge)", "within 95 %", "s"]
     return f"| {' | '.join(names)} |\n|{'---|' * len(names)}"
 
 
 def line(one: dict, before: dict) -> str:
     """Return a line of the table; `before`: the errors of another version by pair, None where it refused."""
-    plain = one["ridges"][f"{CUTOFFS[0]:g} Hz, zero"]
+    ridged = one["ridges"][PLAIN_RIDGE]
     best = min(one["ridges"], key=lambda name: one["ridges"][name]["total"])
-    cells = [one["pair"], "across" if one["across"] else "same", _share(plain["total"])]
+    cells = [one["pair"], "across" if one["across"] else "same", _share(ridged["total"]), _share(one["plain"]["total"])]
     cells.append(f"{_share(one['ridges'][best]['total'])} ({best})")
     if before:
         cells.append(_share(before.get(one["pair"])))
     cells.append(_share(one["ours"] and one["ours"]["total"]))
     if one["ours"] is None:
-        cells += ["–", "–", one["refused"][:80], "–"]
+        cells += ["–", "–", "–", one["refused"][:80], "–"]
     else:
         joints = one["ours"]["joints"]
         worst = int(np.argmax(joints))
+        cells.append(_share(one["in motion"]["total"]))
         cells += [f"{x:.2f}" for x in ratios(one)]
-        cells.append(f"{worst + 1}: {joints[worst]:.0f} % ({plain['joints'][worst]:.0f} %)")
+        cells.append(f"{worst + 1}: {joints[worst]:.0f} % ({ridged['joints'][worst]:.0f} %)")
         cells.append("–" if one["coverage"] is None else f"{one['coverage']:.0f} %")
     return f"| {' | '.join([*cells, format(one['seconds'], '.0f')])} |"
 

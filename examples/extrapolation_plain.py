@@ -1,8 +1,8 @@
 """A plainer baseline: weighted least squares of all parameters, truncated at the rank of the data.
 
 Rows are those of `extrapolation_ridge.Log` (Pinocchio, positions low-passed at 6 Hz). No prior, no selection: what a
-user has after an hour. Joints are weighed by the residuals of the first solution; the ends of a log, where the filter has
-not settled, are left out.
+user has after an hour. Joints are weighed by the residuals of the first solution; the ends of a log, where the filter
+has not settled, are left out.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def predict(
     payload: dict | None = None,
     joints: Sequence[str] = (),
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return instants (N,) and torques (N, n) predicted on each test file; arguments as `extrapolation_ridge.predict`."""
+    """Return instants (N,) and torques (N, n) predicted on each test file; see `extrapolation_ridge.predict`."""
     model = ridge.chosen(urdf, joints)
     logs = [ridge.Log(model, path, cutoff) for path in train]
     inner = [(log.t > log.t[0] + BORDER) & (log.t < log.t[-1] - BORDER) for log in logs]

@@ -108,7 +108,7 @@ def cut(rows: ObservationRows, own: slice) -> ObservationRows:
     """Return the part of the rows in a slice."""
     return replace(
         rows, matrix=rows.matrix[own], target=rows.target[own], present=rows.present[own], block=rows.block[own],
-        standing=rows.standing[own],
+        standing=rows.standing[own], swing=rows.swing[own],
     )  # fmt: skip
 
 

@@ -128,8 +128,8 @@ def _no_zero(value: Any) -> Any:
 
 
 REMOVED = {
-    "cut_slow": "each standstill of a joint now counts once, its friction unknown within the static friction, so that no "
-    "rows need to be cut: remove the line"
+    "cut_slow": "each standstill of a joint now counts once, its friction unknown within the static friction, so that "
+    "no rows need to be cut: remove the line"
 }
 """Keys of earlier versions, and what replaced them."""
 FINDINGS = (

@@ -118,7 +118,7 @@ class Score:
 
     @property
     def judged(self) -> PredictionErrors:
-        """Errors that a verdict is about: in motion, since friction at rest takes any value; of all where none stands."""
+        """Errors that a verdict is about: in motion, as friction at rest takes any value; of all where none stands."""
         return self.moving if self.stands else self.raw
 
     @property

@@ -248,7 +248,7 @@ def scaled(noise: np.ndarray | None, std: np.ndarray, counts: np.ndarray) -> np.
 
 
 def residual_inflation(all_rows: Sequence[ObservationRows], values: np.ndarray) -> np.ndarray:
-    """Return the integrated autocorrelation of each row's residuals in motion (rows,), averaged over cases by length."""
+    """Return the integrated autocorrelation of each row's residuals in motion (rows,), averaged by length of cases."""
     rows = all_rows[0].target.shape[1]
     total, weight = np.zeros(rows), np.zeros(rows)
     for part in all_rows:

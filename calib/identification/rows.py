@@ -117,12 +117,14 @@ class RestWeights:
     """Weights of standstills, see `calib.identification.friction.standstill`.
 
     Attributes:
-        worth: (rows,) how many rows in motion a standstill weighs.
+        worth: (rows,) how many rows in motion a value of the friction at rest weighs.
         count: (rows,) how many rows it counts as where residuals are averaged.
+        reach: (rows,) change of torque [N m or N] after which the friction has another value.
     """
 
     worth: np.ndarray
     count: np.ndarray
+    reach: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,6 +139,7 @@ class ObservationRows:
         block: (M,) number of the time block, for cross-validation; -1 next to a cut.
         rate: sampling rate [Hz].
         standing: (M, rows) share of its standstill that each row is; 0 in motion.
+        swing: (M, rows) range of the torque in that standstill [N m or N]; 0 in motion.
         rest: weights of standstills.
         coulomb: (rows, p) columns that are Coulomb friction of a torque row.
     """
@@ -149,19 +152,25 @@ class ObservationRows:
     block: np.ndarray
     rate: float
     standing: np.ndarray
+    swing: np.ndarray
     rest: RestWeights
     coulomb: np.ndarray
 
     @property
     def weight(self) -> np.ndarray:
         """Factor (M, rows) that rows are multiplied by in estimates: 1 in motion, less at rest, 0 where not used."""
-        at_rest = np.sqrt(self.standing * self.rest.worth)
+        at_rest = np.sqrt(self._frictions * self.rest.worth)
         return np.where(self.standing > 0.0, at_rest, 1.0) * self.present
 
     @property
     def counted(self) -> np.ndarray:
         """How many rows each one counts as (M, rows), where residuals are averaged."""
-        return np.where(self.standing > 0.0, self.standing * self.rest.count, 1.0) * self.present
+        return np.where(self.standing > 0.0, self._frictions * self.rest.count, 1.0) * self.present
+
+    @property
+    def _frictions(self) -> np.ndarray:
+        """How many values of the friction at rest each row stands for (M, rows)."""
+        return self.standing * (1.0 + self.swing / self.rest.reach)
 
     def by_recording(self, own: int, count: int) -> ObservationRows:
         """Return rows with separate torque rows per recording: those of recording `own` of `count` are filled.
@@ -172,7 +181,8 @@ class ObservationRows:
         return replace(
             self, matrix=np.where(place[:, None], self.matrix, 0.0), target=np.where(place, self.target, 0.0),
             present=self.present & place, standing=np.repeat(self.standing, count, axis=1),
-            rest=_no_rest(count), coulomb=np.repeat(self.coulomb, count, axis=0),
+            swing=np.repeat(self.swing, count, axis=1), rest=_no_rest(count),
+            coulomb=np.repeat(self.coulomb, count, axis=0),
         )  # fmt: skip
 
     def extend(self, terms: Sequence[DriveTerm], columns: np.ndarray) -> ObservationRows:
@@ -180,9 +190,11 @@ class ObservationRows:
         if not terms:
             return self
         undecided = np.array([one.form.undecided_at_rest for one in terms])
-        coulomb = np.array([one.shape == "sign" for one in terms]) & columns.any(axis=0)
-        coulomb &= self.coulomb.any(axis=1)[:, None]
-        columns = np.where((self.standing > 0.0)[:, :, None] & undecided, 0.0, columns)
+        signs = np.array([one.shape == "sign" for one in terms])
+        holding = np.asarray(self.coulomb.any(axis=1))
+        coulomb = np.any(columns, axis=0) & signs & holding[:, None]
+        at_rest = np.greater(self.standing, 0.0)[:, :, None]
+        columns = np.where(at_rest & undecided, 0.0, columns)
         return replace(
             self,
             coulomb=np.hstack([self.coulomb, coulomb]),
@@ -226,13 +238,14 @@ def observe(model: RegressorModel, columns: np.ndarray, case: Case, decimator: D
     rate, block = motion.rate / decimator.factor, np.zeros(len(target), dtype=int)
     standing, coulomb = np.zeros(target.shape), np.zeros((model.rows, len(columns)), dtype=bool)
     return ObservationRows(
-        names, units, matrix, target, present, block, rate, standing, _no_rest(model.rows), coulomb
+        names, units, matrix, target, present, block, rate, standing, np.zeros(target.shape), _no_rest(model.rows),
+        coulomb,
     )  # fmt: skip
 
 
 def _no_rest(rows: int) -> RestWeights:
     """Return the weights of standstills before any estimate: each is a row."""
-    return RestWeights(np.ones(rows), np.ones(rows))
+    return RestWeights(np.ones(rows), np.ones(rows), np.full(rows, np.inf))
 
 
 def observe_terms(

@@ -369,7 +369,8 @@ class _Samples:
         """Return the range of the selected states with the standard deviation of all states; error terms are empty."""
         own = self.states[:, chosen]
         edges = own.min(axis=1), own.max(axis=1), np.maximum(self.states.std(axis=1), 1e-6)
-        return TorqueDiscrepancy((), (), (), *(tuple(map(tuple, one.tolist())) for one in edges))
+        lower, upper, scale = (tuple(map(tuple, one.tolist())) for one in edges)
+        return TorqueDiscrepancy((), (), (), lower, upper, scale)
 
 
 def _samples(found: Identification, cases: Sequence[Case]) -> _Samples:

@@ -9,7 +9,6 @@ from calib.dynamics.drives import term
 from calib.errors import CalibError, MeasurementError, UsageError
 from calib.identification.friction.friction_ladder import FrictionCandidates, select_friction
 from calib.identification.gains import identify_gains
-from calib.identification.geometry_uncertainty import standstill_shift
 from calib.identification.identify import chain_states, common_decimator, find_base, identify
 from calib.identification.prediction import Dynamics, predict, score
 from calib.identification.prior import first_fit
@@ -64,17 +63,6 @@ def test_the_ladder_takes_what_is_planted_and_only_there(name, terms, size):
     plain = identify(planted.arm(), [planted.case("a", 0, terms=terms, values=values)], PLAIN)
     one, two = (score(other, predict(model.dynamics, other)).filtered.total for model in (plain, found))
     assert two < 0.8 * one
-
-
-@pytest.mark.parametrize(("soft", "told"), [(0.0, []), (2.0, [1])])
-def test_friction_that_fades_near_standstill_shows_where_slow_rows_are_left_out(soft, told):
-    """Most of joint 2's true sign is ten times softer than the model's."""
-    terms = (term("soft", "sign", 1, 0.1), term("hard", "sign", 1, 0.01))
-    cases = [planted.case("a", 0, terms=terms, values={"soft": soft, "hard": -soft})]
-    found = identify(planted.arm(), cases, PLAIN)
-    index = [found.names.index(f"Fc{j}") for j in (1, 2, 3)]
-    shift = (standstill_shift(found, cases) / found.fitted.estimate.sigma)[index]
-    assert np.flatnonzero(shift > 1.0).tolist() == told and (shift > -1.0).all()
 
 
 def test_a_named_rung_is_taken_at_all_joints_whatever_it_brings():

@@ -4,16 +4,20 @@ While a joint stands, friction takes any value that keeps it there. Of a standst
 
     y_k = w_k x + f + e_k,    abs(f) <= F_s unknown,
 
-w without the friction that only the direction of motion decides (Coulomb's and its kin). The K rows share one f, so that
-together they say as much as one row of variance τ s² / K + f², where s² is the variance of the residuals in motion, τ
-how many neighbouring ones count as one, and
+w without the friction that only the direction of motion decides (Coulomb's and its kin). The K rows share one f, so
+that together they say as much as one row of variance τ s² / K + f², where s² is the variance of the residuals in
+motion, τ how many neighbouring ones count as one, and
 
     f² = max(F_c² / 3, mean square of the residuals at rest),
 
 F_c² / 3 being the variance of a value that may be anywhere within ± F_c. Rows of the standstill share this weight
-evenly, so that they still say how the torque changes with what other joints do. Reversals pass through zero speed and
-stay rows as others: shorter than `MIN_STANDSTILL`, or, of slow motion, as often at one small speed as at another, where
-a joint that stands is slower than `MAX_MEDIAN` for half of the time. Torques of sensors behind the gear have no such friction.
+evenly, so that they still say how the torque changes with what other joints do. Where that changes it by more than the
+friction spans, friction has taken another value: a standstill whose torque ranges over r counts as 1 + r / reach
+values, reach = 2 √3 √(f² + τ s²), the width of an even distribution of that variance.
+
+Reversals pass through zero speed and stay rows as others: shorter than `MIN_STANDSTILL`, or, of slow motion, as often
+at one small speed as at another, where a joint that stands is slower than `MAX_MEDIAN` for half of the time. Torques of
+sensors behind the gear have no such friction.
 """
 
 from __future__ import annotations
@@ -27,7 +31,7 @@ from calib.data.signals.filtering import Decimator, kept
 from calib.dynamics.regressor_model import RegressorModel
 from calib.dynamics.torque_rows import TorqueRows
 from calib.estimation.triangles import Triangles, absorb, empty, retriangulate
-from calib.identification.rows import Case, ObservationRows, RestWeights, pool, segments, thinned
+from calib.identification.rows import Case, ObservationRows, RestWeights, segments, thinned
 from calib.records import frozen
 
 MIN_STANDSTILL = 0.05  # [s] that a joint stands; shorter ones are reversals (our choice)
@@ -85,7 +89,10 @@ def with_standstills(
         if share.any():
             undecided = (share > 0.0)[:, :, None] & coulomb
             matrix = np.where(undecided, 0.0, matrix)
-        result.append(replace(part, matrix=matrix, standing=frozen(share), coulomb=frozen(coulomb, bool)))
+        swing = _swings(share > 0.0, part.target, segment)
+        result.append(
+            replace(part, matrix=matrix, standing=frozen(share), swing=frozen(swing), coulomb=frozen(coulomb, bool))
+        )
     return result
 
 
@@ -123,20 +130,35 @@ def _shares(mask: np.ndarray, segment: np.ndarray) -> np.ndarray:
     return result
 
 
+def _swings(mask: np.ndarray, target: np.ndarray, segment: np.ndarray) -> np.ndarray:
+    """Return the range of the torque in the standstill that each row belongs to (M, rows); 0 in motion."""
+    result = np.zeros(mask.shape)
+    for start, stop in segments(segment):
+        for row in range(mask.shape[1]):
+            for first, end in _runs(mask[start:stop, row]):
+                rows = slice(start + first, start + end)
+                result[rows, row] = np.ptp(target[rows, row])
+    return result
+
+
 @dataclass(frozen=True, eq=False)
 class DividedRows:
     """R factors of moving rows and of standing ones apart, one group per torque row, so that their weights may change.
 
     Attributes:
         moving, standing: the latter's rows scaled by the root of their share of a standstill.
+        swinging: standing rows scaled by the root of that share times the range of the torque.
         standstills: (rows,) how many there are.
+        swing: (rows,) mean range of the torque in one [N m or N].
         length: (rows,) their mean number of rows.
         coulomb: (rows, p) which columns are Coulomb friction of a torque row.
     """
 
     moving: Triangles
     standing: Triangles
+    swinging: Triangles
     standstills: np.ndarray
+    swing: np.ndarray
     length: np.ndarray
     coulomb: np.ndarray
 
@@ -150,16 +172,20 @@ class DividedRows:
         friction = np.sum(np.abs(values) * self.coulomb, axis=1)
         spread = np.maximum(friction**2 / 3.0, self.standing.residual_squares(values) / count)
         noise = tau * std**2
-        of_mean = np.maximum(noise / self.length + spread, 1e-300)
-        return RestWeights(frozen(noise / of_mean), frozen(tau * (std**2 + spread) / of_mean))
+        reach = np.maximum(2.0 * np.sqrt(3.0 * (noise + spread)), 1e-300)
+        values_of_friction = 1.0 + self.swing / reach
+        variance = np.maximum(noise * values_of_friction / self.length + spread, 1e-300)
+        return RestWeights(frozen(noise / variance), frozen(tau * (std**2 + spread) / variance), frozen(reach))
 
     def joined(self, weights: RestWeights) -> Triangles:
         """Return the R factors of all rows, standstills with these weights."""
         if not self.standstills.any():
             return self.moving
         scaled = self.standing.factors * np.sqrt(weights.worth)[:, None, None]
-        both = np.concatenate([self.moving.factors, scaled], axis=1)
-        counted = np.round(self.standstills * weights.count)
+        renewed = self.swinging.factors * np.sqrt(weights.worth / weights.reach)[:, None, None]
+        both = np.concatenate([self.moving.factors, scaled, renewed], axis=1)
+        frictions = self.standstills * (1.0 + self.swing / weights.reach)
+        counted = np.round(frictions * weights.count)
         factors = frozen(np.stack([retriangulate(stacked) for stacked in both]))
         return replace(self.moving, factors=factors, rows=frozen(self.moving.rows + counted, int))
 
@@ -168,21 +194,25 @@ def divided(all_rows: Sequence[ObservationRows]) -> DividedRows:
     """Return the R factors of rows in motion and at rest."""
     first = all_rows[0]
     rows = first.target.shape[1]
-    moving, standing = empty(first.names, first.units, rows), empty(first.names, first.units, rows)
-    standstills, length = np.zeros(rows), np.zeros(rows)
+    moving = standing = swinging = empty(first.names, first.units, rows)
+    standstills, swing, length = np.zeros(rows), np.zeros(rows), np.zeros(rows)
     for part in all_rows:
         for row in range(rows):
             share = part.standing[:, row]
             rests = part.present[:, row] & (share > 0.0)
             moves = part.present[:, row] & (share == 0.0)
             moving = absorb(moving, part.matrix[moves, row], part.target[moves, row], row)
-            root = np.sqrt(share[rests])
-            standing = absorb(standing, part.matrix[rests, row] * root[:, None], part.target[rests, row] * root, row)
+            matrix, target = part.matrix[rests, row], part.target[rests, row]
+            ranges = share[rests] * part.swing[rests, row]
+            root, wider = np.sqrt(share[rests]), np.sqrt(ranges)
+            standing = absorb(standing, matrix * root[:, None], target * root, row)
+            swinging = absorb(swinging, matrix * wider[:, None], target * wider, row)
             standstills[row] += share[rests].sum()
+            swing[row] += ranges.sum()
             length[row] += rests.sum()
+    count = np.maximum(standstills, 1.0)
     return DividedRows(
-        pool(moving, rows), pool(standing, rows), standstills, np.maximum(length, 1.0) / np.maximum(standstills, 1.0),
-        first.coulomb,
+        moving, standing, swinging, standstills, swing / count, np.maximum(length, 1.0) / count, first.coulomb
     )  # fmt: skip
 
 

@@ -21,7 +21,7 @@ from calib.identification.loop import Controller, LoopDisagreement, Replay
 from calib.identification.possible.solve import Contradiction, contradiction
 from calib.identification.prediction import Dynamics, Score, predict, score
 from calib.identification.rows import Case
-from calib.procedure.dynamic_stage import plausibility
+from calib.procedure.dynamic_stage import plain, plausibility
 from calib.procedure.dynamic_stage import verdict as judging
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs, Progress
 from calib.procedure.findings import Verdict, lines_of
@@ -43,6 +43,7 @@ class ModelFindings:
         errors: what makes errors of its torques likely; None where too little was recorded to say.
         contradiction: its distance from every physically consistent robot; None if unknown.
         unlike: how recorded torques refute an estimate that takes the loop for granted; None where they do not.
+        plain: (p,) the model's parameters by plain least squares; () in files of earlier versions.
     """
 
     rests: judging.Resting
@@ -52,6 +53,7 @@ class ModelFindings:
     errors: torque_errors.TorqueDiscrepancy | None = None
     contradiction: Contradiction | None = None
     unlike: LoopDisagreement | None = None
+    plain: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +91,7 @@ class Assessment(Errors):
         noticed: the findings behind the warnings.
         tracking: by recording, the replays with the model fed forward.
         tracking_failure: reason for missing replays.
+        references: by unseen recording, the errors of plain references beside the model's.
     """
 
     verdict: Verdict
@@ -96,6 +99,7 @@ class Assessment(Errors):
     noticed: tuple[Finding, ...]
     tracking: Mapping[str, Replay] = field(default_factory=dict)
     tracking_failure: str = ""
+    references: Mapping[str, plain.PlainReferences] = field(default_factory=dict)
 
 
 def repeated_motion(cases: Sequence[Case], unseen: Sequence[Case]) -> dict[str, float]:
@@ -172,6 +176,12 @@ def assess(
     figures, rules = judging.judge(found.fit, found.proofs, found.repeated, found.excitation, labels)
     if drives := judging.friction_drives(joint + 1 for joint in wrong):
         figures, rules = "", drives
+    nominal = plain.nominal_values(inputs.chain, dynamics) if inputs.unit == TORQUE else None
+    beside = plain.references(
+        inputs.unseen, found.validation, dynamics, np.array(findings.plain), nominal, inputs.options.slow,
+        inputs.currents.own,
+    )  # fmt: skip
+    rules += plain.worse_than_plain({name: one for name, one in beside.items() if name in found.proofs})
     rules += judging.too_narrow(
         {name: found.intervals[name] for name in found.proofs if name in found.intervals}, labels
     )
@@ -199,7 +209,7 @@ def assess(
     said = dict.fromkeys((*lines_of(noticed), *judging.excitation_notes(found.excitation), *findings.notes))
     return Assessment(
         **vars(found), verdict=verdict, warnings=tuple(said), noticed=noticed, tracking=replays,
-        tracking_failure=failure,
+        tracking_failure=failure, references=beside,
     )  # fmt: skip
 
 
@@ -251,6 +261,7 @@ def judged(
         judging.resting_parameters(found), (), judging.model_findings(inputs.cases, found),
         found.loop.controller, errors and errors.discrepancy,
         contradiction(found, inputs.chain) if inputs.unit == TORQUE else None, found.loop.disagreement,
+        tuple(plain.plain_values(found).tolist()),
     )  # fmt: skip
     result = assess(inputs, found.dynamics, findings, errors, wrong, progress=say)
     return IdentificationOutcome(

@@ -27,6 +27,7 @@ from calib.identification.rows import Case
 from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.identify import Assessment, IdentificationOutcome, ModelFindings
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
+from calib.procedure.dynamic_stage.plain import PlainReferences
 from calib.records import Array, Number, Unbounded, evenly
 from calib.units import TORQUE
 
@@ -94,6 +95,7 @@ class JudgedMetrics:
         noticed: the findings of the warnings; other remarks on recordings and estimate are text only.
         rows: names of the torque rows.
         tracking: by recording that was replayed; or why none was.
+        references: by unseen recording, the errors of plain references beside the model's.
     """
 
     verdict: str
@@ -106,11 +108,12 @@ class JudgedMetrics:
     validation: Mapping[str, Score]
     tracking: Mapping[str, Replay] = field(default_factory=dict)
     tracking_failure: str = ""
+    references: Mapping[str, PlainReferences] = field(default_factory=dict)
 
 
 def _judged(found: Assessment) -> dict[str, Any]:
     """Return the entries of an assessment common to both records, without the names of the rows."""
-    same = ("warnings", "noticed", "validation", "tracking", "tracking_failure")
+    same = ("warnings", "noticed", "validation", "tracking", "tracking_failure", "references")
     judged = dict(zip(("verdict", "reason", "code", "advice"), vars(found.verdict).values()))
     return judged | {name: getattr(found, name) for name in same}
 

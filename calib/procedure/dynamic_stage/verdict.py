@@ -2,8 +2,8 @@
 
 The verdict of calib identify (exit code 0 for pass and marginal, 1 for fail) judges the raw total of the worst
 validation recording in which the robot moves and which does not repeat the training (of joints in motion, where some
-stand: what friction is at rest no model knows), beside the training's own error in its band; then every joint in the band, and while it moves. `calib explain torque-unexplained` prints the limits, and so
-on for each code of chapter 11.
+stand: what friction is at rest no model knows), beside the training's own error in its band; then every joint in the
+band, and while it moves. `calib explain torque-unexplained` prints the limits, and so on for each code of chapter 11.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -93,10 +93,8 @@ def judge(
             "no-torque-transfer", times=worst / max(own, 1e-300), most=limit("no-torque-transfer", "times", "marginal")
         ),
     ]
-    return sentence(finding("torque-errors", unseen=worst, file=name, own=own, rest=at_rest)), [
-        *settle(totals)[:1],
-        *joints,
-    ]
+    figures = finding("torque-errors", unseen=worst, file=name, own=own, rest=at_rest)
+    return sentence(figures), [*settle(totals)[:1], *joints]
 
 
 def friction_drives(joints: Iterable[object], payload: str = "") -> list[Finding]:

@@ -165,7 +165,7 @@ def report_section(
         delivered: error of the exported robot there [%]; None where it is not known.
     """
     metrics, unseen = found.metrics, found.unseen
-    blocks: list[page.Block] = [_error_table(unseen), _interval_table(unseen)]
+    blocks: list[page.Block] = [_error_table(unseen), _reference_table(unseen), _interval_table(unseen)]
     recorded = [name for name in drawn if name.startswith("torque_")]
     blocks += [page.pictures("", drawn, ("errors", "residuals")), page.pictures("Torques", drawn, recorded)]
     blocks.append(page.pictures("Excitation", drawn, ("excitation",)))
@@ -248,6 +248,22 @@ def _error_table(unseen: UnseenReport) -> page.Table:
         "torque", "rms error", "of limit", "error", "in band", "moving", "standing", "torque above band", "ACF outside",
     )  # fmt: skip
     return page.grouped("Torque errors", header, groups, ERROR_NOTE, _of_all)
+
+
+def _reference_table(unseen: UnseenReport) -> page.Table:
+    """Return the table of errors of plain references on held-out motion beside the model's; may be empty."""
+    columns = [
+        page.Column("recording", "{0[0]}", number=False),
+        page.Column("nominal masses, no friction", lambda row: percent(row[1].nominal)),
+        page.Column("plain least squares", lambda row: percent(row[1].plain)),
+        page.Column("this model", lambda row: percent(row[1].delivered)),
+    ]
+    note = (
+        "Plain least squares: weighted, base parameters with Coulomb and viscous friction and offsets, no prior, no "
+        "selection, truncated at the data's rank. In motion, where joints stand for more than 5 % of the recording."
+    )
+    title = "Beside plain references: torque unexplained on held-out motion"
+    return page.table(title, columns, list(unseen.references.items()), note)
 
 
 def _error_rows(one: Score, unseen: UnseenReport) -> Iterator[Sequence[str]]:

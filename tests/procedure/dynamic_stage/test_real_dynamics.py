@@ -186,7 +186,6 @@ def test_ur10e_currents_alone_tell_what_they_can(data, tmp_path):
 
 
 TX40 = """
-cut_slow = true
 friction = "standard"
 slow = [0.05, 0.05, 0.075, 0.072, 0.056, 0.122]
 v0 = 0.001
@@ -224,17 +223,6 @@ def test_tx40_its_coupled_wrist_and_coulomb_friction(data, tmp_path):
         v = share * 100.0 * np.array([0.05, 0.05, 0.075, 0.072, 0.056])
         assert np.abs((fc + fv * v) / (fc_there + fv_there * v) - 1.0).max() < 0.025, "what friction does at speed"
     assert total(found, log.name, "filtered") < 5.3, "measured 5.06"
-    assert not [line for line in found["warnings"] if "Coulomb" in line]
-
-
-@pytest.mark.slow
-def test_tx40_standstill_in_the_fit_is_noticed(data, tmp_path):
-    """Measured: Fc2 and Fc3 are 5 % lower with the rows of nearly standing joints, under 10 % of them all."""
-    folder = data / "staubli_tx40"
-    options = TX40.replace("cut_slow = true", "cut_slow = false")
-    found = identify(tmp_path / "out", folder / "model.urdf", folder / "tx40_first_5p4s.npz", options=options)
-    information = " ".join(line for line in found["warnings"] if "Coulomb" in line)
-    assert "Fc3 +" in information and "cut_slow" in information
 
 
 @pytest.mark.slow

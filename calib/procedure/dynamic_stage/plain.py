@@ -1,0 +1,143 @@
+"""Plain references beside an identified model: the nominal masses, and weighted least squares without any choice.
+
+Plain weighted least squares has the base parameters with Coulomb and viscous friction and offsets, the rows and filters
+of the identification, no prior and no richer friction. Directions of unit-norm columns that the motion shows by less
+than `RANK` of the best are left out (truncated at the data's rank). Where recordings are held out, its error and that
+of the nominal masses stand beside the delivered model's: what selection and prior are worth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from calib.data.signals.motion import moving
+from calib.dynamics.bodies import standard_parameters
+from calib.errors import Finding, finding
+from calib.estimation.triangles import Triangles
+from calib.identification.identify import Identification
+from calib.identification.prediction import Dynamics, Score, predict
+from calib.identification.rows import Case, pool, triangulate
+from calib.procedure.findings import settle
+from calib.records import Number, frozen
+from calib.robot.chain import Chain
+
+RANK = 1e-2  # singular values of unit-norm columns below this share of the largest are not identified (our choice)
+ROUNDS = 3  # of weighing joints by their residuals
+
+
+@dataclass(frozen=True)
+class PlainReferences:
+    """Torque unexplained on a recording that was held out [%], all as `Score.judged`.
+
+    Attributes:
+        delivered: by the identified model.
+        plain: by plain weighted least squares; NaN where none was possible.
+        nominal: by the masses of the robot's description, without friction; NaN without masses, or of currents.
+    """
+
+    delivered: Number
+    plain: Number
+    nominal: Number
+
+
+def plain_values(found: Identification[Any]) -> np.ndarray:
+    """Return the parameters (p,) of the identified model by plain weighted least squares.
+
+    Terms beyond the standard model are zero; a payload that no training recording carries keeps its known parameters.
+    """
+    own = np.arange(found.base.b)
+    data = pool(triangulate(found.rows), found.rows[0].target.shape[1]).select(own)
+    result = np.zeros(len(found.dynamics.values))
+    standard = found.base.to_standard(truncated(data))
+    result[: len(standard)] = standard
+    estimated = np.zeros(len(result), dtype=bool)
+    estimated[found.base.kept] = True
+    if hasattr(found.dynamics.model, "bodies"):
+        for number, label in enumerate(found.dynamics.model.bodies.labels):
+            first = slice(10 * number, 10 * number + 10)
+            if label in found.settings.payloads and not estimated[first].any():
+                result[first] = found.dynamics.values[first]
+    return frozen(result)
+
+
+def truncated(data: Triangles) -> np.ndarray:
+    """Return the weighted least-squares values (p,) of least norm, truncated at the data's rank.
+
+    Args:
+        data: R factors, one group per torque row, each weighed by its residuals.
+    """
+    weight, values = np.ones(data.groups), np.zeros(data.parameters)
+    for _ in range(ROUNDS):
+        stacked = (data.factors * weight[:, None, None]).reshape(-1, data.parameters + 1)
+        norms = np.linalg.norm(stacked[:, :-1], axis=0)
+        scale = np.where(norms > 0.0, norms, 1.0)
+        values = np.linalg.lstsq(stacked[:, :-1] / scale, stacked[:, -1], rcond=RANK)[0] / scale
+        std = np.sqrt(data.residual_squares(values) / np.maximum(data.rows, 1))
+        weight = 1.0 / np.maximum(std, 1e-9 * max(float(std.max()), 1e-300))
+    return values
+
+
+def nominal_values(chain: Chain, dynamics: Dynamics[Any]) -> np.ndarray | None:
+    """Return the model's parameters (p,) by the robot's description, without friction; None where it has no masses."""
+    inertias = getattr(chain, "inertias", None)
+    if inertias is None or not np.any(inertias[:, 9] > 0.0):
+        return None
+    bodies, result = standard_parameters(chain), np.zeros(len(dynamics.values))
+    result[: len(bodies)] = bodies
+    return result
+
+
+def references(
+    cases: Sequence[Case], scores: Mapping[str, Score], dynamics: Dynamics[Any], plain: np.ndarray,
+    nominal: np.ndarray | None, slow: float | tuple[float, ...] | None = None, apart: Sequence[int] = (),
+) -> dict[str, PlainReferences]:  # fmt: skip
+    """Return the errors of plain references on held-out recordings beside the model's.
+
+    Args:
+        cases: held out.
+        scores: of the model on them.
+        plain: (p,) parameters by plain least squares; empty where there are none.
+        nominal: (p,) by the description; None without.
+        slow: what stands, see `calib.data.signals.motion.moving`.
+        apart: rows in a unit of their own, which no total holds.
+    """
+    result = {}
+    for case in cases:
+        scored = scores[case.name]
+        errors = [np.nan, np.nan]
+        for place, values in enumerate((plain, nominal)):
+            if values is not None and len(values) == len(dynamics.values):
+                predicted = predict(Dynamics(dynamics.model, values), case)
+                errors[place] = _unexplained(case, predicted, scored.stands, slow, apart)
+        result[case.name] = PlainReferences(scored.judged.total, *errors)
+    return result
+
+
+def _unexplained(
+    case: Case, predicted: np.ndarray, in_motion: bool, slow: float | tuple[float, ...] | None, apart: Sequence[int]
+) -> float:  # fmt: skip
+    """Return 100 ‖τ - τ̂‖ / ‖τ‖ [%] of a case, of joints in motion alone if asked."""
+    motion = case.motion
+    used = np.repeat(motion.weight[:, None] > 0.5, case.target.shape[1], axis=1)
+    if in_motion:
+        moves = moving(motion) if slow is None else moving(motion, slow)
+        used &= moves[:, np.arange(case.target.shape[1]) % motion.n]
+    used[:, list(apart)] = False
+    left, size = float(np.sum((case.target - predicted)[used] ** 2)), float(np.sum(case.target[used] ** 2))
+    return 100.0 * float(np.sqrt(left / size)) if size > 0.0 else np.nan
+
+
+def worse_than_plain(beside: Mapping[str, PlainReferences]) -> list[Finding]:
+    """Return the finding on the held-out recording where plain least squares beats the model most, if it does."""
+    known = {name: one for name, one in beside.items() if np.isfinite(one.plain) and one.plain > 0.0}
+    if not known:
+        return []
+    name = max(known, key=lambda key: known[key].delivered / known[key].plain)
+    worst = known[name]
+    times = worst.delivered / worst.plain
+    one = finding("worse-than-plain", file=name, times=times, delivered=worst.delivered, plain=worst.plain)
+    return list(settle([one]))
