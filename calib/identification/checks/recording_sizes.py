@@ -73,16 +73,16 @@ def clock_ratio(samples: MotionSamples, chain: Chain) -> ClockRatio | None:
 def _ratio_to(whole: np.ndarray, samples: MotionSamples) -> ClockRatio | None:
     """Return the ratio of inertias to masses over that of bodies (10 B,); None where it is not identified."""
     still, moving = samples.at_rest, samples.inertial - samples.at_rest
-    inertia, own = _factor(samples.torque, moving @ whole, np.concatenate([still, samples.drives], axis=2))
-    mass, other = _factor(samples.torque, still @ whole, np.concatenate([moving, samples.drives], axis=2))
+    inertia, own = common_factor(samples.torque, moving @ whole, np.concatenate([still, samples.drives], axis=2))
+    mass, other = common_factor(samples.torque, still @ whole, np.concatenate([moving, samples.drives], axis=2))
     min_factor_sigmas = 5.0  # sigmas from which on a factor is told
     if inertia < min_factor_sigmas * own or mass < min_factor_sigmas * other:
         return None
     return ClockRatio(inertia / mass, float(np.hypot(own / inertia, other / mass)))
 
 
-def _factor(torque: np.ndarray, common: np.ndarray, free: np.ndarray, rounds: int = 3) -> tuple[float, float]:
-    """Return α of τ = α common + free x and its sigma, each joint weighted by its residual.
+def common_factor(torque: np.ndarray, common: np.ndarray, free: np.ndarray, rounds: int = 3) -> tuple[float, float]:
+    """Return α of torques τ (m, n) = α common + free x and its sigma, each joint weighted by its residual.
 
     `rounds`: of weighing joints by what is left of them.
     """
