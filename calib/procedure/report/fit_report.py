@@ -30,6 +30,7 @@ from calib.transforms import invert
 SCHEMA = 2
 READ = (1, SCHEMA)  # 1 kept the findings here, too
 NATURES = ("position", "orientation", "distance")
+CROSS_VALIDATED = "cross-validated"  # name of a set of rows that folds of the fit left out in turn
 
 
 class FittedParameter(NamedTuple):
@@ -44,7 +45,7 @@ class FittedParameter(NamedTuple):
     group: str
 
 
-class _CorrelatedPair(NamedTuple):
+class CorrelatedPair(NamedTuple):
     """Two correlated parameters."""
 
     first: str
@@ -53,7 +54,7 @@ class _CorrelatedPair(NamedTuple):
 
 
 @dataclass(frozen=True)
-class _CorrelationMatrix:
+class CorrelationMatrix:
     """Correlation matrix of the most correlated parameters."""
 
     names: tuple[str, ...]
@@ -129,8 +130,8 @@ class Report:
     metrics: FitMetrics
     parameters: tuple[FittedParameter, ...]
     kept: tuple[str, ...]
-    correlations: tuple[_CorrelatedPair, ...]
-    correlated: _CorrelationMatrix
+    correlations: tuple[CorrelatedPair, ...]
+    correlated: CorrelationMatrix
     singular_values: tuple[float, ...]
     rank: int
     sets: tuple[RowErrors, ...]
@@ -165,8 +166,8 @@ def collect(outcome: Outcome) -> Report:
         metrics=metrics(outcome),
         parameters=tuple(FittedParameter(*row, groups[row[0]]) for row in table.rows()),
         kept=tuple(name for name in chain.names if name not in fitted),
-        correlations=tuple(_CorrelatedPair(*pair) for pair in fit.estimate.strong_correlations(0.9)),
-        correlated=_correlated(table.names, table.covariance),
+        correlations=tuple(CorrelatedPair(*pair) for pair in fit.estimate.strong_correlations(0.9)),
+        correlated=most_correlated(table.names, table.covariance),
         singular_values=tuple(values),
         rank=len(values) if fit.split is None else fit.split.rank,
         sets=tuple(sets),
@@ -240,13 +241,13 @@ def _points(comparison: Comparison) -> np.ndarray:
     return np.concatenate(points)
 
 
-def _correlated(names: Sequence[str], covariance: np.ndarray, most: int = 12) -> _CorrelationMatrix:
+def most_correlated(names: Sequence[str], covariance: np.ndarray, most: int = 12) -> CorrelationMatrix:
     """Return the most correlated parameters and their correlation matrix."""
     sigma = np.sqrt(np.clip(np.diag(covariance), 1e-300, None))
     matrix = covariance / np.outer(sigma, sigma)
     off = np.abs(matrix - np.diag(np.diag(matrix))).max(axis=1, initial=0.0)
     chosen = np.sort(np.argsort(-off, kind="stable")[:most])
-    return _CorrelationMatrix(tuple(str(names[k]) for k in chosen), _plain(matrix[np.ix_(chosen, chosen)]))
+    return CorrelationMatrix(tuple(str(names[k]) for k in chosen), _plain(matrix[np.ix_(chosen, chosen)]))
 
 
 def _noise(blocks: Sequence[PoseMeasurements]) -> dict[str, float | None]:

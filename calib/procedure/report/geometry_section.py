@@ -13,7 +13,7 @@ from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics
 from calib.procedure.kinematic_stage.validation import ARM
 from calib.procedure.report import page
-from calib.procedure.report.fit_report import Report, RowErrors
+from calib.procedure.report.fit_report import CROSS_VALIDATED, Report, RowErrors
 from calib.units import ERRORS, SMALL
 
 KINDS = {f"{nature}_{unit}": (nature, unit) for nature, (_, unit) in ERRORS.items()}
@@ -122,7 +122,9 @@ def _key_figures(report: Report) -> list[page.KeyFigure]:
     if not metrics.proofs and (folds := _left_out(metrics)):
         return [folds]
     proof, own = deciding(report)
-    basis = f"{proof.poses} {'unseen' if metrics.proofs else 'fitted'} poses"
+    seen = "unseen" if metrics.proofs else "fitted"
+    seen = CROSS_VALIDATED if own is not None and own.name == CROSS_VALIDATED else seen
+    basis = f"{proof.poses} {seen} poses"
     arms = (
         {"calibrated": ""}
         if proof.urdf_alone is None

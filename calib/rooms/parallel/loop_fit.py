@@ -21,13 +21,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calib import files
-from calib.api.rendering import Judged, data_frame
+from calib.api.rendering import Drawn, Judged, data_frame
 from calib.arguments import checked
 from calib.data.csv_table import Table, read_table
 from calib.data.poses.fit_options import FitOptions
 from calib.errors import CalibError, MeasurementError, NoPosture, UsageError, finding, refuse_option, suggestion
 from calib.estimation.estimate import Estimate
-from calib.folders import COVARIANCE, ESTIMATE, METRICS, check_target, write_covariance, write_staged
+from calib.folders import COVARIANCE, ESTIMATE, METRICS, PAGES, REPORT, check_target, write_covariance, write_staged
 from calib.procedure.findings import Verdict
 from calib.procedure.kinematic_stage.folder import RESIDUALS
 from calib.procedure.kinematic_stage.settings import FitSettings
@@ -47,15 +47,18 @@ from calib.rooms.parallel.mechanism.parallel_robot import COORDINATES, ParallelR
 from calib.rooms.parallel.robots import ParallelMechanism, refuse_unread
 
 if TYPE_CHECKING:
+    from calib.procedure.report.charts import Chart
     from calib.procedure.report.page import Section
 
 READ = ("holdout", "tolerance", "seed")  # of the settings
-FIT = (ROBOT, METRICS, ESTIMATE, COVARIANCE, calibrated.COVARIANCE, RESIDUALS)
+FIGURES = "plot_*.png"
+FIT = (ROBOT, METRICS, ESTIMATE, COVARIANCE, calibrated.COVARIANCE, RESIDUALS, REPORT, *PAGES, FIGURES)
 HEADER = ("name", "unit", "value", "sigma")
+LEFT_OUT = "left out"  # rows that folds of the fit left out in turn
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ParallelFit(Judged):
+class ParallelFit(Drawn, Judged):
     """Result of the geometric calibration of a parallel robot: estimate, calibrated robot, errors, verdict.
 
     Attributes:
@@ -132,6 +135,8 @@ class ParallelFit(Judged):
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write the result folder of `calib fit`: either all files or none."""
+        from calib.rooms.parallel import loop_report  # slow to load, as all reports
+
         found = self.estimate
 
         def write(folder: Path) -> None:
@@ -141,10 +146,18 @@ class ParallelFit(Judged):
             write_covariance(folder / COVARIANCE, found.names, found.covariance)
             files.write_table(folder / RESIDUALS, *self._residuals())
             self.robot.write_covariance(folder)
+            loop_report.write(self, folder, plots)
             files.write_json(folder / METRICS, self.to_dict())
 
         check_fit_target(Path(out), [self.nominal.source])
         return write_staged(Path(out), FIT, write)
+
+    def charts(self) -> Mapping[str, Chart]:
+        """Return what the figures show: errors before and after, changes of the constants, correlations."""
+        from calib.procedure.report.geometry_figures import captioned
+        from calib.rooms.parallel.loop_report import report_of
+
+        return {name: chart for name, (chart, _) in captioned(report_of(self)).items()}
 
     def _table(self) -> Iterator[tuple[str, str, float, float]]:
         found = self.estimate
@@ -347,7 +360,7 @@ def _cross_validated(known: ClosedRobot, rows: np.ndarray, held: Sequence[str], 
             found.append(_errors(known, fitted.known, rows[own]))
         except CalibError:
             return {}
-    return {"left out": np.concatenate(found, axis=1)}
+    return {LEFT_OUT: np.concatenate(found, axis=1)}
 
 
 def _rms(errors: np.ndarray) -> float:

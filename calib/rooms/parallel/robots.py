@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 INSTEAD = {
     "choosing poses": "choose poses manually, spread over its workspace",
+    "diff": "compare the values and sigmas of both folders' estimate.csv",
     "calib.read_poses": "calib.fit_geometry takes its files",
     "compensation": "use the calibrated robot.toml in its controller",
     "limits": "state velocity, effort, lower and upper in its file",

@@ -13,6 +13,7 @@ from calib.arguments import checked
 from calib.errors import Finding, UsageError, require
 from calib.procedure.findings import LEVELS, Verdict
 from calib.procedure.report.page import Section
+from calib.procedure.robot_kinds import stage_of
 from calib.records import plain
 from calib.rooms.over_time import pages
 from calib.rooms.over_time.comparison import geometry_change, torque_change
@@ -130,6 +131,8 @@ def diff(before: Compared, after: Compared, settings: DiffSettings = DEFAULT_DIF
         RobotError: where they are of different robots.
     """
     with saved(before) as first, saved(after) as second:
+        for place in (first, second):
+            stage_of(place, "diff")
         one, two = place_of(first), place_of(second)
         parts = [*_tool_parts(one, two, settings), *_torque_parts(one, two, settings)]
     if one.nominal and two.nominal:

@@ -1,0 +1,114 @@
+"""The report of a parallel robot's fit in the form of a serial arm's, so that certificate and figures are the same."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from calib.extensions import offered
+from calib.folders import REPORT
+from calib.geometry.accuracy import Errors
+from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics
+from calib.procedure.report import fit_report
+from calib.procedure.report.fit_report import CorrelatedPair, FittedParameter, Report, RowErrors
+from calib.rooms.parallel.loop_fit import LEFT_OUT, ParallelFit
+from calib.rooms.parallel.mechanism.geometric_fit import LoopParameter
+from calib.rooms.parallel.mechanism.parallel_robot import ParallelRobot
+
+MODEL = "loops"  # the one model of a parallel robot's geometry
+
+
+def report_of(fit: ParallelFit) -> Report:
+    """Return the report of a fit: errors by set of rows, verdict, constants of the loops with their sigmas.
+
+    Encoders that contradict each other measure neither position nor orientation: of readings alone it states no errors.
+    """
+    robot, found, estimate = fit.nominal.chain, fit.found, fit.estimate
+    sets = {"fit": fit.own} | _unseen(fit)
+    parameters = []
+    for one, change, sigma in zip(found.parameters, estimate.values.tolist(), estimate.sigma.tolist()):
+        nominal = _nominal_value(robot, one)
+        value = nominal + change
+        parameters.append(FittedParameter(one.name, one.unit, nominal, value, sigma, _relative(sigma, value), "arm"))
+    return Report(
+        schema=fit_report.SCHEMA, robot=robot.name, base="base", tip="platform", joints=robot.joint_names,
+        prismatic=tuple(joint.kind == "prismatic" for joint in robot.joints), metrics=_metrics(fit),
+        parameters=tuple(parameters), kept=(),
+        correlations=tuple(CorrelatedPair(*pair) for pair in estimate.strong_correlations(0.9)),
+        correlated=fit_report.most_correlated(estimate.names, estimate.covariance), singular_values=(), rank=0,
+        sets=tuple(_row_errors(fit, name, both) for name, both in sets.items()),
+        noise={"position": None, "orientation": None}, files=_files(fit), source=str(fit.nominal.source),
+    )  # fmt: skip
+
+
+def write(fit: ParallelFit, folder: Path, plots: bool) -> None:
+    """Write ``report.json``, figures (if `plots`) and the pages that rooms make of them into a fit's folder."""
+    from calib.procedure.report.charts import saved
+    from calib.procedure.report.geometry_figures import captioned
+
+    report = report_of(fit)
+    fit_report.write(report, folder / REPORT)
+    drawn = saved(captioned(report), folder) if plots else {}
+    for pages in offered("fit_pages"):
+        pages(report, drawn, folder)
+
+
+def _metrics(fit: ParallelFit) -> FitMetrics:
+    verdict, tolerance = fit.verdict, fit.settings.tolerance
+    vague = fit.found.vague
+    return FitMetrics(
+        validation={name: _compared(fit, both) for name, both in _unseen(fit).items()}, verdict=verdict.level,
+        reason=verdict.reason, warnings=(), code=verdict.code, advice=verdict.advice,
+        fit=_compared(fit, fit.own, unseen=False, parameters=len(fit.found.parameters)), model=MODEL, ladder=(),
+        seed=fit.settings.seed, tolerance_mm=None if tolerance is None else 1e3 * tolerance,
+        not_identifiable=(f"hardly identified by these poses: {', '.join(vague)}",) if vague else (), outliers=(),
+    )  # fmt: skip
+
+
+def _unseen(fit: ParallelFit) -> dict[str, np.ndarray]:
+    """Return the errors of both robots on rows that were not fitted, by the names that reports have for them."""
+    return {fit_report.CROSS_VALIDATED if name == LEFT_OUT else name: both for name, both in fit.unseen.items()}
+
+
+def _compared(fit: ParallelFit, both: np.ndarray, unseen: bool = True, parameters: int = 0) -> ComparedRows:
+    """Return the statistics of the errors (2, m, k) of both robots on some rows."""
+    nominal, calibrated = (_errors(fit, own).summary() for own in both)
+    return ComparedRows(both.shape[1], "the file's own", nominal, calibrated, unseen=unseen, parameters=parameters)
+
+
+def _errors(fit: ParallelFit, own: np.ndarray) -> Errors:
+    """Return the sizes of errors (m, k) by kind; none where no coordinate of the platform was measured."""
+    if not fit.measured:
+        return Errors(None, None, None)
+    places = fit.nominal.chain.selected < 3
+    position, orientation = (
+        np.linalg.norm(own[:, columns], axis=1) if columns.any() else None for columns in (places, ~places)
+    )
+    return Errors(position, orientation, None)
+
+
+def _row_errors(fit: ParallelFit, name: str, both: np.ndarray) -> RowErrors:
+    nominal, calibrated = (
+        {
+            nature: tuple(size.tolist())
+            for nature in ("position", "orientation")
+            if (size := getattr(found, nature)) is not None
+        }
+        for found in (_errors(fit, own) for own in both)
+    )
+    return RowErrors(name, name != "fit", both.shape[1], nominal, calibrated)
+
+
+def _nominal_value(robot: ParallelRobot, one: LoopParameter) -> float:
+    """Return a constant's nominal value; 0 for a displacement of a leg's base or attachment."""
+    return float(robot.legs[one.leg].chain.elements[one.index].value) if one.part == "element" else 0.0
+
+
+def _relative(sigma: float, value: float) -> float | None:
+    return 100.0 * sigma / abs(value) if value else None
+
+
+def _files(fit: ParallelFit) -> tuple[fit_report.FileRow, ...]:
+    roles = {fit.nominal.source: "nominal robot"} | dict.fromkeys(fit.files, "measured")
+    return tuple(fit_report.file_row(path.name, role, path) for path, role in roles.items() if path.is_file())
