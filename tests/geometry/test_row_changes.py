@@ -12,7 +12,6 @@ from calib.geometry.checks.row_changes import row_changes
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation, see
-from calib.robot.calibrated import Deflection, Term
 from calib.transforms import from_xyz_rpy, to_quaternion
 
 NOISE = 2e-5
@@ -89,12 +88,13 @@ def test_a_sound_file_changed_nowhere(seeds):
 
 
 def test_an_effect_of_a_joint_in_sorted_rows_is_no_change():
-    """Rows in the order of joint 1, and an arm whose joint 2 gives way as joint 1 turns: a model lacks it, no time."""
+    """Rows in the order of joint 1, at whose middle something in the arm gives way: a model lacks that, no time."""
     truth = truth_of(3)
     q = random_joints(truth.chain, ROWS, 3)
-    q = q[np.argsort(q[:, 0])]
-    wavy = replace(truth, deflection=Deflection((Term("theta2", "sin", 0, 1),), np.array([2e-3]), truth.chain))
-    assert changes(measured(wavy, wavy, q, 3)) == []
+    for order, codes in ((np.argsort(q[:, 0]), []), (np.arange(ROWS), ["station-changed"])):
+        block = measured(truth, truth, q[order], 3)
+        later = (np.arange(ROWS) >= CUT)[:, None]
+        assert [one.code for one in changes(replace(block, position=block.position + later * [0, 0, 4e-4]))] == codes
 
 
 def test_grossly_wrong_rows_hide_no_change_and_are_none():
