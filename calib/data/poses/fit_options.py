@@ -72,7 +72,7 @@ Each = Spread(3, "a number or three")
 
 
 OF_COLUMNS = ("sign", "coupling", "order", "zero", "rows", "targets", "reflection", "convention", "copies")
-FINDINGS = ("unexplained", *OF_COLUMNS, "moved", "scale", "commanded")
+FINDINGS = ("unexplained", *OF_COLUMNS, "moved", "scale", "commanded", "range")
 """Names in ``accept``: those of chapter 1 of the catalogue of findings."""
 
 

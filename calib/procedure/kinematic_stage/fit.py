@@ -10,6 +10,7 @@ from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import Finding, NotConverged, finding
 from calib.extensions import offered
 from calib.geometry.accuracy import errors
+from calib.geometry.checks.joint_range import joint_range
 from calib.geometry.checks.row_changes import row_changes
 from calib.geometry.diagnosis import diagnose
 from calib.geometry.error_model import ErrorModel, learn_errors
@@ -174,7 +175,10 @@ def run(
     ]
     if selection is not None and (ratio := compared_with_fit(selection, found.fit)) is not None:
         notes.append(ratio)
-    findings = _found_of(inputs, found, named, notes, options.accept)
+    held = joint_range(found.rigid, found.nominal.cell)
+    if found.chosen != "frames":  # else the arm is the nominal one everywhere
+        notes += plausibility.of_range(held, wanted.tolerance)
+    findings = replace(_found_of(inputs, found, named, notes, options.accept), joint_range=held)
     say("estimating the expected errors")
     expected = learn_errors(found, inputs.fit, seed)
     findings = replace(findings, discrepancy=None if expected is None else expected.discrepancy)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from calib.errors import Finding
 from calib.geometry.accuracy import ArmErrors, ErrorStatistics
+from calib.geometry.checks.joint_range import JointRange
 from calib.geometry.error_model import Discrepancy
 from calib.geometry.model_choice.ladder import ModelStep
 from calib.geometry.repeatability import RepeatedPoses
@@ -105,6 +106,7 @@ class Findings:
         noticed: findings on the fit, worst first, whatever the unseen rows are.
         blind: stations cross-validated by regions only, since their tool is not identifiable from the others.
         rigid_cross_validated: the error of the best model without joint corrections [m].
+        joint_range: in which the fit was made; None in files of earlier versions.
         discrepancy: what makes an error at a pose likely, learnt by cross-validation; None where nothing was.
     """
 
@@ -118,6 +120,7 @@ class Findings:
     blind: tuple[str, ...] = ()
     discrepancy: Discrepancy | None = None
     rigid_cross_validated: float | None = None
+    joint_range: JointRange | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,6 +13,7 @@ from calib.data.poses.measurements import PoseMeasurements, take
 from calib.errors import Finding, finding
 from calib.extensions import needed
 from calib.geometry.accuracy import NATURE, errors
+from calib.geometry.checks.joint_range import JointRange
 from calib.geometry.checks.readings import repeated_readings
 from calib.geometry.diagnosis import Scale, length_factor, scale_of, wrong_angles, wrong_columns
 from calib.geometry.installation import Installation
@@ -23,7 +24,7 @@ from calib.geometry.weighing import GeometricFit
 from calib.procedure.findings import level_of, limit
 from calib.procedure.kinematic_stage.metrics import Outlier
 from calib.records import evenly
-from calib.units import ERRORS
+from calib.units import DEG, ERRORS
 
 FLOOR = 4e-4  # rms per metre of reach: more is not left by a rigid geometry of a sound arm (our choice)
 TOO_GOOD = 2e-6  # rms [m]: less is left by no instrument (our choice)
@@ -88,6 +89,37 @@ def _left(found: GeometricFit) -> float:
     if not sizes or rows <= used:
         return np.inf
     return float(np.sqrt(np.mean(np.concatenate(sizes) ** 2) * rows / (rows - used)))
+
+
+HALF = 0.5  # of the nominal arm's error: a fit that promises less than that elsewhere is better there (our choice)
+
+
+def of_range(held: JointRange, tolerance: float | None) -> list[Finding]:
+    """Return findings on the joint range that a calibration is about, and on what it promises outside.
+
+    Args:
+        held: the measured range, and σ over the whole range.
+        tolerance: largest rms on unseen poses that is good enough [m]; None where none was given.
+    """
+    if held.sigma is None or not held.moved:
+        return []
+    shares = [held.shares[j] for j in held.moved]
+    limit_elsewhere = tolerance if tolerance is not None else HALF * (held.nominal or np.inf)
+    values = {"sigma": held.sigma, "least": min(shares), "most": max(shares)}
+    beyond, times = held.sigma / limit_elsewhere, held.sigma / max(held.left, 1e-300)
+    return [
+        finding("measured-range", joints=ranges(held), **values),
+        finding("small-range", beyond=beyond, times=times, nominal=held.nominal, **values),
+    ]
+
+
+def ranges(held: JointRange) -> list[str]:
+    """Return the measured range of each joint, as text [deg or mm]."""
+    words = []
+    for name, low, high, unit in zip(held.joints, held.lower, held.upper, held.units):
+        factor, shown = (1e3, "mm") if unit == "m" else (1.0 / DEG, "°")
+        words.append(f"{name} {factor * low:.0f} to {factor * high:.0f} {shown}".replace(" °", "°"))
+    return words
 
 
 MAX_TURN, MAX_SHIFT = 0.1, 0.03  # of a healthy arm's elements [rad], of the reach (our choice)

@@ -23,8 +23,8 @@ MAX_FILES = 12  # files listed there
 MAX_VALUE = 90  # letters of what a setup line says there
 DIGEST_DIGITS = 16  # hexadecimal digits of a SHA-256 there
 KNOWN = (
-    "robot", "description", "instrument", "measurements", "model", "recordings", "torques", "payloads", "method",
-    "friction",
+    "robot", "description", "instrument", "measurements", "model", "measured range", "recordings", "torques",
+    "payloads", "method", "friction",
 )  # fmt: skip
 EDITED = "edited by hand"
 WHOLE = "report.html"

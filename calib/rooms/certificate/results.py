@@ -14,6 +14,7 @@ from calib.procedure.report.templates import versions
 from calib.procedure.session.answers import CertificateSection
 from calib.rooms.certificate import rendering
 from calib.rooms.certificate.record import NO_DETAILS, Certificate, Entry, Page, records, report
+from calib.units import DEG
 
 if TYPE_CHECKING:
     from calib.api.rendering import Judged
@@ -67,6 +68,7 @@ def of_fit(
     setup = [
         Entry("robot", f"{found.robot}, {found.base} to {found.tip}, {len(found.joints)} joints"),
         Entry("description", found.source), Entry("measurements", measured), Entry("model", metrics.model),
+        Entry("measured range", measured_range(metrics)),
         Entry("tolerance", tolerance(metrics.tolerance_mm, metrics)), Entry("seed", str(metrics.seed)),
         Entry("toolkit", versions()),
     ]  # fmt: skip
@@ -82,6 +84,16 @@ def tolerance(millimetres: float | None, found: FitMetrics) -> str:
     if not millimetres:
         return f"none given: pass means better than the nominal robot on unseen poses, or no improvement possible{of}"
     return f"{millimetres:g} mm rms on unseen poses{of}"
+
+
+def measured_range(found: FitMetrics) -> str:
+    """Return a text on the joint range that the verdict on a fit is about; empty for fits of earlier versions."""
+    held = None if found.findings is None else found.findings.joint_range
+    if held is None:
+        return ""
+    values = zip(held.lower, held.upper, held.units)
+    scaled = [(low, high, *((1e3, " mm") if unit == "m" else (1.0 / DEG, "°"))) for low, high, unit in values]
+    return ", ".join(f"{factor * low:.0f}…{factor * high:.0f}{shown}" for low, high, factor, shown in scaled)
 
 
 def write_model(found: DynamicReport, drawn: Mapping[str, Picture], folder: Path) -> None:

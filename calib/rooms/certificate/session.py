@@ -33,7 +33,7 @@ from calib.procedure.session.steps import SessionStep
 from calib.records import read_json, read_lines
 from calib.rooms.certificate import dynamics, geometry, rendering
 from calib.rooms.certificate.record import EDITED, Certificate, Entry, Page, Stage, records
-from calib.rooms.certificate.results import tolerance
+from calib.rooms.certificate.results import measured_range, tolerance
 
 ROLES = {
     "1-robot": "nominal robot", "3-measured": "measured", "4-fit": "fit", "6-excitation": "motion to record",
@@ -161,6 +161,7 @@ def _setup(session: Session, found: FitMetrics | None) -> list[Entry]:
             ("measurements", _named(session.brought("measured", "validation"))),
             ("pose plan", plan.words), ("poses kept", ", ".join(plan.checked)),
             ("poses NOT checked for", ", ".join(plan.unchecked)), ("model", found.model),
+            ("measured range", measured_range(found)),
             ("tolerance", tolerance(settings.fit.tolerance_mm, found)),
         ]  # fmt: skip
     if session.dynamic:

@@ -1,0 +1,138 @@
+"""How far a fit holds: the measured range of the joints, and σ of the target's position over their whole range.
+
+A fit to poses of one region determines what moves the target there; elsewhere other combinations of parameters count.
+What the data and the making of the arm leave open of them is their posterior,
+
+    C = (Wᵀ W + Λ)⁻¹,   σ² = tr(J C Jᵀ),
+
+with W the whitened observation matrix of all rigid parameters, Λ the precision of the prior of making and J the
+target's Jacobian at random postures within the joint limits.
+"""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.linalg
+
+from calib.data.poses.measurements import PoseMeasurements, Positions
+from calib.errors import CalibError
+from calib.geometry.accuracy import errors
+from calib.geometry.fit import plausible_deviation, polish_frames
+from calib.geometry.installation import Installation
+from calib.geometry.observation import layout, pose_sigmas, positions, prepare, whitened
+from calib.geometry.weighing import GeometricFit
+from calib.robot.chain import random_joints
+
+POSTURES = 300  # random ones
+STILL = 1e-3  # [rad, m]: a joint that moved by less stood; the others are drawn with it where it stood
+MIN_PRECISION = 1e-12  # of the largest one: placements have no prior
+
+
+@dataclass(frozen=True)
+class JointRange:
+    """Range of the joints in which a fit was made, and what it promises over their whole range.
+
+    Attributes:
+        joints, units: (n,) names; rad or m.
+        lower, upper: (n,) measured range [rad or m].
+        shares: (n,) measured range over the whole one, a turn at most.
+        sigma: of the target's position over the whole range, rms [m]; None where no positions were measured.
+        nominal: error of the nominal arm over the whole range by the calibrated one, rms [m]; None as for sigma.
+        left: error that the rigid arm leaves at the fitted poses, rms [m].
+    """
+
+    joints: tuple[str, ...]
+    units: tuple[str, ...]
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+    shares: tuple[float, ...]
+    sigma: float | None
+    nominal: float | None
+    left: float
+
+    @property
+    def moved(self) -> list[int]:
+        """Indices of the joints that did not stand still."""
+        return [j for j, (low, high) in enumerate(zip(self.lower, self.upper)) if high - low > STILL]
+
+
+def joint_range(found: GeometricFit, nominal: Installation) -> JointRange:
+    """Return the joint range of a rigid fit, with σ over the whole range.
+
+    Args:
+        found: the fit without joint corrections.
+        nominal: the arm as it was, placed for the same rows.
+    """
+    chain, blocks = found.cell.chain, [block.measured for block in found.blocks]
+    q = np.concatenate([block.q for block in blocks])
+    low, high = q.min(axis=0), q.max(axis=0)
+    lower, upper = chain.sampling_limits()
+    whole = np.array([np.inf if joint.kind == "prismatic" else 2.0 * np.pi for joint in chain.joints])
+    whole = np.maximum(np.minimum(upper - lower, whole), STILL)
+    shares = np.minimum((high - low) / whole, 1.0)
+    sigma, worse = None, None
+    if any(isinstance(block, Positions) for block in blocks):
+        postures = random_joints(chain, POSTURES)
+        stood = high - low <= STILL
+        postures[:, stood] = np.median(q, axis=0)[stood]
+        sigma = float(np.sqrt(np.mean(sigma_at(found.cell, found, postures) ** 2)))
+        worse = _nominal_error(found, nominal, postures)
+    return JointRange(
+        joints=chain.joint_names,
+        units=tuple(joint.unit for joint in chain.joints),
+        lower=tuple(low.tolist()),
+        upper=tuple(high.tolist()),
+        shares=tuple(shares.tolist()),
+        sigma=sigma,
+        nominal=worse,
+        left=errors(found.cell, blocks).rms,
+    )
+
+
+def sigma_at(cell: Installation, found: GeometricFit, q: np.ndarray) -> np.ndarray:
+    """Return σ of the first target's position (m,) [m] at postures q (m, n), in its station's frame.
+
+    The fit's covariance where it holds all rigid parameters with a prior, else the posterior of its data and
+    the prior of making (`calib.geometry.fit.PLAUSIBLE`).
+    """
+    table, columns = layout(cell), layout(cell).rigid_index
+    arm = np.intersect1d(columns, table.index("arm"))
+    prior = found.prior
+    if prior is not None and np.isin(arm, found.free[np.isfinite(prior)]).all():
+        columns, covariance = found.free, found.estimate.covariance
+    else:
+        covariance = _posterior(cell, found, columns)
+    (block,) = _positions_at(cell, found, q)
+    return pose_sigmas(cell, block, columns, covariance)[:, 0]
+
+
+def _posterior(cell: Installation, found: GeometricFit, columns: np.ndarray) -> np.ndarray:
+    """Return the covariance of the parameters `columns` by the data of a fit and the prior of making."""
+    square = np.zeros((len(columns), len(columns)))
+    for number, block in enumerate(found.blocks):
+        scales = [piece.sigma / np.sqrt(piece.weight) for piece in found.pieces if piece.block == number]
+        noises = [piece.part.noise for piece in found.pieces if piece.block == number]
+        for _, matrix in whitened(cell, block, columns, scales, noises):
+            square += matrix.T @ matrix
+    square /= found.estimate.residual_std**2
+    precision = plausible_deviation(cell, columns) ** -2.0
+    ridge = MIN_PRECISION * float(np.diag(square).max())
+    return scipy.linalg.inv(square + np.diag(precision + ridge))
+
+
+def _positions_at(cell: Installation, found: GeometricFit, q: np.ndarray) -> Sequence[Positions]:
+    """Return positions of the first target that an installation would measure at postures (m, n)."""
+    measured = next(block.measured for block in found.blocks if isinstance(block.measured, Positions))
+    names, station = measured.tool_names[:1], measured.station
+    block = Positions(q, measured.joint_names, position=np.zeros((len(q), 3)), tool_names=names, station=station)
+    return [replace(block, position=positions(cell, prepare(cell, [block])[0]).T)]
+
+
+def _nominal_error(found: GeometricFit, nominal: Installation, q: np.ndarray) -> float | None:
+    """Return the rms error [m] of the nominal arm at postures (m, n) if the calibrated one is the true arm."""
+    blocks: Sequence[PoseMeasurements] = _positions_at(found.cell, found, q)
+    with suppress(CalibError):
+        return errors(polish_frames(nominal, blocks).cell, blocks).rms
+    return None
