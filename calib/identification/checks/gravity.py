@@ -16,7 +16,6 @@ motion and drives. An arm whose joints all turn about the vertical shows neither
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
