@@ -139,5 +139,5 @@ def worse_than_plain(beside: Mapping[str, PlainReferences]) -> list[Finding]:
     name = max(known, key=lambda key: known[key].delivered / known[key].plain)
     worst = known[name]
     times = worst.delivered / worst.plain
-    one = finding("worse-than-plain", file=name, times=times, delivered=worst.delivered, plain=worst.plain)
+    one = finding("torque-worse-than-plain", file=name, times=times, delivered=worst.delivered, plain=worst.plain)
     return list(settle([one]))

@@ -51,7 +51,7 @@ def test_an_identification_prints_and_stores_its_references(robot, tmp_path):
     found = model.references["other.npz"]
     assert found.delivered == pytest.approx(model.validation["other.npz"].judged.total)
     assert found.plain == pytest.approx(found.delivered, rel=0.1) and found.nominal > 3.0 * found.plain
-    assert "worse-than-plain" not in {one.code for one in model.noticed}
+    assert "torque-worse-than-plain" not in {one.code for one in model.noticed}
     out = model.save(tmp_path / "out", plots=False)
     for name in ("metrics.json", "report.json"):
         stored = json.loads((out / name).read_text())["references"]["other.npz"]
