@@ -460,7 +460,7 @@ def _between(start: Plant, end: Plant, share: float) -> Plant:
 
 
 def _nearer(start: Plant, end: Plant, cases: Sequence[tuple[Case, Loop]]) -> tuple[Plant, Runs]:
-    """Return the plant halfway from `start` to `end`, or nearer to `start` where that cannot be simulated, and its runs.
+    """Return the plant halfway from `start` to `end`, or nearer where that cannot be simulated, and its runs.
 
     Raises:
         CannotSimulate: where none near `start` can.

@@ -229,7 +229,20 @@ def another(table: np.ndarray, header: list[str]) -> np.ndarray:
         (numbers(lambda table, header: table[:1000]), "shorter than one period"),
         (reheaded(lambda header: [name.replace("q_joint4", "x4") for name in header]), "joint"),
     ],
-    ids=["rad", "swapped", "rehearsal", "sign", "one", "horizontal", "unit", "mNm", "most in mNm", "another", "stopped", "missing"],
+    ids=[
+        "rad",
+        "swapped",
+        "rehearsal",
+        "sign",
+        "one",
+        "horizontal",
+        "unit",
+        "mNm",
+        "most",
+        "another",
+        "stopped",
+        "missing",
+    ],
 )
 def test_a_wrong_recording_is_said(recorded: Session, change: Callable[[str], str], message: str) -> None:
     path = recorded.path("7-recorded/training_log.csv")
