@@ -40,10 +40,15 @@ ASKED = {
 
 @pytest.fixture(scope="module")
 def recorded():
+    return simulated(0)
+
+
+def simulated(seed):
+    """Return a recording with the noise of a seed, and its loop."""
     reach, speed = np.array([2.8, 1.8, 2.0, 3.5, 1.9, 4.0]), np.deg2rad([230.0, 230.0, 340.0, 330.0, 250.0, 560.0])
     reference = random_fourier(-reach, reach, speed, 10.0, 5000.0, 20, acceleration=40.0, seed=3)
     controller = known_robots.controller("tx40")
-    run = simulate(PLANT, controller, reference, Sensing(np.deg2rad(1e-4), sigma_tau=0.05, every=5), 0)
+    run = simulate(PLANT, controller, reference, Sensing(np.deg2rad(1e-4), sigma_tau=0.05, every=5), seed)
     recording = Recording(
         run.t, run.measured, run.tau, "torque", tuple(f"joint_{j + 1}" for j in range(6)), file="tx40"
     )
@@ -86,3 +91,20 @@ def test_constrained_instruments(recorded, name, free):
         f"\n{method}, {name}: {held:.2f} s of processor time in {len(found.rounds)} rounds, free {alone:.2f} s in "
         f"{len(before.rounds)}: {held / alone:.2f} times, round by round {each:.2f}"
     )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [3, 8])
+def test_a_step_that_ends_where_the_loop_is_hardly_stable_is_no_dead_end(seed):
+    """Whichever way the noise, or the processor's kernels, lead the iterations: the bound binds, and the rest fits.
+
+    With these seeds a quarter of the second step could be simulated, and nothing further from there.
+    """
+    recorded = simulated(seed)
+    constraints = make_constraints(
+        ConstraintSettings(bounds={"ZZ2R": (-np.inf, -0.15)}, signs=False), MODEL, BASE, BASE.names,
+        [MODEL.columns[k - MODEL.inertial] if k >= MODEL.inertial else None for k in BASE.kept],
+    )  # fmt: skip
+    _, found = seconds(recorded, constraints, "didim")
+    assert found.constrained is not None and found.constrained.binding[0].name == "ZZ2R <= -0.15"
+    assert found.fit.estimate.values[BASE.names.index("ZZ2R")] == pytest.approx(-0.15, abs=1e-6)

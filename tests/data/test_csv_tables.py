@@ -171,6 +171,12 @@ def test_a_column_that_is_not_what_it_should_be_is_refused(write, heading, dimen
     assert error.value.column == (None if heading == "xx" else "x")
 
 
+def test_a_table_of_no_rows_has_columns_of_no_numbers(write):
+    """As what remains of a table when none of its rows holds a position."""
+    table = read_table(write("x [mm],y [deg]", ",1\n,2")).where(np.zeros(2, dtype=bool))
+    assert table.numbers("x", "length", gaps=True).shape == table.numbers("y", "angle").shape == (0,)
+
+
 def test_what_a_header_says(write):
     assert read_table(write("x,T [furlong]", "1,2")).numbers("x", "length")[0] == 1  # of an ignored column nothing
     assert read_table(write("a,b,", "1,2,\n3,4,")).header == ("a", "b")  # each line ends with a separator

@@ -3,7 +3,9 @@
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import dask_cluster
 import fsspec
@@ -81,10 +83,41 @@ def test_a_full_disk_in_the_middle_leaves_the_state_of_before(place: str, tmp_pa
     assert (tmp_path / "cell/state.json").read_text() == "after" and (tmp_path / "cell/big.csv").exists()
 
 
-def test_two_clients_on_one_session(place: str) -> None:
-    with stores.held(place, QUICK), pytest.raises(Busy, match="is busy: process"), stores.held(place, QUICK):
-        pass
+def waits_for_a_change(claim: Path) -> SimpleNamespace:
+    """Return a clock that sleeps until a claim's holder has renewed it: a lease that is long enough on any machine."""
+
+    def sleep(lease: float) -> None:
+        before, until = claim.read_text(), time.monotonic() + SECONDS
+        while claim.read_text() == before and time.monotonic() < until:
+            time.sleep(0.01)
+
+    return SimpleNamespace(sleep=sleep)
+
+
+def test_two_clients_on_one_session(place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as clock, stores.held(place, QUICK):
+        clock.setattr(stores, "time", waits_for_a_change(tmp_path / "cell/calib.claim"))
+        with pytest.raises(Busy, match="is busy: process"), stores.held(place, QUICK):
+            pass
     with stores.held(place, QUICK):
+        pass
+
+
+@pytest.mark.parametrize(("text", "busy"), [("", True), (None, False)], ids=["being written", "released"])
+def test_a_claim_without_text_is_being_renewed(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str | None, busy: bool
+) -> None:
+    claim = tmp_path / "cell/calib.claim"
+    claim.write_text("process 1 on elsewhere (0) 7")
+
+    def sleep(lease: float) -> None:
+        claim.unlink()
+        if text is not None:
+            claim.write_text(text)
+
+    monkeypatch.setattr(stores, "time", SimpleNamespace(sleep=sleep))
+    expected = pytest.raises(Busy, match="process 1 on elsewhere works on it") if busy else nullcontext()
+    with expected, stores.held(place, QUICK):
         pass
 
 

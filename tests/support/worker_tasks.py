@@ -75,6 +75,18 @@ def pid_a_little_later(x: int) -> int:
     return os.getpid()
 
 
+def pid_once_both_began(task: tuple[Path, int]) -> int:
+    """Return this process's number, and for the first two tasks only when two processes have begun a task."""
+    folder, number = task
+    (folder / f"worker {os.getpid()}").touch()
+    if number < 2:
+        until = time.monotonic() + SECONDS
+        while len(list(folder.glob("worker *"))) < 2:
+            assert time.monotonic() < until, "the second worker did not begin"
+            time.sleep(0.01)
+    return pid_a_little_later(number)
+
+
 def until_told(folder: Path) -> str:
     """Wait like a search that hands back the best so far after Ctrl-C."""
     try:

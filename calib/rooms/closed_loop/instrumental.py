@@ -42,6 +42,7 @@ from calib.rooms.closed_loop.loop_recordings import Loop, low_passed, simulated_
 from calib.rooms.closed_loop.simulation import Plant, Sensing, SimulatedRun, plant_of
 
 MAX_ROUNDS = 10  # iterations; 3 to 6 are usual
+MAX_RETREATS = 6  # halvings of a step to parameters that cannot be simulated (our choice)
 MAX_FOLLOWING = 1.25  # times the speed's noise, by which the simulated motion may be off the measured one (our choice)
 MAX_GAIN_RATIO = 1.25  # of distances from the reference, recorded and simulated: beyond, gains are others (our choice)
 
@@ -248,13 +249,23 @@ def identify_instrumental(
         runs, retreats, tau = _runs(plant, cases), 0, 1.0
     except NotConverged as error:
         raise CannotSimulate(str(error), error.last) from error
+    start, returns = plant, 0  # of the last step, and how often it was halved afterwards
     for _ in range(limit):
         found = _estimate_round(task, runs, std, tau)
         task = task.after(found)
         rounds.append(Round(_change(before, found.fit), found.fit.estimate.residual_std, retreats))
         if before is not None and retreats == 0 and instrumental_variables.settled(before, found.fit):
             return _result(task, found, ordinary, task.plant(plant, found), rounds, std, runs)
-        task, found, plant, runs, retreats = _simulate_new(task, found, plant, std, tau)
+        try:
+            task, found, end, runs, retreats = _simulate_new(task, found, plant, std, tau)
+            start, plant, returns = plant, end, 0
+        except CannotSimulate:
+            # the last step led to a loop that is hardly stable, whose motion tells nothing: take a smaller one
+            returns += 1
+            if returns > MAX_RETREATS or plant is start:
+                raise
+            plant, runs = _nearer(start, plant, cases)
+            retreats = returns
         before, std, tau = found.fit, found.fit.group_std, found.tau
     kind = Diverged if len(rounds) > 2 and rounds[-1].change > rounds[1].change else NotConverged
     raise kind(
@@ -425,10 +436,8 @@ def _simulate_new(
     Then those on the way to them (our choice). A controller holds no robot of next to no inertia.
     """
     retreats = 0
-    max_retreats = 6  # halvings of a step to parameters that cannot be simulated
-    while retreats < max_retreats:
-        share, new = 0.5**retreats, task.plant(old, found)
-        tried = new.with_parameters(share * new.parameters + (1.0 - share) * old.parameters)
+    while retreats < MAX_RETREATS:
+        tried = _between(old, task.plant(old, found), 0.5**retreats)
         try:
             return task, found, tried, _runs(tried, task.cases), retreats
         except CalibError as error:
@@ -443,6 +452,27 @@ def _simulate_new(
         retreats += 1
     words = f"neither the estimate nor smaller steps can be simulated: {problem}{_if_weak(task, found, std)}"
     raise CannotSimulate(words, task.plant(old, found))
+
+
+def _between(start: Plant, end: Plant, share: float) -> Plant:
+    """Return the plant whose parameters are a share of the way from one plant to another."""
+    return end.with_parameters(share * end.parameters + (1.0 - share) * start.parameters)
+
+
+def _nearer(start: Plant, end: Plant, cases: Sequence[tuple[Case, Loop]]) -> tuple[Plant, Runs]:
+    """Return the plant halfway from `start` to `end`, or nearer where that cannot be simulated, and its runs.
+
+    Raises:
+        CannotSimulate: where none near `start` can.
+    """
+    problem: CalibError | None = None
+    for halvings in range(1, MAX_RETREATS + 1):
+        tried = _between(start, end, 0.5**halvings)
+        try:
+            return tried, _runs(tried, cases)
+        except CalibError as error:
+            problem = error
+    raise CannotSimulate(f"no robot on the way to the estimate can be simulated: {problem}", start)
 
 
 def _if_weak(task: _Fixed, found: _Found, std: np.ndarray) -> str:

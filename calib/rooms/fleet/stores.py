@@ -95,23 +95,27 @@ class _Claim:
         except FileExistsError:
             before = self._read()
             time.sleep(lease)
-            if (now := self._read()) and now != before:
-                raise Busy(f"{address} is busy: {now.partition(' (')[0]} works on it; wait for it to end") from None
+            now = self._read()
+            # empty: its holder is just renewing it
+            if now is not None and now != before:
+                holder = (now or before or "another process").partition(" (")[0]
+                raise Busy(f"{address} is busy: {holder} works on it; wait for it to end") from None
             self._write("overwrite")
 
     def _write(self, mode: str) -> None:
         self.files.makedirs(self.path.rpartition("/")[0], exist_ok=True)
         self.files.pipe_file(self.path, f"{self.owner} {self.beats}".encode(), mode=mode)
 
-    def _read(self) -> str:
+    def _read(self) -> str | None:
+        """Return the claim's text; None where there is none."""
         try:
             return self.files.cat_file(self.path).decode()
         except FileNotFoundError:
-            return ""
+            return None
 
     def renew(self) -> None:
         """Show that this process is alive; raise if another one took over."""
-        holder = self._read()
+        holder = self._read() or ""
         words = f"{self.address} was taken over by {holder or 'nobody'}; nothing more was written there"
         require(holder.startswith(self.owner), words)
         self.beats += 1
@@ -120,7 +124,7 @@ class _Claim:
     def release(self) -> None:
         """Give the folder free, if it is still ours."""
         with refused_as(CalibError, Exception, f"cannot write {self.address}: {{}}"):
-            if self._read().startswith(self.owner):
+            if (self._read() or "").startswith(self.owner):
                 self.files.rm_file(self.path)
 
 

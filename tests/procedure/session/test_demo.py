@@ -63,6 +63,18 @@ def test_demo_of_other_robots(robot: str, tmp_path: Path) -> None:
     assert run("demo", "--out", tmp_path / "demo", "--plots", "--robot", robot, "--seed", "3") == 0
 
 
+@pytest.mark.slow
+def test_demo_by_camera_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """To the end, and again by `calib view`: validation images measure no positions, which are empty cells."""
+    out = tmp_path / "cell"
+    assert run("demo", "--instrument", "camera", "--geometry-only", "--plots", "--out", out) == 0
+    truth = errors(out)
+    assert truth["urdf_alone"] < truth["nominal"] / 5.0
+    pytest.importorskip("rerun")
+    assert run("view", out, "--save", tmp_path / "cell.rrd") == 0
+    assert (tmp_path / "cell.rrd").stat().st_size > 1e5
+
+
 def test_hard_names_the_robot(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert run("demo", "--hard", "--robot", "tx40", "--out", tmp_path / "d") == 2
     assert "--hard names a robot, too" in capsys.readouterr().err

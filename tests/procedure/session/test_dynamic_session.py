@@ -196,6 +196,11 @@ def scaled(name: str, factor: float) -> Callable[[str], str]:
     return numbers(lambda table, header: np.where([each.startswith(name) for each in header], factor * table, table))
 
 
+def in_milli_but_the_last(text: str) -> str:
+    """Torques in mNm, within ten times the limits of the last joint: no limit tells the unit, the masses do."""
+    return scaled("tau_joint7", 1e-3)(scaled("tau_joint", 1e3)(text))
+
+
 def counted_from_the_horizontal(table: np.ndarray, header: list[str]) -> np.ndarray:
     two, three = (next(k for k, name in enumerate(header) if name.startswith(f"q_joint{j}")) for j in (2, 3))
     table[:, three] += table[:, two]
@@ -218,12 +223,26 @@ def another(table: np.ndarray, header: list[str]) -> np.ndarray:
         (scaled("tau_joint4", -1.0), "training_log.csv: torque of joint4 .* reverse the sign of the column of joint4"),
         (numbers(counted_from_the_horizontal), r"if joint3, joint2 are combined \(-\)"),
         (scaled("tau_joint", 1e-2), "times those of the nominal masses"),
-        (scaled("tau_joint", 11.0), "are they in mNm"),
+        (scaled("tau_joint", 1e3), "every joint exceeds 3 times its limit: N mm"),
+        (in_milli_but_the_last, "joint2, joint3.* are they in mNm"),
         (numbers(another), "does not contain the motion designed in this session"),
         (numbers(lambda table, header: table[:1000]), "shorter than one period"),
         (reheaded(lambda header: [name.replace("q_joint4", "x4") for name in header]), "joint"),
     ],
-    ids=["rad", "swapped", "rehearsal", "sign", "one", "horizontal", "unit", "mNm", "another", "stopped", "missing"],
+    ids=[
+        "rad",
+        "swapped",
+        "rehearsal",
+        "sign",
+        "one",
+        "horizontal",
+        "unit",
+        "mNm",
+        "most",
+        "another",
+        "stopped",
+        "missing",
+    ],
 )
 def test_a_wrong_recording_is_said(recorded: Session, change: Callable[[str], str], message: str) -> None:
     path = recorded.path("7-recorded/training_log.csv")
