@@ -86,7 +86,7 @@ def test_limits_say_what_stands_beside_the_arm(tmp_path):
     assert again.checked == said.checked
     path.unlink()
     without = read_limits(None, Installation(chain), folder / "robot.toml")
-    assert any("links beside the arm (the URDF is not at hand)" in words for words in without.unchecked)
+    assert any("links outside the arm (the URDF is not at hand)" in words for words in without.unchecked)
     assert not any("left_a" in words for words in without.checked)
 
 

@@ -371,7 +371,7 @@ def _model(
                 one.name for one in links_beside(text(source)[0], str(source), chain) if one.name not in model.links
             ]
             missed = (f"{listing(bare, 4)} (not in the arm, without collision shapes)",) if bare else ()
-            return model, f"the URDF's collision shapes, links beside the arm at {stands}", notes, missed
+            return model, f"the URDF's collision shapes, links outside the arm at {stands}", notes, missed
         except RobotError as error:
             if "no usable <collision> shape" not in str(error):
                 raise
@@ -379,14 +379,14 @@ def _model(
     radius = capsules.usual_radius(chain) if table.radius is None else table.radius
     described = _description(source, chain)
     if described is None:
-        beside, missed = (), ("links beside the arm (the URDF is not at hand)",) if chain.links else ()
+        beside, missed = (), ("links outside the arm (the URDF is not at hand)",) if chain.links else ()
     else:
         beside, missed = links_beside(text(described)[0], str(described), chain, posture), ()
     model = capsules.from_chain(chain, radius, floor, obstacles, beside=beside, **around)
     words = f"capsules of radius {radius:g} m"
     if beside:
         names = listing((one.name for one in beside), 4)
-        words += f"; beside the arm, at {stands}: {names}"
+        words += f"; outside the arm, at {stands}: {names}"
     return model, words, notes, missed
 
 
@@ -400,7 +400,7 @@ def _posture(stated: Mapping[str, Any], chain: Chain, source: Path | None) -> di
         return {}
     described = _description(source, chain)
     if described is None:
-        raise RobotError("collision.posture: the links beside the arm are not known; give the URDF as the robot")
+        raise RobotError("collision.posture: the links outside the arm are not known; give the URDF as the robot")
     joints = read_tree(text(described)[0], str(described)).joints
     result: dict[str, float] = {}
     for name, value in stated.items():
