@@ -1,26 +1,33 @@
 """Links of a URDF that are not in the arm's chain, as capsules: a second arm, a torso, a gripper, a camera.
 
-Their joints stand still (here: at zero), so that each link is fixed to one body of the arm or to its base. A capsule
-runs from each link's frame to that of each link behind it; a link that nothing follows is a sphere. Links without
-masses, pictures and shapes are mere frames and take no space, unless a joint outside the chain moves them.
+Their joints stand still, at zero or where it is stated, so that each link is fixed to one body of the arm or to its
+base. A capsule runs from each link's frame to that of each link behind it; a link that nothing follows is a sphere.
+Links without masses, pictures and shapes are mere frames and take no space, unless a joint outside the chain moves
+them.
 """
 
+from collections.abc import Mapping
+
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from calib.robot.capsules import Attached
 from calib.robot.chain import Chain
 from calib.robot.formats.urdf import align
 from calib.robot.formats.urdf_tree import JointTag, UrdfTree, parse, read
-from calib.transforms import invert
+from calib.transforms import invert, pose
 
 
-def links_beside(source: str, where: str, chain: Chain) -> tuple[Attached, ...]:
+def links_beside(
+    source: str, where: str, chain: Chain, posture: Mapping[str, float] | None = None
+) -> tuple[Attached, ...]:
     """Return the links of a URDF text beside a chain of it, as capsules.
 
     Args:
         source: the URDF.
         where: names it in messages.
         chain: whose base and tip are links of it.
+        posture: values of joints outside the chain [rad or m] that do not stand at zero.
 
     Raises:
         RobotError: where its base or tip is no link of the URDF.
@@ -36,8 +43,8 @@ def links_beside(source: str, where: str, chain: Chain) -> tuple[Attached, ...]:
         if link in inside or link not in taking_space:
             continue
         carrier = _carrier(tree, link, bodies)
-        start = _place(tree, chain.base, above.parent if above else link, carrier)
-        end = _place(tree, chain.base, link, carrier)
+        start = _place(tree, chain.base, above.parent if above else link, carrier, posture or {})
+        end = _place(tree, chain.base, link, carrier, posture or {})
         number = bodies.get(carrier, 0)
         ends = [joint for joint in tree.below[link] if joint.child in taking_space]
         if above is not None and np.linalg.norm(end - start) > MIN_LENGTH:
@@ -73,19 +80,21 @@ def _carrier(tree: UrdfTree, link: str, bodies: dict[str, int]) -> str:
     return carriers[-1] if carriers else ""
 
 
-def _place(tree: UrdfTree, base: str, link: str, carrier: str) -> np.ndarray:
+def _place(tree: UrdfTree, base: str, link: str, carrier: str, posture: Mapping[str, float]) -> np.ndarray:
     """Return the origin (3,) of a link in the frame of the chain's moving element that carries it, else in the base.
 
     The element's frame is turned where its axis is oblique (`calib.robot.formats.urdf`).
     """
-    origin = invert(_zero_pose(tree, carrier or base)) @ _zero_pose(tree, link)
+    origin = invert(_still_pose(tree, carrier or base, posture)) @ _still_pose(tree, link, posture)
     turn = align(tree.above[carrier].axis).T if carrier else np.eye(4)
     return (turn @ origin)[:3, 3]
 
 
-def _zero_pose(tree: UrdfTree, link: str) -> np.ndarray:
-    """Return the pose (4, 4) of a link in its root's frame with all joints at zero."""
+def _still_pose(tree: UrdfTree, link: str, posture: Mapping[str, float]) -> np.ndarray:
+    """Return the pose (4, 4) of a link in its root's frame with all joints at zero but those of a posture."""
     result = np.eye(4)
     for joint in tree.ancestry(link):
-        result = result @ joint.origin
+        along = posture.get(joint.name, 0.0) * joint.axis
+        moved = pose(position=along) if joint.kind == "prismatic" else pose(Rotation.from_rotvec(along))
+        result = result @ joint.origin @ moved
     return result

@@ -9,7 +9,7 @@ obstacle that a link never leaves is refused.
 """
 
 import os
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -48,6 +48,7 @@ class Collision:
     _geometry: Any
     _chain: Chain
     _links: int
+    _posture: Mapping[str, float]
 
     @property
     def links(self) -> set[str]:
@@ -85,7 +86,7 @@ class Collision:
         distances, shares = np.empty((2, len(q), len(links)))
         normals, points = np.empty((2, len(q), len(links), 3))
         asked, ends = coal.DistanceRequest(True, coal.GJKInitialGuess.DefaultGuess), np.broadcast_to(end, start.shape)
-        for i, configuration in enumerate(configurations(self._model, self._chain, q)):
+        for i, configuration in enumerate(self._configurations(q)):
             pin.updateGeometryPlacements(self._model, data, self._geometry, placed, configuration)
             away = ends[i] - start[i]
             length = float(np.linalg.norm(away))
@@ -104,9 +105,15 @@ class Collision:
         pin, _ = _libraries()
         data, measured = self._model.createData(), self._geometry.createData()
         q = shaped(q, (None, self._chain.n), f"joint values of '{self._chain.name}'")
-        for configuration in configurations(self._model, self._chain, q):
+        for configuration in self._configurations(q):
             pin.computeDistances(self._model, data, self._geometry, measured, configuration)
             yield measured.distanceResults
+
+    def _configurations(self, q: np.ndarray) -> np.ndarray:
+        """Return Pinocchio's configurations (m, nq) at joint values q (m, n), other joints at the posture."""
+        result = configurations(self._model, self._chain, q)
+        set_still(self._model, result, self._posture)
+        return result
 
     def _closing(self, q: np.ndarray, normal: np.ndarray, point: np.ndarray, shapes: list[int]) -> np.ndarray:
         """Return the speed along normals (m, P, n) of points (m, P, 3) on shapes (P,), per unit of each joint."""
@@ -117,7 +124,7 @@ class Collision:
     @cached_property
     def _stand(self) -> Any:
         """Pose of the base in Pinocchio's world."""
-        return _stand(self._model, self._chain.base)
+        return _stand(self._model, self._chain.base, self._posture)
 
     @cached_property
     def _bodies(self) -> np.ndarray:
@@ -144,9 +151,10 @@ def from_urdf(
     margin: float = 0.0,
     within: bool = True,
     ignored: Collection[frozenset[str]] = (),
+    posture: Mapping[str, float] | None = None,
     seed: int = 0,
 ) -> Collision:
-    """Return the collision model of a URDF's collision shapes; joints outside the chain stay at zero.
+    """Return the collision model of a URDF's collision shapes; joints outside the chain stand still.
 
     Args:
         path: the URDF.
@@ -159,6 +167,7 @@ def from_urdf(
         margin: the least distance that will be asked for [m]; pairs that never have it are left out.
         within: False: parts of the arm are not compared with each other.
         ignored: pairs of links that are not compared.
+        posture: values of joints outside the chain [rad or m] that do not stand at zero.
         seed: of the random postures that show which pairs those are.
 
     Raises:
@@ -183,7 +192,7 @@ def from_urdf(
     _add_targets(model, geometry, chain, targets)
     own = geometry.ngeoms
     planes = [*([] if floor is None else [Wall("floor", np.array([0.0, 0.0, 1.0]), floor)]), *walls]
-    _surround(model, geometry, chain.base, planes, obstacles)
+    _surround(geometry, _stand(model, chain.base, posture or {}), planes, obstacles)
     carriers = [shape.parentJoint for shape in geometry.geometryObjects]
     links = [model.frames[shape.parentFrame].name for shape in geometry.geometryObjects]
     for one in range(own):
@@ -192,7 +201,7 @@ def from_urdf(
             compared = within and model.parents[j] != i and frozenset((links[one], links[two])) not in ignored
             if i != j and (two >= own or compared):
                 geometry.addCollisionPair(pin.CollisionPair(one, two))
-    found = Collision(_names(geometry), (), tuple(missing), model, geometry, chain, own)
+    found = Collision(_names(geometry), (), tuple(missing), model, geometry, chain, own, posture or {})
     return _without_inseparable(found, margin, seed) if found.pairs else found
 
 
@@ -231,10 +240,9 @@ def _attach(model: Any, geometry: Any, link: str, name: str, placed: np.ndarray,
     geometry.addGeometryObject(pin.GeometryObject(name, frame.parentJoint, index, placement, shape))
 
 
-def _surround(model: Any, geometry: Any, base: str, walls: Sequence[Wall], obstacles: Sequence[Obstacle]) -> None:
-    """Add walls and obstacles to `geometry`, fixed relative to the base."""
+def _surround(geometry: Any, stand: Any, walls: Sequence[Wall], obstacles: Sequence[Obstacle]) -> None:
+    """Add walls and obstacles to `geometry`, fixed relative to the base, whose pose is `stand`."""
     pin, coal = _libraries()
-    stand = _stand(model, base)
     things: list[Any] = [(wall.name, coal.Halfspace(wall.normal, wall.offset), np.eye(4)) for wall in walls]
     things += [(obstacle.name, _solid(obstacle.kind, obstacle.size), obstacle.placement) for obstacle in obstacles]
     for name, shape, placed in things:
@@ -248,11 +256,21 @@ def _solid(kind: str, sizes: Sequence[float]) -> Any:
     return makers[kind](*map(float, sizes))
 
 
-def _stand(model: Any, base: str) -> Any:
-    """Return the pose of the base in Pinocchio's world, at zero joints."""
+def set_still(model: Any, configurations: np.ndarray, posture: Mapping[str, float]) -> None:
+    """Write the values of the joints of a posture [rad or m] into Pinocchio's configurations (m, nq)."""
+    for name, value in posture.items():
+        joint = model.joints[model.getJointId(name)]
+        values = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
+        configurations[:, joint.idx_q : joint.idx_q + joint.nq] = values
+
+
+def _stand(model: Any, base: str, posture: Mapping[str, float]) -> Any:
+    """Return the pose of the base in Pinocchio's world, at zero joints but those of a posture."""
     pin, _ = _libraries()
     data = model.createData()
-    pin.framesForwardKinematics(model, data, pin.neutral(model))
+    still = pin.neutral(model)[None]
+    set_still(model, still, posture)
+    pin.framesForwardKinematics(model, data, still[0])
     return data.oMf[link_frame(model, base)].copy()
 
 

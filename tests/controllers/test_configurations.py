@@ -30,7 +30,7 @@ def written(name: str, chain, q: np.ndarray) -> str:
 
 def arm(path):
     tree = read(path.read_text(), str(path))
-    return build(tree, *ends(tree, None, "tool0"))
+    return build(tree, ends(tree, None, "tool0"))
 
 
 ARMS = [

@@ -27,7 +27,7 @@ def fitted(tmp_path_factory):
     """A fit of a FANUC with errors in every element, and its nominal chain."""
     folder = tmp_path_factory.mktemp("poses")
     tree = read(FANUC.read_text(), str(FANUC))
-    chain = build(tree, *ends(tree))
+    chain = build(tree, ends(tree))
     cell = perturbed_cell(chain, 4, SimulatedInstrument(position_sigma=2e-5, orientation_sigma=5e-5))
     write_measured(measure(cell, np.random.default_rng(1).uniform(-1.2, 1.2, (40, 6)), 1), folder / "seen.csv")
     words = ["fit", FANUC, folder / "seen.csv", "--model", "geometry", "--no-plots", "--out", folder / "fit"]

@@ -16,6 +16,7 @@ from calib.geometry.first_guess import install
 from calib.geometry.fit import fit, polish_frames
 from calib.geometry.installation import Installation, see
 from calib.geometry.observability import PLACES, unidentified
+from calib.procedure.findings import lines_of
 from calib.robot.calibrated import Deflection, Term
 from calib.rooms.cells.cell import measure as measured_by
 from calib.rooms.cells.virtual_cells import perturbed_cell
@@ -163,6 +164,8 @@ def test_a_joint_that_moves_nothing_measured_is_named(joint, end):
     cure = diagnosis.wrong_columns(install(named, [block]), [block])
     assert cure is not None and (cure.changes[0].values["end"] or "").startswith(end or "")
     assert (end is None) == (cure.changes[0].values["end"] is None)
+    (said,) = lines_of([cure.finding(named.joint_names, rms=1e-3, before=0.1, times=100.0)])
+    assert f"with {named.joint_names[joint]} held still" in said and (end or "Calibrate the arm without it") in said
 
 
 REAL = {

@@ -4,9 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
+import pytest
 from differences import check
 from robot_oracle import axis, inertial, joint, robot
 
+from calib.errors import UsageError
 from calib.geometry.installation import Installation
 from calib.procedure.measuring.pose_limits import read_limits
 from calib.robot import calibrated, capsules
@@ -84,7 +86,7 @@ def test_limits_say_what_stands_beside_the_arm(tmp_path):
     assert again.checked == said.checked
     path.unlink()
     without = read_limits(None, Installation(chain), folder / "robot.toml")
-    assert any("links beside the arm (the URDF is not at hand)" in words for words in without.unchecked)
+    assert any("links outside the arm (the URDF is not at hand)" in words for words in without.unchecked)
     assert not any("left_a" in words for words in without.checked)
 
 
@@ -119,3 +121,40 @@ def test_an_arm_on_a_pillar_is_no_thicker_for_it():
         )
 
     assert radius(0.2) == 0.11 and radius(1.0) == radius(4.0) == 0.15
+
+
+def test_a_stated_posture_places_them_by_capsules_and_by_shapes(tmp_path):
+    sphere = '<collision><geometry><sphere radius="0.02"/></geometry></collision>'
+    path, stated = tmp_path / "dual.urdf", {"collision": {"posture": {"left_2": "40 deg", "left_finger": "20 mm"}}}
+    values = {"left_2": np.radians(40.0), "left_finger": 0.02}
+    for link, source in (("left_jaw", dual()), ("left_jaw", dual().replace('jaw"></link>', f'jaw">{sphere}</link>'))):
+        path.write_text(source)
+        chain = urdf.read(path, tip="right_tool0")
+        limits = read_limits(stated, Installation(chain), path)
+        assert any("at the stated posture" in words for words in limits.checked)
+        model = pin.buildModelFromXML(source)
+        data, still = model.createData(), pin.neutral(model)
+        for name, value in values.items():
+            still[model.joints[model.getJointId(name)].idx_q] = value
+        pin.framesForwardKinematics(model, data, still)
+        ends = [data.oMf[model.getFrameId(f"{side}_jaw", pin.FrameType.BODY)].translation for side in ("left", "right")]
+        found = limits.collision
+        assert found is not None
+        column = [set(pair) for pair in found.pairs].index({"left_jaw", "right_jaw"})
+        distance = found.distances(np.zeros((1, chain.n)))[0, column]
+        if source == dual():
+            lines = found.lines_at(np.zeros((1, chain.n)))
+            assert np.abs(lines.end[0, found.names.index(link)] - ends[0]).max() < 1e-12
+        else:
+            assert abs(distance - (np.linalg.norm(ends[0] - ends[1]) - 0.04)) < 1e-6
+
+
+@pytest.mark.parametrize(
+    "posture, words",
+    [({"right_2": 0.1}, "joint outside the arm 'right_2' is not one of"), ({"left_9": 0.1}, "did you mean 'left_")],
+)
+def test_a_posture_of_other_joints_is_refused(tmp_path, posture, words):
+    path = tmp_path / "dual.urdf"
+    path.write_text(dual())
+    with pytest.raises(UsageError, match=words):
+        read_limits({"collision": {"posture": posture}}, Installation(urdf.read(path, tip="right_tool0")), path)

@@ -356,20 +356,22 @@ def _model(
     known = links_of(chain, source) if table.ignored else ()
     for name in (name for pair in table.ignored for name in pair):
         one_of(name, known, "collision.ignored: link", RobotError)
+    posture = _posture(table.posture, chain, source)
+    stands = "the stated posture" if posture else "zero of their joints"
     around: dict[str, Any] = {
         "walls": walls, "targets": cell.tools[:, :3, 3], "margin": table.margin, "within": within,
         "ignored": {frozenset(pair) for pair in table.ignored},
     }  # fmt: skip
     if source is not None and is_urdf(source) and "<collision" in text(source)[0]:
         try:
-            model = collision.from_urdf(source, chain.base, chain.tip, floor, obstacles, **around)
+            model = collision.from_urdf(source, chain.base, chain.tip, floor, obstacles, posture=posture, **around)
             if model.missing:
                 notes = (f"collision meshes not found, their shapes are not checked: {', '.join(model.missing[:3])}",)
             bare = [
                 one.name for one in links_beside(text(source)[0], str(source), chain) if one.name not in model.links
             ]
             missed = (f"{listing(bare, 4)} (not in the arm, without collision shapes)",) if bare else ()
-            return model, "the URDF's collision shapes, links beside the arm at zero of their joints", notes, missed
+            return model, f"the URDF's collision shapes, links outside the arm at {stands}", notes, missed
         except RobotError as error:
             if "no usable <collision> shape" not in str(error):
                 raise
@@ -377,15 +379,36 @@ def _model(
     radius = capsules.usual_radius(chain) if table.radius is None else table.radius
     described = _description(source, chain)
     if described is None:
-        beside, missed = (), ("links beside the arm (the URDF is not at hand)",) if chain.links else ()
+        beside, missed = (), ("links outside the arm (the URDF is not at hand)",) if chain.links else ()
     else:
-        beside, missed = links_beside(text(described)[0], str(described), chain), ()
+        beside, missed = links_beside(text(described)[0], str(described), chain, posture), ()
     model = capsules.from_chain(chain, radius, floor, obstacles, beside=beside, **around)
     words = f"capsules of radius {radius:g} m"
     if beside:
         names = listing((one.name for one in beside), 4)
-        words += f"; beside the arm, at zero of their joints: {names}"
+        words += f"; outside the arm, at {stands}: {names}"
     return model, words, notes, missed
+
+
+def _posture(stated: Mapping[str, Any], chain: Chain, source: Path | None) -> dict[str, float]:
+    """Return the values [rad or m] of joints outside the arm.
+
+    Raises:
+        RobotError: for a joint of the arm, or one that its URDF does not have.
+    """
+    if not stated:
+        return {}
+    described = _description(source, chain)
+    if described is None:
+        raise RobotError("collision.posture: the links outside the arm are not known; give the URDF as the robot")
+    joints = read_tree(text(described)[0], str(described)).joints
+    result: dict[str, float] = {}
+    for name, value in stated.items():
+        others = [joint.name for joint in joints.values() if joint.actuated and joint.name not in chain.joint_names]
+        one_of(name, others, "collision.posture: joint outside the arm", RobotError)
+        quantity = "length" if joints[name].kind == "prismatic" else "angle"
+        result[name] = number(value, f"collision.posture: {name}", quantity)
+    return result
 
 
 def _description(source: Path | None, chain: Chain) -> Path | None:
