@@ -5,6 +5,7 @@ TOPICS = {
     "targets": (
         "targets of calib compensate, and the commands it writes",
         "calib.data.poses.pose_lists calib.rooms.compensation.joint_commands calib.rooms.compensation.programs "
-        "calib.rooms.compensation.program_frames calib.rooms.controllers.languages calib.rooms.controllers.configurations",
+        "calib.rooms.compensation.program_frames "
+        "calib.rooms.controllers.languages calib.rooms.controllers.configurations",
     )
 }

@@ -250,10 +250,11 @@ def postures(
             reasons.append("")
             continue
         agreeing = _agreeing(goal, configuration, controller, reached, middle)
-        pool = agreeing if len(agreeing) else reached
-        chosen[k] = pool[np.argmin(np.abs(pool - middle).max(axis=1))]
         nearby = Configuration("").wrapped(controller, goal, reached, middle)
         nearest = nearby[np.argmin(np.nan_to_num(np.abs(nearby - middle), nan=np.inf).max(axis=1))]
+        chosen[k] = nearest
+        if len(agreeing):
+            chosen[k] = agreeing[np.argmin(np.abs(agreeing - middle).max(axis=1))]
         contradicted[k] = start is not None and not configuration.holds(controller, chain, nearest[None])[0]
         reasons.append(_objection(chain, configuration, reached, agreeing, start is not None))
     return Postures(chosen, tuple(reasons), contradicted)
@@ -278,14 +279,14 @@ def _objection(
 ) -> str:
     """Return why the posture of a configuration is none, or not the only one; else an empty text."""
     if not len(agreeing) and configuration.agrees(chain, reached).any():
-        return f"{configuration.words} has no posture at this pose: its turns are not within the joints' limits"
+        return f"{configuration.words} has no posture at this pose: none within the joints' limits has its turns"
     if not len(agreeing):
         signs = np.unique(signs_at(chain, reached, np.array(configuration.upright)), axis=0)
         stood = "; ".join(", ".join(_words(row)) for row in signs)
         said = ", ".join(_words(np.array(configuration.signs()))) or "turns only"
         return f"{configuration.words} ({said}) is no posture at this pose; the arm reaches it with {stood}"
     if len(agreeing) > 1 and not started:
-        return f"{configuration.words} leaves {len(agreeing)} postures; joints near the pose say which: --start"
+        return f"{configuration.words} leaves {len(agreeing)} postures"
     return ""
 
 
