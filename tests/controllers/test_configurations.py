@@ -5,8 +5,7 @@ import pytest
 
 from calib.geometry.installation import Installation
 from calib.geometry.inverse import Goal
-from calib.robot.formats.urdf import build, ends
-from calib.robot.formats.urdf_tree import read
+from calib.robot.formats.urdf import parse
 from calib.robot.kinematics import forward
 from calib.robot.library import load
 from calib.rooms.controllers.configurations import configuration_of, has_spherical_wrist, postures, signs_at
@@ -29,8 +28,7 @@ def written(name: str, chain, q: np.ndarray) -> str:
 
 
 def arm(path):
-    tree = read(path.read_text(), str(path))
-    return build(tree, ends(tree, None, "tool0"))
+    return parse(path.read_text(), str(path), tip="tool0")
 
 
 ARMS = [

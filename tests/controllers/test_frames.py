@@ -9,7 +9,7 @@ import pytest
 
 from calib import cli
 from calib.errors import UsageError
-from calib.robot.formats.urdf import build, ends
+from calib.robot.formats.urdf import parse
 from calib.robot.formats.urdf_tree import read
 from calib.robot.kinematics import forward
 from calib.rooms.controllers.delivery import delivery_text
@@ -24,7 +24,7 @@ AXIS_2 = 0.525  # [m] of that arm
 
 def arm_of(source: str) -> Description:
     tree = read(source, "test.urdf")
-    return Description(build(tree, ends(tree)), tree)
+    return Description(parse(source, "test.urdf"), tree)
 
 
 def changed(*pairs: tuple[str, str]) -> str:
@@ -173,7 +173,7 @@ def test_the_rules_are_where_the_makers_descriptions_have_the_link_base(data):
         tree = read(path.read_text(), str(path))
         if maker is None or not {"base", "base_link"} <= set(tree.bodies):
             continue
-        arm = Description(build(tree, ends(tree, None, "tool0")), tree)
+        arm = Description(parse(path.read_text(), str(path), tip="tool0"), tree)
         controller = controller_named(maker)
         frame, flange = base_frame(controller, arm), flange_frame(controller, arm)
         if "motopos" in path.name:  # a table of two axes has no axis 2 that lies level

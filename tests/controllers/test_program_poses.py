@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from calib import cli
-from calib.robot.formats.urdf import build, ends
-from calib.robot.formats.urdf_tree import read
+from calib.robot.formats.urdf import parse
 from calib.robot.kinematics import forward
 from calib.rooms.cells.cell import SimulatedInstrument, measure, write_measured
 from calib.rooms.cells.virtual_cells import perturbed_cell
@@ -26,8 +25,7 @@ Q = np.radians([[5.0, 20.0, 20.0, 10.0, -70.0, 15.0], [-30.0, 35.0, 5.0, -40.0, 
 def fitted(tmp_path_factory):
     """A fit of a FANUC with errors in every element, and its nominal chain."""
     folder = tmp_path_factory.mktemp("poses")
-    tree = read(FANUC.read_text(), str(FANUC))
-    chain = build(tree, ends(tree))
+    chain = parse(FANUC.read_text(), str(FANUC))
     cell = perturbed_cell(chain, 4, SimulatedInstrument(position_sigma=2e-5, orientation_sigma=5e-5))
     write_measured(measure(cell, np.random.default_rng(1).uniform(-1.2, 1.2, (40, 6)), 1), folder / "seen.csv")
     words = ["fit", FANUC, folder / "seen.csv", "--model", "geometry", "--no-plots", "--out", folder / "fit"]
@@ -114,7 +112,10 @@ def test_a_configuration_that_is_not_the_poses_is_said_with_its_line(fitted, tmp
     assert code == 2 and "CONFIG N U B 0 0 0 (behind axis 1" in err and "before axis 1" in err
     path.write_text(program(chain, configuration="N U T, 3, 0, 0"))
     code, _, err = run(capsys, folder, path, "--out", tmp_path / "no.ls", *statements)
-    assert code == 2 and "its turns are not within the joints' limits" in err and "line 9: " in err
+    assert code == 2 and "none within the joints' limits has its turns" in err and "line 9: " in err
+    near = ",".join(map(str, Q[0]))
+    code, out, err = run(capsys, folder, path, "--out", tmp_path / "near.ls", "--start", near, *statements)
+    assert code == 0 and "warning: line 9: CONFIG N U T 3 0 0 has no posture" in out, err
     path.write_text(program(chain, configuration=""))
     code, _, err = run(capsys, folder, path, "--out", tmp_path / "no.ls", *statements)
     assert code == 2 and "--start" in err

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calib.robot.calibrated import CalibratedChain
-from calib.robot.formats.urdf import build, ends
+from calib.robot.formats.urdf import parse
 from calib.robot.formats.urdf_tree import read
 from calib.robot.library import load
 from calib.rooms.controllers.ur_kinematics import LINKS, kinematics
@@ -32,7 +32,7 @@ def test_urs_own_descriptions_give_back_their_origins(data, base):
     for path in paths:
         tree = read(path.read_text(), str(path))
         prefix = next(name for name in tree.bodies if name.endswith("base_link")).removesuffix("base_link")
-        chain = build(tree, ends(tree, base and prefix + base, prefix + "tool0"))
+        chain = parse(path.read_text(), str(path), base and prefix + base, prefix + "tool0")
         text, remark = kinematics(CalibratedChain(chain, chain), path)
         assert remark == "", path.name
         for link, joint in zip(LINKS, JOINTS, strict=True):

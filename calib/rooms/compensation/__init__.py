@@ -4,6 +4,8 @@ OFFERS = {"commands": "commands:app", "topics": ":TOPICS"}
 TOPICS = {
     "targets": (
         "targets of calib compensate, and the commands it writes",
-        "calib.data.poses.pose_lists calib.rooms.compensation.joint_commands calib.rooms.compensation.programs",
+        "calib.data.poses.pose_lists calib.rooms.compensation.joint_commands calib.rooms.compensation.programs "
+        "calib.rooms.compensation.program_frames "
+        "calib.rooms.controllers.languages calib.rooms.controllers.configurations",
     )
 }

@@ -24,7 +24,13 @@ from calib.geometry.installation import see
 from calib.geometry.inverse import Goal
 from calib.rooms.compensation.joint_commands import Commands, Fitted, computed, lines, placements
 from calib.rooms.compensation.program_frames import Group, Statements, placed, tool_in_tip, user_poses
-from calib.rooms.controllers.configurations import Configuration, configuration_of, has_spherical_wrist, postures
+from calib.rooms.controllers.configurations import (
+    Configuration,
+    Postures,
+    configuration_of,
+    has_spherical_wrist,
+    postures,
+)
 from calib.rooms.controllers.targets import Program, pose_values
 
 
@@ -172,8 +178,9 @@ def _compensated_group(
         goal = Goal(model, 6, chain.lower, chain.upper)
         sought = postures(goal, group.poses, configuration, kind, start, seed)
         commands = computed(fitted, replace(targets, q=sought.q), tool=group.tool, **options)
-        commands = _without(commands, sought.reasons)
-        notes = _posture_notes(program, group, configuration, commands, sought.contradicted)
+        if start is None:
+            commands = _without(commands, sought.reasons)
+        notes = _posture_notes(program, group, configuration, commands, sought)
     values = pose_values(kind, user_poses(group, see(model, commands.q).poses()))
     return Part(group.indices, commands, values, notes)
 
@@ -181,23 +188,29 @@ def _compensated_group(
 def _without(commands: Commands, reasons: Sequence[str]) -> Commands:
     """Return commands of which those with a reason are not reached, for that reason."""
     good = np.array([not reason for reason in reasons])
-    merged = tuple(reason or words for reason, words in zip(reasons, commands.reason))
+    merged = tuple(
+        f"{reason}; --start takes the posture nearest to it" if reason else words
+        for reason, words in zip(reasons, commands.reason)
+    )
     return replace(commands, reached=commands.reached & good, reason=merged)
 
 
 def _posture_notes(
-    program: Program, group: Group, configuration: Configuration, commands: Commands, contradicted: np.ndarray
+    program: Program, group: Group, configuration: Configuration, commands: Commands, sought: Postures
 ) -> tuple[str, ...]:
-    """Return notes on poses whose configuration contradicts the start, and on commands that leave it."""
+    """Return notes on poses whose configuration contradicts the start or the pose, and on commands that leave it."""
     notes = []
     reached = commands.reached
     lines = np.array([program.targets[index].line for index in group.indices])
-    against = lines[reached & contradicted]
+    unfit = np.array([bool(reason) for reason in sought.reasons])
+    taken = "the posture nearest to --start is taken"
+    notes += [f"warning: line {lines[k]}: {sought.reasons[k]}; {taken}" for k in np.flatnonzero(reached & unfit)]
+    against = lines[reached & sought.contradicted & ~unfit]
     if len(against):
         words = f"the posture nearest to --start is not that of {configuration.words}, which is followed"
         notes.append(f"line {listing(against.tolist(), 5)}: {words}")
     chain = commands.fitted.nominal.chain
-    crossing = lines[reached & ~configuration.holds(program.controller, chain, commands.q)]
+    crossing = lines[reached & ~unfit & ~configuration.holds(program.controller, chain, commands.q)]
     if len(crossing):
         words = (
             f"the command crosses the boundary of {configuration.words}, which stays in the program: change it there"

@@ -18,6 +18,7 @@ TOPICS = {
         "calib.rooms.controllers.program calib.rooms.controllers.motion "
         "calib.rooms.controllers.targets calib.rooms.controllers.table",
     ),
+    "frames": ("controllers' base and flange frames, of calib deliver and programs", "calib.rooms.controllers.frames"),
     "logs": (
         "logs of robot controllers, by brand, and ROS bags",
         "calib.rooms.controllers.logs calib.rooms.controllers.bags",

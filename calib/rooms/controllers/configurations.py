@@ -29,6 +29,7 @@ from calib.robot.chain import AXES, Chain
 from calib.robot.kinematics import joint_frames
 from calib.rooms.controllers.table import Controller
 
+CLEAR = (0.01, 0.001)  # [m], [m²] the upright posture is clearly before axis 1, and its elbow clearly bent
 SLACK = np.radians(0.5)  # [rad] an angle that is rounded onto a boundary is on both sides of it
 TRIES = 4000  # random postures among which starts in the configuration are looked for
 STARTS = 24  # starts for each configuration, in its branch, and as many again where a pose has no posture yet
@@ -145,13 +146,16 @@ def _rapid(words: Sequence[str], controller: Controller) -> Configuration:
 
 
 def signs_at(chain: Chain, q: np.ndarray, upright: np.ndarray) -> np.ndarray:
-    """Return the signs (m, 3) of wrist centre, elbow and axis 5 at postures (m, 6); 0 within rounding of a boundary.
+    """Return the signs (m, 3) of wrist centre, elbow and axis 5 at postures (m, 6); 0 for none.
+
+    None is at a boundary, and where the upright posture of this arm is at one: its zeros are not the maker's.
 
     Args:
         upright: (6,) posture whose wrist centre and elbow are +1.
     """
     raw = _distances(chain, np.vstack([upright, q]))
-    signs = np.sign(raw[1:, :2] * np.sign(raw[0, :2]))
+    reference = np.where(np.abs(raw[0]) > CLEAR, np.sign(raw[0]), 0.0)
+    signs = np.sign(raw[1:]) * reference
     turned = np.sign(np.where(np.abs(q[:, 4]) < SLACK, 0.0, np.sin(q[:, 4])))
     return np.column_stack([signs, turned])
 
@@ -246,9 +250,11 @@ def postures(
             reasons.append("")
             continue
         agreeing = _agreeing(goal, configuration, controller, reached, middle)
-        pool = agreeing if len(agreeing) else reached
-        chosen[k] = pool[np.argmin(np.abs(pool - middle).max(axis=1))]
-        nearest = reached[np.argmin(np.abs(reached - middle).max(axis=1))]
+        nearby = Configuration("").wrapped(controller, goal, reached, middle)
+        nearest = nearby[np.argmin(np.nan_to_num(np.abs(nearby - middle), nan=np.inf).max(axis=1))]
+        chosen[k] = nearest
+        if len(agreeing):
+            chosen[k] = agreeing[np.argmin(np.abs(agreeing - middle).max(axis=1))]
         contradicted[k] = start is not None and not configuration.holds(controller, chain, nearest[None])[0]
         reasons.append(_objection(chain, configuration, reached, agreeing, start is not None))
     return Postures(chosen, tuple(reasons), contradicted)
@@ -273,14 +279,14 @@ def _objection(
 ) -> str:
     """Return why the posture of a configuration is none, or not the only one; else an empty text."""
     if not len(agreeing) and configuration.agrees(chain, reached).any():
-        return f"{configuration.words} has no posture at this pose: its turns are not within the joints' limits"
+        return f"{configuration.words} has no posture at this pose: none within the joints' limits has its turns"
     if not len(agreeing):
         signs = np.unique(signs_at(chain, reached, np.array(configuration.upright)), axis=0)
         stood = "; ".join(", ".join(_words(row)) for row in signs)
         said = ", ".join(_words(np.array(configuration.signs()))) or "turns only"
         return f"{configuration.words} ({said}) is no posture at this pose; the arm reaches it with {stood}"
     if len(agreeing) > 1 and not started:
-        return f"{configuration.words} leaves {len(agreeing)} postures; joints near the pose say which: --start"
+        return f"{configuration.words} leaves {len(agreeing)} postures"
     return ""
 
 
