@@ -149,7 +149,7 @@ def identify_model(
     rows = with_blocks([observe(model, base.kept, case, decimator) for case in cases], settings.folds)
     if model.torque_rows == POWER and len(cases) > 1:
         rows = [part.by_recording(k, len(cases)) for k, part in enumerate(rows)]
-    if isinstance(method, LeastSquares):
+    if isinstance(method, LeastSquares) and isinstance(model, IdentificationModel):
         width = np.array(per_joint(settings.v0, cases[0].motion.n, "v0"))
         rows = with_standstills(rows, cases, decimator, model, base.kept, width)
     _require_enough(rows, base)
