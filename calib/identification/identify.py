@@ -21,7 +21,6 @@ from calib.estimation.triangles import condition_numbers
 from calib.extensions import needed
 from calib.identification.friction.friction_ladder import FrictionCandidates, FrictionSelection, select_friction
 from calib.identification.friction.ripple import Ripple, find_all
-from calib.identification.friction.standstill import with_standstills, with_weights
 from calib.identification.loop import LoopResults, per_joint
 from calib.identification.methods.least_squares import LeastSquares
 from calib.identification.methods.method import IdentificationProblem, Method, MethodEstimate
@@ -30,6 +29,7 @@ from calib.identification.prediction import Dynamics, Model, predict
 from calib.identification.prior import TEMPERING, FirstFit, Prior, find_prior, first_fit, rods, tempered_prior
 from calib.identification.rows import Case, ObservationRows, observe, observe_terms, with_blocks
 from calib.identification.settings import IdentificationSettings, make_model, require_usable
+from calib.identification.standstill import with_standstills, with_weights
 from calib.identification.time_folds import regimes
 from calib.robot.calibrated import CalibratedChain, as_calibrated
 from calib.robot.chain import Chain
@@ -149,7 +149,7 @@ def identify_model(
     rows = with_blocks([observe(model, base.kept, case, decimator) for case in cases], settings.folds)
     if model.torque_rows == POWER and len(cases) > 1:
         rows = [part.by_recording(k, len(cases)) for k, part in enumerate(rows)]
-    if isinstance(method, LeastSquares):
+    if isinstance(method, LeastSquares) and isinstance(model, IdentificationModel):
         width = np.array(per_joint(settings.v0, cases[0].motion.n, "v0"))
         rows = with_standstills(rows, cases, decimator, model, base.kept, width)
     _require_enough(rows, base)

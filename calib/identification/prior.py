@@ -45,8 +45,8 @@ from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.regressor_model import RegressorModel
 from calib.estimation.triangles import Triangles, retriangulate
 from calib.estimation.whiteness import inflation
-from calib.identification.friction.standstill import divided
 from calib.identification.rows import ObservationRows, RestWeights, triangulate
+from calib.identification.standstill import divided
 from calib.identification.time_folds import CrossValidation, Regimes, estimate
 from calib.records import frozen
 from calib.robot.chain import Chain

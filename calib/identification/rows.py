@@ -114,7 +114,7 @@ BLOCK = 4096  # samples of the full rate at a time
 
 @dataclass(frozen=True, eq=False)
 class RestWeights:
-    """Weights of standstills, see `calib.identification.friction.standstill`.
+    """Weights of standstills, see `calib.identification.standstill`.
 
     Attributes:
         worth: (rows,) how many rows in motion a value of the friction at rest weighs.

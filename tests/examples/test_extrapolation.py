@@ -23,7 +23,7 @@ def parts(monkeypatch) -> None:
 
 
 def told(text: str) -> dict[str, list[float]]:
-    """Return pair → its percentages, in the table's order: ridge, best ridge, before or not, toolkit, …."""
+    """Return pair → its percentages, in the table's order: ridge, plain, best ridge, before or not, toolkit, …."""
     rows = re.findall(r"^\| ([^|]+?) \| (?:same|across) \| (.+)$", text, re.MULTILINE)
     return {name: [float(x) for x in re.findall(r"(\d+\.\d) %", cells)] for name, cells in rows}
 
@@ -51,15 +51,17 @@ def test_simulated_motors_see_what_inverse_dynamics_and_friction_need(tmp_path) 
     assert np.abs(gravity).max() > 0.1 * robot.effort.max()
 
 
-def test_the_plain_ridge_finds_a_simple_arm(tmp_path) -> None:
+def test_the_plain_references_find_a_simple_arm(tmp_path) -> None:
     """Rich motion of an arm with plain friction is predicted within 5 %."""
     import extrapolation
+    import extrapolation_plain as plain
     import extrapolation_ridge as ridge
     from extrapolation_pairs import Simulated, rich
 
     pair = Simulated("plain", "rv2sq", "simple", rich(10), rich(10), across=False)
     files = pair.prepare(tmp_path)
-    for name, predicted in ridge.predict(files.robot, files.train, files.test, 15.0).items():
+    least = plain.predict(files.robot, files.train, files.test, 15.0)
+    for name, predicted in {**ridge.predict(files.robot, files.train, files.test, 15.0), "plain": least}.items():
         left, size = extrapolation.squared_errors(files.test, predicted)
         assert np.sqrt(left.sum() / size.sum()) < 0.05, name
 
@@ -73,4 +75,4 @@ def test_the_document_states_what_a_fresh_run_gives(data, tmp_path) -> None:
     assert set(CHOSEN) <= set(found)
     for name, values in found.items():
         before = len(stated[name]) - len(values)  # the other version's column
-        assert [*stated[name][:2], stated[name][2 + before]] == pytest.approx(values[:3], rel=NEAR, abs=0.05), name
+        assert [*stated[name][:3], stated[name][3 + before]] == pytest.approx(values[:4], rel=NEAR, abs=0.05), name

@@ -9,13 +9,13 @@ import pytest
 from calib.data.recordings.recording import Recording
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.errors import UsageError
-from calib.identification.friction import standstill
-from calib.identification.friction.standstill import divided, standing_joints, with_standstills
+from calib.identification import standstill
 from calib.identification.identify import Identification, chain_states, common_decimator, find_base, identify
 from calib.identification.identify_options import parse_options
 from calib.identification.prediction import predict, score
 from calib.identification.rows import Case, ObservationRows, make_case, observe, with_blocks
 from calib.identification.settings import IdentificationSettings, make_model
+from calib.identification.standstill import divided, standing_joints, with_standstills
 from calib.identification.torque_errors import intervals, learn_torque_errors
 
 PLAIN = IdentificationSettings(friction="standard", essential="none")

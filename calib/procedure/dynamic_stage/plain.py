@@ -82,9 +82,12 @@ def truncated(data: Triangles) -> np.ndarray:
 
 
 def nominal_values(chain: Chain, dynamics: Dynamics[Any]) -> np.ndarray | None:
-    """Return the model's parameters (p,) by the robot's description, without friction; None where it has no masses."""
+    """Return the model's parameters (p,) by the robot's description, without friction.
+
+    None where it states no masses, or the torques are drives' alone, which hold no bodies.
+    """
     inertias = getattr(chain, "inertias", None)
-    if inertias is None or not np.any(inertias[:, 9] > 0.0):
+    if inertias is None or not np.any(inertias[:, 9] > 0.0) or not dynamics.model.torque_rows.has_bodies:
         return None
     bodies, result = standard_parameters(chain), np.zeros(len(dynamics.values))
     result[: len(bodies)] = bodies
