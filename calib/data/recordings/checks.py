@@ -19,7 +19,7 @@ class RecordingBounds:
     """Bounds on the values of a recording; all of them our choice.
 
     Attributes:
-        min_samples: of a recording, for filters to begin and to end; whether they suffice for the unknowns is asked later.
+        min_samples: of a recording, for filters to begin and to end; unknowns are counted later.
         min_rate, max_rate: of sampling [Hz].
         min_travel: smallest travel of a moving joint [rad or m], above encoder noise.
         max_compared: rows searched for two nearly equal poses.
@@ -60,9 +60,7 @@ def check_recording(recording: Recording, joints: Joints | None = None) -> Recor
         MeasurementError: for too few samples, values that are not finite, time that stands or runs backwards, degrees
             for radians, a torque that is one number while its joint moves.
     """
-    few = (
-        f"{len(recording)} samples are too few for filters; at least {LIMITS.min_samples} are needed"
-    )
+    few = f"{len(recording)} samples are too few for filters; at least {LIMITS.min_samples} are needed"
     require(len(recording) >= LIMITS.min_samples, few, MeasurementError, recording.file)
     recording = _without_absent(recording)
     _check_finite(recording)

@@ -96,7 +96,7 @@ def _read_twice(recording: Recording) -> np.ndarray:
     edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]])))
     twice = np.zeros(len(recording), dtype=bool)
     for first, end in edges.reshape(-1, 2).tolist():
-        inner = 0 < first and end < len(same)
+        inner = first > 0 and end < len(same)
         if inner and end - first <= MAX_REPEATS and moved[first - 1] and moved[end]:
             twice[first + 1 : end + 1] = True
     return twice
