@@ -130,7 +130,7 @@ def _no_zero(value: Any) -> Any:
 
 FINDINGS = (
     "masses", "limit", "speed", "lag", "clock", "order", "zero", "coupling", "sign", "jump", "bodies", "description",
-    "loop",
+    "loop", "gravity",
 )  # fmt: skip
 """Names in ``accept``: the codes in chapters 9 and 10 of the catalogue of findings."""
 Texts = Annotated[tuple[Name, ...], Spread(words="a text, or a list of texts")]

@@ -30,7 +30,7 @@ def test_steps_are_counted_through_jitter_and_holes(dropped, jitter):
 
 
 def test_stamps_that_are_no_lattice_are_not_called_one():
-    steps, t = stamps(0, 0.0, 0.5)
+    _steps, t = stamps(0, 0.0, 0.5)
     assert find_lattice(t, 101) is None
     assert find_lattice(np.cumsum(np.random.default_rng(1).exponential(PERIOD, 4000)), 101) is None
 
