@@ -19,7 +19,7 @@ class RecordingBounds:
     """Bounds on the values of a recording; all of them our choice.
 
     Attributes:
-        min_samples: of a recording, for filters to begin and to end; the unknowns are counted later.
+        min_samples: of a recording, for filters to begin and to end; unknowns are counted later.
         min_rate, max_rate: of sampling [Hz].
         min_travel: smallest travel of a moving joint [rad or m], above encoder noise.
         max_compared: rows searched for two nearly equal poses.

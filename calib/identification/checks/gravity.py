@@ -7,11 +7,11 @@ For stated masses torque is linear in the gravity vector g, and for a stated g i
 So each direction costs one least-squares fit of bodies of any masses, from products that are computed once, and all
 directions together have a bound that costs one more: masses of their own for each of x, y, z. Magnitude stays the
 stated one's, since only the ratio of masses to inertias tells it (`recording_sizes.ClockRatio`). Masses that may be
-negative fit -g as well as g: the robot's own masses, or rods between its joints, have the right sign.
+negative fit -g nearly as well as g in slow motion; in fast motion the same first moments bend the inertias.
 
-Whether torques hold gravity at all is another question: bodies without mass explain torques without gravity. There
-the gravity torque of the robot's masses (else of rods, as large as their inertias are) is fitted to each joint, beside
-motion and drives. An arm whose joints all turn about the vertical shows neither, and nothing is said of it.
+Whether a joint's torque holds gravity at all is another question: bodies without mass explain torques without
+gravity. There the gravity torque of the robot's masses (else of rods, as large as their inertias are) is fitted to each
+joint, beside motion and drive. An arm whose joints all turn about the vertical shows neither, and nothing is said.
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -29,14 +29,15 @@ from calib.identification.prior import rods
 from calib.robot.chain import Chain
 
 STANDARD_GRAVITY = 9.81  # [m/s²], where the stated one is zero
-MAX_LEFT = 0.6  # residual with another direction over that with the stated one, from which on it is reported
-MIN_ANGLE = np.radians(5.0)  # between both directions: a robot on a floor that slopes by less is not another mounting
-MAX_DIRECTION_SIGMA = np.radians(5.0)  # of a direction that is reported
-RIVAL = 1.2  # residual of another direction over the best one's, up to which both explain the torques
-APART = np.radians(20.0)  # between two directions that are not one
+# residual with another hypothesis over that with gravity as stated, from which on it is reported; 0.95 and more on the
+# real recordings at hand (our choice)
+MAX_LEFT = 0.8
+MAX_WORSE = 1.02  # the same for joints whose torques lack what is expected: no worse
+MIN_ANGLE = np.radians(10.0)  # between both directions: a robot on a floor that slopes by less is not mounted otherwise
+RIVAL = 1.1  # residual with the opposite direction over the best one's, up to which both explain the torques
 MAX_FACTOR = 0.15  # gravity torque over the expected, with 2 sigmas, up to which a joint's torque holds none
-MIN_SHARE = 0.1  # of the largest joint's expected gravity torque, below which nothing is said of a joint
-MIN_CORRELATED = 0.3  # of a joint's expected gravity torque that motion and friction do not explain as well
+MIN_SHARE = 0.2  # of the largest joint's expected gravity torque, below which nothing is said of a joint
+MIN_CORRELATED = 0.1  # of a joint's expected gravity torque that motion and friction do not explain as well
 MIN_SIGMAS = 5.0  # of the inertias' size relative to rods, from which on it is known
 MASSES = [6, 7, 8, 9]  # of a body's standard parameters, those that gravity acts on
 ROUNDS = 4  # of weighing joints by their residuals
@@ -78,31 +79,67 @@ class GravityHypotheses:
         return self.direction is not None or bool(self.absent)
 
 
-def gravity_of(motions: Sequence[MotionSamples], chain: Chain) -> GravityHypotheses:
+def gravity_of(motions: Sequence[MotionSamples], chain: Chain, newtons: bool = True) -> GravityHypotheses:
     """Return what recordings of one robot, all mounted alike, say of gravity.
 
     Args:
         motions: samples of the recordings, their bodies under the stated gravity.
         chain: the arm, whose masses count where it has any.
+        newtons: whether torques are in N m; of those in another unit only proportions count.
     """
     sums = _Sums(motions)
     stated = np.array(motions[0].bodies.gravity)
-    size = float(np.linalg.norm(stated)) or STANDARD_GRAVITY
     before = sums.left(stated)
-    after, direction, ambiguous = before, None, False
+    turned = _another_direction(sums, stated, before)
+    gravity, after = (stated, before) if turned is None else (turned, sums.left(turned))
+    factors, sigmas, outweighed = _gravity_factors(motions, chain, gravity, newtons)
+    ambiguous = False
+    if turned is not None and _mean(sums.left(-gravity) / after) < RIVAL:
+        # masses are positive: the expected torques' sign decides between both
+        ambiguous = not np.isfinite(factors).any()
+        if not ambiguous and np.nanmedian(factors) < 0.0:
+            turned, gravity, after, factors = -turned, -gravity, sums.left(-gravity), -factors
+    # and the whole torque varies less than gravity's alone would
+    certain = np.isfinite(factors) & (np.abs(factors) + 2.0 * sigmas < MAX_FACTOR) & outweighed
+    absent = _without_gravity(sums, gravity, after, np.flatnonzero(certain).tolist())
+    return GravityHypotheses(stated, before, turned, after, ambiguous, absent, factors, sigmas)
+
+
+def _another_direction(sums: "_Sums", stated: np.ndarray, before: np.ndarray) -> np.ndarray | None:
+    """Return the gravity vector (3,) of the stated one's magnitude that explains the torques instead; None if it does.
+
+    `before`: (n,) unexplained shares with the stated vector.
+    """
     bound = sums.bound()
-    if _mean(bound / before) < MAX_LEFT:
-        turned = _best_direction(sums, size, bound)
-        left = sums.left(turned)
-        none = sums.left(np.zeros(3))
-        helps = _mean(left / before) < MAX_LEFT and _mean(left / none) < MAX_LEFT
-        if helps and _angle(turned, stated) > MIN_ANGLE:
-            direction, ambiguous = _with_sign(turned, motions, chain)
-            after = left
-    factors, sigmas = _gravity_factors(motions, chain, stated if direction is None else direction)
-    certain = np.isfinite(factors) & (np.abs(factors) + 2.0 * sigmas < MAX_FACTOR)
-    absent = tuple(np.flatnonzero(certain).tolist())
-    return GravityHypotheses(stated, before, direction, after, ambiguous, absent, factors, sigmas)
+    if _mean(bound / before) > MAX_LEFT:
+        return None
+    axis = _best_direction(sums, float(np.linalg.norm(stated)) or STANDARD_GRAVITY, bound)
+    best = min((axis, -axis), key=lambda gravity: _mean(sums.left(gravity)))
+    left = sums.left(best)
+    none = sums.left(np.zeros(3))
+    helps = _mean(left / before) < MAX_LEFT and _mean(left / none) < MAX_LEFT
+    return best if helps and _angle(best, stated) > MIN_ANGLE else None
+
+
+def _without_gravity(
+    sums: "_Sums", gravity: np.ndarray, left: np.ndarray, candidates: Sequence[int]
+) -> tuple[int, ...]:
+    """Return the joints whose torques hold no gravity: those that are better explained without.
+
+    Of `candidates`, whose torques lack what is expected of the robot's masses, it is enough that they are explained
+    as well. `left`: (n,) unexplained shares with gravity at all joints.
+    """
+    absent, now = list(candidates), left
+    if absent:
+        now = sums.left(gravity, absent)
+        absent, now = (absent, now) if _mean(now / left) < MAX_WORSE else ([], left)
+    while len(absent) < sums.n:
+        tried = {joint: sums.left(gravity, [*absent, joint]) for joint in range(sums.n) if joint not in absent}
+        joint = min(tried, key=lambda each: _mean(tried[each]))
+        if _mean(tried[joint] / now) > MAX_LEFT:
+            break
+        absent, now = [*absent, joint], tried[joint]
+    return tuple(sorted(absent))
 
 
 class _Sums:
@@ -204,13 +241,22 @@ def _angle(one_vector: np.ndarray, other_vector: np.ndarray) -> float:
 def _best_direction(sums: _Sums, size: float, left: np.ndarray) -> np.ndarray:
     """Return the gravity vector (3,) of a size [m/s²] that leaves least unexplained, of both signs either.
 
-    Joints are weighed by what masses of their own for each axis leave of them (n,).
+    Joints are weighed by what masses of their own for each axis leave of them (n,), then by what the direction leaves.
     """
+    cost = sums.cost(left)
+    first = min(size * _half_sphere(DIRECTIONS), key=cost)
+    near = min((first, -first), key=cost)
+    for _ in range(2):
+        near = _refined(cost, near)
+        cost = sums.cost(sums.left(near))
+    return near
+
+
+def _refined(cost: Callable[[np.ndarray], float], first: np.ndarray) -> np.ndarray:
+    """Return the vector (3,) of least cost near `first`, of the same size."""
     from scipy.optimize import minimize  # slow to load
 
-    cost = sums.cost(left)
-    tried = size * _half_sphere(DIRECTIONS)
-    first = tried[int(np.argmin([cost(gravity) for gravity in tried]))]
+    size = float(np.linalg.norm(first))
     across = np.linalg.svd(first[None])[2][1:]
 
     def turned(amounts: np.ndarray) -> np.ndarray:
@@ -230,35 +276,24 @@ def _half_sphere(count: int) -> np.ndarray:
     return np.column_stack([radius * np.cos(turn), radius * np.sin(turn), height])
 
 
-def _reference(motions: Sequence[MotionSamples], chain: Chain) -> tuple[np.ndarray, bool]:
-    """Return standard parameters (10 B,) with the sign and about the proportions of the robot's, and if its own."""
-    if chain.inertias is not None and chain.inertias[:, 9].any():
-        return standard_parameters(chain), True
-    return np.asarray(rods(chain, IdentificationModel(motions[0].bodies, ()))).ravel(), False
-
-
-def _with_sign(gravity: np.ndarray, motions: Sequence[MotionSamples], chain: Chain) -> tuple[np.ndarray, bool]:
-    """Return a gravity vector (3,) or its opposite, whichever masses above zero need, and whether neither is sure."""
-    factors, sigmas = _gravity_factors(motions, chain, gravity)
-    known = np.isfinite(factors)
-    votes = (factors[known] / np.maximum(sigmas[known], 0.05)).sum()
-    return (gravity if votes >= 0.0 else -gravity), bool(abs(votes) < 3.0)
-
-
 def _gravity_factors(
-    motions: Sequence[MotionSamples], chain: Chain, gravity: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+    motions: Sequence[MotionSamples], chain: Chain, gravity: np.ndarray, newtons: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the joints' gravity torques over those expected under a vector (3,), and their sigmas, (n,) each.
+
+    The third array says where the expected torque of gravity varies more than the whole recorded one.
 
     Each joint's torque is that of gravity by the robot's masses, that of motion by its inertias, each times a factor,
     and that of its drive. NaN where no gravity torque is expected, or motion and friction look like it.
     """
     n = chain.n
-    reference, own_masses = _reference(motions, chain)
-    scale = 1.0 if own_masses else _inertia_factor(motions, reference)
+    own_masses = chain.inertias is not None and bool(chain.inertias[:, 9].any())
+    rod_like = rods(chain, IdentificationModel(motions[0].bodies, ()))
+    reference = standard_parameters(chain) if own_masses else np.asarray(rod_like).ravel()
+    scale = 1.0 if own_masses and newtons else _inertia_factor(motions, reference)
     factors, sigmas = np.full(n, np.nan), np.full(n, np.nan)
     if not np.isfinite(scale):
-        return factors, sigmas
+        return factors, sigmas, np.zeros(n, dtype=bool)
     expected, moved = [], []
     for motion in motions:
         still = np.zeros_like(motion.v)
@@ -269,7 +304,8 @@ def _gravity_factors(
     torque = np.concatenate([motion.torque for motion in motions])
     drives = np.concatenate([drive_columns(motion.v, motion.a) for motion in motions])
     size = weight.std(axis=0)
-    for joint in np.flatnonzero(size > MIN_SHARE * max(float(size.max()), 1e-9)):
+    least = MIN_SHARE * max(float(size.max()), 1e-9)
+    for joint in np.flatnonzero(size > least):
         spanned = basis(np.column_stack([inertia[:, joint], drives[:, joint]]))
         part, seen = (x - spanned @ (spanned.T @ x) for x in (weight[:, joint], torque[:, joint]))
         if np.sqrt(np.mean(part**2)) < MIN_CORRELATED * size[joint]:
@@ -279,7 +315,7 @@ def _gravity_factors(
         rest = seen - factor * part
         factors[joint] = factor / scale
         sigmas[joint] = np.sqrt(inflation(rest) * float(rest @ rest) / len(rest) / power) / scale
-    return factors, sigmas
+    return factors, sigmas, abs(scale) * size > torque.std(axis=0)
 
 
 def _inertia_factor(motions: Sequence[MotionSamples], reference: np.ndarray) -> float:

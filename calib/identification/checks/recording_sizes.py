@@ -105,7 +105,7 @@ def common_factor(torque: np.ndarray, common: np.ndarray, free: np.ndarray, roun
 
 
 def wrong_joints(samples: MotionSamples) -> Explanation | None:
-    """Return the joints with reversed torques or with positions coupled to another joint; None if all joints are right.
+    """Return the joints with reversed or exchanged torques, or positions coupled to another joint; None if all are right.
 
     One model of all joints is fitted to each: bodies and offsets of any size, Ia, Fv and Fc of every drive not
     negative, since no drive brakes backwards. The robot's own masses need not be known. What is left are shares of the
@@ -114,24 +114,31 @@ def wrong_joints(samples: MotionSamples) -> Explanation | None:
     n = samples.q.shape[1]
     shares = cache(_shares)
 
-    def reversed_(joint: int) -> Callable[[tuple], tuple]:
-        return lambda data: (data[0], data[1] @ reversal(n, joint))
+    def mixed(matrix: np.ndarray) -> Callable[[tuple], tuple]:
+        return lambda data: (data[0], matrix @ data[1])
 
     def counted(matrix: np.ndarray) -> Callable[[tuple], tuple]:
         return lambda data: (_changed(data[0], matrix), data[1])
 
     # shares that may be left: sound recordings at hand are left 0.91 and more, and 0.84 by couplings (our choice)
-    max_left, max_left_coupled = 0.8, 0.7
-    table = [Change("torque-sign", reversed_(j), (j,), max_left=max_left) for j in range(n)]
+    max_left, max_left_coupled, max_left_exchanged = 0.8, 0.7, 0.6
+    table = [Change("torque-sign", mixed(reversal(n, j)), (j,), max_left=max_left) for j in range(n)]
+    table += [
+        Change("torques-exchanged", mixed(exchange(n, *pair)), pair, max_left=max_left_exchanged)
+        for pair in combinations(range(n), 2)
+    ]
     table += [
         Change("axis-coupled", counted(coupling(n, j, k, way)), (j, k), {"way": "+-"[way < 0.0]}, max_left_coupled)
         for j, k, way in couplings(n)
     ]
-    return best_changes((samples, np.ones(n)), table, lambda data: shares(data[0])(data[1]), max_changes=n)
+    return best_changes((samples, np.eye(n)), table, lambda data: shares(data[0])(data[1]), max_changes=n)
 
 
 def _shares(samples: MotionSamples) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function from torque signs (n,) to the unexplained share of each joint's torque variance (n,)."""
+    """Return a function from torques by joint to the unexplained share of each one's variance (n,).
+
+    Its argument (n, n) mixes the recorded columns: the identity, with signs reversed or rows exchanged.
+    """
     m, n = samples.q.shape
     scale = 1.0 / np.maximum(samples.torque.std(axis=0), 1e-12)
 
@@ -140,17 +147,18 @@ def _shares(samples: MotionSamples) -> Callable[[np.ndarray], np.ndarray]:
 
     drives = samples.drives.reshape(m, n, n, 4)
     free = rows(np.concatenate([samples.inertial, drives[..., 3]], axis=2))
-    positive, each = rows(drives[..., :3].reshape(m, n, -1)), rows(samples.torque[:, :, None] * np.eye(n))
+    free = free @ spanning(free.T @ free)
+    positive = rows(drives[..., :3].reshape(m, n, -1))
     positive /= np.maximum(np.abs(positive).max(axis=0), 1e-12)
-    part, among = np.column_stack([positive, each]), spanning(free.T @ free)
-    part -= free @ (among @ (among.T @ (free.T @ part)))
-    triangle, p = np.asarray(np.linalg.qr(part, mode="r")), positive.shape[1]
-    positive, each = part[:, :p], part[:, p:]
+    positive -= free @ (free.T @ positive)
+    across, triangle = np.linalg.qr(positive)
 
-    def left(signs: np.ndarray) -> np.ndarray:
-        torque = each @ signs
-        residual = torque - positive @ nnls(triangle[:p, :p], triangle[:p, p:] @ signs)[0]
-        return np.maximum((residual.reshape(n, m) ** 2).mean(axis=1), 1e-9)
+    def left(mixing: np.ndarray) -> np.ndarray:
+        torque = (scale * (samples.torque @ mixing.T)).T.ravel()
+        power = torque.reshape(n, m).var(axis=1)
+        torque = torque - free @ (free.T @ torque)
+        residual = torque - positive @ nnls(triangle, across.T @ torque)[0]
+        return np.maximum((residual.reshape(n, m) ** 2).mean(axis=1) / np.maximum(power, 1e-300), 1e-9)
 
     return left
 

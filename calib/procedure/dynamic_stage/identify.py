@@ -23,6 +23,7 @@ from calib.identification.prediction import Dynamics, Score, predict, score
 from calib.identification.rows import Case
 from calib.procedure.dynamic_stage import plain, plausibility
 from calib.procedure.dynamic_stage import verdict as judging
+from calib.procedure.dynamic_stage.hypotheses import gravity_hypotheses
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs, Progress
 from calib.procedure.findings import Verdict, lines_of
 from calib.procedure.robot_kinds import stage_of
@@ -240,8 +241,15 @@ T = TypeVar("T", bound=IdentificationOutcome)
 
 
 def run(inputs: IdentificationInputs, progress: Progress | None = None) -> IdentificationOutcome:
-    """Return the outcome of an identification: the model, its prediction of every recording, and the verdict."""
-    return judged(inputs, identify(inputs.robot, inputs.cases, inputs.options.settings, progress), progress)
+    """Return the outcome of an identification: the model, its prediction of every recording, and the verdict.
+
+    Where the torques refute gravity as stated, no richer friction is tried: couplings would take its place.
+    """
+    settings = inputs.options.settings
+    hypotheses = gravity_hypotheses(inputs)
+    if settings.friction == "auto" and hypotheses is not None and hypotheses.refuted:
+        settings = replace(settings, friction="standard")
+    return judged(inputs, identify(inputs.robot, inputs.cases, settings, progress), progress)
 
 
 def judged(

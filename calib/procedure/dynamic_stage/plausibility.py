@@ -15,6 +15,7 @@ from calib.identification.checks.recording_sizes import FOLLOWS, ClockRatio, Rec
 from calib.identification.checks.torque_lag import Lag
 from calib.identification.loop import LoopDisagreement
 from calib.identification.possible.solve import Contradiction
+from calib.procedure.dynamic_stage.hypotheses import gravity_findings, gravity_hypotheses
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.findings import level_of, limit, settle
 from calib.robot.chain import Chain
@@ -32,9 +33,19 @@ def implausible(
         loop: disagreement of recorded torques with an estimate that relies on the stated loop.
     """
     chain, gravity = inputs.chain, inputs.options.settings.gravity
+    hypotheses = gravity_hypotheses(inputs)
+    if hypotheses is not None and hypotheses.direction is not None:
+        # columns that seem exchanged or coupled under a wrong gravity need not be
+        gravity = tuple(hypotheses.direction.tolist())
     sizes = [compare_sizes(case, chain, gravity, inputs.unit == TORQUE) for case in inputs.cases]
     signs = {case.name: signs_of(case, chain, gravity) for case in (*inputs.cases, *inputs.unseen)}
-    found = [*findings(sizes, chain.joint_names), *impossible(impossible_by), *another_loop(loop), *described(chain)]
+    found = [
+        *gravity_findings(hypotheses, chain.joint_names),
+        *findings(sizes, chain.joint_names),
+        *impossible(impossible_by),
+        *another_loop(loop),
+        *described(chain),
+    ]
     for label, load in inputs.options.settings.payloads.items():
         if not load.parameters and not any(label in case.carried for case in inputs.cases):
             found.append(finding("payload-never", label=label))

@@ -1,0 +1,61 @@
+"""Findings on hypotheses that explain recordings better than what was stated: gravity (catalogue, chapter 9)."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from calib.errors import Finding, finding
+from calib.identification.checks.gravity import GravityHypotheses, gravity_of
+from calib.identification.checks.recorded_motion import bodies_under, take_samples
+from calib.identification.checks.recording_sizes import MAX_SAMPLES
+from calib.procedure.dynamic_stage.inputs import IdentificationInputs
+from calib.robot.chain import Chain
+from calib.units import TORQUE
+
+
+def gravity_hypotheses(inputs: IdentificationInputs) -> GravityHypotheses | None:
+    """Return what the training recordings say of gravity; None where they hold no motor torques, or too few samples.
+
+    Recordings with one payload, or without any, are looked at together: those with the most samples.
+    """
+    if not isinstance(inputs.chain, Chain):
+        return None
+    bodies = bodies_under(inputs.chain, inputs.options.settings.gravity)
+    loads = [case.carried for case in inputs.cases]
+    usual = max(loads, key=loads.count)
+    taken = [take_samples(case, bodies, MAX_SAMPLES) for case in inputs.cases if case.carried == usual]
+    usable = [samples for samples in taken if samples is not None]
+    return gravity_of(usable, inputs.chain, inputs.unit == TORQUE) if usable else None
+
+
+def gravity_findings(hypotheses: GravityHypotheses | None, joints: Sequence[str]) -> list[Finding]:
+    """Return the findings that gravity has another direction, or is not in the torques of some joints."""
+    if hypotheses is None:
+        return []
+    findings = []
+    if hypotheses.direction is not None:
+        rival = _vector(-hypotheses.direction, " ") if hypotheses.ambiguous else None
+        values = {
+            "direction": _vector(hypotheses.direction, " "),
+            "option": _vector(hypotheses.direction, ", "),
+            "stated": _vector(hypotheses.stated, " "),
+            "before": _typical(hypotheses.before),
+            "after": _typical(hypotheses.after),
+        }
+        findings.append(finding("gravity-direction", rival=rival, **values))
+    if hypotheses.absent:
+        absent = list(hypotheses.absent)
+        known = [joint for joint in absent if np.isfinite(hypotheses.factors[joint])]
+        factors = [f"{joints[joint]} {hypotheses.factors[joint]:.2g}" for joint in known]
+        findings.append(finding("gravity-absent", joints=[joints[joint] for joint in absent], factors=factors))
+    return findings
+
+
+def _typical(shares: np.ndarray) -> float:
+    """Return the geometric mean of the joints' unexplained shares (n,)."""
+    return float(np.exp(np.mean(np.log(shares))))
+
+
+def _vector(vector: np.ndarray, between: str) -> str:
+    """Return a vector (3,) [m/s²] as text, as an option takes it."""
+    return between.join(f"{component:.4g}" for component in np.round(vector, 3) + 0.0)

@@ -1,0 +1,80 @@
+"""Gravity as a hypothesis: found where it is another, said to be absent where it is, silent where it is as stated."""
+
+from dataclasses import replace
+
+import numpy as np
+import planted_motion as planted
+import pytest
+
+from calib.dynamics.bodies import bodies_of, standard_parameters
+from calib.dynamics.rigid_body import inverse_dynamics
+from calib.identification.checks.gravity import GravityHypotheses, gravity_of
+from calib.identification.checks.recorded_motion import MotionSamples
+from calib.robot.library import load
+
+STATED = np.array([0.0, 0.0, -9.81])
+MOUNTS = {"wall": (9.81, 0.0, 0.0), "ceiling": (0.0, 0.0, 9.81), "slope": (0.0, 6.937, -6.937)}
+
+
+def sines(t: np.ndarray, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return q, v, a (N, n) of joints that move by 1 rad or so in four sines each."""
+    q, v, a = np.zeros((3, len(t), n))
+    for harmonic in range(1, 5):
+        speed = 2.0 * np.pi * 0.15 * harmonic
+        size, phase = rng.normal(size=n) / harmonic, rng.uniform(0.0, 2.0 * np.pi, n)
+        turn = speed * t[:, None] + phase
+        q += size * np.sin(turn)
+        v += size * speed * np.cos(turn)
+        a -= size * speed**2 * np.sin(turn)
+    return q, v, a
+
+
+def said(gravity: np.ndarray, masses: bool, without: tuple[int, ...] = (), seed: int = 0) -> GravityHypotheses:
+    """Return what torques of the LWR4+ under a gravity vector (3,) say; joints `without` hold none."""
+    chain = load("lwr4plus")
+    t = np.arange(0.0, 20.0, 0.04)
+    rng = np.random.default_rng(seed)
+    q, v, a = sines(t, chain.n, rng)
+    bodies = bodies_of(chain)
+    torques = inverse_dynamics(bodies.with_gravity(gravity), standard_parameters(chain), q, v, a)
+    free = inverse_dynamics(bodies.with_gravity(np.zeros(3)), standard_parameters(chain), q, v, a)
+    torques[:, list(without)] = free[:, list(without)]
+    size = free.std(axis=0)
+    torques += size * (0.2 * np.tanh(v / 0.05) + 0.02 * rng.normal(size=q.shape))
+    known = chain if masses else replace(chain, inertias=None)
+    return gravity_of([MotionSamples(np.arange(len(t)), q, v, a, torques, v, bodies)], known)
+
+
+@pytest.mark.parametrize("masses", [True, False])
+def test_gravity_as_stated_is_not_remarked_upon(masses):
+    for seed in range(3):
+        assert not said(STATED, masses, seed=seed).refuted
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_another_mounting_is_found_with_its_vector(mount):
+    gravity = np.array(MOUNTS[mount])
+    hypotheses = said(gravity, masses=True)
+    assert hypotheses.direction is not None and not hypotheses.absent
+    assert hypotheses.direction @ gravity > 9.81**2 * np.cos(np.radians(5.0))
+
+
+def test_torques_without_gravity_are_called_that():
+    assert 1 in said(np.zeros(3), masses=True).absent
+    assert said(np.zeros(3), masses=True).direction is None
+
+
+def test_two_joints_compensated_are_the_ones_named():
+    assert said(STATED, masses=True, without=(1, 2)).absent == (1, 2)
+
+
+def test_axes_along_the_vertical_tell_nothing():
+    chain = planted.arm()
+    assert chain.n == 3
+    t, q, v, a = planted.motion(0)
+    rows = slice(None, None, max(1, len(t) // 400))
+    q, v, a = q[rows], v[rows], a[rows]
+    q[:, 1:], v[:, 1:], a[:, 1:] = 0.0, 0.0, 0.0
+    bodies = bodies_of(chain)
+    torques = inverse_dynamics(bodies, standard_parameters(chain), q, v, a)
+    assert not gravity_of([MotionSamples(np.arange(len(q)), q, v, a, torques, v, bodies)], chain).refuted
