@@ -15,7 +15,7 @@ RESULTS = (
     "dynamics.json", "drive_gains.csv", "errors.csv", "rows.json", "trajectory.toml", "front.csv", "rehearsal.csv",
     "robot.toml", "robot.urdf", "robot_for_corrections.urdf", "robot.xml", "joint_corrections.csv",
     "joint_corrections.txt", "report.json", "certificate.html", "certificate.pdf", "residuals.csv", "trajectory.csv",
-    "run.csv",
+    "run.csv", "arm.toml",
     "motion.csv", "approach.csv", "trajectory.yaml", "trajectory.json", "geometries.csv", "geometry_effects.csv",
     "sensitivity.csv", "covariance_torque.csv", "drift.csv", "parameters.json", "drives.csv", "joint_offsets.csv",
     "joint_origins.yaml", "ur_kinematics.yaml", "poses.csv", "validation_poses.csv", "selection.json", "summary.txt",

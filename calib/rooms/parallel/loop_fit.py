@@ -36,6 +36,7 @@ from calib.robot.calibrated import ROBOT
 from calib.rooms.parallel.mechanism import parallel_robot
 from calib.rooms.parallel.mechanism.closure import ClosedRobot
 from calib.rooms.parallel.mechanism.geometric_fit import (
+    LEFT_OUT,
     LoopCovariance,
     LoopFit,
     contradictions,
@@ -54,7 +55,6 @@ READ = ("holdout", "tolerance", "seed")  # of the settings
 FIGURES = "plot_*.png"
 FIT = (ROBOT, METRICS, ESTIMATE, COVARIANCE, calibrated.COVARIANCE, RESIDUALS, REPORT, *PAGES, FIGURES)
 HEADER = ("name", "unit", "value", "sigma")
-LEFT_OUT = "left out"  # rows that folds of the fit left out in turn
 
 
 @dataclass(frozen=True, eq=False, repr=False)

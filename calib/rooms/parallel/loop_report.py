@@ -2,24 +2,53 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
+from calib.estimation.estimate import Estimate
 from calib.extensions import offered
 from calib.folders import REPORT
 from calib.geometry.accuracy import Errors
+from calib.procedure.findings import Verdict
 from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics
+from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.report import fit_report
 from calib.procedure.report.fit_report import CorrelatedPair, FittedParameter, Report, RowErrors
-from calib.rooms.parallel.loop_fit import LEFT_OUT, ParallelFit
-from calib.rooms.parallel.mechanism.geometric_fit import LoopParameter
+from calib.rooms.parallel.mechanism.geometric_fit import LEFT_OUT, LoopFit, LoopParameter
 from calib.rooms.parallel.mechanism.parallel_robot import ParallelRobot
+from calib.rooms.parallel.robots import ParallelMechanism
+
+
+class ReportedFit(Protocol):
+    """What a report says of `calib.rooms.parallel.loop_fit.ParallelFit`."""
+
+    @property
+    def nominal(self) -> ParallelMechanism: ...
+    @property
+    def files(self) -> tuple[Path, ...]: ...
+    @property
+    def found(self) -> LoopFit: ...
+    @property
+    def own(self) -> np.ndarray: ...
+    @property
+    def unseen(self) -> Mapping[str, np.ndarray]: ...
+    @property
+    def settings(self) -> FitSettings: ...
+    @property
+    def estimate(self) -> Estimate: ...
+    @property
+    def verdict(self) -> Verdict: ...
+    @property
+    def measured(self) -> bool: ...
+
 
 MODEL = "loops"  # the one model of a parallel robot's geometry
 
 
-def report_of(fit: ParallelFit) -> Report:
+def report_of(fit: ReportedFit) -> Report:
     """Return the report of a fit: errors by set of rows, verdict, constants of the loops with their sigmas.
 
     Encoders that contradict each other measure neither position nor orientation: of readings alone it states no errors.
@@ -42,7 +71,7 @@ def report_of(fit: ParallelFit) -> Report:
     )  # fmt: skip
 
 
-def write(fit: ParallelFit, folder: Path, plots: bool) -> None:
+def write(fit: ReportedFit, folder: Path, plots: bool) -> None:
     """Write ``report.json``, figures (if `plots`) and the pages that rooms make of them into a fit's folder."""
     from calib.procedure.report.charts import saved
     from calib.procedure.report.geometry_figures import captioned
@@ -54,7 +83,7 @@ def write(fit: ParallelFit, folder: Path, plots: bool) -> None:
         pages(report, drawn, folder)
 
 
-def _metrics(fit: ParallelFit) -> FitMetrics:
+def _metrics(fit: ReportedFit) -> FitMetrics:
     verdict, tolerance = fit.verdict, fit.settings.tolerance
     vague = fit.found.vague
     return FitMetrics(
@@ -66,18 +95,18 @@ def _metrics(fit: ParallelFit) -> FitMetrics:
     )  # fmt: skip
 
 
-def _unseen(fit: ParallelFit) -> dict[str, np.ndarray]:
+def _unseen(fit: ReportedFit) -> dict[str, np.ndarray]:
     """Return the errors of both robots on rows that were not fitted, by the names that reports have for them."""
     return {fit_report.CROSS_VALIDATED if name == LEFT_OUT else name: both for name, both in fit.unseen.items()}
 
 
-def _compared(fit: ParallelFit, both: np.ndarray, unseen: bool = True, parameters: int = 0) -> ComparedRows:
+def _compared(fit: ReportedFit, both: np.ndarray, unseen: bool = True, parameters: int = 0) -> ComparedRows:
     """Return the statistics of the errors (2, m, k) of both robots on some rows."""
     nominal, calibrated = (_errors(fit, own).summary() for own in both)
     return ComparedRows(both.shape[1], "the file's own", nominal, calibrated, unseen=unseen, parameters=parameters)
 
 
-def _errors(fit: ParallelFit, own: np.ndarray) -> Errors:
+def _errors(fit: ReportedFit, own: np.ndarray) -> Errors:
     """Return the sizes of errors (m, k) by kind; none where no coordinate of the platform was measured."""
     if not fit.measured:
         return Errors(None, None, None)
@@ -88,7 +117,7 @@ def _errors(fit: ParallelFit, own: np.ndarray) -> Errors:
     return Errors(position, orientation, None)
 
 
-def _row_errors(fit: ParallelFit, name: str, both: np.ndarray) -> RowErrors:
+def _row_errors(fit: ReportedFit, name: str, both: np.ndarray) -> RowErrors:
     nominal, calibrated = (
         {
             nature: tuple(size.tolist())
@@ -109,6 +138,6 @@ def _relative(sigma: float, value: float) -> float | None:
     return 100.0 * sigma / abs(value) if value else None
 
 
-def _files(fit: ParallelFit) -> tuple[fit_report.FileRow, ...]:
+def _files(fit: ReportedFit) -> tuple[fit_report.FileRow, ...]:
     roles = {fit.nominal.source: "nominal robot"} | dict.fromkeys(fit.files, "measured")
     return tuple(fit_report.file_row(path.name, role, path) for path, role in roles.items() if path.is_file())

@@ -5,7 +5,8 @@ of its loops' constants (choices of frames have none), so that the dynamics' sig
 identify: ``dynamics.json`` (values of all parameters, base expressions, ``preload``: mean torque of redundant actuators
 that does no work, see `calib explain preload`); the others are those of a serial arm (``calib formats identified``).
 fit: ``estimate.csv`` (changes of the loops' constants), ``covariance.csv``, ``residuals.csv`` (a row per pose:
-readings, measured coordinates, errors of the calibrated and of the nominal robot), ``metrics.json``. excite:
+readings, measured coordinates, errors of the calibrated and of the nominal robot), ``metrics.json``, certificate and
+report with figures as a serial arm's. excite:
 ``motion.csv`` (time, platform coordinates, and position, speed, torque of each actuator), ``trajectory.toml`` (the
 actuators' positions as Fourier series, for `calib recall`), ``metrics.json``, figures, and with --after
 ``prediction.csv``. plan: the same without series. `calib view` shows each of these folders.

@@ -41,6 +41,7 @@ STEP = 1e-6  # of differences by a parameter [m or rad]
 OPENS = 1e-6  # of a parameter's effect on a gap that no joint and no freedom can follow (our choice)
 LIMIT = 30
 SPREAD = 0.01  # standard deviation of a parameter before anything is measured [m or rad] (our choice)
+LEFT_OUT = "left out"  # name of rows that folds of a fit left out in turn
 TOLERANCE = 1e-6  # of a column that no other explains, at unit norm: counts what the poses could tell
 
 
