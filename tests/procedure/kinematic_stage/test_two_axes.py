@@ -58,11 +58,15 @@ def test_the_public_positioner(data, calib, tmp_path, monkeypatch):
     assert found["fit"]["calibrated"]["position_mm"]["mean"] < 0.15
 
 
+@pytest.mark.parametrize("step", [1, 17])
 @pytest.mark.parametrize("holdout", [(), ("--holdout", "0.25")])
-def test_twelve_rows_of_a_positioner_get_an_answer(data, calib, tmp_path, monkeypatch, holdout):
+def test_twelve_rows_of_a_positioner_get_an_answer(data, calib, tmp_path, monkeypatch, holdout, step):
+    """Of the first twelve rows one joint stands still, and no model of the arm can be better than the nominal one."""
     monkeypatch.chdir(tmp_path)
     folder = data / "positioner_2axis"
-    Path("m.csv").write_text("".join((folder / "positioner.csv").read_text().splitlines(keepends=True)[:13]))
+    header, *rows = (folder / "positioner.csv").read_text().splitlines(keepends=True)
+    Path("m.csv").write_text("".join([header, *rows[::step][:12]]))
     code, out, err = calib("fit", folder / "positioner.urdf", "m.csv", *holdout, "--out", "o")
-    assert code == 0 and "verdict" in out and not err
+    level = json.loads(Path("o/metrics.json").read_text())["verdict"]
+    assert code == (level == "fail") and not err
     assert "times the arm's" not in out and "reversed" not in out
