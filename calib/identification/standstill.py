@@ -58,9 +58,13 @@ def standing_joints(case: Case, v0: np.ndarray) -> np.ndarray:
 
 
 def with_standstills(
-    all_rows: Sequence[ObservationRows], cases: Sequence[Case], decimator: Decimator, model: RegressorModel,
-    columns: np.ndarray, v0: np.ndarray,
-) -> list[ObservationRows]:  # fmt: skip
+    all_rows: Sequence[ObservationRows],
+    cases: Sequence[Case],
+    decimator: Decimator,
+    model: RegressorModel,
+    columns: np.ndarray,
+    v0: np.ndarray,
+) -> list[ObservationRows]:
     """Return rows with their standstills marked, Coulomb's columns zero there.
 
     Args:
@@ -213,7 +217,7 @@ def divided(all_rows: Sequence[ObservationRows]) -> DividedRows:
     count = np.maximum(standstills, 1.0)
     return DividedRows(
         moving, standing, swinging, standstills, swing / count, np.maximum(length, 1.0) / count, first.coulomb
-    )  # fmt: skip
+    )
 
 
 def with_weights(all_rows: Sequence[ObservationRows], weights: RestWeights) -> list[ObservationRows]:

@@ -95,9 +95,14 @@ def nominal_values(chain: Chain, dynamics: Dynamics[Any]) -> np.ndarray | None:
 
 
 def references(
-    cases: Sequence[Case], scores: Mapping[str, Score], dynamics: Dynamics[Any], plain: np.ndarray,
-    nominal: np.ndarray | None, slow: float | tuple[float, ...] | None = None, apart: Sequence[int] = (),
-) -> dict[str, PlainReferences]:  # fmt: skip
+    cases: Sequence[Case],
+    scores: Mapping[str, Score],
+    dynamics: Dynamics[Any],
+    plain: np.ndarray,
+    nominal: np.ndarray | None,
+    slow: float | tuple[float, ...] | None = None,
+    apart: Sequence[int] = (),
+) -> dict[str, PlainReferences]:
     """Return the errors of plain references on held-out recordings beside the model's.
 
     Args:
@@ -122,7 +127,7 @@ def references(
 
 def _unexplained(
     case: Case, predicted: np.ndarray, in_motion: bool, slow: float | tuple[float, ...] | None, apart: Sequence[int]
-) -> float:  # fmt: skip
+) -> float:
     """Return 100 ‖τ - τ̂‖ / ‖τ‖ [%] of a case, of joints in motion alone if asked."""
     motion = case.motion
     used = np.repeat(motion.weight[:, None] > 0.5, case.target.shape[1], axis=1)

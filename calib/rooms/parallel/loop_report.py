@@ -61,14 +61,24 @@ def report_of(fit: ReportedFit) -> Report:
         value = nominal + change
         parameters.append(FittedParameter(one.name, one.unit, nominal, value, sigma, _relative(sigma, value), "arm"))
     return Report(
-        schema=fit_report.SCHEMA, robot=robot.name, base="base", tip="platform", joints=robot.joint_names,
-        prismatic=tuple(joint.kind == "prismatic" for joint in robot.joints), metrics=_metrics(fit),
-        parameters=tuple(parameters), kept=(),
+        schema=fit_report.SCHEMA,
+        robot=robot.name,
+        base="base",
+        tip="platform",
+        joints=robot.joint_names,
+        prismatic=tuple(joint.kind == "prismatic" for joint in robot.joints),
+        metrics=_metrics(fit),
+        parameters=tuple(parameters),
+        kept=(),
         correlations=tuple(CorrelatedPair(*pair) for pair in estimate.strong_correlations(0.9)),
-        correlated=fit_report.most_correlated(estimate.names, estimate.covariance), singular_values=(), rank=0,
+        correlated=fit_report.most_correlated(estimate.names, estimate.covariance),
+        singular_values=(),
+        rank=0,
         sets=tuple(_row_errors(fit, name, both) for name, both in sets.items()),
-        noise={"position": None, "orientation": None}, files=_files(fit), source=str(fit.nominal.source),
-    )  # fmt: skip
+        noise={"position": None, "orientation": None},
+        files=_files(fit),
+        source=str(fit.nominal.source),
+    )
 
 
 def write(fit: ReportedFit, folder: Path, plots: bool) -> None:
@@ -87,12 +97,20 @@ def _metrics(fit: ReportedFit) -> FitMetrics:
     verdict, tolerance = fit.verdict, fit.settings.tolerance
     vague = fit.found.vague
     return FitMetrics(
-        validation={name: _compared(fit, both) for name, both in _unseen(fit).items()}, verdict=verdict.level,
-        reason=verdict.reason, warnings=(), code=verdict.code, advice=verdict.advice,
-        fit=_compared(fit, fit.own, unseen=False, parameters=len(fit.found.parameters)), model=MODEL, ladder=(),
-        seed=fit.settings.seed, tolerance_mm=None if tolerance is None else 1e3 * tolerance,
-        not_identifiable=(f"hardly identified by these poses: {', '.join(vague)}",) if vague else (), outliers=(),
-    )  # fmt: skip
+        validation={name: _compared(fit, both) for name, both in _unseen(fit).items()},
+        verdict=verdict.level,
+        reason=verdict.reason,
+        warnings=(),
+        code=verdict.code,
+        advice=verdict.advice,
+        fit=_compared(fit, fit.own, unseen=False, parameters=len(fit.found.parameters)),
+        model=MODEL,
+        ladder=(),
+        seed=fit.settings.seed,
+        tolerance_mm=None if tolerance is None else 1e3 * tolerance,
+        not_identifiable=(f"hardly identified by these poses: {', '.join(vague)}",) if vague else (),
+        outliers=(),
+    )
 
 
 def _unseen(fit: ReportedFit) -> dict[str, np.ndarray]:
