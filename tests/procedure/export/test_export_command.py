@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from robot_oracle import axis, joint, robot
 from without_figures import run
 
 from calib import export
-from calib.procedure.export.geometry import export_offsets
+from calib.procedure.export.geometry import check_readback, export_offsets
 from calib.robot.calibrated import CalibratedChain, CorrectedChain, Deflection, Term
 from calib.robot.formats import urdf
 from calib.robot.formats.urdf_write import write_new
@@ -214,3 +215,14 @@ def test_a_marginal_result_is_exported_with_what_made_it_marginal(cell, calib, f
         Path("x/README.txt").read_text().startswith("verdict pass: ")
         and "verdict" not in Path("x/robot.urdf").read_text()
     )
+
+
+def test_a_link_and_a_joint_of_one_name_are_told_apart():
+    """As in Sawyer's description, whose last fixed joint is called as its link; here the moving ones, too."""
+    source = robot(
+        joint("one", "revolute", "base", "one", axis("0 0 1"), "0.1 0 0.2"),
+        joint("two", "revolute", "one", "two", axis("0 1 0"), "0 0.2 0.3"),
+        joint("hand", "fixed", "two", "hand", "", "0 0 0.1"),
+    )
+    chain = urdf.parse(source)
+    assert chain.tip == "hand" and check_readback(source, "same names", chain).startswith("Pinocchio and yourdfpy read")
