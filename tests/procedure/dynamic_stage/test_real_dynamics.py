@@ -84,9 +84,12 @@ def test_panda_on_the_first_seconds(data, tmp_path, seconds, most):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("end", "most"), [(10, 10.3), (12, 5.7), (16, 5.8), (24, 4.4)])
+@pytest.mark.parametrize(("end", "most"), [(10, 10.3), (12, 5.7), (16, 7.0), (24, 4.4)])
 def test_ur10e_on_the_first_seconds(data, tmp_path, end, most):
-    """Measured 9.7, 5.1, 5.3 and 4.1 %; weighted least squares with its switches: refused, 25, 7.8 and 4.1."""
+    """Measured 9.7, 5.1, 5.3 and 4.1 %; weighted least squares with its switches: refused, 25, 7.8 and 4.1.
+
+    The third is 6.7 % since standstills count once (another step of friction is taken, on two of them).
+    """
     folder = data / "ur10e_innopolis"
     unseen = folder / "ur-20_02_19_14harm50sec.npz"
     train = f"{folder / 'ur-20_02_10-30sec_12harm.npz'}@8:{end}"
@@ -287,11 +290,10 @@ def test_lwr_full_parameters_hold_where_it_has_not_been(data, tmp_path):
 
 @pytest.mark.slow
 def test_kr300_needs_the_prior_on_other_motion(data, tmp_path):
-    """Measured: A → B 21.8 % drawn, 43.0 bare with standard friction; B → A 24.4 and 46.0; fitted together 16.3, 17.1.
+    """Measured in motion: A → B 13.6 % drawn, 18.5 bare with standard friction; B → A 13.4 and 31.5.
 
-    That is what a rigid model can do here: joint 2 moves over ranges that barely overlap, and the joints bend by
-    0.5 to 0.7 mrad rms. A counterbalance as a term at joint 2 does not help on the other record: sine and cosine of
-    order 1 give 24.5 and 47.4 %, of order 2 34.9 and 47.1, a linear spring 21.6 and 27.1.
+    Joint 2 moves over ranges that barely overlap. Of all samples, a quarter at rest, 19.3 and 21.7, 20.2 and 31.6 %;
+    with standing rows as any others they were 21.8 and 43.0, 24.4 and 46.0.
     """
     folder = data / "kuka_kr300_tuk"
     robot, train, other = folder / "model.urdf", folder / "traj_A.npz", folder / "traj_B.npz"
@@ -299,18 +301,19 @@ def test_kr300_needs_the_prior_on_other_motion(data, tmp_path):
     bare = identify(
         tmp_path / "bare", robot, train, "--validate", other, "--friction", "standard", options='prior = "none"'
     )
-    assert total(drawn, "traj_B.npz") < 25.0 < total(bare, "traj_B.npz")
+    assert total(drawn, "traj_B.npz", "moving") < 15.0 < 17.0 < total(bare, "traj_B.npz", "moving")
 
 
 @pytest.mark.slow
 def test_tiago_prismatic_torso_and_signed_gains(data, tmp_path):
+    """Measured 22.7 %; 17.6 with standing rows as any others: at joint 3 these say more here than one row each."""
     folder = data / "tiago_laas"
     log = folder / "dynamic.npz"
     found = identify(
         tmp_path / "out", folder / "model.urdf", f"{log}@0:50", "--validate", f"{log}@50:",
         "--base", "base_footprint", "--tip", "arm_7_link",
     )  # fmt: skip
-    assert total(found, "dynamic.npz@50:") < 20.0
+    assert total(found, "dynamic.npz@50:") < 24.0
     with (tmp_path / "out" / "estimate.csv").open() as file:
         units = {row["name"]: row["unit"] for row in csv.DictReader(file)}
     assert units["Fc1"] == "N" and units["Fc2"] == "N m"
