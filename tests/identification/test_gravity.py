@@ -10,6 +10,7 @@ from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.rigid_body import inverse_dynamics
 from calib.identification.checks.gravity import GravityHypotheses, gravity_of
 from calib.identification.checks.recorded_motion import MotionSamples
+from calib.identification.checks.recording_sizes import wrong_joints
 from calib.robot.library import load
 
 STATED = np.array([0.0, 0.0, -9.81])
@@ -78,3 +79,14 @@ def test_axes_along_the_vertical_tell_nothing():
     bodies = bodies_of(chain)
     torques = inverse_dynamics(bodies, standard_parameters(chain), q, v, a)
     assert not gravity_of([MotionSamples(np.arange(len(q)), q, v, a, torques, v, bodies)], chain).refuted
+
+
+def test_exchanged_torque_columns_are_named_without_masses():
+    chain = load("lwr4plus")
+    t = np.arange(0.0, 20.0, 0.04)
+    q, v, a = sines(t, chain.n, np.random.default_rng(1))
+    torques = inverse_dynamics(bodies_of(chain), standard_parameters(chain), q, v, a)
+    sound = MotionSamples(np.arange(len(t)), q, v, a, torques, v, bodies_of(chain))
+    assert wrong_joints(sound) is None
+    exchanged = wrong_joints(replace(sound, effort=torques[:, [0, 2, 1, 3, 4, 5, 6]]))
+    assert exchanged is not None and (exchanged.code, exchanged.joints) == ("torques-exchanged", (1, 2))

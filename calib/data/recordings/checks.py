@@ -31,6 +31,7 @@ class RecordingBounds:
             within it.
         max_number: of any quantity of a robot, whatever its unit.
         max_jump: off the slope of the rows around it [rad]; real positions are by 7 mrad; in m a tenth.
+        max_degrees: of a joint, four turns: larger numbers are no degrees.
     """
 
     min_samples: int = 20
@@ -47,6 +48,7 @@ class RecordingBounds:
     min_spike: float = 10.0
     max_number: float = 1e12
     max_jump: float = 0.02
+    max_degrees: float = 1440.0
 
 
 LIMITS = RecordingBounds()
@@ -224,8 +226,17 @@ def _check_size(recording: Recording, joints: Joints | None = None) -> None:
         most = np.where(np.isfinite(reach), np.maximum(most, reach), most)
     check_travel(
         recording.q, most, recording, _columns(recording, "q"), recording.joint_names, kinds,
-        lambda j, other: f"looks like {other}; if so, state the unit (header 'q{j + 1} [{other}]', or units)",
+        lambda j, other: _likely_unit(recording, j, other),
     )  # fmt: skip
+
+
+def _likely_unit(recording: Recording, joint: int, other: str) -> str:
+    """Return advice on positions of a joint [rad or m] beyond its travel, that may be in the unit `other`."""
+    if other == "deg" and np.abs(recording.q[:, joint]).max() > LIMITS.max_degrees:
+        return (
+            "too large for deg, too: encoder counts? Convert them to rad or deg, zero and counts per turn allowed for"
+        )
+    return f"looks like {other}; if so, state the unit (header 'q{joint + 1} [{other}]', or units)"
 
 
 def _check_speed(recording: Recording) -> None:

@@ -73,7 +73,8 @@ def _rounded(t: np.ndarray, period: float, drift_samples: int) -> tuple[np.ndarr
     for start, end in pairwise([0, *stops.tolist(), len(t)]):
         own = t[start:end]
         directions = _directions(own, period)
-        mean = uniform_filter1d(directions.real, drift_samples) + 1j * uniform_filter1d(directions.imag, drift_samples)
+        along, across = (uniform_filter1d(part(directions), drift_samples) for part in (np.real, np.imag))
+        mean = along + 1j * across
         drift = np.unwrap(np.angle(mean)) / (2.0 * np.pi)
         exact = (own - own[0]) / period - (drift - drift[0])
         # steps rise: what is left after one per sample does not fall, and rounding keeps the nearest such numbers

@@ -91,8 +91,8 @@ def _read_twice(recording: Recording) -> np.ndarray:
     Such a row is the last sample read once more, since the next one is late. Rows of a robot that stands may well be
     equal: only short runs count, between rows whose positions differ.
     """
-    moved = np.diff(recording.q, axis=0).any(axis=1)
-    same = ~moved & ~np.diff(recording.effort, axis=0).any(axis=1)
+    moved = np.asarray(np.diff(recording.q, axis=0).any(axis=1))
+    same = ~moved & ~np.asarray(np.diff(recording.effort, axis=0).any(axis=1))
     edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]])))
     twice = np.zeros(len(recording), dtype=bool)
     for first, end in edges.reshape(-1, 2).tolist():
@@ -108,9 +108,11 @@ def _even_times(t: np.ndarray, drift_samples: int = 101) -> tuple[np.ndarray, fl
     `drift_samples`: samples over which a drift of the stamps is followed.
     """
     lattice = find_lattice(t, drift_samples)
-    # stamps that jitter by more than that show lost samples only where all later ones stay late
-    lost = None if lattice is not None else _lost(t, _step(t))
-    k = np.arange(len(t)) + np.concatenate([[0], np.cumsum(lost)]) if lattice is None else lattice.steps
+    if lattice is None:
+        # stamps that jitter by more than that show lost samples only where all later ones stay late
+        k = np.arange(len(t)) + np.concatenate([[0], np.cumsum(_lost(t, _step(t)))])
+    else:
+        k = lattice.steps
     period, start = np.polyfit(k, t, 1)
     late = t - (start + period * k)
     even = start + period * k + uniform_filter1d(late, drift_samples, mode="nearest")

@@ -105,7 +105,7 @@ def common_factor(torque: np.ndarray, common: np.ndarray, free: np.ndarray, roun
 
 
 def wrong_joints(samples: MotionSamples) -> Explanation | None:
-    """Return the joints with reversed or exchanged torques, or positions that count from another joint; None if right.
+    """Return the joints with reversed or exchanged torques, or coupled positions; None if all joints are right.
 
     One model of all joints is fitted to each: bodies and offsets of any size, Ia, Fv and Fc of every drive not
     negative, since no drive brakes backwards. The robot's own masses need not be known. What is left are shares of the

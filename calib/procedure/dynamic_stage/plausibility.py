@@ -36,7 +36,8 @@ def implausible(
     hypotheses = gravity_hypotheses(inputs)
     if hypotheses is not None and hypotheses.direction is not None:
         # columns that seem exchanged or coupled under a wrong gravity need not be
-        gravity = tuple(hypotheses.direction.tolist())
+        x, y, z = hypotheses.direction.tolist()
+        gravity = (x, y, z)
     sizes = [compare_sizes(case, chain, gravity, inputs.unit == TORQUE) for case in inputs.cases]
     signs = {case.name: signs_of(case, chain, gravity) for case in (*inputs.cases, *inputs.unseen)}
     found = [

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from calib.data.recordings.checks import check_recording
+from calib.data.recordings.recording import Recording
 from calib.data.recordings.recording_files import read_recording
 from calib.data.recordings.recording_options import RecordingOptions
 from calib.data.schema import Joints
@@ -99,3 +101,22 @@ def test_the_reference_of_ur_and_franka_logs_is_read(tmp_path, names):
     assert found.q_ref is not None and np.abs(found.q_ref - series["q"] - 0.01).max() < 1e-8
     assert np.abs(found.q - series["q"]).max() < 1e-8 and np.abs(found.effort - series["tau"]).max() < 1e-8
     assert found.v is None
+
+
+def test_what_is_nan_in_every_row_is_not_provided():
+    t = np.linspace(0.0, 2.0, 400)
+    q = np.column_stack([np.sin(3.0 * t), np.cos(3.0 * t)])
+    absent = np.full_like(q, np.nan)
+    checked = check_recording(Recording.of(t, q, q + 1.0, v=absent))
+    assert checked.v is None and any("not provided" in note for note in checked.notes)
+    with pytest.raises(MeasurementError, match=r"torque of q1, q2 is NaN in every row: its driver does not provide"):
+        check_recording(Recording.of(t, q, absent))
+
+
+def test_encoder_counts_are_not_called_degrees():
+    t = np.linspace(0.0, 2.0, 400)
+    counts = 2048.0 + 600.0 * np.sin(3.0 * t)[:, None]
+    with pytest.raises(MeasurementError, match="encoder counts"):
+        check_recording(Recording.of(t, counts, counts))
+    with pytest.raises(MeasurementError, match="looks like deg"):
+        check_recording(Recording.of(t, counts / 20.0, counts))
