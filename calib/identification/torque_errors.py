@@ -459,7 +459,8 @@ class _Fold:
 
 def _friction(found: Identification) -> np.ndarray:
     """Return Coulomb's friction (rows,) of the torque rows that hold a motor's; zero in others [N m or N]."""
-    return np.sum(np.abs(found.fitted.estimate.values) * found.rows[0].coulomb, axis=1)
+    coulomb = found.rows[0].coulomb[: found.dynamics.model.rows]  # recordings weighed apart repeat them
+    return np.sum(np.abs(found.fitted.estimate.values) * coulomb, axis=1)
 
 
 def _standing_speeds(found: Identification, friction: np.ndarray) -> np.ndarray:
