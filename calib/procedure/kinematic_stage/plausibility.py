@@ -118,7 +118,7 @@ def ranges(held: JointRange) -> list[str]:
     words = []
     for name, low, high, unit in zip(held.joints, held.lower, held.upper, held.units):
         factor, shown = (1e3, "mm") if unit == "m" else (1.0 / DEG, "°")
-        words.append(f"{name} {factor * low:.0f} to {factor * high:.0f} {shown}".replace(" °", "°"))
+        words.append(f"{name} {round(factor * low)} to {round(factor * high)} {shown}".replace(" °", "°"))
     return words
 
 

@@ -93,7 +93,7 @@ def measured_range(found: FitMetrics) -> str:
         return ""
     values = zip(held.lower, held.upper, held.units)
     scaled = [(low, high, *((1e3, " mm") if unit == "m" else (1.0 / DEG, "°"))) for low, high, unit in values]
-    return ", ".join(f"{factor * low:.0f}…{factor * high:.0f}{shown}" for low, high, factor, shown in scaled)
+    return ", ".join(f"{round(factor * low)}…{round(factor * high)}{shown}" for low, high, factor, shown in scaled)
 
 
 def write_model(found: DynamicReport, drawn: Mapping[str, Picture], folder: Path) -> None:
