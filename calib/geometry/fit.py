@@ -33,7 +33,7 @@ from calib.robot.chain import Chain, element_length
 PLAUSIBLE = {"m": 0.01, "rad": 0.05}
 TYPICAL = {"m": 3e-3, "rad": 5e-3}  # widths of making of a usual arm: what one more parameter would say (our choice)
 WIDTH_UPDATES = 2  # fits with new widths of making, which then change by less than their uncertainty
-ROUNDING = 1e-12  # of WᵀW with its diagonal scaled to 1
+ROUNDING = 1e-12  # of WᵀW with its diagonal scaled to 1; its root of columns
 WIDTH_ROUNDS = 30  # of the fixed point of the widths between two fits
 MERGED = 0.1  # share of its largest coefficient from which a parameter counts as merged with another
 WARM_POSES = 2000  # poses with which the fit of many more begins, and that widths are estimated from (our choice)
@@ -54,8 +54,9 @@ def fit(
     Minimises Σ ‖(y - f(x)) / σ‖² + Σ ((x - x_nominal) / w)². Nothing of the arm is selected: parameters that merge
     share what the measurements say of them, and those that the measurements do not determine stay near nominal. The
     widths w of making, one for joint offsets, one for other angles and one for lengths, maximise the evidence (MacKay
-    1992). Placements have no prior: of them the base columns are fitted. What is identifiable is read off afterwards
-    (`GeometricFit.split`, `GeometricFit.base_covariance`).
+    1992). Placements have no prior: of them the base columns are fitted, and what of the arm only displaces them stays
+    at nominal. What is identifiable is read off afterwards
+    (`GeometricFit.split`, `GeometricFit.base_sigma`).
 
     Args:
         cell: where to start; frames placed (`calib.geometry.first_guess`).
@@ -110,9 +111,17 @@ def plain_fit(cell: Installation, measured: Sequence[PoseMeasurements]) -> Geome
 
 
 def _estimated(cell: Installation, split: ColumnSplit, candidates: np.ndarray) -> np.ndarray:
-    """Return the parameters to estimate: those of the arm that have an effect, and the base columns of the others."""
+    """Return the parameters to estimate: those of the arm that have an effect, and the base columns of the others.
+
+    Parameters of the arm that do no more than displace base or tool stay at nominal: that is what these frames are.
+    """
     arm = layout(cell).index("arm")
-    effective = np.setdiff1d(candidates, candidates[split.without_effect])
+    in_arm = np.isin(candidates[split.kept], arm)
+    size = np.abs(split.coefficients)
+    largest = size.max(axis=0, initial=0.0)
+    displaces_frames = size[in_arm].max(axis=0, initial=0.0) <= ROUNDING**0.5 * largest
+    excluded = np.concatenate([split.without_effect, split.dropped[displaces_frames]])
+    effective = np.setdiff1d(candidates, candidates[excluded])
     return np.union1d(np.intersect1d(effective, arm), candidates[split.kept])
 
 
