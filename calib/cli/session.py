@@ -83,8 +83,8 @@ def formats(topic: Annotated[str | None, typer.Argument(autocompletion=topics)] 
     Example: calib formats measurements
 
     Args:
-        topic: measurements, instruments, robodk, join, images, descriptions, moveit, ros2, targets, programs, logs,
-            options, identify-options, identified, exports, constraints, mdh, parallel, robot, session, limits,
+        topic: measurements, instruments, robodk, join, images, descriptions, moveit, ros2, targets, programs, frames,
+            logs, identify-options, options, identified, exports, constraints, mdh, parallel, robot, session, limits,
             waypoints, excitation, study or recordings
         schema: the JSON schema of a TOML file, for editors that complete its keys
     """

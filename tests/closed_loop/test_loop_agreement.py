@@ -1,5 +1,6 @@
 """Claims of what takes a loop for granted: a loop stated wrongly is named, by recorded torques; a right one never."""
 
+import re
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -83,12 +84,13 @@ def test_a_loop_that_explains_less_torque_than_the_model_is_named():
 
 
 def test_weak_instruments_are_named_beside_an_estimate_and_in_its_failure():
-    """Positions of 1.5 mrad noise: Cragg-Donald 8.8; of 2 mrad the estimate cannot be simulated: 4.9."""
+    """Positions of 1.5 mrad noise: Cragg-Donald 8.8; of 2 mrad the estimate does not settle."""
     _, test = judged("iv", 1.5e-3, 0.05)
     (said,) = test.findings(taken=True)
     assert said.code == "weak-instruments" and 5.0 < said.values["donald"] < 10.0
     failed = METHODS["iv"].estimate(problem(0, 2e-3, 0.05)).failure
-    assert "The instruments are weak (Cragg-Donald 4.9" in str(failed)
+    weak = re.search(r"The instruments are weak \(Cragg-Donald (\S+), sound above 10", str(failed))
+    assert weak is not None and float(weak[1]) < 10.0
 
 
 def test_a_wrong_derivative_of_a_curved_constraint_is_refused_in_a_simulated_loop_too():

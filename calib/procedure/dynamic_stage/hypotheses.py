@@ -18,7 +18,7 @@ def gravity_hypotheses(inputs: IdentificationInputs) -> GravityHypotheses | None
 
     Recordings with one payload, or without any, are looked at together: those with the most samples.
     """
-    if not isinstance(inputs.chain, Chain):
+    if not isinstance(inputs.chain, Chain) or not inputs.options.settings.torque_rows.has_bodies:
         return None
     bodies = bodies_under(inputs.chain, inputs.options.settings.gravity)
     loads = [case.carried for case in inputs.cases]

@@ -93,7 +93,7 @@ def test_the_calibrated_robots_folder_serves_and_the_nominal_chooses_columns(tmp
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
-        (lambda t, q, tau: (t[:50], q[:50], tau[:50]), "50 samples are too few"),
+        (lambda t, q, tau: (t[:15], q[:15], tau[:15]), "15 samples are too few"),
         (lambda t, q, tau: (t, np.hstack([q, q]), np.hstack([tau, tau])), "has 6 joints"),
         (lambda t, q, tau: (t, q, tau * [1, 1, 0] + [0, 0, 1]), "was it logged"),
         (lambda t, q, tau: (t, 0 * q + q[0], tau), "no joint moves"),

@@ -158,7 +158,7 @@ def test_joint_targets_are_the_nominal_robots_poses(cell, fitted, here, calib):
     assert "base frame of the calibrated robot" in out and "tool 'flange'" in out
     sent = np.deg2rad(numbers(commands(), [f"q{k + 1} [deg]" for k in range(6)]))
     found = joint_commands.read(fitted)
-    goal = Goal(joint_commands.placements(found)[1], torques=found.torques)
+    goal = Goal(joint_commands.placements(found)[1])
     at = inverse.seen_at(goal, sent).poses()
     position, turn = off(at, forward(cell.nominal, q))
     assert position < 1e-7 and turn < 1e-7

@@ -227,7 +227,7 @@ def test_a_failed_robots_files_say_so_until_it_does_not_fail(finished: Session, 
     place, settings = finished.path("6-export"), finished.path("session.toml")
     before = (place / "robot.urdf").read_bytes()
     marginal = (place / "README.txt").read_text()
-    assert marginal.startswith("verdict marginal: geometry: ") and "remain with rigid geometry alone" in marginal
+    assert marginal.startswith("verdict marginal: geometry: ") and "rigid geometry leaves" in marginal
     assert marginal.splitlines()[0] in before.decode()
     assert "none given: pass means" in finished.path("report.html").read_text(), "no tolerance"
     edit(settings, "tolerance_mm = 0.0", "tolerance_mm = 0.001")
