@@ -136,7 +136,7 @@ def test_sigmas_that_are_not_stated_are_estimated(name, seeds):
 
 
 def test_merging_parameters_share_what_is_identified():
-    """Base parameters are as many as ever; what displaces base or tool alone stays at nominal, what merges else shares."""
+    """Base parameters are as many as ever; what displaces base or tool alone stays at nominal, the others share."""
     nominal, truth, measured, _ = planted("pose", 3)
     found = calibrate(nominal, measured)
     table = layout(found.cell)
