@@ -94,13 +94,13 @@ def joint_range(found: GeometricFit, nominal: Installation) -> JointRange:
 def sigma_at(cell: Installation, found: GeometricFit, q: np.ndarray) -> np.ndarray:
     """Return σ of the first target's position (m,) [m] at postures q (m, n), in its station's frame.
 
-    The fit's covariance where it holds all rigid parameters with a prior, else the posterior of its data and
+    The fit's covariance where all rigid parameters were its candidates, else the posterior of its data and
     the prior of making (`calib.geometry.fit.PLAUSIBLE`).
     """
     table, columns = layout(cell), layout(cell).rigid_index
     arm = np.intersect1d(columns, table.index("arm"))
-    prior = found.prior
-    if prior is not None and np.isin(arm, found.free[np.isfinite(prior)]).all():
+    # of these, what the fit leaves at nominal has no effect, or displaces base or tool, which the fit places
+    if found.prior is not None and np.isin(arm, found.candidates).all():
         columns, covariance = found.free, found.estimate.covariance
     else:
         covariance = _posterior(cell, found, columns)
