@@ -80,7 +80,7 @@ def problem(nominal, count: int):
     block = measured(nominal, count)[1]
     few = take(block, np.arange(min(500, count)))
     start = polish_frames(install(nominal, [few]), [few]).cell
-    return start, block, fit(start, [few]).free
+    return start, block, fit(start, [few]).base
 
 
 def library(name: str):

@@ -24,6 +24,11 @@ def one_kind(kind: str, count: int):
     return lambda truth, seed, sigma, more: [measure(truth, kind, count * more, seed, sigma=sigma)]
 
 
+def sockets(truth, seed, sigma, more):
+    """Sockets whose distances are not known: the arm's scale is a gauge, as with planes."""
+    return [replace(block, links=()) for block in one_kind("sockets", 96)(truth, seed, sigma, more)]
+
+
 def two_stations(truth, seed, sigma, more):
     """Poses of one tool from a camera, positions of another from a tracker that is three times as good."""
     first = measure(truth, "pose", 30 * more, seed, sigma=sigma, sigma_rotation=4 * sigma, file="camera")
@@ -44,7 +49,7 @@ SCENES = {
     "pose": (one_kind("pose", 40), 1, 1),
     "position": (one_kind("position", 60), 1, 1),
     "distance": (one_kind("distance", 200), 1, 1),
-    "sockets": (one_kind("sockets", 96), 1, 1),
+    "sockets": (sockets, 1, 1),
     "plane": (one_kind("plane", 200), 1, 1),
     "bar": (one_kind("bar", 180), 1, 1),
     "two stations": (two_stations, 2, 2),

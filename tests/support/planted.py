@@ -164,7 +164,8 @@ def deviation(found: GeometricFit, exact: Sequence[PoseMeasurements]) -> tuple[f
     parts = [part for block in prepare(found.cell, exact) for part in observe(found.cell, block, found.free)]
     residual, matrix = map(np.concatenate, zip(*(part.whitened(np.ones(1)) for part in parts)))
     scale = np.linalg.norm(matrix, axis=0)
-    dx = np.linalg.lstsq(matrix / scale, residual, rcond=None)[0] / scale
+    # parameters that merge leave directions that are zero but for rounding
+    dx = np.linalg.lstsq(matrix / scale, residual, rcond=1e-9)[0] / scale
     rest = np.linalg.norm(residual - matrix @ dx) / np.linalg.norm(residual)
     base, sigma = found.regrouping(), found.base_sigma()
     correlation = base @ found.estimate.covariance @ base.T / np.outer(sigma, sigma)

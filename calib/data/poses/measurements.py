@@ -55,7 +55,10 @@ class PoseMeasurements:
 
     @property
     def measures_length(self) -> bool:
-        """Whether the rows hold a measured length, without which a smaller arm explains them as well."""
+        """Whether the rows hold measured lengths, without which a smaller arm explains them as well.
+
+        Not so sockets: distances between a few of them are short beside the arm, and noise draws its scale off them.
+        """
         return self.has_instrument
 
     def __post_init__(self) -> None:
@@ -252,10 +255,6 @@ class Sockets(GroupedMeasurements):
 
     kind: ClassVar[str] = "sockets"
     placing: ClassVar[int] = 3
-
-    @property
-    def measures_length(self) -> bool:
-        return any(distance > 0.0 for _, _, distance in self.links)
 
 
 @dataclass(frozen=True, eq=False)

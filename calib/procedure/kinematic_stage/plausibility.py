@@ -57,7 +57,7 @@ def misfit(found: ModelSelection, reach: float) -> Finding | None:
     fitted = _left(found.rigid)
     if min(rigid.cross_validated, fitted) <= FLOOR * reach:
         return None
-    left = min(found.cross_validated, _left(found.fit)) / (FLOOR * reach)
+    left = found.cross_validated / (FLOOR * reach)
     return finding(
         "rigid-misfit", rms=fitted, folds=rigid.cross_validated, reach=reach, healthy=FLOOR * reach, left=left
     )

@@ -91,8 +91,8 @@ def test_motoman_wide(data, calib, here):
     unseen = found["validation"]["right_wide_386.csv"]
     assert unseen["poses"] == 100
     assert unseen["calibrated"]["position_mm"]["rms"] < 1.3
-    assert (found["verdict"], found["code"]) == ("marginal", "rigid-misfit")
-    assert "set-up-changed" in {one["code"] for one in found["noticed"]}
+    assert (found["verdict"], found["code"]) == ("marginal", "many-outliers")
+    assert {"set-up-changed", "rigid-misfit"} <= {one["code"] for one in found["noticed"]}
 
 
 @pytest.mark.parametrize(("robot", "position", "distance"), [("panda_2", 0.79, 0.21), ("panda_3", 0.23, 0.05)])
