@@ -75,12 +75,13 @@ def standing_columns(cases: Sequence[Case], joints: Sequence[str]) -> list[Findi
     """Return the findings on clipped torques, and on positions and velocities that stand while their joint moves."""
     found = []
     for case in cases:
-        clipped = []
+        clipped, values = [], []
         for fault in case.motion.faults:
             joint = joints[fault.joint]
             if fault.kind == "clipped":
-                values = " and ".join(f"{value:.4g}" for value in fault.values)
-                clipped.append(f"{joint} ({values} in {fault.share:.0%} of its motion)")
+                extremes = " and ".join(f"{value:.4g}" for value in fault.values)
+                clipped.append(joint)
+                values.append(f"{extremes} in {fault.share:.0%} of its motion")
                 continue
             span = {"file": case.name, "joint": joint, "start": fault.start, "stop": fault.stop, "share": fault.share}
             if fault.kind == "velocity":
@@ -88,7 +89,7 @@ def standing_columns(cases: Sequence[Case], joints: Sequence[str]) -> list[Findi
             else:
                 found.append(finding("encoder-stands", missed=fault.missed, **span))
         if clipped:
-            found.append(finding("torque-clipped", file=case.name, joints=clipped))
+            found.append(finding("torque-clipped", file=case.name, joints=clipped, values=values))
     return [one for one in found if level_of(one)]
 
 

@@ -34,7 +34,7 @@ def test_each_fault_is_named_with_its_file_and_joint(robot, tmp_path, capsys):
     plain = planted.write(tmp_path, "plain.npz", 0)
     loaded = planted.write(tmp_path, "loaded.npz", 1, tau=planted.series(1, payload=True)["tau"])
     words = said(capsys, robot, plain, loaded, "--validate", spoiled(tmp_path), "--out", tmp_path / "out", "-v")
-    assert "spoiled.npz: torques stand at one extreme value while moving: joint2" in words
+    assert "spoiled.npz: torque of joint2 stands at one extreme value in motion" in words
     assert "spoiled.npz: position of joint3 stands at 7.5 to 7.995 s" in words
     assert "spoiled.npz: measured velocity of joint1 stands at 5 to 5.495 s" in words
     assert "loaded.npz: an unstated payload of 2" in words
