@@ -49,3 +49,14 @@ def test_sound_recordings_with_a_stated_payload_are_accused_of_nothing(robot, tm
     assert "unstated payload" not in words and " stand at " not in words
     codes = json.dumps(json.loads((tmp_path / "out" / "metrics.json").read_text()))
     assert not any(code in codes for code in CODES)
+
+
+def test_a_joint_that_stands_is_no_fault_and_no_obstacle(robot, tmp_path, capsys):
+    t, q, v, a = (np.array(series) for series in planted.motion(0))
+    q[:, 0], v[:, 0], a[:, 0] = 0.3, 0.0, 0.0
+    noise = 0.2 * np.random.default_rng(0).normal(size=q.shape)
+    np.savez(tmp_path / "standing.npz", t=t, q=q, tau=planted.torques(q, v, a) + noise)
+    words = said(capsys, robot, tmp_path / "standing.npz", "--out", tmp_path / "out", "-v")
+    assert " stands at " not in words and "joint1 never moves" in words
+    found = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert 1.0 < found["condition_number"]["normalised"] < 1e3
