@@ -148,11 +148,16 @@ def _upper(size: int) -> np.ndarray:
 
 
 def condition_numbers(factor: np.ndarray) -> tuple[float, float]:
-    """Return cond(W) and cond(W with unit-norm columns) from W or any R factor of it."""
+    """Return cond(W) and cond(W with unit-norm columns) from W or any R factor of it; zero columns are left out.
+
+    Such columns belong to parameters without rows, e.g. of a joint that stands; infinite where all columns are.
+    """
     norms = np.linalg.norm(factor, axis=0)
-    return _ratio(np.linalg.svd(factor, compute_uv=False)), _ratio(
-        np.linalg.svd(factor / np.where(norms > 0.0, norms, 1.0), compute_uv=False)
-    )
+    excited = factor[:, norms > 0.0]
+    if not excited.size:
+        return float("inf"), float("inf")
+    normed = excited / norms[norms > 0.0]
+    return _ratio(np.linalg.svd(excited, compute_uv=False)), _ratio(np.linalg.svd(normed, compute_uv=False))
 
 
 def solve_triangle(factor: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:

@@ -134,7 +134,7 @@ REMOVED = {
 """Keys of earlier versions, and what replaced them."""
 FINDINGS = (
     "masses", "limit", "speed", "lag", "clock", "order", "zero", "coupling", "sign", "jump", "bodies", "description",
-    "loop", "gravity",
+    "loop", "gravity", "encoder", "payload",
 )  # fmt: skip
 """Names in ``accept``: the codes in chapters 9 and 10 of the catalogue of findings."""
 Texts = Annotated[tuple[Name, ...], Spread(words="a text, or a list of texts")]

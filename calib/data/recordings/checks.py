@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from calib.data.recordings.column_faults import column_faults
 from calib.data.recordings.recording import Recording
 from calib.data.recordings.row_order import goes_far_back, in_order
 from calib.data.schema import BOUNDS, Joints, check_travel, max_travel, more_rows, refuse
@@ -74,7 +75,9 @@ def check_recording(recording: Recording, joints: Joints | None = None) -> Recor
     _check_size(recording, joints)
     _check_speed(recording)
     notes = (*_still(recording), *_effort_notes(recording, joints), *_limit_notes(recording, joints))
-    return replace(_noted(recording, *notes, *_work_notes(recording)), jumps=tuple(_jumps(recording, joints)))
+    noted = _noted(recording, *notes, *_work_notes(recording))
+    faults = column_faults(recording.t, recording.q, recording.effort, recording.v)
+    return replace(noted, jumps=tuple(_jumps(recording, joints)), faults=faults)
 
 
 def _without_absent(recording: Recording) -> Recording:

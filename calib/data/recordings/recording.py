@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from calib.data.recordings.column_faults import ColumnFault
 from calib.errors import MeasurementError, UsageError, one_of, refuse_data, refuse_option, refused_as
 from calib.records import frozen
 
@@ -43,7 +44,8 @@ class Recording:
         effort_variance: (n,) mean variance of the effort's samples, from repeats [its unit²]; None where not known.
         file: where it came from.
         rows: (N,) number of each sample in the file, counted from 1.
-        notes: odd but accepted findings, for the message; jumps: descriptions of position jumps.
+        notes: odd but accepted findings, for the message; jumps: descriptions of position jumps; faults: columns that
+            stand while what they measure moves.
     """
 
     t: np.ndarray
@@ -63,6 +65,7 @@ class Recording:
     rows: np.ndarray = None  # type: ignore[assignment]  # set below
     notes: tuple[str, ...] = ()
     jumps: tuple[str, ...] = ()
+    faults: tuple[ColumnFault, ...] = ()
 
     def __post_init__(self) -> None:
         one_of(self.kind, KINDS, "kind", MeasurementError, self.file)

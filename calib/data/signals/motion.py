@@ -17,6 +17,7 @@ from scipy.interpolate import CubicSpline
 from calib.config import strict
 from calib.config_types import OneOf, OneOrMany, Positive, Real, Whole
 from calib.data.recordings.archives import read_archived_positions
+from calib.data.recordings.column_faults import ColumnFault
 from calib.data.recordings.recording import Recording
 from calib.data.recordings.recording_files import read_positions
 from calib.data.recordings.recording_options import RecordingOptions
@@ -89,7 +90,8 @@ class Motion:
         joint_names, kind, file, drive_gain, effort_variance: the recording's.
         tau_link, tau_motor, q_link, q_ref, tau_ff, v_measured: (N, n) the recording's others on the grid, not
             filtered; or None.
-        sampling, cutoffs: what was found; notes: for the user; jumps: the recording's, in words.
+        sampling, cutoffs: what was found; notes: for the user; jumps: the recording's, in words; faults: the
+            recording's.
         located: where a designed motion that is the reference was found to begin [s]; None: another reference.
     """
 
@@ -120,6 +122,7 @@ class Motion:
     drive_gain: np.ndarray | None = None
     effort_variance: np.ndarray | None = None
     jumps: tuple[str, ...] = ()
+    faults: tuple[ColumnFault, ...] = ()
     located: float | None = None
 
     def __len__(self) -> int:
@@ -216,6 +219,7 @@ def make_motion(
         effort_variance=recording.effort_variance,
         v_measured=v_measured,
         jumps=recording.jumps,
+        faults=recording.faults,
         **others,
     )
 

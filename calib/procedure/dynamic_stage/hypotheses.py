@@ -1,4 +1,4 @@
-"""Findings on hypotheses that explain recordings better than what was stated: gravity (catalogue, chapter 9)."""
+"""Findings on hypotheses that explain recordings better than what was stated: gravity, loads (catalogue, chapter 9)."""
 
 from collections.abc import Sequence
 
@@ -8,9 +8,12 @@ from calib.errors import Finding, finding
 from calib.identification.checks.gravity import GravityHypotheses, gravity_of
 from calib.identification.checks.recorded_motion import bodies_under, take_samples
 from calib.identification.checks.recording_sizes import MAX_SAMPLES
+from calib.identification.checks.unstated_load import unstated_load
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.robot.chain import Chain
 from calib.units import TORQUE
+
+MAX_COMPARED = 12  # recordings in which an unstated load is looked for (our choice)
 
 
 def gravity_hypotheses(inputs: IdentificationInputs) -> GravityHypotheses | None:
@@ -49,6 +52,42 @@ def gravity_findings(hypotheses: GravityHypotheses | None, joints: Sequence[str]
         factors = [f"{joints[joint]} {hypotheses.factors[joint]:.2g}" for joint in known]
         findings.append(finding("gravity-absent", joints=[joints[joint] for joint in absent], factors=factors))
     return findings
+
+
+def load_findings(inputs: IdentificationInputs, gravity: Sequence[float] | None) -> list[Finding]:
+    """Return the findings that a recording carries a load which the options do not state.
+
+    Recordings with the same stated payload are compared, training and unseen ones.
+
+    Args:
+        gravity: in the base frame [m/s²], where it is not the robot's own.
+    """
+    rows = inputs.options.settings.torque_rows
+    if not isinstance(inputs.chain, Chain) or inputs.unit != TORQUE or not rows.has_bodies:
+        return []
+    bodies = bodies_under(inputs.chain, gravity)
+    cases = [*inputs.cases, *inputs.unseen]
+    found = []
+    for carried in dict.fromkeys(case.carried for case in cases):
+        samples = {}
+        for case in cases:
+            taken = take_samples(case, bodies, MAX_SAMPLES) if case.carried == carried else None
+            if taken is not None and len(samples) < MAX_COMPARED:
+                samples[case.name] = taken
+        load = unstated_load(samples)
+        if load is not None:
+            found.append(
+                finding(
+                    "payload-unstated",
+                    file=load.name,
+                    mass=load.mass,
+                    sigma=load.sigma,
+                    reach=load.reach,
+                    before=load.before,
+                    after=load.after,
+                )
+            )
+    return found
 
 
 def _typical(shares: np.ndarray) -> float:

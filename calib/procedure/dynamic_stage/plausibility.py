@@ -15,7 +15,8 @@ from calib.identification.checks.recording_sizes import FOLLOWS, ClockRatio, Rec
 from calib.identification.checks.torque_lag import Lag
 from calib.identification.loop import LoopDisagreement
 from calib.identification.possible.solve import Contradiction
-from calib.procedure.dynamic_stage.hypotheses import gravity_findings, gravity_hypotheses
+from calib.identification.rows import Case
+from calib.procedure.dynamic_stage.hypotheses import gravity_findings, gravity_hypotheses, load_findings
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.findings import level_of, limit, settle
 from calib.robot.chain import Chain
@@ -42,6 +43,8 @@ def implausible(
     signs = {case.name: signs_of(case, chain, gravity) for case in (*inputs.cases, *inputs.unseen)}
     found = [
         *gravity_findings(hypotheses, chain.joint_names),
+        *load_findings(inputs, gravity),
+        *standing_columns([*inputs.cases, *inputs.unseen], chain.joint_names),
         *findings(sizes, chain.joint_names),
         *impossible(impossible_by),
         *another_loop(loop),
@@ -65,6 +68,28 @@ def findings(sizes: Sequence[RecordingSizes], joints: Sequence[str]) -> list[Fin
             sizes_left = dict(factor=other.factor, gain=1.0 - other.factor, explained=1.0 - max(other.after))
             found.append(other.finding(joints, file=each.name, **sizes_left))
         found += [finding("position-jump", file=each.name, jump=words) for words in each.jumps]
+    return [one for one in found if level_of(one)]
+
+
+def standing_columns(cases: Sequence[Case], joints: Sequence[str]) -> list[Finding]:
+    """Return the findings on clipped torques, and on positions and velocities that stand while their joint moves."""
+    found = []
+    for case in cases:
+        clipped, values = [], []
+        for fault in case.motion.faults:
+            joint = joints[fault.joint]
+            if fault.kind == "clipped":
+                extremes = " and ".join(f"{value:.4g}" for value in fault.values)
+                clipped.append(joint)
+                values.append(f"{extremes} in {fault.share:.0%} of its motion")
+                continue
+            span = {"file": case.name, "joint": joint, "start": fault.start, "stop": fault.stop, "share": fault.share}
+            if fault.kind == "velocity":
+                found.append(finding("velocity-stands", missed=fault.missed, **span))
+            else:
+                found.append(finding("encoder-stands", missed=fault.missed, **span))
+        if clipped:
+            found.append(finding("torque-clipped", file=case.name, joints=clipped, values=values))
     return [one for one in found if level_of(one)]
 
 

@@ -1,0 +1,180 @@
+"""Columns of a recording that stand while what they measure moves: clipped torques and frozen encoders.
+
+Said only where columns contradict each other as recorded: a value that is exactly repeated is no measurement of
+something that changes. A joint that stands, and a torque whose largest values differ, are sound.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+MIN_ROWS = 10  # that repeat a value exactly (all below: our choice; open recordings: at most 5 at an extreme torque)
+MIN_SHARE = 0.01  # of the rows in motion, at a torque's extremes (open recordings: at most 0.001)
+MIN_LEVELS = 20  # values of a torque, below which it is too coarse to tell a clipped one
+CROWDED = 5.0  # rows at the extreme over those at each of the values next to it
+NEXT_LEVELS = 5  # values that the extreme is compared with
+MOVING = 0.05  # of a joint's peak speed, from which on it moves
+MIN_SPEED_RANGE = 0.1  # of the peak speed, that clipped rows spread over: at one speed a torque may well be one value
+MIN_TRAVEL = 0.02  # between a standing column and the motion beside it [rad]
+MAX_WANDER = 5.0  # standard deviations of the sum of a velocity's noise
+MIN_STEPS = 3.0  # of a column's own resolution in that
+MAX_STANDING = 0.9  # of the rows with one velocity: then it was not logged, which is another finding
+JUMP = 5.0  # step behind a standing position over those at the joint's speed
+ABOUT = 3.0  # factor between that step and the motion expected meanwhile
+
+
+@dataclass(frozen=True)
+class ColumnFault:
+    """A column of one joint that stands.
+
+    Attributes:
+        kind: ``clipped`` torque, ``position`` or ``velocity`` that stands.
+        joint: index of the joint.
+        share: of the rows in motion that a torque is clipped in, or of all rows that a column stands in.
+        values: the extremes at which a torque is clipped [N m or N; A].
+        start, stop: when the longest standing part begins and ends [s].
+        missed: motion that it does not show [rad or m].
+    """
+
+    kind: str
+    joint: int
+    share: float
+    values: tuple[float, ...] = ()
+    start: float = 0.0
+    stop: float = 0.0
+    missed: float = 0.0
+
+
+def column_faults(
+    t: np.ndarray, q: np.ndarray, effort: np.ndarray, v: np.ndarray | None = None
+) -> tuple[ColumnFault, ...]:
+    """Return the columns that stand of a recording as logged.
+
+    Args:
+        t: (N,) [s].
+        q: (N, n) positions [rad or m].
+        effort: (N, n) torques or currents.
+        v: (N, n) measured velocities; None where not recorded.
+    """
+    faults = []
+    for joint, position in enumerate(q.T):
+        candidates = [_clipped(joint, t, position, effort[:, joint])]
+        if v is None:
+            candidates.append(_jumping(joint, t, position))
+        else:
+            candidates.append(_standing_position(joint, t, position, v[:, joint]))
+            candidates.append(_standing_velocity(joint, t, position, v[:, joint]))
+        faults += [fault for fault in candidates if fault is not None]
+    return tuple(faults)
+
+
+def _clipped(joint: int, t: np.ndarray, q: np.ndarray, torque: np.ndarray) -> ColumnFault | None:
+    """Return a torque that repeats its extreme value exactly while its joint moves at various speeds."""
+    speed = np.abs(_speed(t, q))
+    peak = float(speed.max())
+    moves = speed > MOVING * peak
+    if np.ptp(q) < MIN_TRAVEL or not moves.any():
+        return None
+    levels, counts = np.unique(torque[moves], return_counts=True)
+    if len(levels) < MIN_LEVELS:
+        return None
+    values = []
+    rows = np.zeros(len(torque), dtype=bool)
+    for extreme, nearby in ((0, counts[1 : NEXT_LEVELS + 1]), (-1, counts[-NEXT_LEVELS - 1 : -1])):
+        crowded = counts[extreme] >= max(MIN_ROWS, CROWDED * float(nearby.max()))
+        at_extreme = moves & (torque == levels[extreme])
+        if not crowded:
+            continue
+        slow, fast = np.quantile(speed[at_extreme], (0.1, 0.9))
+        if fast - slow > MIN_SPEED_RANGE * peak:
+            values.append(float(levels[extreme]))
+            rows |= at_extreme
+    share = float(rows.sum() / moves.sum())
+    return ColumnFault("clipped", joint, share, tuple(values)) if share >= MIN_SHARE else None
+
+
+def _standing_position(joint: int, t: np.ndarray, q: np.ndarray, v: np.ndarray) -> ColumnFault | None:
+    """Return a position that stands while the measured velocity changes and adds up to a motion."""
+    least = max(MIN_TRAVEL, MIN_STEPS * _resolution(q))
+    parts = []
+    for first, last in _constant(q):
+        part = slice(first, last)
+        moved = _moved(t[part], v[part])
+        fast = np.sqrt(np.mean(v[part] ** 2)) > MOVING * np.abs(v).max()
+        if fast and np.ptp(v[part]) > 0.0 and moved > least + _wander(t[part], v[part]):
+            parts.append((first, last, moved))
+    return _of_parts("position", joint, t, parts)
+
+
+def _standing_velocity(joint: int, t: np.ndarray, q: np.ndarray, v: np.ndarray) -> ColumnFault | None:
+    """Return a velocity that stands while the position moves otherwise."""
+    parts = []
+    for first, last in _constant(v):
+        time = t[first:last] - t[first]
+        apart = float(np.ptp(q[first:last] - v[first] * time))
+        if apart > max(MIN_TRAVEL, MIN_STEPS * _resolution(v) * float(time[-1])):
+            parts.append((first, last, apart))
+    fault = _of_parts("velocity", joint, t, parts)
+    return fault if fault is not None and fault.share < MAX_STANDING else None
+
+
+def _jumping(joint: int, t: np.ndarray, q: np.ndarray) -> ColumnFault | None:
+    """Return a position that stands at once while it moves, then jumps by about what it would have moved."""
+    around = 5  # rows of the speed before and behind
+    parts = []
+    for first, last in _constant(q):
+        if first < around or last + around >= len(q):
+            continue
+        before = abs(q[first] - q[first - around]) / (t[first] - t[first - around])
+        behind = abs(q[last + around] - q[last]) / (t[last + around] - t[last])
+        speed, step = float(before + behind) / 2.0, abs(float(q[last] - q[last - 1]))
+        expected = speed * float(t[last] - t[first])
+        sudden = step > max(MIN_TRAVEL, JUMP * speed * float(t[last] - t[last - 1]))
+        if sudden and min(before, behind) > 0.0 and expected / ABOUT < step < expected * ABOUT:
+            parts.append((first, last, step))
+    return _of_parts("position", joint, t, parts)
+
+
+def _of_parts(kind: str, joint: int, t: np.ndarray, parts: list[tuple[int, int, float]]) -> ColumnFault | None:
+    """Return the fault of standing parts (first row, row behind the last, motion missed); None without any."""
+    if not parts:
+        return None
+    rows = sum(last - first for first, last, _ in parts)
+    first, last, missed = max(parts, key=lambda part: part[1] - part[0])
+    return ColumnFault(kind, joint, rows / len(t), (), float(t[first]), float(t[last - 1]), missed)
+
+
+def _constant(values: np.ndarray) -> Iterator[tuple[int, int]]:
+    """Yield the first row and the row behind the last of parts of `MIN_ROWS` or more exactly equal values (N,)."""
+    edges = np.flatnonzero(np.concatenate([[True], np.diff(values) != 0.0, [True]]))
+    for first, last in zip(edges[:-1].tolist(), edges[1:].tolist()):
+        if last - first >= MIN_ROWS:
+            yield first, last
+
+
+def _resolution(values: np.ndarray) -> float:
+    """Return the smallest step between values (N,), numbers that differ by rounding alone left aside; 0 without any."""
+    steps = np.diff(np.unique(values))
+    steps = steps[steps > 1e-9 * np.abs(values).max(initial=0.0)]
+    return float(steps.min(initial=np.inf)) if len(steps) else 0.0
+
+
+def _moved(t: np.ndarray, v: np.ndarray) -> float:
+    """Return the range of the integral of velocities (N,), without gaps in the log [rad or m]."""
+    step = np.diff(t)
+    step = np.minimum(step, 3.0 * np.median(step))
+    return float(np.ptp(np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * step)])))
+
+
+def _wander(t: np.ndarray, v: np.ndarray) -> float:
+    """Return how far white noise of velocities (N,) may add up to [rad or m]."""
+    noise = float(np.std(np.diff(v))) / np.sqrt(2.0)
+    return MAX_WANDER * noise * float(np.median(np.diff(t))) * float(np.sqrt(len(t)))
+
+
+def _speed(t: np.ndarray, q: np.ndarray, around: int = 5) -> np.ndarray:
+    """Return the slope (N,) of positions (N,) between the rows `around` before and behind."""
+    rows = np.arange(len(t))
+    behind, before = np.minimum(rows + around, len(t) - 1), np.maximum(rows - around, 0)
+    return np.asarray((q[behind] - q[before]) / (t[behind] - t[before]))
