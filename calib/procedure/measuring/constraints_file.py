@@ -40,7 +40,7 @@ TOML; every table is optional, a key that is none of these is refused. Lengths i
     floor = 0.0                      # height of the floor; by default of what the arm stands on
     box = [[-1, 1], [-1, 1], [0, 2]] # x, y and z that no part of the arm leaves
     ignored = [["base", "tool0"]]     # pairs of links that are not compared, as an SRDF's disable_collisions
-    # posture = {left_elbow = "90 deg"}: where joints outside the arm stand: a second arm, a gripper; by default at zero
+    posture = {}                     # {left_elbow = "90 deg"}: where joints outside the arm stand; others at zero
     [[obstacle]]                     # any number of these
     name = "table"                   # for messages
     kind = "box"                     # box, sphere or cylinder
