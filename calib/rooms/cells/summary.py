@@ -58,7 +58,7 @@ NUMBERS: Mapping[str, Callable[[Session], tuple[float, str]]] = {
     "record": lambda s: (s.settings.dynamics.repeats, "periods of it logged, with torques"),
     "identify": lambda s: (len(read_estimate(s.identification.path)), "parameters of its dynamics, with sigma"),
     "predict": lambda s: (
-        torque_error(s) or nan, f"% unexplained by the identified model: {s.identification.unseen.read().verdict}"
+        torque_error(s) or nan, f"% unexplained by identified model: {s.identification.unseen.read().verdict}"
     ),
     "export": _exported,
 }  # fmt: skip
