@@ -104,7 +104,7 @@ def of_range(held: JointRange, tolerance: float | None) -> list[Finding]:
     if held.sigma is None or not held.moved:
         return []
     shares = [held.shares[j] for j in held.moved]
-    limit_elsewhere = tolerance if tolerance is not None else HALF * (held.nominal or np.inf)
+    limit_elsewhere = tolerance if tolerance is not None else max(HALF * (held.nominal or np.inf), TOO_GOOD)
     values = {"sigma": held.sigma, "least": min(shares), "most": max(shares)}
     beyond, times = held.sigma / limit_elsewhere, held.sigma / max(held.left, 1e-300)
     return [
