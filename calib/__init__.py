@@ -61,13 +61,39 @@ _HOMES = {
 }
 
 __all__ = [  # noqa: RUF022 (in the order of use)
-    "load", "read_poses", "read_recording", "join", "select_poses", "fit_geometry", "diff", "tool", "base", "hand_eye",
-    "design_excitation", "plan_motion",
-    "identify_dynamics", "methods", "validate", "export", "compensate", "new_session", "run_sessions",
-    "CalibratedChain", "PoseSelection", "GeometryFit", "ExcitationDesign", "MotionPlan", "DynamicsModel",
-    "JointCommands", "SelectionSettings", "FitSettings", "ExcitationSettings", "PlanSettings", "IdentifySettings",
+    "load",
+    "read_poses",
+    "read_recording",
+    "join",
+    "select_poses",
+    "fit_geometry",
+    "diff",
+    "tool",
+    "base",
+    "hand_eye",
+    "design_excitation",
+    "plan_motion",
+    "identify_dynamics",
+    "methods",
+    "validate",
+    "export",
+    "compensate",
+    "new_session",
+    "run_sessions",
+    "CalibratedChain",
+    "PoseSelection",
+    "GeometryFit",
+    "ExcitationDesign",
+    "MotionPlan",
+    "DynamicsModel",
+    "JointCommands",
+    "SelectionSettings",
+    "FitSettings",
+    "ExcitationSettings",
+    "PlanSettings",
+    "IdentifySettings",
     "CalibError",
-]  # fmt: skip
+]
 
 
 # before any kernel is loaded

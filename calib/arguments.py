@@ -16,8 +16,13 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 C = TypeVar("C")
 _PLAIN = {int: (Integral,), float: (Real,)}
 _WORDS = {
-    bool: "True or False", int: "a whole number", float: "a number", str: "a text", NoneType: "None", Path: "a path",
-}  # fmt: skip
+    bool: "True or False",
+    int: "a whole number",
+    float: "a number",
+    str: "a text",
+    NoneType: "None",
+    Path: "a path",
+}
 _TABLE = "found a DataFrame: write it by frame.to_csv('table.csv', index=False) and give that file"
 
 

@@ -23,9 +23,13 @@ T = TypeVar("T")
 Tables = str | Path | Mapping[str, Any]  # a TOML file, or what stands in one
 MAX_LEVELS = 32
 _PLAIN = {  # pydantic's words
-    "float": "a number", "int": "a whole number", "string": "a text", "bool": "true or false", "tuple": "a list",
+    "float": "a number",
+    "int": "a whole number",
+    "string": "a text",
+    "bool": "true or false",
+    "tuple": "a list",
     "too_short": "at least one number",
-}  # fmt: skip
+}
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 _ENTRY = re.compile(r"^ {4}(\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", re.M)  # of a docstring: names, and what they are
 

@@ -19,8 +19,10 @@ TURNED = ("rad", "deg", "°", "mrad", "rad/s", "deg/s", "°/s", "rpm")
 VELOCITIES = {"rad/s": 1.0, "m/s": 1.0, "deg/s": DEG, "°/s": DEG, "mm/s": 1e-3, "rpm": math.pi / 30}
 EFFORTS = {
     **{f"n{dot}{length}": size for length, size in (("m", 1.0), ("mm", 1e-3)) for dot in ("", "·", ".", "*", " ", "-")},
-    "n": 1.0, "mnm": 1e-3, "knm": 1e3,
-}  # fmt: skip
+    "n": 1.0,
+    "mnm": 1e-3,
+    "knm": 1e3,
+}
 CURRENTS = {"a": 1.0, "ma": 1e-3}
 
 QUANTITIES: Mapping[str, Mapping[str, float]] = {

@@ -335,10 +335,16 @@ def _multistart(task: _Request, starts: int) -> _Chosen:
 
     return _of(
         multistart_search(
-            space, random_starts(joints, task.m, starts, task.seed), task.index, task.before,
-            evaluations=task.settings.evaluations, seconds=task.settings.seconds, map=task.map, report=report,
+            space,
+            random_starts(joints, task.m, starts, task.seed),
+            task.index,
+            task.before,
+            evaluations=task.settings.evaluations,
+            seconds=task.settings.seconds,
+            map=task.map,
+            report=report,
         )
-    )  # fmt: skip
+    )
 
 
 def _mlsl(task: _Request) -> _Chosen:
@@ -364,8 +370,18 @@ def _tabu(task: _Request) -> _Chosen:
     def report(chosen: int, _: float) -> None:
         task.progress(chosen, task.m, "poses constructed")
 
-    return _of(tabu_search(task.space, task.m, task.index, task.before, seed=task.seed, rule=task.settings.rule,
-                           seconds=task.settings.seconds, report=report))  # fmt: skip
+    return _of(
+        tabu_search(
+            task.space,
+            task.m,
+            task.index,
+            task.before,
+            seed=task.seed,
+            rule=task.settings.rule,
+            seconds=task.settings.seconds,
+            report=report,
+        )
+    )
 
 
 def _of(run: Improved) -> _Chosen:
@@ -392,9 +408,21 @@ def _selection(task: _Request, chosen: _Chosen, baseline: float, began: float) -
     history = history / np.sqrt(poses) if task.index == "O1" else history
     history = np.append(history[:-1], value)
     out = Selection(
-        q, indices, task.index, value, history, efficiency, task.bound, ceiling, baseline, 0.0, chosen.evaluations,
-        task.seed, task.settings.method, chosen.interrupted,
-    )  # fmt: skip
+        q,
+        indices,
+        task.index,
+        value,
+        history,
+        efficiency,
+        task.bound,
+        ceiling,
+        baseline,
+        0.0,
+        chosen.evaluations,
+        task.seed,
+        task.settings.method,
+        chosen.interrupted,
+    )
     return replace(out, seconds=time.perf_counter() - began)
 
 

@@ -135,10 +135,12 @@ def _starts(
     """Return start poses: half with the highest d, pairwise distinct, and half at random."""
     ranked = _apart(q[np.argsort(-scores, kind="stable")[: 20 * count]])[: count - count // 2]
     rest = count - len(ranked)
-    return np.concatenate([
-        ranked, draw_candidates(space.lower, space.upper, rest, lambda x: is_feasible(space, x), seed=generator,
-                                block=256),
-    ])  # fmt: skip
+    return np.concatenate(
+        [
+            ranked,
+            draw_candidates(space.lower, space.upper, rest, lambda x: is_feasible(space, x), seed=generator, block=256),
+        ]
+    )
 
 
 def _apart(q: np.ndarray, least: float = 0.1) -> np.ndarray:

@@ -182,13 +182,29 @@ def identify_dynamics(
     designed = [] if excitation is None else [coefficients.read(Path(excitation))]
     if (stage := stage_of(robot, "identify", base, tip)) is not None:
         return stage.run(
-            listed(recordings), listed(validate), options=chosen, method=method, friction=friction, seed=seed,
-            designed=designed, on_read=on_read, progress=progress,
-        )  # fmt: skip
+            listed(recordings),
+            listed(validate),
+            options=chosen,
+            method=method,
+            friction=friction,
+            seed=seed,
+            designed=designed,
+            on_read=on_read,
+            progress=progress,
+        )
     given = inputs.gather(
-        cast(Any, robot), listed(recordings), listed(validate), options=chosen, method=method, friction=friction,
-        base=base, tip=tip, seed=seed, designed=designed, progress=progress,
-    )  # fmt: skip
+        cast(Any, robot),
+        listed(recordings),
+        listed(validate),
+        options=chosen,
+        method=method,
+        friction=friction,
+        base=base,
+        tip=tip,
+        seed=seed,
+        designed=designed,
+        progress=progress,
+    )
     if on_read is not None:
         on_read(given)
     return DynamicsModel(**vars(identify.run(given, progress)))

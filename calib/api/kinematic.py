@@ -240,9 +240,16 @@ def select_poses(
     say, lost = progress or (lambda words: None), []
     with as_ours(), opened(workers) as crew:
         chosen = selection.choose(
-            robot, count, settings, constraints=optional(constraints), existing=optional(existing), base=base, tip=tip,
-            map=crew.map_without(lost), progress=lambda done, total, what: say(f"{what} ({done} of {total})"),
-        )  # fmt: skip
+            robot,
+            count,
+            settings,
+            constraints=optional(constraints),
+            existing=optional(existing),
+            base=base,
+            tip=tip,
+            map=crew.map_without(lost),
+            progress=lambda done, total, what: say(f"{what} ({done} of {total})"),
+        )
     return PoseSelection(**vars(replace(chosen, notes=(*chosen.notes, *map(str, lost)))))
 
 

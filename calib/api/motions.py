@@ -156,10 +156,17 @@ def design_excitation(
                 settings, model=place, limits=limits, options=options, after=after, map=crew.map, progress=progress
             )
         designed = design.excite(
-            cast(Any, robot), settings, model=place, limits=optional(limits), base=base, tip=tip,
-            options=None if options is None else _read(options).settings, after=before,
-            map=crew.map_without(lost), progress=progress,
-        )  # fmt: skip
+            cast(Any, robot),
+            settings,
+            model=place,
+            limits=optional(limits),
+            base=base,
+            tip=tip,
+            options=None if options is None else _read(options).settings,
+            after=before,
+            map=crew.map_without(lost),
+            progress=progress,
+        )
     return ExcitationDesign(**vars(replace(designed, notes=(*designed.notes, *map(str, lost)))))
 
 
@@ -197,11 +204,22 @@ def plan_motion(
         place = None if model is None else stack.enter_context(saved(model))
         if stage is not None:
             return stage.run(
-                optional(waypoints), settings, model=place, limits=optional(limits), drives=optional(drives),
+                optional(waypoints),
+                settings,
+                model=place,
+                limits=optional(limits),
+                drives=optional(drives),
                 progress=progress,
-            )  # fmt: skip
+            )
         planned = planning.plan(
-            cast(Any, robot), optional(waypoints), settings, model=place, limits=optional(limits),
-            drives=optional(drives), base=base, tip=tip, progress=progress,
-        )  # fmt: skip
+            cast(Any, robot),
+            optional(waypoints),
+            settings,
+            model=place,
+            limits=optional(limits),
+            drives=optional(drives),
+            base=base,
+            tip=tip,
+            progress=progress,
+        )
     return MotionPlan(**vars(planned))

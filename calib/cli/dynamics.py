@@ -43,9 +43,17 @@ def excite(
     check_destination("excite", robot, out, [robot, model, limits, options, after, *settings.existing])
     with progress() as say:
         designed = design_excitation(
-            robot, settings, model=model, limits=limits, options=options, after=after, base=base, tip=tip,
-            workers=workers, progress=say,
-        )  # fmt: skip
+            robot,
+            settings,
+            model=model,
+            limits=limits,
+            options=options,
+            after=after,
+            base=base,
+            tip=tip,
+            workers=workers,
+            progress=say,
+        )
         say("writing")
         with finishing():
             designed.save(out, plots=plots)
@@ -114,9 +122,19 @@ def identify_dynamics(
 
     with progress() as show:
         found = identified(
-            robot, recordings, validate=validate or (), method=method, friction=friction, options=options, base=base,
-            excitation=excitation, tip=tip, seed=seed, on_read=read, progress=show,
-        )  # fmt: skip
+            robot,
+            recordings,
+            validate=validate or (),
+            method=method,
+            friction=friction,
+            options=options,
+            base=base,
+            excitation=excitation,
+            tip=tip,
+            seed=seed,
+            on_read=read,
+            progress=show,
+        )
         show("writing")
         found.save(out, plots=plots)
     compared = []

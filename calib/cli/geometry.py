@@ -56,9 +56,16 @@ def select(
     check_results(written, [robot, existing, constraints, *named], overwrite)
     with progress() as show:
         chosen = select_poses(
-            robot, m, settings, constraints=constraints, existing=existing, base=base, tip=tip, workers=workers,
+            robot,
+            m,
+            settings,
+            constraints=constraints,
+            existing=existing,
+            base=base,
+            tip=tip,
+            workers=workers,
             progress=show,
-        )  # fmt: skip
+        )
         show("writing")
         with together():
             chosen.save(out, plots=plots, overwrite=overwrite)
@@ -112,9 +119,17 @@ def fit(
 
     with progress() as show:
         found = fit_geometry(
-            robot, measured, settings, validate=validate or (), options=options, poses=selection, base=base, tip=tip,
-            on_read=read, progress=show,
-        )  # fmt: skip
+            robot,
+            measured,
+            settings,
+            validate=validate or (),
+            options=options,
+            poses=selection,
+            base=base,
+            tip=tip,
+            on_read=read,
+            progress=show,
+        )
         show("writing")
         found.save(out, plots=plots)
     say_written(found.renderables(), out, found.verdict.level)
@@ -173,16 +188,25 @@ def export(
         with progress() as show:
             show("writing all formats, and reading each file back")
             lines = export_all(
-                folder, target, urdf=urdf, prior=prior, ros2=ros2, moveit=moveit or (), control=ros2_control,
+                folder,
+                target,
+                urdf=urdf,
+                prior=prior,
+                ros2=ros2,
+                moveit=moveit or (),
+                control=ros2_control,
                 overwrite=overwrite,
-            )  # fmt: skip
+            )
         say_written(lines, target / ros2, delivery.verdicts(folder).level)
         return
     words = "nothing to write: give --urdf SOURCE.urdf --out FILE.urdf, --ur-kinematics, --offsets, --ros2 or --into"
     require((urdf is None) == (out is None) and (urdf or ur_kinematics or offsets), words, UsageError)
     form = delivery.CORRECTED_URDF if for_corrections else delivery.URDF
-    asked = [(form, out, (".urdf",)), (delivery.UR_KINEMATICS, ur_kinematics, (".yaml", ".yml")),
-             (delivery.OFFSETS, offsets, (".csv",))]  # fmt: skip
+    asked = [
+        (form, out, (".urdf",)),
+        (delivery.UR_KINEMATICS, ur_kinematics, (".yaml", ".yml")),
+        (delivery.OFFSETS, offsets, (".csv",)),
+    ]
     targets = [(path, suffixes) for _, path, suffixes in asked if path]
     own = delivery.verdicts(folder).of("corrections" if for_corrections else "urdf", dynamics=True)
     found = geometry.read(folder)

@@ -143,9 +143,12 @@ def random_samples(
 
 
 def find(
-    model: RegressorModel, samples: States | None = None, loads: Loads | None = None, tolerance: float = 1e-6,
+    model: RegressorModel,
+    samples: States | None = None,
+    loads: Loads | None = None,
+    tolerance: float = 1e-6,
     nominal: RegressorModel | None = None,
-) -> Base:  # fmt: skip
+) -> Base:
     """Return the base parameters of a model: independent columns of its regressor.
 
     Args:

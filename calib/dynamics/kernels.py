@@ -234,9 +234,17 @@ def _project_lanes(motion, twist, columns):
         w, e, a = _lane(motion, 0, k), _lane(motion, 3, k), _lane(motion, 6, k)
         u, s = _lane(twist, 0, k), _lane(twist, 3, k)
         (
-            columns[k], columns[L + k], columns[2 * L + k], columns[3 * L + k], columns[4 * L + k],
-            columns[5 * L + k], columns[6 * L + k], columns[7 * L + k], columns[8 * L + k], columns[9 * L + k],
-        ) = ten_columns(w, e, a, u, s)  # fmt: skip
+            columns[k],
+            columns[L + k],
+            columns[2 * L + k],
+            columns[3 * L + k],
+            columns[4 * L + k],
+            columns[5 * L + k],
+            columns[6 * L + k],
+            columns[7 * L + k],
+            columns[8 * L + k],
+            columns[9 * L + k],
+        ) = ten_columns(w, e, a, u, s)
 
 
 @njit(**OPTIONS)

@@ -71,9 +71,13 @@ def split_columns(
     values = np.linalg.svd(scaled, compute_uv=False)
     values = np.concatenate([values, np.zeros(p - len(values))])
     return ColumnSplit(
-        frozen(kept, int), frozen(dropped, int), frozen(np.flatnonzero(silent), int), frozen(coefficients),
-        frozen(values), tolerance,
-    )  # fmt: skip
+        frozen(kept, int),
+        frozen(dropped, int),
+        frozen(np.flatnonzero(silent), int),
+        frozen(coefficients),
+        frozen(values),
+        tolerance,
+    )
 
 
 def _complete(groups: Sequence[np.ndarray] | None, p: int) -> list[np.ndarray]:

@@ -133,9 +133,15 @@ def _step(
     f, p = nested_test(current, [worst])
     spread = float(rsd.max() / rsd.min()) if rsd.min() > 0.0 else np.inf
     return EliminationStep(
-        current.estimate.names[worst], float(rsd[worst]), spread, f, p, nested_test(base, gone)[1],
-        smaller.estimate.residual_std, listed,
-    )  # fmt: skip
+        current.estimate.names[worst],
+        float(rsd[worst]),
+        spread,
+        f,
+        p,
+        nested_test(base, gone)[1],
+        smaller.estimate.residual_std,
+        listed,
+    )
 
 
 def _next(current: LinearFit, keep: Sequence[str], drop: Sequence[str]) -> int | None:

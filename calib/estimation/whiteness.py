@@ -45,9 +45,14 @@ def examine(residual: np.ndarray, lags: int = 30) -> Whiteness:
     bound = 1.96 / np.sqrt(len(x))
     skewness, kurtosis = _shape(x)
     return Whiteness(
-        frozen(rho), frozen(partial_autocorrelation(rho)), bound, float(np.mean(np.abs(rho) > bound)),
-        ljung_box(rho, len(x))[1], kurtosis, _normality(skewness, kurtosis, len(x)),
-    )  # fmt: skip
+        frozen(rho),
+        frozen(partial_autocorrelation(rho)),
+        bound,
+        float(np.mean(np.abs(rho) > bound)),
+        ljung_box(rho, len(x))[1],
+        kurtosis,
+        _normality(skewness, kurtosis, len(x)),
+    )
 
 
 def _shape(x: np.ndarray) -> tuple[float, float]:

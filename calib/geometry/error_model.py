@@ -277,9 +277,11 @@ class _Rows:
             parts = observe(cell, ready, self.free)
             root = np.sqrt(weights[number][self.chosen[number]])
             self.whitened.append(
-                [(each.value * root / scales[number][each.label],
-                  each.jacobian * root / scales[number][each.label]) for each in parts]
-            )  # fmt: skip
+                [
+                    (each.value * root / scales[number][each.label], each.jacobian * root / scales[number][each.label])
+                    for each in parts
+                ]
+            )
             self.metric.append(next((each.value, each.jacobian) for each in parts if each.label == "position"))
         total = sum((self._gram(k, slice(None)) for k in range(1, len(self.measured))), self._gram(0, slice(None)))
         groups = np.concatenate([np.full(len(own), -1), term_groups(terms)]).astype(int)

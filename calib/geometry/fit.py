@@ -271,9 +271,8 @@ def fit_with_prior(
     image_passes = 20  # at most, until the noise of images settles (our choice)
     for _ in range(image_passes if any(weigher.noises) and settings.passes > 1 else settings.passes):
         solution = solve(
-            weigher.linearise, lambda s, dx: step(s, free, dx), state,
-            damping=settings.damping, limit=settings.limit,
-        )  # fmt: skip
+            weigher.linearise, lambda s, dx: step(s, free, dx), state, damping=settings.damping, limit=settings.limit
+        )
         state, settled = solution.state, weigher.settle(solution)
         if settled is not None:
             return weigher.result(settled)

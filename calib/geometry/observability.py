@@ -286,6 +286,10 @@ def _measured(q: np.ndarray, cell: Installation, number: int, full: bool) -> Pos
     """Return noise-free measurements of one target at joint values q (m, n)."""
     poses = see(cell, q, 0, np.full(len(q), number)).poses()
     return PoseMeasurements.of(
-        q, poses[:, :3, 3], to_quaternion(poses) if full else None, joint_names=cell.chain.joint_names,
-        tool_names=(cell.tool_names[number],), station=cell.station_names[0],
-    )  # fmt: skip
+        q,
+        poses[:, :3, 3],
+        to_quaternion(poses) if full else None,
+        joint_names=cell.chain.joint_names,
+        tool_names=(cell.tool_names[number],),
+        station=cell.station_names[0],
+    )

@@ -77,12 +77,14 @@ def layout(cell: Installation) -> ParameterLayout:
     return ParameterLayout(
         names=(*cell.chain.names, *frames, *cell.optics.names, *cell.deflection.names(cell.chain)),
         units=(
-            *cell.chain.units, *(units * (len(frames) // 6)), *cell.optics.units,
+            *cell.chain.units,
+            *(units * (len(frames) // 6)),
+            *cell.optics.units,
             *(element_units[t.element] + TERM_UNITS.get(t.basis, "") for t in terms),
         ),
         kinds=tuple(np.repeat(KINDS, layout_counts(cell)).tolist()),
         moving=tuple((len(cell.chain.elements) + len(frames) + cell.optics.moving).tolist()),
-    )  # fmt: skip
+    )
 
 
 def families(cell: Installation) -> np.ndarray:

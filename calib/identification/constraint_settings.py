@@ -66,8 +66,9 @@ class CurvedConstraint:
 
 Bounds = Annotated[
     tuple[Annotated[float, Real(infinite=True)], Annotated[float, Real(infinite=True)]],
-    Expect("two numbers, [lower, upper]; -inf or inf for no bound"), Checked(_in_order),
-]  # fmt: skip
+    Expect("two numbers, [lower, upper]; -inf or inf for no bound"),
+    Checked(_in_order),
+]
 
 
 @strict

@@ -90,9 +90,13 @@ class GainRecord:
         """Return the record of estimated gains; `unit` is the torques' unit."""
         told = np.array(found.told)
         return cls(
-            np.where(told == "not told", np.nan, found.gains), np.where(told == "told", found.sigma, np.nan),
-            found.told, found.covariance, f"{unit} per A", found.scale,
-        )  # fmt: skip
+            np.where(told == "not told", np.nan, found.gains),
+            np.where(told == "told", found.sigma, np.nan),
+            found.told,
+            found.covariance,
+            f"{unit} per A",
+            found.scale,
+        )
 
 
 def identify_gains(

@@ -107,9 +107,14 @@ def rows_on(found: Identification, chain: Chain, cases: Sequence[Case]) -> list[
 def cut(rows: ObservationRows, own: slice) -> ObservationRows:
     """Return the part of the rows in a slice."""
     return replace(
-        rows, matrix=rows.matrix[own], target=rows.target[own], present=rows.present[own], block=rows.block[own],
-        standing=rows.standing[own], swing=rows.swing[own],
-    )  # fmt: skip
+        rows,
+        matrix=rows.matrix[own],
+        target=rows.target[own],
+        present=rows.present[own],
+        block=rows.block[own],
+        standing=rows.standing[own],
+        swing=rows.swing[own],
+    )
 
 
 def inverted(upper: np.ndarray) -> np.ndarray:
@@ -216,9 +221,16 @@ def propagate(
         own = np.sqrt(np.clip(np.diag(covariance)[:count], 0.0, None))
         deviations[:count] = np.where(own > 0.0, own, np.nan)
     return GeometryUncertainty(
-        found.names, (*chain.names, *TILTS), (*chain.units, *("rad" for _ in TILTS)), matrix,
-        found.fitted.estimate.covariance, deviations, geometry, felt, left,
-    )  # fmt: skip
+        found.names,
+        (*chain.names, *TILTS),
+        (*chain.units, *("rad" for _ in TILTS)),
+        matrix,
+        found.fitted.estimate.covariance,
+        deviations,
+        geometry,
+        felt,
+        left,
+    )
 
 
 def sensitivity(
@@ -235,9 +247,12 @@ def sensitivity(
 
 
 def solve_sensitivity(
-    found: Identification[Any], cases: Sequence[Case], differences: Callable[..., tuple[np.ndarray, np.ndarray]],
-    samples: int, progress: Progress | None = None,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    found: Identification[Any],
+    cases: Sequence[Case],
+    differences: Callable[..., tuple[np.ndarray, np.ndarray]],
+    samples: int,
+    progress: Progress | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the results of `sensitivity` for any robot, K changes of whose geometry `differences` evaluates.
 
     Args:
@@ -315,9 +330,13 @@ def pieces(case: Case, decimator: Decimator, step: int = 1, min_piece: int = 32)
 
 
 def _differences(
-    found: Identification, moved: Sequence[tuple[Bodies, Bodies]], case: Case, span: slice, residual: np.ndarray,
+    found: Identification,
+    moved: Sequence[tuple[Bodies, Bodies]],
+    case: Case,
+    span: slice,
+    residual: np.ndarray,
     decimator: Decimator,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+) -> tuple[np.ndarray, np.ndarray]:
     """Return (∂W/∂g) φ (M, rows, K + 2), filtered and decimated, and (∂W/∂g)ᵀ R⁻¹ (y - W φ) (b, K + 2).
 
     Args:
@@ -406,6 +425,9 @@ def compare(
             alone += np.sum((gain * spread_of) ** 2, axis=1)
             apart += np.sum(((gain - ours) * spread_of) ** 2, axis=1)
     return GeometryComparison(
-        found.names, found.fitted.estimate.units, frozen(np.stack([values + first - second, values])),
-        frozen(np.stack([np.sqrt(alone), carried.sigma])), frozen(np.sqrt(apart)),
-    )  # fmt: skip
+        found.names,
+        found.fitted.estimate.units,
+        frozen(np.stack([values + first - second, values])),
+        frozen(np.stack([np.sqrt(alone), carried.sigma])),
+        frozen(np.sqrt(apart)),
+    )

@@ -96,10 +96,16 @@ def identify(
     nominal = None if robot.nominal is None or not robot.moved else make_model(robot.nominal, settings)
     states = chain_states(chain, nominal or model, settings.seed)
     found = identify_model(
-        model, cases, settings, nominal=nominal, states=states, cad=_known_masses(chain),
+        model,
+        cases,
+        settings,
+        nominal=nominal,
+        states=states,
+        cad=_known_masses(chain),
         shape=np.where(model.bodies.coordinates[:, None] >= 0, rods(chain, model), 0.0).ravel(),
-        effort=_torque_limits(chain), progress=progress,
-    )  # fmt: skip
+        effort=_torque_limits(chain),
+        progress=progress,
+    )
     return cast(Identification, found)  # its model is the chain's
 
 
@@ -174,17 +180,29 @@ def identify_model(
         prior = found(full, groups=np.array(friction.groups), start=prior, tempering=prior.tempering)
         full = tuple(with_weights(full, prior.first.rest))
     problem = IdentificationProblem(
-        model, base, cases, decimator, full, (*own, *friction.terms),
-        np.concatenate([np.full(base.b, -1), friction.groups]), noise, prior, settings.loop, cad,
+        model,
+        base,
+        cases,
+        decimator,
+        full,
+        (*own, *friction.terms),
+        np.concatenate([np.full(base.b, -1), friction.groups]),
+        noise,
+        prior,
+        settings.loop,
+        cad,
         settings.constraints,
-    )  # fmt: skip
+    )
     return _identified(problem, method, friction, settings, say)
 
 
 def _identified(
-    problem: IdentificationProblem, method: Method, friction: FrictionSelection, settings: IdentificationSettings,
+    problem: IdentificationProblem,
+    method: Method,
+    friction: FrictionSelection,
+    settings: IdentificationSettings,
     say: Progress,
-) -> Identification[RegressorModel]:  # fmt: skip
+) -> Identification[RegressorModel]:
     """Return the identification of a problem by a method: estimate, test of its loop, ripple, essential parameters."""
     model, base, cases = problem.model, problem.base, problem.cases
     say("simulating the closed loop" if method.needs_controller else "estimate")
@@ -237,9 +255,16 @@ def _sees_drives(model: RegressorModel) -> TypeGuard[IdentificationModel]:
 
 
 def _richer_friction(
-    model: RegressorModel, base: Base, rows: Sequence[ObservationRows], cases: Sequence[Case], decimator: Decimator,
-    first: FirstFit, prior: Prior | None, settings: IdentificationSettings, progress: Progress | None,
-) -> tuple[FrictionSelection, Sequence[np.ndarray | None]]:  # fmt: skip
+    model: RegressorModel,
+    base: Base,
+    rows: Sequence[ObservationRows],
+    cases: Sequence[Case],
+    decimator: Decimator,
+    first: FirstFit,
+    prior: Prior | None,
+    settings: IdentificationSettings,
+    progress: Progress | None,
+) -> tuple[FrictionSelection, Sequence[np.ndarray | None]]:
     """Return the friction selected on held-out time, and the torques (N, n) that load-dependent terms depend on."""
     nothing: list[np.ndarray | None] = [None] * len(cases)
     if not _sees_drives(model):
@@ -248,11 +273,19 @@ def _richer_friction(
     plain = Dynamics(model, base.to_standard(values))
     loads = nothing if settings.friction in ("standard", "ripple") else [plain.transmitted(case) for case in cases]
     candidates = FrictionCandidates(
-        cases, rows, loads, decimator, std, tau if prior is None else tau * prior.tempering / TEMPERING,
-        np.array(per_joint(settings.v0, model.n, "v0")), model.prismatic,
-        prior, settings.apart, model.torque_rows,
+        cases,
+        rows,
+        loads,
+        decimator,
+        std,
+        tau if prior is None else tau * prior.tempering / TEMPERING,
+        np.array(per_joint(settings.v0, model.n, "v0")),
+        model.prismatic,
+        prior,
+        settings.apart,
+        model.torque_rows,
         frozenset(tuple(sorted({row for row, _ in one.acts})) for one in model.columns if len(one.acts) > 1),
-    )  # fmt: skip
+    )
     return select_friction(candidates, settings.friction, progress), loads
 
 
@@ -347,11 +380,15 @@ def _essential(found: MethodEstimate, settings: IdentificationSettings) -> Elimi
         return None
     data, std, inflation = found.testable()
     return eliminate(
-        data, Rule(settings.essential), ratio=settings.ratio, level=settings.level,
+        data,
+        Rule(settings.essential),
+        ratio=settings.ratio,
+        level=settings.level,
         keep=[bases.standard_name(name, data.names) for name in settings.keep],
         drop=[bases.standard_name(name, data.names) for name in settings.drop],
-        std=std, inflation=inflation,
-    )  # fmt: skip
+        std=std,
+        inflation=inflation,
+    )
 
 
 def _require_constrainable(method: Method, settings: IdentificationSettings) -> None:

@@ -97,18 +97,7 @@ from typing import Annotated, Any
 
 from calib.arguments import checked
 from calib.config import check_keys, inherited, own_table, parse, read_toml, strict
-from calib.config_types import (  # fmt: skip
-    Checked,
-    Expect,
-    JointNumber,
-    Name,
-    Names,
-    OneOf,
-    OneOrMany,
-    Real,
-    Spread,
-    shown,
-)
+from calib.config_types import Checked, Expect, JointNumber, Name, Names, OneOf, OneOrMany, Real, Spread, shown
 from calib.data.recordings.recording import parse_cut
 from calib.data.recordings.recording_options import RecordingOptions
 from calib.data.signals.motion import FilterOptions
@@ -133,9 +122,23 @@ REMOVED = {
 }
 """Keys of earlier versions, and what replaced them."""
 FINDINGS = (
-    "masses", "limit", "speed", "lag", "clock", "order", "zero", "coupling", "sign", "jump", "bodies", "description",
-    "loop", "gravity", "encoder", "payload",
-)  # fmt: skip
+    "masses",
+    "limit",
+    "speed",
+    "lag",
+    "clock",
+    "order",
+    "zero",
+    "coupling",
+    "sign",
+    "jump",
+    "bodies",
+    "description",
+    "loop",
+    "gravity",
+    "encoder",
+    "payload",
+)
 """Names in ``accept``: the codes in chapters 9 and 10 of the catalogue of findings."""
 Texts = Annotated[tuple[Name, ...], Spread(words="a text, or a list of texts")]
 Gains = Annotated[tuple[float, ...], Expect("a list of finite numbers other than zero"), Checked(_no_zero)]
@@ -254,9 +257,13 @@ def options_of(read: IdentifySettings, source: str = "settings") -> IdentifyOpti
         UsageError: for an invalid term, or an unknown payload of a file.
     """
     settings = IdentificationSettings(
-        **{key.name: getattr(read, key.name) for key in fields(Choices)}, sets=read.drives, torque_rows=ROWS[read.rows],
-        couplings=read.coupling, terms=_terms(read.term, source), payloads=read.payload,
-    )  # fmt: skip
+        **{key.name: getattr(read, key.name) for key in fields(Choices)},
+        sets=read.drives,
+        torque_rows=ROWS[read.rows],
+        couplings=read.coupling,
+        terms=_terms(read.term, source),
+        payloads=read.payload,
+    )
     for name, file in read.files.items():
         check_keys(dict.fromkeys(file.payload), read.payload, f'{source}: files."{name}".payload')
     every = FileSettings(read.recording, read.filter, gains=read.gains)

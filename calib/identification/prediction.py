@@ -250,7 +250,5 @@ def predict(dynamics: Dynamics[RegressorModel], case: Case) -> np.ndarray:
     for start in range(0, len(motion), BLOCK):
         part = slice(start, start + BLOCK)
         q, v, a = motion.q[part], motion.v[part], motion.a[part]
-        result[part] = model.torque(
-            dynamics.values, q, v, a, case.carried, states[:, part], **case.deflected(part)
-        )  # fmt: skip
+        result[part] = model.torque(dynamics.values, q, v, a, case.carried, states[:, part], **case.deflected(part))
     return result

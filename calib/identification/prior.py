@@ -192,10 +192,13 @@ def find_prior(
     own = spread @ spread.T
     own[np.diag_indices(base.b)] *= 1.0 + 1e-9
     return Prior(
-        frozen(own + whole_part @ whole_part.T), frozen(np.sqrt(np.diag(own))),
-        {name: float(np.exp(one)) for name, one in zip(sizes.names, t) if name}, source,
-        FirstFit(frozen(std), frozen(tau), frozen(values[: base.b]), rest), tempering,
-    )  # fmt: skip
+        frozen(own + whole_part @ whole_part.T),
+        frozen(np.sqrt(np.diag(own))),
+        {name: float(np.exp(one)) for name, one in zip(sizes.names, t) if name},
+        source,
+        FirstFit(frozen(std), frozen(tau), frozen(values[: base.b]), rest),
+        tempering,
+    )
 
 
 def first_fit(rows: Sequence[ObservationRows], noise: np.ndarray | None = None) -> FirstFit:
@@ -215,9 +218,14 @@ def first_fit(rows: Sequence[ObservationRows], noise: np.ndarray | None = None) 
 
 
 def weighing(
-    rows: Sequence[ObservationRows], data: Triangles, values: np.ndarray, covariance: np.ndarray, std: np.ndarray,
-    tau: np.ndarray, noise: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    rows: Sequence[ObservationRows],
+    data: Triangles,
+    values: np.ndarray,
+    covariance: np.ndarray,
+    std: np.ndarray,
+    tau: np.ndarray,
+    noise: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
     """Return standard deviation and inflation of the residuals (rows,), by their degrees of freedom.
 
     Args:
@@ -341,9 +349,13 @@ def _most_probable(factor: np.ndarray, columns: np.ndarray, sizes: _Sizes, start
         return value, away / sizes.width - np.bincount(sizes.member, slope, len(t))
 
     found = scipy.optimize.minimize(
-        lost, np.clip(start, sizes.least, sizes.most), jac=True, method="L-BFGS-B",
-        bounds=np.column_stack([sizes.least, sizes.most]), options={"maxiter": 60, "ftol": 1e-8},
-    )  # fmt: skip
+        lost,
+        np.clip(start, sizes.least, sizes.most),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=np.column_stack([sizes.least, sizes.most]),
+        options={"maxiter": 60, "ftol": 1e-8},
+    )
     return np.asarray(found.x)
 
 
@@ -370,7 +382,7 @@ STEPS = (TEMPERING, 2.0 * TEMPERING, 4.0 * TEMPERING)
 
 def tempered_prior(
     find: Callable[..., Prior], found: Prior, rows: Sequence[ObservationRows], regimes: Regimes
-) -> Prior:  # fmt: skip
+) -> Prior:
     """Return the prior with the tempering that best predicts held-out ranges of motion.
 
     Errors are squares of all rows, each in units of its residuals, and their geometric mean over the regimes: where

@@ -179,11 +179,15 @@ class ObservationRows:
         """
         place = np.arange(count) == own
         return replace(
-            self, matrix=np.where(place[:, None], self.matrix, 0.0), target=np.where(place, self.target, 0.0),
-            present=self.present & place, standing=np.repeat(self.standing, count, axis=1),
-            swing=np.repeat(self.swing, count, axis=1), rest=_no_rest(count),
+            self,
+            matrix=np.where(place[:, None], self.matrix, 0.0),
+            target=np.where(place, self.target, 0.0),
+            present=self.present & place,
+            standing=np.repeat(self.standing, count, axis=1),
+            swing=np.repeat(self.swing, count, axis=1),
+            rest=_no_rest(count),
             coulomb=np.repeat(self.coulomb, count, axis=0),
-        )  # fmt: skip
+        )
 
     def extend(self, terms: Sequence[DriveTerm], columns: np.ndarray) -> ObservationRows:
         """Return rows with columns (M, rows, k) appended."""
@@ -238,9 +242,18 @@ def observe(model: RegressorModel, columns: np.ndarray, case: Case, decimator: D
     rate, block = motion.rate / decimator.factor, np.zeros(len(target), dtype=int)
     standing, coulomb = np.zeros(target.shape), np.zeros((model.rows, len(columns)), dtype=bool)
     return ObservationRows(
-        names, units, matrix, target, present, block, rate, standing, np.zeros(target.shape), _no_rest(model.rows),
+        names,
+        units,
+        matrix,
+        target,
+        present,
+        block,
+        rate,
+        standing,
+        np.zeros(target.shape),
+        _no_rest(model.rows),
         coulomb,
-    )  # fmt: skip
+    )
 
 
 def _no_rest(rows: int) -> RestWeights:
@@ -249,9 +262,12 @@ def _no_rest(rows: int) -> RestWeights:
 
 
 def observe_terms(
-    terms: Sequence[DriveTerm], case: Case, decimator: Decimator, load: np.ndarray | None = None,
+    terms: Sequence[DriveTerm],
+    case: Case,
+    decimator: Decimator,
+    load: np.ndarray | None = None,
     torque_rows: TorqueRows = MOTOR,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """Return the regressor columns of drive terms (M, rows, k), filtered and decimated.
 
     One column at a time at the full rate: an hour of all friction there is would fill 15 GB.

@@ -78,9 +78,15 @@ def estimated_columns(dynamics: Dynamics, names: Sequence[str]) -> np.ndarray:
 
 
 def parameter_variances(
-    dynamics: Dynamics, columns: np.ndarray, covariance: np.ndarray, q: np.ndarray, v: np.ndarray,
-    a: np.ndarray, carried: Collection[str] | None = None, states: np.ndarray | None = None,
-) -> np.ndarray:  # fmt: skip
+    dynamics: Dynamics,
+    columns: np.ndarray,
+    covariance: np.ndarray,
+    q: np.ndarray,
+    v: np.ndarray,
+    a: np.ndarray,
+    carried: Collection[str] | None = None,
+    states: np.ndarray | None = None,
+) -> np.ndarray:
     """Return the variances w Σ wᵀ (N, rows) of torques, for columns (k,) with covariance Σ (k, k) [N² m² or N²].
 
     Args:
@@ -197,9 +203,14 @@ class TorqueErrorModel:
     discrepancy: TorqueDiscrepancy
 
     def sigma(
-        self, dynamics: Dynamics, q: np.ndarray, v: np.ndarray, a: np.ndarray,
-        carried: Collection[str] | None = None, states: np.ndarray | None = None,
-    ) -> np.ndarray:  # fmt: skip
+        self,
+        dynamics: Dynamics,
+        q: np.ndarray,
+        v: np.ndarray,
+        a: np.ndarray,
+        carried: Collection[str] | None = None,
+        states: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Return standard deviations (N, rows) of the errors of predicted torques [N m or N]; 1.96 of them cover 95 %.
 
         Args:
@@ -274,9 +285,13 @@ class TorqueIntervals:
     def coverage(self) -> IntervalCoverage:
         """Return the record of the shares of errors within their intervals."""
         return IntervalCoverage(
-            100.0 * self.covered, 100.0 * self.joints, self.median, int(self.known.sum()),
-            100.0 * float(self.beyond.mean()), self.median_at_rest,
-        )  # fmt: skip
+            100.0 * self.covered,
+            100.0 * self.joints,
+            self.median,
+            int(self.known.sum()),
+            100.0 * float(self.beyond.mean()),
+            self.median_at_rest,
+        )
 
     def ways(self, joints: Sequence[str]) -> list[str]:
         """Return texts on how the motion leaves the training range: by q, v or a, and at which of the named joints."""
@@ -392,11 +407,16 @@ def _samples(found: Identification, cases: Sequence[Case]) -> _Samples:
     matrices = [_together(rows.matrix, errors[0].shape[1]) for rows in found.rows]
     everything = range(triangles.groups // len(found.fitted.std))
     return _Samples(
-        np.concatenate(states, axis=1), np.concatenate(torques), np.concatenate(errors),
-        np.concatenate(matrices), np.concatenate(blocks), np.concatenate(whole),
-        np.concatenate(parts), triangles,
+        np.concatenate(states, axis=1),
+        np.concatenate(torques),
+        np.concatenate(errors),
+        np.concatenate(matrices),
+        np.concatenate(blocks),
+        np.concatenate(whole),
+        np.concatenate(parts),
+        triangles,
         _estimate(found, triangles, everything)[0],
-    )  # fmt: skip
+    )
 
 
 def _together(matrix: np.ndarray, rows: int) -> np.ndarray:

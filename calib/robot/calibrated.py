@@ -373,10 +373,15 @@ def _covariance(path: Path, names: tuple[str, ...]) -> np.ndarray | None:
 def _deflection_table(corrections: CorrectedChain) -> dict[str, Any]:
     deflection, names = corrections.deflection, corrections.chain.joint_names
     terms = [
-        {"element": term.element, "basis": term.basis, "joint": names[term.source], "order": term.order,
-         "coefficient": float(value)}
+        {
+            "element": term.element,
+            "basis": term.basis,
+            "joint": names[term.source],
+            "order": term.order,
+            "coefficient": float(value),
+        }
         for term, value in zip(deflection.terms, np.asarray(deflection.coefficients))
-    ]  # fmt: skip
+    ]
     if (reference := deflection.reference) is None:
         return {"term": terms}
     described, known = corrections.chain.inertias, reference.inertias

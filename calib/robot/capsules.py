@@ -294,9 +294,15 @@ class Capsules:
         ]
         attached = [np.concatenate([[one.body], one.start, one.end]) for one in self.beside]
         return (
-            np.array(form), np.array(place), min(self.chain.floor, 0.0), np.array(attached).reshape(-1, 7),
-            self.targets, self.own, self.radii, np.array(faces).reshape(-1, 5),
-        )  # fmt: skip
+            np.array(form),
+            np.array(place),
+            min(self.chain.floor, 0.0),
+            np.array(attached).reshape(-1, 7),
+            self.targets,
+            self.own,
+            self.radii,
+            np.array(faces).reshape(-1, 5),
+        )
 
     @cached_property
     def _with_obstacles(self) -> Capsules | None:
@@ -437,9 +443,18 @@ def from_chain(
     planes = (*([] if floor is None else [Wall("floor", np.array([0.0, 0.0, 1.0]), floor)]), *walls)
     world = [(i, k) for k in range(len(planes) + len(obstacles)) for i in there if bodies[i]]
     found = Capsules(
-        chain, tuple(names), bodies, radii, there, places, np.array(own, dtype=int).reshape(-1, 2),
-        np.array(world, dtype=int).reshape(-1, 2), planes, tuple(obstacles), beside=tuple(beside),
-    )  # fmt: skip
+        chain,
+        tuple(names),
+        bodies,
+        radii,
+        there,
+        places,
+        np.array(own, dtype=int).reshape(-1, 2),
+        np.array(world, dtype=int).reshape(-1, 2),
+        planes,
+        tuple(obstacles),
+        beside=tuple(beside),
+    )
     if not found.pairs:
         return found
     fixed = np.arange(len(own) + len(world)) >= len(own)

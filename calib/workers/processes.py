@@ -115,8 +115,9 @@ def _lost(number: int, task: _Task, error: Died) -> TaskLost:
     return TaskLost(
         f"task {number + 1} ({shortened(given)}) is lost: {error}. The usual cause is too little memory: run "
         "fewer tasks at once",
-        number, given,
-    )  # fmt: skip
+        number,
+        given,
+    )
 
 
 def run_call(

@@ -236,9 +236,15 @@ def climb(
     options = {"maxiter": evaluations, "ftol": 1e-2 * tolerance}
     try:
         run = scipy.optimize.minimize(
-            negative, start.ravel(), jac=True, method="SLSQP", bounds=bounds, constraints=kept, callback=accepted,
+            negative,
+            start.ravel(),
+            jac=True,
+            method="SLSQP",
+            bounds=bounds,
+            constraints=kept,
+            callback=accepted,
             options=options,
-        )  # fmt: skip
+        )
         last = np.asarray(run.x).reshape(m, n)
     except _Ended:
         pass

@@ -65,18 +65,27 @@ def design(
     best = min(polished or search.found, key=lambda one: one.merit)
     share = sum(one.feasible * one.evaluations for one in search.found) / search.spent
     return replace(
-        best, evaluations=search.spent, feasible=share, seconds=time.perf_counter() - began,
+        best,
+        evaluations=search.spent,
+        feasible=share,
+        seconds=time.perf_counter() - began,
         interrupted=search.interrupted,
-    )  # fmt: skip
+    )
 
 
 class _Starts:
     """Searches from several starts, in rounds."""
 
     def __init__(
-        self, problem: ExcitationProblem, evaluations: int, method: Method, seed: int, map: Callable,
-        report: Callable[[int, int, str], None] | None, starts: int,
-    ):  # fmt: skip
+        self,
+        problem: ExcitationProblem,
+        evaluations: int,
+        method: Method,
+        seed: int,
+        map: Callable,
+        report: Callable[[int, int, str], None] | None,
+        starts: int,
+    ):
         self.problem, self.arguments, self.map, self.report = problem, (evaluations, method, seed), map, report
         self.found, self.stuck = list[SearchResult](), list[Stuck]()
         self.done, self.total = 0, starts + _kept(starts)
@@ -126,8 +135,10 @@ def _nothing(problem: ExcitationProblem, stuck: list[Stuck], starts: int) -> Not
                 f"the hard goal {goal.words or f'{goal.objective.name} ≤ {goal.goal:g}'} was not reached in "
                 f"{_counted(starts)}, though all limits were kept: the nearest motion has {goal.stated(value):.4g}; "
                 "relax it, give it a weight, or take a longer period",
-                goal.objective.name, lacking, "of the goal",
-            )  # fmt: skip
+                goal.objective.name,
+                lacking,
+                "of the goal",
+            )
     worst = max(problem.constraints, key=lambda c: float((c.values(motion) / c.scale).max()), default=None)
     if worst is None:
         raise NotExciting(f"no motion could be evaluated: {best.reason}")
@@ -138,8 +149,10 @@ def _nothing(problem: ExcitationProblem, stuck: list[Stuck], starts: int) -> Not
         f"no feasible motion in {_counted(starts)}: the nearest one breaks the {worst.name} limit "
         f"({worst.labels[column]}) by {max(excess, 0.0):.3g} {worst.unit} at t = {motion.times[row]:.3g} s; widen that "
         "limit or take a longer period",
-        worst.name, excess, worst.unit,
-    )  # fmt: skip
+        worst.name,
+        excess,
+        worst.unit,
+    )
 
 
 def _counted(starts: int) -> str:

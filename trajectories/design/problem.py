@@ -195,10 +195,15 @@ def evaluate(problem: ExcitationProblem, basis: Basis, y: np.ndarray, sharpness:
     inside = np.broadcast_to(problem.tightening, len(problem.constraints))
     parts = tuple(smoothed(c, motion, sharpness[1], float(own)) for c, own in zip(problem.constraints, inside))
     return Evaluation(
-        problem, basis, motion, factor, sharpness[0], parts,
+        problem,
+        basis,
+        motion,
+        factor,
+        sharpness[0],
+        parts,
         np.concatenate([np.zeros(0), *(part.values for part in parts)]),
         max((part.excess for part in parts), default=-np.inf),
-    )  # fmt: skip
+    )
 
 
 def critical_times(

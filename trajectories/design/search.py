@@ -237,9 +237,18 @@ class StartSearch:
                 records.append(k)
         history, times = tuple(self.history[k] for k in records), tuple(self.times[k] for k in records)
         return SearchResult(
-            best[:p], factor, self.merit, self.values, history, self.count, self.kept / self.count, seconds, seed,
-            self.interrupted, times,
-        )  # fmt: skip
+            best[:p],
+            factor,
+            self.merit,
+            self.values,
+            history,
+            self.count,
+            self.kept / self.count,
+            seconds,
+            seed,
+            self.interrupted,
+            times,
+        )
 
     def at(self, y: np.ndarray) -> Evaluation:
         """Return the evaluation of a point, computed once; remember the best feasible one."""
@@ -361,9 +370,14 @@ class StartSearch:
             bounds = np.column_stack(self._ends(size))
         try:
             found = minimize(
-                value, start, method="SLSQP", jac=gradient, bounds=bounds, constraints=[kept] if rows else (),
+                value,
+                start,
+                method="SLSQP",
+                jac=gradient,
+                bounds=bounds,
+                constraints=[kept] if rows else (),
                 options={"maxiter": max(2, last - self.count), "ftol": tolerance},
-            )  # fmt: skip
+            )
         except _Spent:
             return self._tried
         except NotExciting as error:

@@ -129,9 +129,12 @@ def ensured(
         found = replace(found, evaluations=found.evaluations + again.evaluations)
         if isinstance(again, SearchResult):
             found = replace(
-                again, history=original.history, evaluations=found.evaluations, seconds=found.seconds + again.seconds,
+                again,
+                history=original.history,
+                evaluations=found.evaluations,
+                seconds=found.seconds + again.seconds,
                 interrupted=found.interrupted or again.interrupted,
-            )  # fmt: skip
+            )
             report = verified(found.x)
     for share in 0.8 ** np.arange(21):
         small = shrunk(problem, found.x, share)
@@ -141,8 +144,10 @@ def ensured(
     raise NothingFeasible(
         f"feasible at the samples, but between them the {worst.name} limit ({worst.label}) is broken by "
         f"{-worst.margin:.3g} {worst.unit} at t = {worst.time:.3g} s; widen that limit or take a longer period",
-        worst.name, -worst.margin, worst.unit,
-    )  # fmt: skip
+        worst.name,
+        -worst.margin,
+        worst.unit,
+    )
 
 
 def _margins(
@@ -166,8 +171,14 @@ def _margins(
         margin = -float(reached[row, k])
         result.append(
             Margin(
-                constraint.name, label, constraint.unit, margin, margin / float(constraint.scale[k]),
-                float(motion.times[row]), float(allowance[row, k]), proved,
+                constraint.name,
+                label,
+                constraint.unit,
+                margin,
+                margin / float(constraint.scale[k]),
+                float(motion.times[row]),
+                float(allowance[row, k]),
+                proved,
             )
-        )  # fmt: skip
+        )
     return result

@@ -79,8 +79,10 @@ def _follow(forward: Forward, jacobian: Forward, start: np.ndarray, targets: np.
                 f"no tool line: at {k / (len(targets) - 1):.0%} of it the arm stays {1e3 * short:.3g} mm and "
                 f"{np.degrees(turn):.3g} deg short (out of reach, or the elbow must flip); take waypoints closer "
                 "to each other, another posture at the start, or joint motion",
-                "reach", short, "m",
-            )  # fmt: skip
+                "reach",
+                short,
+                "m",
+            )
         found.append(q)
     return np.array(found)
 

@@ -139,8 +139,10 @@ def fastest(rows: _Bounded, s: np.ndarray) -> Profile:
         k = int(np.flatnonzero(~np.isfinite(most)).max())
         raise NothingFeasible(
             f"no motion: no speed at {s[k] / s[-1]:.0%} of the path allows a stop at its end within the limits",
-            "torque", float("nan"), "N m",
-        )  # fmt: skip
+            "torque",
+            float("nan"),
+            "N m",
+        )
     x = np.zeros(len(s))
     for k, step in enumerate(np.diff(s)):
         x[k + 1] = min(max(x[k] + 2 * step * _largest(rows, k, x[k], step), 0.0), most[k + 1])
@@ -149,8 +151,10 @@ def fastest(rows: _Bounded, s: np.ndarray) -> Profile:
         k = int(np.argmax(x[1:-1] <= 0)) + 1
         raise NothingFeasible(
             f"no motion: it comes to a stop at {s[k] / s[-1]:.0%} of the path, within these limits",
-            "torque", float("nan"), "N m",
-        )  # fmt: skip
+            "torque",
+            float("nan"),
+            "N m",
+        )
     return Profile(s, x)
 
 

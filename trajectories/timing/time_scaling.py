@@ -173,8 +173,10 @@ def _check_holding(path: Path, limits: TimingLimits, law: Law, s: np.ndarray) ->
                 f"no motion: to {doing} at {s[k] / path.length:.0%} of the path, joint {j + 1} needs "
                 f"{abs(torque[k, j]):.4g} N m, its limit is {limits.torque[j]:.4g} ({excess[k, j]:.3g} short); "
                 "take another path, a smaller payload, or check the limits",
-                f"torque of joint {j + 1}", float(excess[k, j]), "N m",
-            )  # fmt: skip
+                f"torque of joint {j + 1}",
+                float(excess[k, j]),
+                "N m",
+            )
 
 
 def _grid_points(path: Path, count: int | None = None) -> np.ndarray:
@@ -203,5 +205,7 @@ def _not_settled(excess: dict[str, np.ndarray]) -> NothingFeasible:
     return NothingFeasible(
         f"the timing did not converge: the {name} of joint {j + 1} exceeds its limit by {worst:.2g} of it between grid "
         "points; try a path with gentler bends, or more grid points",
-        f"{name} of joint {j + 1}", worst, "of the limit",
-    )  # fmt: skip
+        f"{name} of joint {j + 1}",
+        worst,
+        "of the limit",
+    )

@@ -21,9 +21,11 @@ MATRIX = Column(tuple(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)))
 ANGLES = tuple(tuple(names.split()) for names in ("rx ry rz", "roll pitch yaw", "a b c", "w p r", "rpy_x rpy_y rpy_z"))
 TURNS = Column(ANGLES[0], "angle", "orientation", BOUNDS.max_turn, "deg")
 SIGMA = Column(
-    ("sigma_x", "sigma_y", "sigma_z"), "length", "sigma",
+    ("sigma_x", "sigma_y", "sigma_z"),
+    "length",
+    "sigma",
     positive="a sigma must be above 0; where it was rounded to 0, set sigma.floor in the options",
-)  # fmt: skip
+)
 SIGMA_ROTATION = Column(
     ("sigma_rx", "sigma_ry", "sigma_rz"), "angle", "sigma_rotation", positive="a sigma must be above 0"
 )

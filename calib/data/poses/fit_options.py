@@ -53,7 +53,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from calib.config import inherited, own_table, parse, read_toml, strict
-from calib.config_types import Expect, Flag, Hidden, Label, Name, Names, OneOf, Positive, Real, Spread  # fmt: skip
+from calib.config_types import Expect, Flag, Hidden, Label, Name, Names, OneOf, Positive, Real, Spread
 from calib.data.poses import IN_HAND, MIN_SIGMA, TO_HAND, Loss, Model
 from calib.data.poses.measurements import KINDS
 from calib.errors import refuse_option, suggestion

@@ -74,9 +74,13 @@ class PoseMeasurements:
 
     @staticmethod
     def of(
-        q: ArrayLike, position: ArrayLike, quaternion: ArrayLike | None = None, *,
-        joint_names: Sequence[str] = (), **more: Any,
-    ) -> Positions:  # fmt: skip
+        q: ArrayLike,
+        position: ArrayLike,
+        quaternion: ArrayLike | None = None,
+        *,
+        joint_names: Sequence[str] = (),
+        **more: Any,
+    ) -> Positions:
         """Return measurements from arrays: positions, or poses if `quaternion` is given.
 
         Args:

@@ -107,9 +107,11 @@ def unit_quaternions(values: np.ndarray, source: Rows, columns: Sequence[str]) -
     norm = np.linalg.norm(values, axis=1)
     rest = "not 1: were columns rounded or swapped, or are they not a quaternion?"
     refuse(
-        source, np.abs(norm - 1) > BOUNDS.max_norm_error, columns,
+        source,
+        np.abs(norm - 1) > BOUNDS.max_norm_error,
+        columns,
         lambda row, _: f"the quaternion {', '.join(columns)} has norm {norm[row]:.4g}, {rest}",
-    )  # fmt: skip
+    )
     return values / norm[:, None]
 
 

@@ -75,10 +75,14 @@ def read_groups(sheet: Sheet, layout: Layout, q: np.ndarray) -> GroupedMeasureme
     tool_names, tool = labels(table, (layout.tool,)) if layout.tool else ((options.tool,), np.zeros(len(q), dtype=int))
     single = [name for name, size in zip(names, np.bincount(group)) if size == 1]
     common: dict[str, Any] = {
-        "group": group, "group_names": names, "tool": tool, "tool_names": tool_names, "file": table.file,
+        "group": group,
+        "group_names": names,
+        "tool": tool,
+        "tool_names": tool_names,
+        "file": table.file,
         "rows": table.rows,
         "notes": (f"{layout.kind} {', '.join(single[:5])}: a group of one row determines nothing",) if single else (),
-    }  # fmt: skip
+    }
     stated = None if options.sigma.position is None else np.tile(options.sigma.position, (len(q), 1))
     if layout.kind == Sockets.kind:
         return Sockets(q, layout.joints, sigma=stated, links=_links(sheet, layout, group), **common)
@@ -281,14 +285,18 @@ def _read_targets(sheet: Sheet, layout: Layout, q: np.ndarray) -> Positions:
     sigma = _sigma(sheet, layout, seen)
     unseen = len(seen) - np.sum(seen, axis=0)
     common: dict[str, Any] = {
-        "sigma": None if sigma is None else sigma[index, target], "tool": tool, "tool_names": names,
-        "file": table.file, "rows": table.rows[index], "late": _late(sheet, layout, index),
+        "sigma": None if sigma is None else sigma[index, target],
+        "tool": tool,
+        "tool_names": names,
+        "file": table.file,
+        "rows": table.rows[index],
+        "late": _late(sheet, layout, index),
         "notes": tuple(
             f"{', '.join(names)}: not seen in {count} of {len(seen)} rows"
             for names, count in zip(layout.positions, unseen)
             if count
         ),
-    }  # fmt: skip
+    }
     block = Positions(q[index], layout.joints, position[index, target], **common)
     if layout.kind == Poses.kind:
         turns, about = plausible.orientation(sheet, layout.orientation), _sigma_rotation(sheet, layout)

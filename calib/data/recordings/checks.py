@@ -159,10 +159,14 @@ def _drop_spikes(recording: Recording, joints: Joints | None) -> Recording:
     columns, median = _columns(recording, "effort"), f"where {1 - LIMITS.max_unit_share:.0%} of the rows are within"
     if rows.sum() > few:
         refuse(
-            recording, wild, columns,
-            lambda row, j: f"is {recording.effort[row, j]:.4g} at {recording.t[row]:.6g} s, {median} {usual[j]:.4g} of "
-            "its median: spikes of the log? They are too many to ignore; cut those parts out",
-        )  # fmt: skip
+            recording,
+            wild,
+            columns,
+            lambda row, j: (
+                f"is {recording.effort[row, j]:.4g} at {recording.t[row]:.6g} s, {median} {usual[j]:.4g} of "
+                "its median: spikes of the log? They are too many to ignore; cut those parts out"
+            ),
+        )
     row, j = np.argwhere(wild)[0]
     note = (
         f"row {recording.rows[row]}: the {columns[j]} is {recording.effort[row, j]:.4g} at {recording.t[row]:.6g} s"
@@ -201,15 +205,23 @@ def _check_time(recording: Recording) -> None:
     if len(step) and (step < 0).all():
         refuse_data(recording.file, "time runs backwards in every row: reverse the order of the rows")
     refuse(
-        recording, back, ["t"],
-        lambda i, _: f"time goes back from {t[i - 1]:.6g} s to {t[i]:.6g} s: were two logs joined, or was the clock "
-        f"set? Cut the file there{_sound_part(recording, back)}",
-    )  # fmt: skip
+        recording,
+        back,
+        ["t"],
+        lambda i, _: (
+            f"time goes back from {t[i - 1]:.6g} s to {t[i]:.6g} s: were two logs joined, or was the clock "
+            f"set? Cut the file there{_sound_part(recording, back)}"
+        ),
+    )
     refuse(
-        recording, stands, ["t"],
-        lambda i, _: f"two samples have the stamp {t[i]:.6g} s but different values: is the clock too coarse? Number "
-        "the samples, or remove one of each pair",
-    )  # fmt: skip
+        recording,
+        stands,
+        ["t"],
+        lambda i, _: (
+            f"two samples have the stamp {t[i]:.6g} s but different values: is the clock too coarse? Number "
+            "the samples, or remove one of each pair"
+        ),
+    )
     rate = 1 / float(np.median(step))
     if not LIMITS.min_rate <= rate <= LIMITS.max_rate:
         units = {"ms": 1e3, "us": 1e6, "ns": 1e9}
@@ -228,9 +240,14 @@ def _check_size(recording: Recording, joints: Joints | None = None) -> None:
         reach = 2 * np.maximum(np.abs(joints.lower), np.abs(joints.upper))
         most = np.where(np.isfinite(reach), np.maximum(most, reach), most)
     check_travel(
-        recording.q, most, recording, _columns(recording, "q"), recording.joint_names, kinds,
+        recording.q,
+        most,
+        recording,
+        _columns(recording, "q"),
+        recording.joint_names,
+        kinds,
         lambda j, other: _likely_unit(recording, j, other),
-    )  # fmt: skip
+    )
 
 
 def _likely_unit(recording: Recording, joint: int, other: str) -> str:

@@ -45,20 +45,40 @@ SYNONYMS: Mapping[str, tuple[str, ...]] = {
     "tau_motor": ("tau_motor", "tau_m", "motor_torque"),
     "q_link": ("q_link", "link_position"),
     "q_ref": (
-        "q_ref", "q_des", "q_cmd", "q_desired", "q_reference", "q_command", "q_target", "position_reference",
-        "position_command", "desired_position", "reference_position", "target_position", "target_q", "q_d",
+        "q_ref",
+        "q_des",
+        "q_cmd",
+        "q_desired",
+        "q_reference",
+        "q_command",
+        "q_target",
+        "position_reference",
+        "position_command",
+        "desired_position",
+        "reference_position",
+        "target_position",
+        "target_q",
+        "q_d",
     ),
     "tau_ff": ("tau_ff", "tau_feedforward", "torque_feedforward"),
-}  # fmt: skip
+}
 MEASURED = ("actual", "measured", "state", "robot")
 _NUMBER = re.compile(r"\d+(?!.*\d)")
 MAX_LAG = 1.0  # largest lag that is believed [s] (our choice)
 RATES = ("frequency", "rate", "sample_rate", "fs")
 KEYS_BESIDE_SERIES = ("joint_names", "drive_gain", "use_range")
 SCALES = {
-    "t": TIMES, "q": POSITIONS, "v": VELOCITIES, "torque": EFFORTS, "current": CURRENTS, "tau_link": EFFORTS,
-    "tau_motor": EFFORTS, "tau_ff": EFFORTS, "q_link": POSITIONS, "q_ref": POSITIONS,
-}  # fmt: skip
+    "t": TIMES,
+    "q": POSITIONS,
+    "v": VELOCITIES,
+    "torque": EFFORTS,
+    "current": CURRENTS,
+    "tau_link": EFFORTS,
+    "tau_motor": EFFORTS,
+    "tau_ff": EFFORTS,
+    "q_link": POSITIONS,
+    "q_ref": POSITIONS,
+}
 
 
 def _ours(names: Any) -> Any:

@@ -159,15 +159,28 @@ class Motion:
 
 
 ROWS = (
-    "t", "q", "v", "a", "effort", "weight", "segment", "tau_link", "tau_motor", "q_link", "q_ref", "tau_ff",
+    "t",
+    "q",
+    "v",
+    "a",
+    "effort",
+    "weight",
+    "segment",
+    "tau_link",
+    "tau_motor",
+    "q_link",
+    "q_ref",
+    "tau_ff",
     "v_measured",
-)  # fmt: skip
+)
 
 
 def make_motion(
-    recording: Recording, options: FilterOptions | None = None, sampled: Resampled | None = None,
+    recording: Recording,
+    options: FilterOptions | None = None,
+    sampled: Resampled | None = None,
     cutoffs: Cutoffs | None = None,
-) -> Motion:  # fmt: skip
+) -> Motion:
     """Return the motion of a recording: resampled to an even grid, low-passed without phase shift, differentiated.
 
     Args:

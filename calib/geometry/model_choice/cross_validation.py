@@ -138,9 +138,13 @@ class FoldStatistics:
         square[rigid, rigid] += 1.0 / self.plausible**2
         _, groups = np.unique(self.coordinates.groups[index], return_inverse=True)
         return relevance(
-            Gram(square, data.cross[index], data.total, data.rows), groups - int(self.rigid > 0), begin, iterations,
-            SETTLED, self.coordinates.counts[index],
-        )  # fmt: skip
+            Gram(square, data.cross[index], data.total, data.rows),
+            groups - int(self.rigid > 0),
+            begin,
+            iterations,
+            SETTLED,
+            self.coordinates.counts[index],
+        )
 
 
 def fold_statistics(
@@ -177,8 +181,9 @@ def fold_statistics(
     whole = list(chain(*shares)) if pooled else rows_of.statistics([np.arange(len(b)) for b in measured])[0]
     coordinates = condensed(
         lambda columns: sum(factor * own.square[np.ix_(columns, columns)] for own, factor, _ in whole),
-        np.concatenate([np.full(rigid, -1), groups]).astype(int), np.concatenate([np.ones(rigid), sizes]),
-    )  # fmt: skip
+        np.concatenate([np.full(rigid, -1), groups]).astype(int),
+        np.concatenate([np.ones(rigid), sizes]),
+    )
     shares = [[(coordinates.gram(data), white, metric) for data, white, metric in own] for own in shares]
     held_out, each = ([_sum(own, in_metres) for own in shares] for in_metres in (True, False))
     total = sum(each[1:], each[0]) if pooled else coordinates.gram(_sum(whole))

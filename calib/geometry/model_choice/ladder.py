@@ -195,9 +195,15 @@ def select_model(
     """
     one_of(model, ("auto", *MODELS), "model", UsageError)
     climber = _Climber(
-        cell, measured, settings or Settings(), NONE if fixed is None else fixed, prior,
-        folds or transfer_folds(measured, seed), progress or (lambda done, total, what: None), seed,
-    )  # fmt: skip
+        cell,
+        measured,
+        settings or Settings(),
+        NONE if fixed is None else fixed,
+        prior,
+        folds or transfer_folds(measured, seed),
+        progress or (lambda done, total, what: None),
+        seed,
+    )
     climber.rigid(model)
     if climber.settings.loss == "auto" and climber.best.outliers(MAX_RESIDUAL):
         climber = replace(climber, settings=replace(climber.settings, loss="cauchy"))
@@ -334,9 +340,13 @@ class _Climber:
         free = np.concatenate([rigid.free, layout(cell).index("deflection")])
         own = np.full(len(rigid.free), np.inf) if rigid.prior is None else rigid.prior
         found = fit_with_prior(
-            cell, prepare(cell, self.measured), free, np.concatenate([own, ridge[ridge > 0.0]]),
-            settings=self.settings, nominal=replace(cell, chain=reference),
-        )  # fmt: skip
+            cell,
+            prepare(cell, self.measured),
+            free,
+            np.concatenate([own, ridge[ridge > 0.0]]),
+            settings=self.settings,
+            nominal=replace(cell, chain=reference),
+        )
         return replace(found, start=rigid.start, split=rigid.split, candidates=rigid.candidates)
 
     def _terms(self, effect: str, poses_per_order: int = 8) -> list[Term]:
@@ -360,9 +370,16 @@ class _Climber:
         loss = "none" if self.settings.loss == "auto" else self.settings.loss
         known = self.nominal.cell.known.terms
         return ModelSelection(
-            self.best, self.nominal, self.stiff, tuple(self.rungs), self.chosen, self.folds, loss, self.offered,
+            self.best,
+            self.nominal,
+            self.stiff,
+            tuple(self.rungs),
+            self.chosen,
+            self.folds,
+            loss,
+            self.offered,
             None if known else self.error,
-        )  # fmt: skip
+        )
 
 
 def _declined(tried: UnseenErrors, error: UnseenErrors) -> str:

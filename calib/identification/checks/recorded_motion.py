@@ -71,11 +71,14 @@ def locate(recording: Recording, motion: DesignedMotion) -> LocatedMotion | None
     played = q[found.rows] - np.tile(reference, (found.periods, 1))[: len(q[found.rows])]
     tracking = np.sqrt(np.mean(played**2, axis=0))
     return LocatedMotion(
-        start=max(float(recording.t[0]), float(start) - EDGE_TIME), stop=min(float(recording.t[-1]), float(stop) +
-        EDGE_TIME), began=float(start) + STEP * found.lag, periods=found.periods,
-        tracking=tuple(map(float, tracking)), likeness=min(found.likeness),
+        start=max(float(recording.t[0]), float(start) - EDGE_TIME),
+        stop=min(float(recording.t[-1]), float(stop) + EDGE_TIME),
+        began=float(start) + STEP * found.lag,
+        periods=found.periods,
+        tracking=tuple(map(float, tracking)),
+        likeness=min(found.likeness),
         loosest=int(np.argmax(tracking / np.maximum(np.std(reference, axis=0), 1e-9))),
-    )  # fmt: skip
+    )
 
 
 def another_motion(recording: Recording, motion: DesignedMotion, others: Mapping[str, DesignedMotion]) -> Change | None:
@@ -164,9 +167,13 @@ def _best_order(q: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def share_of_nominal(
-    t: np.ndarray, q: np.ndarray, effort: np.ndarray, chain: Chain, gravity: Sequence[float] | None = None,
+    t: np.ndarray,
+    q: np.ndarray,
+    effort: np.ndarray,
+    chain: Chain,
+    gravity: Sequence[float] | None = None,
     static: bool = False,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """Return the ratios (n,) of recorded torques to those of the nominal masses, with the drives estimated as well.
 
     Least squares of τ_j on [τ_nominal,j, a_j, v_j, tanh(v_j / v0), 1] on the coarse grid: without the rotor's inertia

@@ -204,9 +204,7 @@ class _Fit:
     def sigma(self, at: int) -> float:
         """Return the sigma of the common lag at index `at` [s], each joint counted as one independent sample."""
         inner = int(np.clip(at, 1, len(SHIFTS) - 2))
-        torque, parts = (
-            (x[:, inner + 1] - x[:, inner - 1]) / (2.0 * STEP) for x in (self.rows.torque, self.parts)
-        )  # fmt: skip
+        torque, parts = ((x[:, inner + 1] - x[:, inner - 1]) / (2.0 * STEP) for x in (self.rows.torque, self.parts))
         slope = self._unexplained(torque, parts.sum(axis=0))
         votes, power = (self.left(np.full(len(slope), inner)) * slope).sum(axis=1), float((slope**2).sum())
         few = len(votes) / max(len(votes) - 1, 1)

@@ -226,8 +226,10 @@ class _Bench:
         for _ in range(2):  # with the joints left that it pays at, once more
             both = [*taken, *some]
             new, other, beyond = (
-                self.errors(both), self.errors(both, 2), self.validation.extrapolated(self._with_base(both))
-            )  # fmt: skip
+                self.errors(both),
+                self.errors(both, 2),
+                self.validation.extrapolated(self._with_base(both)),
+            )
             at = tuple(
                 own
                 for own in at
@@ -245,9 +247,14 @@ class _Bench:
         return some, new, _flat(at)
 
     def trial(
-        self, name: str, taken: Sequence[int], error: np.ndarray, at: tuple[int, ...], note: str = "",
+        self,
+        name: str,
+        taken: Sequence[int],
+        error: np.ndarray,
+        at: tuple[int, ...],
+        note: str = "",
         terms: tuple[str, ...] = (),
-    ) -> FrictionTrial:  # fmt: skip
+    ) -> FrictionTrial:
         """Return the result of a step from its columns, its squared errors, and the joints at which it is kept."""
         squares = (self.validation.data.factors[:, :, -1] ** 2).sum(axis=1).reshape(-1, self.validation.rows)
         size = squares[: self.validation.blocks].sum(axis=0)  # Σ τ² per row over the judged blocks

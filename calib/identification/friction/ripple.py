@@ -168,7 +168,7 @@ def _family(n: int) -> tuple[tuple[int, ...], ...]:
     """Return the orders per turn of the ripple of a gear with n motor turns per turn, in sets tested together."""
     return tuple(
         one for one in ((2 * n, 2 * n + 2), (n,), (3 * n,), (4 * n, 4 * n + 2, 4 * n + 4)) if one[-1] <= MAX_ORDER
-    )  # fmt: skip
+    )
 
 
 def _terms(

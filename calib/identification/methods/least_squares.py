@@ -135,12 +135,18 @@ def _driving(problem: IdentificationProblem, values: np.ndarray) -> np.ndarray:
 
 
 OLS = LeastSquares(
-    "ols", "the torques of all joints are equally noisy; q, v and a are exact",
-    lambda problem, std, tau: ols(problem.pooled, tau), weighted=False,
-    description="least squares, equal weights", source="Gauss; Atkeson, An & Hollerbach 1986",
-)  # fmt: skip
+    "ols",
+    "the torques of all joints are equally noisy; q, v and a are exact",
+    lambda problem, std, tau: ols(problem.pooled, tau),
+    weighted=False,
+    description="least squares, equal weights",
+    source="Gauss; Atkeson, An & Hollerbach 1986",
+)
 WLS = LeastSquares(
-    "wls", "each joint's torque noise is that of its residuals; q, v and a are exact",
-    lambda problem, std, tau: wls(problem.pooled, std, tau), takes_prior=True,
-    description="least squares, each joint weighted by its residuals", source="Gautier & Poignet 2001",
-)  # fmt: skip
+    "wls",
+    "each joint's torque noise is that of its residuals; q, v and a are exact",
+    lambda problem, std, tau: wls(problem.pooled, std, tau),
+    takes_prior=True,
+    description="least squares, each joint weighted by its residuals",
+    source="Gautier & Poignet 2001",
+)

@@ -166,9 +166,10 @@ class MethodEstimate:
             return self.pooled, self.std, self.inflation
         known = retriangulate(np.pad(self.beforehand, ((0, 0), (0, 1))))  # one more group of rows
         data = replace(
-            self.pooled, factors=frozen(np.concatenate([self.pooled.factors, known[None]])),
+            self.pooled,
+            factors=frozen(np.concatenate([self.pooled.factors, known[None]])),
             rows=frozen([*self.pooled.rows, len(self.beforehand)], int),
-        )  # fmt: skip
+        )
         return data, np.append(self.std, 1.0), np.append(self.inflation, 1.0)
 
 
@@ -180,7 +181,7 @@ def _standing_for(estimate: Estimate) -> Triangles:
     factor[0, p, p] = np.sqrt(max(estimate.dof, 1))
     return replace(
         empty(estimate.names, estimate.units, 1), factors=frozen(factor), rows=frozen([max(estimate.dof, 1) + p], int)
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True)

@@ -74,9 +74,15 @@ def of(found: Identification, chain: Chain) -> Information:
     estimate, standard = found.fitted.estimate, found.dynamics.model.names
     transform = _transform(found.names, regrouping(found.base), standard)
     return Information(
-        chain, found.dynamics, found.names, estimate.units, estimate.values, estimate.covariance, transform,
+        chain,
+        found.dynamics,
+        found.names,
+        estimate.units,
+        estimate.values,
+        estimate.covariance,
+        transform,
         _information(found),
-    )  # fmt: skip
+    )
 
 
 def _information(found: Identification) -> np.ndarray:

@@ -149,10 +149,14 @@ def make_problem(information: Information, references: PriorBodies) -> BodyCost:
         if one.shape == "acceleration" and positive[k]:
             sizes[k] = min(sizes[k], mass * ROTOR**2)
     return BodyCost(
-        np.column_stack([columns, information.factor[:, -1]]), bodies,
+        np.column_stack([columns, information.factor[:, -1]]),
+        bodies,
         pseudo_inertia.from_standard(references.parameters),
-        references.drawn, np.where(seen, sizes, 0.0), positive, information.dynamics.values[10 * bodies :],
-    )  # fmt: skip
+        references.drawn,
+        np.where(seen, sizes, 0.0),
+        positive,
+        information.dynamics.values[10 * bodies :],
+    )
 
 
 def nearest(problem: BodyCost, spared: int | None = None, pull: float = 0.0) -> np.ndarray:

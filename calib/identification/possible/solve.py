@@ -156,11 +156,19 @@ def find_possible(information: Information, weight: float | None = None, prior: 
         values = nearest(problem, pull=gamma) if euclidean else solve(problem, gamma)
     curved_at = _reference(problem) if euclidean else values
     return PossibleBodies(
-        Dynamics(model, values), _covariance(problem, gamma, curved_at), gamma, doubt,
+        Dynamics(model, values),
+        _covariance(problem, gamma, curved_at),
+        gamma,
+        doubt,
         np.array([pseudo_inertia.margin(body) for body in _bodies(problem, values)]),
-        information.distance(values), away, allowed, blamed, references.source, prior,
+        information.distance(values),
+        away,
+        allowed,
+        blamed,
+        references.source,
+        prior,
         (*references.notes, *_notes(model, problem, values)),
-    )  # fmt: skip
+    )
 
 
 def _candidates(

@@ -30,13 +30,26 @@ from calib.units import headings, per_ampere
 
 INSTRUMENTAL = "instrumental.csv"
 OURS = (
-    calibrated.ROBOT, MODEL, folders.ESTIMATE, folders.COVARIANCE, information.INFORMATION, INSTRUMENTAL,
-    folders.METRICS, "drive_gains.csv", folders.REPORT, *folders.PAGES,
-    "torques_1.csv", calibrated.COVARIANCE, geometry_tables.EFFECTS, geometry_tables.SENSITIVITY,
-    geometry_tables.GEOMETRIES, geometry_tables.TORQUE_COVARIANCE, "plot_torque_[0-9]*.png",
+    calibrated.ROBOT,
+    MODEL,
+    folders.ESTIMATE,
+    folders.COVARIANCE,
+    information.INFORMATION,
+    INSTRUMENTAL,
+    folders.METRICS,
+    "drive_gains.csv",
+    folders.REPORT,
+    *folders.PAGES,
+    "torques_1.csv",
+    calibrated.COVARIANCE,
+    geometry_tables.EFFECTS,
+    geometry_tables.SENSITIVITY,
+    geometry_tables.GEOMETRIES,
+    geometry_tables.TORQUE_COVARIANCE,
+    "plot_torque_[0-9]*.png",
     *(f"plot_{name}.png" for name in ("errors", "residuals", "friction", "significance")),
     *(f"plot_{name}.png" for name in ("geometries", "geometry_effects")),
-)  # fmt: skip
+)
 """Files of an earlier identification that a new one replaces."""
 TORQUE_RATE = 100.0  # of torques_1.csv [Hz]
 INSTRUMENTAL_HEADER = ("name", "unit", "instrumental", "sigma", "least_squares", "shift_sigma", "explained_percent")
@@ -128,9 +141,12 @@ def check_identification_target(out: Path, inputs: Sequence[str | Path | None] =
 
 
 def write_folder(
-    outcome: IdentificationOutcome, out: Path, plots: Callable[[IdentificationOutcome, Path], None] | None = None,
-    *, owned: bool = False,
-) -> Path:  # fmt: skip
+    outcome: IdentificationOutcome,
+    out: Path,
+    plots: Callable[[IdentificationOutcome, Path], None] | None = None,
+    *,
+    owned: bool = False,
+) -> Path:
     """Write the result folder `out` of an identification, or nothing on an error, and return its path.
 
     An `owned` folder is ours, whatever is left in it.

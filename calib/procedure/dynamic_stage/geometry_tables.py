@@ -139,13 +139,19 @@ def effects(carried: GeometryUncertainty) -> list[GeometricEffect]:
         known = bool(np.isfinite(sigma))
         found.append(
             GeometricEffect(
-                rank, carried.elements[k], carried.units[k], float(sigma),
+                rank,
+                carried.elements[k],
+                carried.units[k],
+                float(sigma),
                 ("yes" if shifts.max() > MIN_SHIFT else "no") if known else "",
                 carried.names[worst] if per_unit[worst] > 0.0 else "",
-                shifts[worst], int((shifts > MIN_SHIFT).sum()) if known else None,
-                float(carried.felt[k] * sigma), float(carried.left[k] * sigma), 1e-3 * per_unit[worst],
+                shifts[worst],
+                int((shifts > MIN_SHIFT).sum()) if known else None,
+                float(carried.felt[k] * sigma),
+                float(carried.left[k] * sigma),
+                1e-3 * per_unit[worst],
             )
-        )  # fmt: skip
+        )
     return found
 
 

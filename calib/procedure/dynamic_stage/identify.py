@@ -179,9 +179,14 @@ def assess(
         figures, rules = "", drives
     nominal = plain.nominal_values(inputs.chain, dynamics) if inputs.unit == TORQUE else None
     beside = plain.references(
-        inputs.unseen, found.validation, dynamics, np.array(findings.plain), nominal, inputs.options.slow,
+        inputs.unseen,
+        found.validation,
+        dynamics,
+        np.array(findings.plain),
+        nominal,
+        inputs.options.slow,
         inputs.currents.own,
-    )  # fmt: skip
+    )
     rules += plain.worse_than_plain({name: one for name, one in beside.items() if name in found.proofs})
     rules += judging.too_narrow(
         {name: found.intervals[name] for name in found.proofs if name in found.intervals}, labels
@@ -201,17 +206,25 @@ def assess(
     if relative:
         verdict, failure = verdict.for_prediction(f"torques are {without_gains(inputs.unit)}"), lines_of(amperes)[0]
     noticed = (
-        *amperes, *odd, *rules, *overlaps(inputs.cases, inputs.unseen),
+        *amperes,
+        *odd,
+        *rules,
+        *overlaps(inputs.cases, inputs.unseen),
         *(one for case in (*inputs.cases, *inputs.unseen) for one in judging.beyond(case, inputs.chain)),
         *judging.motion_findings(found.validation, found.repeated),
         *(one for case in inputs.unseen for one in judging.extrapolates(case.name, found.intervals.get(case.name))),
         *findings.noticed,
-    )  # fmt: skip
+    )
     said = dict.fromkeys((*lines_of(noticed), *judging.excitation_notes(found.excitation), *findings.notes))
     return Assessment(
-        **vars(found), verdict=verdict, warnings=tuple(said), noticed=noticed, tracking=replays,
-        tracking_failure=failure, references=beside,
-    )  # fmt: skip
+        **vars(found),
+        verdict=verdict,
+        warnings=tuple(said),
+        noticed=noticed,
+        tracking=replays,
+        tracking_failure=failure,
+        references=beside,
+    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -266,16 +279,26 @@ def judged(
     say("errors on held-out time")
     errors = torque_errors.learn_torque_errors(found, inputs.cases, carried.covariance)
     findings = ModelFindings(
-        judging.resting_parameters(found), (), judging.model_findings(inputs.cases, found),
-        found.loop.controller, errors and errors.discrepancy,
-        contradiction(found, inputs.chain) if inputs.unit == TORQUE else None, found.loop.disagreement,
+        judging.resting_parameters(found),
+        (),
+        judging.model_findings(inputs.cases, found),
+        found.loop.controller,
+        errors and errors.discrepancy,
+        contradiction(found, inputs.chain) if inputs.unit == TORQUE else None,
+        found.loop.disagreement,
         tuple(plain.plain_values(found).tolist()),
-    )  # fmt: skip
+    )
     result = assess(inputs, found.dynamics, findings, errors, wrong, progress=say)
     return IdentificationOutcome(
-        **vars(result), inputs=inputs, found=found, findings=findings, carried=carried, geometries=geometries,
-        errors=errors, seed=found.settings.seed,
-    )  # fmt: skip
+        **vars(result),
+        inputs=inputs,
+        found=found,
+        findings=findings,
+        carried=carried,
+        geometries=geometries,
+        errors=errors,
+        seed=found.settings.seed,
+    )
 
 
 def assessed(outcome: T, inputs: IdentificationInputs) -> T:

@@ -202,16 +202,13 @@ def _with_choices(options: IdentifyOptions, method: str | None, friction: str | 
     return replace(options, settings=replace(options.settings, seed=seed, **given))
 
 
-def _read_case(
-    path: str, name: str, motion: Motion, options: IdentifyOptions, found: FoundGains, robot: Any
-) -> Case:  # fmt: skip
+def _read_case(path: str, name: str, motion: Motion, options: IdentifyOptions, found: FoundGains, robot: Any) -> Case:
     """Return the case of one recording: payload, gains, and the links' motion where joints have corrections."""
     own = options.file_settings(path)
     with refused_as(MeasurementError, NoPosture, "{}", name):
         case = make_case(
-            name, motion, options.settings.torque_rows, gains=found.for_motion(motion, own),
-            carried=own.payload,
-        )  # fmt: skip
+            name, motion, options.settings.torque_rows, gains=found.for_motion(motion, own), carried=own.payload
+        )
     for moved in offered("link_motion") if getattr(robot, "corrections", None) is not None else ():
         case = moved(robot, case, options.settings)
     return case
@@ -276,9 +273,12 @@ def _sharper(recording: Recording, motion: Motion, options: FilterOptions, sampl
 
 
 def _referred(
-    motion: Motion, given: str | Path | Recording, joints: Joints, options: IdentifyOptions,
+    motion: Motion,
+    given: str | Path | Recording,
+    joints: Joints,
+    options: IdentifyOptions,
     designed: Sequence[DesignedMotion],
-) -> Motion:  # fmt: skip
+) -> Motion:
     """Return the motion with its reference: of a file that the options name, its own, or a designed motion."""
     own, loop = options.file_settings(_path(given)), options.settings.loop
     if loop is None:

@@ -254,9 +254,14 @@ class UnseenReport(JudgedMetrics):
         known = inputs.options.settings.torque_rows.projection is None and inputs.unit == TORQUE
         limits = np.resize([joint.effort if known else np.inf for joint in inputs.chain.joints], len(rows))
         return cls(
-            **_judged(found), rows=tuple(rows), units=tuple(inputs.row_units), fit=found.fit, curves=tuple(curves),
-            limits=limits, robot=inputs.chain.name,
-        )  # fmt: skip
+            **_judged(found),
+            rows=tuple(rows),
+            units=tuple(inputs.row_units),
+            fit=found.fit,
+            curves=tuple(curves),
+            limits=limits,
+            robot=inputs.chain.name,
+        )
 
     @property
     def proofs(self) -> dict[str, Score]:
@@ -306,6 +311,8 @@ def _score(one: Mapping[str, Any]) -> dict[str, Any]:
 def _replay(one: Mapping[str, Any]) -> dict[str, Any]:
     control = one["controller"]
     rows = {"share": [1.0] * len(control["kp"]), "windup": [None] * len(control["kp"])} if "kp" in control else {}
-    return {"name": "", "seconds": 0.0, "terms_left_out": []} | dict(one) | {
-        "stated": control["stated"], "controller": {**control, **rows} if rows else None,
-    }  # fmt: skip
+    return (
+        {"name": "", "seconds": 0.0, "terms_left_out": []}
+        | dict(one)
+        | {"stated": control["stated"], "controller": {**control, **rows} if rows else None}
+    )

@@ -104,11 +104,18 @@ def wrong_joints(found: Mapping[str, Explanation | None], joints: Sequence[str])
             j, k = change.joints[0], change.joints[-1]
             wrong.append(
                 finding(
-                    change.code, file=name, joint=joints[j], other=joints[k], **change.values,
-                    before=np.sqrt(each.before[j]), after=np.sqrt(each.after[j]), gain=1.0 - each.factor,
-                    factor=each.factor, explained=1.0 - max(each.after[concerned]),
+                    change.code,
+                    file=name,
+                    joint=joints[j],
+                    other=joints[k],
+                    **change.values,
+                    before=np.sqrt(each.before[j]),
+                    after=np.sqrt(each.after[j]),
+                    gain=1.0 - each.factor,
+                    factor=each.factor,
+                    explained=1.0 - max(each.after[concerned]),
                 )
-            )  # fmt: skip
+            )
     return [one for one in wrong if level_of(one)]
 
 
@@ -117,9 +124,12 @@ def impossible(found: Contradiction | None) -> list[Finding]:
     if found is None:
         return []
     one = finding(
-        "no-possible-robot", distance=found.distance, allowed=found.allowed, unexplained=found.unexplained,
+        "no-possible-robot",
+        distance=found.distance,
+        allowed=found.allowed,
+        unexplained=found.unexplained,
         times=found.distance / found.allowed,
-    )  # fmt: skip
+    )
     return [one] if level_of(one) else []
 
 
@@ -142,12 +152,19 @@ def another_loop(found: LoopDisagreement | None) -> list[Finding]:
     by_joint = not scaled and bool(np.any(np.abs(times - 1.0) > 0.1))
     return [
         finding(
-            "loop-refuted", method=found.method, other=found.beside, parameter=found.parameter, sigmas=found.sigmas,
-            worst=max(found.left), left=shown(found.left), other_left=shown(found.beside_left),
-            times=median if scaled else None, factors=shown(found.factor) if by_joint else (),
+            "loop-refuted",
+            method=found.method,
+            other=found.beside,
+            parameter=found.parameter,
+            sigmas=found.sigmas,
+            worst=max(found.left),
+            left=shown(found.left),
+            other_left=shown(found.beside_left),
+            times=median if scaled else None,
+            factors=shown(found.factor) if by_joint else (),
             velocity="" if scaled or by_joint else "reference_velocity",
         )
-    ]  # fmt: skip
+    ]
 
 
 def _masses(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
@@ -207,10 +224,18 @@ def _speed(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
         return
     clock = each.clock
     yield finding(
-        "velocities-scaled", file=each.name, factor=usual, times=_off(ratio[off]), rate=each.rate,
-        counted=usual * each.rate, size=max(usual, 1.0 / usual), way="large" if usual > 1.0 else "small",
-        against=_against(clock, usual), ratio=clock and clock.ratio, sigma=clock and clock.relative_sigma,
-    )  # fmt: skip
+        "velocities-scaled",
+        file=each.name,
+        factor=usual,
+        times=_off(ratio[off]),
+        rate=each.rate,
+        counted=usual * each.rate,
+        size=max(usual, 1.0 / usual),
+        way="large" if usual > 1.0 else "small",
+        against=_against(clock, usual),
+        ratio=clock and clock.ratio,
+        sigma=clock and clock.relative_sigma,
+    )
 
 
 def _against(clock: ClockRatio | None, usual: float) -> str:
@@ -240,9 +265,16 @@ def _lag(name: str, lag: Lag | None, joints: Sequence[str]) -> Iterator[Finding]
         return
     if lag.certain:
         yield finding(
-            "torques-late", file=name, by=abs(lag.seconds), sigma=lag.sigma, way=_way(lag.seconds), lag=lag.seconds,
-            before=lag.before, after=lag.after, times=lag.factor,
-        )  # fmt: skip
+            "torques-late",
+            file=name,
+            by=abs(lag.seconds),
+            sigma=lag.sigma,
+            way=_way(lag.seconds),
+            lag=lag.seconds,
+            before=lag.before,
+            after=lag.after,
+            times=lag.factor,
+        )
     if (j := lag.joint) is not None:
         apart = float(lag.own[j] - lag.seconds)
         yield finding(
@@ -259,7 +291,12 @@ def _clock(name: str, found: ClockRatio | None) -> Iterator[Finding]:
         return
     times = _off(np.float64(found.ratio))
     yield finding(
-        "clock-off", file=name, ratio=found.ratio, sigma=found.relative_sigma, times=times,
-        surely=times * float(np.exp(-2.0 * found.relative_sigma)), stamps=max(found.clock, 1.0 / found.clock),
+        "clock-off",
+        file=name,
+        ratio=found.ratio,
+        sigma=found.relative_sigma,
+        times=times,
+        surely=times * float(np.exp(-2.0 * found.relative_sigma)),
+        stamps=max(found.clock, 1.0 / found.clock),
         way="large" if found.clock > 1.0 else "small",
-    )  # fmt: skip
+    )

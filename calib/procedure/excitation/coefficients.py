@@ -119,10 +119,16 @@ def table(motion: Periodic, robot: str, limits: Sequence[str]) -> dict[str, Any]
     """Return the content of ``trajectory.toml`` for a motion; `limits`: text lines on its limits."""
     fourier = motion.kind == "fourier"
     head: dict[str, Any] = {
-        "robot": robot, "family": motion.kind, "period": motion.period, "rate": motion.rate, "repeat": motion.repeat,
-        "note": "q(t) = q0 + sum_k a_k sin(k w t) + b_k cos(k w t), w = 2 pi / period; rad, m, s" if fourier
-        else "periodic spline, uniform knots over the period; rad, m, s", "limits": list(limits),
-    }  # fmt: skip
+        "robot": robot,
+        "family": motion.kind,
+        "period": motion.period,
+        "rate": motion.rate,
+        "repeat": motion.repeat,
+        "note": "q(t) = q0 + sum_k a_k sin(k w t) + b_k cos(k w t), w = 2 pi / period; rad, m, s"
+        if fourier
+        else "periodic spline, uniform knots over the period; rad, m, s",
+        "limits": list(limits),
+    }
     joints = []
     for name, kind, c in zip(motion.joint_names, motion.kinds, motion.coefficients):
         half = len(c) // 2
@@ -151,9 +157,15 @@ def read(folder: Path) -> Periodic:
             raise UsageError(f"{place}: a and b need {len(table.joint[0].a or ())} values each, as many as joint 1's a")
         coefficients.append(np.concatenate([np.array(part, dtype=float) for part in parts]))
     found = Periodic(
-        tuple(joint.name for joint in table.joint), tuple(joint.kind for joint in table.joint), table.period,
-        table.rate, table.repeat, table.family, tuple(coefficients), table.degree,
-    )  # fmt: skip
+        tuple(joint.name for joint in table.joint),
+        tuple(joint.kind for joint in table.joint),
+        table.period,
+        table.rate,
+        table.repeat,
+        table.family,
+        tuple(coefficients),
+        table.degree,
+    )
     damage, words = (ValueError, IndexError, BadInput), f"{path} is damaged ({{}}); write it again with calib excite"
     with refused_as(UsageError, damage, words):
         found.orders(np.zeros(1))

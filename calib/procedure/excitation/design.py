@@ -177,11 +177,19 @@ def search_motion(
     cut += missed(goals, values, given)
     reached = tuple((*split_goal(goal.words), goal.share, goal.stated(value)) for goal, value in zip(goals, values))
     return Designed(
-        given, settings, problem, found, proof, condition_found,
-        reached, front, played,
-        (*given.limits.notes, *given.model.notes, *notes, *given.columns.notes, *cut, *played.notes), outlook,
+        given,
+        settings,
+        problem,
+        found,
+        proof,
+        condition_found,
+        reached,
+        front,
+        played,
+        (*given.limits.notes, *given.model.notes, *notes, *given.columns.notes, *cut, *played.notes),
+        outlook,
         predicted,
-    )  # fmt: skip
+    )
 
 
 def _reached(
@@ -216,9 +224,15 @@ def _excitation_problem(
     if shortest > settings.period:
         raise UsageError(f"--shortest {shortest:g} s: expected at most the period, {settings.period:g} s")
     problem = ExcitationProblem(
-        family, smooth.regressor, smooth.regressor_gradient, objectives, search, samples=settings.samples,
-        stretch=(shortest / settings.period, 1.0), coarse=coarse,
-    )  # fmt: skip
+        family,
+        smooth.regressor,
+        smooth.regressor_gradient,
+        objectives,
+        search,
+        samples=settings.samples,
+        stretch=(shortest / settings.period, 1.0),
+        coarse=coarse,
+    )
     return problem, checked, notes
 
 
@@ -294,7 +308,7 @@ def _family(given: ExcitationInputs, settings: ExcitationSettings) -> tuple[Fami
                 np.minimum(counts, top).tolist(), settings.period, held=fixed, resonance=resonance, rate=settings.rate
             )
             for top in (most, COARSE)
-        )  # fmt: skip
+        )
         return full, few if most > COARSE else None
     if settings.family == "bspline":
         return bspline_family(counts.tolist(), settings.period, held=fixed, rate=settings.rate), None
@@ -313,11 +327,18 @@ def _constraints(
         notes = () if dynamics.friction else (f"{GUARD:.0%} of the torque limits are reserved for friction",)
     torque = [
         TorqueLimit(
-            one.regressor, one.regressor_gradient, dynamics.values, one.of_rows(limits.torque), dynamics.covariance,
-            limits.deviations, margin, one.torque_gradient, rows=one.row_names,
+            one.regressor,
+            one.regressor_gradient,
+            dynamics.values,
+            one.of_rows(limits.torque),
+            dynamics.covariance,
+            limits.deviations,
+            margin,
+            one.torque_gradient,
+            rows=one.row_names,
         )
         for one in (dynamics.smooth, dynamics.exact)
-    ]  # fmt: skip
+    ]
     return (*limits.constraints, torque[0]), (*limits.constraints, torque[1]), notes
 
 

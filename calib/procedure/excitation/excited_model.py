@@ -94,8 +94,10 @@ def read_model(
     if chain.inertias is not None:
         check_bodies(chain, limits.torque)
         side = "motor" if model.torque_rows.with_motors else "link"  # where all friction counts, as the limits do
-        drive_values = [known[one.shape][one.acts[0][0]] if one.shape in known and one.side == side else 0.0
-                        for one in model.columns]  # fmt: skip
+        drive_values = [
+            known[one.shape][one.acts[0][0]] if one.shape in known and one.side == side else 0.0
+            for one in model.columns
+        ]
         payloads, said = stated_payloads(options)
         values = np.concatenate([standard_parameters(chain), *payloads, drive_values])
         notes += said

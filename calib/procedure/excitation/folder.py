@@ -73,10 +73,15 @@ def write_design(designed: Designed, out: Path, draw: Callable[[Designed, Path],
         _write_setpoints(period, bounds, folder / coefficients.SAMPLES)
         settings, family = designed.settings, designed.family
         motion = Periodic(
-            chain.joint_names, tuple(joint.kind for joint in chain.joints), designed.period, settings.rate,
-            settings.repeat, settings.family, tuple(family.coefficients(designed.found.x)),
+            chain.joint_names,
+            tuple(joint.kind for joint in chain.joints),
+            designed.period,
+            settings.rate,
+            settings.repeat,
+            settings.family,
+            tuple(family.coefficients(designed.found.x)),
             getattr(family, "degree", 5),
-        )  # fmt: skip
+        )
         files.write(folder / coefficients.NAME, dumps(coefficients.table(motion, chain.name, bounds.lines())))
         if played.approach is not None or played.repeat > 1:
             _write_setpoints(played.run, bounds, folder / coefficients.RUN)
@@ -155,26 +160,42 @@ def design_metrics(designed: Designed) -> dict[str, Any]:
     """Return the content of ``metrics.json`` of a designed motion."""
     found, given, settings, family = designed.found, designed.inputs, designed.settings, designed.family
     played = designed.playback
-    return plain({
-        "condition_number": designed.condition.table(), "objective": found.merit, "feasible": designed.proof.feasible,
-        "margins": {name: plain(one) | {"at": one.label} for name, one in designed.proof.worst.items()},
-        "seconds": found.seconds, "evaluations": found.evaluations, "feasible_evaluations": found.feasible,
-        "history": found.history,
-        "goals": {name: {"goal": goal, "weight": w, "reached": value} for name, goal, w, value in designed.goals},
-        "setting": {
-            "robot": given.chain.name, "family": settings.family, "period": designed.period,
-            "harmonics": getattr(family, "harmonics", getattr(family, "counts", ())),
-            "columns": given.columns.aimed_names, "samples": designed.problem.samples,
-            "samples_reported": INSTANTS, "instants_verified": designed.proof.instants, "rate": settings.rate,
-            "interrupted": found.interrupted, "held": designed.locked,
-        },
-        "existing": None if given.prior is None else {"names": given.prior.names, "seconds": given.prior.seconds},
-        "playback": {
-            "repeat": played.repeat, "seconds": played.run.duration, "approach": _seconds(played.approach),
-            "rehearsal": _seconds(played.rehearsal),
-        },
-        "prediction": designed.outlook, "limits": given.limits.bounds.lines(), "notes": designed.notes,
-    })  # fmt: skip
+    return plain(
+        {
+            "condition_number": designed.condition.table(),
+            "objective": found.merit,
+            "feasible": designed.proof.feasible,
+            "margins": {name: plain(one) | {"at": one.label} for name, one in designed.proof.worst.items()},
+            "seconds": found.seconds,
+            "evaluations": found.evaluations,
+            "feasible_evaluations": found.feasible,
+            "history": found.history,
+            "goals": {name: {"goal": goal, "weight": w, "reached": value} for name, goal, w, value in designed.goals},
+            "setting": {
+                "robot": given.chain.name,
+                "family": settings.family,
+                "period": designed.period,
+                "harmonics": getattr(family, "harmonics", getattr(family, "counts", ())),
+                "columns": given.columns.aimed_names,
+                "samples": designed.problem.samples,
+                "samples_reported": INSTANTS,
+                "instants_verified": designed.proof.instants,
+                "rate": settings.rate,
+                "interrupted": found.interrupted,
+                "held": designed.locked,
+            },
+            "existing": None if given.prior is None else {"names": given.prior.names, "seconds": given.prior.seconds},
+            "playback": {
+                "repeat": played.repeat,
+                "seconds": played.run.duration,
+                "approach": _seconds(played.approach),
+                "rehearsal": _seconds(played.rehearsal),
+            },
+            "prediction": designed.outlook,
+            "limits": given.limits.bounds.lines(),
+            "notes": designed.notes,
+        }
+    )
 
 
 def _seconds(track: Setpoints | None) -> float | None:
@@ -189,10 +210,15 @@ def design_lines(designed: Designed) -> list[str]:
     """Return the lines that `calib excite` prints: condition number, goals, margins, limits, notes."""
     found, cond = designed.found, designed.condition
     columns, prior = len(designed.inputs.columns.aimed_names), designed.inputs.prior
-    together = [] if prior is None else [
-        f"together with {', '.join(prior.names)}, which alone has {_pair(cond.raw_before, cond.normalised_before)}; "
-        f"this motion alone has {_pair(cond.raw_alone, cond.normalised_alone)}"
-    ]  # fmt: skip
+    together = (
+        []
+        if prior is None
+        else [
+            f"together with {', '.join(prior.names)}, "
+            f"which alone has {_pair(cond.raw_before, cond.normalised_before)}; "
+            f"this motion alone has {_pair(cond.raw_alone, cond.normalised_alone)}"
+        ]
+    )
     result = [
         *(["interrupted: this is the best motion so far"] if found.interrupted else []),
         f"condition number of {columns} columns: {cond.raw:.4g} raw, {cond.normalised:.4g} normalised "
@@ -217,22 +243,37 @@ def design_lines(designed: Designed) -> list[str]:
 def plan_metrics(planned: Planned) -> dict[str, Any]:
     """Return the content of ``metrics.json`` of a planned motion."""
     shaped, deviation = planned.shaped, planned.deviation
-    return plain({
-        "feasible": True, "duration": planned.track.duration, "margins": _margins(planned),
-        "active_share": planned.active_share, "active_within": ACTIVE,
-        "iterations": sum(one.iterations for one in planned.timings),
-        "tightened": max(one.tightened for one in planned.timings),
-        "history": [one.history for one in planned.timings],
-        "segments": [one.duration for one in planned.timings], "rate": planned.track.rate,
-        "samples": len(planned.track), "samples_verified": _verified(planned),
-        "line_deviation": None if deviation is None else dict(zip(("position", "orientation"), deviation.tolist())),
-        "shortened": None if shaped is None else {
-            "before": shaped.before, "after": shaped.after, "evaluations": shaped.evaluations,
-            "refused": shaped.refused, "parameters": shaped.phi,
-        },
-        "torque_sigma": planned.sigma, "torque_limits": planned.limits.torque,
-        "approach": _seconds(planned.approach), "limits": planned.bounds.lines(), "notes": planned.notes,
-    })  # fmt: skip
+    return plain(
+        {
+            "feasible": True,
+            "duration": planned.track.duration,
+            "margins": _margins(planned),
+            "active_share": planned.active_share,
+            "active_within": ACTIVE,
+            "iterations": sum(one.iterations for one in planned.timings),
+            "tightened": max(one.tightened for one in planned.timings),
+            "history": [one.history for one in planned.timings],
+            "segments": [one.duration for one in planned.timings],
+            "rate": planned.track.rate,
+            "samples": len(planned.track),
+            "samples_verified": _verified(planned),
+            "line_deviation": None if deviation is None else dict(zip(("position", "orientation"), deviation.tolist())),
+            "shortened": None
+            if shaped is None
+            else {
+                "before": shaped.before,
+                "after": shaped.after,
+                "evaluations": shaped.evaluations,
+                "refused": shaped.refused,
+                "parameters": shaped.phi,
+            },
+            "torque_sigma": planned.sigma,
+            "torque_limits": planned.limits.torque,
+            "approach": _seconds(planned.approach),
+            "limits": planned.bounds.lines(),
+            "notes": planned.notes,
+        }
+    )
 
 
 def plan_lines(planned: Planned) -> list[str]:

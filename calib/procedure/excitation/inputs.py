@@ -159,9 +159,12 @@ def _read_locked(texts: Sequence[str], chain: Chain, limits: BoxLimit) -> dict[i
 
 
 def identifiable(
-    model: ExcitedModel, chain: Chain, locked: Mapping[int, float | None], prior: PriorMotions | None = None,
+    model: ExcitedModel,
+    chain: Chain,
+    locked: Mapping[int, float | None],
+    prior: PriorMotions | None = None,
     noise: np.ndarray | None = None,
-) -> IdentifiableColumns:  # fmt: skip
+) -> IdentifiableColumns:
     """Return the columns that a motion with locked joints, together with earlier motions, can identify.
 
     Args:

@@ -37,7 +37,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from calib.config import Tables, check_keys, read, strict
-from calib.config_types import Name, NotNegative, Numeric, Real, Spread, Whole, number  # fmt: skip
+from calib.config_types import Name, NotNegative, Numeric, Real, Spread, Whole, number
 from calib.errors import UsageError, require
 from calib.geometry.observability import targets_of
 from calib.procedure.measuring.constraints_file import DEFAULTS, ConstraintsFile, Point
@@ -140,10 +140,14 @@ class MotionBounds:
 
 MARGINS = ("margin", "deviations")  # keys of [torque] that are no joint's
 STATED_IN = {
-    "position": "[joints]", "velocity": "[velocity]", "acceleration": "[acceleration]", "jerk": "[jerk]",
-    "torque": "[torque] (a joint's, or margin)", "workspace": "[target] (height, axis_distance) and [[point]]",
+    "position": "[joints]",
+    "velocity": "[velocity]",
+    "acceleration": "[acceleration]",
+    "jerk": "[jerk]",
+    "torque": "[torque] (a joint's, or margin)",
+    "workspace": "[target] (height, axis_distance) and [[point]]",
     "clearance": "[collision] (margin, radius, floor) and [[obstacle]]",
-}  # fmt: skip
+}
 """Tables of the limits file by the name of the constraint."""
 
 
@@ -416,9 +420,12 @@ def _places(stated: LimitsFile, found: Limits, points: Points) -> list[MotionCon
 
 
 def _per_joint(
-    stated: Mapping[str, Any], where: str, chain: Chain, default: np.ndarray | None = None,
+    stated: Mapping[str, Any],
+    where: str,
+    chain: Chain,
+    default: np.ndarray | None = None,
     quantities: tuple[str, str] = ("", ""),
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """Return limits (n,) from a table with the keys joint name, q1 …, ``all``, ``share``; infinite if not stated.
 
     Args:

@@ -239,10 +239,22 @@ def plan(
     known.bounds.check(motion)
     lead, remarks = approach_to(settings.start, motion.q[0], settings.rate, known, chain)
     return Planned(
-        chain, known.bounds, bounds, lower, upper, timings, motion, (*known.notes, *notes, *remarks), margins,
-        deviation, shaped, lead, slowed(motion, settings.slower) if settings.slower != 1 else None, sigma,
+        chain,
+        known.bounds,
+        bounds,
+        lower,
+        upper,
+        timings,
+        motion,
+        (*known.notes, *notes, *remarks),
+        margins,
+        deviation,
+        shaped,
+        lead,
+        slowed(motion, settings.slower) if settings.slower != 1 else None,
+        sigma,
         found.source or str(source),
-    )  # fmt: skip
+    )
 
 
 def _read_drives(given: Tables | None, chain: Chain) -> dict[str, np.ndarray]:

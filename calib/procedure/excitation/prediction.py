@@ -217,9 +217,8 @@ def task_of(given: ExcitationInputs, seed: int) -> Task:
 
 
 def _prediction(
-    given: ExcitationInputs, noise: np.ndarray, task: Task, family: Family, x: np.ndarray, factor: float,
-    repeat: float,
-) -> tuple[MotionPrediction, tuple[np.ndarray, np.ndarray]]:  # fmt: skip
+    given: ExcitationInputs, noise: np.ndarray, task: Task, family: Family, x: np.ndarray, factor: float, repeat: float
+) -> tuple[MotionPrediction, tuple[np.ndarray, np.ndarray]]:
     """Return the prediction for `repeat` periods of a motion, and the two parts of the parameters' errors.
 
     They are a root (c, c) of the covariance by the torques' errors, and the shifts (c, r) by the geometry's errors.
@@ -294,10 +293,9 @@ def lines(one: MotionOutlook, predicted: Sequence[PredictedSigma] = ()) -> list[
     )[:3]
     return [
         f"{head}{100 * one.before:.2g} % so far, with this motion {own}{others}",
-        "most improved: " + "; ".join(
-            f"{row.name} from ± {row.sigma_before:.3g} to ± {row.sigma:.3g} {row.unit}" for row in gains
-        ),
-    ]  # fmt: skip
+        "most improved: "
+        + "; ".join(f"{row.name} from ± {row.sigma_before:.3g} to ± {row.sigma:.3g} {row.unit}" for row in gains),
+    ]
 
 
 def check_folder(folder: Path) -> None:

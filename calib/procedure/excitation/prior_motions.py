@@ -54,9 +54,13 @@ class PriorMotions:
 
 
 def read_prior(
-    paths: Sequence[str], model: ExcitedModel, chain: Chain, after: Path | None = None,
-    noise: np.ndarray | None = None, geometry: GeometrySpread | None = None,
-) -> PriorMotions | None:  # fmt: skip
+    paths: Sequence[str],
+    model: ExcitedModel,
+    chain: Chain,
+    after: Path | None = None,
+    noise: np.ndarray | None = None,
+    geometry: GeometrySpread | None = None,
+) -> PriorMotions | None:
     """Return the information from recordings (``log.npz@0:9.4`` cuts) and folders of `calib excite`; None if none.
 
     Recordings are filtered and differentiated as `calib identify` does it. What an identification `after` knows, its

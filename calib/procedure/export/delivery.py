@@ -69,9 +69,19 @@ README, UR_KINEMATICS, MJCF, DRIVES = "README.txt", "ur_kinematics.yaml", "robot
 GEOMETRY, DYNAMICS = "geometry", "dynamics"
 READ_BACK = "Pinocchio reads the same poses and torques to 1e-9"
 DRIVE_COLUMNS = (
-    "joint", "armature", "damping", "friction", "offset", "armature_unit", "damping_unit", "friction_unit",
-    "armature_sigma", "damping_sigma", "friction_sigma", "offset_sigma",
-)  # fmt: skip
+    "joint",
+    "armature",
+    "damping",
+    "friction",
+    "offset",
+    "armature_unit",
+    "damping_unit",
+    "friction_unit",
+    "armature_sigma",
+    "damping_sigma",
+    "friction_sigma",
+    "offset_sigma",
+)
 
 
 @dataclass(frozen=True, eq=False)

@@ -140,10 +140,16 @@ def notes_of(given: IdentifiedRobot) -> list[str]:
     masses, theirs = given.bodies[:, 9], [] if chain.inertias is None else chain.inertias[:, 9]
     found = [
         finding(
-            "inertias", distance=solved.distance, count=given.information.b, allowed=solved.allowed,
-            source=solved.source, weight=solved.weight, prior=solved.prior, thinnest=solved.margins.min(),
+            "inertias",
+            distance=solved.distance,
+            count=given.information.b,
+            allowed=solved.allowed,
+            source=solved.source,
+            weight=solved.weight,
+            prior=solved.prior,
+            thinnest=solved.margins.min(),
         )
-    ]  # fmt: skip
+    ]
     if not solved.possible:
         blamed = [f"{name} (without it {left:.3g})" for name, left in solved.blamed]
         found.append(finding("inertias-inconsistent", nearest=solved.nearest, allowed=solved.allowed, blamed=blamed))
@@ -167,9 +173,11 @@ def parameters(given: IdentifiedRobot) -> dict[str, Any]:
     model = found.dynamics.model
     same = ("possible", "nearest", "distance", "allowed", "weight", "prior", "notes")
     consistency = {name: getattr(found, name) for name in same} | {
-        "margins_m": dict(zip(model.bodies.labels, found.margins)), "sigmas_widened_by": found.doubt,
-        "drawn_to": found.source, "blamed": dict(found.blamed),
-    }  # fmt: skip
+        "margins_m": dict(zip(model.bodies.labels, found.margins)),
+        "sigmas_widened_by": found.doubt,
+        "drawn_to": found.source,
+        "blamed": dict(found.blamed),
+    }
     geometric = {"nominal": nominal_of(given.robot).values, "covariance": given.robot.covariance}
     frames = "about the chain's frame behind each joint (robot.toml), payloads about the tip"
     standard = {"names": model.names, "units": model.units, "values": found.dynamics.values}

@@ -145,10 +145,17 @@ def compare(
     first, second = (pair_errors(cell, blocks, seed=seed) for cell in both)
     corners: Any = tuple(room(cell, blocks) for room in offered("reprojection") for cell in both)
     return Comparison(
-        tuple(blocks), both, (one, two), (first, second), pose_count(blocks), frames, proves,
-        alone=alone[0] if alone else None, repeated=repeated_poses(both, blocks),
+        tuple(blocks),
+        both,
+        (one, two),
+        (first, second),
+        pose_count(blocks),
+        frames,
+        proves,
+        alone=alone[0] if alone else None,
+        repeated=repeated_poses(both, blocks),
         reprojection=None if None in corners else corners or None,
-    )  # fmt: skip
+    )
 
 
 def compare_unseen(

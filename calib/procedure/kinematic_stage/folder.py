@@ -37,13 +37,31 @@ URDF, CORRECTED_URDF = "robot.urdf", "robot_for_corrections.urdf"
 RESIDUALS = "residuals.csv"
 TERMS, FORMULA = "joint_corrections.csv", "joint_corrections.txt"  # the latter is shipped beside this module
 FIGURES = (
-    "position", "orientation", "distance", "ladder", "singular_values", "joints", "map", "parameters", "correlations",
-)  # fmt: skip
+    "position",
+    "orientation",
+    "distance",
+    "ladder",
+    "singular_values",
+    "joints",
+    "map",
+    "parameters",
+    "correlations",
+)
 OURS = (
-    calibrated.ROBOT, URDF, CORRECTED_URDF,
-    ESTIMATE, COVARIANCE, calibrated.COVARIANCE, RESIDUALS, TERMS,
-    FORMULA, REPORT, *PAGES, METRICS, *(f"plot_{name}.png" for name in FIGURES),
-)  # fmt: skip
+    calibrated.ROBOT,
+    URDF,
+    CORRECTED_URDF,
+    ESTIMATE,
+    COVARIANCE,
+    calibrated.COVARIANCE,
+    RESIDUALS,
+    TERMS,
+    FORMULA,
+    REPORT,
+    *PAGES,
+    METRICS,
+    *(f"plot_{name}.png" for name in FIGURES),
+)
 """Files of an earlier fit that a new one replaces."""
 
 IN_SESSION, VALIDATED = "4-fit", "5-validation"  # what these folders are called in a session

@@ -123,8 +123,10 @@ def gather(
     weighed = chain if masses is None else replace(chain, inertias=masses)
     blocks = _named(
         [(path, block) for path, each in zip(files, measured) for block in read_file(each, weighed, options)],
-        options, settings.stations, settings.tools,
-    )  # fmt: skip
+        options,
+        settings.stations,
+        settings.tools,
+    )
     unseen: dict[str, Unseen] = {}
     fit = []
     for block in blocks:

@@ -76,9 +76,13 @@ def gross_rows(found: ModelSelection, robust: ModelSelection, reach: float) -> F
         return None
     best = min(rung.cross_validated for rung in robust.rungs)
     return finding(
-        "gross-rows", count=len({(row.file, row.row) for row in off}), rows=[row.words for row in off], loss=found.loss,
-        rms=best, left=found.cross_validated / (FLOOR * reach),
-    )  # fmt: skip
+        "gross-rows",
+        count=len({(row.file, row.row) for row in off}),
+        rows=[row.words for row in off],
+        loss=found.loss,
+        rms=best,
+        left=found.cross_validated / (FLOOR * reach),
+    )
 
 
 def _left(found: GeometricFit) -> float:

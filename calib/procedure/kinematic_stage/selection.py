@@ -154,25 +154,39 @@ def choose(
         if not is_feasible(space, q).all():
             notes.append(f"{int((~is_feasible(space, q)).sum())} of the {len(q)} existing poses break the constraints")
     search = SearchSettings(
-        index, method, settings.candidates, settings.seed, starts=settings.starts, evaluations=settings.evaluations,
-        seconds=np.inf if settings.seconds is None else settings.seconds, climbs=settings.climbs,
-    )  # fmt: skip
+        index,
+        method,
+        settings.candidates,
+        settings.seed,
+        starts=settings.starts,
+        evaluations=settings.evaluations,
+        seconds=np.inf if settings.seconds is None else settings.seconds,
+        climbs=settings.climbs,
+    )
     candidates = _drawn(space, limits, settings) if joints is None else joints
     found = select_poses(None, m, search, q=candidates, space=space, existing=before, map=map, progress=progress)
     comparable = float(found.history[0]) if method == "polish" else found.value
     notes += [] if view is None else [view.assumed]
     pool = Exchange(space.jacobian, candidates, before, index)
     driven = drivable(
-        chain, found.joints, pool, limits, settings.run, settings.seed,
-        lambda words: progress and progress(0, 1, words),
-    )  # fmt: skip
+        chain, found.joints, pool, limits, settings.run, settings.seed, lambda words: progress and progress(0, 1, words)
+    )
     found, run = _driven(found, driven), driven.run
     notes += [driven.words] if driven.replaced else []
     outlook = _outlook(jacobian, limits, search, driven.q, pool, comparable)
     return Chosen(
-        chain, found, len(jacobian.free), value, limits.checked, limits.unchecked, tuple(notes), outlook, run,
-        settings.run, view is not None,
-    )  # fmt: skip
+        chain,
+        found,
+        len(jacobian.free),
+        value,
+        limits.checked,
+        limits.unchecked,
+        tuple(notes),
+        outlook,
+        run,
+        settings.run,
+        view is not None,
+    )
 
 
 def _driven(found: Selection, driven: Drivable) -> Selection:
@@ -184,9 +198,13 @@ def _driven(found: Selection, driven: Drivable) -> Selection:
         indices = indices[driven.run.order]
     history = np.append(found.history, value) if driven.replaced else found.history
     return replace(
-        found, q=driven.q[driven.run.order], indices=indices, value=value, history=history,
+        found,
+        q=driven.q[driven.run.order],
+        indices=indices,
+        value=value,
+        history=history,
         efficiency=found.efficiency * float(np.exp(driven.gain)),
-    )  # fmt: skip
+    )
 
 
 def _drawn(space: SearchSpace, limits: Limits, settings: SelectionSettings) -> np.ndarray:

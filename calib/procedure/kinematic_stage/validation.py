@@ -208,9 +208,13 @@ def _doubts(
         if (held := rows.intervals) is not None:
             chance = 3.0 * float(np.sqrt(0.95 * 0.05 / len(held.size)))
             yield finding(
-                "intervals-too-narrow", where=name, errors=len(held.size), covered=held.covered,
-                median=np.median(held.radius), missing=0.95 - chance - held.covered,
-            )  # fmt: skip
+                "intervals-too-narrow",
+                where=name,
+                errors=len(held.size),
+                covered=held.covered,
+                median=np.median(held.radius),
+                missing=0.95 - chance - held.covered,
+            )
     yield finding("small-gain", left=worst.left)
     yield finding("many-outliers", share=findings.outlier_share)
 
@@ -308,9 +312,12 @@ def assess(arms: Arms, inputs: Inputs, findings: Findings, settings: Settings, w
     for name, rows in validation.items():
         references += filter(level_of, _references(name, rows, chosen, frames_only))
     noticed = (
-        *others, *references, *findings.noticed, *([finding("not-unseen", files=copies)] if copies else []),
+        *others,
+        *references,
+        *findings.noticed,
+        *([finding("not-unseen", files=copies)] if copies else []),
         *(one for name, each in validation.items() for one in _noticed(name, each, usual)),
-    )  # fmt: skip
+    )
     blocks = (*inputs.fit, *(unseen.block for unseen in inputs.unseen.values()))
     notes = (*inputs.notes, *(note for block in blocks for note in block.notes))
     return Assessment(fitted, validation, judged[chosen], noticed, notes, judged, chosen)
@@ -374,9 +381,13 @@ def _noticed(name: str, each: Comparison, usual: float) -> Iterator[Finding]:
     if rows := _rows_off(each, far := _far(sizes)):
         beyond = np.zeros(len(sizes), bool) if each.intervals is None else each.intervals.beyond
         yield finding(
-            "doubtful-rows", file=name, rows=rows, median=np.median(sizes),
-            without=float(np.sqrt(np.mean(sizes[~far] ** 2))), outside=int(np.count_nonzero(beyond[far])),
-        )  # fmt: skip
+            "doubtful-rows",
+            file=name,
+            rows=rows,
+            median=np.median(sizes),
+            without=float(np.sqrt(np.mean(sizes[~far] ** 2))),
+            outside=int(np.count_nonzero(beyond[far])),
+        )
     if not each.settled:
         yield finding("placement-unsettled", file=name)
     elif each.placed_by is not None:

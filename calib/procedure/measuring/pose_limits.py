@@ -359,9 +359,12 @@ def _model(
     posture = _posture(table.posture, chain, source)
     stands = "the stated posture" if posture else "zero of their joints"
     around: dict[str, Any] = {
-        "walls": walls, "targets": cell.tools[:, :3, 3], "margin": table.margin, "within": within,
+        "walls": walls,
+        "targets": cell.tools[:, :3, 3],
+        "margin": table.margin,
+        "within": within,
         "ignored": {frozenset(pair) for pair in table.ignored},
-    }  # fmt: skip
+    }
     if source is not None and is_urdf(source) and "<collision" in text(source)[0]:
         try:
             model = collision.from_urdf(source, chain.base, chain.tip, floor, obstacles, posture=posture, **around)

@@ -75,8 +75,9 @@ class Run:
         pairs = enumerate(pairwise(self.order))
         return {
             _pair(one, two): self.ways[k] if one < two else self.ways[k][::-1]
-            for k, (one, two) in pairs if k not in self.blocked
-        }  # fmt: skip
+            for k, (one, two) in pairs
+            if k not in self.blocked
+        }
 
     @property
     def cut_off(self) -> tuple[int, ...]:
@@ -198,9 +199,15 @@ def turns(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> 
 
 
 def way_to(
-    chain: Chain, limits: Any, settings: RunSettings, postures: np.ndarray, others: np.ndarray, *, straight: bool,
+    chain: Chain,
+    limits: Any,
+    settings: RunSettings,
+    postures: np.ndarray,
+    others: np.ndarray,
+    *,
+    straight: bool,
     seed: int = 0,
-) -> tuple[int, np.ndarray] | None:  # fmt: skip
+) -> tuple[int, np.ndarray] | None:
     """Return a clear path (k, n) from one of m poses to one of p postures, and the start's index; None: not found.
 
     The moves of least time are tried, for each of the `MAX_NEIGHBOURS` nearest postures: straight ones from the

@@ -44,9 +44,17 @@ def layer(draw: Callable[Concatenate[Axes, P], None]) -> Callable[P, Layer]:
 
 @layer
 def line(
-    axes: Axes, x: Any, y: Any, form: str = "-", colour: str = AFTER, width: float = 0.9, size: float = 3.5,
-    hollow: bool = False, label: str = "", spread: Any = None,
-) -> None:  # fmt: skip
+    axes: Axes,
+    x: Any,
+    y: Any,
+    form: str = "-",
+    colour: str = AFTER,
+    width: float = 0.9,
+    size: float = 3.5,
+    hollow: bool = False,
+    label: str = "",
+    spread: Any = None,
+) -> None:
     """Draw a curve or points (k,) in a matplotlib format (``-``, ``o``, ``o-``); long curves are thinned.
 
     Args:
@@ -56,16 +64,31 @@ def line(
     if form == "-":
         x, y = style.thinned(x, y)
     axes.errorbar(
-        x, y, spread, fmt=form, color=colour, linewidth=width, markersize=size, label=label,
-        markerfacecolor="white" if hollow else colour, markeredgewidth=0.8 if hollow or form == "+" else 0.0,
-    )  # fmt: skip
+        x,
+        y,
+        spread,
+        fmt=form,
+        color=colour,
+        linewidth=width,
+        markersize=size,
+        label=label,
+        markerfacecolor="white" if hollow else colour,
+        markeredgewidth=0.8 if hollow or form == "+" else 0.0,
+    )
 
 
 @layer
 def bars(
-    axes: Axes, values: Any, colours: Any = AFTER, upright: bool = False, shift: float = 0.0, thick: float = 0.7,
-    base: float = 0.0, spread: Any = None, label: str = "",
-) -> None:  # fmt: skip
+    axes: Axes,
+    values: Any,
+    colours: Any = AFTER,
+    upright: bool = False,
+    shift: float = 0.0,
+    thick: float = 0.7,
+    base: float = 0.0,
+    spread: Any = None,
+    label: str = "",
+) -> None:
     """Draw bars (k,) from `base` at 0, 1, …, in one colour or one each; `spread` (k,): half the error bars' length."""
     values = np.asarray(values, dtype=float)
     kind, error = (axes.bar, "yerr") if upright else (axes.barh, "xerr")
@@ -76,25 +99,42 @@ def bars(
 
 @layer
 def level(
-    axes: Axes, at: float, colour: str = MARK, form: str = "--", upright: bool = False, words: str = "",
+    axes: Axes,
+    at: float,
+    colour: str = MARK,
+    form: str = "--",
+    upright: bool = False,
+    words: str = "",
     height: float = 0.98,
-) -> None:  # fmt: skip
+) -> None:
     """Draw a horizontal or vertical line across the panel, with a label (for a vertical line at the given height)."""
     (axes.axvline if upright else axes.axhline)(at, color=colour, linewidth=0.8, linestyle=form)
     right = not upright or axes.transAxes.inverted().transform(axes.transData.transform((at, at)))[0] < 0.6
     axes.annotate(
-        words, (at, height) if upright else (0.0, at),
+        words,
+        (at, height) if upright else (0.0, at),
         xycoords=("data", "axes fraction") if upright else ("axes fraction", "data"),
-        xytext=(3 if right else -3, 0 if upright else 1), textcoords="offset points", color=colour,
-        va="top" if upright else "bottom", ha="left" if right else "right", path_effects=HALO,
-    )  # fmt: skip
+        xytext=(3 if right else -3, 0 if upright else 1),
+        textcoords="offset points",
+        color=colour,
+        va="top" if upright else "bottom",
+        ha="left" if right else "right",
+        path_effects=HALO,
+    )
 
 
 @layer
 def text(
-    axes: Axes, words: str, x: float, y: float, offset: tuple[float, float] = (4, 4), colour: str = INK,
-    size: float = 7.0, across: str = "left", along: str = "baseline",
-) -> None:  # fmt: skip
+    axes: Axes,
+    words: str,
+    x: float,
+    y: float,
+    offset: tuple[float, float] = (4, 4),
+    colour: str = INK,
+    size: float = 7.0,
+    across: str = "left",
+    along: str = "baseline",
+) -> None:
     """Draw a text at a point, shifted by an offset [pt]."""
     axes.annotate(words, (x, y), offset, textcoords="offset points", color=colour, fontsize=size, ha=across, va=along)
 
@@ -111,9 +151,14 @@ def dots(axes: Axes, x: Any, y: Any, values: Any, least: float, most: float, uni
 
 @layer
 def heat(
-    axes: Axes, values: Any, unit: str = "", extent: tuple[float, float, float, float] | None = None,
-    limits: tuple[float, float | None] = (0.0, None), colours: str = "cividis_r", written: bool = False,
-) -> None:  # fmt: skip
+    axes: Axes,
+    values: Any,
+    unit: str = "",
+    extent: tuple[float, float, float, float] | None = None,
+    limits: tuple[float, float | None] = (0.0, None),
+    colours: str = "cividis_r",
+    written: bool = False,
+) -> None:
     """Draw a colour map of values (rows, columns) with a colour bar, row 0 at the top, NaN white.
 
     Args:
@@ -122,9 +167,14 @@ def heat(
         written: whether values stand in their cells.
     """
     drawn = axes.imshow(
-        values, colours, vmin=limits[0], vmax=limits[1], extent=extent, interpolation="nearest",
+        values,
+        colours,
+        vmin=limits[0],
+        vmax=limits[1],
+        extent=extent,
+        interpolation="nearest",
         aspect="equal" if extent else "auto",
-    )  # fmt: skip
+    )
     for (i, j), value in np.ndenumerate(values) if written else ():
         colour = INK if abs(value) <= 0.6 else "white"
         axes.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=5.5, color=colour)
@@ -142,11 +192,19 @@ def histogram(axes: Axes, counts: Any, edges: Any, colour: str = AFTER) -> None:
 def box(axes: Axes, values: Any, place: float, colour: str = AFTER) -> None:
     """Draw a box plot of values (k,) at a place on y: quartiles and median, 5th and 95th percentile, points beyond."""
     axes.boxplot(
-        [values], positions=[place], orientation="horizontal", whis=(5, 95), widths=0.56, patch_artist=True,
-        manage_ticks=False, boxprops={"facecolor": colour, "linewidth": 0}, whiskerprops={"color": QUIET},
-        medianprops={"color": "white", "linewidth": 1.4}, capprops={"linewidth": 0},
+        [values],
+        positions=[place],
+        orientation="horizontal",
+        whis=(5, 95),
+        widths=0.56,
+        patch_artist=True,
+        manage_ticks=False,
+        boxprops={"facecolor": colour, "linewidth": 0},
+        whiskerprops={"color": QUIET},
+        medianprops={"color": "white", "linewidth": 1.4},
+        capprops={"linewidth": 0},
         flierprops={"marker": ".", "markersize": 2.0, "markeredgecolor": QUIET},
-    )  # fmt: skip
+    )
 
 
 def _scale(axes: Axes, drawn: Any, unit: str, **options: Any) -> None:

@@ -98,9 +98,15 @@ def friction(outcome: IdentificationOutcome) -> dict[str, Chart]:
 
 
 def torques(
-    t: np.ndarray, measured: np.ndarray, predicted: np.ndarray, rows: Sequence[str], units: Sequence[str], title: str,
-    errors: Sequence[float] | np.ndarray = (), band: float = np.nan,
-) -> Chart:  # fmt: skip
+    t: np.ndarray,
+    measured: np.ndarray,
+    predicted: np.ndarray,
+    rows: Sequence[str],
+    units: Sequence[str],
+    title: str,
+    errors: Sequence[float] | np.ndarray = (),
+    band: float = np.nan,
+) -> Chart:
     """Return the chart of measured torques, predicted torques and residuals over time.
 
     Args:
@@ -142,10 +148,14 @@ def autocorrelations(
     panels = [
         Panel(
             [bars([0.0, *white.acf], upright=True, thick=0.4), level(white.bound), level(-white.bound)],
-            row, "lag [samples]", ylim=(-1.0, 1.0), xlim=(0.0, len(white.acf) + 1.0), ticks=3,
+            row,
+            "lag [samples]",
+            ylim=(-1.0, 1.0),
+            xlim=(0.0, len(white.acf) + 1.0),
+            ticks=3,
         )
         for row, white in shown
-    ]  # fmt: skip
+    ]
     height = 0.65 + 0.95 * -(-max(1, len(shown)) // columns)
     return Chart(panels or [Panel([])], height, columns, width, title, shared="xy")
 
@@ -184,9 +194,10 @@ def _geometries(rows: Sequence[TwoGeometries]) -> Chart:
     above = [
         line(x + shift, percent * (values - own), "o", colour, 1.0, 2.5, label=label, spread=2.0 * percent * sigma)
         for values, sigma, colour, shift, label in (
-            (nominal, s_nominal, BEFORE, -0.15, "nominal (CAD) geometry"), (own, s_own, AFTER, 0.15, "calibrated"),
+            (nominal, s_nominal, BEFORE, -0.15, "nominal (CAD) geometry"),
+            (own, s_own, AFTER, 0.15, "calibrated"),
         )
-    ]  # fmt: skip
+    ]
     shown = bars(size, [MARK if abs(one) > 2.0 else QUIET for one in size], upright=True)
     panels = [
         Panel(above, y="from calibrated [%]", xnames=[""] * len(chosen), grid="y", symlog=1.0),
@@ -199,9 +210,10 @@ def _effects(rows: Sequence[GeometricEffect]) -> Chart:
     """Return the chart of geometric errors, ranked by the largest parameter shift they cause."""
     size = np.nan_to_num(np.array([row.shift_sigma or 0.0 for row in rows]), posinf=0.0)
     layers = [
-        bars(size, [AFTER if one > MIN_SHIFT else QUIET for one in size]), level(MIN_SHIFT, upright=True),
+        bars(size, [AFTER if one > MIN_SHIFT else QUIET for one in size]),
+        level(MIN_SHIFT, upright=True),
         *(text(row.parameter, one, k, (3, 0), along="center") for k, (row, one) in enumerate(zip(rows, size))),
-    ]  # fmt: skip
+    ]
     labels = [f"{row.element} ({small(row.sigma or 0.0, row.unit, digits=2)})" for row in rows]
     title = f"{int((size > MIN_SHIFT).sum())} of {len(rows)} geometric errors matter"
     limits = 0.0, 1.25 * float(size.max(initial=MIN_SHIFT))

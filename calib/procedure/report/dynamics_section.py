@@ -62,9 +62,11 @@ PARAMETERS = (
     page.Column("what it holds", lambda row: page.shortened(row.expression, WORDS), number=False),
 )
 FED_FORWARD = {
-    FEEDBACK: "feedback alone", CAD: "CAD fed forward", IDENTIFIED: "model fed forward",
+    FEEDBACK: "feedback alone",
+    CAD: "CAD fed forward",
+    IDENTIFIED: "model fed forward",
     FLOOR: "measured torque fed forward",
-}  # fmt: skip
+}
 
 
 class IdentifiedParameter(NamedTuple):
@@ -153,9 +155,12 @@ def outcome_section(outcome: IdentificationOutcome) -> page.Section:
 
 
 def report_section(
-    found: DynamicReport, drawn: Mapping[str, page.Picture], exported: Sequence[str] = (), tolerance: float = 0.0,
+    found: DynamicReport,
+    drawn: Mapping[str, page.Picture],
+    exported: Sequence[str] = (),
+    tolerance: float = 0.0,
     delivered: float | None = None,
-) -> page.Section:  # fmt: skip
+) -> page.Section:
     """Return the section of a report: errors on unseen motion, torques, excitation, and parameters.
 
     Args:
@@ -245,8 +250,16 @@ def _error_table(unseen: UnseenReport) -> page.Table:
         sets[f"{name} ({'unseen' if one.evidence else 'repeat: no evidence'})"] = one
     groups = {label: _error_rows(one, unseen) for label, one in sets.items()}
     header = (
-        "torque", "rms error", "of limit", "error", "in band", "moving", "standing", "torque above band", "ACF outside",
-    )  # fmt: skip
+        "torque",
+        "rms error",
+        "of limit",
+        "error",
+        "in band",
+        "moving",
+        "standing",
+        "torque above band",
+        "ACF outside",
+    )
     return page.grouped("Torque errors", header, groups, ERROR_NOTE, _of_all)
 
 
@@ -271,9 +284,12 @@ def _error_rows(one: Score, unseen: UnseenReport) -> Iterator[Sequence[str]]:
     yield "all", "", "", *(percent(part.total) for part in parts), "", ""
     for j, (row, white) in enumerate(zip(unseen.rows, one.whiteness)):
         yield (
-            row, *rms_words(one, unseen, j), *(percent(part.joints[j]) for part in parts),
-            percent(one.above_band_percent[j]), "" if white is None else f"{100 * white.outside:.0f} %",
-        )  # fmt: skip
+            row,
+            *rms_words(one, unseen, j),
+            *(percent(part.joints[j]) for part in parts),
+            percent(one.above_band_percent[j]),
+            "" if white is None else f"{100 * white.outside:.0f} %",
+        )
 
 
 def rms_words(one: Score, unseen: UnseenReport, row: int) -> tuple[str, str]:
@@ -299,8 +315,12 @@ def _interval_table(unseen: UnseenReport) -> page.Table:
                 inside, half = f"{found.joints_percent[k]:.0f} %", f"± {found.median[k]:.3g} {unit}"
                 groups[name].append((row, inside, half, resting, ""))
     header = (
-        "torque", "errors within the 95 % interval", "median interval in motion", "at rest", "of the time extrapolated",
-    )  # fmt: skip
+        "torque",
+        "errors within the 95 % interval",
+        "median interval in motion",
+        "at rest",
+        "of the time extrapolated",
+    )
     return page.grouped("Intervals stated", header, groups, strong=_of_all)
 
 

@@ -45,9 +45,13 @@ def error_histogram(
             level(rms[1], AFTER, upright=True, words=arm, height=0.9),
             *([level(seen, INK, ":", upright=True, words="instrument", height=0.82)] if noise else []),
         ],
-        f"{rms[0]:.3g} {unit} rms before, {rms[1]:.3g} {unit} after", f"{nature} error [{unit}]", "poses",
-        xlim=(edges[0], edges[-1]), ylim=(0.0, 1.3 * max(1, *map(max, counts))), log="x" if apart else "",
-    )  # fmt: skip
+        f"{rms[0]:.3g} {unit} rms before, {rms[1]:.3g} {unit} after",
+        f"{nature} error [{unit}]",
+        "poses",
+        xlim=(edges[0], edges[-1]),
+        ylim=(0.0, 1.3 * max(1, *map(max, counts))),
+        log="x" if apart else "",
+    )
     return Chart([panel], 2.4, width=HALF_WIDTH)
 
 
@@ -88,9 +92,12 @@ def residuals_by_joint(
 
 
 def error_map(
-    points: np.ndarray, sizes: np.ndarray, words: str = "at most {} remain", expected: np.ndarray | None = None,
+    points: np.ndarray,
+    sizes: np.ndarray,
+    words: str = "at most {} remain",
+    expected: np.ndarray | None = None,
     least: float = 0.0,
-) -> Chart:  # fmt: skip
+) -> Chart:
     """Return the maps of remaining errors in the workspace (from above and from the side) and of expected errors.
 
     Args:
@@ -112,12 +119,19 @@ def error_map(
         Panel(
             [
                 dots(points[:, 0], points[:, j], 1e3 * np.asarray(values), 1e3 * least, most, "[mm]" if j == 2 else ""),
-                line([0.0], [0.0], "+", INK, size=9.0), text("base", 0.0, 0.0, (-5, 4), across="right"),
+                line([0.0], [0.0], "+", INK, size=9.0),
+                text("base", 0.0, 0.0, (-5, 4), across="right"),
             ],
-            title, "x [m]", f"{'xyz'[j]} [m]", grid="both", equal=True, ticks=6,
+            title,
+            "x [m]",
+            f"{'xyz'[j]} [m]",
+            grid="both",
+            equal=True,
+            ticks=6,
         )
-        for values, row in zip(both, titles) for j, title in zip((1, 2), row)
-    ]  # fmt: skip
+        for values, row in zip(both, titles)
+        for j, title in zip((1, 2), row)
+    ]
     return Chart(panels, 3.0 * len(both), 2)
 
 
@@ -182,9 +196,7 @@ def singular_values(values: np.ndarray, rank: int) -> Chart:
     values = np.asarray(values, dtype=float)
     shown = np.maximum(values, max(values[0] * 1e-17, 1e-17))
     count = np.arange(1, len(values) + 1)
-    layers: list = [
-        line(count[:rank], shown[:rank], "o"), line(count[rank:], shown[rank:], "o", MARK, hollow=True),
-    ]  # fmt: skip
+    layers: list = [line(count[:rank], shown[:rank], "o"), line(count[rank:], shown[rank:], "o", MARK, hollow=True)]
     if 0 < rank < len(values):
         last, first = shown[rank - 1], shown[rank]
         middle = rank + 0.5, float(np.sqrt(last * first))
@@ -207,18 +219,25 @@ def ladder(steps: Sequence[ModelStep], noise: float | None = None) -> Chart:
     taken = np.flatnonzero([not step.note for step in steps])
     left_out, last = np.setdiff1d(x, taken), taken[-1:]
     layers: list = [
-        line(x[taken], errors[taken], "o-", size=5.0), line(x[left_out], errors[left_out], "o", size=5.0, hollow=True),
+        line(x[taken], errors[taken], "o-", size=5.0),
+        line(x[left_out], errors[left_out], "o", size=5.0, hollow=True),
         line(x[last], errors[last], "o", size=8.0),
         *(text(f"{error:.3g}", place, error, (0, 8), across="center") for place, error in enumerate(errors)),
-    ]  # fmt: skip
+    ]
     if noise:
         layers.append(level(1e3 * noise, INK, ":", words="instrument"))
     limits = 0.7 * min(errors.min(), 1e3 * (noise or np.inf)), 2.4 * errors.max()
     ends = (f"{steps[k].model.removeprefix('+ ')} is the last to reduce the error: to {errors[k]:.3g} mm" for k in last)
     panel = Panel(
-        layers, next(ends, ""), "model, parameters", "cross-validated error [mm]", ylim=limits, log="y",
-        xnames=[f"{step.model}\n{step.parameters}" for step in steps], grid="y",
-    )  # fmt: skip
+        layers,
+        next(ends, ""),
+        "model, parameters",
+        "cross-validated error [mm]",
+        ylim=limits,
+        log="y",
+        xnames=[f"{step.model}\n{step.parameters}" for step in steps],
+        grid="y",
+    )
     return Chart([panel], 2.4)
 
 
@@ -247,9 +266,15 @@ def outlook_figure(others: Curve, own: tuple[float, float], along: str, across: 
         text("this plan", *own),
     ]
     panel = Panel(
-        layers, "predicted before measuring", along, across, (0.8 * low[0], 1.25 * high[0]),
-        (0.7 * low[1], 1.4 * high[1]), log="xy", grid="both",
-    )  # fmt: skip
+        layers,
+        "predicted before measuring",
+        along,
+        across,
+        (0.8 * low[0], 1.25 * high[0]),
+        (0.7 * low[1], 1.4 * high[1]),
+        log="xy",
+        grid="both",
+    )
     return Chart([panel], 2.4, width=HALF_WIDTH)
 
 

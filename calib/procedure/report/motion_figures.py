@@ -73,13 +73,20 @@ def _path_figure(designed: Designed) -> Chart:
     panels = [
         Panel(
             [
-                line(tool[0], tool[j], form="-"), line(tool[0, :1], tool[j, :1], "o", MARK),
-                text("start", tool[0, 0], tool[j, 0]), line([0.0], [0.0], "+", QUIET), text("base", 0.0, 0.0),
+                line(tool[0], tool[j], form="-"),
+                line(tool[0, :1], tool[j, :1], "o", MARK),
+                text("start", tool[0, 0], tool[j, 0]),
+                line([0.0], [0.0], "+", QUIET),
+                text("base", 0.0, 0.0),
             ],
-            title, "x [m]", f"{'xyz'[j]} [m]", grid="both", equal=True,
+            title,
+            "x [m]",
+            f"{'xyz'[j]} [m]",
+            grid="both",
+            equal=True,
         )
         for j, title in ((1, "the tool's path from above"), (2, "from the side"))
-    ]  # fmt: skip
+    ]
     return Chart(panels, 3.2, 2)
 
 
@@ -98,9 +105,11 @@ def front_figure(front: Front) -> Chart:
     good, rest = order[front.best[order]], order[~front.best[order]]
     own = front.designed
     points = [
-        line(torque[good], index[good], "o-", size=4.0), line(torque[rest], index[rest], "o", BEFORE, hollow=True),
-        line(torque[[own]], index[[own]], "s", MARK, size=5.5), text("designed", torque[own], index[own]),
-    ]  # fmt: skip
+        line(torque[good], index[good], "o-", size=4.0),
+        line(torque[rest], index[rest], "o", BEFORE, hollow=True),
+        line(torque[[own]], index[[own]], "s", MARK, size=5.5),
+        text("designed", torque[own], index[own]),
+    ]
     title = f"{len(np.unique(front.values[good], axis=0))} motions to choose from"
     words = f"mean {front.names[1].replace('slack ', '')} / limit"
     return Chart([Panel(points, title, words, front.names[0])], 2.5, width=HALF_WIDTH)

@@ -55,9 +55,13 @@ class Column(NamedTuple):
 
 
 def table(
-    title: str, columns: Sequence[Column], records: Sequence[Any], note: str = "",
-    strong: Callable[[Any], bool] = lambda record: False, most: int | None = None,
-) -> Table:  # fmt: skip
+    title: str,
+    columns: Sequence[Column],
+    records: Sequence[Any],
+    note: str = "",
+    strong: Callable[[Any], bool] = lambda record: False,
+    most: int | None = None,
+) -> Table:
     """Return a table of records, one row per record up to `most`, with the `strong` ones in bold."""
     if most is not None and len(records) > most:
         note, records = f"{note} {len(records) - most} more in metrics.json.", records[:most]
@@ -68,9 +72,13 @@ def table(
 
 
 def grouped(
-    title: str, header: Sequence[str], groups: Mapping[str, Iterable[Sequence[str]]], note: str = "",
-    strong: Callable[[Sequence[str]], bool] = lambda row: False, texts: int = 1,
-) -> Table:  # fmt: skip
+    title: str,
+    header: Sequence[str],
+    groups: Mapping[str, Iterable[Sequence[str]]],
+    note: str = "",
+    strong: Callable[[Sequence[str]], bool] = lambda row: False,
+    texts: int = 1,
+) -> Table:
     """Return a table of rows under headings, with the `strong` rows in bold; the first `texts` columns are text."""
     rows = [row for heading, own in groups.items() for row in ((heading,), *own)]
     bold = frozenset(k for k, row in enumerate(rows) if strong(row))
@@ -183,9 +191,12 @@ def _rich_table(table: Table) -> RichTable:
     """Return a table as a rich renderable."""
     title = table.title[:1].lower() + table.title[1:]
     result = RichTable(
-        title=RichText(title), title_justify="left", caption=RichText(table.note) if table.note else None,
-        caption_justify="left", box=box.HEAVY_HEAD,
-    )  # fmt: skip
+        title=RichText(title),
+        title_justify="left",
+        caption=RichText(table.note) if table.note else None,
+        caption_justify="left",
+        box=box.HEAVY_HEAD,
+    )
     numbers = set(table.numbers)
     for k, name in enumerate(table.header):
         result.add_column(RichText(name), justify="right" if k in numbers else "left", overflow="fold")

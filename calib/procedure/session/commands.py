@@ -138,9 +138,16 @@ LIMITS = "limits.toml"
 CAMERA_FILES = {"lens": "camera.yaml", "board": "board.toml"}  # a camera's files, beside the limits
 HEAD = "# The cell, as given to `calib new`. `calib formats limits` lists the possible keys.\n"
 COLOURS = {
-    **page.COLOURS, "done": "green", "kept": "green", "ready": "cyan", "stale": "yellow", "waiting": "yellow",
-    "waits": "yellow", "after": "dim", "failed": "red",
-}  # fmt: skip
+    **page.COLOURS,
+    "done": "green",
+    "kept": "green",
+    "ready": "cyan",
+    "stale": "yellow",
+    "waiting": "yellow",
+    "waits": "yellow",
+    "after": "dim",
+    "failed": "red",
+}
 
 
 @dataclass(frozen=True)
@@ -204,12 +211,16 @@ def new_session(
         needed("check_controller")(program, chain.n)
     copied, named = _limits(limits, chain, source, dynamics)
     table = {
-        "name": chain.name, "created": "", "seed": seed, "fit": {"tolerance_mm": tolerance_mm},
+        "name": chain.name,
+        "created": "",
+        "seed": seed,
+        "fit": {"tolerance_mm": tolerance_mm},
         "robot": {"file": source.name, "given": str(robot), "base": base, "tip": tip, "controller": program},
         "instrument": asdict(device) | ({} if tool is None else {"tool": [*map(float, tool)]}),
         "poses": {"fit": poses, "validation": validation, "constraints": named},
-        "dynamics": {"wanted": dynamics, "limits": named, **motion}, "certificate": dict(certificate or {}),
-    }  # fmt: skip
+        "dynamics": {"wanted": dynamics, "limits": named, **motion},
+        "certificate": dict(certificate or {}),
+    }
     create(Path(folder), source, parse(SessionSettings, table, SESSION), copied | meshes_beside(source))
     return Path(folder)
 

@@ -25,7 +25,7 @@ from calib.identification.checks.recorded_motion import (
     another_motion,
     locate,
     share_of_nominal,
-)  # fmt: skip
+)
 from calib.identification.identify_options import FileSettings, IdentifyOptions, read_options
 from calib.identification.settings import Payload
 from calib.procedure.dynamic_stage import identify as identifying
@@ -83,17 +83,26 @@ def excite(session: Session, say: Say) -> list[str]:
     for name in names:
         first = name == "training"
         settings = ExcitationSettings(
-            period=section.period * (1.0 if first else VALIDATION_PERIOD), harmonics=section.harmonics,
-            rate=section.rate, starts=section.starts if first else 1,
+            period=section.period * (1.0 if first else VALIDATION_PERIOD),
+            harmonics=section.harmonics,
+            rate=section.rate,
+            starts=section.starts if first else 1,
             evaluations=section.evaluations if first else max(20, section.evaluations // 3),
-            seed=session.settings.seed + (0 if first else VALIDATION_SEED), repeat=section.repeats, outlook=first,
-            goals=section.goals if first else (), hard=section.hard if first else (),
-            front=section.front if first else 0, within="" if first else str(session.path("6-excitation/training")),
-        )  # fmt: skip
+            seed=session.settings.seed + (0 if first else VALIDATION_SEED),
+            repeat=section.repeats,
+            outlook=first,
+            goals=section.goals if first else (),
+            hard=section.hard if first else (),
+            front=section.front if first else 0,
+            within="" if first else str(session.path("6-excitation/training")),
+        )
         designed = design.excite(
-            session.fit.path, settings, limits=limits, options=options_of(session).settings,
+            session.fit.path,
+            settings,
+            limits=limits,
+            options=options_of(session).settings,
             progress=lambda words, name=name: say(f"{name} motion: {words}"),
-        )  # fmt: skip
+        )
         if designed.found.interrupted:  # a session is resumed, not gone on with half a search
             raise KeyboardInterrupt
         motion_folder.write_design(designed, session.path("6-excitation") / name, draw if first else None)
@@ -192,10 +201,11 @@ def _other_motion(recording: Recording, motion: DesignedMotion, found: Change | 
     unit, order, sign = (found.values[key] for key in ("unit", "order", "sign"))
     moved = [(names[column], names[j]) for j, column in enumerate(order) if column != j]
     return finding(
-        found.code, unit="" if unit == 1.0 else "deg" if unit < 1.0 else "rad although the header says deg",
+        found.code,
+        unit="" if unit == 1.0 else "deg" if unit < 1.0 else "rad although the header says deg",
         swapped=[f"the column of {column} contains {joint}" for column, joint in moved],
         reversed=[names[j] for j, one in enumerate(sign) if one < 0],
-    )  # fmt: skip
+    )
 
 
 def check_torques(recording: Recording, chain: Chain) -> None:

@@ -71,9 +71,12 @@ POSES_CHECKED, MOTION_CHECKED = f"3-measured/{CHECKED}", f"7-recorded/{CHECKED}"
 ROUND = "round"  # of further motions: round2, round3 …
 LOGS = (".csv", ".npz", ".mcap", ".bag", ".db3")
 BROUGHT = {  # what people bring: where to, and how its name begins
-    "measured": ("3-measured", ""), "validation": ("3-measured", "validation"), "drift": ("3-measured", "drift"),
-    "training": ("7-recorded", ""), "unseen": ("7-recorded", "validation"),
-}  # fmt: skip
+    "measured": ("3-measured", ""),
+    "validation": ("3-measured", "validation"),
+    "drift": ("3-measured", "drift"),
+    "training": ("7-recorded", ""),
+    "unseen": ("7-recorded", "validation"),
+}
 
 
 @dataclass(frozen=True)

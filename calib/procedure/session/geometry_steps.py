@@ -67,13 +67,21 @@ def _choose(session: Session, chain: Chain, say: Say) -> list[str]:
     section, instrument = settings.poses, settings.instrument
     sigmas = (instrument.sigma_position, instrument.sigma_orientation or SIGMA_ORIENTATION)
     choice = SelectionSettings(
-        kind=_seen_as(instrument.measures), tools=(instrument.tool,), index=section.index, method=section.method,
-        sigmas=sigmas if instrument.sigma_position else None, seed=settings.seed,
-    )  # fmt: skip
+        kind=_seen_as(instrument.measures),
+        tools=(instrument.tool,),
+        index=section.index,
+        method=section.method,
+        sigmas=sigmas if instrument.sigma_position else None,
+        seed=settings.seed,
+    )
     chosen = selection.choose(
-        robot_file, section.fit, choice, constraints=session.named(section.constraints), **session.links,
+        robot_file,
+        section.fit,
+        choice,
+        constraints=session.named(section.constraints),
+        **session.links,
         progress=lambda done, total, what: say(f"choosing poses: {what}"),
-    )  # fmt: skip
+    )
     said = any(words.startswith(VIEW_UNCHECKED) for words in chosen.unchecked)
     if instrument.measures == IMAGES and not chosen.by_images and not said:
         chosen = replace(chosen, unchecked=(*chosen.unchecked, f"{VIEW_UNCHECKED} ({HOW})"))
@@ -252,10 +260,16 @@ def _fit_settings(session: Session) -> FitSettings:
     section, masses = session.settings.fit, session.path(folder.MASSES)
     model, loss = (None if value == "auto" else value for value in (section.model, section.loss))
     return FitSettings(
-        model=model, loss=loss, stations=section.stations, tolerance=1e-3 * section.tolerance_mm or None,
-        refit_frames=section.validation_frames == "own", seed=session.settings.seed, holdout=section.holdout,
-        deliverable=section.deliverable, masses=str(masses) if (masses / MODEL).is_file() else "",
-    )  # fmt: skip
+        model=model,
+        loss=loss,
+        stations=section.stations,
+        tolerance=1e-3 * section.tolerance_mm or None,
+        refit_frames=section.validation_frames == "own",
+        seed=session.settings.seed,
+        holdout=section.holdout,
+        deliverable=section.deliverable,
+        masses=str(masses) if (masses / MODEL).is_file() else "",
+    )
 
 
 def _gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
@@ -264,9 +278,13 @@ def _gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
     if is_urdf(session.robot_file):  # whatever joints the files' columns name
         links = {"base": chain.base, "tip": chain.tip}
     return inputs.gather(
-        session.robot_file, measured, validate, options=_options_of(session, [*measured, *validate]),
-        settings=_fit_settings(session), **links,
-    )  # fmt: skip
+        session.robot_file,
+        measured,
+        validate,
+        options=_options_of(session, [*measured, *validate]),
+        settings=_fit_settings(session),
+        **links,
+    )
 
 
 def fit(session: Session, say: Say) -> list[str]:

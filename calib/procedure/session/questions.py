@@ -92,10 +92,19 @@ class Question:
 
 
 DEFAULTS = {
-    "robot": "", "instrument": "tracker", "tool": "0.05,0,0.05", "program": "none", "limits": "none", "facing": "z",
-    "dynamics": "yes", "torques": "motor", "payloads": "none", "tolerance_mm": "0", "tolerance_percent": "0",
+    "robot": "",
+    "instrument": "tracker",
+    "tool": "0.05,0,0.05",
+    "program": "none",
+    "limits": "none",
+    "facing": "z",
+    "dynamics": "yes",
+    "torques": "motor",
+    "payloads": "none",
+    "tolerance_mm": "0",
+    "tolerance_percent": "0",
     "details": "yes",
-}  # fmt: skip
+}
 QUESTIONS = (
     *(Question(one.name, DEFAULTS.get(one.name, "unknown")) for one in fields(Answers) if one.name != "certificate"),
     *(Question(one.name, "", CertificateSection) for one in fields(CertificateSection)),
@@ -114,9 +123,13 @@ def with_answer(given: Answers, question: Question, text: str) -> Answers:
         return replace(given, certificate=replace(given.certificate, **{name: entry}))
     said = {"y": True, "n": False}.get(text[:1].lower(), text)
     values: dict[str, Any] = {
-        "tool": text.split(","), "limits": None if empty else text, "payloads": [] if empty else text.split(),
-        "obstacles": [text], "dynamics": said, "details": said,
-    }  # fmt: skip
+        "tool": text.split(","),
+        "limits": None if empty else text,
+        "payloads": [] if empty else text.split(),
+        "obstacles": [text],
+        "dynamics": said,
+        "details": said,
+    }
     found = replace(given, **{name: getattr(parse(Answers, {name: values.get(name, text)}, ""), name)})
     if name == "robot":
         require(text, "a robot is needed", UsageError)

@@ -13,27 +13,14 @@ from typing import Annotated, Any, get_type_hints
 import rtoml
 
 from calib.config import described, parse, read_toml, strict
-from calib.config_types import (  # fmt: skip
-    Checked,
-    Expect,
-    Flag,
-    Holdout,
-    Name,
-    NotNegative,
-    OneOf,
-    Real,
-    Seed,
-    Text,
-    Whole,
-    shown,
-)
+from calib.config_types import Checked, Expect, Flag, Holdout, Name, NotNegative, OneOf, Real, Seed, Text, Whole, shown
 from calib.data.poses import Loss, Model
 from calib.data.poses.fit_options import FitOptions, MetresOrZero, RadiansOrZero
 from calib.errors import SessionError
 from calib.identification.friction.friction_ladder import NAMES as FRICTION
 from calib.identification.methods.registry import METHODS
 from calib.identification.settings import IdentificationSettings
-from calib.procedure.excitation.settings import (  # fmt: skip
+from calib.procedure.excitation.settings import (
     DEFAULT_DESIGN,
     HARMONICS,
     Evaluations,
@@ -44,7 +31,7 @@ from calib.procedure.excitation.settings import (  # fmt: skip
     Rate,
     Starts,
 )
-from calib.procedure.kinematic_stage.settings import (  # fmt: skip
+from calib.procedure.kinematic_stage.settings import (
     DEFAULT_SELECTION,
     Deliverable,
     FitSettings,

@@ -65,9 +65,11 @@ def contradicting(matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> t
     size = np.maximum(np.linalg.norm(rows, axis=1), 1e-300)
     count, p = rows.shape
     found = linprog(
-        np.concatenate([np.zeros(p), np.ones(count)]), np.hstack([rows / size[:, None], -np.eye(count)]), limit / size,
+        np.concatenate([np.zeros(p), np.ones(count)]),
+        np.hstack([rows / size[:, None], -np.eye(count)]),
+        limit / size,
         bounds=[(None, None)] * p + [(0.0, None)] * count,
-    )  # fmt: skip
+    )
     if found.fun <= 1e-9 * max(1.0, float(np.abs(limit / size).max(initial=0.0))):
         return ()
     places = np.concatenate([np.flatnonzero(low), np.flatnonzero(high)])
@@ -264,9 +266,12 @@ class _Planes:
         scales = np.concatenate([self.sizes[:c], np.ones(len(force)), self.sizes[c:]])
         apart = np.concatenate([slack, np.where(force > 0.0, np.maximum(sizes, 0.0), sizes), np.zeros(len(rates))])
         return _frozen(
-            b * self.unit, np.concatenate([mu, force, rates]) * self.length**2 / scales, apart * scales, binding,
+            b * self.unit,
+            np.concatenate([mu, force, rates]) * self.length**2 / scales,
+            apart * scales,
+            binding,
             whole * scales[:, None] / self.unit,
-        )  # fmt: skip
+        )
 
 
 def _frozen(*parts: np.ndarray) -> Constrained:
@@ -278,6 +283,9 @@ def _widened(found: Constrained, place: int, normals: np.ndarray, slack: np.ndar
     """Return the optimum with further, inactive inequalities inserted at `place`."""
     zero = np.zeros(len(slack))
     return _frozen(
-        found.values, np.insert(found.multipliers, place, zero), np.insert(found.slack, place, slack),
-        np.insert(found.binding, place, zero > 0.0), np.insert(found.normals, place, normals, axis=0),
-    )  # fmt: skip
+        found.values,
+        np.insert(found.multipliers, place, zero),
+        np.insert(found.slack, place, slack),
+        np.insert(found.binding, place, zero > 0.0),
+        np.insert(found.normals, place, normals, axis=0),
+    )

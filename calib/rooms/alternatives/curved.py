@@ -25,9 +25,12 @@ from calib.identification.constraint_settings import CurvedConstraint
 from calib.rooms.alternatives.constrained import Constrained
 
 _OPERATIONS = {
-    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
     ast.Pow: operator.pow,
-}  # fmt: skip
+}
 _KNOWN = {name: getattr(np, name) for name in ("pi", "sqrt", "exp", "log", "sin", "cos", "tanh")}
 MAX_FORMULA = 1000  # characters
 
@@ -226,9 +229,10 @@ def tangents(
         planes = np.hstack([normals / size[:, None], np.eye(m)])
         rows = np.vstack([planes, np.eye(p + m)[p:]])
         found = solve(
-            _elastic(factor, b, bend, unit, price * np.full(m, length)), rows,
+            _elastic(factor, b, bend, unit, price * np.full(m, length)),
+            rows,
             np.append((normals @ b - heights) / size, np.zeros(m)),
-        )  # fmt: skip
+        )
         multipliers, moved, slack = found.multipliers[:m], found.values[:p] - b, found.values[p:]
         satisfied = bool((slack < SETTLED).all())
         if satisfied and np.linalg.norm(factor[:p, :p] @ moved) < SETTLED * length:

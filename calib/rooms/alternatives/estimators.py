@@ -98,9 +98,14 @@ def _null_direction(
 
 
 def _covariance(
-    upper: np.ndarray, noise: np.ndarray, values: np.ndarray, variance: float, rows: int, names: tuple[str, ...],
+    upper: np.ndarray,
+    noise: np.ndarray,
+    values: np.ndarray,
+    variance: float,
+    rows: int,
+    names: tuple[str, ...],
     more: np.ndarray,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """Return V (p, p) of `tls`, computed on columns of unit norm; `more` (k, p): rows √(τ - 1) W."""
     norms = np.linalg.norm(upper, axis=0)
     scaled, own, x = upper / norms, variance * (noise[:-1] / norms) ** 2, values * norms
@@ -169,9 +174,7 @@ class _ConstrainedLeastSquares(Method):
         if self.free is IRLS:
             factor = _reweighted(problem, tau, lambda triangle: constraints.solve(triangle).values).factor
         fit, held = hold(free, factor, pooled, weights, constraints, stated=self.free.weighted)
-        return MethodEstimate(
-            self.name, EstimateStatus.FOUND, fit, pooled, std, tau, self.free.weighted, held=held
-        )  # fmt: skip
+        return MethodEstimate(self.name, EstimateStatus.FOUND, fit, pooled, std, tau, self.free.weighted, held=held)
 
 
 def _reweighted(
@@ -191,25 +194,34 @@ def samples_of(problem: IdentificationProblem) -> Samples:
 
 
 IRLS = LeastSquares(
-    "irls", "torque noise is correlated across joints, outlier samples are rejected; q, v, a are exact",
+    "irls",
+    "torque noise is correlated across joints, outlier samples are rejected; q, v, a are exact",
     lambda problem, std, tau: _reweighted(problem, tau).fit,
-    description="least squares, weighted across joints, outliers rejected", source="Han, Wu, Liu & Xiong 2020",
-    tunes=("gate of 3 sigma",), version=2,
-)  # fmt: skip
+    description="least squares, weighted across joints, outliers rejected",
+    source="Han, Wu, Liu & Xiong 2020",
+    tunes=("gate of 3 sigma",),
+    version=2,
+)
 TLS = LeastSquares(
     "tls",
     f"W has noise of {COLUMN_NOISE:.0%} of each column's rms, each joint's torque that of its "
     "residuals, both up to a common estimated factor, independently in each row; offsets and signs are exact",
     lambda problem, std, tau: scaled_tls(problem.pooled, std, problem.exact, tau),
-    description="total least squares with scaled columns", version=2,
+    description="total least squares with scaled columns",
+    version=2,
     source="Golub & Van Loan 1980; Van Huffel & Vandewalle 1991",
     tunes=("ratio of the columns' noise to the torques'",),
-)  # fmt: skip
+)
 PC_OLS, PC_WLS, PC_IRLS = (
     _ConstrainedLeastSquares(
-        f"pc-{one.name}", one.assumes + CONSISTENT, one, tunes=one.tunes, version=one.version,
-        description=one.name + CONSTRAINED, source="Sousa & Cortesão 2014; Wensing et al. 2018",
+        f"pc-{one.name}",
+        one.assumes + CONSISTENT,
+        one,
+        tunes=one.tunes,
+        version=one.version,
+        description=one.name + CONSTRAINED,
+        source="Sousa & Cortesão 2014; Wensing et al. 2018",
     )
     for one in (OLS, WLS, IRLS)
-)  # fmt: skip
+)
 METHODS = (IRLS, TLS, PC_OLS, PC_WLS, PC_IRLS)

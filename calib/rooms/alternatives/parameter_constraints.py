@@ -106,9 +106,14 @@ class Constraints(Frozen):
             return replace(self, cone=None)
         named = f"bodies that can exist ({', '.join(plane.bodies) or 'all'} on the border)"
         return replace(
-            self, cone=None, plane=named, names=(*self.names, named), matrix=np.vstack([self.matrix, plane.normal]),
-            lower=np.append(self.lower, plane.bound), upper=np.append(self.upper, np.inf),
-        )  # fmt: skip
+            self,
+            cone=None,
+            plane=named,
+            names=(*self.names, named),
+            matrix=np.vstack([self.matrix, plane.normal]),
+            lower=np.append(self.lower, plane.bound),
+            upper=np.append(self.upper, np.inf),
+        )
 
     def _flattened(self, factor: np.ndarray) -> Constraints:
         """Return the constraints with the curved ones replaced by their tangent planes at the optimum."""
@@ -119,18 +124,25 @@ class Constraints(Frozen):
         def solve(triangle: np.ndarray, rows: np.ndarray, lower: np.ndarray) -> Constrained:
             wider = np.pad(self.matrix, ((0, 0), (0, m)))
             return replace(
-                others, names=("",) * len(rows) + self.names, matrix=np.vstack([rows, wider]),
-                lower=np.append(lower, self.lower), upper=np.append(np.full(len(lower), np.inf), self.upper),
+                others,
+                names=("",) * len(rows) + self.names,
+                matrix=np.vstack([rows, wider]),
+                lower=np.append(lower, self.lower),
+                upper=np.append(np.full(len(lower), np.inf), self.upper),
                 inertia=np.pad(self.inertia, ((0, 0), (0, 0), (0, 0), (0, m))),
-            ).solve(triangle, free)  # fmt: skip
+            ).solve(triangle, free)
 
         names = tuple(one.name for one in self.curved)
         with _unsatisfied(f"no estimate satisfies {'; '.join(names)} beside {others}: remove one of them"):
             normals, bounds = tangents(self.curved, factor, start, solve)
         return replace(
-            others, tangents=names, names=(*self.names, *names), matrix=np.vstack([self.matrix, normals]),
-            lower=np.append(self.lower, bounds), upper=np.append(self.upper, np.full(m, np.inf)),
-        )  # fmt: skip
+            others,
+            tangents=names,
+            names=(*self.names, *names),
+            matrix=np.vstack([self.matrix, normals]),
+            lower=np.append(self.lower, bounds),
+            upper=np.append(self.upper, np.full(m, np.inf)),
+        )
 
 
 @contextmanager
@@ -242,11 +254,16 @@ def _binding(constraints: Constraints, found: Constrained, free: LinearFit) -> H
         name, origin = constraints.names[places[k]], 0.0
         if name in constraints.tangents:  # told as h, by its plane, above zero
             origin = bound
-        binding.append(Binding(
-            name, float(found.multipliers[k]), float(row @ free.estimate.values - origin),
-            float(np.sqrt(max(row @ free.estimate.covariance @ row, 0.0))), float(bound - origin),
-            bool(same[places[k]]),
-        ))  # fmt: skip
+        binding.append(
+            Binding(
+                name,
+                float(found.multipliers[k]),
+                float(row @ free.estimate.values - origin),
+                float(np.sqrt(max(row @ free.estimate.covariance @ row, 0.0))),
+                float(bound - origin),
+                bool(same[places[k]]),
+            )
+        )
     tight = frozen(np.flatnonzero(found.binding[places < 0]), int)
     findings = tuple(_findings(constraints, binding, len(tight)))
     return Held(constraints.names, tuple(binding), tight, free, found.normals[found.binding], findings)

@@ -212,9 +212,14 @@ def row_irls(data: Samples) -> LinearFit:
 
 
 def _pack(
-    data: Samples, values: np.ndarray, noise: np.ndarray, size: np.ndarray, weights: np.ndarray, factor: np.ndarray,
+    data: Samples,
+    values: np.ndarray,
+    noise: np.ndarray,
+    size: np.ndarray,
+    weights: np.ndarray,
+    factor: np.ndarray,
     inflation: float,
-) -> SampleFit:  # fmt: skip
+) -> SampleFit:
     """Return the fit with the covariance of the chosen estimator."""
     _, inverse, conditions = solve_triangle(factor, data.names)
     squares = np.sum(weights * _consistent(data) * size**2)

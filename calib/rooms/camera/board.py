@@ -29,8 +29,11 @@ from calib.errors import require
 
 KINDS = ("charuco", "chessboard", "apriltag")
 DICTIONARIES = {f"{bits}x{bits}_{count}": count for bits in (4, 5, 6, 7) for count in (50, 100, 250, 1000)} | {
-    "apriltag_16h5": 30, "apriltag_25h9": 35, "apriltag_36h10": 2320, "apriltag_36h11": 587,
-}  # fmt: skip
+    "apriltag_16h5": 30,
+    "apriltag_25h9": 35,
+    "apriltag_36h10": 2320,
+    "apriltag_36h11": 587,
+}
 """Number of markers in each dictionary."""
 MIN_CORNERS = 8  # corners that make an image useful
 

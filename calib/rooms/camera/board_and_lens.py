@@ -55,9 +55,10 @@ def board_poses(lens: Lens, board: Board, pixel: np.ndarray) -> BoardPoses:
     one, two = (_refine(lens, table, pixel, guess) for guess in (start, _tilted_back(start, table)))
     worse = (two.rms < one.rms)[:, None, None]
     return BoardPoses(
-        np.where(worse, two.poses, one.poses), np.fmin(one.rms, two.rms),
+        np.where(worse, two.poses, one.poses),
+        np.fmin(one.rms, two.rms),
         np.where(worse, two.information, one.information),
-    )  # fmt: skip
+    )
 
 
 def _from_homography(table: np.ndarray, sight: np.ndarray) -> np.ndarray:

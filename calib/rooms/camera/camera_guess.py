@@ -165,9 +165,16 @@ def pnp_poses(block: Pixels) -> Poses:
     """Return the images as measured poses: one pose per image, computed from its corners (PnP)."""
     seen = seen_target(block.mounting, _own_poses(block, np.arange(len(block))))
     return Poses(
-        block.q, block.joint_names, seen[:, :3, 3], to_quaternion(seen), station=block.station,
-        tool_names=block.tool_names, file=block.file, rows=block.rows, torque=block.torque,
-    )  # fmt: skip
+        block.q,
+        block.joint_names,
+        seen[:, :3, 3],
+        to_quaternion(seen),
+        station=block.station,
+        tool_names=block.tool_names,
+        file=block.file,
+        rows=block.rows,
+        torque=block.torque,
+    )
 
 
 def place_camera(block: Pixels, arm: np.ndarray) -> CameraPlacement:

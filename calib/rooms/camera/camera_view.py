@@ -115,15 +115,25 @@ class CameraView:
         """Return a block of images at joint values q (m, n), ready for a fit, with all corners set to zero."""
         pixel = np.zeros((len(q), len(corners(self.board)), 2))
         block = Pixels(
-            q, self.cell.chain.joint_names, pixel, self.board, self.lens, mounting=self.mounting,
-            station=self.cell.station_names[0], tool_names=self.cell.tool_names,
-        )  # fmt: skip
+            q,
+            self.cell.chain.joint_names,
+            pixel,
+            self.board,
+            self.lens,
+            mounting=self.mounting,
+            station=self.cell.station_names[0],
+            tool_names=self.cell.tool_names,
+        )
         return prepare(self.cell, [block])
 
     def draw(
-        self, count: int, feasible: Callable[[np.ndarray], np.ndarray], lower: np.ndarray, upper: np.ndarray,
+        self,
+        count: int,
+        feasible: Callable[[np.ndarray], np.ndarray],
+        lower: np.ndarray,
+        upper: np.ndarray,
         seed: int | np.random.Generator,
-    ) -> np.ndarray:  # fmt: skip
+    ) -> np.ndarray:
         """Return up to `count` random postures (·, n) with the board in view: views are drawn, and the arm put there.
 
         Postures drawn at random see a board once in a thousand.

@@ -47,8 +47,10 @@ def place_robustly(arm: np.ndarray, seen: np.ndarray, lever: float) -> Placement
         lever: what a radian counts in the misfit [m].
     """
     methods: dict[str, Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]] = {
-        "Shah": by_orientations, "Li": by_li, "Park-Martin": by_park_martin,
-    }  # fmt: skip
+        "Shah": by_orientations,
+        "Li": by_li,
+        "Park-Martin": by_park_martin,
+    }
     best: Placement | None = None
     kept_share = 0.7
     rounds = 3  # of leaving the worst images out (our choice)

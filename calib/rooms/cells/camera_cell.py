@@ -185,10 +185,19 @@ def photograph(
     own = q + rng.normal(0.0, found.cell.instrument.encoder_sigma, q.shape)
     free = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
     return Pixels(
-        own, found.cell.nominal.joint_names, pixel, found.board, None, sigma=np.full(seen.shape, max(noise, 1e-3)),
-        station=names.station_names[0], tool_names=names.tool_names, size=found.lens.size, file=file, free=free,
+        own,
+        found.cell.nominal.joint_names,
+        pixel,
+        found.board,
+        None,
+        sigma=np.full(seen.shape, max(noise, 1e-3)),
+        station=names.station_names[0],
+        tool_names=names.tool_names,
+        size=found.lens.size,
+        file=file,
+        free=free,
         names=tuple(f"{k + 1:04}.png" for k in range(len(q))),
-    )  # fmt: skip
+    )
 
 
 def take_pictures(

@@ -118,8 +118,11 @@ def measure(
         sigma, sigma_rotation = _stated(instrument, seen[:, :3, 3], frames=2)
     seen[:, :3, 3] += _gross_errors(instrument, len(q), rng)
     common: dict[str, Any] = {
-        "sigma": sigma, "station": cell.truth.station_names[0], "tool_names": cell.truth.tool_names, "file": file,
-    }  # fmt: skip
+        "sigma": sigma,
+        "station": cell.truth.station_names[0],
+        "tool_names": cell.truth.tool_names,
+        "file": file,
+    }
     q, names = np.asarray(q) + rng.normal(0.0, instrument.encoder_sigma, np.shape(q)), cell.nominal.joint_names
     if instrument.orientation_sigma is None:
         return Positions(q, names, seen[:, :3, 3], **common)

@@ -47,9 +47,17 @@ def demo(
             return
         require(not (hard and robot), f"--robot {robot}: --hard names a robot, too; leave one out", UsageError)
         found = demonstration.run(
-            out, robot or (demonstration.HARD if hard else demonstration.ROBOT), seed, say, progress,
-            dynamics=not geometry_only, guided=guided, plots=plots, instrument=instrument, verbose=verbose,
-        )  # fmt: skip
+            out,
+            robot or (demonstration.HARD if hard else demonstration.ROBOT),
+            seed,
+            say,
+            progress,
+            dynamics=not geometry_only,
+            guided=guided,
+            plots=plots,
+            instrument=instrument,
+            verbose=verbose,
+        )
     if found.asks:
         say("", *found.asks)
         return

@@ -57,9 +57,18 @@ class DemoResult:
 
 
 def run(
-    folder: Path, robot: str, seed: int, say: Say, progress: Say, *, dynamics: bool = True, guided: bool = False,
-    plots: bool = True, instrument: str = "cmm", verbose: bool = False,
-) -> DemoResult:  # fmt: skip
+    folder: Path,
+    robot: str,
+    seed: int,
+    say: Say,
+    progress: Say,
+    *,
+    dynamics: bool = True,
+    guided: bool = False,
+    plots: bool = True,
+    instrument: str = "cmm",
+    verbose: bool = False,
+) -> DemoResult:
     """Return the result of a session on a simulated robot, compared with its hidden truth.
 
     Args:
@@ -110,9 +119,7 @@ def run(
         draw(session)
     unit = 2.0**20 if sys.platform == "darwin" else 2.0**10  # the system counts in bytes on macOS, in kB on Linux
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
-    return DemoResult(
-        session, session.verdicts().level, time.perf_counter() - started, (), before, after, memory
-    )  # fmt: skip
+    return DemoResult(session, session.verdicts().level, time.perf_counter() - started, (), before, after, memory)
 
 
 def _stopped(session: Session, waiting: steps.State) -> tuple[str, ...]:

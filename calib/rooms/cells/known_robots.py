@@ -40,9 +40,15 @@ def _fourier(
 
 
 def random_fourier(
-    lower: np.ndarray, upper: np.ndarray, velocity: np.ndarray, duration: float, rate: float,
-    harmonics: int = 5, acceleration: float = np.inf, seed: int | np.random.Generator = 0,
-) -> Reference:  # fmt: skip
+    lower: np.ndarray,
+    upper: np.ndarray,
+    velocity: np.ndarray,
+    duration: float,
+    rate: float,
+    harmonics: int = 5,
+    acceleration: float = np.inf,
+    seed: int | np.random.Generator = 0,
+) -> Reference:
     """Return one period of a random Fourier motion inside the limits, at rest at both ends.
 
     Coefficients fall with the harmonic's number and are projected to rest (Σ k a_k = Σ k² b_k = 0); each joint is

@@ -63,9 +63,10 @@ def _torque(session: Session) -> Panel:
     above = high + 0.1 * (high - low)
     layers = []
     for name, at, values, colour, width in (
-        ("measured", 0.03, measured, BROWN, 1.6), ("predicted", 0.38, predicted, AFTER, 0.8),
+        ("measured", 0.03, measured, BROWN, 1.6),
+        ("predicted", 0.38, predicted, AFTER, 0.8),
         ("residual", 0.7, measured - predicted, QUIET, 0.6),
-    ):  # fmt: skip
+    ):
         layers.append(line(t, values[:, j], colour=colour, width=width))
         layers.append(text(name, t[0] + at * (t[-1] - t[0]), above, (0, 0), colour))
     title, y = f"{torque_error(session):.1f} % of torque unexplained", f"{unseen.rows[j]} [{unseen.units[j]}]"

@@ -24,9 +24,16 @@ from calib.rooms.viewer import viewer
 
 PICTURE = "demo.png"
 SECONDS = {  # of processor time, about, by which the share done is told
-    "select": 1.0, "fit": 1.0, "validate": 0.1, "excite": 3.0, "record": 1.2, "identify": 3.0, "predict": 1.6,
-    "export": 0.3, "certificate": 2.0,
-}  # fmt: skip
+    "select": 1.0,
+    "fit": 1.0,
+    "validate": 0.1,
+    "excite": 3.0,
+    "record": 1.2,
+    "identify": 3.0,
+    "predict": 1.6,
+    "export": 0.3,
+    "certificate": 2.0,
+}
 
 
 def row(name: str, number: float, words: str) -> str:
@@ -52,16 +59,18 @@ NUMBERS: Mapping[str, Callable[[Session], tuple[float, str]]] = {
     "measure": lambda s: (_minutes(s), "min at the robot to measure them"),
     "fit": lambda s: (len(read_estimate(s.fit.path)), "parameters of its geometry, with sigma"),
     "validate": lambda s: (
-        (position_errors(s) or (nan, nan))[1], f"mm error left on unseen poses: {s.validation.metrics().verdict}"
+        (position_errors(s) or (nan, nan))[1],
+        f"mm error left on unseen poses: {s.validation.metrics().verdict}",
     ),
     "excite": lambda s: (s.settings.dynamics.period, "s of motion designed for its dynamics"),
     "record": lambda s: (s.settings.dynamics.repeats, "periods of it logged, with torques"),
     "identify": lambda s: (len(read_estimate(s.identification.path)), "parameters of its dynamics, with sigma"),
     "predict": lambda s: (
-        torque_error(s) or nan, f"% unexplained by identified model: {s.identification.unseen.read().verdict}"
+        torque_error(s) or nan,
+        f"% unexplained by identified model: {s.identification.unseen.read().verdict}",
     ),
     "export": _exported,
-}  # fmt: skip
+}
 """Number of each step and what it is, read from the session's folders."""
 
 
@@ -125,8 +134,13 @@ def reasons(session: Session) -> Iterator[str]:
 def paths(session: Session) -> list[str]:
     """Return the five files to look at."""
     found = {
-        "session": SETTINGS, "certificate": CERTIFICATE, "robot": f"{session.export}/{URDF}", "picture": PICTURE,
-        "replay": viewer.FILE, "truth": "truth.txt", "fit": "4-fit",
-    }  # fmt: skip
+        "session": SETTINGS,
+        "certificate": CERTIFICATE,
+        "robot": f"{session.export}/{URDF}",
+        "picture": PICTURE,
+        "replay": viewer.FILE,
+        "truth": "truth.txt",
+        "fit": "4-fit",
+    }
     there = [f"{name:<11} {path}" for name, file in found.items() if (path := session.path(file)).exists()]
     return [*there[1:5], there[0]]

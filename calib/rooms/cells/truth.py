@@ -40,9 +40,13 @@ def position_errors(cell: Cell, calibrated: Installation, urdf: Chain) -> tuple[
     q = random_joints(cell.nominal, TRUTH, 12345)
     true = true_poses(cell, q)
     block = Poses(
-        q, cell.nominal.joint_names, true[:, :3, 3], to_quaternion(true), station=calibrated.station_names[0],
+        q,
+        cell.nominal.joint_names,
+        true[:, :3, 3],
+        to_quaternion(true),
+        station=calibrated.station_names[0],
         tool_names=calibrated.tool_names[:1],
-    )  # fmt: skip
+    )
     nominal, alone = (polish_frames(install(chain, [block]), [block]).cell for chain in (cell.nominal, urdf))
     before, after, bare = (_rms(arm, block) for arm in (nominal, calibrated, alone))
     return before, after, bare

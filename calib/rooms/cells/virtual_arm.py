@@ -107,11 +107,16 @@ def moving_arm(cell: Cell, robot: str, seed: int = 0, unmodelled: TorqueErrors =
         f"{noise} of the limits{unmodelled.note}"
     )
     return MovingArm(
-        chain, plant, IdentificationModel(plant.bodies, plant.terms, LINK),
+        chain,
+        plant,
+        IdentificationModel(plant.bodies, plant.terms, LINK),
         Plant(bodies_of(nominal), tuple(terms), told),
-        replace(pd(omega**2 * inertia, 2 * DAMPING * omega * inertia), cutoff=CUTOFF), effort, note, unmodelled,
+        replace(pd(omega**2 * inertia, 2 * DAMPING * omega * inertia), cutoff=CUTOFF),
+        effort,
+        note,
+        unmodelled,
         sensors,
-    )  # fmt: skip
+    )
 
 
 def sensed(robot: str) -> bool:

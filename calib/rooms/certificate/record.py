@@ -23,9 +23,18 @@ MAX_FILES = 12  # files listed there
 MAX_VALUE = 90  # letters of what a setup line says there
 DIGEST_DIGITS = 16  # hexadecimal digits of a SHA-256 there
 KNOWN = (
-    "robot", "description", "instrument", "measurements", "model", "measured range", "recordings", "torques",
-    "payloads", "method", "friction",
-)  # fmt: skip
+    "robot",
+    "description",
+    "instrument",
+    "measurements",
+    "model",
+    "measured range",
+    "recordings",
+    "torques",
+    "payloads",
+    "method",
+    "friction",
+)
 EDITED = "edited by hand"
 WHOLE = "report.html"
 CONVENTIONS = (
@@ -118,9 +127,15 @@ class Stage:
 
 
 def records(
-    title: str, subtitle: str, setup: Sequence[Entry], stages: Sequence[Stage], unchecked: Sequence[str] = (),
-    files: Sequence[FileRow] = (), details: CertificateSection = NO_DETAILS, alert: str = "",
-) -> tuple[Certificate, Page]:  # fmt: skip
+    title: str,
+    subtitle: str,
+    setup: Sequence[Entry],
+    stages: Sequence[Stage],
+    unchecked: Sequence[str] = (),
+    files: Sequence[FileRow] = (),
+    details: CertificateSection = NO_DETAILS,
+    alert: str = "",
+) -> tuple[Certificate, Page]:
     """Return certificate and report of a calibration.
 
     Args:
@@ -135,15 +150,26 @@ def records(
     known = [Entry(one.label, shortened(_local(one.value), MAX_VALUE)) for one in setup if one.label in KNOWN]
     last = [
         Text("NOT checked", [*unchecked, *(line for one in stages for line in one.unchecked)]),
-        Text("Findings", [line for one in stages for line in one.findings]), files_table(files, MAX_FILES), *NOTES,
-    ]  # fmt: skip
+        Text("Findings", [line for one in stages for line in one.findings]),
+        files_table(files, MAX_FILES),
+        *NOTES,
+    ]
     sheets = [*((one.section.title, one.sheet) for one in stages), ("Validity", last)]
     shown = [Section(name, [_cut(one) if isinstance(one, Text) else one for one in blocks]) for name, blocks in sheets]
     return Certificate(
-        "Calibration certificate", title, subtitle, f"issued {issued()}", shown, number, alert,
-        [judgement(one, MAX_REASON) for one in sections if one.verdict], key_table(sections), known, stated,
+        "Calibration certificate",
+        title,
+        subtitle,
+        f"issued {issued()}",
+        shown,
+        number,
+        alert,
+        [judgement(one, MAX_REASON) for one in sections if one.verdict],
+        key_table(sections),
+        known,
+        stated,
         ("Calibrated by", "Date", "Signature", "Checked by", "Date", "Signature"),
-    ), report(title, f"{f'{alert}; ' if alert else ''}{subtitle}", setup, sections, files)  # fmt: skip
+    ), report(title, f"{f'{alert}; ' if alert else ''}{subtitle}", setup, sections, files)
 
 
 def judgement(section: Section, most: int | None = None) -> Judgement:

@@ -67,11 +67,14 @@ def of_fit(
     measured = ", ".join(name for name, role, *_ in found.files if role != "nominal robot")
     setup = [
         Entry("robot", f"{found.robot}, {found.base} to {found.tip}, {len(found.joints)} joints"),
-        Entry("description", found.source), Entry("measurements", measured), Entry("model", metrics.model),
+        Entry("description", found.source),
+        Entry("measurements", measured),
+        Entry("model", metrics.model),
         Entry("measured range", measured_range(metrics)),
-        Entry("tolerance", tolerance(metrics.tolerance_mm, metrics)), Entry("seed", str(metrics.seed)),
+        Entry("tolerance", tolerance(metrics.tolerance_mm, metrics)),
+        Entry("seed", str(metrics.seed)),
         Entry("toolkit", versions()),
-    ]  # fmt: skip
+    ]
     stages, unchecked = [geometry.stage(found, drawn)], ["dynamics: not identified"]
     return records(title, "Geometry", setup, stages, unchecked, found.files, details)
 
@@ -126,10 +129,14 @@ def of_model(
 
     unseen, metrics = found.unseen, found.metrics
     setup = [
-        Entry("robot", unseen.robot), Entry("recordings", ", ".join((*unseen.fit, *unseen.validation))),
-        Entry("torques", f"{len(unseen.rows)} rows"), Entry("method", metrics.method),
-        Entry("friction", metrics.friction), Entry("seed", str(metrics.seed)), Entry("toolkit", versions()),
-    ]  # fmt: skip
+        Entry("robot", unseen.robot),
+        Entry("recordings", ", ".join((*unseen.fit, *unseen.validation))),
+        Entry("torques", f"{len(unseen.rows)} rows"),
+        Entry("method", metrics.method),
+        Entry("friction", metrics.friction),
+        Entry("seed", str(metrics.seed)),
+        Entry("toolkit", versions()),
+    ]
     stages = [dynamics.stage(found, dynamics_section.report_section(found, drawn), bool(drawn))]
     unchecked = ["geometry: taken as described"]
     return records(f"Calibration of {unseen.robot}", "Dynamics", setup, stages, unchecked, details=details)

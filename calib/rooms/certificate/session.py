@@ -36,14 +36,20 @@ from calib.rooms.certificate.record import EDITED, Certificate, Entry, Page, Sta
 from calib.rooms.certificate.results import measured_range, tolerance
 
 ROLES = {
-    "1-robot": "nominal robot", "3-measured": "measured", "4-fit": "fit", "6-excitation": "motion to record",
-    "7-recorded": "recorded", "8-dynamics": "identified model", "6-export": "calibrated robot",
+    "1-robot": "nominal robot",
+    "3-measured": "measured",
+    "4-fit": "fit",
+    "6-excitation": "motion to record",
+    "7-recorded": "recorded",
+    "8-dynamics": "identified model",
+    "6-export": "calibrated robot",
     "9-export": "calibrated robot",
-}  # fmt: skip
+}
 TORQUES = {
-    "motor": "of the motors", "link": "of sensors behind the gears",
+    "motor": "of the motors",
+    "link": "of sensors behind the gears",
     "both": "of the motors and of sensors behind the gears",
-}  # fmt: skip
+}
 
 
 def certify(session: Session, say: Say) -> list[str]:
@@ -151,31 +157,36 @@ def _setup(session: Session, found: FitMetrics | None) -> list[Entry]:
     settings, chain = session.settings, chain_of(session)
     described = settings.robot.given if found else f"{settings.robot.given}, taken as calibrated"
     rows = [
-        ("robot", f"{chain.name}, {chain.base} to {chain.tip}, {chain.n} joints"), ("description", described),
+        ("robot", f"{chain.name}, {chain.base} to {chain.tip}, {chain.n} joints"),
+        ("description", described),
         ("session made", settings.created.replace("T", " ")),
-    ]  # fmt: skip
+    ]
     if found:
         plan = _session_plan(session)
         rows += [
             ("instrument", _instrument(session, found)),
             ("measurements", _named(session.brought("measured", "validation"))),
-            ("pose plan", plan.words), ("poses kept", ", ".join(plan.checked)),
-            ("poses NOT checked for", ", ".join(plan.unchecked)), ("model", found.model),
+            ("pose plan", plan.words),
+            ("poses kept", ", ".join(plan.checked)),
+            ("poses NOT checked for", ", ".join(plan.unchecked)),
+            ("model", found.model),
             ("measured range", measured_range(found)),
             ("tolerance", tolerance(settings.fit.tolerance_mm, found)),
-        ]  # fmt: skip
+        ]
     if session.dynamic:
         section = settings.dynamics
         allowed = section.tolerance_percent
         rows += [
-            ("recordings", _named(session.brought("training", "unseen"))), ("torques", TORQUES[section.torques]),
+            ("recordings", _named(session.brought("training", "unseen"))),
+            ("torques", TORQUES[section.torques]),
             ("tolerance of torque", f"{allowed:g} % on unseen motion" if allowed else "none given: pass below 10 %"),
             ("payloads", ", ".join(f"{label} {mass:g} kg" for label, mass in section.payloads.items())),
-        ]  # fmt: skip
+        ]
     rows += [
-        ("seed", str(settings.seed)), ("command", command_line("next", session.folder.name)),
+        ("seed", str(settings.seed)),
+        ("command", command_line("next", session.folder.name)),
         ("toolkit", versions()),
-    ]  # fmt: skip
+    ]
     return [Entry(label, value) for label, value in rows if value.strip()]
 
 
@@ -258,9 +269,11 @@ def listed(session: Session) -> list[FileRow]:
 
 
 STEP = SessionStep(
-    "certificate", "print the certificate", certify,
+    "certificate",
+    "print the certificate",
+    certify,
     f"{VERDICT} 4-fit/report.json 5-validation/metrics.json export/robot.urdf {SELECTION}? {POSES_CHECKED} "
     f"{MOTION_CHECKED} 8-dynamics/metrics.json 8-dynamics/estimate.csv 8-dynamics/unseen/report.json {MARK}?",
     " ".join(PAGES),
     "name created instrument poses fit dynamics.torques,payloads,tolerance_percent certificate",
-)  # fmt: skip
+)

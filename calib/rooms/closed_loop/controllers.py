@@ -67,9 +67,12 @@ def pd(kp: np.ndarray, kd: np.ndarray, limit: np.ndarray | float = np.inf, ki: n
 
 
 def cascade(
-    position: np.ndarray, velocity: np.ndarray, reset: np.ndarray | float = np.inf, limit: np.ndarray | float = np.inf,
+    position: np.ndarray,
+    velocity: np.ndarray,
+    reset: np.ndarray | float = np.inf,
+    limit: np.ndarray | float = np.inf,
     share: float = 1.0,
-) -> Controller:  # fmt: skip
+) -> Controller:
     """Return a cascade P-PI: v_c = share v_r + P e, tau = K [(v_c - v) + ∫ (v_c - v) / Ti], as a single law.
 
     (v_c - v) integrates to share q_r - q + P ∫ e (start aside): with share = 1 that is kp = K (P + 1/Ti), kd = K,
@@ -104,9 +107,15 @@ def computed_torque(
 def completed(controller: Controller, loop: LoopSettings, n: int) -> Controller:
     """Return the controller with the saturation, delay and velocity filter given in the settings."""
     return Controller(
-        controller.kp, controller.kd, controller.ki, np.full(n, loop.share), loop.per_joint("limit", n),
-        loop.per_joint("windup", n), delay=loop.delay, cutoff=loop.velocity_cutoff,
-    )  # fmt: skip
+        controller.kp,
+        controller.kd,
+        controller.ki,
+        np.full(n, loop.share),
+        loop.per_joint("limit", n),
+        loop.per_joint("windup", n),
+        delay=loop.delay,
+        cutoff=loop.velocity_cutoff,
+    )
 
 
 def stated_controller(loop: LoopSettings, n: int) -> Controller:
@@ -139,9 +148,14 @@ class IdentifiedController:
 
 
 def identify_controller(
-    reference: Reference, measured: np.ndarray, tau: np.ndarray, rate: float, band: float = BAND,
-    orders: tuple[int, int] = ORDERS, integral: bool = False,
-) -> IdentifiedController:  # fmt: skip
+    reference: Reference,
+    measured: np.ndarray,
+    tau: np.ndarray,
+    rate: float,
+    band: float = BAND,
+    orders: tuple[int, int] = ORDERS,
+    integral: bool = False,
+) -> IdentifiedController:
     """Return a PD or PID identified from logged positions and torques and their reference.
 
     Args:

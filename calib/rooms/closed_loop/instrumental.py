@@ -389,7 +389,7 @@ def _drowned_signs(model: IdentificationModel, columns: np.ndarray, case: Case) 
 
 def _result(
     task: _Fixed, found: _Found, ordinary: LinearFit, plant: Plant, rounds: Sequence[Round], std: np.ndarray, runs: Runs
-) -> Instrumental:  # fmt: skip
+) -> Instrumental:
     """Return the result of the last iteration: σ with the variance inflation of its residuals, and the tests."""
     problem = found.problem if task.estimator.measured else _stack(found.observed, found.simulated)
     fit, bound = _held_fit(task, problem, std, found.tau)
@@ -400,9 +400,21 @@ def _result(
         moved = (simulated_case(case, run, loop) for (case, loop), run in runs)
         rows = ((case, replace(own, matrix=z), z) for case, own, z in zip(moved, found.observed, found.simulated))
     return Instrumental(
-        fit, ordinary, plant, tuple(rounds), strength, verdict, frozen(std), found.tau,
-        _distance(runs), _stray(runs), bound, problem, task.estimator, tuple(rows),
-    )  # fmt: skip
+        fit,
+        ordinary,
+        plant,
+        tuple(rounds),
+        strength,
+        verdict,
+        frozen(std),
+        found.tau,
+        _distance(runs),
+        _stray(runs),
+        bound,
+        problem,
+        task.estimator,
+        tuple(rows),
+    )
 
 
 def _regular(model: IdentificationModel, terms: Sequence[DriveTerm], loop: Loop, inertia: np.ndarray | None) -> Plant:
@@ -484,9 +496,7 @@ def _if_weak(task: _Fixed, found: _Found, std: np.ndarray) -> str:
     return f"{words}: record faster motion, or positions with less noise" if strength.weak else ""
 
 
-def _stack(
-    observed: Sequence[ObservationRows], simulated: Sequence[np.ndarray], measured: bool = True
-) -> Instruments:  # fmt: skip
+def _stack(observed: Sequence[ObservationRows], simulated: Sequence[np.ndarray], measured: bool = True) -> Instruments:
     """Return the R factors of [Z W y], one group per torque row; without `measured`, those of [Z 0 y] (cheaper)."""
     first, count = observed[0], observed[0].target.shape[1]
     problem = instrumental_variables.unseen(first.names, first.units, count)

@@ -258,14 +258,16 @@ def _projected(factor: np.ndarray, names: Sequence[str]) -> np.ndarray:
     p = len(names)
     size = np.linalg.norm(factor[:p, :p], axis=0)
     require_rank(
-        factor[:p, :p] / np.where(size > 0.0, size, 1.0), [f"instrument of {name}" for name in names],
+        factor[:p, :p] / np.where(size > 0.0, size, 1.0),
+        [f"instrument of {name}" for name in names],
         "the simulated motion does not excite them: simulate the reference of this recording",
-    )  # fmt: skip
+    )
     norms = np.linalg.norm(factor[:, p : 2 * p], axis=0)
     require_rank(
-        factor[:p, p : 2 * p] / np.where(norms > 0.0, norms, 1.0), names,
+        factor[:p, p : 2 * p] / np.where(norms > 0.0, norms, 1.0),
+        names,
         "the instruments do not distinguish them: W has dependent columns, or the simulated motion differs",
-    )  # fmt: skip
+    )
     return retriangulate(factor[:p, p:])
 
 

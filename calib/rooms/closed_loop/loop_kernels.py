@@ -105,9 +105,12 @@ def _load(body, i, work):
     jxy, jxz = dot(y, a) - g[0] * t[1] - t[0] * h[1], dot(z, a) - g[0] * t[2] - t[0] * h[2]
     jyz = dot(z, b) - g[1] * t[2] - t[1] * h[2]
     moment, force, _ = wrench(
-        ((jxx, jxy, jxz, jyy, jyz, jzz), h, mass), three(work, i, 12), three(work, i, 15), three(work, i, 18),
+        ((jxx, jxy, jxz, jyy, jyz, jzz), h, mass),
+        three(work, i, 12),
+        three(work, i, 15),
+        three(work, i, 18),
         three(work, i, 21),
-    )  # fmt: skip
+    )
     write(work, i, 30, moment)
     write(work, i, 33, force)
     write(work, i, 36, (jxx, jxy, jxz))
@@ -365,9 +368,7 @@ def forward_dynamics(tree, body, linear, kinds, acts, order, entries, shares, ow
 
 
 @njit(**OPTIONS)
-def _advance(
-    tree, body, linear, kinds, acts, memory, loads, q, v, tau, period, slopes, work, matrix, at, rate
-):  # fmt: skip
+def _advance(tree, body, linear, kinds, acts, memory, loads, q, v, tau, period, slopes, work, matrix, at, rate):
     """Advance q, v (n,) by one control period under constant torques (classical Runge-Kutta method).
 
     In as many steps as friction near standstill asks for. On the negative axis the form's stability function
@@ -406,7 +407,7 @@ def _advance(
 @njit(**OPTIONS)
 def _advance_midpoint(
     tree, body, linear, kinds, acts, memory, loads, q, v, tau, period, slopes, work, matrix, at, rate
-):  # fmt: skip
+):
     """Advance q, v (n,) by one short period with the midpoint rule, at half the cost of `_advance`.
 
     In steps of at most `MIDPOINT_STEP` reciprocals of friction's fastest decay: the rule's 1 + z + z²/2 has no zero, so
@@ -496,9 +497,25 @@ def _reading(place, encoder, quantum, k, j):
 
 @njit(**OPTIONS)
 def closed_loop(
-    tree, body, linear, kinds, acts, model, gains, reference, encoder, quantum, push, period, smoothing, late, every,
-    q, v, out,
-):  # fmt: skip
+    tree,
+    body,
+    linear,
+    kinds,
+    acts,
+    model,
+    gains,
+    reference,
+    encoder,
+    quantum,
+    push,
+    period,
+    smoothing,
+    late,
+    every,
+    q,
+    v,
+    out,
+):
     """Run the loop: measure, command, hold the torque for one period, integrate. Return (status, period reached).
 
     gains (6, n): kp, kd, ki, share of the reference's velocity, torque limit, limit of the integral. reference

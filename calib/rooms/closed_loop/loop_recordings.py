@@ -303,9 +303,14 @@ def _best_shift(identified: Callable[[float], IdentifiedController]) -> float:
 
 
 def _fed_forward(
-    controller: Controller, loop: LoopSettings, cad: np.ndarray | None, model: Any, motion: Motion,
-    reference: Reference, every: float,
-) -> Controller:  # fmt: skip
+    controller: Controller,
+    loop: LoopSettings,
+    cad: np.ndarray | None,
+    model: Any,
+    motion: Motion,
+    reference: Reference,
+    every: float,
+) -> Controller:
     """Return the controller with its feedforward torques along the reference."""
     if loop.feedforward == "none":
         return controller

@@ -41,9 +41,13 @@ from calib.rooms.closed_loop.simulation import Plant, feed_forward, tracking_err
 
 
 def replay(
-    chain: Chain, dynamics: Dynamics, case: Case, predicted: np.ndarray, controller: Controller | None = None,
+    chain: Chain,
+    dynamics: Dynamics,
+    case: Case,
+    predicted: np.ndarray,
+    controller: Controller | None = None,
     rate: float | None = None,
-) -> Replay:  # fmt: skip
+) -> Replay:
     """Return the tracking errors on a recorded motion with three feedforwards: none, the CAD model, and the model.
 
     Args:
@@ -151,9 +155,11 @@ def _default(robot: Plant, reference: Reference) -> Controller:
 
 
 def track(
-    inputs: IdentificationInputs, dynamics: Dynamics, predictions: Mapping[str, np.ndarray],
+    inputs: IdentificationInputs,
+    dynamics: Dynamics,
+    predictions: Mapping[str, np.ndarray],
     controller: Controller | None = None,
-) -> tuple[dict[str, Replay], str]:  # fmt: skip
+) -> tuple[dict[str, Replay], str]:
     """Return the replays by name, of unseen recordings or else of a training recording, or the reason for none.
 
     Args:

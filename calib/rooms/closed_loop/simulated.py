@@ -88,15 +88,27 @@ class _Simulated(Method):
 
         def estimate() -> LoopEstimate:
             found = identify_instrumental(
-                model, problem.base, loops.pairs, problem.decimator, method=self.instruments or loop.instruments,
-                inertia=inertia, positive=loop.positive, terms=terms,
+                model,
+                problem.base,
+                loops.pairs,
+                problem.decimator,
+                method=self.instruments or loop.instruments,
+                inertia=inertia,
+                positive=loop.positive,
+                terms=terms,
                 constraints=constraints_of(problem) if self.takes_constraints else None,
-            )  # fmt: skip
+            )
             result = replace(
-                plain, method=self.name, solution=found.fit, std=found.std, iterations=len(found.rounds),
-                simulations=len(loops.pairs) * sum(1 + one.retreats for one in found.rounds), beforehand=None,
-                held=found.constrained, instruments=found.rows,
-            )  # fmt: skip
+                plain,
+                method=self.name,
+                solution=found.fit,
+                std=found.std,
+                iterations=len(found.rounds),
+                simulations=len(loops.pairs) * sum(1 + one.retreats for one in found.rounds),
+                beforehand=None,
+                held=found.constrained,
+                instruments=found.rows,
+            )
             return LoopEstimate(**{**vars(result), "loops": loops, "instrumental": found})
 
         return attempted_in_loop(self.name, problem, loops, estimate)
@@ -104,9 +116,11 @@ class _Simulated(Method):
 
 CHOSEN = "friction model (with friction = 'auto': steps chosen by least squares) are those of the robot"
 IV = _Simulated(
-    "iv", f"the stated controller, reference and {CHOSEN}",
-    description="instrumental variables from the simulated closed loop", source="Janot, Vandanjon & Gautier 2014",
-)  # fmt: skip
+    "iv",
+    f"the stated controller, reference and {CHOSEN}",
+    description="instrumental variables from the simulated closed loop",
+    source="Janot, Vandanjon & Gautier 2014",
+)
 DIDIM = _Simulated(
     "didim",
     f"the simulated robot moves like the real one: stated controller, reference and {CHOSEN}; measured positions are "
@@ -117,11 +131,16 @@ DIDIM = _Simulated(
 )
 PC_IV, PC_DIDIM = (
     replace(
-        one, name=f"pc-{one.name}", assumes=one.assumes + CONSISTENT, instruments=one.name, takes_constraints=True,
-        description=one.name + CONSTRAINED, source=source,
+        one,
+        name=f"pc-{one.name}",
+        assumes=one.assumes + CONSISTENT,
+        instruments=one.name,
+        takes_constraints=True,
+        description=one.name + CONSTRAINED,
+        source=source,
     )
     for one, source in ((IV, "Janot & Wensing 2021"), (DIDIM, "Leboutet et al. 2021"))
-)  # fmt: skip
+)
 METHODS = (IV, DIDIM, PC_IV, PC_DIDIM)
 
 
@@ -240,9 +259,14 @@ def disagreement(problem: IdentificationProblem, found: MethodEstimate, test: Lo
     if away[worst] < SIGMAS or not np.any(left > limit * beside):
         return None
     return LoopDisagreement(
-        found.method, name, other.names[worst], float(away[worst]), tuple(left.tolist()), tuple(beside.tolist()),
+        found.method,
+        name,
+        other.names[worst],
+        float(away[worst]),
+        tuple(left.tolist()),
+        tuple(beside.tolist()),
         _factors(problem, own.values, other.values),
-    )  # fmt: skip
+    )
 
 
 def _factors(problem: IdentificationProblem, own: np.ndarray, other: np.ndarray) -> tuple[float, ...]:
@@ -257,9 +281,12 @@ def loop_results(problem: IdentificationProblem, estimate: MethodEstimate) -> Lo
     test = compare_with_loop(problem, estimate)
     taken = isinstance(estimate, LoopEstimate) and estimate.instrumental is not None
     return LoopResults(
-        _metrics(test, not taken), tuple(test.findings(taken)), () if test.found is None else _table(test.found),
-        test.loops and test.loops.controller, disagreement(problem, estimate, test),
-    )  # fmt: skip
+        _metrics(test, not taken),
+        tuple(test.findings(taken)),
+        () if test.found is None else _table(test.found),
+        test.loops and test.loops.controller,
+        disagreement(problem, estimate, test),
+    )
 
 
 def _metrics(test: LoopTest, beside: bool) -> LoopMetrics:
@@ -275,10 +302,24 @@ def _metrics(test: LoopTest, beside: bool) -> LoopMetrics:
             f"{apart.max():.2g} σ away, at {found.names[int(np.argmax(apart))]}",
         )
     return LoopMetrics(
-        "", notes, found.estimator.name, beside, len(found.rounds), found.verdict, float(found.shift.max()),
-        strength.cragg_donald, strength.weak, float(strength.partial_r2.min()), found.distance, found.direct,
-        found.stray, found.valid, found.explains, loops.controller, identified and identified.explained,
-    )  # fmt: skip
+        "",
+        notes,
+        found.estimator.name,
+        beside,
+        len(found.rounds),
+        found.verdict,
+        float(found.shift.max()),
+        strength.cragg_donald,
+        strength.weak,
+        float(strength.partial_r2.min()),
+        found.distance,
+        found.direct,
+        found.stray,
+        found.valid,
+        found.explains,
+        loops.controller,
+        identified and identified.explained,
+    )
 
 
 def _table(found: Instrumental) -> tuple[tuple[Any, ...], ...]:

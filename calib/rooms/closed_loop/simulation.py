@@ -188,10 +188,21 @@ def simulate(
     out = np.empty((5, len(tick), n))
     model = np.empty((0, 0)) if controller.model is None else body_rows(plant.bodies, controller.model)
     status, reached = loop_kernels.closed_loop(
-        *packed(plant), model, controller.rows, reference.sampled(controller.ahead), drawn["sigma_q"],
-        np.ascontiguousarray(np.broadcast_to(sensing.quantum, (n,)), dtype=float), drawn["push"], reference.period,
-        controller.smoothing(reference.period), controller.delay, float(sensing.every), q, v, out,
-    )  # fmt: skip
+        *packed(plant),
+        model,
+        controller.rows,
+        reference.sampled(controller.ahead),
+        drawn["sigma_q"],
+        np.ascontiguousarray(np.broadcast_to(sensing.quantum, (n,)), dtype=float),
+        drawn["push"],
+        reference.period,
+        controller.smoothing(reference.period),
+        controller.delay,
+        float(sensing.every),
+        q,
+        v,
+        out,
+    )
     if status != loop_kernels.FINE:
         raise failure(status, reached * reference.period)
     heard = drawn["sigma_tau"][tick.astype(int)] if len(drawn["sigma_tau"]) else 0.0
@@ -346,9 +357,12 @@ def feed_forward(believed: Plant, reference: Reference) -> np.ndarray:
 
 
 def tracking_error(
-    robot: Plant, controller: Controller, reference: Reference, ahead: np.ndarray | None = None,
+    robot: Plant,
+    controller: Controller,
+    reference: Reference,
+    ahead: np.ndarray | None = None,
     push: np.ndarray | None = None,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """Return the rms of q - q_r (n,) [rad or m] of a robot without noise, at the controller's instants.
 
     Args:

@@ -44,7 +44,7 @@ class ReferenceShift:
 
 def reference_shift(
     case: Case, reference: Reference, every: float, controller: Controller, band: float
-) -> ReferenceShift:  # fmt: skip
+) -> ReferenceShift:
     """Return by how much later than stated the reference of a recording's part without gaps was played.
 
     Args:

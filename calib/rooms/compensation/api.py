@@ -87,7 +87,14 @@ def compensate(
     if isinstance(targets, str | Path):
         targets = read_targets(targets, joints_of(chain))
     commands = joint_commands.computed(
-        found, Targets.of(targets), frame=frame, tool=tool, dof=dof, start=start, tolerance=tolerance, seed=seed,
+        found,
+        Targets.of(targets),
+        frame=frame,
+        tool=tool,
+        dof=dof,
+        start=start,
+        tolerance=tolerance,
+        seed=seed,
         progress=progress,
-    )  # fmt: skip
+    )
     return JointCommands(**vars(commands))

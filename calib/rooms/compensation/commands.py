@@ -79,9 +79,12 @@ def compensate(
     written = [(out, (".csv",) if whole is None else (targets.suffix,))]
     files.check_results(written, [targets, *results(fitted.folder)], overwrite)
     options: dict[str, Any] = {
-        "frame": frame, "dof": dof, "tolerance": (1e-3 * may[0], 1e-3 * may[1]), "seed": seed,
+        "frame": frame,
+        "dof": dof,
+        "tolerance": (1e-3 * may[0], 1e-3 * may[1]),
+        "seed": seed,
         "start": numbers(start, fitted.nominal.chain.n, "--start") if start else None,
-    }  # fmt: skip
+    }
     if whole is None and (user_frame or frames or world or flange):
         raise UsageError("--user-frame, --frames, --world and --flange are for programs; a CSV stands in --frame")
     with progress() as show:

@@ -251,9 +251,21 @@ def computed(
         placed, real = placements(fitted, "nominal", tool)
         own = _sizes(inverse.differences(replace(after, cell=real), held, see(placed, held).poses()))
     return Commands(
-        targets, fitted, q, q0, reached, reason, left, missed, sigma, expected, beyond, count, tuple(lines_of(notes)),
+        targets,
+        fitted,
+        q,
+        q0,
+        reached,
+        reason,
+        left,
+        missed,
+        sigma,
+        expected,
+        beyond,
+        count,
+        tuple(lines_of(notes)),
         own,
-    )  # fmt: skip
+    )
 
 
 def _inside(goal: Goal, q: np.ndarray) -> np.ndarray:
@@ -383,9 +395,17 @@ def _turn_note(fitted: Fitted, dof: int) -> list[Finding]:
 
 SHOWN = 20  # targets that a message lists
 COLUMNS = (
-    "left [mm]", "left [mrad]", "before [mm]", "before [mrad]", "sigma [mm]", "sigma [mrad]", "unseen_rms [mm]",
-    "expected [mm]", "interval95 [mm]", "extrapolated",
-)  # fmt: skip
+    "left [mm]",
+    "left [mrad]",
+    "before [mm]",
+    "before [mrad]",
+    "sigma [mm]",
+    "sigma [mrad]",
+    "unseen_rms [mm]",
+    "expected [mm]",
+    "interval95 [mm]",
+    "extrapolated",
+)
 
 
 def _unreached(commands: Commands) -> list[str]:

@@ -31,7 +31,7 @@ def read_bag(path: Path, joints: Joints | None, options: RecordingOptions) -> Re
     with opened(path) as reader:
         connections = connections_of(
             reader, (*JOINT_STATE, FRANKA_STATE), options.topic, path, "joint states", "topic = '...'", "/joint_states"
-        )  # fmt: skip
+        )
         names, parts, skipped = joint_states(reader, connections, joints, path)
     for ours, what in (("q", "positions"), ("effort", "efforts")):
         require(parts[ours].size, f"its joint states have no {what}", MeasurementError, path)
@@ -39,9 +39,15 @@ def read_bag(path: Path, joints: Joints | None, options: RecordingOptions) -> Re
     if not parts["header"].any():
         notes.append("message headers have no stamps; the logging times are used, which jitter more")
     return Recording(
-        (parts["stamp"] - parts["stamp"][0]) * 1e-9, parts["q"], parts["effort"], options.kind or "torque", names,
-        v=parts["v"] if parts["v"].size else None, file=str(path), notes=tuple(notes),
-    )  # fmt: skip
+        (parts["stamp"] - parts["stamp"][0]) * 1e-9,
+        parts["q"],
+        parts["effort"],
+        options.kind or "torque",
+        names,
+        v=parts["v"] if parts["v"].size else None,
+        file=str(path),
+        notes=tuple(notes),
+    )
 
 
 @contextmanager

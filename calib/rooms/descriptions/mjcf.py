@@ -111,9 +111,11 @@ class _Tree:
         ET.SubElement(inertial, "origin", xyz=numbers_text(turn[:3, 3]), rpy="0 0 0")
         ET.SubElement(inertial, "mass", value=repr(float(model.body_mass[k])))
         moments = (turn[:3, :3] * model.body_inertia[k]) @ turn[:3, :3].T
-        ET.SubElement(inertial, "inertia", {
-            f"i{'xyz'[a]}{'xyz'[b]}": repr(float(moments[a, b])) for a in range(3) for b in range(a, 3)
-        })  # fmt: skip
+        ET.SubElement(
+            inertial,
+            "inertia",
+            {f"i{'xyz'[a]}{'xyz'[b]}": repr(float(moments[a, b])) for a in range(3) for b in range(a, 3)},
+        )
 
     def _add_joint(self, j: int, parent: str, child: str, placed: np.ndarray) -> None:
         model, name, kinds = self.model, self.joints[j], self.mj.mjtJoint

@@ -35,9 +35,11 @@ HERE = "calib.rooms.descriptions"
 NAME = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")  # REP 149's [a-z](_?[a-z0-9]+)*, without its backtracking
 SHOWS = ("robot_state_publisher", "joint_state_publisher_gui", "rviz2")
 FILES = {
-    "package.xml": "package.xml", "CMakeLists.txt": "CMakeLists.txt", "display.rviz": "rviz/display.rviz",
+    "package.xml": "package.xml",
+    "CMakeLists.txt": "CMakeLists.txt",
+    "display.rviz": "rviz/display.rviz",
     "display.launch.template": "launch/display.launch.py",
-}  # fmt: skip
+}
 _PACKAGE = re.compile(r"package://([^/]+)/")
 
 
@@ -83,11 +85,13 @@ def write_package(
     made: dict[str, str | bytes] = {f"urdf/{robot}.urdf": content.encode(encoding)}
     made |= {place: file.read_bytes() for place, file in {**meshes, **configs}.items()}
     words = {
-        "NAME": name, "ROBOT": robot, "ROOT": read_tree(content, name).roots[0],
+        "NAME": name,
+        "ROBOT": robot,
+        "ROOT": read_tree(content, name).roots[0],
         "ABOUT": escape(f"{chain.name}, calibrated by armature-calib. {export.remark}".strip()),
         "DEPENDS": "\n".join(f"  <exec_depend>{each}</exec_depend>" for each in needed),
         "FOLDERS": " ".join(sorted({each.split("/")[0] for each in (*made, *FILES.values()) if "/" in each})),
-    }  # fmt: skip
+    }
     for template, place in FILES.items():
         made[place] = re.sub(r"@([A-Z]+)@", lambda found: words[found[1]], read(HERE, f"templates/{template}"))
     files.check_results([(target / place, ()) for place in made], [export.urdf, *configs.values()], overwrite)

@@ -86,7 +86,7 @@ class FleetReport(Judged):
             Column("σ of that", lambda one: f"{1e3 * _moved(one[1]).expected:.2g}"),
             Column("p", lambda one: f"{one[1].geometry.probability:.1g}"),
             Column("", "{0[1].verdict.level}", number=False),
-        ]  # fmt: skip
+        ]
         blocks: list[Block] = [
             Text("Notes", lines_of(self.noticed), "note"),
             table("Arms calibrated more than once", drift, self.changes),
@@ -118,40 +118,56 @@ class FleetReport(Judged):
         """Return the numbers as in ``metrics.json`` [SI]."""
         types = {
             one.name: {
-                "arms": [each.name for each in one.arms], "failed": one.failed, "odd": one.odd,
-                "parameters": one.parameters, "tools": one.tools,
+                "arms": [each.name for each in one.arms],
+                "failed": one.failed,
+                "odd": one.odd,
+                "parameters": one.parameters,
+                "tools": one.tools,
             }
             for one in self.types
-        }  # fmt: skip
+        }
         changes = [{"arm": arm} | one.to_dict() for arm, one in self.changes]
-        return plain({
-            "verdict": self.verdict.level, "reason": self.verdict.reason, "types": types, "changes": changes,
-            "noticed": self.noticed,
-        })  # fmt: skip
+        return plain(
+            {
+                "verdict": self.verdict.level,
+                "reason": self.verdict.reason,
+                "types": types,
+                "changes": changes,
+                "noticed": self.noticed,
+            }
+        )
 
 
 def _tables(one: ArmType) -> list[Block]:
     def cell(name: str) -> Column:
         return Column(name, lambda row: small(getattr(row, name), row.unit, 3))
 
-    parameters = [Column("parameter", "{0.name}", number=False), Column("arms", "{0.arms}"),
-                  *map(cell, ("mean", "sigma", "width"))]  # fmt: skip
+    parameters = [
+        Column("parameter", "{0.name}", number=False),
+        Column("arms", "{0.arms}"),
+        *map(cell, ("mean", "sigma", "width")),
+    ]
     used = [
-        Column("tool", "{0.tool}", number=False), Column("arms", lambda row: f"{len(row.arms)}"),
-        Column("from the others' mm", lambda row: f"{1e3 * row.moved:.3g}"), Column("σ", "{0.moved_sigmas:.1f}"),
+        Column("tool", "{0.tool}", number=False),
+        Column("arms", lambda row: f"{len(row.arms)}"),
+        Column("from the others' mm", lambda row: f"{1e3 * row.moved:.3g}"),
+        Column("σ", "{0.moved_sigmas:.1f}"),
         Column("error, times the others'", "{0.times:.3g}"),
         Column("σ ", lambda row: f"{row.times_sigmas:.1f}" if row.times > MIN_TIMES else ""),
-    ]  # fmt: skip
+    ]
     arms = [
-        Column("arm", lambda row: row.serial or row.name, number=False), Column("calibrated", "{0.name}", number=False),
-        Column("verdict", "{0.judged[0]}", number=False), Column("rms mm", lambda row: f"{1e3 * row.left:.3g}"),
-    ]  # fmt: skip
+        Column("arm", lambda row: row.serial or row.name, number=False),
+        Column("calibrated", "{0.name}", number=False),
+        Column("verdict", "{0.judged[0]}", number=False),
+        Column("rms mm", lambda row: f"{1e3 * row.left:.3g}"),
+    ]
     note = "Deviations from nominal; the next arm is expected within width of the mean."
     compared = [row for row in one.tools if row.moved is not None]
     return [
-        table(f"Arms of type {one.name}", arms, one.arms, most=20), table(f"Tools of {one.name}", used, compared),
+        table(f"Arms of type {one.name}", arms, one.arms, most=20),
+        table(f"Tools of {one.name}", used, compared),
         table(f"Parameters of {one.name}", parameters, one.parameters, note),
-    ]  # fmt: skip
+    ]
 
 
 @checked
@@ -229,17 +245,22 @@ def _moved(change: RobotChange) -> ToolMotion:
 def _findings(types: Sequence[ArmType], changes: Sequence[tuple[str, RobotChange]]) -> list[Finding]:
     found = [
         finding("arm-drifts", arm=arm, moved=_moved(one).rms, reason=one.verdict.reason)
-        for arm, one in changes if one.verdict.level in ("marginal", "fail")
-    ]  # fmt: skip
+        for arm, one in changes
+        if one.verdict.level in ("marginal", "fail")
+    ]
     for one in types:
         found += [_failure(arm, len(one.failed) / len(one.arms)) for arm in one.arms if arm.name in one.failed]
-        found += [finding("arm-marginal", arm=arm.name, reason=arm.judged[1]) for arm in one.arms
-                  if arm.judged[0] == "marginal"]  # fmt: skip
+        found += [
+            finding("arm-marginal", arm=arm.name, reason=arm.judged[1])
+            for arm in one.arms
+            if arm.judged[0] == "marginal"
+        ]
         if len(one.tools) == 1 and len(one.arms) >= sum(MIN_ARMS):
             at = np.array([arm.cell.tools[0][:3, 3] for arm in one.plausible or one.arms])
             away = np.linalg.norm(at - np.median(at, axis=0), axis=1).max()
             found.append(finding("tools-unnamed", type=one.name, tool=one.tools[0].tool, away=away))
-        found += [finding("unlike-its-type", arm=arm.name, name=_farthest(arm)[0]) for arm in one.arms
-                  if arm.name in one.odd]  # fmt: skip
+        found += [
+            finding("unlike-its-type", arm=arm.name, name=_farthest(arm)[0]) for arm in one.arms if arm.name in one.odd
+        ]
         found += [each for tool in one.tools for each in tool.findings()]
     return found

@@ -82,7 +82,11 @@ def _current(arm: str, own: Sequence[Visit]) -> Finding:
     current, given = _in_time(own)[-1][1].name, own[-1][1].name
     dated = dates.count(max(dates)) == 1 if dates else False
     return finding(
-        "current-calibration", arm=arm, current=current, date=str(max(dates)) if dated else "",
-        how=f"date of {what}" if dated else "the order given", last=given if given != current else "",
+        "current-calibration",
+        arm=arm,
+        current=current,
+        date=str(max(dates)) if dated else "",
+        how=f"date of {what}" if dated else "the order given",
+        last=given if given != current else "",
         needed="" if dated else "measured_on",
-    )  # fmt: skip
+    )

@@ -61,10 +61,17 @@ def extend(session: Session, say: Say) -> list[str]:
         return ["no further motion is needed: joints and parameters are as asked for"]
     payloads = tuple(options_of(session).settings.payloads)
     settings = ExcitationSettings(
-        period=section.period, harmonics=section.harmonics, rate=section.rate, starts=section.starts,
-        evaluations=section.evaluations, repeat=section.repeats, outlook=False, columns=weak,
-        seed=session.settings.seed + int(round_name.removeprefix(ROUND)), loads=("none", *payloads) if payloads else (),
-    )  # fmt: skip
+        period=section.period,
+        harmonics=section.harmonics,
+        rate=section.rate,
+        starts=section.starts,
+        evaluations=section.evaluations,
+        repeat=section.repeats,
+        outlook=False,
+        columns=weak,
+        seed=session.settings.seed + int(round_name.removeprefix(ROUND)),
+        loads=("none", *payloads) if payloads else (),
+    )
     try:
         given = read_inputs(session.fit.path, settings, limits=session.named(section.limits), after=place.path)
         before = prediction.known_sigmas(given, prediction.task_of(given, settings.seed))[0][0]
@@ -161,8 +168,11 @@ def _short_of_default(session: Session) -> tuple[str, ...]:
 
 
 STEP = SessionStep(
-    "extend", "see whether more motion is needed", extend,
+    "extend",
+    "see whether more motion is needed",
+    extend,
     "fit/robot.toml dynamics:limits dynamics:options 8-dynamics/estimate.csv 8-dynamics/unseen/report.json",
     f"6-excitation/{ROUND}*/*",
-    "dynamics.tolerance_percent,sigma_percent,period,harmonics,rate,starts,evaluations,repeats seed", "need",
-)  # fmt: skip
+    "dynamics.tolerance_percent,sigma_percent,period,harmonics,rate,starts,evaluations,repeats seed",
+    "need",
+)

@@ -33,11 +33,14 @@ BEGIN = 60  # lines, without comments, in which the numbers begin (our choice)
 STACK = 7  # rows above the numbers that may name columns
 COMMENTS = ("#", "//", "%", "!")
 UNITS = {
-    **dict.fromkeys(("in", "inch", "inches", '"'), "in"), **dict.fromkeys(("s", "sec", "seconds"), "s"),
+    **dict.fromkeys(("in", "inch", "inches", '"'), "in"),
+    **dict.fromkeys(("s", "sec", "seconds"), "s"),
     **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), "mm"),
-    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), "m"), **dict.fromkeys(("rad", "radians"), "rad"),
-    **dict.fromkeys(("cm", "centimeter", "centimeters"), "cm"), **dict.fromkeys(("deg", "degree", "degrees"), "deg"),
-}  # fmt: skip
+    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), "m"),
+    **dict.fromkeys(("rad", "radians"), "rad"),
+    **dict.fromkeys(("cm", "centimeter", "centimeters"), "cm"),
+    **dict.fromkeys(("deg", "degree", "degrees"), "deg"),
+}
 _STATED = re.compile(r"(?i)\b(?:length )?units?\b[\s:=,;]*([a-z]+)")
 _NUMBER = {mark: re.compile(rf"[+-]?(\d+\{mark}?\d*|\{mark}\d+)([eE][+-]?\d+)?|nan") for mark in ".,"}
 _HEADING = re.compile(r"^(.*?)\s*[\[(]([^\[\]()]*)[\])]$")
@@ -180,8 +183,10 @@ def _ours(names: Sequence[str], above: Sequence[Sequence[str]]) -> list[str]:
     """Return the toolkit's names of columns, from the row of names and the rows of quantities and objects above it."""
     plain = [re.sub(r"[^a-z0-9]", "", name.lower()) for name in names]
     turns = [any(row[k].lower() == "rotation" for row in above) for k in range(len(names))]
-    axes = [name if name == "w" and turn else match[1] if (match := _AXIS.fullmatch(name)) else ""
-            for name, turn in zip(plain, turns)]  # fmt: skip
+    axes = [
+        name if name == "w" and turn else match[1] if (match := _AXIS.fullmatch(name)) else ""
+        for name, turn in zip(plain, turns)
+    ]
     if not {"x", "y", "z"} <= {axis for axis, turn in zip(axes, turns) if not turn}:
         return list(names)
     letter = "q" if "w" in axes else "r"

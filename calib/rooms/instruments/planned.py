@@ -47,8 +47,10 @@ def read_planned(path: Path, chain: Chain, options: FileOptions) -> list[PoseMea
     q = read_poses(options.planned, joints_of(chain))
     pose, notes = ordered(chain, q, points, _stated(points, len(q)), sheet)
     plan = Table(options.planned, chain.joint_names, ("",) * chain.n, tuple(q.T), np.arange(1, len(q) + 1))
-    units = tuple(sheet.unit(name, "position") if name in sheet.family(POSITION.names) else unit
-                  for name, unit in zip(points.header, points.units))  # fmt: skip
+    units = tuple(
+        sheet.unit(name, "position") if name in sheet.family(POSITION.names) else unit
+        for name, unit in zip(points.header, points.units)
+    )
     keys = [name for name in [column_of(points, NAMES)] if name]
     joined = merged(plan, replace(points, units=units), pose, notes, keys, told=False)
     (block,) = read_measurements(joined.table, joints_of(chain), replace(options, units={}))

@@ -35,10 +35,15 @@ def diff(before: str, after: str, settings: DiffSettings, out: Folder = None, pl
 
 @command(app, "Geometry")
 def drift(
-    robot: Robot, measured: list[Path], settings: DriftSettings, out: Folder = None, plots: bool = True,
+    robot: Robot,
+    measured: list[Path],
+    settings: DriftSettings,
+    out: Folder = None,
+    plots: bool = True,
     options: Annotated[Path | None, typer.Option(help="TOML, see calib formats options")] = None,
-    base: str | None = None, tip: str | None = None,
-) -> None:  # fmt: skip
+    base: str | None = None,
+    tip: str | None = None,
+) -> None:
     """Show how the target drifts with time and temperature, from poses of ROBOT measured more than once.
 
     Example: calib drift robot.urdf measured.csv drift.csv --tolerance 0.1

@@ -126,11 +126,16 @@ def repeats(
     pairs += [(block.file, "more than once", drift_of(chain, block)) for block in blocks]
     return [
         finding(
-            "poses-moved" if sigma and found.exceeds(sigma) else "poses-repeat", file=Path(file).name, when=when,
-            poses=found.poses, rms=found.rms, noise=noise_of_difference(sigma) if sigma else None,
+            "poses-moved" if sigma and found.exceeds(sigma) else "poses-repeat",
+            file=Path(file).name,
+            when=when,
+            poses=found.poses,
+            rms=found.rms,
+            noise=noise_of_difference(sigma) if sigma else None,
         )
-        for file, when, found in pairs if found is not None
-    ]  # fmt: skip
+        for file, when, found in pairs
+        if found is not None
+    ]
 
 
 def drift_of(chain: Chain, later: PoseMeasurements, first: Sequence[PoseMeasurements] | None = None) -> Drift | None:
@@ -192,8 +197,9 @@ def trends(
     columns = [(name, tables[0][name][0], [each[name][1] for each in tables]) for name in shared]
     found = (
         _trend(name, unit, np.concatenate(values), np.concatenate(off), pose, sigma)
-        for name, unit, values in columns if unit != "h" or _one_clock(values)
-    )  # fmt: skip
+        for name, unit, values in columns
+        if unit != "h" or _one_clock(values)
+    )
     return [one for one in found if one is not None]
 
 

@@ -52,10 +52,14 @@ class DriftFound(Drawn, Judged):
     def section(self) -> Section:
         """Return a report section with the trends, and how far repeated poses are apart."""
         columns = [
-            Column("with", "{0.what}", number=False), Column("poses", "{0.poses}"), Column("visits", "{0.x.size}"),
-            Column("slope", _rate), *(Column(f"{axis} mm", _of_axis(k)) for k, axis in enumerate("xyz")),
-            Column("in all mm", lambda one: f"{1e3 * one.total:.3g}"), Column("σ", lambda one: f"{one.sigmas:.1f}"),
-        ]  # fmt: skip
+            Column("with", "{0.what}", number=False),
+            Column("poses", "{0.poses}"),
+            Column("visits", "{0.x.size}"),
+            Column("slope", _rate),
+            *(Column(f"{axis} mm", _of_axis(k)) for k, axis in enumerate("xyz")),
+            Column("in all mm", lambda one: f"{1e3 * one.total:.3g}"),
+            Column("σ", lambda one: f"{one.sigmas:.1f}"),
+        ]
         blocks = [Text("Notes", lines_of(self.noticed), "note"), table("Drift of the target", columns, self.trends)]
         return Section("Drift", blocks, self.verdict.level, self.verdict.reason)
 
@@ -79,13 +83,18 @@ class DriftFound(Drawn, Judged):
         header = ("column", "unit", "x", "dx [mm]", "dy [mm]", "dz [mm]")
         rows = [(one.what, one.unit, x, *(1e3 * moved)) for one in self.trends for x, moved in zip(one.x, one.moved)]
         part = pages.ResultPart(
-            self.section(), self.charts() if plots else {}, ["Targets of repeated poses less the arm's prediction."],
+            self.section(),
+            self.charts() if plots else {},
+            ["Targets of repeated poses less the arm's prediction."],
             (TABLE, header, rows),
-        )  # fmt: skip
-        numbers = plain({"robot": self.robot, "verdict": self.verdict.level, "noticed": self.noticed} | {
-            one.what: {"slope": one.slope, "sigma": one.sigma, "sigmas": one.sigmas, "total": one.total}
-            for one in self.trends
-        })  # fmt: skip
+        )
+        numbers = plain(
+            {"robot": self.robot, "verdict": self.verdict.level, "noticed": self.noticed}
+            | {
+                one.what: {"slope": one.slope, "sigma": one.sigma, "sigmas": one.sigmas, "total": one.total}
+                for one in self.trends
+            }
+        )
         return pages.save(Path(out), "drift", f"Drift of {self.robot}", {"robot": self.robot}, [part], numbers, [TABLE])
 
 
@@ -98,9 +107,13 @@ def _of_axis(k: int):
 
 
 def drift(
-    robot: str | Path, measured: Sequence[str | Path], settings: DriftSettings = DEFAULT_DRIFT,
-    options: str | Path | FitOptions | None = None, base: str | None = None, tip: str | None = None,
-) -> DriftFound:  # fmt: skip
+    robot: str | Path,
+    measured: Sequence[str | Path],
+    settings: DriftSettings = DEFAULT_DRIFT,
+    options: str | Path | FitOptions | None = None,
+    base: str | None = None,
+    tip: str | None = None,
+) -> DriftFound:
     """Return how the target drifts with time and temperature, from poses that were measured more than once.
 
     Args:

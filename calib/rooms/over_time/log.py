@@ -27,9 +27,21 @@ if TYPE_CHECKING:
 
 TABLE = "log.csv"
 HEADER = (
-    "folder", "date", "robot", "serial", "verdict", "nominal [mm]", "calibrated [mm]", "torque [%]", "moved [mm]",
-    "sigma [mm]", "parameter", "change", "change sigma", "unit",
-)  # fmt: skip
+    "folder",
+    "date",
+    "robot",
+    "serial",
+    "verdict",
+    "nominal [mm]",
+    "calibrated [mm]",
+    "torque [%]",
+    "moved [mm]",
+    "sigma [mm]",
+    "parameter",
+    "change",
+    "change sigma",
+    "unit",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,10 +164,17 @@ def log(folders: Sequence[str | Path], *, mixed: bool = False) -> RobotLog:
         if (one.fit.path / METRICS).exists() and one.geometric:
             change = last and diff(last, one.folder).geometry
             last = one.folder
-        lines.append(LogLine(
-            str(one.folder), one.settings.created[:10], _serial(one), one.verdicts().level, position_errors(one),
-            torque_error(one), change or None,
-        ))  # fmt: skip
+        lines.append(
+            LogLine(
+                str(one.folder),
+                one.settings.created[:10],
+                _serial(one),
+                one.verdicts().level,
+                position_errors(one),
+                torque_error(one),
+                change or None,
+            )
+        )
     return RobotLog(found[-1].settings.name, tuple(lines))
 
 

@@ -26,9 +26,14 @@ class ResultPart(NamedTuple):
 
 
 def save(
-    out: Path, kind: str, title: str, setup: Mapping[str, str], parts: Sequence[ResultPart], numbers: Any,
+    out: Path,
+    kind: str,
+    title: str,
+    setup: Mapping[str, str],
+    parts: Sequence[ResultPart],
+    numbers: Any,
     tables: Sequence[str],
-) -> Path:  # fmt: skip
+) -> Path:
     """Write the folder `out` and return its path; `tables`: names of all that this `kind` of result may write.
 
     Raises:

@@ -36,9 +36,19 @@ from trajectories.setpoints import Setpoints
 
 SAMPLES = 100  # instants over the period while searching
 READ = (
-    "period", "harmonics", "drives", "starts", "evaluations", "seed", "rate", "outlook", "goals", "hard", "loads",
+    "period",
+    "harmonics",
+    "drives",
+    "starts",
+    "evaluations",
+    "seed",
+    "rate",
+    "outlook",
+    "goals",
+    "hard",
+    "loads",
     "columns",
-)  # of the settings  # fmt: skip
+)  # of the settings
 GOALS = ("raw", "normalised", "logdet", "smallest")
 FIGURES = "plot_*.png"
 MOTION = (ROBOT, COVARIANCE, METRICS, PLANNED, coefficients.NAME, prediction.NAME, FIGURES)
@@ -198,11 +208,14 @@ def excite_parallel(
     if options is None and after is None and not settings.loads and not settings.columns:
         made, values = read_model(robot, folder, settings.drives or "Fv Fc off")
         return design_parallel(robot, made, values, settings, map=map, progress=progress)
-    require(options is None or folder is None, f"{folder} already states rows, drives and payloads; leave the options "
-            "out", UsageError)  # fmt: skip
-    made, values, loads, notes = of_options(robot, options, settings) if folder is None else of_folder(
-        robot, folder, settings
-    )  # fmt: skip
+    require(
+        options is None or folder is None,
+        f"{folder} already states rows, drives and payloads; leave the options out",
+        UsageError,
+    )
+    made, values, loads, notes = (
+        of_options(robot, options, settings) if folder is None else of_folder(robot, folder, settings)
+    )
     purpose = purpose_of(made, values, loads, notes, settings, folder, after)
     found = design_parallel(robot, made, values, settings, purpose=purpose, map=map, progress=progress)
     return found if after is None else foretold(found)
@@ -252,9 +265,13 @@ def design_parallel(
     platform: Any = SimpleNamespace(name=own.name, n=own.r, joint_names=own.freedom, joints=joints)  # like an arm's
     free = np.full(own.r, np.inf)
     given = ExcitationInputs(
-        platform, MotionLimits(tuple(constraints), bounds, free, None, 0.0, None, None, ()),
-        replace(purpose.model, values=None, covariance=None), {}, purpose.columns, purpose.prior,
-    )  # fmt: skip
+        platform,
+        MotionLimits(tuple(constraints), bounds, free, None, 0.0, None, None, ()),
+        replace(purpose.model, values=None, covariance=None),
+        {},
+        purpose.columns,
+        purpose.prior,
+    )
     goals, harmonics = settings.goals or ("logdet",), settings.harmonics or COARSE
     asked = replace(settings, goals=goals, harmonics=harmonics, samples=SAMPLES)
     return ParallelExcitation(**vars(search_motion(given, asked, map, progress)), robot=robot, plan=plan)
@@ -280,9 +297,14 @@ def check_motion_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> 
 
 
 def write_motion(
-    robot: ParallelMechanism, out: Path, track: Setpoints, coordinates: np.ndarray, bounds: MotionBounds,
-    metrics: dict[str, Any], more: Callable[[Path], None],
-) -> Path:  # fmt: skip
+    robot: ParallelMechanism,
+    out: Path,
+    track: Setpoints,
+    coordinates: np.ndarray,
+    bounds: MotionBounds,
+    metrics: dict[str, Any],
+    more: Callable[[Path], None],
+) -> Path:
     """Write the folder of a motion: ``robot.toml``, ``motion.csv``, ``metrics.json`` and what `more` adds.
 
     Args:

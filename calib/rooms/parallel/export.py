@@ -185,8 +185,10 @@ class OpenedRobot:
         table = {
             "closed_loop": [[f"{leg.name}_end", f"{leg.name}_attachment"] for leg in self.closing],
             "type": ["6d" if leg.end == "rigid" else "3d" for leg in self.closing],
-            "name_mot": self.actuated, "joint_name": [], "joint_type": [],
-        }  # fmt: skip
+            "name_mot": self.actuated,
+            "joint_name": [],
+            "joint_type": [],
+        }
         lines = [f"{key}: {json.dumps(value)}" for key, value in table.items()]
         lines += ["home:", *(f"  {json.dumps(name)}: {value:.12f}" for name, value in self.home.items())]
         return "\n".join(["# Loops of robot.urdf: pairs of links that coincide; values at home [rad or m]", *lines, ""])

@@ -75,15 +75,22 @@ def drive_gains(
         J = loop_jacobians(own, own.locate(motion.q)).readings.transpose(0, 2, 1)
         currents = J * case.target[:, None]
         projected = replace(
-            case, target=currents.sum(axis=2), torque_rows=model.torque_rows,
+            case,
+            target=currents.sum(axis=2),
+            torque_rows=model.torque_rows,
             present=model.torque_rows.of_joints(case.present),
-        )  # fmt: skip
+        )
         seen = observe(model, base.kept, projected, decimator)
         matrix = np.concatenate([decimate(currents, decimator, motion.segment), -seen.matrix[:, :, ~fixed]], axis=2)
-        rows.append(replace(
-            seen, matrix=matrix, target=seen.matrix @ given, names=(*robot.joint_names, *np.array(names)[~fixed]),
-            units=("",) * matrix.shape[2],
-        ))  # fmt: skip
+        rows.append(
+            replace(
+                seen,
+                matrix=matrix,
+                target=seen.matrix @ given,
+                names=(*robot.joint_names, *np.array(names)[~fixed]),
+                units=("",) * matrix.shape[2],
+            )
+        )
         squares.append(np.mean(J**2, axis=0))
         noises.append(np.mean((case.target - motion.in_band(case.target)) ** 2, axis=0))
     noise = np.mean(noises, axis=0) + 1e-12 * np.mean(noises)
@@ -100,9 +107,13 @@ def drive_gains(
     values[fixed], values[~fixed] = given[fixed], found.others
     scale = ", ".join(f"{name} = {value:g}" for name, value in known.items())
     return DriveGains(
-        frozen(found.gains), frozen(found.covariance * np.outer(wider, wider)), tuple(names), frozen(values),
-        frozen(np.sqrt(found.share * noise)), scale,
-    )  # fmt: skip
+        frozen(found.gains),
+        frozen(found.covariance * np.outer(wider, wider)),
+        tuple(names),
+        frozen(values),
+        frozen(np.sqrt(found.share * noise)),
+        scale,
+    )
 
 
 class _Solution(NamedTuple):

@@ -57,10 +57,16 @@ def propagate(
     deviations = np.sqrt(np.clip(np.diag(covariance.matrix), 0.0, None))
     names, units = (tuple(getattr(one, key) for one in parameters) for key in ("name", "unit"))
     return GeometryUncertainty(
-        found.names, (*names, *TILTS), (*units, *("rad" for _ in TILTS)), matrix, found.fitted.estimate.covariance,
+        found.names,
+        (*names, *TILTS),
+        (*units, *("rad" for _ in TILTS)),
+        matrix,
+        found.fitted.estimate.covariance,
         np.append(np.where(deviations > 0.0, deviations, np.nan), np.full(len(TILTS), np.nan)),
-        frozen(own @ covariance.matrix @ own.T), felt, left,
-    )  # fmt: skip
+        frozen(own @ covariance.matrix @ own.T),
+        felt,
+        left,
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -127,9 +127,14 @@ def model_of(known: ClosedRobot, settings: IdentificationSettings) -> ParallelMo
     """Return the model of a robot that the settings ask for, with their torque rows."""
     v0 = per_joint(settings.v0, 1, "v0")[0]
     return make_parallel_model(
-        known, settings.sets, v0, settings.torque_rows, tuple(settings.payloads), settings.passive,
+        known,
+        settings.sets,
+        v0,
+        settings.torque_rows,
+        tuple(settings.payloads),
+        settings.passive,
         settings.identical_legs,
-    )  # fmt: skip
+    )
 
 
 def actuator_torques(inputs: IdentificationInputs, case: Case) -> np.ndarray:
@@ -146,11 +151,16 @@ def _preload(known: ClosedRobot, inputs: IdentificationInputs, case: Case) -> li
     unit = "N" if known.robot.joints[0].kind == "prismatic" else "N m"
     return [
         finding(
-            "preload", file=case.name, number=k, mean=x.mean(), spread=x.std(), unit=unit,
+            "preload",
+            file=case.name,
+            number=k,
+            mean=x.mean(),
+            spread=x.std(),
+            unit=unit,
             sigma=x.std() * np.sqrt(inflation(x) / len(x)),
         )
         for k, x in enumerate(own.T, 1)
-    ]  # fmt: skip
+    ]
 
 
 def assess(inputs: IdentificationInputs, found: Identification[RegressorModel], findings: ModelFindings) -> Assessment:
@@ -160,9 +170,11 @@ def assess(inputs: IdentificationInputs, found: Identification[RegressorModel], 
     errors = errors_of(inputs, found.dynamics)
     verdict, rules = _judged(model, found, cases, errors)
     noticed = (
-        *rules, *motion_findings(errors.validation, errors.repeated), *findings.noticed,
+        *rules,
+        *motion_findings(errors.validation, errors.repeated),
+        *findings.noticed,
         *settle(_encoders(model.known, (*cases, *unseen))),
-    )  # fmt: skip
+    )
     notes = (*lines_of(noticed), *excitation_notes(errors.excitation), *findings.notes)
     return Assessment(**vars(errors), verdict=verdict, warnings=notes, noticed=noticed)
 

@@ -110,9 +110,10 @@ class ParallelFit(Drawn, Judged):
                 figures[-1] += f", tolerance {1e3 * tolerance:g} mm"
             left, times = after / max(before, 1e-300), after / max(_rms(self.own[1][:, columns]), 1e-300)
             rules += [
-                finding("worse-than-nominal", times=left), finding("no-transfer", times=times, remedy=""),
+                finding("worse-than-nominal", times=left),
+                finding("no-transfer", times=times, remedy=""),
                 finding("small-gain", left=left),
-            ]  # fmt: skip
+            ]
         return Verdict.of("; ".join(figures), rules if figures else [finding("no-unseen-poses")])
 
     @property
@@ -193,12 +194,16 @@ class ParallelFit(Drawn, Judged):
             for key, row in zip(("nominal", "calibrated"), np.sqrt(np.mean(both**2, axis=1)))
         }
         return {
-            "robot": self.nominal.chain.name, "parameters": len(found.parameters), "not_told": list(found.vague),
+            "robot": self.nominal.chain.name,
+            "parameters": len(found.parameters),
+            "not_told": list(found.vague),
             "reading_rms": {"nominal": found.before, "calibrated": found.after},
-            "platform_rms": errors if self.measured else None, "contradiction_rms": None if self.measured else errors,
-            "judged_on": ", ".join(self.judged), "iterations": found.iterations,
+            "platform_rms": errors if self.measured else None,
+            "contradiction_rms": None if self.measured else errors,
+            "judged_on": ", ".join(self.judged),
+            "iterations": found.iterations,
             "verdict": {"level": verdict.level, "reason": verdict.reason},
-        }  # fmt: skip
+        }
 
     def section(self) -> Section:
         """Return errors on unseen rows and the verdict as a section of a report."""

@@ -141,10 +141,17 @@ def plan_parallel(
     motion = joined([track(one.path, one.profile, settings.rate, law.torque) for one in timings])
     joints = joints_of(known.robot)
     return ParallelPlan(
-        chain=cast(Any, known.robot), bounds=bounds, limits=kept, lower=joints.lower, upper=joints.upper,
-        timings=timings, track=motion, notes=() if model else (FRICTIONLESS,), robot=robot,
+        chain=cast(Any, known.robot),
+        bounds=bounds,
+        limits=kept,
+        lower=joints.lower,
+        upper=joints.upper,
+        timings=timings,
+        track=motion,
+        notes=() if model else (FRICTIONLESS,),
+        robot=robot,
         coordinates=coordinates_of(known, known.locate(motion.q)),
-    )  # fmt: skip
+    )
 
 
 def _read_waypoints(path: Path | np.ndarray, known: ClosedRobot) -> np.ndarray:
@@ -159,8 +166,11 @@ def _read_waypoints(path: Path | np.ndarray, known: ClosedRobot) -> np.ndarray:
     if any(name in table for name in known.robot.freedom):
         return read_coordinates(table, known.robot)
     if not any(name in table for name in known.robot.joint_names):
-        refuse_data(path, f"neither the platform's coordinates ({', '.join(known.robot.freedom)}) nor the actuators "
-            f"({', '.join(known.robot.joint_names)}) are among its columns: {', '.join(table.header)}")  # fmt: skip
+        refuse_data(
+            path,
+            f"neither the platform's coordinates ({', '.join(known.robot.freedom)}) nor the actuators "
+            f"({', '.join(known.robot.joint_names)}) are among its columns: {', '.join(table.header)}",
+        )
     try:
         return coordinates_of(known, known.locate(read_rows(path, known.robot)[:, : known.robot.n]))
     except NoPosture as error:

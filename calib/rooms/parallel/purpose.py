@@ -102,9 +102,12 @@ def read_model(robot: ParallelMechanism, folder: Path | None, drives: str = "") 
         texts = [" ".join(one for one in DRIVES if one + label in known) for label in tree.labels]
         passive = next((text for j, text in enumerate(texts) if j not in tree.actuated and text), "")
         model = make_parallel_model(
-            robot.known, [texts[j] for j in tree.actuated], v0=float(table.get("v0", V0)),
-            payloads=[str(label) for label in table.get("payloads", ())], passive=passive,
-        )  # fmt: skip
+            robot.known,
+            [texts[j] for j in tree.actuated],
+            v0=float(table.get("v0", V0)),
+            payloads=[str(label) for label in table.get("payloads", ())],
+            passive=passive,
+        )
         model = replace(
             model, identical_legs=bool(table.get("identical_legs")), preload=tuple(map(float, table.get("preload", ())))
         )
@@ -156,9 +159,14 @@ def of_folder(
 
 
 def purpose_of(
-    model: ParallelModel, values: np.ndarray, loads: Loads, notes: tuple[str, ...], settings: ExcitationSettings,
-    folder: Path | None, after: Path | None,
-) -> Purpose:  # fmt: skip
+    model: ParallelModel,
+    values: np.ndarray,
+    loads: Loads,
+    notes: tuple[str, ...],
+    settings: ExcitationSettings,
+    folder: Path | None,
+    after: Path | None,
+) -> Purpose:
     """Return the base columns of a model under some loads, with what an identification `after` knows of them.
 
     After an identification its own columns count; those of payloads that no load has rest on it alone.

@@ -73,13 +73,18 @@ class ParallelMechanism:
 
         model = dynamics.model
         return {
-            "robot": ROBOT, "kind": model.torque_rows.name, "unit": unit, "payloads": list(model.payloads),
-            "preload": model.preload, "identical_legs": model.identical_legs,
+            "robot": ROBOT,
+            "kind": model.torque_rows.name,
+            "unit": unit,
+            "payloads": list(model.payloads),
+            "preload": model.preload,
+            "identical_legs": model.identical_legs,
             "v0": next((one.settings[0] for one in model.terms if one.shape == "sign"), V0),
             "values": dict(zip(model.single.names, model.spread(dynamics.values).tolist())),
-            "base": dict(zip(base.names, expressions(base))), "regrouping": regrouping(base),
+            "base": dict(zip(base.names, expressions(base))),
+            "regrouping": regrouping(base),
             "covariance": OF_PARAMETERS,
-        }  # fmt: skip
+        }
 
     def __repr__(self) -> str:
         robot = self.known.robot

@@ -20,9 +20,14 @@ Options = Annotated[Path | None, typer.Option("--options", help="TOML, see calib
 
 @command(app, "Geometry")
 def tool(
-    robot: Robot, measured: Measured, settings: PlacementSettings, out: Folder = None, options: Options = None,
-    base: str | None = None, tip: str | None = None,
-) -> None:  # fmt: skip
+    robot: Robot,
+    measured: Measured,
+    settings: PlacementSettings,
+    out: Folder = None,
+    options: Options = None,
+    base: str | None = None,
+    tip: str | None = None,
+) -> None:
     """Calibrate the tool (TCP) of ROBOT from a dozen measured poses, the arm left as it is.
 
     Example: calib tool robot.urdf m.csv --tolerance 0.5
@@ -32,9 +37,14 @@ def tool(
 
 @command(app, "Geometry")
 def base(
-    robot: Robot, measured: Measured, settings: PlacementSettings, out: Folder = None, options: Options = None,
-    base: str | None = None, tip: str | None = None,
-) -> None:  # fmt: skip
+    robot: Robot,
+    measured: Measured,
+    settings: PlacementSettings,
+    out: Folder = None,
+    options: Options = None,
+    base: str | None = None,
+    tip: str | None = None,
+) -> None:
     """Calibrate where ROBOT stands, its base in the instrument's frame, from a dozen measured poses.
 
     Example: calib base robot.urdf measured.csv
@@ -44,9 +54,14 @@ def base(
 
 @command(app, "Geometry", "hand-eye")
 def hand_eye(
-    robot: Robot, measured: Measured, settings: PlacementSettings, out: Folder = None, options: Options = None,
-    base: str | None = None, tip: str | None = None,
-) -> None:  # fmt: skip
+    robot: Robot,
+    measured: Measured,
+    settings: PlacementSettings,
+    out: Folder = None,
+    options: Options = None,
+    base: str | None = None,
+    tip: str | None = None,
+) -> None:
     """Calibrate camera and board, one on ROBOT and the other beside it, from a dozen images.
 
     Example: calib hand-eye robot.urdf photos --holdout 0.25
@@ -55,9 +70,14 @@ def hand_eye(
 
 
 def _place(
-    verb: str, shown: tuple[str, ...], robot: str, measured: list[Path], settings: PlacementSettings, out: Path | None,
+    verb: str,
+    shown: tuple[str, ...],
+    robot: str,
+    measured: list[Path],
+    settings: PlacementSettings,
+    out: Path | None,
     **more: Any,
-) -> None:  # fmt: skip
+) -> None:
     from calib.rooms.placements import api
 
     if out is not None:

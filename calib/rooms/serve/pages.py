@@ -90,11 +90,15 @@ def application(work: Work, token: str = "", host: str = "127.0.0.1") -> Starlet
     """
     steps.clear_staging(open_session(work.folder))
     routes = [
-        Route("/", page), Route("/page.js", script), Route("/files/{name:path}", file),
+        Route("/", page),
+        Route("/page.js", script),
+        Route("/files/{name:path}", file),
         Route("/view", view),
-        Route("/next", go_on, methods=["POST"]), Route("/redo/{step}", go_on, methods=["POST"]),
-        Route("/bring/{kind}", bring, methods=["POST"]), Route("/aside/{name:path}", set_aside, methods=["POST"]),
-    ]  # fmt: skip
+        Route("/next", go_on, methods=["POST"]),
+        Route("/redo/{step}", go_on, methods=["POST"]),
+        Route("/bring/{kind}", bring, methods=["POST"]),
+        Route("/aside/{name:path}", set_aside, methods=["POST"]),
+    ]
     guard = Middleware(Guard, token=token, host=host)  # type: ignore[arg-type]
     errors = {CalibError: refused, OSError: refused}
     made = Starlette(routes=routes, middleware=[guard], exception_handlers=errors)  # type: ignore[arg-type]
@@ -119,14 +123,20 @@ def page(request: Request) -> Response:
     task, file = commands.asks(session, waits) if waits else ("", "")
     made = [path for path in _files(session) if path.suffix in PICTURES]
     values = {
-        "session": session, "states": states, "ahead": ahead, "work": work, "to_bring": file,
+        "session": session,
+        "states": states,
+        "ahead": ahead,
+        "work": work,
+        "to_bring": file,
         "tasks": [re.sub(r"^\d+ ", "", line) for line in task.splitlines()],
-        "verdicts": None if ahead else session.verdicts(), "kinds": _kinds(session), "notes": _notes(session),
+        "verdicts": None if ahead else session.verdicts(),
+        "kinds": _kinds(session),
+        "notes": _notes(session),
         "pages": [name for name in PAGES if session.path(name).exists()],
         "recording": RECORDING if session.path(RECORDING).exists() else "",
         "pictures": [_name(session, path) for path in made],
         "files": [_name(session, path) for path in _files(session)],
-    }  # fmt: skip
+    }
     headers = {"Content-Security-Policy": POLICY, "Cache-Control": "no-store"}
     return HTMLResponse(filled(HERE, "page.html", **values), headers=headers)
 

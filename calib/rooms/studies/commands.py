@@ -58,9 +58,15 @@ def study(
     kept = stores.held(place) if stores.is_address(place) else nullcontext(Path(place))
     with kept as folder, reporting(log_interval) as (_, progress):
         found = report.run_study(
-            studies, folder, methods=_names(methods), runs=runs, where=workers, report_only=report_only, plots=plots,
+            studies,
+            folder,
+            methods=_names(methods),
+            runs=runs,
+            where=workers,
+            report_only=report_only,
+            plots=plots,
             say=progress,
-        )  # fmt: skip
+        )
     seen = [one for one in found.conditions if one.methods]
     max_shown = 3  # conditions whose tables are printed in full
     if len(seen) > max_shown:
@@ -111,12 +117,17 @@ def compare(
     chosen = _names(methods)
     with reporting() as (say_now, progress):
         given = inputs.gather(
-            robot, recordings, validate or (), options=read_options(options), base=base, tip=tip, seed=seed,
-            friction=friction, progress=progress,
-        )  # fmt: skip
-        found = compare_methods(
-            given, chosen, friction, progress, lambda one: say_now(method_comparison.line(one))
-        )  # fmt: skip
+            robot,
+            recordings,
+            validate or (),
+            options=read_options(options),
+            base=base,
+            tip=tip,
+            seed=seed,
+            friction=friction,
+            progress=progress,
+        )
+        found = compare_methods(given, chosen, friction, progress, lambda one: say_now(method_comparison.line(one)))
     say(*page.section(method_comparison.section(found, caveats(given, found))), result=True)
     if out is not None:
         with files.results(table, overwrite=overwrite):

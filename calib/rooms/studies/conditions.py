@@ -183,9 +183,7 @@ def shipped() -> dict[str, Path]:
     return {path.stem: path for path in sorted(LIBRARY.glob("*.toml"))}
 
 
-def read_study(
-    files: Sequence[str | Path], methods: Sequence[str] | None = None, runs: int | None = None
-) -> Study:  # fmt: skip
+def read_study(files: Sequence[str | Path], methods: Sequence[str] | None = None, runs: int | None = None) -> Study:
     """Return the study of one or several files.
 
     Args:
@@ -261,9 +259,14 @@ def _parse(path: Path) -> StudyFile:
 def _expanded(study: StudyFile) -> list[Condition]:
     """Return the conditions of a study: all combinations of its values, each with a name."""
     axes: dict[str, tuple[Any, ...]] = {
-        "robot": study.robot, "motion": study.motion, "rate": study.rate, "noise": study.noise,
-        "decimation": study.decimation, "cutoff": study.cutoff, "mismatch": study.mismatch,
-    }  # fmt: skip
+        "robot": study.robot,
+        "motion": study.motion,
+        "rate": study.rate,
+        "noise": study.noise,
+        "decimation": study.decimation,
+        "cutoff": study.cutoff,
+        "mismatch": study.mismatch,
+    }
     result = []
     for values in product(*axes.values()):
         chosen = dict(zip(axes, values))
@@ -271,11 +274,16 @@ def _expanded(study: StudyFile) -> list[Condition]:
         noise = chosen.pop("noise")
         result.append(
             Condition(
-                "-".join([study.name, *parts]), sigma_q=noise.sigma_q, sigma_tau=noise.sigma_tau,
-                duration=study.duration, guess=study.guess, guesses=study.guesses, resimulated=study.resimulated,
+                "-".join([study.name, *parts]),
+                sigma_q=noise.sigma_q,
+                sigma_tau=noise.sigma_tau,
+                duration=study.duration,
+                guess=study.guess,
+                guesses=study.guesses,
+                resimulated=study.resimulated,
                 **chosen,
             )
-        )  # fmt: skip
+        )
     return result
 
 

@@ -124,9 +124,15 @@ def _drawn(chain: Chain, duration: float, rate: float, number: int) -> Reference
     middle, half = 0.5 * (lower + upper), 0.5 * REACH * (upper - lower)
     speed = SPEED * np.array([joint.velocity for joint in chain.joints])
     return random_fourier(
-        middle - half, middle + half, speed, duration, rate, HARMONICS, acceleration=ACCELERATION,
+        middle - half,
+        middle + half,
+        speed,
+        duration,
+        rate,
+        HARMONICS,
+        acceleration=ACCELERATION,
         seed=np.random.default_rng([number, HARMONICS]),
-    )  # fmt: skip
+    )
 
 
 @lru_cache(maxsize=4)
@@ -161,9 +167,16 @@ def data_set(condition: Condition, seed: int) -> Experiment:
     rows = observe(model, base.kept, case, decimator)
     terms = tuple(None if k < model.inertial else model.columns[k - model.inertial] for k in base.kept)
     problem = IdentificationProblem(
-        model, base, (case,), decimator, (rows,), terms, np.full(base.b, -1),
-        loop=_loop(condition, controller), constraints=ConstraintSettings(bodies=True),
-    )  # fmt: skip
+        model,
+        base,
+        (case,),
+        decimator,
+        (rows,),
+        terms,
+        np.full(base.b, -1),
+        loop=_loop(condition, controller),
+        constraints=ConstraintSettings(bodies=True),
+    )
     part = slice(None, None, THIN)
     thin = Reference(*(series[part] for series in (setup.other.t, setup.other.q, setup.other.v, setup.other.a)))
     matrix = model.regressor(thin.q, thin.v, thin.a)[:, :, base.kept]
@@ -217,7 +230,7 @@ def _recorded(condition: Condition, setup: Setup, true: Plant, controller: Contr
     asked = CubicSpline(setup.reference.t, setup.reference.q)(log.t)
     recording = Recording(
         log.t, log.measured, torque, "torque", setup.chain.joint_names, q_ref=asked, file=condition.name
-    )  # fmt: skip
+    )
     cutoff = condition.cutoff or USABLE * rate / 2
     decimator = design_decimator(rate, condition.decimation, "chebyshev")
     motion = make_motion(recording, FilterOptions(cutoff=cutoff, band=0.999 * decimator.band, clock="stamps"))
@@ -229,9 +242,13 @@ def _loop(condition: Condition, controller: Controller) -> LoopSettings:
     kp, kd = BELIEVED if condition.mismatch == "controller" else (1.0, 1.0)
     known = known_robots.truth(condition.robot)
     return LoopSettings(
-        "pd", kp=tuple(kp * controller.kp), kd=tuple(kd * controller.kd), limit=tuple(controller.limit),
-        rate=float(known["control"]["rate"]), inertia=tuple(known["drives"]["Ia"]),
-    )  # fmt: skip
+        "pd",
+        kp=tuple(kp * controller.kp),
+        kd=tuple(kd * controller.kd),
+        limit=tuple(controller.limit),
+        rate=float(known["control"]["rate"]),
+        inertia=tuple(known["drives"]["Ia"]),
+    )
 
 
 def _guess(plant: Plant, spread: float, seed: int) -> np.ndarray:

@@ -88,9 +88,12 @@ class _Sums:
 
 
 def compare_methods(
-    inputs: IdentificationInputs, methods: Sequence[str] | None = None, friction: str = "standard",
-    say: Callable[[str], None] = lambda words: None, each: Callable[[ComparedMethod], None] = lambda one: None,
-) -> list[ComparedMethod]:  # fmt: skip
+    inputs: IdentificationInputs,
+    methods: Sequence[str] | None = None,
+    friction: str = "standard",
+    say: Callable[[str], None] = lambda words: None,
+    each: Callable[[ComparedMethod], None] = lambda one: None,
+) -> list[ComparedMethod]:
     """Return the results of all methods on the recordings, best first; failed methods come last.
 
     Args:
@@ -192,22 +195,24 @@ def _held(
     return replace(one, chosen=taken, verdict=verdict, warnings=warnings)
 
 
-def _errors(
-    found: Identification, inputs: IdentificationInputs, same_unit: np.ndarray
-) -> tuple[ComparedMethod, _Sums]:  # fmt: skip
+def _errors(found: Identification, inputs: IdentificationInputs, same_unit: np.ndarray) -> tuple[ComparedMethod, _Sums]:
     """Return the errors of a method's model, and their sums by block of time."""
     unseen, training = (_sums(found, cases) for cases in (inputs.unseen, inputs.cases))
     joints = 100.0 * np.sqrt(unseen.error.sum(axis=0) / np.maximum(unseen.size.sum(axis=0), 1e-300))
     worst = int(np.argmax(np.where(same_unit, joints, -1.0)))
     fitted = found.fitted
     return ComparedMethod(
-        fitted.method, unseen=_percent(unseen.error[:, same_unit], unseen.size[:, same_unit]),
+        fitted.method,
+        unseen=_percent(unseen.error[:, same_unit], unseen.size[:, same_unit]),
         sigma=float(_jackknife(_leaving_out(unseen, same_unit))),
         raw=_percent(unseen.raw_error[:, same_unit], unseen.raw_size[:, same_unit]),
         training=_percent(training.error[:, same_unit], training.size[:, same_unit]),
-        worst=(worst + 1, float(joints[worst])), parameters=len(fitted.estimate.values), seconds=fitted.seconds,
-        iterations=fitted.iterations, simulations=fitted.simulations,
-    ), unseen  # fmt: skip
+        worst=(worst + 1, float(joints[worst])),
+        parameters=len(fitted.estimate.values),
+        seconds=fitted.seconds,
+        iterations=fitted.iterations,
+        simulations=fitted.simulations,
+    ), unseen
 
 
 def _sums(found: Identification, cases: Sequence[Case], blocks: int = 10) -> _Sums:
@@ -259,22 +264,50 @@ def _ranked(done: Sequence[tuple[ComparedMethod, _Sums]], same_unit: np.ndarray)
 
 
 HEADER = [
-    "rank", "method", "unseen_percent", "sigma", "raw_percent", "training_percent", "worst_joint",
-    "worst_joint_percent", "behind", "behind_sigma", "as_good", "take", "parameters", "seconds", "iterations",
-    "simulations", "failure",
-]  # fmt: skip
+    "rank",
+    "method",
+    "unseen_percent",
+    "sigma",
+    "raw_percent",
+    "training_percent",
+    "worst_joint",
+    "worst_joint_percent",
+    "behind",
+    "behind_sigma",
+    "as_good",
+    "take",
+    "parameters",
+    "seconds",
+    "iterations",
+    "simulations",
+    "failure",
+]
 
 
 def write_table(found: Sequence[ComparedMethod], path: Path) -> Path:
     """Write the comparison as CSV."""
     lines = [
         (
-            one.rank or "", one.name, one.unseen, one.sigma, one.raw, one.training, one.worst[0] or "", one.worst[1],
-            one.behind, one.behind_sigma, "yes" if one.good else "no", "yes" if one.chosen else "no", one.parameters,
-            one.seconds, one.iterations, one.simulations, one.failure,
+            one.rank or "",
+            one.name,
+            one.unseen,
+            one.sigma,
+            one.raw,
+            one.training,
+            one.worst[0] or "",
+            one.worst[1],
+            one.behind,
+            one.behind_sigma,
+            "yes" if one.good else "no",
+            "yes" if one.chosen else "no",
+            one.parameters,
+            one.seconds,
+            one.iterations,
+            one.simulations,
+            one.failure,
         )
         for one in found
-    ]  # fmt: skip
+    ]
     return files.write_table(path, HEADER, lines)
 
 

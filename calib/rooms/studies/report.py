@@ -134,12 +134,15 @@ def overview(conditions: Sequence[ConditionSummary]) -> Table:
         failed = ", ".join(f"{m.method} {sum(m.failures.values())}/{m.trials}" for m in one.methods if m.failures)
         lines.append(
             (
-                one.condition.name, _described(one.condition), chosen.method if chosen else "none",
+                one.condition.name,
+                _described(one.condition),
+                chosen.method if chosen else "none",
                 _short(chosen.figures["torque_error"].median) if chosen else "",
                 f"{best.method} {_short(best.figures['torque_error'].median)}" if best else "",
-                ", ".join(m.method for m in one.methods if m.as_good and m is not chosen), failed,
+                ", ".join(m.method for m in one.methods if m.as_good and m is not chosen),
+                failed,
             )
-        )  # fmt: skip
+        )
     header = ("condition", "", "take", "torque [%]", "best [%]", "as good", "without an estimate")
     return Table("What to take", header, lines, numbers=(3,))
 
@@ -245,9 +248,14 @@ def make_page(
         blocks = [*blocks, *drawn, *failures(one)]
         sections.append(Section(one.condition.name, blocks))
     return filled(
-        "calib.rooms.studies", "study.html", title=study.name, about=study.about, sections=sections,
-        notes=notes, issued=f"{issued()}, {len(rows)} trials",
-    )  # fmt: skip
+        "calib.rooms.studies",
+        "study.html",
+        title=study.name,
+        about=study.about,
+        sections=sections,
+        notes=notes,
+        issued=f"{issued()}, {len(rows)} trials",
+    )
 
 
 SUMMARY, REPORT = "summary.csv", "report.html"

@@ -217,17 +217,19 @@ def _parquet(rows: Iterable[TrialRow]) -> bytes:
 
     table = sorted(rows, key=lambda row: (row.condition, row.key))
     kinds = {int: pyarrow.int64(), float: pyarrow.float64(), str: pyarrow.string()}
-    arrays = [
-        pyarrow.array([getattr(row, name) for row in table], kinds[kind]) for name, kind in zip(COLUMNS, _TYPES)
-    ]  # fmt: skip
+    arrays = [pyarrow.array([getattr(row, name) for row in table], kinds[kind]) for name, kind in zip(COLUMNS, _TYPES)]
     sink = pyarrow.BufferOutputStream()
     schema = pyarrow.schema(list(zip(COLUMNS, (one.type for one in arrays))), metadata={"store": _HEAD[0]})
     numbers: Any = [name for name, kind in zip(COLUMNS, _TYPES) if kind is float]  # byte by byte: a third smaller
     others: Any = [name for name in COLUMNS if name not in numbers]
     parquet.write_table(
-        pyarrow.Table.from_arrays(arrays, schema=schema), sink, compression="zstd", compression_level=19,
-        use_dictionary=others, use_byte_stream_split=numbers,
-    )  # fmt: skip
+        pyarrow.Table.from_arrays(arrays, schema=schema),
+        sink,
+        compression="zstd",
+        compression_level=19,
+        use_dictionary=others,
+        use_byte_stream_split=numbers,
+    )
     return sink.getvalue().to_pybytes()
 
 
@@ -247,6 +249,7 @@ def _read_whole(path: Path) -> list[TrialRow]:
     _check_columns(path, [store, *table.column_names])
     rows = [TrialRow(**row) for row in table.to_pylist()]
     if wrong := {row.status for row in rows} - set(STATUSES):
-        raise UsageError(f"{path} is damaged: no trial ends with the status '{min(wrong)}'; delete it, and its trials "
-                         "are run again")  # fmt: skip
+        raise UsageError(
+            f"{path} is damaged: no trial ends with the status '{min(wrong)}'; delete it, and its trials are run again"
+        )
     return rows

@@ -24,9 +24,19 @@ from calib.rooms.studies.trial import TrialRow
 RELIABLE, LEVEL, SLACK, ALIKE = 0.95, 0.05, 0.05, 2.0  # our choices
 MIN_DATA_SETS = 6  # common data sets below which the sign test cannot tell at 5 %
 FIGURES = (
-    "torque_error", "torque_worst", "beta_error", "beta_distance", "beta_sigma", "coverage", "survey_tau", "survey_q",
-    "iterations", "simulations", "cpu", "seconds",
-)  # fmt: skip
+    "torque_error",
+    "torque_worst",
+    "beta_error",
+    "beta_distance",
+    "beta_sigma",
+    "coverage",
+    "survey_tau",
+    "survey_q",
+    "iterations",
+    "simulations",
+    "cpu",
+    "seconds",
+)
 
 
 class Quartiles(NamedTuple):

@@ -21,9 +21,7 @@ from calib.rooms.viewer import scene as viewing
 from calib.rooms.viewer.scene import Drawn, ErrorSizes, Measured, Played, Scene, Torques
 from calib.transforms import to_quaternion
 
-ARM, BEFORE, AFTER, SEEN, LIMIT = (
-    [90, 100, 115], [213, 94, 0], [0, 130, 90], [40, 90, 180], [200, 60, 60],
-)  # fmt: skip
+ARM, BEFORE, AFTER, SEEN, LIMIT = ([90, 100, 115], [213, 94, 0], [0, 130, 90], [40, 90, 180], [200, 60, 60])
 GAP = 1.0  # between one part and the next [s]
 EACH = 0.2  # that a pose stands still [s]
 FILE = "session.rrd"
@@ -279,16 +277,18 @@ def _arm(recording: Any, scene: Scene, index: list[Any], q: np.ndarray) -> None:
     thick = 0.006 if scene.meshes else 0.018 / len(lines)
     count = len(q) * len(lines)
     strips = rr.LineStrips3D.columns(
-        strips=[line for at_once in zip(*lines) for line in at_once], radii=np.full(count, thick),
+        strips=[line for at_once in zip(*lines) for line in at_once],
+        radii=np.full(count, thick),
         colors=np.tile(ARM, (count, 1)),
-    )  # fmt: skip
+    )
     recording.send_columns("world/robot/lines", indexes=index, columns=strips.partition([len(lines)] * len(q)))
     points = np.concatenate(lines, axis=1)
     count = points.shape[1]
     spheres = rr.Points3D.columns(
-        positions=points.reshape(-1, 3), radii=np.full(count * len(q), 1.4 * thick),
+        positions=points.reshape(-1, 3),
+        radii=np.full(count * len(q), 1.4 * thick),
         colors=np.tile(ARM, (count * len(q), 1)),
-    )  # fmt: skip
+    )
     recording.send_columns("world/robot/joints", indexes=index, columns=spheres.partition([count] * len(q)))
     if scene.meshes and isinstance(scene.chain, Chain):
         frames = joint_frames(scene.chain, q)

@@ -166,9 +166,16 @@ def _page(board: Board, size: tuple[float, float]) -> tuple[np.ndarray, list[tup
 
 
 def make(
-    out: Path, kind: str, columns: int | None, rows: int, square: float, marker: float | None, words: str | None,
-    paper: str | None, overwrite: bool = False,
-) -> list[str]:  # fmt: skip
+    out: Path,
+    kind: str,
+    columns: int | None,
+    rows: int,
+    square: float,
+    marker: float | None,
+    words: str | None,
+    paper: str | None,
+    overwrite: bool = False,
+) -> list[str]:
     """Write ``board.toml``, ``board.pdf`` and ``board.svg``; return printing instructions.
 
     Args:

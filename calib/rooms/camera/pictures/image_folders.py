@@ -68,13 +68,24 @@ def read_images(
     lens, known = _own_lens(path, found.size, options)
     detected = [found.images[names[row]] for row in rows]
     return Pixels(
-        q[rows], columns, np.array([one.pixel for one in detected]), board, lens,
-        mounting=options.camera.mounting.replace("auto", ""), sigma=np.array([one.sigma for one in detected]),
+        q[rows],
+        columns,
+        np.array([one.pixel for one in detected]),
+        board,
+        lens,
+        mounting=options.camera.mounting.replace("auto", ""),
+        sigma=np.array([one.sigma for one in detected]),
         names=tuple(names),
-        size=found.size if found.size[0] else (lens.size if lens else (0, 0)), known=known, free=_free(options, known),
-        model=options.camera.model, tool_names=(options.tool,), station=options.station or path.name, file=str(path),
-        rows=table.rows[rows], notes=tuple(notes),
-    )  # fmt: skip
+        size=found.size if found.size[0] else (lens.size if lens else (0, 0)),
+        known=known,
+        free=_free(options, known),
+        model=options.camera.model,
+        tool_names=(options.tool,),
+        station=options.station or path.name,
+        file=str(path),
+        rows=table.rows[rows],
+        notes=tuple(notes),
+    )
 
 
 def read_own_board(path: Path) -> Board:

@@ -108,10 +108,18 @@ def read_fit(place: Place) -> Calibration:
     robot = calibrated.read(folder.path)
     asked = session.settings.fit.tolerance_mm if session else metrics.tolerance_mm
     return Calibration(
-        place.name, robot, cell, free, covariance, folder.learnt_joints(robot.chain.joints), metrics,
-        (judged.verdict, judged.reason), (unseen or [metrics.fit])[0], 1e-3 * asked if asked else None,
+        place.name,
+        robot,
+        cell,
+        free,
+        covariance,
+        folder.learnt_joints(robot.chain.joints),
+        metrics,
+        (judged.verdict, judged.reason),
+        (unseen or [metrics.fit])[0],
+        1e-3 * asked if asked else None,
         place.serial,
-    )  # fmt: skip
+    )
 
 
 def _nominal(name: str, like: Chain) -> Calibration:

@@ -125,10 +125,16 @@ class ChangePart(ABC):
         """Return the numbers as in ``metrics.json`` [SI]."""
         found: ChangeTest = self.found
         return {
-            "verdict": self.verdict.level, "reason": self.verdict.reason, "tolerance": self.tolerance,
-            "today": self.today, "chi2": found.chi2, "freedom": found.freedom, "probability": found.probability,
-            "noticed": self.noticed, **self.numbers(),
-        }  # fmt: skip
+            "verdict": self.verdict.level,
+            "reason": self.verdict.reason,
+            "tolerance": self.tolerance,
+            "today": self.today,
+            "chi2": found.chi2,
+            "freedom": found.freedom,
+            "probability": found.probability,
+            "noticed": self.noticed,
+            **self.numbers(),
+        }
 
 
 def plus_minus(value: float, sigma: float, unit: str) -> str:
@@ -143,10 +149,11 @@ def _value(value: float, unit: str) -> str:
 
 
 _PARAMETERS = [
-    Column("parameter", "{0.name}", number=False), Column("before", lambda one: _value(one.before, one.unit)),
+    Column("parameter", "{0.name}", number=False),
+    Column("before", lambda one: _value(one.before, one.unit)),
     Column("after", lambda one: _value(one.after, one.unit)),
     Column("change", lambda one: plus_minus(one.after - one.before, one.sigma, one.unit)),
     Column("σ", lambda one: f"{abs(one.after - one.before) / one.sigma:.1f}" if one.sigma else ""),
     Column("if it changed alone", lambda one: plus_minus(one.alone, one.alone_sigma, one.unit)),
     Column("χ² explained", lambda one: f"{one.explained:.3g}"),
-]  # fmt: skip
+]

@@ -147,9 +147,14 @@ def compare(before: Calibration, after: Calibration, settings: DiffSettings) -> 
     motions.append(pair.see(random_joints(chain, MAX_POSES, settings.seed)).motion("random poses within limits", total))
     by_joint = tuple((name, seen.size(step[None])) for name, step in zip(chain.joint_names, steps))
     return GeometryChange(
-        found.chi2, len(found.difference), tuple(changes), found.extra, by_joint, tuple(motions),
+        found.chi2,
+        len(found.difference),
+        tuple(changes),
+        found.extra,
+        by_joint,
+        tuple(motions),
         frame_changes(before, after),
-    )  # fmt: skip
+    )
 
 
 def corrected_motion(before: Calibration, after: Calibration, settings: DiffSettings) -> float:

@@ -114,13 +114,20 @@ def _read(place: Place) -> Identified:
     judged, tables = folder.judged, {f"{place.name}/{path.name}": path for path in folder.torques}
     motions = {name: read_states(path, dynamics.model.n) for name, path in tables.items()}
     return Identified(
-        place.name, calibrated.read(folder.path), dynamics, names,
-        tuple(units[standard_name(name, standard)] for name in names), estimated_columns(dynamics, names),
-        covariance * np.outer(measured, measured), regrouping,
+        place.name,
+        calibrated.read(folder.path),
+        dynamics,
+        names,
+        tuple(units[standard_name(name, standard)] for name in names),
+        estimated_columns(dynamics, names),
+        covariance * np.outer(measured, measured),
+        regrouping,
         {name: states for name, states in motions.items() if states},
-        table.get("unit", TORQUE), (judged.verdict, judged.reason),
-        session.settings.dynamics.tolerance_percent if session else 0.0, place.serial,
-    )  # fmt: skip
+        table.get("unit", TORQUE),
+        (judged.verdict, judged.reason),
+        session.settings.dynamics.tolerance_percent if session else 0.0,
+        place.serial,
+    )
 
 
 def _key(model: IdentificationModel, column: int) -> Hashable:

@@ -86,11 +86,13 @@ class RobotChange(Drawn, Judged):
         """Write a folder: report.html, tables of all parameters, metrics.json, and the figures as PNG."""
         parts = [
             pages.ResultPart(
-                part.section(), part.charts() if plots else {}, part.captions,
+                part.section(),
+                part.charts() if plots else {},
+                part.captions,
                 (part.table, ParameterChange._fields, part.found.parameters),
             )
             for part in self.parts
-        ]  # fmt: skip
+        ]
         one, two, robot = self._names
         setup = {"earlier": one, "later": two}
         return pages.save(Path(out), "comparison", f"Change of {robot}", setup, parts, self.to_dict(), TABLES)

@@ -63,10 +63,15 @@ class ToolPart(ChangePart):
         beyond = moved.rms / max(left, 1e-12)
         if not found.freedom:
             result.append(finding("arm-not-tested", names=[one.name, two.name]))
-        result.append(finding(
-            "arm-changed", sigmas=found.sigmas, beyond=0.0 if self.tolerance else beyond,
-            probability=found.probability, left=left if beyond <= 1.0 else None,
-        ))  # fmt: skip
+        result.append(
+            finding(
+                "arm-changed",
+                sigmas=found.sigmas,
+                beyond=0.0 if self.tolerance else beyond,
+                probability=found.probability,
+                left=left if beyond <= 1.0 else None,
+            )
+        )
         corrected, counts = [each.name for each in (one, two) if each.cell.deflection.terms], self.settings
         if corrected and not (counts.same_base or counts.same_tool):
             whole = geometry_change.corrected_motion(one, two, counts)
@@ -82,7 +87,8 @@ class ToolPart(ChangePart):
     def blocks(self) -> list[Block]:
         joints = self.before.chain.joints
         motions = [
-            Column("target's motion at", "{0.where}", number=False), Column("poses", lambda one: f"{len(one.q)}"),
+            Column("target's motion at", "{0.where}", number=False),
+            Column("poses", lambda one: f"{len(one.q)}"),
             Column("median mm", lambda one: f"{1e3 * np.median(one.position):.3g}"),
             Column("rms mm", lambda one: f"{1e3 * one.rms:.3g}"),
             Column("σ of that mm", lambda one: f"{1e3 * one.expected:.2g}"),
@@ -90,12 +96,13 @@ class ToolPart(ChangePart):
             Column("median mrad", lambda one: f"{1e3 * np.median(one.orientation):.3g}"),
             Column("worst mrad", lambda one: f"{1e3 * one.orientation.max():.3g}"),
             Column("worst at", lambda one: _joints(one, joints), number=False),
-        ]  # fmt: skip
+        ]
         by_joint = [Column("joint", "{0[0]}", number=False), Column("rms mm", lambda one: f"{1e3 * one[1]:.3g}")]
         return [
-            Text("Motion", self._motion()), table("Motion of the tool", motions, self.found.motions),
+            Text("Motion", self._motion()),
+            table("Motion of the tool", motions, self.found.motions),
             table("Motion of the tool by what describes one joint", by_joint, self.found.by_joint),
-        ]  # fmt: skip
+        ]
 
     def _motion(self) -> list[str]:
         """Return sentences on the target's motion: how far, where most, and by which joint."""
@@ -116,8 +123,9 @@ class ToolPart(ChangePart):
         arm = {element.name: k for k, element in enumerate(self.before.chain.elements)}
         rows = [
             FittedParameter(one.name, one.unit, one.before, one.after, one.sigma, None, "arm")
-            for one in sorted(self.found.parameters, key=lambda one: arm[one.name]) if one.sigma
-        ]  # fmt: skip
+            for one in sorted(self.found.parameters, key=lambda one: arm[one.name])
+            if one.sigma
+        ]
         result = {"map": error_map(motion.points, motion.position, words="the tool moved by up to {}")}
         if rows:
             result["parameters"] = parameter_changes(rows, of="later - earlier")
@@ -126,12 +134,17 @@ class ToolPart(ChangePart):
     def numbers(self) -> dict[str, Any]:
         motions = {
             one.where: {
-                "poses": len(one.q), "rms": one.rms, "expected": one.expected, "median": float(np.median(one.position)),
-                "worst": float(one.position.max()), "worst_at": one.q[one.position.argmax()],
-                "turn_median": float(np.median(one.orientation)), "turn_worst": float(one.orientation.max()),
+                "poses": len(one.q),
+                "rms": one.rms,
+                "expected": one.expected,
+                "median": float(np.median(one.position)),
+                "worst": float(one.position.max()),
+                "worst_at": one.q[one.position.argmax()],
+                "turn_median": float(np.median(one.orientation)),
+                "turn_worst": float(one.orientation.max()),
             }
             for one in self.found.motions
-        }  # fmt: skip
+        }
         return {"motions": motions, "by_joint": dict(self.found.by_joint)}
 
 

@@ -62,10 +62,16 @@ class TorquePart(ChangePart):
             result.append(finding("model-outgrown", times=times, today=self.today, after=self.after.name))
         left = 1e-2 * min(one.unexplained) * _rms(one.torque) if one.unexplained else 0.0
         beyond = one.rms / max(left, 1e-12)
-        result.append(finding(
-            "dynamics-changed", sigmas=found.sigmas, beyond=0.0 if self.tolerance else beyond, unit=self.unit,
-            probability=found.probability, left=left if beyond <= 1.0 else None,
-        ))  # fmt: skip
+        result.append(
+            finding(
+                "dynamics-changed",
+                sigmas=found.sigmas,
+                beyond=0.0 if self.tolerance else beyond,
+                unit=self.unit,
+                probability=found.probability,
+                left=left if beyond <= 1.0 else None,
+            )
+        )
         if found.changed and not found.alone and found.part:
             part = found.part
             result.append(
@@ -85,9 +91,11 @@ class TorquePart(ChangePart):
             Column("torque rms", lambda row: f"{_rms(row[0].torque[:, row[1]]):.3g}"),
         ]
         parts = [
-            Column("part", "{0.name}", number=False), Column("χ² explained", "{0.explained:.3g}"),
-            Column("of combinations", "{0.count}"), Column(f"torque if it changed alone, rms {unit}", "{0.rms:.3g}"),
-        ]  # fmt: skip
+            Column("part", "{0.name}", number=False),
+            Column("χ² explained", "{0.explained:.3g}"),
+            Column("of combinations", "{0.count}"),
+            Column(f"torque if it changed alone, rms {unit}", "{0.rms:.3g}"),
+        ]
         return [
             Text("Torque", [self._words(one) for one in self.found.torques]),
             table("Change of the torque", torques, rows),
@@ -115,11 +123,13 @@ class TorquePart(ChangePart):
     def numbers(self) -> dict[str, Any]:
         torques = {
             one.where: {
-                "rms": one.rms, "expected": _rms(one.expected), "unexplained_percent": one.unexplained,
+                "rms": one.rms,
+                "expected": _rms(one.expected),
+                "unexplained_percent": one.unexplained,
                 "by_row": [_rms(column) for column in one.change.T],
             }
             for one in self.found.torques
-        }  # fmt: skip
+        }
         parts = [{"name": one.name, "explained": one.explained, "rms": one.rms} for one in self.found.parts]
         return {"torques": torques, "parts": parts}
 

@@ -331,15 +331,21 @@ def _tell_unreached(known: ClosedRobot, found: Posture, left: np.ndarray, max_rc
     worst = max(links, key=lambda name: float(np.abs(links[name].gap).max()))
     gap = 1e3 * float(np.abs(links[worst].gap).max())
     weak = [n for (n, one), home in zip(links.items(), at_home) if float(_leg_rcond(one, home)[0]) < max_rcond]
-    why = f"{worst} stays {gap:.3g} mm from its attachment: out of reach" if gap > 1.0 else (
-        f"{weak[0]} is stretched or folded: a singularity (type 1), the end of its reach" if weak
-        else "Newton's method does not converge: singularity (type 2) or contradictory readings"
-    )  # fmt: skip
+    why = (
+        f"{worst} stays {gap:.3g} mm from its attachment: out of reach"
+        if gap > 1.0
+        else (
+            f"{weak[0]} is stretched or folded: a singularity (type 1), the end of its reach"
+            if weak
+            else "Newton's method does not converge: singularity (type 2) or contradictory readings"
+        )
+    )
     more = f" ({len(left)} of {len(found)} samples)" if len(left) > 1 else ""
     raise NoPosture(
         f"sample {left[0] + 1}: the loops of '{known.robot.name}' cannot be closed (last try: platform at "
-        f"{_where(known, own)}): {why}{more}; check units, zeros and order of the encoders", left.tolist(),
-    )  # fmt: skip
+        f"{_where(known, own)}): {why}{more}; check units, zeros and order of the encoders",
+        left.tolist(),
+    )
 
 
 def _from_readings(

@@ -139,6 +139,17 @@ def legs(links, constants, tail, attachment, q, pose, full, inverse, carried, ga
     frame = np.empty((4, 6 + 3 * q.shape[1]))
     for s in range(q.shape[0]):
         one_leg(
-            links, constants, tail, attachment, gap.shape[1], q[s], pose[s], full[s], inverse[s], carried[s], gap[s],
-            lever[s], frame,
-        )  # fmt: skip
+            links,
+            constants,
+            tail,
+            attachment,
+            gap.shape[1],
+            q[s],
+            pose[s],
+            full[s],
+            inverse[s],
+            carried[s],
+            gap[s],
+            lever[s],
+            frame,
+        )

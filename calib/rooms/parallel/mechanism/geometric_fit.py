@@ -126,9 +126,13 @@ def loop_parameters(known: ClosedRobot) -> tuple[LoopParameter, ...]:
 
 
 def fit_loops(
-    nominal: ClosedRobot, readings: np.ndarray, coordinates: np.ndarray | None = None, *,
-    held: Sequence[str] = (), loss: float = 1e-6,
-) -> LoopFit:  # fmt: skip
+    nominal: ClosedRobot,
+    readings: np.ndarray,
+    coordinates: np.ndarray | None = None,
+    *,
+    held: Sequence[str] = (),
+    loss: float = 1e-6,
+) -> LoopFit:
     """Return the geometry of a parallel robot fitted to encoder readings, with or without platform coordinates.
 
     Args:

@@ -226,9 +226,14 @@ class ParallelModel:
         )
 
     def regressor(
-        self, q: np.ndarray, v: np.ndarray, a: np.ndarray, load: np.ndarray | None = None,
-        carried: Collection[str] | None = None, states: np.ndarray | None = None,
-    ) -> np.ndarray:  # fmt: skip
+        self,
+        q: np.ndarray,
+        v: np.ndarray,
+        a: np.ndarray,
+        load: np.ndarray | None = None,
+        carried: Collection[str] | None = None,
+        states: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Return W (N, rows, p) at the encoders' q, v, a (N, n); other arguments as `IdentificationModel.regressor`."""
         return self.along(self.moved(q, v, a), carried)
 
@@ -237,9 +242,14 @@ class ParallelModel:
         return self.on_rows(self.platform_regressor(motion, carried), motion)
 
     def torque(
-        self, values: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray, carried: Collection[str] | None = None,
+        self,
+        values: np.ndarray,
+        q: np.ndarray,
+        v: np.ndarray,
+        a: np.ndarray,
+        carried: Collection[str] | None = None,
         states: np.ndarray | None = None,
-    ) -> np.ndarray:  # fmt: skip
+    ) -> np.ndarray:
         """Return the torques, forces or power (N, rows) for parameters (p,), computed without the regressor."""
         motion = self.moved(q, v, a)
         return self.on_rows(self.platform_force(values, motion, carried)[:, :, None], motion)[:, :, 0]
@@ -427,9 +437,14 @@ def rows_named(known: ClosedRobot, name: str = "") -> TorqueRows:
 
 
 def make_parallel_model(
-    known: ClosedRobot, sets: Sequence[str] = (), v0: float = V0, rows: TorqueRows | None = None,
-    payloads: Sequence[str] = (), passive: str = "", identical_legs: bool = False,
-) -> ParallelModel:  # fmt: skip
+    known: ClosedRobot,
+    sets: Sequence[str] = (),
+    v0: float = V0,
+    rows: TorqueRows | None = None,
+    payloads: Sequence[str] = (),
+    passive: str = "",
+    identical_legs: bool = False,
+) -> ParallelModel:
     """Return the identification model of a robot: bodies, drive terms of actuated joints, friction of passive joints.
 
     Args:

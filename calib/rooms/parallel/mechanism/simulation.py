@@ -70,9 +70,13 @@ class ParallelPlant:
         return self.model.actuator_torques(self.parameters, motion, self.carried)
 
     def run(
-        self, controller: Controller, reference: Reference, sensing: Sensing | None = None,
-        seed: int | np.random.Generator = 0, mixing: np.ndarray | None = None,
-    ) -> SimulatedRun:  # fmt: skip
+        self,
+        controller: Controller,
+        reference: Reference,
+        sensing: Sensing | None = None,
+        seed: int | np.random.Generator = 0,
+        mixing: np.ndarray | None = None,
+    ) -> SimulatedRun:
         """Return the simulated motion of the robot that follows a reference of its actuators.
 
         Args:
@@ -91,11 +95,21 @@ class ParallelPlant:
         rate = np.linalg.pinv(loop_jacobians(known, start).readings[0]) @ reference.v[0]
         out, period = np.empty((3, *shape)), reference.period
         status, reached = simulation_kernels.run(
-            _robot(self.model), self._values(), np.array(start.q[0]), np.array(start.pose[0]), rate,
-            np.empty((0, n, n)) if mixing is None else np.ascontiguousarray(mixing), controller.rows,
-            reference.sampled(controller.ahead), encoder, period, controller.smoothing(period), controller.delay, FAR,
+            _robot(self.model),
+            self._values(),
+            np.array(start.q[0]),
+            np.array(start.pose[0]),
+            rate,
+            np.empty((0, n, n)) if mixing is None else np.ascontiguousarray(mixing),
+            controller.rows,
+            reference.sampled(controller.ahead),
+            encoder,
+            period,
+            controller.smoothing(period),
+            controller.delay,
+            FAR,
             out,
-        )  # fmt: skip
+        )
         if status != simulation_kernels.FINE:
             raise failure(status, reached * period)
         tick = sample_ticks(len(out[0]), sensing.every)
@@ -129,9 +143,17 @@ def _robot(model: Any) -> tuple:
     kinds = [bodies.links for bodies, _ in legs], [bodies.constants for bodies, _ in legs], [tail for _, tail in legs]
     links, constants, tails, attachments = map(_stacked, (*kinds, [leg.attachment for leg in robot.legs]))
     return (
-        frozen(links, np.int64), frozen(constants), frozen(tails), frozen(attachments), robot.starts,
-        np.array([leg.held for leg in robot.legs]), robot.selected, robot.actuated, robot.gravity, model.known.fixed,
-    )  # fmt: skip
+        frozen(links, np.int64),
+        frozen(constants),
+        frozen(tails),
+        frozen(attachments),
+        robot.starts,
+        np.array([leg.held for leg in robot.legs]),
+        robot.selected,
+        robot.actuated,
+        robot.gravity,
+        model.known.fixed,
+    )
 
 
 def _stacked(arrays: list[np.ndarray]) -> np.ndarray:

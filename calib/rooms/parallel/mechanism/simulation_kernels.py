@@ -190,9 +190,20 @@ def _accelerate(robot, values, q, pose, rate, tau, rates, twist, change):
     mend, still, wrench, h, torque = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(r), np.zeros(n_t)
     for leg in range(L):
         one_leg(
-            links[leg], constants[leg], tails[leg], attachments[leg], held[leg], q[starts[leg] : starts[leg + 1]], pose,
-            full[leg], inverse[leg], carried[leg], gap[leg], lever[leg], frame,
-        )  # fmt: skip
+            links[leg],
+            constants[leg],
+            tails[leg],
+            attachments[leg],
+            held[leg],
+            q[starts[leg] : starts[leg + 1]],
+            pose,
+            full[leg],
+            inverse[leg],
+            carried[leg],
+            gap[leg],
+            lever[leg],
+            frame,
+        )
     if fixed:
         for i in range(r):
             D[selected[i], i] = 1.0
@@ -217,9 +228,22 @@ def _accelerate(robot, values, q, pose, rate, tau, rates, twist, change):
     for leg in range(L):
         first, last = starts[leg], starts[leg + 1]
         _leg_share(
-            links[leg], constants[leg], parameters[leg], drives[first:last], held[leg], inverse[leg], carried[leg],
-            shift[leg], still, q[first:last], rates[first:last], torque[first:last], J[first:last], M, h,
-        )  # fmt: skip
+            links[leg],
+            constants[leg],
+            parameters[leg],
+            drives[first:last],
+            held[leg],
+            inverse[leg],
+            carried[leg],
+            shift[leg],
+            still,
+            q[first:last],
+            rates[first:last],
+            torque[first:last],
+            J[first:last],
+            M,
+            h,
+        )
     _platform(body, pose, twist[3:], gravity, whole, wrench)
     _add(whole, still, wrench)
     for i in range(r):

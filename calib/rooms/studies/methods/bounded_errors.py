@@ -47,8 +47,9 @@ class _GeneralisedTLS(Method):
             concerned = np.argsort(-np.abs(vectors[:, 0]))[:5]
             raise Unidentifiable(
                 "the noise of the encoders alone explains some combination of columns; filter, or excite more",
-                [problem.pooled.names[k] for k in concerned], eigenvalues,
-            )  # fmt: skip
+                [problem.pooled.names[k] for k in concerned],
+                eigenvalues,
+            )
         values = np.linalg.solve(gram, upper.T @ factor[:p, p])
         meat = np.outer(noise @ values, noise @ values) / max(float(problem.pooled.rows.sum()), 1.0)
         for part in states.parts:
@@ -57,9 +58,7 @@ class _GeneralisedTLS(Method):
             left = np.where(used, states.target[part.own] / std, 0.0) - white @ values
             meat += scatter(white, left)
         bread = np.linalg.inv(gram) / norms[:, None]
-        estimate = replace(
-            plain.estimate, values=values / norms, covariance=bread @ meat @ bread.T, residual_std=1.0
-        )  # fmt: skip
+        estimate = replace(plain.estimate, values=values / norms, covariance=bread @ meat @ bread.T, residual_std=1.0)
         group = np.sqrt(problem.pooled.residual_squares(estimate.values) / problem.pooled.rows)
         fit = replace(plain, estimate=estimate, group_std=group)
         return MethodEstimate(self.name, EstimateStatus.FOUND, fit, problem.pooled, std, tau, alone=True)
@@ -111,7 +110,7 @@ class _SetMembership(Method):
         fit = replace(plain, estimate=estimate, group_std=group)
         return MethodEstimate(
             self.name, EstimateStatus.FOUND, fit, problem.pooled, std, tau, iterations=count, alone=True
-        )  # fmt: skip
+        )
 
 
 def intervals(rows: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
@@ -150,10 +149,11 @@ GTLS = _GeneralisedTLS(
     "that of the residuals, independent of it; signs are exact",
     description="generalised total least squares, noise of the columns from the encoders'",
     source="Van Huffel & Vandewalle 1989; Fuller 1987",
-)  # fmt: skip
+)
 SET_MEMBERSHIP = _SetMembership(
-    "set-membership", "no torque error is larger than the largest residual of wls; q, v and a are exact",
+    "set-membership",
+    "no torque error is larger than the largest residual of wls; q, v and a are exact",
     description="centres of the intervals that a bound on the errors leaves",
     source="Milanese & Belforte 1982; Ramdani & Poignet 2005",
     tunes=("bound of the errors", f"{ROUNDS} rounds of linear programs"),
-)  # fmt: skip
+)

@@ -56,9 +56,7 @@ class _KalmanFilter(Method):
         plain = WLS.estimate(problem)
         if not plain.found:
             return replace(plain, method=self.name)
-        return attempted(
-            self.name, problem, lambda: self._estimate(problem, plain, believed_robot(problem, self))
-        )  # fmt: skip
+        return attempted(self.name, problem, lambda: self._estimate(problem, plain, believed_robot(problem, self)))
 
     def _estimate(self, problem: IdentificationProblem, plain: MethodEstimate, robot: BelievedRobot) -> MethodEstimate:
         values, sigma = plain.estimate.values, plain.estimate.sigma
@@ -79,12 +77,18 @@ class _KalmanFilter(Method):
             )
         estimate = replace(
             plain.estimate, values=state.mean, covariance=max(1.0, innovation) * state.covariance, residual_std=1.0
-        )  # fmt: skip
+        )
         fit = LinearFit(estimate, plain.std, plain.fit.condition, plain.fit.condition_normalised)
         return replace(
-            plain, method=self.name, status=EstimateStatus.FOUND, solution=fit, iterations=1,
-            simulations=state.count, beforehand=None, alone=True,
-        )  # fmt: skip
+            plain,
+            method=self.name,
+            status=EstimateStatus.FOUND,
+            solution=fit,
+            iterations=1,
+            simulations=state.count,
+            beforehand=None,
+            alone=True,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,9 +169,12 @@ def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
         sizes.append(size / n)
     settled = sizes[len(sizes) // 4 :]
     return replace(
-        before, mean=belief.mean[2 * n :], covariance=belief.covariance[2 * n :, 2 * n :],
-        sizes=[*before.sizes, *settled], count=before.count + 1,
-    )  # fmt: skip
+        before,
+        mean=belief.mean[2 * n :],
+        covariance=belief.covariance[2 * n :, 2 * n :],
+        sizes=[*before.sizes, *settled],
+        count=before.count + 1,
+    )
 
 
 def _joined(belief: Belief, parameters: np.ndarray, first: int) -> np.ndarray:
@@ -242,16 +249,27 @@ _ASSUMES = (
 )
 EKF, SREKF, UKF, SRUKF, CDKF, SRCDKF = (
     _KalmanFilter(
-        ("sr" if root else "") + rule, _ASSUMES, Filter(rule, bool(root)), source=source,
+        ("sr" if root else "") + rule,
+        _ASSUMES,
+        Filter(rule, bool(root)),
+        source=source,
         description="the same, square-root form" if root else description,
         tunes=("initial covariance of the parameters", "rate of the filter", *(["α = 0.1"] if rule == "ukf" else [])),
     )
     for rule, description, *sources in (
-        ("ekf", "extended Kalman filter, parameters as states", "Gautier & Poignet 2001",
-         "Kaminski, Bryson & Schmidt 1971"),
+        (
+            "ekf",
+            "extended Kalman filter, parameters as states",
+            "Gautier & Poignet 2001",
+            "Kaminski, Bryson & Schmidt 1971",
+        ),
         ("ukf", "unscented Kalman filter, parameters as states", "Julier & Uhlmann 2004", "van der Merwe & Wan 2001"),
-        ("cdkf", "central-difference Kalman filter, parameters as states", "Nørgaard, Poulsen & Ravn 2000",
-         "van der Merwe & Wan 2001"),
+        (
+            "cdkf",
+            "central-difference Kalman filter, parameters as states",
+            "Nørgaard, Poulsen & Ravn 2000",
+            "van der Merwe & Wan 2001",
+        ),
     )
     for root, source in enumerate(sources)
-)  # fmt: skip
+)

@@ -77,9 +77,7 @@ def believe(mean: np.ndarray, sigma: np.ndarray, kind: Filter) -> Belief:
 def points(before: Belief, kind: Filter, narrower: float = 1.0) -> np.ndarray:
     """Return the sigma points (2 L + 1, L) of a belief, the mean first; `narrower` scales their distance."""
     deviations, gamma = before.deviations, narrower * _gamma(kind, len(before.mean))
-    return np.concatenate(
-        [before.mean[None], before.mean + gamma * deviations.T, before.mean - gamma * deviations.T]
-    )  # fmt: skip
+    return np.concatenate([before.mean[None], before.mean + gamma * deviations.T, before.mean - gamma * deviations.T])
 
 
 def predicted(images: np.ndarray, noise: np.ndarray, kind: Filter, narrower: float = 1.0) -> Belief:

@@ -77,9 +77,15 @@ class _MaximumLikelihood(Method):
                 values,
             )
         return MethodEstimate(
-            self.name, EstimateStatus.FOUND, _packed(problem, found, noise), problem.pooled, np.sqrt(noise),
-            residual_inflation(problem.rows, values), iterations=count, alone=True,
-        )  # fmt: skip
+            self.name,
+            EstimateStatus.FOUND,
+            _packed(problem, found, noise),
+            problem.pooled,
+            np.sqrt(noise),
+            residual_inflation(problem.rows, values),
+            iterations=count,
+            alone=True,
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -51,7 +51,7 @@ def adaline(data: Samples, start: np.ndarray, rate: float = 1.0, steps: int = ST
 
 def hopfield(
     factor: np.ndarray, start: np.ndarray, bound: float, rate: float = 1.0, steps: int = STEPS
-) -> tuple[np.ndarray, int]:  # fmt: skip
+) -> tuple[np.ndarray, int]:
     """Return the outputs x (p,) of a Hopfield-Tank network, and the number of steps until it rests, at most `steps`.
 
         u̇ = -Wᵀ W x + Wᵀ y,    x = α tanh(u / 5)
@@ -118,7 +118,7 @@ class _Network(Method):
         found = _off(fit, values, np.sqrt(pooled.residual_squares(values) / pooled.rows))
         return MethodEstimate(
             self.name, EstimateStatus.FOUND, found, pooled, std, tau, False, iterations=count, alone=True
-        )  # fmt: skip
+        )
 
     def trained(self, problem: IdentificationProblem, start: np.ndarray) -> tuple[np.ndarray, int]:
         """Return the network's weights (p,) from a start, and its steps."""
@@ -148,10 +148,14 @@ def _off(fit: LinearFit, values: np.ndarray, group_std: np.ndarray) -> LinearFit
 
 _LIKE_OLS = "the torques of all joints are equally noisy; q, v and a exact; enough steps"
 ADALINE = _Adaline(
-    "adaline", f"{_LIKE_OLS}; samples in random order",
-    description="adaptive linear neuron: stochastic gradients", source="Widrow & Hoff 1960; Leboutet et al. 2021",
-)  # fmt: skip
+    "adaline",
+    f"{_LIKE_OLS}; samples in random order",
+    description="adaptive linear neuron: stochastic gradients",
+    source="Widrow & Hoff 1960; Leboutet et al. 2021",
+)
 HOPFIELD = _Hopfield(
-    "hopfield", f"{_LIKE_OLS}; no parameter is above 1.5 times the largest start value",
-    description="Hopfield-Tank network, Euler steps", source="Tank & Hopfield 1986; Atencia, Joya & Sandoval 2004",
-)  # fmt: skip
+    "hopfield",
+    f"{_LIKE_OLS}; no parameter is above 1.5 times the largest start value",
+    description="Hopfield-Tank network, Euler steps",
+    source="Tank & Hopfield 1986; Atencia, Joya & Sandoval 2004",
+)

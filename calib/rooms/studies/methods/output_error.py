@@ -99,9 +99,16 @@ class _OutputError(Method):
         if not found.status.good and step > 0.5:
             raise NotConverged(f"{self.name}: {found.status.value} ({step:.2g} standard deviations from rest)", fit)
         return replace(
-            plain, method=self.name, status=EstimateStatus.FOUND, solution=fit, std=std if self.torques else plain.std,
-            iterations=count, simulations=task.count[0], beforehand=None, alone=True,
-        )  # fmt: skip
+            plain,
+            method=self.name,
+            status=EstimateStatus.FOUND,
+            solution=fit,
+            std=std if self.torques else plain.std,
+            iterations=count,
+            simulations=task.count[0],
+            beforehand=None,
+            alone=True,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,9 +215,13 @@ class _Comparison:
         max_simulations = 25  # simulations with tangents per round
         step_tolerance = 0.05  # standard deviations of the estimate
         return nonlinear.solve(
-            lambda x: nonlinear.triangle(*self.whitened(x, std)), lambda x, step: x + step, values,
-            damping=first_damping, tolerance=step_tolerance, limit=max_simulations,
-        )  # fmt: skip
+            lambda x: nonlinear.triangle(*self.whitened(x, std)),
+            lambda x, step: x + step,
+            values,
+            damping=first_damping,
+            tolerance=step_tolerance,
+            limit=max_simulations,
+        )
 
     def spread(self, residual: np.ndarray, p: int) -> np.ndarray:
         """Return the standard deviation (r,) of each row's residuals."""
@@ -254,18 +265,22 @@ def _packed(
     covariance, rounds = rows / max(rows - p, 1) * bread @ scatter(white, left) @ bread, 5
     for _ in range(rounds):
         covariance = bread @ scatter(white, left, covariance) @ bread
-    estimate = replace(
-        plain.estimate, values=values[:own], covariance=covariance[:own, :own], residual_std=1.0
-    )  # fmt: skip
+    estimate = replace(plain.estimate, values=values[:own], covariance=covariance[:own, :own], residual_std=1.0)
     return LinearFit(estimate, std, *condition_numbers(flat))
 
 
 _LOOP = "controller and reference are those of [loop], the robot has the model's friction; "
 CLOE = _OutputError(
-    "cloe", _LOOP + "measured motor torques are not used", False, source="Landau 1979; Leboutet et al. 2021",
+    "cloe",
+    _LOOP + "measured motor torques are not used",
+    False,
+    source="Landau 1979; Leboutet et al. 2021",
     description="closed-loop output error: simulated positions are fitted to measured ones",
-)  # fmt: skip
+)
 CLIE = _OutputError(
-    "clie", _LOOP + "measured positions are not used", True, source="Leboutet et al. 2021",
+    "clie",
+    _LOOP + "measured positions are not used",
+    True,
+    source="Leboutet et al. 2021",
     description="closed-loop input error: simulated torques are fitted to measured ones",
-)  # fmt: skip
+)

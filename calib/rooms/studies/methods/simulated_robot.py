@@ -52,9 +52,13 @@ class Sensitivities:
 
 
 def simulate_tangents(
-    plant: Plant, controller: Controller, reference: Reference, columns: np.ndarray, every: float = 1,
+    plant: Plant,
+    controller: Controller,
+    reference: Reference,
+    columns: np.ndarray,
+    every: float = 1,
     relative: np.ndarray | None = None,
-) -> Sensitivities:  # fmt: skip
+) -> Sensitivities:
     """Return a noise-free simulated motion along a reference, and its exact derivatives with respect to the parameters.
 
     Args:
@@ -82,10 +86,22 @@ def simulate_tangents(
     model = np.empty((0, 0)) if controller.model is None else body_rows(plant.bodies, controller.model)
     scale = np.zeros((n, c)) if relative is None else np.ascontiguousarray(shaped(relative, (n, c), "relative"))
     status, reached = tangent_kernels.closed_loop_tangent(
-        packed(plant), (*layout_of(plant), find), model, controller.rows, scale, reference.sampled(controller.ahead),
-        reference.period, controller.smoothing(reference.period), controller.delay, float(every),
-        np.array(reference.q[0]), np.array(reference.v[0]), count, out, slopes,
-    )  # fmt: skip
+        packed(plant),
+        (*layout_of(plant), find),
+        model,
+        controller.rows,
+        scale,
+        reference.sampled(controller.ahead),
+        reference.period,
+        controller.smoothing(reference.period),
+        controller.delay,
+        float(every),
+        np.array(reference.q[0]),
+        np.array(reference.v[0]),
+        count,
+        out,
+        slopes,
+    )
     if status != loop_kernels.FINE:
         raise failure(status, reached * reference.period)
     # slope of the last sample by a parameter, in SI units, from which on the loop is unstable (our choice)
@@ -198,9 +214,14 @@ class BelievedRobot:
         return plant if case is None else plant.carrying(case.carried)
 
     def sensitivities(
-        self, values: np.ndarray, case: Case, controller: Controller, reference: Reference, every: float,
+        self,
+        values: np.ndarray,
+        case: Case,
+        controller: Controller,
+        reference: Reference,
+        every: float,
         relative: np.ndarray | None = None,
-    ) -> Sensitivities:  # fmt: skip
+    ) -> Sensitivities:
         """Return the simulated motion with parameters (p,) and its slopes by them; none by payloads not attached."""
         plant = self.at(values, case)
         if self.steps is not None:

@@ -158,9 +158,27 @@ def _columns(tree, order, find, work, more, out):
 
 @njit(**OPTIONS)
 def _linearise(
-    tree, body, linear, kinds, acts, order, entries, shares, owners, find, memory, q, v, a, work, own, more,
-    by_q, by_v, out,
-):  # fmt: skip
+    tree,
+    body,
+    linear,
+    kinds,
+    acts,
+    order,
+    entries,
+    shares,
+    owners,
+    find,
+    memory,
+    q,
+    v,
+    a,
+    work,
+    own,
+    more,
+    by_q,
+    by_v,
+    out,
+):
     """Write K, D (n, n) and Y (n, c) of the inverse dynamics at q, v, a; `work` is that of `dynamics`."""
     n = q.shape[0]
     by_q[:] = 0.0
@@ -216,7 +234,7 @@ def _solve(matrix, by_q, by_v, columns, dq, dv, dtau, out):
 @njit(**OPTIONS)
 def _advance_tangent(
     plant, layout, memory, loads, q, v, dq, dv, tau, dtau, period, slopes, dslopes, work, matrix, rooms
-):  # fmt: skip
+):
     """Advance q, v (n,) and δq, δv (n, c) by one period as `loop_kernels.advance` does; `slopes[0]` is not used."""
     tree, body, linear, kinds, acts = plant
     own, more, by_q, by_v, columns, at, rate, dat, drate = rooms
@@ -307,9 +325,25 @@ def advance_linearised(plant, layout, values, q, v, tau, period, gain, dq, dv):
 
 @njit(**OPTIONS)
 def _command_tangent(
-    plant, layout, model, empty, gains, relative, ahead, read, speed, dread, dspeed, dintegral, feedback, wish, dwish,
-    work, matrix, rooms,
-):  # fmt: skip
+    plant,
+    layout,
+    model,
+    empty,
+    gains,
+    relative,
+    ahead,
+    read,
+    speed,
+    dread,
+    dspeed,
+    dintegral,
+    feedback,
+    wish,
+    dwish,
+    work,
+    matrix,
+    rooms,
+):
     """Write the derivatives (n, c) of the command before saturation; feedback (n,) is its feedback part."""
     own, more, by_q, by_v, columns, at, _, dat, _ = rooms
     tree, linear = plant[0], plant[2]
@@ -339,7 +373,7 @@ def _command_tangent(
 @njit(**OPTIONS)
 def closed_loop_tangent(
     plant, layout, model, gains, relative, reference, period, smoothing, late, every, q, v, count, out, dout
-):  # fmt: skip
+):
     """Write the noise-free motion of `loop_kernels.closed_loop` with its tangents. Return (status, period reached).
 
     relative (n, c): slopes of the gains' common factor, joint by joint, over that factor; zero for gains that stay.
@@ -371,9 +405,25 @@ def closed_loop_tangent(
             else:
                 dintegral[j] = 0.0
         _command_tangent(
-            plant, layout, model, empty, gains, relative, reference[3, k], q, speed, dq, dspeed, dintegral, feedback,
-            wish, dwish, work, matrix, rooms,
-        )  # fmt: skip
+            plant,
+            layout,
+            model,
+            empty,
+            gains,
+            relative,
+            reference[3, k],
+            q,
+            speed,
+            dq,
+            dspeed,
+            dintegral,
+            feedback,
+            wish,
+            dwish,
+            work,
+            matrix,
+            rooms,
+        )
         wish[:] = feedback
         if model.shape[0]:
             linearise_command(tree, model, linear, reference[3, k], q, speed, work, matrix, wish)
