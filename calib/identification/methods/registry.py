@@ -7,8 +7,12 @@ from calib.extensions import offered
 from calib.identification.methods.least_squares import OLS, WLS
 from calib.identification.methods.method import Method
 
-METHODS: Mapping[str, Method] = {one.name: one for group in ((OLS, WLS), *offered("methods")) for one in group}
-VERSIONS: Mapping[str, int] = {one.name: one.version for one in METHODS.values()}
+_METHODS = [OLS, WLS]
+for _offered_methods in offered("methods"):
+    _METHODS += _offered_methods
+
+METHODS: Mapping[str, Method] = {method.name: method for method in _METHODS}
+VERSIONS: Mapping[str, int] = {method.name: method.version for method in _METHODS}
 
 
 def method_named(name: str) -> Method:
