@@ -10,6 +10,9 @@ import numpy as np
 from calib.dynamics.bodies import PRISMATIC, REVOLUTE, Bodies
 from calib.records import shaped
 
+MAX_ANGLE = 1e6
+"""Angle up to which the kernels' sine is accurate [rad]."""
+
 
 def regressor(bodies: Bodies, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
     """Return the regressor of the standard parameters, (N, n, 10 B).
@@ -30,8 +33,9 @@ def fill_regressor(bodies: Bodies, q: np.ndarray, v: np.ndarray, a: np.ndarray, 
     from calib.dynamics import kernels
 
     amount = q.T[bodies.coordinates] * bodies.scales[:, None]
-    if np.abs(amount).max(initial=0.0) >= 1e6:  # beyond what the kernel's sine is made for
-        amount = np.where(bodies.kinds[:, None] == REVOLUTE, np.remainder(amount, 2 * np.pi), amount)
+    if np.abs(amount).max(initial=0.0) >= MAX_ANGLE:
+        is_angle = bodies.kinds[:, None] == REVOLUTE
+        amount = np.where(is_angle, np.remainder(amount, 2 * np.pi), amount)
     v, a = np.ascontiguousarray(v.T), np.ascontiguousarray(a.T)
     kernels.regressor(bodies.links, bodies.constants, bodies.order, amount, v, a, out)
 
@@ -44,34 +48,43 @@ def energies(bodies: Bodies, q: np.ndarray, v: np.ndarray) -> np.ndarray:
     (Gautier 1997, with Y the regressor of the torques, so that M(q) q̇ = [Y(q, 0, q̇) - Y(q, 0, 0)] chi.)
 
     Args:
+        bodies: of the robot.
         q, v: (N, n) [rad or m, and per s].
     """
-    still = np.zeros_like(np.asarray(v, dtype=float))
-    moved = regressor(bodies.with_gravity(np.zeros(3)), q, still, v)
-    result = 0.5 * np.einsum("nj,njc->nc", v, moved)
-    for i, frame in enumerate(_frames(bodies, q)):
-        result[:, 10 * i + 6 : 10 * i + 9] -= np.einsum("nji,j->ni", frame[:, :3, :3], bodies.gravity)
-        result[:, 10 * i + 9] -= frame[:, :3, 3] @ bodies.gravity
+    zero = np.zeros_like(np.asarray(v, dtype=float))
+    weightless = bodies.with_gravity(np.zeros(3))
+    momentum = regressor(weightless, q, zero, v)
+    result = 0.5 * np.einsum("nj,njc->nc", v, momentum)
+    for body, T_base_body in enumerate(_frames(bodies, q)):
+        first_moment = slice(10 * body + 6, 10 * body + 9)
+        result[:, first_moment] -= np.einsum("nji,j->ni", T_base_body[:, :3, :3], bodies.gravity)
+        result[:, 10 * body + 9] -= T_base_body[:, :3, 3] @ bodies.gravity
     return result
 
 
 def _frames(bodies: Bodies, q: np.ndarray) -> np.ndarray:
     """Return the bodies' frames in the base, (B, N, 4, 4)."""
-    result = np.empty((bodies.count, len(q), 4, 4))
-    for i, parent in enumerate(bodies.parents):
-        placed = bodies.placements[i] if parent < 0 else result[parent] @ bodies.placements[i]
-        own = np.tile(np.eye(4), (len(q), 1, 1))
-        if bodies.coordinates[i] >= 0:
-            amount, axis = bodies.scales[i] * q[:, bodies.coordinates[i]], int(bodies.axes[i])
-            if bodies.kinds[i] == PRISMATIC:
-                own[:, axis, 3] = amount
+    frames = np.empty((bodies.count, len(q), 4, 4))
+    for body, parent in enumerate(bodies.parents):
+        placement = bodies.placements[body]
+        if parent >= 0:
+            placement = frames[parent] @ placement
+        motion = np.tile(np.eye(4), (len(q), 1, 1))
+        coordinate = bodies.coordinates[body]
+        if coordinate >= 0:
+            amount = bodies.scales[body] * q[:, coordinate]
+            axis = int(bodies.axes[body])
+            if bodies.kinds[body] == PRISMATIC:
+                motion[:, axis, 3] = amount
             else:
-                one, two = (axis + 1) % 3, (axis + 2) % 3
-                own[:, one, one] = own[:, two, two] = np.cos(amount)
-                own[:, two, one] = np.sin(amount)
-                own[:, one, two] = -own[:, two, one]
-        result[i] = placed @ own
-    return result
+                first, second = (axis + 1) % 3, (axis + 2) % 3
+                cosine, sine = np.cos(amount), np.sin(amount)
+                motion[:, first, first] = cosine
+                motion[:, second, second] = cosine
+                motion[:, second, first] = sine
+                motion[:, first, second] = -sine
+        frames[body] = placement @ motion
+    return frames
 
 
 def regressor_gradient(
@@ -135,9 +148,14 @@ def inverse_dynamics(bodies: Bodies, parameters: np.ndarray, q: np.ndarray, v: n
 
 def mass_matrix(bodies: Bodies, parameters: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Return the joint-space inertia matrices M(q) (N, n, n) of the bodies."""
-    q, free = np.asarray(q, dtype=float), bodies.with_gravity(np.zeros(3))
-    units = (np.broadcast_to(one, q.shape) for one in np.eye(bodies.n))
-    return np.stack([inverse_dynamics(free, parameters, q, np.zeros_like(q), one) for one in units], axis=2)
+    q = np.asarray(q, dtype=float)
+    weightless = bodies.with_gravity(np.zeros(3))
+    zero = np.zeros_like(q)
+    columns = []
+    for unit in np.eye(bodies.n):
+        acceleration = np.broadcast_to(unit, q.shape)
+        columns.append(inverse_dynamics(weightless, parameters, q, zero, acceleration))
+    return np.stack(columns, axis=2)
 
 
 def kernel_parameters(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:

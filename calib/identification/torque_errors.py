@@ -341,8 +341,8 @@ class TorqueIntervals:
     def ways(self, joints: Sequence[str]) -> list[str]:
         """Return texts on how the motion leaves the training range: by q, v or a, and at which of the named joints."""
         texts = []
-        for text, by_joint in zip(EXTRAPOLATIONS, self.extrapolated.any(axis=1)):
-            names = [name for name, extrapolated in zip(joints, by_joint.tolist()) if extrapolated]
+        for text, by_joint in zip(EXTRAPOLATIONS, np.any(self.extrapolated, axis=1).tolist()):
+            names = [name for name, extrapolated in zip(joints, by_joint) if extrapolated]
             if names:
                 texts.append(f"{text} {', '.join(names)}")
         return texts
