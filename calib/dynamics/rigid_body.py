@@ -184,5 +184,6 @@ def _plain(array: np.ndarray) -> np.ndarray:
 
 def _placed(bodies: Bodies, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return each body's joint position, its cosine and sine (N, B), vectorised by numpy."""
-    amount = q.take(bodies.coordinates, axis=1) * bodies.scales  # q[:, …] is laid out by columns
+    # Not q[:, …], which is laid out by columns.
+    amount = q.take(bodies.coordinates, axis=1) * bodies.scales
     return amount, np.cos(amount), np.sin(amount)

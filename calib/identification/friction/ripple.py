@@ -67,7 +67,8 @@ SKIPPED_START = 0.5
 """Time excluded at the beginning of a recording, where the robot starts [s]."""
 
 
-Wave = tuple[int, int]  # joint whose gear turns, order per turn of it
+Wave = tuple[int, int]
+"""Joint whose gear turns, and order per turn of it."""
 
 
 @dataclass(frozen=True)
