@@ -198,7 +198,8 @@ def regroup(base: Base, model: RegressorModel, samples: States | None = None, lo
     if loads is None:
         loads = model.load_cases()
     factor = r_factor(model, samples, loads)
-    kept, dropped = base.split.kept, base.split.dropped
+    kept = base.split.kept
+    dropped = base.split.dropped
     without_effect, scale = _norms(factor)
     scaled = np.where(without_effect, 0.0, factor / scale)
     coefficients = np.linalg.lstsq(scaled[:, kept], scaled[:, dropped], rcond=None)[0]
@@ -224,7 +225,9 @@ def r_factor(model: RegressorModel, samples: States, loads: Loads = (None,)) -> 
     triangles = np.zeros((model.rows, p, p))
     for start in range(0, len(samples.q), BLOCK):
         part = slice(start, start + BLOCK)
-        q, v, a = samples.q[part], samples.v[part], samples.a[part]
+        q = samples.q[part]
+        v = samples.v[part]
+        a = samples.a[part]
         load = None if samples.load is None else samples.load[part]
         for carried in loads:
             regressor = model.regressor(q, v, a, load, carried, states[:, part])
@@ -364,7 +367,9 @@ def columns_at_rest(
         unused: torque rows that do not count; default those of the resting joints.
     """
     states = random_samples(model.model, lower=lower, upper=upper)
-    q, v, a = np.array(states.q), np.array(states.v), np.array(states.a)
+    q = np.array(states.q)
+    v = np.array(states.v)
+    a = np.array(states.a)
     for joint, position in resting.items():
         q[:, joint] = q[0, joint] if position is None else position
         v[:, joint] = 0.0

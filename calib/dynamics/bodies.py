@@ -115,7 +115,10 @@ def bodies_of(chain: Chain) -> Bodies:
                 count = sum(previous.rstrip("bcdefgh") == label for previous in labels)
                 label += "abcdefgh"[count]
             labels.append(label)
-    kinds, axes, scales, coordinates = [], [], [], []
+    kinds = []
+    axes = []
+    scales = []
+    coordinates = []
     for k in chain.driven:
         element = chain.elements[k]
         kinds.append(REVOLUTE if element.axis[0] == "r" else PRISMATIC)
@@ -179,7 +182,8 @@ def _elementary(axis: str, amount: float) -> np.ndarray:
     if axis[0] == "t":
         transform[along, 3] = amount
         return frozen(transform)
-    first, second = (along + 1) % 3, (along + 2) % 3
+    first = (along + 1) % 3
+    second = (along + 2) % 3
     transform[first, first] = np.cos(amount)
     transform[second, second] = np.cos(amount)
     transform[second, first] = np.sin(amount)

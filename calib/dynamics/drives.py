@@ -109,7 +109,8 @@ class DriveTerm:
 
         acts = np.zeros((1, 8))
         acts[0, 1 : 1 + len(self.settings)] = self.settings
-        x, v = np.ascontiguousarray(joined.x), np.ascontiguousarray(joined.v)
+        x = np.ascontiguousarray(joined.x)
+        v = np.ascontiguousarray(joined.v)
         state = v if joined.state is None else np.ascontiguousarray(joined.state)
         out = np.empty((rows, len(joined.v)))
         code = getattr(shape_kernels, self.shape.upper())

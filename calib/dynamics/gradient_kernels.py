@@ -39,7 +39,7 @@ def _share(links, order, i, weights, motion, twists, slopes, bars):
     ``slopes`` (B + 1, 9) belongs to w, dw, a; ``bars`` (B + 1, n, 6) to the twists.
     """
     h = i + 1
-    own = order[i]
+    index = order[i]
     w = three(motion, h, 0)
     e = three(motion, h, 3)
     a = three(motion, h, 6)
@@ -50,14 +50,17 @@ def _share(links, order, i, weights, motion, twists, slopes, bars):
         u = three(twist, j, 0)
         s = three(twist, j, 3)
         g = weights[j, 10 * i : 10 * i + 10]
-        J = g[own[0]], g[own[1]], g[own[2]], g[own[3]], g[own[4]], g[own[5]]
-        m = (g[own[6]], g[own[7]], g[own[8]])
-        mass = g[own[9]]
+        J = g[index[0]], g[index[1]], g[index[2]], g[index[3]], g[index[4]], g[index[5]]
+        m = g[index[6]], g[index[7]], g[index[8]]
+        mass = g[index[9]]
         p = inertia_times(J, w)
-        increase(bar, j, 0, add(add(inertia_times(J, e), cross(w, p)), cross(m, a)))
-        increase(bar, j, 3, add(add(scaled(mass, a), cross(e, m)), cross(w, cross(w, m))))
+        moment = add(add(inertia_times(J, e), cross(w, p)), cross(m, a))
+        force = add(add(scaled(mass, a), cross(e, m)), cross(w, cross(w, m)))
+        increase(bar, j, 0, moment)
+        increase(bar, j, 3, force)
         turning = add(cross(p, u), inertia_times(J, cross(u, w)))
-        increase(slopes, h, 0, add(turning, add(cross(cross(w, m), s), cross(m, cross(s, w)))))
+        shifting = add(cross(cross(w, m), s), cross(m, cross(s, w)))
+        increase(slopes, h, 0, add(turning, shifting))
         increase(slopes, h, 3, add(inertia_times(J, u), cross(m, s)))
         increase(slopes, h, 6, add(scaled(mass, s), cross(u, m)))
 
@@ -90,20 +93,25 @@ def _unadvance(links, i, rate, frames, motion, slopes):
         vx = motion[h, 0]
         vy = motion[h, 1]
         by_amount += slopes[h, 0] * vy - slopes[h, 1] * vx
-        by_amount += slopes[h, 3] * (motion[h, 4] + vx * rate) - slopes[h, 4] * (motion[h, 3] - vy * rate)
+        ex = motion[h, 3] - vy * rate
+        ey = motion[h, 4] + vx * rate
+        by_amount += slopes[h, 3] * ey - slopes[h, 4] * ex
         by_amount += slopes[h, 6] * motion[h, 7] - slopes[h, 7] * motion[h, 6]
     g = turned(frames, i, three(slopes, h, 6))
     w = three(motion, p, 0)
     x = three(frames, i, 9)
     across = cross(w, g)
     turning = add(cross(cross(w, x), g), cross(across, x))
-    increase(slopes, p, 0, add(turned(frames, i, three(slopes, h, 0)), turning))
-    increase(slopes, p, 3, add(turned(frames, i, three(slopes, h, 3)), cross(x, g)))
+    by_w = turned(frames, i, three(slopes, h, 0))
+    by_e = turned(frames, i, three(slopes, h, 3))
+    increase(slopes, p, 0, add(by_w, turning))
+    increase(slopes, p, 3, add(by_e, cross(x, g)))
     increase(slopes, p, 6, g)
     if links[i, KIND] > REVOLUTE:
         # The slope by the shift, along z.
         shift = frames[i, 2], frames[i, 5], frames[i, 8]
-        by_amount += dot(shift, add(cross(g, three(motion, p, 3)), cross(w, across)))
+        by_shift = add(cross(g, three(motion, p, 3)), cross(w, across))
+        by_amount += dot(shift, by_shift)
     return by_amount
 
 
@@ -121,12 +129,16 @@ def _uncarry(links, i, frames, twists, bars):
         b = three(bar, j, 0)
         c = three(bar, j, 3)
         s = turned(frames, i, c)
-        increase(bar_up, j, 0, add(turned(frames, i, b), cross(three(frames, i, 9), s)))
+        lever = three(frames, i, 9)
+        increase(bar_up, j, 0, add(turned(frames, i, b), cross(lever, s)))
         increase(bar_up, j, 3, s)
         if links[i, KIND] == REVOLUTE:
-            by_amount += cross(b, three(twist, j, 0))[2] + cross(c, three(twist, j, 3))[2]
+            by_turn = cross(b, three(twist, j, 0))
+            by_lever = cross(c, three(twist, j, 3))
+            by_amount += by_turn[2] + by_lever[2]
         elif links[i, KIND] != FIXED:
-            by_amount += dot((frames[i, 2], frames[i, 5], frames[i, 8]), cross(s, three(twist_up, j, 0)))
+            shift = frames[i, 2], frames[i, 5], frames[i, 8]
+            by_amount += dot(shift, cross(s, three(twist_up, j, 0)))
     return by_amount
 
 

@@ -125,7 +125,9 @@ class IdentificationModel:
             link: q, v, a (N, n) of the bodies where joints deflect; None: those of the drives.
         """
         shape = (len(q), self.n)
-        q, v, a = shaped(q, shape, "q"), shaped(v, shape, "v"), shaped(a, shape, "a")
+        q = shaped(q, shape, "q")
+        v = shaped(v, shape, "v")
+        a = shaped(a, shape, "a")
         load_columns = None if load is None else shaped(load, q.shape, "load").T
         out = np.zeros((self.p, self.n * len(self.torque_rows.blocks), len(q)))
         if self.inertial:

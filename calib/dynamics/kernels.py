@@ -18,7 +18,11 @@ import numpy as np
 from numba import njit
 
 FIXED, REVOLUTE = 0, 1
-PARENT, KIND, COORDINATE, DEPTH, PATH = 0, 1, 2, 3, 4
+PARENT = 0
+KIND = 1
+COORDINATE = 2
+DEPTH = 3
+PATH = 4
 """Columns of ``links``."""
 SCALE = 12
 """Column of ``constants``, behind the placement's three rows; its last row is gravity."""
@@ -113,19 +117,28 @@ def dot(a, b):
 @njit(**JOINED)
 def cross(a, b):
     """Return a × b."""
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+    x = a[1] * b[2] - a[2] * b[1]
+    y = a[2] * b[0] - a[0] * b[2]
+    z = a[0] * b[1] - a[1] * b[0]
+    return x, y, z
 
 
 @njit(**JOINED)
 def inertia_times(J, a):
     """Return J a, J being XX, XY, XZ, YY, YZ, ZZ."""
-    return dot((J[0], J[1], J[2]), a), dot((J[1], J[3], J[4]), a), dot((J[2], J[4], J[5]), a)
+    x = dot((J[0], J[1], J[2]), a)
+    y = dot((J[1], J[3], J[4]), a)
+    z = dot((J[2], J[4], J[5]), a)
+    return x, y, z
 
 
 @njit(**JOINED)
 def turned(frames, i, a, k=0):
     """Return R a, R being the matrix by rows in row i from column k on."""
-    return dot(three(frames, i, k), a), dot(three(frames, i, k + 3), a), dot(three(frames, i, k + 6), a)
+    x = dot(three(frames, i, k), a)
+    y = dot(three(frames, i, k + 3), a)
+    z = dot(three(frames, i, k + 6), a)
+    return x, y, z
 
 
 @njit(**JOINED)
@@ -133,7 +146,8 @@ def turned_back(frames, i, a, k=0):
     """Return Rᵀ a."""
     x = scaled(a[0], three(frames, i, k))
     y = scaled(a[1], three(frames, i, k + 3))
-    return add(add(x, y), scaled(a[2], three(frames, i, k + 6)))
+    z = scaled(a[2], three(frames, i, k + 6))
+    return add(add(x, y), z)
 
 
 @njit(**JOINED)
@@ -149,7 +163,8 @@ def ten_columns(w, e, a, u, s):
     zx = u[2] * e[0] + c[2] * w[0]
     zy = u[2] * e[1] + c[2] * w[1]
     zz = u[2] * e[2] + c[2] * w[2]
-    h = add(add(cross(s, e), cross(w, cross(w, s))), cross(a, u))
+    centripetal = cross(w, cross(w, s))
+    h = add(add(cross(s, e), centripetal), cross(a, u))
     return xx, xy + yx, xz + zx, yy, yz + zy, zz, h[0], h[1], h[2], dot(s, a)
 
 
@@ -161,7 +176,9 @@ def advance(links, i, rate, change, frames, motion):
     w = three(motion, p, 0)
     e = three(motion, p, 3)
     x = three(frames, i, 9)
-    a = add(add(three(motion, p, 6), cross(e, x)), cross(w, cross(w, x)))
+    tangential = cross(e, x)
+    centripetal = cross(w, cross(w, x))
+    a = add(add(three(motion, p, 6), tangential), centripetal)
     write(motion, h, 0, turned_back(frames, i, w))
     write(motion, h, 3, turned_back(frames, i, e))
     write(motion, h, 6, turned_back(frames, i, a))
@@ -190,9 +207,11 @@ def carry(links, constants, i, frames, twists):
         j = links[p, PATH + k]
         u = three(up, j, 0)
         write(twists_here, j, 0, turned_back(frames, i, u))
-        write(twists_here, j, 3, turned_back(frames, i, add(three(up, j, 3), cross(u, three(frames, i, 9)))))
+        s = add(three(up, j, 3), cross(u, three(frames, i, 9)))
+        write(twists_here, j, 3, turned_back(frames, i, s))
     if coordinate >= 0:
-        twists_here[coordinate, 2 if links[i, KIND] == REVOLUTE else 5] += constants[i, SCALE]
+        axis = 2 if links[i, KIND] == REVOLUTE else 5
+        twists_here[coordinate, axis] += constants[i, SCALE]
 
 
 @njit(**OPTIONS)
@@ -260,10 +279,13 @@ def _advance_lanes(turning, joint, turn, up, motion_here):
         change = joint[4 * L + k]
         w_turned = _lane_back(turn, k, w)
         across = rate * w_turned[1], -rate * w_turned[0], change
-        a = add(add(_lane(up, 6, k), cross(e, x)), cross(w, cross(w, x)))
+        tangential = cross(e, x)
+        centripetal = cross(w, cross(w, x))
+        a = add(add(_lane(up, 6, k), tangential), centripetal)
+        coriolis = (g * across[0], g * across[1], 0.5 * g * change)
         _write_lane(motion_here, 0, k, (w_turned[0], w_turned[1], w_turned[2] + f * rate))
         _write_lane(motion_here, 3, k, add(_lane_back(turn, k, e), scaled(f, across)))
-        _write_lane(motion_here, 6, k, add(_lane_back(turn, k, a), (g * across[0], g * across[1], 0.5 * g * change)))
+        _write_lane(motion_here, 6, k, add(_lane_back(turn, k, a), coriolis))
 
 
 @njit(**OPTIONS)
@@ -272,7 +294,8 @@ def _carry_lanes(turn, up, twist_here):
     for k in range(L):
         u = _lane(up, 0, k)
         _write_lane(twist_here, 0, k, _lane_back(turn, k, u))
-        _write_lane(twist_here, 3, k, _lane_back(turn, k, add(_lane(up, 3, k), cross(u, _lane(turn, 9, k)))))
+        s = add(_lane(up, 3, k), cross(u, _lane(turn, 9, k)))
+        _write_lane(twist_here, 3, k, _lane_back(turn, k, s))
 
 
 @njit(**OPTIONS)
@@ -375,8 +398,12 @@ def _wrench(i, parameters, motion, wrench):
     a = three(motion, i + 1, 6)
     body = parameters[10 * i : 10 * i + 10]
     h = body[6], body[7], body[8]
-    write(wrench, i, 0, add(add(scaled(body[9], a), cross(e, h)), cross(w, cross(w, h))))
-    write(wrench, i, 3, add(add(inertia_times(body, e), cross(w, inertia_times(body, w))), cross(h, a)))
+    centripetal = cross(w, cross(w, h))
+    force = add(add(scaled(body[9], a), cross(e, h)), centripetal)
+    gyroscopic = cross(w, inertia_times(body, w))
+    moment = add(add(inertia_times(body, e), gyroscopic), cross(h, a))
+    write(wrench, i, 0, force)
+    write(wrench, i, 3, moment)
 
 
 @njit(**OPTIONS)
@@ -385,11 +412,14 @@ def _return(links, constants, i, frames, wrench, tau):
     c = links[i, COORDINATE]
     p = links[i, PARENT]
     if c >= 0:
-        tau[c] += constants[i, SCALE] * wrench[i, 5 if links[i, KIND] == REVOLUTE else 2]
+        axis = 5 if links[i, KIND] == REVOLUTE else 2
+        tau[c] += constants[i, SCALE] * wrench[i, axis]
     if p >= 0:
         force = turned(frames, i, three(wrench, i, 0))
         increase(wrench, p, 0, force)
-        increase(wrench, p, 3, add(turned(frames, i, three(wrench, i, 3)), cross(three(frames, i, 9), force)))
+        moment = turned(frames, i, three(wrench, i, 3))
+        lever = three(frames, i, 9)
+        increase(wrench, p, 3, add(moment, cross(lever, force)))
 
 
 @njit(**OPTIONS)
@@ -426,5 +456,6 @@ def stop(x, width):
     """Return the states (N,) of a stop operator driven by x (N,), unstressed at first."""
     out = np.zeros(x.shape[0])
     for k in range(1, x.shape[0]):
-        out[k] = min(1.0, max(-1.0, out[k - 1] + (x[k] - x[k - 1]) / width))
+        free = out[k - 1] + (x[k] - x[k - 1]) / width
+        out[k] = min(1.0, max(-1.0, free))
     return out

@@ -106,7 +106,8 @@ def of_standard(model: IdentificationModel, values: np.ndarray) -> PathDynamics:
     values = shaped(values, (model.p,), "parameters of the model")
     if not model.torque_rows.has_bodies:
         raise CalibError("rows tau - tau_l contain no bodies: no motion planning; use a model of the torques tau")
-    body_values, term_values = values[: model.inertial], values[model.inertial :]
+    body_values = values[: model.inertial]
+    term_values = values[model.inertial :]
     without_friction = []
     rigid_values = list(body_values)
     terms, amounts = [], []

@@ -36,7 +36,8 @@ def fill_regressor(bodies: Bodies, q: np.ndarray, v: np.ndarray, a: np.ndarray, 
     if np.abs(amount).max(initial=0.0) >= MAX_ANGLE:
         is_angle = bodies.kinds[:, None] == REVOLUTE
         amount = np.where(is_angle, np.remainder(amount, 2 * np.pi), amount)
-    v, a = np.ascontiguousarray(v.T), np.ascontiguousarray(a.T)
+    v = np.ascontiguousarray(v.T)
+    a = np.ascontiguousarray(a.T)
     kernels.regressor(bodies.links, bodies.constants, bodies.order, amount, v, a, out)
 
 
@@ -77,8 +78,10 @@ def _frames(bodies: Bodies, q: np.ndarray) -> np.ndarray:
             if bodies.kinds[body] == PRISMATIC:
                 motion[:, axis, 3] = amount
             else:
-                first, second = (axis + 1) % 3, (axis + 2) % 3
-                cosine, sine = np.cos(amount), np.sin(amount)
+                first = (axis + 1) % 3
+                second = (axis + 2) % 3
+                cosine = np.cos(amount)
+                sine = np.sin(amount)
                 motion[:, first, first] = cosine
                 motion[:, second, second] = cosine
                 motion[:, second, first] = sine

@@ -248,7 +248,8 @@ def torque_rows(name: str) -> TorqueRows:
     return ROWS[name]
 
 
-_LINK, _MOTOR = frozenset({BODIES, "link"}), frozenset({"motor"})
+_LINK = frozenset({BODIES, "link"})
+_MOTOR = frozenset({"motor"})
 MOTOR = TorqueRows("motor", (_JointBlock("", _LINK | _MOTOR, motor=1.0),), "Ia Fv Fc off")
 LINK = TorqueRows("link", (_JointBlock("", _LINK, sensor=1.0, suffix=" sensor"),), "Fvl Fcl offl")
 BOTH = TorqueRows(

@@ -184,7 +184,8 @@ def identify_gains(
         triangle = retriangulate(rows.reshape(-1, rows.shape[2]))
         upper = triangle[:-1, :-1]
         step = -np.linalg.lstsq(upper, triangle[:-1, -1], rcond=1e-12)[0]
-        x_step, gain_step = step[: len(free)], step[len(free) :]
+        x_step = step[: len(free)]
+        gain_step = step[len(free) :]
         largest = float(np.abs(gain_step).max())
         size = min(1.0, MAX_LOG_STEP / max(largest, 1e-12))
         x = x + size * x_step

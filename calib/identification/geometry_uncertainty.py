@@ -94,7 +94,8 @@ def estimator(identification: Identification[Any]) -> _Estimator:
         return _Estimator(deviation, np.zeros((0, p)), np.zeros(p))
     deviation = deviation * np.sqrt(fitted.inflation)
     factors = (fitted.pooled.factors / deviation[:, None, None]).reshape(-1, p + 1)
-    matrix, target = factors[:, :p], factors[:, p]
+    matrix = factors[:, :p]
+    target = factors[:, p]
     values = fitted.estimate.values
     pull = matrix.T @ (matrix @ values - target) + prior_rows.T @ (prior_rows @ values)
     return _Estimator(deviation, prior_rows, pull)
@@ -307,7 +308,10 @@ def solve_sensitivity(
         recordings = tuple((case, rows, None) for rows, case in zip(identification.rows, cases))
 
     # Whitened columns, changes of the residuals and instruments of all pieces.
-    matrices, row_weights, changes, instruments = [], [], [], []
+    matrices = []
+    row_weights = []
+    changes = []
+    instruments = []
     pull: np.ndarray | float = 0.0
     present_rows = 0
     for case, rows, instrument in recordings:

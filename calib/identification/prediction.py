@@ -173,7 +173,10 @@ def score(
     """
     motion = case.motion
     moves = moving(motion) if slow is None else moving(motion, slow)
-    sums, above, explained, residuals = [], [], [], []
+    sums = []
+    above = []
+    explained = []
+    residuals = []
     for row in range(case.target.shape[1]):
         row_moves = moves[:, row % motion.n]
         row_sums, row_above, row_explained, residual = _score_row(case, np.asarray(predicted)[:, row], row, row_moves)
@@ -234,9 +237,11 @@ def _row(
         (4, 3) Σ (τ - τ̂)², Σ τ² and their number of all samples, raw and in the band, of moving and of standing ones;
         `Score.above_band_percent` and `Score.r_squared` of the row; (M,) the residual in the band, thinned.
     """
-    motion, target = case.motion, case.target[:, k]
+    motion = case.motion
+    target = case.target[:, k]
     low = motion.in_band(np.stack([target, predicted], axis=1))
-    residual, own = target - predicted, low[:, 0] - low[:, 1]
+    residual = target - predicted
+    own = low[:, 0] - low[:, 1]
     sums = [_sums(target, residual, known), _sums(low[:, 0], own, known)]
     sums += [_sums(target, residual, known & moves), _sums(target, residual, known & ~moves)]
     size = float(np.linalg.norm(target))
@@ -305,6 +310,8 @@ def predict(dynamics: Dynamics[RegressorModel], case: Case) -> np.ndarray:
     result = np.empty((len(motion), model.rows))
     for start in range(0, len(motion), BLOCK):
         part = slice(start, start + BLOCK)
-        q, v, a = motion.q[part], motion.v[part], motion.a[part]
+        q = motion.q[part]
+        v = motion.v[part]
+        a = motion.a[part]
         result[part] = model.torque(dynamics.values, q, v, a, case.carried, states[:, part], **case.deflected(part))
     return result

@@ -220,7 +220,8 @@ def find_prior(
     t = np.array(sizes.centre)
     values = np.zeros(len(columns))
     if start is not None:
-        std, inflation = start.first.std, start.first.inflation
+        std = start.first.std
+        inflation = start.first.inflation
         for name, size in start.sizes.items():
             t[sizes.names.index(name)] = np.log(size)
     for _ in range(ROUNDS):
@@ -257,7 +258,8 @@ def first_fit(rows: Sequence[ObservationRows], noise: np.ndarray | None = None) 
     row_count = rows[0].target.shape[1]
     parts = divided(rows)
     rest_weights = rows[0].rest
-    std, inflation = np.ones(row_count), np.ones(row_count)
+    std = np.ones(row_count)
+    inflation = np.ones(row_count)
     values = np.zeros(parts.moving.parameters)
     for _ in range(FIRST_FIT_ROUNDS):
         data = parts.joined(rest_weights)

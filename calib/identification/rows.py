@@ -246,7 +246,8 @@ def observe(model: RegressorModel, columns: np.ndarray, case: Case, decimator: D
     source = model.torque_rows.repeated(motion.n)
     is_source = source[entry_row] == entry_row
     filtered_row, filtered_column = entry_row[is_source], entry_column[is_source]
-    copied_row, copied_column = entry_row[~is_source], entry_column[~is_source]
+    copied_row = entry_row[~is_source]
+    copied_column = entry_column[~is_source]
     model_column = columns[filtered_column]
 
     # Transposed, because readers take the columns of one row.
@@ -314,7 +315,8 @@ def observe_terms(
 
     One column at a time at the full rate: an hour of all friction there is would fill 15 GB.
     """
-    segment, n = case.motion.segment, case.motion.n
+    segment = case.motion.segment
+    n = case.motion.n
     sample_count = len(kept(segment, decimator))
     columns = np.zeros((sample_count, torque_rows.count(n), len(terms)))
     for k, term in enumerate(terms):
@@ -379,7 +381,8 @@ def triangulate(all_rows: Sequence[ObservationRows]) -> Triangles:
         for row in range(row_count):
             present = rows.present[:, row]
             group = block[present] * row_count + row
-            matrix, target = rows.matrix[present, row], rows.target[present, row]
+            matrix = rows.matrix[present, row]
+            target = rows.target[present, row]
             if rows.standing[:, row].any():
                 weight = rows.weight[present, row]
                 matrix = matrix * weight[:, None]
@@ -403,7 +406,9 @@ def pool(data: Triangles, rows: int, blocks: Sequence[int] | None = None) -> Tri
 def _regressor(model: RegressorModel, case: Case, part: slice, states: np.ndarray) -> np.ndarray:
     """Return the regressor (N_i, rows, p) at a part of the samples."""
     motion = case.motion
-    q, v, a = motion.q[part], motion.v[part], motion.a[part]
+    q = motion.q[part]
+    v = motion.v[part]
+    a = motion.a[part]
     return model.regressor(q, v, a, None, case.carried, states[:, part], **case.deflected(part))
 
 
@@ -428,7 +433,8 @@ def power_block(
     power = np.where(np.isfinite(power), power, plain_power)
     power = power[part.start - start :][: part.stop - part.start].T
 
-    q, v = motion.q[part], motion.v[part]
+    q = motion.q[part]
+    v = motion.v[part]
     regressor = model.regressor(q, v, np.zeros_like(v), None, case.carried, states[:, part])
     losses = regressor.transpose(2, 1, 0)[columns, 0]
     stores_energy = []

@@ -46,14 +46,18 @@ def regimes(all_rows: Sequence[ObservationRows], cases: Sequence[Case], decimato
 
     Standstills belong to none: no model is judged by friction that nothing decides.
     """
-    positions, speeds, accelerations = [], [], []
+    positions = []
+    speeds = []
+    accelerations = []
     for case in cases:
         motion = case.motion
         index = kept(motion.segment, decimator)
         positions.append(motion.q[index])
         speeds.append(motion.v[index])
         accelerations.append(motion.a[index])
-    q, v, a = np.concatenate(positions), np.concatenate(speeds), np.concatenate(accelerations)
+    q = np.concatenate(positions)
+    v = np.concatenate(speeds)
+    a = np.concatenate(accelerations)
 
     row_count, p = all_rows[0].matrix.shape[1:]
     joint = np.arange(row_count) % q.shape[1]

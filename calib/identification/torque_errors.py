@@ -492,11 +492,19 @@ def _collect_samples(identification: Identification, cases: Sequence[Case]) -> _
     """Return motion and residuals of all recordings at their decimated samples."""
     dynamics = identification.dynamics
     decimator = common_decimator(cases, identification.settings)
-    states, torques, errors, matrices, blocks, trajectories, trajectory_blocks = [], [], [], [], [], [], []
+    states = []
+    torques = []
+    errors = []
+    matrices = []
+    blocks = []
+    trajectories = []
+    trajectory_blocks = []
     for case, rows in zip(cases, identification.rows):
         motion = case.motion
         index = kept(motion.segment, decimator)
-        q, v, a = motion.q[index], motion.v[index], motion.a[index]
+        q = motion.q[index]
+        v = motion.v[index]
+        a = motion.a[index]
         memory = segmented_states(dynamics.model.columns, case)[:, index]
         torque = np.asarray(case.target[index])
         error = torque - dynamics.model.torque(dynamics.values, q, v, a, case.carried, memory)

@@ -106,7 +106,9 @@ def _settled(problem: IdentificationProblem, prior: Prior) -> tuple[LinearFit, n
     """
     pooled = problem.pooled
     base_count = problem.base.b
-    std, inflation, tempering = prior.first.std, prior.first.inflation, prior.tempering
+    std = prior.first.std
+    inflation = prior.first.inflation
+    tempering = prior.tempering
     fit, covariance, prior_rows = _regularised(problem, prior, std, inflation, tempering)
     for _ in range(SETTLING_ROUNDS):
         estimated = fit.estimate
