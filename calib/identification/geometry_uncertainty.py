@@ -146,7 +146,8 @@ def cut(rows: ObservationRows, part: slice) -> ObservationRows:
 def inverted(upper: np.ndarray) -> np.ndarray:
     """Return the inverse of an upper triangular matrix (p, p) whose columns have different units."""
     unit = np.linalg.norm(upper, axis=0)
-    return np.asarray(scipy.linalg.solve_triangular(upper / unit, np.eye(len(unit)))) / unit[:, None]
+    inverse = np.asarray(scipy.linalg.solve_triangular(upper / unit, np.eye(len(unit))))
+    return inverse / unit[:, None]
 
 
 def stacked(rows: ObservationRows) -> np.ndarray:
@@ -339,11 +340,13 @@ def solve_sensitivity(
         augmented = np.hstack([np.concatenate(instruments), matrix, change])
         factor = retriangulate(augmented * scale[:, None])[:p, p:]
         unit = np.linalg.norm(factor[:, :p], axis=0)
-        slopes = -np.linalg.solve(factor[:, :p] / unit, factor[:, p:]) / unit[:, None]
+        scaled_slopes = -np.linalg.solve(factor[:, :p] / unit, factor[:, p:])
+        slopes = scaled_slopes / unit[:, None]
     else:
         # The prior counts as much beside the pieces as it did beside all rows.
         share = float(np.count_nonzero(scale) / present_rows)
-        prior_rows = np.sqrt(share) * np.pad(weighting.beforehand, ((0, 0), (0, change.shape[1])))
+        padding = ((0, 0), (0, change.shape[1]))
+        prior_rows = np.sqrt(share) * np.pad(weighting.beforehand, padding)
         whitened = np.hstack([matrix, change]) * scale[:, None]
         factor = retriangulate(np.vstack([prior_rows, whitened]))
         inverse = inverted(factor[:p, :p])

@@ -228,30 +228,11 @@ def _score_row(
     return np.array(sums), above, r_squared(target[valid], residual[valid]), thinned
 
 
-def _row(
-    case: Case, predicted: np.ndarray, k: int, known: np.ndarray, moves: np.ndarray
-) -> tuple[np.ndarray, float, float, np.ndarray]:
-    """Return the sums of one torque row for a score; rows are processed one by one to save memory.
-
-    Returns:
-        (4, 3) Σ (τ - τ̂)², Σ τ² and their number of all samples, raw and in the band, of moving and of standing ones;
-        `Score.above_band_percent` and `Score.r_squared` of the row; (M,) the residual in the band, thinned.
-    """
-    motion = case.motion
-    target = case.target[:, k]
-    low = motion.in_band(np.stack([target, predicted], axis=1))
-    residual = target - predicted
-    own = low[:, 0] - low[:, 1]
-    sums = [_sums(target, residual, known), _sums(low[:, 0], own, known)]
-    sums += [_sums(target, residual, known & moves), _sums(target, residual, known & ~moves)]
-    size = float(np.linalg.norm(target))
-    above = 100.0 * float(np.linalg.norm(target - low[:, 0])) / size if size > 0.0 else 0.0
-    return np.array(sums), above, r_squared(target[known], residual[known]), own[:: motion.decimator.factor]
-
-
 def _sums(target: np.ndarray, residual: np.ndarray, selected: np.ndarray) -> tuple[float, float, float]:
     """Return Σ (τ - τ̂)², Σ τ² and the number of some samples."""
-    return float(np.sum(residual[selected] ** 2)), float(np.sum(target[selected] ** 2)), float(selected.sum())
+    residual_square = float(np.sum(residual[selected] ** 2))
+    target_square = float(np.sum(target[selected] ** 2))
+    return residual_square, target_square, float(selected.sum())
 
 
 def _prediction_errors(sums: np.ndarray, apart: Sequence[int]) -> PredictionErrors:

@@ -298,7 +298,8 @@ def weighing(
     squares = np.sum((data.factors @ np.append(values, -1.0)) ** 2, axis=1)
     freedom = np.maximum(data.rows - inflation * parameters_of_row, 0.1 * counts)
     std = np.sqrt(squares / freedom)
-    torque_rms = np.sqrt(np.sum(data.factors[:, :, -1] ** 2, axis=1) / counts)
+    torque_squares = np.sum(data.factors[:, :, -1] ** 2, axis=1)
+    torque_rms = np.sqrt(torque_squares / counts)
     std = np.maximum(std, MIN_NOISE * max(float(torque_rms.max()), 1e-300))
     return scaled(noise, std, data.rows), inflation
 

@@ -131,9 +131,11 @@ def case_names(paths: Sequence[str]) -> tuple[str, ...]:
 
 
 def _file(path: str) -> str:
+    """Return the name of a recording's file without its folder and cut."""
     from calib.data.recordings.recording import parse_cut
 
-    return parse_cut(path)[0].replace("\\", "/").rstrip("/").rsplit("/", 1)[-1]
+    file, *_ = parse_cut(path)
+    return file.replace("\\", "/").rstrip("/").rsplit("/", 1)[-1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,9 +277,11 @@ def observe(model: RegressorModel, columns: np.ndarray, case: Case, decimator: D
     matrix[:, copied_row, copied_column] = matrix[:, source[copied_row], copied_column]
 
     target = decimate(case.target, decimator, segment)
+    names = tuple(model.names[column] for column in columns)
+    units = tuple(model.units[column] for column in columns)
     return ObservationRows(
-        names=tuple(model.names[column] for column in columns),
-        units=tuple(model.units[column] for column in columns),
+        names=names,
+        units=units,
         matrix=matrix,
         target=target,
         present=thinned(case.present, segment, decimator),
@@ -329,7 +333,8 @@ def observe_terms(
 def term_columns(term: DriveTerm, case: Case, load: np.ndarray | None = None) -> Iterator[tuple[int, np.ndarray]]:
     """Yield the torque rows that a drive term acts on, each with its column (N,) at the full rate."""
     motion = case.motion
-    motions = [motion.q.T, motion.v.T, motion.a.T, None if load is None else load.T]
+    load_of_joints = None if load is None else load.T
+    motions = [motion.q.T, motion.v.T, motion.a.T, load_of_joints]
     return term.acting(motions, segmented_states([term], case))
 
 
@@ -342,7 +347,8 @@ def segmented_states(terms: Sequence[DriveTerm], case: Case) -> np.ndarray:
 
 def segments(segment: np.ndarray) -> list[tuple[int, int]]:
     """Return (start, stop) of each run of equal numbers in an array."""
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(segment)) + 1, [len(segment)]])
+    changes = np.flatnonzero(np.diff(segment)) + 1
+    edges = np.concatenate([[0], changes, [len(segment)]])
     return list(pairwise(edges.tolist()))
 
 
@@ -361,7 +367,8 @@ def with_blocks(all_rows: Sequence[ObservationRows], count: int) -> list[Observa
             case_blocks = max(1, round(count * size / max(total, 1)))
         number = first + (np.arange(size) * case_blocks) // max(size, 1)
         cuts = np.flatnonzero(np.diff(number)) + 1
-        distance = np.abs(np.arange(size)[:, None] - cuts[None, :]).min(axis=1, initial=size)
+        distances = np.abs(np.arange(size)[:, None] - cuts[None, :])
+        distance = distances.min(axis=1, initial=size)
         numbered.append(replace(rows, block=np.where(distance <= CUT_MARGIN, -1, number)))
         first += case_blocks
     return numbered
@@ -373,7 +380,8 @@ def triangulate(all_rows: Sequence[ObservationRows]) -> Triangles:
     The last block holds the samples beside cuts. Rows of standstills have their weights.
     """
     row_count = all_rows[0].target.shape[1]
-    block_count = 1 + max((int(rows.block.max(initial=-1)) for rows in all_rows), default=-1)
+    last_blocks = [int(rows.block.max(initial=-1)) for rows in all_rows]
+    block_count = 1 + max(last_blocks, default=-1)
     result = empty(all_rows[0].names, all_rows[0].units, (block_count + 1) * row_count)
     counts = np.zeros(result.groups)
     for rows in all_rows:
@@ -425,7 +433,8 @@ def power_block(
     motion = case.motion
     start = max(segment.start, part.start - DIFFERENCE_REACH)
     stop = min(segment.stop, part.stop + DIFFERENCE_REACH)
-    energies = model.energy_columns(motion.q[start:stop], motion.v[start:stop], case.carried)[:, columns]
+    all_energies = model.energy_columns(motion.q[start:stop], motion.v[start:stop], case.carried)
+    energies = all_energies[:, columns]
     power = slope(energies, motion.rate)
     plain_power = np.zeros_like(energies)
     if len(energies) > 1:

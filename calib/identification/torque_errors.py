@@ -569,7 +569,8 @@ def _estimate(identification: Identification, data: Triangles, blocks: Sequence[
     """Return the values (p,) estimated from some time blocks, and a root (p, k) of their covariance."""
     fitted = identification.fitted
     base_count = identification.base.b
-    group = np.concatenate([np.full(base_count, -1), np.asarray(identification.friction.groups, dtype=int)])
+    friction_group = np.asarray(identification.friction.groups, dtype=int)
+    group = np.concatenate([np.full(base_count, -1), friction_group])
     prior_rows, tempered_rows = None, None
     if identification.prior is not None:
         prior_rows = identification.prior.widened(len(group) - base_count)
@@ -581,10 +582,12 @@ def _estimate(identification: Identification, data: Triangles, blocks: Sequence[
     # The covariance of the columns that no ridge has switched off, inverted in units of a diagonal of 1.
     active = np.flatnonzero(ridges > 0.0)
     weight = 1.0 / (fitted.std * np.sqrt(fitted.inflation))
-    whitened = (pooled.factors[:, :, :-1] * weight[:, None, None]).reshape(-1, len(group))
+    whitened = pooled.factors[:, :, :-1] * weight[:, None, None]
+    whitened = whitened.reshape(-1, len(group))
     if prior_rows is not None:
         whitened = np.vstack([whitened, prior_rows[:, :-1]])
-    information = (whitened.T @ whitened)[np.ix_(active, active)] + np.diag(ridges[active] ** -2.0)
+    square = whitened.T @ whitened
+    information = square[np.ix_(active, active)] + np.diag(ridges[active] ** -2.0)
     unit = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     eigenvalues, vectors = np.linalg.eigh(information * np.outer(unit, unit))
     root = np.zeros((len(group), len(active)))
@@ -690,13 +693,13 @@ def _variance_weights(folds: Sequence[_HeldOut], run_count: int) -> np.ndarray:
         other_squares = squares[other_rows, thinned].ravel()
         other_terms = terms[other_rows, thinned].reshape(-1, 3)
         other_counts = BORROWED / run_count * counts[other_rows, thinned].ravel()
-        scale = np.array([max(float(terms[row, :, 0].mean()), 1e-300), 1.0, 1.0])
-        row_weights = variance_weights(
-            np.concatenate([squares[row], other_squares, expected_squares]),
-            np.concatenate([terms[row], other_terms, expected_terms]) / scale,
-            np.full(3, 1.0 / 3.0),
-            np.concatenate([counts[row], other_counts, expected_counts]),
-        )
+        mean_term = float(terms[row, :, 0].mean())
+        scale = np.array([max(mean_term, 1e-300), 1.0, 1.0])
+        all_squares = np.concatenate([squares[row], other_squares, expected_squares])
+        all_terms = np.concatenate([terms[row], other_terms, expected_terms])
+        all_counts = np.concatenate([counts[row], other_counts, expected_counts])
+        equal = np.full(3, 1.0 / 3.0)
+        row_weights = variance_weights(all_squares, all_terms / scale, equal, all_counts)
         weights[row] = row_weights / scale * [1.0, mean_square[row], mean_square[row]]
     return weights
 
