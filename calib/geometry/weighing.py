@@ -260,7 +260,11 @@ class Weigher:
             weight = robust.weights(_size(part, sigma), loss, scale)
             self.pieces.append(Piece(number, replace(part, noise=noise) if noise else part, sigma, weight))
         if not first:
-            squares = sum(float(np.sum(piece.weight * (piece.part.value / piece.sigma) ** 2)) for piece in self.pieces)
+            # what the rows of an image share has its own noise model, and says nothing of the common factor
+            squares = 0.0
+            for piece in self.pieces:
+                whitened_residual = piece.part.alone(piece.sigma) / piece.sigma
+                squares += float(np.sum(piece.weight * whitened_residual**2))
             self.noise = float(np.sqrt(max(squares / rows / share, MIN_NOISE**2)))
 
     def settle(self, solution: Solution) -> Solution | None:
