@@ -6,6 +6,7 @@ from importlib import resources
 from pathlib import Path
 
 from calib.errors import RobotError, refuse_robot, require, suggestion
+from calib.result_kinds import refusal
 from calib.robot import calibrated, description
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
@@ -78,7 +79,7 @@ def resolve(robot: str | Path) -> Path:
     if place.is_dir():
         if (place / calibrated.ROBOT).is_file():
             return place / calibrated.ROBOT
-        require(str(robot) in listed, f"folder {place} has no robot.toml; give {known}", RobotError)
+        require(str(robot) in listed, f"{refusal(place, 'robot')}; the library has {', '.join(listed)}", RobotError)
     elif place.is_file() or converter(place):
         require(place.suffix == ".toml" or is_urdf(place), f"{place} is no robot file; give {known}", RobotError)
         return place
