@@ -32,8 +32,8 @@ from calib.geometry.error_model import Discrepancy, ErrorModel, outside
 from calib.geometry.installation import Installation, see
 from calib.geometry.inverse import Goal
 from calib.geometry.observation import layout, pose_sigmas
-from calib.procedure.findings import lines_of, sentence
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
+from calib.procedure.findings import lines_of, sentence
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.kinematic_stage.tables import read_covariance
 from calib.result_kinds import refusal
