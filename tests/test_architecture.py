@@ -26,8 +26,8 @@ HOMES = {
         "calib.rooms.parallel.mechanism.closure_kernels",
         "calib.rooms.parallel.mechanism.simulation_kernels",
         "calib.robot.capsule_kernels",
-        "calib.rooms.closed_loop.loop_kernels",
-        "calib.rooms.studies.methods.tangent_kernels",
+        "calib.identification.closed_loop.loop_kernels",
+        "calib.identification.survey.tangent_kernels",
     ],
     "yourdfpy": ["calib.robot.formats.simulators"],
     "cv2": [
