@@ -26,7 +26,7 @@ TOPICS: Mapping[str, tuple[str, str]] = {
     ),
     "exports": (
         "files that calib export --into writes",
-        "calib.procedure.export.delivery calib.identification.possible.solve",
+        "calib.procedure.export.delivery calib.identification.physical_consistency.solve",
     ),
     "constraints": ("the TOML file of calib select --constraints", "calib.procedure.measuring.constraints_file"),
     "mdh": ("a robot as a table of modified Denavit-Hartenberg rows", "calib.robot.mdh calib.robot.tables"),

@@ -21,7 +21,8 @@ parameters.json       names, units, values and covariances of geometry and dynam
                       with drives.csv) and by the identified model, at the samples of the ``torques_N.csv`` named there.
 README.txt            what each file is for, and the verdict on it.
 
-Masses are those of physically consistent bodies (`calib.identification.possible.solve`). What the torques do not
+Masses are those of physically consistent bodies (`calib.identification.physical_consistency.solve`). What the torques
+do not
 identify is regularised towards the masses of the robot's description: by the entropic (log-det) prior, which keeps off
 the border of the physically consistent; with ``--prior euclidean`` by its second order, which does not, so that a body
 may come out thin. A link to which others are fixed (flange, covers, sensors) is identified with them as one body: the
@@ -100,7 +101,7 @@ class Export:
         fit: folder of the fit; None: identified dynamics alone.
         identified: folder of the identification; None: geometry alone.
         prior: regularisation of masses that the torques do not identify, see
-            `calib.identification.possible.solve.PRIORS`.
+            `calib.identification.physical_consistency.solve.PRIORS`.
         remark: for the head of files that a robot or a simulation moves by.
     """
 

@@ -30,9 +30,6 @@ from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.kinematics import gravity_torques
 from calib.robot.library import load, resolve
 
-IDENTIFIED_MASSES: Point[Callable[[str, Chain], np.ndarray]] = Point(
-    "identified_masses", "standard parameters (n, 10) in the folder of an identification"
-)
 IMAGE_FOLDERS: Point[Any] = Point("image_folders", "a module: `read_images` reads a folder of images as a block")
 PLANNED_POSES: Point[Callable[[Path, Chain, FileOptions], list[PoseMeasurements]]] = Point(
     "planned_poses", "points without joints, with those of planned poses"
@@ -129,7 +126,11 @@ def gather(
     chain, source = load_robot(robot, files[0], options, base, tip)
     stored = source.suffix == ".toml"
     earlier = robot if isinstance(robot, CalibratedChain) else calibrated.read(source) if stored else None
-    masses = IDENTIFIED_MASSES.one()(settings.masses, chain) if settings.masses else None
+    masses = None
+    if settings.masses:
+        from calib.identification.model_file import identified_masses  # a fit alone loads no dynamics
+
+        masses = identified_masses(settings.masses, chain)
     weighed = chain if masses is None else replace(chain, inertias=masses)
     blocks = _named(
         [(path, block) for path, each in zip(files, measured) for block in read_file(each, weighed, options)],

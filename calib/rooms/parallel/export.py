@@ -46,9 +46,9 @@ from calib.folders import (
     write_staged,
 )
 from calib.identification.model_file import MODEL, refuse_currents
-from calib.identification.possible import information
-from calib.identification.possible.problem import find_prior_bodies
-from calib.identification.possible.solve import PossibleBodies, find_possible
+from calib.identification.physical_consistency import information
+from calib.identification.physical_consistency.problem import find_prior_bodies
+from calib.identification.physical_consistency.solve import PossibleBodies, find_possible
 from calib.identification.prediction import Dynamics
 from calib.identification.prior import RADIUS
 from calib.procedure.export.delivery import DRIVES, MJCF, README, TO_SIMULATE, write_drives

@@ -10,8 +10,8 @@ import pytest
 
 from calib.data.recordings.recording import Recording
 from calib.errors import UsageError
-from calib.identification.geometry_uncertainty import propagate
 from calib.identification.identify_options import IdentifyOptions
+from calib.identification.uncertainty.geometry_uncertainty import propagate
 from calib.procedure.dynamic_stage import identify, inputs
 from calib.procedure.excitation import design, prediction
 from calib.procedure.excitation import folder as motion_folder

@@ -42,17 +42,13 @@ from calib.dynamics import rigid_body
 from calib.dynamics.bodies import Bodies
 from calib.dynamics.torque_rows import BODIES
 from calib.estimation.triangles import retriangulate
-from calib.extensions import Point
 from calib.identification.identify import Identification, common_decimator
+from calib.identification.link_motion import bodies_torques, chosen_terms, joint_terms, motion_of_bases
 from calib.identification.rows import Case, ObservationRows, observe, segments
 from calib.identification.settings import make_bodies, make_model
 from calib.records import Frozen, frozen
-from calib.robot.calibrated import CalibratedChain, as_calibrated
+from calib.robot.calibrated import CalibratedChain, as_calibrated, target_elements
 from calib.robot.chain import Chain
-
-DEFLECTION_SENSITIVITY: Point[Callable[[Any, Any, Any], np.ndarray]] = Point(
-    "deflection_sensitivity", "derivative of an estimate by the joint corrections' coefficients"
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +134,7 @@ def weights(how: _Estimator, rows: ObservationRows, by: np.ndarray | None = None
 
 STEP = 1e-5  # of the central differences [m or rad]
 SAMPLES = 30_000  # at the full rate; longer recordings are represented by pieces spread over them (our choice)
+DEFLECTION_SAMPLES = 10_000  # the same for the sensitivity to joint corrections (our choice)
 NOTHING = 0.01  # a σ that grows by a smaller share has not changed (our choice)
 TILTS = ("gravity.rx", "gravity.ry")
 
@@ -220,7 +217,7 @@ def propagate(
     geometry, deviations, felt_by = None, np.full(count + len(TILTS), np.nan), matrix[:, :count]
     if covariance is not None:
         if deflected:
-            felt_by = np.hstack([felt_by, DEFLECTION_SENSITIVITY.one()(found, robot, cases)])
+            felt_by = np.hstack([felt_by, deflection_sensitivity(found, robot, cases)])
         geometry = frozen(felt_by @ covariance @ felt_by.T)
         own = np.sqrt(np.clip(np.diag(covariance)[:count], 0.0, None))
         deviations[:count] = np.where(own > 0.0, own, np.nan)
@@ -435,3 +432,48 @@ def compare(
         frozen(np.stack([np.sqrt(alone), carried.sigma])),
         frozen(np.sqrt(apart)),
     )
+
+
+def deflection_sensitivity(found: Identification, robot: CalibratedChain, cases: Sequence[Case]) -> np.ndarray:
+    """Return the derivative (p, E) of the estimate by the corrections' coefficients, zero for those left out.
+
+        dφ/dc = -(Wᵀ R⁻¹ W)⁻¹ Wᵀ R⁻¹ Σ_s ∂τ/∂s b_s,    s one of q, v, a of the joint, b_s the basis or its derivative
+
+    as in `sensitivity`, of which the part by the residual is left out: it vanishes with
+    the residual.
+    """
+    terms, chain, settings = robot.deflection, robot.complete, found.settings
+    where, how = target_elements(chain, terms), estimator(found)
+    inverse, decimator = estimate(how, found.rows)[1], common_decimator(cases, found.settings)
+    model = found.dynamics.model
+    standard = found.base.to_standard(found.fitted.estimate.values[: found.base.b])[: model.inertial]
+    pull, seen = np.zeros((len(inverse), len(terms.terms))), 0
+    every = -(-sum(len(case.motion) for case in cases) // DEFLECTION_SAMPLES)
+    for rows, case in zip(found.rows, cases):
+        torque = bodies_torques(joint_terms(chain, terms), case, settings)
+        values = standard * model.carried_columns(case.carried)
+        spans = []
+        for chosen, span in pieces(case, decimator, every):
+            part = cut(rows, chosen)
+            white = part.matrix * (weights(how, part) ** 2).reshape(part.present.shape)[:, :, None]
+            back = spread(white, decimator, span.stop - span.start)
+            spans.append((span, model.torque_rows.fold(back, (BODIES,) * back.shape[2])))
+            seen += np.count_nonzero(part.present)
+        for j in np.flatnonzero(np.isin(chain.moving, where)):
+            own = where == chain.moving[j]
+            bases = motion_of_bases(chosen_terms(terms, own), case.motion, torque)
+            for span, felt in spans:
+                slopes = _torque_slopes(model.bodies, values, [x[span] for x in case.links], int(j))
+                pull[:, own] += np.einsum("nip,sni,sen->pe", felt, slopes, bases[:, :, span], optimize=True)
+    return -inverse @ pull * (sum(np.count_nonzero(part.present) for part in found.rows) / seen)
+
+
+def _torque_slopes(bodies: Bodies, values: np.ndarray, states: Sequence[np.ndarray], joint: int) -> np.ndarray:
+    """Return ∂τ/∂q_j, ∂τ/∂v_j and ∂τ/∂a_j (3, N, n) of one joint by central differences."""
+    result = np.zeros((3, *states[0].shape))
+    for order in range(3):
+        for sign in (1.0, -1.0):
+            moved = [np.array(x) for x in states]
+            moved[order][:, joint] += sign * STEP
+            result[order] += sign / (2.0 * STEP) * rigid_body.inverse_dynamics(bodies, values, *moved)
+    return result

@@ -9,7 +9,8 @@ Prior bodies, towards which consistent parameters are regularised, are the CAD's
 (Sousa & Cortesão 2014; Wensing, Kim & Slotine 2018): a semidefinite program (Clarabel).
 Its optimum lies on the border wherever the estimate itself is impossible; it says what consistency costs and no more.
 With a pull γ towards the prior bodies P_i⁰ = L Lᵀ it is the Euclidean counterpart of the entropic prior of
-`calib.identification.possible.solve`, whose second order it is: + ½ γ Σ ½ ‖L⁻¹ P_i L⁻ᵀ - 1‖², the drives' likewise. In
+`calib.identification.physical_consistency.solve`, whose second order it is: + ½ γ Σ ½ ‖L⁻¹ P_i L⁻ᵀ - 1‖², the drives'
+likewise. In
 these coordinates no weight between kg and kg m² is needed; unlike the entropic one it does not keep off the border.
 """
 
@@ -24,7 +25,7 @@ from calib.dynamics.bodies import standard_parameters
 from calib.dynamics.idim import IdentificationModel
 from calib.estimation.cone_program import minimise
 from calib.estimation.triangles import retriangulate
-from calib.identification.possible.information import Information
+from calib.identification.physical_consistency.information import Information
 from calib.identification.prior import DRIVES, PAYLOAD, RADIUS, ROTOR, rods
 from calib.records import Frozen
 from calib.robot.chain import Chain

@@ -13,12 +13,12 @@ from calib.data.poses.measurements import Poses
 from calib.errors import UsageError
 from calib.procedure.session.commands import new_session
 from calib.procedure.session.folder import MASSES, open_session, read_state
+from calib.procedure.session.masses import ROUNDS, identified_masses, largest_move
 from calib.records import read_json
 from calib.robot import calibrated, description
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward, gravity_torques
-from calib.rooms.deflections.masses import ROUNDS, identified_masses, largest_move
 from calib.transforms import pose, to_quaternion
 
 COMPLIANCE = np.array([0.0, -5e-5, -2e-4])  # [rad/(N m)]; the first axis is vertical

@@ -13,42 +13,16 @@ The fit takes the masses as exact: the share of the compliance's σ that comes f
 import shutil
 from pathlib import Path
 
-import numpy as np
-
-from calib.errors import refuse_option
 from calib.files import write_json
 from calib.folders import ESTIMATE, read_estimate
-from calib.identification.model_file import MODEL, read_dynamics, read_table, refuse_currents, refuse_other_arm
+from calib.identification.model_file import MODEL, read_table
 from calib.procedure.session.folder import MASSES, Session
 from calib.records import read_json
 from calib.robot import calibrated
-from calib.robot.chain import Chain
 from calib.units import TORQUE
 
 MAX_MOVE = 0.1  # of a parameter's σ
 ROUNDS = "rounds.json"
-
-
-def identified_masses(folder: str | Path, chain: Chain) -> np.ndarray:
-    """Return the standard parameters (n, 10) of an arm's bodies from an identification's folder.
-
-    Their gravity torques are right on the geometry that they were identified on, single parameters are not
-    (`calib.dynamics.base.to_standard`); payloads are left out.
-
-    Raises:
-        UsageError: for an identification of another arm, in amperes, or without bodies.
-    """
-    folder = Path(folder)
-    refuse_currents(folder, "a fit of the compliance")
-    refuse_other_arm(folder, chain)
-    _, dynamics = read_dynamics(folder)
-    bodies, result = dynamics.model.bodies, np.zeros((chain.n, 10))
-    if not dynamics.model.inertial:
-        refuse_option(folder, "has identified no bodies, hence no gravity torques; identify with motor or link torques")
-    for row, label in enumerate(bodies.labels):
-        if label.isdigit():
-            result[int(label) - 1] = dynamics.values[10 * row : 10 * row + 10]
-    return result
 
 
 def largest_move(before: Path, now: Path) -> float:

@@ -5,11 +5,12 @@ body. With P_i the pseudo-inertia of body i (`calib.dynamics.pseudo_inertia`), P
 Fv, Fc (1×1 matrices of the same kind), the parameters are
 
     argmin  ½ ‖R T χ - z‖² + ½ γ Σ_i D(P_i ‖ P_i⁰) + ½ Σ_d D(x_d ‖ x_d⁰)      R, z:
-    `calib.identification.possible.information`
+    `calib.identification.physical_consistency.information`
 
 with the log-det divergence D (Lee, Wensing & Park 2020): convex, the same in any frame and any unit, and infinite at
 the border, so every body is possible with a margin. A plain Euclidean distance would need a weight between kg and kg
-m²; that in the coordinates of P_i⁰ does not, and may be asked for (`calib.identification.possible.problem`).
+m²; that in the coordinates of P_i⁰ does not, and may be asked for
+(`calib.identification.physical_consistency.problem`).
 
 How much the CAD counts. exp(-½ γ D) is, up to its norm, the Wishart density of a 4×4 matrix with mode P⁰ and γ + 5
 degrees of freedom (our observation), so γ has a marginal likelihood,
@@ -50,8 +51,8 @@ from scipy.special import multigammaln  # type: ignore[attr-defined]
 from calib.dynamics import pseudo_inertia
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import NotConverged, UsageError, one_of
-from calib.identification.possible.information import Information, of
-from calib.identification.possible.problem import (
+from calib.identification.physical_consistency.information import Information, of
+from calib.identification.physical_consistency.problem import (
     DRIVE,
     BodyCost,
     PriorBodies,
