@@ -37,9 +37,9 @@ HOMES = {
         "calib.rooms.camera.pictures.board_print",
         "calib.rooms.cells.rendered_camera",
     ],
-    "ruamel": ["calib.rooms.camera.lens", "calib.rooms.descriptions.moveit"],
+    "ruamel": ["calib.rooms.camera.lens", "calib.procedure.measuring.moveit"],
     "mcap": ["calib.data.", "calib.rooms.camera."],
-    "rosbags": ["calib.rooms.controllers.bags", "calib.rooms.camera."],
+    "rosbags": ["calib.data.recordings.bags", "calib.rooms.camera."],
     "pandas": ["calib.api.rendering"],
     "starlette": ["calib.rooms.serve.pages"],
     "uvicorn": ["calib.rooms.serve.commands"],
@@ -50,8 +50,8 @@ HOMES = {
     "ruckig": ["trajectories."],
     "clarabel": ["calib.estimation."],
     "cvxpy": [],  # the tests' independent solver
-    "matplotlib": ["calib.procedure.", "calib.api.", "calib.rooms."],
-    "jinja2": ["calib.procedure.report.templates", "calib.rooms.controllers.program"],
+    "matplotlib": ["calib.procedure.", "calib.api.", "calib.rooms.", "calib.apps."],
+    "jinja2": ["calib.templates", "calib.apps.programs.program"],
     "typst": ["calib.rooms.certificate.rendering"],
     "pyarrow": ["calib.rooms.studies.store"],
     "dask": ["calib.workers.cluster"],
@@ -59,9 +59,9 @@ HOMES = {
     "fsspec": ["calib.rooms.fleet.stores"],
     "cloudpickle": ["calib.workers.cluster"],
     "threadpoolctl": ["calib.workers.threads"],
-    "typer": ["calib.cli", "calib.cli.", "calib.rooms."],
+    "typer": ["calib.cli", "calib.cli.", "calib.rooms.", "calib.apps."],
     "click": ["calib.cli", "calib.cli."],
-    "rich": ["calib.cli", "calib.cli.", "calib.api.rendering", "calib.procedure.", "calib.rooms."],
+    "rich": ["calib.cli", "calib.cli.", "calib.api.rendering", "calib.procedure.", "calib.rooms.", "calib.apps."],
 }
 
 
@@ -134,10 +134,14 @@ def test_the_walker_sees_every_form_of_import():
 def test_no_core_module_names_a_room():
     """Except the list of what `import calib` offers, whose entries are loaded when first used."""
     others = [
-        path for path in SOURCES if path.parts[len(ROOT.parts) + 1] != "rooms" and path != ROOT / "calib/__init__.py"
+        path
+        for path in SOURCES
+        if path.parts[len(ROOT.parts) + 1] not in ("rooms", "apps") and path != ROOT / "calib/__init__.py"
     ]
     core = {path: path.read_text(encoding="utf-8") for path in others}
-    assert [path for path in core if re.search(r"(import|from) calib\.rooms", path.read_text(encoding="utf-8"))] == []
+    assert [
+        path for path in core if re.search(r"(import|from) calib\.(rooms|apps)", path.read_text(encoding="utf-8"))
+    ] == []
 
 
 def test_the_rooms_can_be_shut(monkeypatch):
@@ -152,7 +156,7 @@ def test_the_rooms_can_be_shut(monkeypatch):
     assert extensions.Point("commands", "").all() == []
     with pytest.raises(UsageError):
         extensions.Point("camera_guess", "").one()
-    code = "import sys; sys.modules['calib.rooms'] = None; import calib; from calib.cli import run; "
+    code = "import sys; sys.modules['calib.rooms'] = sys.modules['calib.apps'] = None; import calib; from calib.cli import run; "
     code += "from calib.data.poses.measurements import PoseMeasurements as Measured; import numpy as np; "
     code += "rng = np.random.default_rng(0); q = rng.uniform(-1, 1, (40, 6)); robot = calib.load('tx40'); "
     code += "seen = Measured.of(q, robot.forward(q)[:, :3, 3] + rng.normal(0, 1e-4, (40, 3))); "

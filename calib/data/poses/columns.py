@@ -7,10 +7,11 @@ from typing import NoReturn
 
 import numpy as np
 
+from calib.controllers.table import as_described
 from calib.data.csv_table import Table
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.measurements import KINDS
-from calib.data.schema import AS_DESCRIBED, BOUNDS, Column
+from calib.data.schema import BOUNDS, Column
 from calib.errors import MeasurementError, one_of, suggestion
 
 SUFFIXES = ("", "_meas", "_measured")
@@ -83,7 +84,7 @@ class Sheet:
         names = self.find_joints(joints)
         q = self.numbers(names, Column(tuple(joints), "joint", "joints"))
         name = self.options.controller
-        return AS_DESCRIBED.one()(name, q) if name else q, names
+        return as_described(name, q) if name else q, names
 
     def check_names(self, joints: Sequence[str]) -> None:
         """Refuse options that name a column unknown to both the toolkit and the file."""

@@ -28,7 +28,7 @@ between series. Both measurements are noisy, and the base's orientation noise ac
 Rows that belong together: sockets, planes, pairs and bars.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -64,12 +64,8 @@ from calib.data.poses.measurements import (
     Positions,
     Sockets,
 )
+from calib.data.poses.robodk import FORMS
 from calib.data.schema import Joints, refuse
-from calib.extensions import Point, merged
-
-POSE_FORMS: Point[Mapping[str, Any]] = Point(
-    "pose_forms", "files of poses that are no standard table: whether a header is of that form, and its reader"
-)
 
 
 def read_groups(sheet: Sheet, layout: Layout, q: np.ndarray) -> GroupedMeasurements:
@@ -224,11 +220,10 @@ def read_measurements(
     """
     robot, options = Joints.of(joints), options or FileOptions()
     table, path, notes = (source, source.file, ()) if isinstance(source, Table) else (None, source, ())
-    forms = merged(POSE_FORMS)
     header = () if options.format or table is not None else read_header(path)[0]
-    form = options.format or next((name for name, (known, _) in forms.items() if known(header)), "csv")
-    if form in forms:
-        reader: Callable[..., tuple[Table, FileOptions, tuple[str, ...]]] = forms[form][1]
+    form = options.format or next((name for name, (known, _) in FORMS.items() if known(header)), "csv")
+    if form in FORMS:
+        reader: Callable[..., tuple[Table, FileOptions, tuple[str, ...]]] = FORMS[form][1]
         table, options, notes = reader(path, len(robot.names), options)
     table = table or read_table(path)
     if table.notes:  # names that were understood need no map

@@ -14,6 +14,7 @@ from rich.text import Text
 
 from calib.arguments import checked
 from calib.config import parse
+from calib.controllers.table import check_controller
 from calib.data.csv_table import read_table
 from calib.data.poses import IMAGES
 from calib.errors import UsageError, command_line, require
@@ -38,9 +39,6 @@ from calib.robot.collision import meshes_beside
 from calib.robot.library import load, resolve
 from calib.robot.tables import dumps
 
-CHECK_CONTROLLER: Point[Callable[[str, int], None]] = Point(
-    "check_controller", "raises where a controller takes no arm of n joints"
-)
 ENDINGS: Point[Callable[[Session], list[str]]] = Point("endings", "lines on a complete session")
 
 
@@ -213,7 +211,7 @@ def new_session(
     require(dynamics or device.measures != NOTHING, words, UsageError)
     chain = load(robot, base or None, tip or None)
     if program:
-        CHECK_CONTROLLER.one()(program, chain.n)
+        check_controller(program, chain.n)
     copied, named = _limits(limits, chain, source, dynamics)
     table = {
         "name": chain.name,

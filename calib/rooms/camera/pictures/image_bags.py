@@ -15,12 +15,12 @@ import numpy as np
 
 from calib import files
 from calib.data.poses import BOARD, CORNERS, JOINTS
+from calib.data.recordings.bags import JOINT_STATE, connections_of, header_stamp, joint_states, opened
 from calib.errors import MeasurementError, require
 from calib.rooms.camera.board import Board, read_board, write_board
 from calib.rooms.camera.pictures.detection import detected
 from calib.rooms.camera.pictures.image_folders import detection_summary
 from calib.rooms.camera.pixels import Found, write_corners
-from calib.rooms.controllers.bags import JOINT_STATE, connections_of, header_stamp, joint_states, opened
 
 IMAGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/Image", "sensor_msgs/CompressedImage")
 
