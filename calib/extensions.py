@@ -118,7 +118,7 @@ def _packages() -> list[str]:
         except ModuleNotFoundError:
             continue
         found += [f"{host}.{module.name}" for module in pkgutil.iter_modules(folders) if module.ispkg]
-    return sorted(found, key=lambda name: name.rpartition(".")[2])
+    return sorted(set(found) - set(HOSTS), key=lambda name: name.rpartition(".")[2])
 
 
 def _load(package: str, place: str) -> Any:

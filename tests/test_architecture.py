@@ -51,7 +51,7 @@ HOMES = {
     "clarabel": ["calib.estimation."],
     "cvxpy": [],  # the tests' independent solver
     "matplotlib": ["calib.procedure.", "calib.api.", "calib.rooms.", "calib.apps."],
-    "jinja2": ["calib.templates", "calib.apps.programs.program"],
+    "jinja2": ["calib.procedure.report.templates", "calib.apps.controller_programs.program"],
     "typst": ["calib.rooms.certificate.rendering"],
     "pyarrow": ["calib.rooms.studies.store"],
     "dask": ["calib.workers.cluster"],
@@ -133,15 +133,10 @@ def test_the_walker_sees_every_form_of_import():
 
 def test_no_core_module_names_a_room():
     """Except the list of what `import calib` offers, whose entries are loaded when first used."""
-    others = [
-        path
-        for path in SOURCES
-        if path.parts[len(ROOT.parts) + 1] not in ("rooms", "apps") and path != ROOT / "calib/__init__.py"
-    ]
-    core = {path: path.read_text(encoding="utf-8") for path in others}
-    assert [
-        path for path in core if re.search(r"(import|from) calib\.(rooms|apps)", path.read_text(encoding="utf-8"))
-    ] == []
+    upper = [path for folder in ("rooms", "apps") for path in (ROOT / "calib" / folder).rglob("*.py")]
+    core = [path for path in SOURCES if path not in upper and path != ROOT / "calib/__init__.py"]
+    named = re.compile(r"(import|from) calib\.(rooms|apps)")
+    assert [path for path in core if named.search(path.read_text(encoding="utf-8"))] == []
 
 
 def test_the_rooms_can_be_shut(monkeypatch):
@@ -156,7 +151,8 @@ def test_the_rooms_can_be_shut(monkeypatch):
     assert extensions.Point("commands", "").all() == []
     with pytest.raises(UsageError):
         extensions.Point("camera_guess", "").one()
-    code = "import sys; sys.modules['calib.rooms'] = sys.modules['calib.apps'] = None; import calib; from calib.cli import run; "
+    code = "import sys; sys.modules['calib.rooms'] = sys.modules['calib.apps'] = None; "
+    code += "import calib; from calib.cli import run; "
     code += "from calib.data.poses.measurements import PoseMeasurements as Measured; import numpy as np; "
     code += "rng = np.random.default_rng(0); q = rng.uniform(-1, 1, (40, 6)); robot = calib.load('tx40'); "
     code += "seen = Measured.of(q, robot.forward(q)[:, :3, 3] + rng.normal(0, 1e-4, (40, 3))); "

@@ -15,10 +15,8 @@ import numpy as np
 
 from calib.config import parse, strict
 from calib.errors import UsageError, one_of, require
-from calib.templates import read
+from calib.files import shipped_text
 from calib.units import ANGLES, LENGTHS
-
-HERE = "calib.controllers"
 
 
 @strict
@@ -87,7 +85,7 @@ class Controller:
 @cache
 def controllers() -> dict[str, Controller]:
     """Return all controllers by name."""
-    table = tomllib.loads(read(HERE, "controllers.toml"))
+    table = tomllib.loads(shipped_text("calib.controllers", "controllers.toml"))
     return {
         name: parse(
             Controller, (table[entry["like"]] if "like" in entry else {}) | _own(entry), f"controllers.toml: {name}"

@@ -35,11 +35,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.distance import pdist
 
+from calib.apps.controller_programs.program import joints_table
+from calib.apps.controller_programs.targets import is_program
 from calib.apps.joining.joined import CLOCKS, NAMES, Joined, column_of
 from calib.apps.joining.order import MAX_MISFIT, MIN_FOUND, MIN_POINTS, find_order
 from calib.apps.joining.streams import join_streams
-from calib.apps.programs.program import joints_table
-from calib.apps.programs.targets import is_program
 from calib.arguments import checked
 from calib.data.csv_table import Table, read_table
 from calib.data.poses.columns import POSITION, SIGMA, Sheet

@@ -22,7 +22,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from calib.templates import read
+from calib.files import shipped_text
 
 LONGEST = 1 << 16  # letters of a line of names (our choice)
 LOOKED = 50  # rows in which a time is looked at (our choice)
@@ -37,7 +37,7 @@ class Log(io.StringIO):
 @cache
 def logs() -> dict[str, dict[str, Any]]:
     """Return the known logs by name."""
-    return tomllib.loads(read("calib.data.recordings", "logs.toml"))
+    return tomllib.loads(shipped_text("calib.data.recordings", "logs.toml"))
 
 
 def translated(path: str | Path) -> Log | None:

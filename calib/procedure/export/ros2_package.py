@@ -20,6 +20,7 @@ from xml.sax.saxutils import escape, quoteattr
 
 from calib import files
 from calib.errors import UsageError, require
+from calib.files import shipped_text
 from calib.procedure.export.delivery import Export, deliver_single
 from calib.procedure.export.geometry import check_readback
 from calib.procedure.kinematic_stage.folder import URDF
@@ -29,7 +30,6 @@ from calib.robot.collision import find_mesh, urdf_meshes
 from calib.robot.descriptions.xacro_files import split
 from calib.robot.formats.urdf_tree import edited, set_attributes, text
 from calib.robot.formats.urdf_tree import read as read_tree
-from calib.templates import read
 
 HERE = "calib.procedure.export"
 NAME = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")  # REP 149's [a-z](_?[a-z0-9]+)*, without its backtracking
@@ -93,7 +93,7 @@ def write_package(
         "FOLDERS": " ".join(sorted({each.split("/")[0] for each in (*made, *FILES.values()) if "/" in each})),
     }
     for template, place in FILES.items():
-        made[place] = re.sub(r"@([A-Z]+)@", lambda found: words[found[1]], read(HERE, f"templates/{template}"))
+        made[place] = re.sub(r"@([A-Z]+)@", lambda found: words[found[1]], shipped_text(HERE, f"templates/{template}"))
     files.check_results([(target / place, ()) for place in made], [export.urdf, *configs.values()], overwrite)
     with files.together():
         for place, written in made.items():

@@ -21,11 +21,11 @@ from calib.extensions import Point
 from calib.files import fingerprint
 from calib.procedure.excitation.coefficients import NAME as MOTION
 from calib.procedure.findings import Warned
+from calib.procedure.report.templates import versions
 from calib.procedure.session import dynamics_steps, folder, geometry_steps
 from calib.procedure.session.folder import Say, Session, StateFile, StepRecord, read_state
 from calib.procedure.session.geometry_steps import clear_staging
 from calib.procedure.session.settings import default_keys
-from calib.templates import versions
 
 MORE_STEPS: "Point[SessionStep]" = Point("steps", "steps after the export")
 

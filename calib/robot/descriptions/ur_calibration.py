@@ -28,10 +28,10 @@ from scipy.spatial.transform import Rotation
 
 from calib.config_types import number
 from calib.errors import RobotError, one_of, refuse_robot, refused_as, require
+from calib.files import shipped_text
 from calib.robot.descriptions.xacro_files import split
 from calib.robot.formats.urdf_tree import UNLIMITED
 from calib.robot.formats.urdf_write import add_joint, xml_text
-from calib.templates import read
 from calib.transforms import invert, pose
 
 KEYS = ("theta", "a", "d", "alpha")
@@ -47,7 +47,7 @@ def convert(path: str) -> str:
         RobotError: for a file that is none, without a type, or with one that cannot be the file's.
     """
     file, given = split(path)
-    table = tomllib.loads(read("calib.robot.descriptions", "universal_robots.toml"))
+    table = tomllib.loads(shipped_text("calib.robot.descriptions", "universal_robots.toml"))
     words = f'{file}: say of which type the arm is, in quotes: "{file} {TYPE}:=ur5e" (one of {", ".join(table)})'
     require({*given} == {TYPE}, words, RobotError)
     kind = one_of(given[TYPE], table, f"{file}: {TYPE}", RobotError)

@@ -12,8 +12,8 @@ from dataclasses import dataclass, fields
 
 from calib.config import described
 from calib.procedure.report.page import Block, FileRow, KeyFigure, Section, Table, Text, shortened
+from calib.procedure.report.templates import issued
 from calib.procedure.session.answers import CertificateSection
-from calib.templates import issued
 
 MAX_PAGES = 4
 MAX_REASON = 420  # letters of a verdict's reason on the certificate

@@ -16,9 +16,9 @@ from typing import Any
 from calib import files
 from calib.folders import PAGES
 from calib.procedure.report.page import Pictures
+from calib.procedure.report.templates import filled, read
 from calib.records import plain
 from calib.rooms.certificate.record import MAX_PAGES, Certificate, Page
-from calib.templates import filled, read
 
 HERE = "calib.rooms.certificate"
 FONT = "DejaVu Sans"

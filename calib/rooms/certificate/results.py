@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 from calib.errors import UsageError, command_line, require
 from calib.folders import SESSION
 from calib.procedure.report.page import Picture
+from calib.procedure.report.templates import versions
 from calib.procedure.session.answers import CertificateSection
 from calib.result_kinds import refusal
 from calib.rooms.certificate import rendering
 from calib.rooms.certificate.record import NO_DETAILS, Certificate, Entry, Page, records, report
-from calib.templates import versions
 from calib.units import DEG
 
 if TYPE_CHECKING:

@@ -16,6 +16,7 @@ from calib.procedure.kinematic_stage.metrics import FitMetrics
 from calib.procedure.report import fit_report
 from calib.procedure.report.fit_report import RowErrors, file_row, unseen_role
 from calib.procedure.report.page import FileRow, Text
+from calib.procedure.report.templates import versions
 from calib.procedure.session.folder import (
     CHECKED,
     MARK,
@@ -33,7 +34,6 @@ from calib.records import read_json, read_lines
 from calib.rooms.certificate import dynamics, geometry, rendering
 from calib.rooms.certificate.record import EDITED, Certificate, Entry, Page, Stage, records
 from calib.rooms.certificate.results import measured_range, tolerance
-from calib.templates import versions
 
 RECORDINGS: Point[Callable[[Path], str]] = Point(
     "recordings", "writes a recording of a session for Rerun, and returns its name"

@@ -60,8 +60,8 @@ def compensate(
         partial: write the reached targets even if others are not reached
     """
     from calib import files
-    from calib.apps.programs.frames import stated_frame
-    from calib.apps.programs.targets import is_program, read_program, text_of
+    from calib.apps.controller_programs.frames import stated_frame
+    from calib.apps.controller_programs.targets import is_program, read_program, text_of
     from calib.errors import UsageError
     from calib.procedure.export.geometry import results
     from calib.rooms.compensation import api

@@ -17,13 +17,13 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from calib.errors import CalibError, complaint
 from calib.folders import PAGES
+from calib.procedure.report.templates import filled
 from calib.procedure.session import commands, steps
 from calib.procedure.session.folder import BROUGHT, Session, open_session
 from calib.rooms.serve import uploads
 from calib.rooms.serve.web_viewer import LOCAL, WebViewer
 from calib.rooms.serve.work import CHECK, NEXT, REDO, Work
 from calib.rooms.viewer.viewer import FILE as RECORDING
-from calib.templates import filled
 
 HERE = "calib.rooms.serve"
 DRIFT = "the first poses measured again at the end, to check for drift (optional)"

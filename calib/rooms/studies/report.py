@@ -235,7 +235,7 @@ def make_page(
         rows: of these conditions.
         plots: with box plots.
     """
-    from calib.templates import filled, issued
+    from calib.procedure.report.templates import filled, issued
 
     head = [overview(conditions), *([torque_table(conditions)] if len(conditions) > 1 else [])]
     sections = [Section("", [*head, Text("How that was decided", RULE), Text("Figures", MEANING)])]

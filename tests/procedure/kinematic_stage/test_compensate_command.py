@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calib import cli, config
-from calib.apps.programs.targets import pose_values, read_program
+from calib.apps.controller_programs.targets import pose_values, read_program
 from calib.controllers.table import controller_named
 from calib.data.poses.measurements import Poses
 from calib.data.poses.pose_lists import Targets, read_targets

@@ -4,7 +4,8 @@ A controller that keeps its nominal geometry takes the tool's and the instrument
 meets the measurements best. One whose axes are mastered anew takes joint offsets with the frames that belong to them:
 from a fit with ``--model offsets``, since offsets of a richer model are not the best ones by themselves.
 
-Each frame stands in the controller's base or flange (`calib.apps.programs.frames`), and is printed with it. Where
+Each frame stands in the controller's base or flange (`calib.apps.controller_programs.frames`), and is printed with it.
+Where
 nothing says where that is, no number is printed.
 """
 
@@ -13,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.apps.programs.frames import ControllerFrame, Description, base_frame, flange_frame
-from calib.apps.programs.targets import number, pose_values
+from calib.apps.controller_programs.frames import ControllerFrame, Description, base_frame, flange_frame
+from calib.apps.controller_programs.targets import number, pose_values
 from calib.controllers.table import Controller
 from calib.geometry.installation import Installation, read_arms
 from calib.procedure.export.delivery import verdicts

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calib.apps.programs.configurations import configuration_of, has_spherical_wrist, postures, signs_at
+from calib.apps.controller_programs.configurations import configuration_of, has_spherical_wrist, postures, signs_at
 from calib.controllers.table import controller_named
 from calib.geometry.installation import Installation
 from calib.geometry.inverse import Goal

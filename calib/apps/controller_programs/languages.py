@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from calib.apps.programs.targets import NUMBER, Program, Target, pose_of_values
+from calib.apps.controller_programs.targets import NUMBER, Program, Target, pose_of_values
 from calib.controllers.table import Controller
 from calib.errors import UsageError
 

@@ -19,15 +19,15 @@ import jinja2
 import numpy as np
 
 from calib import files
-from calib.apps.programs.motion import is_motion, setpoints, stream_values
-from calib.apps.programs.program_settings import CSV, ProgramSettings
-from calib.apps.programs.targets import is_program, number, read_program
+from calib.apps.controller_programs.motion import is_motion, setpoints, stream_values
+from calib.apps.controller_programs.program_settings import CSV, ProgramSettings
+from calib.apps.controller_programs.targets import is_program, number, read_program
 from calib.controllers.table import Controller, check_controller, controller_named
 from calib.data.csv_table import Table, read_table
 from calib.data.poses.columns import OURS
 from calib.data.poses.pose_lists import read_poses
 from calib.errors import UsageError, require
-from calib.templates import read
+from calib.procedure.report.templates import read
 from calib.units import ANGLES, LENGTHS
 
 
@@ -156,4 +156,4 @@ def _template(file: str) -> jinja2.Template:
     environment = jinja2.Environment(
         trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, undefined=jinja2.StrictUndefined
     )
-    return environment.from_string(read("calib.apps.programs", f"templates/{file}"))
+    return environment.from_string(read("calib.apps.controller_programs", f"templates/{file}"))

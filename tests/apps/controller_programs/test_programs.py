@@ -10,9 +10,9 @@ import pytest
 from sessions import begin, edit
 
 from calib import cli
-from calib.apps.programs.program import joints_in, joints_table, program_files
-from calib.apps.programs.program_settings import CSV, ProgramSettings
-from calib.apps.programs.targets import read_program
+from calib.apps.controller_programs.program import joints_in, joints_table, program_files
+from calib.apps.controller_programs.program_settings import CSV, ProgramSettings
+from calib.apps.controller_programs.targets import read_program
 from calib.controllers.table import check_controller, controller_named, controllers
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.pose_files import read_measurements

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.apps.programs.targets import number
+from calib.apps.controller_programs.targets import number
 from calib.controllers.table import Controller
 from calib.data.csv_table import read_header, read_table
 from calib.errors import UsageError, require

@@ -110,7 +110,8 @@ def has_spherical_wrist(chain: Chain) -> bool:
 
 
 def configuration_of(controller: Controller, words: str) -> Configuration | None:
-    """Return the configuration that a program says (`calib.apps.programs.languages.Setting`); None for none."""
+    """Return the configuration that a program says (`calib.apps.controller_programs.languages.Setting`); None for
+    none."""
     readers = {"tp": _tp, "krl": _krl, "rapid": _rapid}
     reader = readers.get(controller.language)
     return reader(words.split(), controller) if reader and words else None

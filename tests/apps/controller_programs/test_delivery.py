@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from calib import cli
-from calib.apps.programs.delivery import delivery_text
+from calib.apps.controller_programs.delivery import delivery_text
 from calib.controllers.table import as_described, controller_named, controllers
 from calib.procedure.kinematic_stage.folder import FitFolder
 from calib.robot.kinematics import forward

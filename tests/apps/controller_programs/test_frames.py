@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from calib import cli
-from calib.apps.programs.delivery import delivery_text
-from calib.apps.programs.frames import Description, base_frame, flange_frame, stated_frame
+from calib.apps.controller_programs.delivery import delivery_text
+from calib.apps.controller_programs.frames import Description, base_frame, flange_frame, stated_frame
 from calib.controllers.table import controller_named, controllers
 from calib.errors import UsageError
 from calib.robot.formats.urdf import parse

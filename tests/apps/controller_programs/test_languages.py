@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.apps.programs.languages import Setting, frames_in
-from calib.apps.programs.targets import read_program
+from calib.apps.controller_programs.languages import Setting, frames_in
+from calib.apps.controller_programs.targets import read_program
 from calib.errors import UsageError
 from calib.transforms import from_xyz_rpy
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calib import cli
-from calib.apps.programs.targets import pose_values, read_program
+from calib.apps.controller_programs.targets import pose_values, read_program
 from calib.controllers.table import controller_named
 from calib.robot.formats.urdf import parse
 from calib.robot.kinematics import forward

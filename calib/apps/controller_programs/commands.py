@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from calib.apps.programs.program_settings import CSV, ProgramSettings
+from calib.apps.controller_programs.program_settings import CSV, ProgramSettings
 from calib.cli.shared import command, say
 
 app = typer.Typer()
@@ -35,9 +35,9 @@ def program(
         listed: list controllers, with what each can be told of a calibration
     """
     from calib import files
-    from calib.apps.programs.motion import motion_file
-    from calib.apps.programs.program import program_files
-    from calib.apps.programs.targets import is_program, read_program
+    from calib.apps.controller_programs.motion import motion_file
+    from calib.apps.controller_programs.program import program_files
+    from calib.apps.controller_programs.targets import is_program, read_program
     from calib.controllers.table import controllers
     from calib.errors import UsageError, require
 
@@ -88,8 +88,8 @@ def deliver(
         out: text file; by default it is printed
     """
     from calib import files
-    from calib.apps.programs.delivery import delivery_text
-    from calib.apps.programs.frames import stated_frame
+    from calib.apps.controller_programs.delivery import delivery_text
+    from calib.apps.controller_programs.frames import stated_frame
     from calib.controllers.table import controller_named
     from calib.procedure.export.geometry import results
 
