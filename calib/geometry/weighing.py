@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.errors import UsageError, one_of, refuse_data
+from calib.errors import Unidentifiable, UsageError, one_of, refuse_data
 from calib.estimation import robust
 from calib.estimation.base_columns import ColumnSplit
 from calib.estimation.estimate import Estimate
@@ -350,6 +350,14 @@ class Weigher:
 
     def result(self, solution: Solution) -> GeometricFit:
         state = solution.state
+        undetermined = self.free[np.diag(solution.factor) == 0.0]
+        if len(undetermined):
+            names = [layout(state).names[parameter] for parameter in undetermined]
+            raise Unidentifiable(
+                f"{self.blocks[0].measured.file}: these rows no longer determine {', '.join(names)} where the search "
+                "ended; measure at more different joint values",
+                names,
+            )
         table, parts = layout(state), [piece.part for piece in self.pieces]
         # parameters that rest on their prior take nothing from the measurements' degrees of freedom
         pull, resting = self._pull(state), self._resting(solution)
