@@ -187,7 +187,7 @@ def calibrated_chain(
     return CalibratedChain(chain, nominal, covariance, corrections)
 
 
-MIN_SIGMA = 1e-7  # [m, rad, px] of estimated sigmas: no instrument is as exact; computed positions are
+MIN_SIGMA = 1e-6  # [m, rad, px] of estimated sigmas: no instrument is as exact; computed positions are
 MIN_NOISE = 1e-6  # residuals over their sigmas: computed positions leave less
 START_SIGMA = dict.fromkeys(("position", "orientation", "consistency", "distance", "plane"), 1e-3) | {"pixel": 0.3}
 
