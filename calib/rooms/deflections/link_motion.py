@@ -27,7 +27,7 @@ from calib.dynamics.bodies import Bodies, standard_parameters
 from calib.dynamics.torque_rows import BODIES, POWER
 from calib.identification.geometry_uncertainty import STEP, cut, estimate, estimator, pieces, weights
 from calib.identification.identify import Identification, common_decimator
-from calib.identification.methods.registry import method_named
+from calib.identification.registry import method_named
 from calib.identification.rows import Case, segments
 from calib.identification.settings import IdentificationSettings, make_model
 from calib.robot.calibrated import CalibratedChain, Deflection, evaluate, target_elements
