@@ -2,8 +2,7 @@
 
 ``calib study``: what is missing is run, what is there is summed up, and a report says what to take.
 
-rows.parquet, rows.csv   every trial (`store`): more may be added by anyone, at any time. While a command
-                         runs its rows go to rows.csv, which is emptied into rows.parquet at the end
+rows.sqlite              every trial (`store`): more may be added by anyone, at any time
 summary.csv              one line per condition and method: of every figure its median and, as lower and upper, its
                          quartiles, the nearest of the runs' own values
 report.html              tables, box plots, the decision rule; one file
@@ -25,7 +24,7 @@ from calib.procedure.report.style import AFTER, BEFORE, MARK
 from calib.rooms.studies import summary
 from calib.rooms.studies.conditions import Condition, Study, read_study, shipped
 from calib.rooms.studies.run import Progress, run, span
-from calib.rooms.studies.store import JOURNAL, LOCK, WHOLE, opened, read_rows
+from calib.rooms.studies.store import LOCK, ROWS, check_format, opened, read_rows
 from calib.rooms.studies.summary import (
     ALIKE,
     FIGURES,
@@ -259,7 +258,7 @@ def make_page(
 
 
 SUMMARY, REPORT = "summary.csv", "report.html"
-OURS = (JOURNAL, WHOLE, LOCK, SUMMARY, REPORT)
+OURS = (ROWS, LOCK, SUMMARY, REPORT)
 
 
 @dataclass(frozen=True)
@@ -323,15 +322,12 @@ def run_study(
         kept = read_rows(out)  # takes no lock: a study that runs there may be looked at
     else:
         with opened(out) as store:
-            if store.dropped:
-                notes.append(f"{store.dropped} incomplete line was removed; its trial is run again")
             say(f"{len(store.rows)} rows are there")
             with workers(where) as crew:
                 progress = run(study, store, crew, lambda found: say(str(found)))
             say("writing")
-            place = store.settle()
             kept = list(store.rows.values())
-            settled = f"{place.name} holds {len(kept)} rows"
+            settled = f"{ROWS} holds {len(kept)} rows"
     own, more = _counted(study, kept)
     notes += more
     if not progress.lost and not own:
@@ -368,8 +364,9 @@ def _check_folder(out: Path, named: Sequence[str | Path]) -> None:
     """Raise if the output folder is a file, or contains files of these names that no study has written."""
     require(not out.is_file(), f"{out} is a file; give a folder for the study's rows (--out)", UsageError)
     files.check_not_input([out, *(out / name for name in OURS)], named)
+    check_format(out)
     foreign = [name for name in (SUMMARY, REPORT) if (out / name).exists()]
-    if foreign and not any((out / name).exists() for name in (JOURNAL, WHOLE)):
+    if foreign and not (out / ROWS).exists():
         raise UsageError(f"{out} contains {', '.join(foreign)}, not written by a study; choose another folder (--out)")
 
 
