@@ -213,11 +213,11 @@ def from_urdf(
     for link in parse(source, str(path)).all("link"):
         link_name = link.attributes.get("name", "")
         for number, node in enumerate(link.all("collision")):
-            place = f"{path}, line {node.line}, link '{link_name}'"
-            shape = _shape(node.first("geometry"), folders, missing, place)
+            where = f"{path}, line {node.line}, link '{link_name}'"
+            shape = _shape(node.first("geometry"), folders, missing, where)
             if shape is not None:
                 shape_name = f"{link_name}_{number}" if number else link_name
-                _attach(model, geometry, link_name, shape_name, origin(node, place), shape)
+                _attach(model, geometry, link_name, shape_name, origin(node, where), shape)
     if geometry.ngeoms == 0:
         hint = f" ({len(missing)} meshes were not found, e.g. {missing[0]})" if missing else ""
         refuse_robot(path, f"no usable <collision> shape{hint}; give mesh_folders, or use capsules")
@@ -320,24 +320,24 @@ def _link_pose(model: Any, link: str, posture: Mapping[str, float]) -> Any:
     return data.oMf[link_frame(model, link)].copy()
 
 
-def _shape(node: Node | None, folders: Sequence[Path], missing: list[str], place: str) -> Any | None:
+def _shape(node: Node | None, folders: Sequence[Path], missing: list[str], where: str) -> Any | None:
     """Return the coal shape of a <geometry>; None, with an entry in `missing`, for an unreadable mesh."""
     kind = node.children[0] if node is not None and node.children else None
     if kind is None:
-        refuse_robot(place, "<collision> without a shape")
+        refuse_robot(where, "<collision> without a shape")
     if kind.tag == "mesh":
-        return _hull(kind, folders, missing, place)
+        return _hull(kind, folders, missing, where)
     if kind.tag == "box":
-        return _solid(kind.tag, numbers(kind, "size", place).tolist())
+        return _solid(kind.tag, numbers(kind, "size", where).tolist())
     if kind.tag not in ("sphere", "cylinder", "capsule"):
-        refuse_robot(place, f"<{kind.tag}> is not one of box, sphere, cylinder, capsule, mesh")
-    sizes = [numbers(kind, "radius", place, count=1)[0]]
+        refuse_robot(where, f"<{kind.tag}> is not one of box, sphere, cylinder, capsule, mesh")
+    sizes = [numbers(kind, "radius", where, count=1)[0]]
     if kind.tag != "sphere":
-        sizes.append(numbers(kind, "length", place, count=1)[0])
+        sizes.append(numbers(kind, "length", where, count=1)[0])
     return _solid(kind.tag, sizes)
 
 
-def _hull(node: Node, folders: Sequence[Path], missing: list[str], place: str) -> Any | None:
+def _hull(node: Node, folders: Sequence[Path], missing: list[str], where: str) -> Any | None:
     """Return the scaled convex hull of a mesh file; None, with an entry in `missing`, if unreadable."""
     _, coal = _libraries()
     name = node.attributes.get("filename", "")
@@ -345,7 +345,7 @@ def _hull(node: Node, folders: Sequence[Path], missing: list[str], place: str) -
     if path is None:
         missing.append(name)
         return None
-    scale = numbers(node, "scale", place, "1 1 1")
+    scale = numbers(node, "scale", where, "1 1 1")
     try:
         mesh = coal.MeshLoader().load(str(path), scale)
         mesh.buildConvexHull(True, "Qt")
