@@ -218,7 +218,7 @@ def inseparable(
     of_world = (highest <= margin) & ~changes
     of_arm = nearly_always | (highest <= margin + slack)
     touching = np.where(fixed, of_world, of_arm)
-    excluded = tuple(pairs[k] for k in np.flatnonzero(touching))
+    excluded = tuple(pairs[k] for k in np.flatnonzero(touching).tolist())
     return touching, excluded
 
 
@@ -517,15 +517,15 @@ def from_chain(
     solid = np.flatnonzero((length > MIN_LENGTH) | is_attached)
     arm_pairs: list[tuple[int, int]] = []
     if within:
-        for i in solid:
-            for j in solid:
+        for i in solid.tolist():
+            for j in solid.tolist():
                 # Neighbours in the chain overlap by construction.
                 gap = 0 if is_attached[i] or is_attached[j] else 1
                 if bodies[j] > bodies[i] + gap and frozenset((names[i], names[j])) not in ignored:
                     arm_pairs.append((i, j))
     planes = [] if floor is None else [Wall("floor", np.array([0.0, 0.0, 1.0]), floor)]
     planes += walls
-    moving = [i for i in solid if bodies[i]]
+    moving = [i for i in solid.tolist() if bodies[i]]
     world_pairs = [(i, number) for number in range(len(planes) + len(obstacles)) for i in moving]
     model = Capsules(
         chain=chain,

@@ -196,7 +196,8 @@ class Chain:
     @cached_property
     def driven(self) -> np.ndarray:
         """Indices of the elements moved by joints, including followers of mimic joints."""
-        return np.array([k for k, element in enumerate(self.elements) if element.joint is not None], dtype=int)
+        indices = [k for k, element in enumerate(self.elements) if element.joint is not None]
+        return np.array(indices, dtype=int)
 
     @cached_property
     def moving(self) -> np.ndarray:

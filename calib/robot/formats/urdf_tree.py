@@ -488,20 +488,20 @@ def _limits(node: Node, kind: str, where: str) -> tuple[float, float, float, flo
 
 def _body(node: Node, where: str) -> np.ndarray | None:
     """Return the standard parameters (10,) of a link about its frame; None without mass."""
-    place = f"{where}, line {node.line}, link '{node.attributes.get('name')}'"
+    link_where = f"{where}, line {node.line}, link '{node.attributes.get('name')}'"
     inertial = node.first("inertial")
     if inertial is None:
         return None
     mass_node, inertia_node = inertial.first("mass"), inertial.first("inertia")
     mass = 0.0
     if mass_node is not None:
-        mass = _number(mass_node, "value", 0.0, place)
+        mass = _number(mass_node, "value", 0.0, link_where)
     moments = [0.0] * 6
     if inertia_node is not None:
-        moments = [_number(inertia_node, key, 0.0, place) for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")]
+        moments = [_number(inertia_node, key, 0.0, link_where) for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")]
     if mass == 0.0 and not any(moments):
         return None
-    return transform_body(np.array([*moments, 0.0, 0.0, 0.0, mass]), origin(inertial, place))
+    return transform_body(np.array([*moments, 0.0, 0.0, 0.0, mass]), origin(inertial, link_where))
 
 
 def numbers(node: Node, key: str, where: str, default: str = "", count: int = 3, infinite: bool = False) -> np.ndarray:
