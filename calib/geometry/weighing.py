@@ -23,7 +23,7 @@ from calib.records import frozen
 from calib.robot.calibrated import CalibratedChain, CorrectedChain
 from calib.robot.chain import Chain
 
-# [m, rad, px] of estimated sigmas: computed positions are no more exact, nor is a fit of them
+# [m, rad, px] of estimated sigmas: no instrument of an arm is more exact, though computed positions are
 MIN_SIGMA = 1e-6
 # residuals over their sigmas: computed positions leave less
 MIN_NOISE = 1e-6
