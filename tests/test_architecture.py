@@ -149,9 +149,9 @@ def test_the_rooms_can_be_shut(monkeypatch):
     from calib.errors import UsageError
 
     monkeypatch.setattr(extensions, "_offers", dict)
-    assert extensions.offered("commands") == [] and extensions.merged("stages") == {}
+    assert extensions.Point("commands", "").all() == []
     with pytest.raises(UsageError):
-        extensions.needed("camera_guess")
+        extensions.Point("camera_guess", "").one()
     code = "import sys; sys.modules['calib.rooms'] = None; import calib; from calib.cli import run; "
     code += "from calib.data.poses.measurements import PoseMeasurements as Measured; import numpy as np; "
     code += "rng = np.random.default_rng(0); q = rng.uniform(-1, 1, (40, 6)); robot = calib.load('tx40'); "

@@ -42,13 +42,17 @@ from calib.dynamics import rigid_body
 from calib.dynamics.bodies import Bodies
 from calib.dynamics.torque_rows import BODIES
 from calib.estimation.triangles import retriangulate
-from calib.extensions import needed
+from calib.extensions import Point
 from calib.identification.identify import Identification, common_decimator
 from calib.identification.rows import Case, ObservationRows, observe, segments
 from calib.identification.settings import make_bodies, make_model
 from calib.records import Frozen, frozen
 from calib.robot.calibrated import CalibratedChain, as_calibrated
 from calib.robot.chain import Chain
+
+DEFLECTION_SENSITIVITY: Point[Callable[[Any, Any, Any], np.ndarray]] = Point(
+    "deflection_sensitivity", "derivative of an estimate by the joint corrections' coefficients"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +220,7 @@ def propagate(
     geometry, deviations, felt_by = None, np.full(count + len(TILTS), np.nan), matrix[:, :count]
     if covariance is not None:
         if deflected:
-            felt_by = np.hstack([felt_by, needed("deflection_sensitivity")(found, robot, cases)])
+            felt_by = np.hstack([felt_by, DEFLECTION_SENSITIVITY.one()(found, robot, cases)])
         geometry = frozen(felt_by @ covariance @ felt_by.T)
         own = np.sqrt(np.clip(np.diag(covariance)[:count], 0.0, None))
         deviations[:count] = np.where(own > 0.0, own, np.nan)

@@ -18,7 +18,7 @@ from calib.dynamics.torque_rows import POWER
 from calib.errors import MeasurementError, UsageError, refuse_data, require
 from calib.estimation.essential import Elimination, Rule, eliminate
 from calib.estimation.triangles import condition_numbers
-from calib.extensions import needed
+from calib.extensions import Point
 from calib.identification.friction.friction_ladder import FrictionCandidates, FrictionSelection, select_friction
 from calib.identification.friction.ripple import Ripple, find_all
 from calib.identification.loop import LoopResults, per_joint
@@ -33,6 +33,10 @@ from calib.identification.standstill import with_standstills, with_weights
 from calib.identification.time_folds import regimes
 from calib.robot.calibrated import CalibratedChain, as_calibrated
 from calib.robot.chain import Chain
+
+LOOP_RESULTS: Point[Callable[[IdentificationProblem, MethodEstimate], LoopResults]] = Point(
+    "loop_results", "results of simulating the recordings' closed loop"
+)
 
 Progress = Callable[[str], None]
 
@@ -211,7 +215,7 @@ def _identified(
     friction = friction.fitted(found.estimate.sigma[base.b :])
     if settings.loop is not None and not method.needs_controller:
         say("simulating the closed loop")
-    loop = LoopResults() if settings.loop is None else needed("loop_results")(problem, found)
+    loop = LoopResults() if settings.loop is None else LOOP_RESULTS.one()(problem, found)
     richer = model.with_terms(*friction.terms) if _sees_drives(model) else model
     dynamics = Dynamics(richer, np.concatenate([base.to_standard(values[: base.b]), values[base.b :]]))
     dynamics, ripples = _with_ripple(dynamics, cases, settings, say)

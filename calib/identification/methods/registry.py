@@ -3,11 +3,13 @@
 from collections.abc import Mapping
 
 from calib.errors import UsageError, one_of
-from calib.extensions import offered
+from calib.extensions import Point
 from calib.identification.methods.least_squares import OLS, WLS
 from calib.identification.methods.method import Method
 
-METHODS: Mapping[str, Method] = {one.name: one for group in ((OLS, WLS), *offered("methods")) for one in group}
+METHODS_OF_ROOMS: Point[tuple[Method, ...]] = Point("methods", "further methods")
+
+METHODS: Mapping[str, Method] = {one.name: one for group in ((OLS, WLS), *METHODS_OF_ROOMS.all()) for one in group}
 VERSIONS: Mapping[str, int] = {one.name: one.version for one in METHODS.values()}
 
 

@@ -21,9 +21,13 @@ from xml.parsers import expat
 import numpy as np
 
 from calib.errors import RobotError, listing, refuse_robot, refused_as, require, suggestion
-from calib.extensions import offered
+from calib.extensions import Point
 from calib.robot.chain import MIN_LIMIT, Joint
 from calib.transforms import from_xyz_rpy
+
+DESCRIPTIONS: Point[Any] = Point(
+    "descriptions", "a module: `takes` says whether it reads a file, `urdf` returns that robot as URDF"
+)
 
 XACRO = "this is a xacro file; name it so (robot.urdf.xacro)"
 _DECLARED = re.compile(rb"""^\s*<\?xml[^>]*?encoding\s*=\s*["']([A-Za-z0-9._-]+)["']""")
@@ -53,7 +57,7 @@ class Node:
 
 def converter(path: str | Path) -> Any:
     """Return the module of a room that converts this file to a URDF (``descriptions``); None where there is none."""
-    return next((room for room in offered("descriptions") if room.takes(str(path))), None)
+    return next((room for room in DESCRIPTIONS.all() if room.takes(str(path))), None)
 
 
 def is_urdf(path: Path) -> bool:
