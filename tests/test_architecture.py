@@ -53,7 +53,6 @@ HOMES = {
     "matplotlib": ["calib.procedure.", "calib.api.", "calib.rooms.", "calib.apps."],
     "jinja2": ["calib.procedure.report.templates", "calib.apps.controller_programs.program"],
     "typst": ["calib.rooms.certificate.rendering"],
-    "pyarrow": ["calib.rooms.studies.store"],
     "dask": ["calib.workers.cluster"],
     "distributed": ["calib.workers.cluster"],
     "fsspec": ["calib.rooms.fleet.stores"],

@@ -162,13 +162,13 @@ def identify_model(
     say("first fit")
     whole, source = (shape, "sizes") if cad is None else (cad, "cad")
     prior = None
-    found = partial(find_prior, model, base, whole=whole, source=source, noise=noise, effort=effort)
+    found = partial(find_prior, model, base, robot=whole, source=source, noise=noise, effort=effort)
     if _takes_prior(method, model, settings, source):
         prior = found(rows)
-        rows = with_weights(rows, prior.first.rest)
+        rows = with_weights(rows, prior.first.rest_weights)
         prior = tempered_prior(found, prior, rows, regimes(rows, cases, decimator))
     first = first_fit(rows, noise) if prior is None else prior.first
-    rows = with_weights(rows, first.rest)
+    rows = with_weights(rows, first.rest_weights)
     friction, loads = _richer_friction(model, base, rows, cases, decimator, first, prior, settings, progress)
     own = [None if k < model.inertial else model.columns[k - model.inertial] for k in base.kept]
     full = tuple(
@@ -178,7 +178,7 @@ def identify_model(
     if prior is not None and friction.terms:
         say("sizes beside richer friction")
         prior = found(full, groups=np.array(friction.groups), start=prior, tempering=prior.tempering)
-        full = tuple(with_weights(full, prior.first.rest))
+        full = tuple(with_weights(full, prior.first.rest_weights))
     problem = IdentificationProblem(
         model,
         base,

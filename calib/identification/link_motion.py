@@ -33,7 +33,8 @@ def with_link_motion(robot: CalibratedChain, case: Case, settings: Identificatio
     """Return a case with its links' motion (`Case.link`) by the robot's joint corrections; unchanged without any."""
     simulated = settings.loop is not None or method_named(settings.method).needs_simulation
     rigid = simulated or not settings.deflections or settings.torque_rows == POWER
-    chain, terms = robot.complete, joint_terms(robot.complete, robot.deflection)
+    chain = robot.complete
+    terms = joint_terms(robot.complete, robot.deflection)
     if rigid or not terms.terms or len(chain.driven) != chain.n:
         return case
     own = target_elements(chain, terms)
@@ -67,7 +68,8 @@ def bodies_torques(terms: Deflection, case: Case, settings: IdentificationSettin
     known = standard_parameters(terms.reference)
     values[: len(known)] = known
     for label, stated in settings.payloads.items():
-        if (load := settings.payload_values.get(label, stated.parameters)) is not None:
+        load = settings.payload_values.get(label, stated.parameters)
+        if load is not None:
             first = 10 * model.bodies.labels.index(label)
             values[first : first + 10] = load
     motion = case.motion

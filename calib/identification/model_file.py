@@ -208,7 +208,8 @@ def identified_masses(folder: str | Path, chain: Chain) -> np.ndarray:
     refuse_currents(folder, "a fit of the compliance")
     refuse_other_arm(folder, chain)
     _, dynamics = read_dynamics(folder)
-    bodies, result = dynamics.model.bodies, np.zeros((chain.n, 10))
+    bodies = dynamics.model.bodies
+    result = np.zeros((chain.n, 10))
     if not dynamics.model.inertial:
         refuse_option(folder, "has identified no bodies, hence no gravity torques; identify with motor or link torques")
     for row, label in enumerate(bodies.labels):

@@ -9,10 +9,10 @@ from calib.identification.methods import estimators
 from calib.identification.methods.least_squares import OLS, WLS
 from calib.identification.methods.method import Method
 
-METHODS: Mapping[str, Method] = {
-    method.name: method for method in (OLS, WLS, *estimators.METHODS, *simulated.METHODS, *survey.METHODS)
-}
-VERSIONS: Mapping[str, int] = {one.name: one.version for one in METHODS.values()}
+_METHODS = (OLS, WLS, *estimators.METHODS, *simulated.METHODS, *survey.METHODS)
+
+METHODS: Mapping[str, Method] = {method.name: method for method in _METHODS}
+VERSIONS: Mapping[str, int] = {method.name: method.version for method in _METHODS}
 
 
 def method_named(name: str) -> Method:

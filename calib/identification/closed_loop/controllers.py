@@ -85,7 +85,8 @@ def cascade(
     """
     if share != 1.0 and np.isfinite(reset).any():
         raise CalibError("a cascade with integral action needs the full reference velocity: set share = 1")
-    position, velocity = np.asarray(position, dtype=float), np.asarray(velocity, dtype=float)
+    position = np.asarray(position, dtype=float)
+    velocity = np.asarray(velocity, dtype=float)
     ki = velocity * position / np.asarray(reset, dtype=float)
     kp = velocity * (position + 1.0 / np.asarray(reset, dtype=float))
     return Controller(kp, velocity, ki, np.asarray(share), np.asarray(limit), np.asarray(np.inf))
@@ -100,7 +101,8 @@ def computed_torque(
         model: (10 B,) standard parameters; the drives' inertias and friction are those of the plant.
         frequency: ω [rad/s].
     """
-    kp, kd = np.full(n, frequency**2), np.full(n, 2 * damping * frequency)
+    kp = np.full(n, frequency**2)
+    kd = np.full(n, 2 * damping * frequency)
     return Controller(kp, kd, np.zeros(n), np.ones(n), np.asarray(limit), np.asarray(np.inf), model=frozen(model))
 
 
@@ -130,8 +132,10 @@ def stated_controller(loop: LoopSettings, n: int) -> Controller:
     return completed(pd(loop.per_joint("kp", n), loop.per_joint("kd", n), ki=loop.per_joint("ki", n)), loop, n)
 
 
-BAND = 20.0  # [Hz] the usual bandwidth of an industrial position loop
-ORDERS = (0, 1)  # of a PD; more for a controller with memory, at the price of noise
+# [Hz] the usual bandwidth of an industrial position loop
+BAND = 20.0
+# of a PD; more for a controller with memory, at the price of noise
+ORDERS = (0, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,8 +173,10 @@ def identify_controller(
     Raises:
         MeasurementError: where reference and log do not fit together, or the error is zero.
     """
-    error, tau = _error(reference, measured, rate), shaped(tau, np.shape(measured), "torques")
-    error, tau = low_pass(error, rate, band), low_pass(tau, rate, band)
+    error = _error(reference, measured, rate)
+    tau = shaped(tau, np.shape(measured), "torques")
+    error = low_pass(error, rate, band)
+    tau = low_pass(tau, rate, band)
     edge = border(rate, band)
     basis = np.linalg.qr(_instruments(reference, len(error), rate, band)[edge:-edge])[0]
     found = [_joint(error[edge:-edge, j], tau[edge:-edge, j], basis, orders) for j in range(error.shape[1])]
@@ -213,7 +219,8 @@ def _joint(
     if not np.ptp(error) > 0.0:
         raise MeasurementError("the position error is zero throughout: log measured positions, not the reference")
     na, nb = orders
-    first, count = max(orders), len(error)
+    first = max(orders)
+    count = len(error)
     own = basis[first:]
     columns = [tau[first - i : count - i] for i in range(1, na + 1)]
     columns += [error[first - i : count - i] for i in range(nb + 1)]

@@ -41,10 +41,14 @@ from calib.identification.methods.parameter_constraints import Constraints, hold
 from calib.identification.rows import Case, ObservationRows, observe, observe_terms, pool, triangulate
 from calib.records import frozen
 
-MAX_ROUNDS = 10  # iterations; 3 to 6 are usual
-MAX_RETREATS = 6  # halvings of a step to parameters that cannot be simulated (our choice)
-MAX_FOLLOWING = 1.25  # times the speed's noise, by which the simulated motion may be off the measured one (our choice)
-MAX_GAIN_RATIO = 1.25  # of distances from the reference, recorded and simulated: beyond, gains are others (our choice)
+# iterations; 3 to 6 are usual
+MAX_ROUNDS = 10
+# halvings of a step to parameters that cannot be simulated (our choice)
+MAX_RETREATS = 6
+# times the speed's noise, by which the simulated motion may be off the measured one (our choice)
+MAX_FOLLOWING = 1.25
+# of distances from the reference, recorded and simulated: beyond, gains are others (our choice)
+MAX_GAIN_RATIO = 1.25
 
 
 @dataclass(frozen=True)
@@ -142,11 +146,13 @@ class Instrumental:
     @property
     def off(self) -> np.ndarray:
         """Joints (from 0) whose given gains are wrong: recorded and simulated tracking errors differ."""
-        estimate, simulated = self.fit.estimate, self.problem.data.factors[:, :, : len(self.names)]
+        estimate = self.fit.estimate
+        simulated = self.problem.data.factors[:, :, : len(self.names)]
         sizes = np.maximum(np.sum((simulated @ estimate.values) ** 2, axis=1), 1e-300)
         # the torques' share that is unsure makes e_s = q_ref - q_s unsure, too
         unsure = np.sqrt(np.einsum("gij,jk,gik->g", simulated, estimate.covariance, simulated) / sizes)
-        unsure = unsure[-len(self.stray) :] if len(unsure) >= len(self.stray) else unsure.max()  # rows of the motors
+        # rows of the motors
+        unsure = unsure[-len(self.stray) :] if len(unsure) >= len(self.stray) else unsure.max()
         away = np.abs(np.log(np.maximum(np.nan_to_num(self.stray, nan=1.0), 1e-3)))
         return np.flatnonzero(away > np.log(MAX_GAIN_RATIO) + 5.0 * unsure)
 
@@ -177,7 +183,8 @@ class Instrumental:
 
         Zero where nothing binds, and for didim; see `instrumental_variables.by_free_instruments`.
         """
-        held, values = self.constrained, self.fit.estimate.values
+        held = self.constrained
+        values = self.fit.estimate.values
         if held is None or not len(held.normals) or not self.estimator.measured:
             return np.zeros(len(values))
         other = instrumental_variables.by_free_instruments(self.problem, self.std, values, held.normals)
@@ -231,7 +238,8 @@ def identify_instrumental(
             f"parallel robot motor or platform); found '{rows.name}'"
         )
     observed = [replace(observe(model, base.kept, case, decimator), names=base.names) for case, _ in cases]
-    data, friction = pool(triangulate(observed), model.rows), _Friction((), model, decimator, None)
+    data = pool(triangulate(observed), model.rows)
+    friction = _Friction((), model, decimator, None)
     if terms:
         loads = base.to_standard(wls(data, settled_std(data, 1e-3)).estimate.values)
         friction = _Friction(tuple(terms), model, decimator, loads)
@@ -242,14 +250,18 @@ def identify_instrumental(
         constraints = make_constraints(settings, model, base, base.names, [None] * base.b)
     task = _Fixed(model, base, cases, decimator, observed, ROUNDS[method], constraints, friction)
     ordinary = wls(data, settled_std(data, 1e-3))
-    plant, std = _regular(model, friction.terms, cases[0][1], inertia), ordinary.group_std
+    plant = _regular(model, friction.terms, cases[0][1], inertia)
+    std = ordinary.group_std
     before: LinearFit | None = None
     rounds: list[Round] = []
     try:
-        runs, retreats, tau = _runs(plant, cases), 0, 1.0
+        runs = _runs(plant, cases)
+        retreats = 0
+        tau = 1.0
     except NotConverged as error:
         raise CannotSimulate(str(error), error.last) from error
-    start, returns = plant, 0  # of the last step, and how often it was halved afterwards
+    # of the last step, and how often it was halved afterwards
+    start, returns = plant, 0
     for _ in range(limit):
         found = _estimate_round(task, runs, std, tau)
         task = task.after(found)
@@ -266,7 +278,9 @@ def identify_instrumental(
                 raise
             plant, runs = _nearer(start, plant, cases)
             retreats = returns
-        before, std, tau = found.fit, found.fit.group_std, found.tau
+        before = found.fit
+        std = found.fit.group_std
+        tau = found.tau
     kind = Diverged if len(rounds) > 2 and rounds[-1].change > rounds[1].change else NotConverged
     raise kind(
         f"instruments from simulation: parameters still change by {100 * rounds[-1].change:.3g} % after {limit} "
@@ -314,7 +328,8 @@ class _Fixed:
 
     def plant(self, old: Plant, found: _Found) -> Plant:
         """Return the simulated robot with an estimate; without motor torques, its motor inertias J are unchanged."""
-        own, b = found.fit.estimate.values, self.base.b
+        own = found.fit.estimate.values
+        b = self.base.b
         values = np.concatenate([self.base.to_standard(own[:b]), own[b:]])
         regular = old.parameters[len(values) :] * (not self.model.torque_rows.driven)
         return old.with_parameters(np.concatenate([values, regular]))
@@ -357,7 +372,8 @@ def _with_signs(
     drowned = np.append(signs, np.zeros(len(task.friction.terms), dtype=bool))
     if not drowned.any():
         return rows
-    motion, band = case.motion, 0.5 * case.motion.band
+    motion = case.motion
+    band = 0.5 * case.motion.band
     measured, expected = (slope(low_pass(one.motion.q, motion.rate, band), motion.rate) for one in (case, moved))
     away = np.sqrt(np.nanmean((measured - expected) ** 2, axis=0))
     followed = away <= MAX_FOLLOWING * motion.velocity_noise(band)
@@ -372,12 +388,15 @@ def _with_signs(
 def sign_noise(model: Any, motion: Motion) -> np.ndarray:
     """Return the velocity noise of all joints that drive terms of a model act on, passive ones included."""
     noise = motion.velocity_noise()
-    return model.joint_noise(noise) if hasattr(model, "joint_noise") else noise
+    if hasattr(model, "joint_noise"):
+        return model.joint_noise(noise)
+    return noise
 
 
 def _drowned_signs(model: IdentificationModel, columns: np.ndarray, case: Case) -> np.ndarray:
     """Return the mask (p,) of Coulomb columns of joints whose velocity noise exceeds the sign's smoothing."""
-    noise, found = sign_noise(model, case.motion), np.zeros(len(columns), dtype=bool)
+    noise = sign_noise(model, case.motion)
+    found = np.zeros(len(columns), dtype=bool)
     for place, k in enumerate(columns - model.inertial):
         if k < 0 or model.columns[k].shape != "sign":
             continue
@@ -433,7 +452,8 @@ def _runs(plant: Plant, cases: Sequence[tuple[Case, Loop]]) -> Runs:
     """Return the noise-free simulation of every recording's loop."""
     result: Runs = []
     for case, loop in cases:
-        robot, controller = plant.carrying(case.carried), loop.controller
+        robot = plant.carrying(case.carried)
+        controller = loop.controller
         if loop.design is not None:
             controller = controller.scaled(robot.inertia_diagonal(loop.reference.q[::200]) / loop.design)
         result.append(((case, loop), robot.run(controller, loop.reference, Sensing(every=loop.every))))
@@ -454,12 +474,16 @@ def _simulate_new(
             return task, found, tried, _runs(tried, task.cases), retreats
         except CalibError as error:
             problem = error
-        bound = task.constraints.raised() if task.constraints and found.bound and found.bound.postures else None
+        if task.constraints and found.bound and found.bound.postures:
+            bound = task.constraints.raised()
+        else:
+            bound = None
         if bound is not None:
             further = replace(task, constraints=bound)
             with suppress(NotConverged):
                 fit, held = _held_fit(further, found.problem, std, tau)
-                task, found = further, replace(found, fit=fit, bound=held)
+                task = further
+                found = replace(found, fit=fit, bound=held)
                 continue
         retreats += 1
     words = f"neither the estimate nor smaller steps can be simulated: {problem}{_if_weak(task, found, std)}"
@@ -493,16 +517,20 @@ def _if_weak(task: _Fixed, found: _Found, std: np.ndarray) -> str:
         return ""
     strength = instrumental_variables.strength(found.problem, std)
     words = f". The instruments are weak (Cragg-Donald {strength.cragg_donald:.2g}, sound above 10)"
-    return f"{words}: record faster motion, or positions with less noise" if strength.weak else ""
+    if strength.weak:
+        return f"{words}: record faster motion, or positions with less noise"
+    return ""
 
 
 def _stack(observed: Sequence[ObservationRows], simulated: Sequence[np.ndarray], measured: bool = True) -> Instruments:
     """Return the R factors of [Z W y], one group per torque row; without `measured`, those of [Z 0 y] (cheaper)."""
-    first, count = observed[0], observed[0].target.shape[1]
+    first = observed[0]
+    count = observed[0].target.shape[1]
     problem = instrumental_variables.unseen(first.names, first.units, count)
     for rows, z in zip(observed, simulated, strict=True):
         for row in range(count):
-            used = slice(None) if rows.present[:, row].all() else rows.present[:, row]  # no copy of all
+            # no copy of all
+            used = slice(None) if rows.present[:, row].all() else rows.present[:, row]
             own = z[used, row]
             w = rows.matrix[used, row] if measured else np.zeros_like(own)
             problem = instrumental_variables.instrument(own, w, rows.target[used, row], row, before=problem)
@@ -523,7 +551,8 @@ def _inflation(observed: Sequence[ObservationRows], fit: LinearFit) -> float:
 
 def _held_fit(task: _Fixed, problem: Instruments, std: np.ndarray, tau: float) -> tuple[LinearFit, Held | None]:
     """Return the estimate of an iteration, with the constraints if any are set."""
-    fit, own = task.estimator.fit(problem, std, tau), task.estimator
+    fit = task.estimator.fit(problem, std, tau)
+    own = task.estimator
     if task.constraints is None:
         return fit, None
     data = problem.least_squares() if own.measured else _simulated(problem)
@@ -551,7 +580,8 @@ def _stray(runs: Runs) -> np.ndarray:
     """Return the ratios (n,) of recorded to simulated tracking errors, by regression; NaN where noise hides them."""
     pairs = []
     for (case, loop), run in runs:
-        motion, used = case.motion, simulated_samples(case, run.t, loop)
+        motion = case.motion
+        used = simulated_samples(case, run.t, loop)
         asked = loop.reference.at(np.arange(len(run.t)) * loop.every)[0]
         asked, moved = (low_passed(x, motion)[used] for x in (asked, run.q))
         pairs.append((asked - motion.q, asked - moved))

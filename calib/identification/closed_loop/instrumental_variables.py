@@ -139,7 +139,10 @@ def iv(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1
         Unidentifiable: where Zᵀ W is singular, naming the columns concerned.
     """
     p = len(problem.names)
-    sigma = np.ones(problem.data.groups) if std is None else shaped(std, (problem.data.groups,), "std per group")
+    if std is None:
+        sigma = np.ones(problem.data.groups)
+    else:
+        sigma = shaped(std, (problem.data.groups,), "std per group")
     factor = combine(problem.data, sigma)
     values, inverse, _ = solve_triangle(_projected(factor, problem.names), problem.names)
     squares = problem.data.residual_squares(np.concatenate([np.zeros(p), values]))
@@ -173,7 +176,8 @@ def strength(problem: Instruments, std: np.ndarray | None = None) -> InstrumentS
         problem: triangles of [Z W y].
         std: as in `iv`.
     """
-    p, rows = len(problem.names), int(problem.data.rows.sum())
+    p = len(problem.names)
+    rows = int(problem.data.rows.sum())
     factor = combine(problem.data, std)
     explained = factor[:p, p : 2 * p]
     norms = np.linalg.norm(factor[:, p : 2 * p], axis=0)
@@ -204,7 +208,8 @@ def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: f
         std: as in `iv`; unlike groups tested with equal weights give false alarms.
         inflation: >= 1; autocorrelated residuals without it give false alarms.
     """
-    p, rows = len(problem.names), problem.data.rows.sum() / inflation
+    p = len(problem.names)
+    rows = problem.data.rows.sum() / inflation
     factor = combine(problem.data, std)
     whole = factor[:, p : 2 * p]
     norms = np.linalg.norm(whole, axis=0)
@@ -217,7 +222,8 @@ def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: f
     dof = int(rows) - p - k
     require(k > 0 and dof > 0, "nothing to test: the instruments equal the columns, or there are too few rows")
     target = factor[:, -1]
-    first, second = _rss(whole, target), _rss(columns[:, split.kept], target)
+    first = _rss(whole, target)
+    second = _rss(columns[:, split.kept], target)
     f = (first - second) / k / (second / (rows - p - k)) / inflation if second > 0.0 else np.inf
     return ExogeneityTest(float(f), (k, dof), float(fdtrc(k, dof, f)))
 
@@ -249,7 +255,9 @@ def by_free_instruments(problem: Instruments, std: np.ndarray, held: np.ndarray,
     factor = combine(problem.data, std)
     norms = np.linalg.norm(factor[:, p : 2 * p], axis=0)
     free = null_space(normals / norms) / norms[:, None]
-    z, w, rest = factor[:p, :p] @ free, factor[:p, p : 2 * p] @ free, factor[:p, -1] - factor[:p, p : 2 * p] @ held
+    z = factor[:p, :p] @ free
+    w = factor[:p, p : 2 * p] @ free
+    rest = factor[:p, -1] - factor[:p, p : 2 * p] @ held
     return np.asarray(held + free @ np.linalg.solve(z.T @ w, z.T @ rest))
 
 

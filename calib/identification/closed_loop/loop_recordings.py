@@ -95,7 +95,8 @@ def close_loops(
     ordered = sorted(stretches, key=lambda part: -len(part.motion))
     controller, identified, notes = _controller(loop, ordered[0])
     shifts: dict[str, float] = {}
-    for part in ordered:  # the longest part of each recording tells
+    # the longest part of each recording tells
+    for part in ordered:
         if part.name not in shifts and loop.timing != "stated":
             shifts[part.name], said = _shift(part, loop, partial(_fed_forward, controller, loop, cad, model))
             notes += said
@@ -105,7 +106,8 @@ def close_loops(
         reference, every = _make_reference(part.motion, loop.rate, shifts.get(part.name, 0.0))
         own = _fed_forward(controller, loop, cad, model, part.motion, reference, every)
         if loop.reference_velocity == "difference":
-            late = np.diff(reference.q, axis=0) / reference.period  # by half a period
+            # by half a period
+            late = np.diff(reference.q, axis=0) / reference.period
             reference = replace(reference, v=np.vstack([reference.v[:1], late]))
         pairs.append((take(part, _inside(part.motion)), Loop(own, reference, every, design)))
     return ClosedLoops(tuple(pairs), controller, identified, notes)
@@ -143,7 +145,8 @@ def _compare(motion: Motion, asked: np.ndarray, joint: int, max_difference: floa
     `max_difference`: largest deviation, over a joint's motion, from its own reference (our choice).
     """
     q = motion.q[:, joint]
-    spread, size = np.std(q), np.std(asked)
+    spread = np.std(q)
+    size = np.std(asked)
     away = float(np.sqrt(np.mean((q - asked) ** 2)) / spread)
     if away < max_difference:
         return
@@ -176,7 +179,8 @@ def _shift(part: Case, loop: LoopSettings, fed_forward: Callable[..., Controller
         MeasurementError: for a reference that is late or early by the motors' torques.
         UsageError: for a designed motion without motor torques to time it by.
     """
-    motion, estimated = part.motion, part.motion.located is not None or loop.timing == "estimated"
+    motion = part.motion
+    estimated = part.motion.located is not None or loop.timing == "estimated"
     if motor_torques(part) is None:
         if estimated:
             raise UsageError(
@@ -197,7 +201,8 @@ def _shift(part: Case, loop: LoopSettings, fed_forward: Callable[..., Controller
             f"{part.name}: {where}the reference was moved {shown} {way}; the controller explains "
             f"{100 * (1 - found.left):.3g} % of the torques, one σ of time changes them by {100 * found.effect:.2g} %",
         )
-    min_shift, min_gain, max_left = 1.5e-3, 2.0, 0.5  # [s], and shares of the torques (our choice)
+    # [s], and shares of the torques (our choice)
+    min_shift, min_gain, max_left = 1.5e-3, 2.0, 0.5
     late = abs(found.seconds) > max(5.0 * found.sigma, min_shift)
     if late and found.left < max_left and found.before > min_gain * found.left:
         refuse_data(
@@ -240,7 +245,8 @@ def periods_per_sample(motion: Motion, rate: float | None = None) -> float:
     Raises:
         UsageError: where the control rate is below the motion's.
     """
-    min_rate = 1000.0  # of a controller whose rate is not stated [Hz] (our choice)
+    # of a controller whose rate is not stated [Hz] (our choice)
+    min_rate = 1000.0
     if rate is None:
         return max(1, int(np.ceil(min_rate / motion.rate - 1e-6)))
     every = round(rate / motion.rate)
@@ -251,7 +257,9 @@ def periods_per_sample(motion: Motion, rate: float | None = None) -> float:
             f"[loop] rate: {rate:g} Hz is below {motion.rate:.6g} Hz, the rate of {motion.file}: no controller is "
             "slower than its log; check the unit (Hz)"
         )
-    return every if abs(rate / motion.rate - every) <= max_rounding * every else rate / motion.rate
+    if abs(rate / motion.rate - every) <= max_rounding * every:
+        return every
+    return rate / motion.rate
 
 
 def _inside(motion: Motion, settling_time: float = 0.2) -> slice:
@@ -280,7 +288,8 @@ def _controller(loop: LoopSettings, case: Case) -> tuple[Controller, IdentifiedC
         return identify_controller(reference, motion.q, tau, motion.rate, band, orders, loop.integral)
 
     found = identified(_best_shift(identified) if motion.located is not None or loop.timing == "estimated" else 0.0)
-    kp, kd = found.controller.kp, found.controller.kd
+    kp = found.controller.kp
+    kd = found.controller.kd
     bad = np.flatnonzero((kp <= 0.0) | (kd <= 0.0))
     shown = ", ".join(f"{x:.4g}/{y:.3g} ({share:.0f} %)" for x, y, share in zip(kp, kd, found.explained))
     if len(bad):
@@ -295,10 +304,12 @@ def _controller(loop: LoopSettings, case: Case) -> tuple[Controller, IdentifiedC
 
 def _best_shift(identified: Callable[[float], IdentifiedController]) -> float:
     """Return the shift of the reference [s] with which an identified controller explains the torques best."""
-    middle, step = 0.0, 0.01  # within 0.03 s of where positions match best (our choice)
+    # within 0.03 s of where positions match best (our choice)
+    middle, step = 0.0, 0.01
     while step > 1e-6:
         near = middle + step * np.arange(-3, 4)
-        middle, step = max(near, key=lambda shift: float(np.mean(identified(shift).explained))), step / 3.0
+        middle = max(near, key=lambda shift: float(np.mean(identified(shift).explained)))
+        step = step / 3.0
     return float(middle)
 
 
@@ -366,7 +377,8 @@ def low_passed(q: np.ndarray, motion: Motion, cutoff: np.ndarray | None = None) 
     Args:
         cutoff: (n,) of another of its filters [Hz].
     """
-    result, cutoffs = np.empty_like(q), motion.cutoff if cutoff is None else cutoff
+    result = np.empty_like(q)
+    cutoffs = motion.cutoff if cutoff is None else cutoff
     for f in np.unique(cutoffs):
         own = cutoffs == f
         result[:, own] = low_pass(q[:, own], motion.rate, float(f))

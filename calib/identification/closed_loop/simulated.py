@@ -33,7 +33,8 @@ class LoopEstimate(MethodEstimate):
 
     def testable(self) -> tuple[Triangles, np.ndarray, np.ndarray]:
         """Return R factors on which least squares gives this estimate, with std and inflation (g,), for tests."""
-        if (own := self.instrumental) is None:
+        own = self.instrumental
+        if own is None:
             return super().testable()
         return own.problem.testable(own.fit, own.std), np.ones(1), np.array([own.inflation])
 
@@ -43,7 +44,9 @@ def attempted_in_loop(
 ) -> LoopEstimate:
     """Return the result of `run` on a problem with its loops and computing time; a failure is returned as a status."""
     found = attempted(method, problem, run)
-    return found if isinstance(found, LoopEstimate) else LoopEstimate(**vars(found), loops=loops)
+    if isinstance(found, LoopEstimate):
+        return found
+    return LoopEstimate(**vars(found), loops=loops)
 
 
 @dataclass(frozen=True)
@@ -190,9 +193,12 @@ def _weakness(found: Instrumental) -> list[Finding]:
 
 
 def _distance(found: Instrumental) -> list[Finding]:
-    max_miss = 10.0  # [%] of a joint's motion by which the simulated robot may miss the recorded one (our choice)
+    # [%] of a joint's motion by which the simulated robot may miss the recorded one (our choice)
+    max_miss = 10.0
     joints = [f"{x:.3g} % at joint {j + 1}" for j, x in enumerate(found.distance) if not x < max_miss]
-    return [finding("loop-not-followed", joints=joints)] if joints else []
+    if joints:
+        return [finding("loop-not-followed", joints=joints)]
+    return []
 
 
 def _gains(found: Instrumental) -> list[Finding]:
@@ -203,7 +209,9 @@ def _gains(found: Instrumental) -> list[Finding]:
 
 def _torques(found: Instrumental) -> list[Finding]:
     """Return the finding on torque rows that the simulated motion does not explain, though the measured one does."""
-    case, direct, own = found.rows[0][0], found.direct, found.own
+    case = found.rows[0][0]
+    direct = found.direct
+    own = found.own
     labels = case.torque_rows.numbered(case.motion.n)
     rows = [f"{direct[k]:.3g} % for {own[k]:.3g} % at joint {labels[k]}" for k in found.unexplained]
     return [finding("loop-unexplained", rows=rows)] if rows else []
@@ -211,7 +219,9 @@ def _torques(found: Instrumental) -> list[Finding]:
 
 def _biased(found: Instrumental) -> list[Finding]:
     """Return the finding on a bias of least squares; none if the bias is small or the simulated loop fits poorly."""
-    shift, min_shift = found.shift, 1.0  # standard deviations of a shift that is worth a word (our choice)
+    # standard deviations of a shift that is worth a word (our choice)
+    shift = found.shift
+    min_shift = 1.0
     if not found.verdict.biased() or not found.valid or not found.explains or shift.max() < min_shift:
         return []
     names = [f"{found.names[k]} by {shift[k]:.2g} σ" for k in np.argsort(-shift)[:5]]
@@ -222,14 +232,17 @@ def _blurred(found: Instrumental, loops: ClosedLoops) -> list[Finding]:
     """Return the finding on joints whose Coulomb sign is mainly velocity noise, which instruments cannot correct."""
     if not found.estimator.measured:
         return []
-    noise, max_blur = sign_noise(found.plant, loops.pairs[0][0].motion), 3.0  # widths of the sign (our choice)
+    # widths of the sign (our choice)
+    noise = sign_noise(found.plant, loops.pairs[0][0].motion)
+    max_blur = 3.0
     signs = [one for one in found.plant.terms if one.shape == "sign"]
     blurred = {one.name: noise[one.acts[0][0]] / one.settings[-1] for one in signs}
     joints = [f"{size:.2g} at {name}" for name, size in blurred.items() if size > max_blur]
     return [finding("noisy-signs", joints=joints)] if joints else []
 
 
-SIGMAS = 5.0  # of both together, by which a parameter differs surely (our choice)
+# of both together, by which a parameter differs surely (our choice)
+SIGMAS = 5.0
 
 
 def disagreement(problem: IdentificationProblem, found: MethodEstimate, test: LoopTest) -> LoopDisagreement | None:
@@ -242,17 +255,24 @@ def disagreement(problem: IdentificationProblem, found: MethodEstimate, test: Lo
     """
     if not (found.found and found.alone and isinstance(found, LoopEstimate)):
         return None
-    own, instruments = found.estimate, test.found
-    max_beside_instruments = 1.2  # times the torque that instruments leave unexplained (our choice)
-    max_beside_wls = 2.0  # the same beside least squares, of which it is the least that there is (our choice)
+    own = found.estimate
+    instruments = test.found
+    # times the torque that instruments leave unexplained (our choice)
+    max_beside_instruments = 1.2
+    # the same beside least squares, of which it is the least that there is (our choice)
+    max_beside_wls = 2.0
     if instruments is not None and instruments.valid and len(instruments.names) == len(own.values):
-        name, other, limit = instruments.estimator.name, instruments.fit.estimate, max_beside_instruments
+        name = instruments.estimator.name
+        other = instruments.fit.estimate
+        limit = max_beside_instruments
         left, beside = (instruments.simulated_error(x.values) for x in (own, other))
     else:
         plain = WLS.estimate(problem)
         if not plain.found:
             return None
-        name, other, limit = "wls", plain.estimate, max_beside_wls
+        name = "wls"
+        other = plain.estimate
+        limit = max_beside_wls
         left, beside = (problem.pooled.relative_errors(x.values) for x in (own, other))
     away = np.abs(own.values - other.values) / np.maximum(np.hypot(own.sigma, other.sigma), 1e-300)
     worst = int(np.argmax(away))
@@ -272,7 +292,8 @@ def disagreement(problem: IdentificationProblem, found: MethodEstimate, test: Lo
 def _factors(problem: IdentificationProblem, own: np.ndarray, other: np.ndarray) -> tuple[float, ...]:
     """Return for each torque row the ratio (regression slope) of the torques of two estimates."""
     factors = problem.pooled.factors[:, :, :-1]
-    mine, theirs = factors @ own, factors @ other
+    mine = factors @ own
+    theirs = factors @ other
     return tuple(map(float, np.sum(mine * theirs, axis=1) / np.maximum(np.sum(theirs**2, axis=1), 1e-300)))
 
 
@@ -291,11 +312,14 @@ def loop_results(problem: IdentificationProblem, estimate: MethodEstimate) -> Lo
 
 def _metrics(test: LoopTest, beside: bool) -> LoopMetrics:
     """Return the metrics of a test by simulation."""
-    found, loops = test.found, test.loops
+    found = test.found
+    loops = test.loops
     notes = () if loops is None else loops.notes
     if found is None or loops is None:
         return LoopMetrics(test.failure, notes, valid=False, explains=False)
-    identified, strength, apart = loops.identified, found.strength, found.apart
+    identified = loops.identified
+    strength = found.strength
+    apart = found.apart
     if apart.any():
         notes += (
             f"with the instruments of unbound parameters alone (Janot's slides) the estimate is at most "

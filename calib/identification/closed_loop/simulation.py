@@ -32,7 +32,8 @@ from calib.identification.loop import Controller
 from calib.records import frozen, shaped
 
 Packed = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-LINEAR = ("acceleration", "velocity", "one")  # shapes that the kernels hold as matrices; the others are acts
+# shapes that the kernels hold as matrices; the others are acts
+LINEAR = ("acceleration", "velocity", "one")
 LOWER = "these gains cannot stabilise this robot at this rate; lower kp and kd (check their unit), or the delay"
 
 
@@ -172,7 +173,8 @@ def simulate(
     from calib.identification.closed_loop import loop_kernels
 
     sensing = Sensing() if sensing is None else sensing
-    n, count = plant.bodies.n, len(reference.t)
+    n = plant.bodies.n
+    count = len(reference.t)
     rng = np.random.default_rng(seed)
     noise = {name: np.broadcast_to(getattr(sensing, name), (n,)) for name in ("sigma_q", "push", "sigma_tau")}
     drawn = {name: _draw(rng, size, count) for name, size in noise.items()}
@@ -233,8 +235,12 @@ def forward_dynamics(
     from calib.identification.closed_loop import loop_kernels
 
     q, v, tau = (np.ascontiguousarray(shaped(x, (len(q), plant.bodies.n), "states")) for x in (q, v, tau))
-    out, count = np.empty_like(q), len(plant.parameters)
-    values = np.empty((0, count)) if parameters is None else shaped(parameters, (len(q), count), "parameters")
+    out = np.empty_like(q)
+    count = len(plant.parameters)
+    if parameters is None:
+        values = np.empty((0, count))
+    else:
+        values = shaped(parameters, (len(q), count), "parameters")
     layout = layout_of(plant)
     failed = loop_kernels.forward_dynamics(*packed(plant), *layout, np.ascontiguousarray(values), q, v, tau, out)
     require(failed < 0, f"sample {failed}: the inertia matrix is not positive definite", CannotSimulate)
@@ -259,7 +265,8 @@ def _coloured(white: np.ndarray, step: float) -> np.ndarray:
 
 def layout_of(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the index arrays by which `loop_kernels.set_parameters` writes parameters into the output of `packed`."""
-    n, first = plant.bodies.n, plant.inertial
+    n = plant.bodies.n
+    first = plant.inertial
     order = np.ascontiguousarray(np.broadcast_to(plant.bodies.order, (plant.bodies.count, 10)), dtype=np.int64)
     entries: list[tuple[int, int, int]] = []
     shares: list[float] = []
@@ -278,7 +285,8 @@ def layout_of(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
 
 def packed(plant: Plant) -> Packed:
     """Return the robot model as arrays in the layout of the kernels: tree, body, linear, kinds and acts."""
-    bodies, n = plant.bodies.count, plant.bodies.n
+    bodies = plant.bodies.count
+    n = plant.bodies.n
     parents = np.where(plant.bodies.parents < 0, bodies, plant.bodies.parents)
     links = np.column_stack([parents, plant.bodies.kinds, plant.bodies.coordinates]).astype(np.int64)
     linear, acts = _drives(plant.terms, plant.parameters[10 * bodies :], n)
@@ -309,7 +317,8 @@ def _drives(terms: Sequence[DriveTerm], values: np.ndarray, n: int, ramp: float 
     """
     from calib.dynamics import shape_kernels
 
-    linear, acts = np.zeros((n, 2 * n + 1)), []
+    linear = np.zeros((n, 2 * n + 1))
+    acts = []
     for one, value in zip(terms, values, strict=True):
         for row, motion in one.acts:
             if one.shape == "one":
@@ -319,7 +328,10 @@ def _drives(terms: Sequence[DriveTerm], values: np.ndarray, n: int, ramp: float 
             for joint, weight in motion:
                 weights[joint] += weight
             if one.shape not in LINEAR:
-                settings = [*one.settings, ramp * one.settings[0]] if one.shape == "dead" else [*one.settings]
+                if one.shape == "dead":
+                    settings = [*one.settings, ramp * one.settings[0]]
+                else:
+                    settings = [*one.settings]
                 code = getattr(shape_kernels, one.shape.upper())
                 acts.append((row, code, value, [*settings, *[0.0] * (7 - len(settings))], weights))
             else:
@@ -350,7 +362,8 @@ def failure(status: int, time: float, where: str | None = None) -> NotConverged:
 def feed_forward(believed: Plant, reference: Reference) -> np.ndarray:
     """Return the torques (N, n) of the controller's robot model along the reference, drives included [N m or N]."""
     model = IdentificationModel(believed.bodies, believed.terms)
-    block = 4096  # instants at a time
+    # instants at a time
+    block = 4096
     parts = [slice(k, k + block) for k in range(0, len(reference.t), block)]
     states = ((reference.q[part], reference.v[part], reference.a[part]) for part in parts)
     return np.concatenate([model.torque(believed.parameters, *each) for each in states])

@@ -21,7 +21,8 @@ from calib.identification.closed_loop.controllers import Reference
 from calib.identification.loop import Controller
 from calib.identification.rows import Case
 
-MAX_SHIFT = 0.5  # [s] by which a reference may be off (this and all below: our choice)
+# [s] by which a reference may be off (this and all below: our choice)
+MAX_SHIFT = 0.5
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,8 @@ class _Law:
     """Control law of a recording as splines in time: reference, measured positions and torques, low-passed."""
 
     def __init__(self, case: Case, reference: Reference, every: float, controller: Controller, band: float) -> None:
-        rate, n = case.motion.rate, case.motion.n
+        rate = case.motion.rate
+        n = case.motion.n
         self.controller = controller
         self.t = np.arange(len(case.motion)) / rate
         place = np.arange(len(self.t)) * every
@@ -90,16 +92,19 @@ class _Law:
             ahead = CubicSpline(np.arange(len(controller.ahead)), controller.ahead)(place)
             self.ahead = low_pass(ahead, rate, band)
         edge = border(rate, band)
-        free = (np.abs(parts[2]) < 0.98 * controller.limit).all(axis=1)  # saturated ones follow no law
+        # saturated ones follow no law
+        free = (np.abs(parts[2]) < 0.98 * controller.limit).all(axis=1)
         inside = (np.arange(len(self.t)) >= edge) & (np.arange(len(self.t)) < len(self.t) - edge)
         self.rows = np.flatnonzero(inside & free)
         self.late = controller.delay * reference.period
         lag = 0.0 if controller.cutoff is None else 1.0 / (2 * np.pi * controller.cutoff)
-        self.speed_late = self.late + 0.5 * reference.period + lag  # the measured speed is a backward difference
+        # the measured speed is a backward difference
+        self.speed_late = self.late + 0.5 * reference.period + lag
 
     def linearised(self, shift: float) -> tuple[np.ndarray, np.ndarray]:
         """Return residual torques (M, n), without their means, and the law's derivative with respect to the shift."""
-        own, now = self.controller, self.t - self.late
+        own = self.controller
+        now = self.t - self.late
         asked = [self.asked(np.clip(now - shift, self.t[0], self.t[-1]), order) for order in range(3)]
         error = asked[0] - self.measured(now)
         speed = own.share * asked[1] - self.measured(self.t - self.speed_late, 1)
@@ -129,9 +134,12 @@ class _Law:
 
 def _by_positions(asked: CubicSpline, measured: CubicSpline, t: np.ndarray) -> float:
     """Return the shift [s] of the reference at which it is nearest to the measured positions, at times t (M,)."""
-    shift, low, high = 0.0, float(asked.x[0]), float(asked.x[-1])
+    shift = 0.0
+    low = float(asked.x[0])
+    high = float(asked.x[-1])
     for _ in range(30):
-        rest, slopes = measured(t) - asked(np.clip(t - shift, low, high)), -asked(np.clip(t - shift, low, high), 1)
+        rest = measured(t) - asked(np.clip(t - shift, low, high))
+        slopes = -asked(np.clip(t - shift, low, high), 1)
         size = np.maximum(measured(t).var(axis=0), 1e-300)
         step = float(np.sum(rest * slopes / size) / max(np.sum(slopes**2 / size), 1e-300))
         shift = float(np.clip(shift + step, -MAX_SHIFT, MAX_SHIFT))
@@ -161,18 +169,21 @@ def check_no_copy(motion: Motion, asked: np.ndarray) -> None:
     """
     moves = np.ptp(motion.q, axis=0) > 1e-3
     t = np.arange(len(motion)) / motion.rate
-    edge = 4 * border(motion.rate, float(motion.cutoff.min()))  # the filters' ends differ
+    # the filters' ends differ
+    edge = 4 * border(motion.rate, float(motion.cutoff.min()))
     rows = t[edge:-edge]
     if len(rows) < 10 or not moves.any():
         return
     measured, reference = (CubicSpline(t, x[:, moves]) for x in (motion.q, asked))
     shift = _by_positions(reference, measured, rows)
     rest = measured(rows) - reference(np.clip(rows - shift, t[0], t[-1]))
-    share = 0.01  # of the positions' noise in the band; no commanded motion has that of the encoders
+    # of the positions' noise in the band; no commanded motion has that of the encoders
+    share = 0.01
     noise = (motion.cutoffs.noise * np.sqrt(2.0 * motion.cutoff / motion.rate))[moves]
     exact = np.sqrt(np.mean(rest**2, axis=0)) < np.maximum(share * noise, 1e-7 * measured(rows).std(axis=0))
     shares = _noise_shares(motion, measured(rows), rest, np.flatnonzero(moves))
-    max_share = 0.1  # of the noise's power in the distance from a copy; from a commanded motion it is all (our choice)
+    # of the noise's power in the distance from a copy; from a commanded motion it is all (our choice)
+    max_share = 0.1
     if exact.all() or (len(shares) and np.median(shares) < max_share):
         late = f", {1e3 * -shift:.4g} ms later" if abs(shift) > 1e-5 else ""
         refuse_data(
@@ -188,13 +199,16 @@ def _noise_shares(motion: Motion, measured: np.ndarray, rest: np.ndarray, joints
 
     In the lowest octave in which the positions' spectrum is at the floor of their noise, below f_q.
     """
-    from scipy.signal import welch  # slow to load
+    # slow to load
+    from scipy.signal import welch
 
-    size = min(len(measured), max(64, int(4.0 * motion.rate)))  # windows of 4 s
+    # windows of 4 s
+    size = min(len(measured), max(64, int(4.0 * motion.rate)))
     f, power = welch(measured, motion.rate, "hann", size, detrend="linear", axis=0)
     left = welch(rest, motion.rate, "hann", size, detrend="linear", axis=0)[1]
     floor = 2.0 * motion.cutoffs.noise[joints] ** 2 / motion.rate
-    above, min_bins = 4.0, 8  # times the floor that are still noise; frequencies that make a spectrum (our choice)
+    # times the floor that are still noise; frequencies that make a spectrum (our choice)
+    above, min_bins = 4.0, 8
     result = []
     for column, joint in enumerate(joints):
         quiet = (power[:, column] < above * floor[column]) & (f > 0.0) & (f < 0.8 * motion.cutoff[joint])

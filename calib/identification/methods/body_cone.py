@@ -52,22 +52,30 @@ class BodyCone(Frozen):
         Raises:
             NotConverged: where no bodies satisfy the bounds.
         """
-        p, count, base = len(factor) - 1, len(self.labels), len(self.transform)
+        p = len(factor) - 1
+        count = len(self.labels)
+        base = len(self.transform)
         unit = np.linalg.norm(factor[:p, :p], axis=0)
         size = max(1.0, float(np.linalg.norm(factor[:p, p])))
-        R, z = factor[:p, :p] / unit, factor[:p, p] / size  # β = size · b / unit
-        unit_length = 0.1  # [m] of a body of one kilogram, in whose units the program is written
+        # β = size · b / unit
+        R = factor[:p, :p] / unit
+        z = factor[:p, p] / size
+        # [m] of a body of one kilogram, in whose units the program is written
+        unit_length = 0.1
         root = np.diag([unit_length, unit_length, unit_length, 1.0])
-        block = pseudo_inertia.to_standard(root @ pseudo_inertia.UNITS @ root).T  # of the unknowns' pseudo-inertia
+        # of the unknowns' pseudo-inertia
+        block = pseudo_inertia.to_standard(root @ pseudo_inertia.UNITS @ root).T
         made = unit[:base, None] / size * self.transform @ block_diag(*[block] * count, np.eye(len(self.positive)))
         made = np.asarray(
             block_diag(made, np.eye(p - base))
         )  # b of bodies and terms, and of columns that are none of theirs
         bodies = pseudo_inertia.unknown_bodies(count, made.shape[1] - 10 * count)
-        max_trace = 1e4  # of a body in those units: keeps finite what the data do not tell
+        # of a body in those units: keeps finite what the data do not tell
+        max_trace = 1e4
         rows = [-np.einsum("irrj->ij", bodies) / max_trace]
         rows.append(np.eye(made.shape[1])[10 * count : 10 * count + len(self.positive)][self.positive])
-        low, high = np.isfinite(lower), np.isfinite(upper)
+        low = np.isfinite(lower)
+        high = np.isfinite(upper)
         sides = np.vstack([matrix[low], -matrix[high]]) / unit * size
         lengths = np.linalg.norm(sides, axis=1, keepdims=True)
         edges = np.concatenate([lower[low], -upper[high]]) / lengths[:, 0]
@@ -77,13 +85,15 @@ class BodyCone(Frozen):
         b = made @ found.values
         # the gradient's part that the cone balances
         held = (R.T @ (R @ b - z) - sides.T @ found.rows[len(offset) - len(edges) :])[:base]
-        min_multiplier = 1e-6  # of the gradient, from which on the cone holds the optimum
+        # of the gradient, from which on the cone holds the optimum
+        min_multiplier = 1e-6
         if np.abs(held).max() < min_multiplier * max(float(np.abs(R.T @ z).max()), 1e-300):
             return None
         normal = np.zeros(p)
         normal[:base] = held
         eigenvalues = np.linalg.eigvalsh(bodies @ found.values)
-        max_on_border = 1e-4  # of a body's largest moment in those units, below which it counts as on the border
+        # of a body's largest moment in those units, below which it counts as on the border
+        max_on_border = 1e-4
         border = eigenvalues[:, 0] < max_on_border * np.maximum(eigenvalues[:, -1], max_on_border)
         labels = tuple(label for label, near in zip(self.labels, border) if near)
         return _Plane(normal * unit / size, float(normal @ b), labels)

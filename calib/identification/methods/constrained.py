@@ -46,7 +46,8 @@ class Definite:
 
     def satisfied(self, sizes: np.ndarray) -> bool:
         """Return whether the smallest eigenvalues minus `least` (K,) satisfy the constraint."""
-        max_violation = 1e-3  # of the least eigenvalue, by which a matrix that did not enter may miss it (our choice)
+        # of the least eigenvalue, by which a matrix that did not enter may miss it (our choice)
+        max_violation = 1e-3
         return bool((sizes >= -max_violation * self.least).all())
 
 
@@ -59,7 +60,8 @@ def contradicting(matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> t
 
     unit = np.linalg.norm(matrix, axis=0)
     scaled = matrix / np.where(unit > 0.0, unit, 1.0)
-    low, high = np.isfinite(lower), np.isfinite(upper)
+    low = np.isfinite(lower)
+    high = np.isfinite(upper)
     rows = np.vstack([-scaled[low], scaled[high]])
     limit = np.concatenate([-lower[low], upper[high]])
     size = np.maximum(np.linalg.norm(rows, axis=1), 1e-300)
@@ -94,7 +96,8 @@ def restricted(covariance: np.ndarray, factor: np.ndarray, normals: np.ndarray) 
     if not free.shape[1]:
         return np.zeros((p, p))
     upper = factor[:p, :p] / norms
-    shrink = free @ np.linalg.lstsq(upper @ free, upper)[0] * norms / norms[:, None]  # P
+    # P
+    shrink = free @ np.linalg.lstsq(upper @ free, upper)[0] * norms / norms[:, None]
     return np.asarray(shrink @ covariance @ shrink.T)
 
 
@@ -146,15 +149,18 @@ def within(
     """
     p = len(factor) - 1
     matrix = shaped(matrix, (None, p), "constraint matrix A")
-    lower, upper = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
+    lower = np.asarray(lower, dtype=float)
+    upper = np.asarray(upper, dtype=float)
     sound = lower.shape == (len(matrix),) == upper.shape and not np.isnan([lower, upper]).any()
     require(sound, f"bounds: expected {len(matrix)} lower and upper ones, none of them NaN")
     if (lower > upper).any():
         worst = int(np.argmax(lower - upper))
         raise CalibError(f"bounds: lower {lower[worst]:g} is above upper {upper[worst]:g} in row {worst}")
     same = lower == upper
-    low, high = np.isfinite(lower) & ~same, np.isfinite(upper) & ~same
-    rows, edges = np.vstack([matrix[low], -matrix[high]]), np.concatenate([lower[low], -upper[high]])
+    low = np.isfinite(lower) & ~same
+    high = np.isfinite(upper) & ~same
+    rows = np.vstack([matrix[low], -matrix[high]])
+    edges = np.concatenate([lower[low], -upper[high]])
     planes = _Planes(factor, rows, edges, matrix[same], lower[same])
     matrices = matrices or Definite(np.zeros((0, 1, 1, p)), 1.0)
     found = planes.optimum(np.zeros(len(rows), dtype=bool))
@@ -178,12 +184,17 @@ class _Planes:
         self.upper = factor[:p, :p] / np.where(norms > 0.0, norms, 1.0)
         require_rank(self.upper, [f"x{k + 1}" for k in range(p)])
         self.length = float(np.linalg.norm(factor[:p, p])) or 1.0
-        self.unit, self.target = self.length / norms, factor[:p, p] / self.length
-        self.normals, self.sides, self.count = np.vstack([rows, equal]), np.concatenate([sides, held]), len(rows)
+        self.unit = self.length / norms
+        self.target = factor[:p, p] / self.length
+        self.normals = np.vstack([rows, equal])
+        self.sides = np.concatenate([sides, held])
+        self.count = len(rows)
         sizes = np.linalg.norm(self.normals * self.unit, axis=1)
         self.sizes = np.where(sizes > 0.0, sizes, 1.0)
-        self.scaled, self.edges = self.normals * self.unit / self.sizes[:, None], self.sides / self.sizes
-        self.factor, self.free = factor, scipy.linalg.solve_triangular(factor[:p, :p], factor[:p, p])
+        self.scaled = self.normals * self.unit / self.sizes[:, None]
+        self.edges = self.sides / self.sizes
+        self.factor = factor
+        self.free = scipy.linalg.solve_triangular(factor[:p, :p], factor[:p, p])
         self._require_solvable()
 
     def _require_solvable(self, max_contradiction: float = 1e-8) -> None:
@@ -191,7 +202,8 @@ class _Planes:
 
         `max_contradiction`: of an equality, by which the best point may miss it.
         """
-        scaled, wanted = self.scaled[self.count :], self.edges[self.count :]
+        scaled = self.scaled[self.count :]
+        wanted = self.edges[self.count :]
         if not len(scaled):
             return
         acts = scaled.any(axis=1)
@@ -204,11 +216,14 @@ class _Planes:
     def optimum(self, active: np.ndarray) -> Constrained:
         """Return the optimum under equalities and active inequalities (c,), the other inequalities ignored."""
         binding = np.append(active, np.ones(len(self.sides) - self.count, dtype=bool))
-        normals, sides = self.normals[binding], self.sides[binding]
-        values, multipliers = np.array(self.free), np.zeros(len(binding))
+        normals = self.normals[binding]
+        sides = self.sides[binding]
+        values = np.array(self.free)
+        multipliers = np.zeros(len(binding))
         if len(normals):
             values = from_free(self.factor, self.free, normals, sides)
-            for row in np.flatnonzero(np.count_nonzero(normals, axis=1) == 1):  # bounds on single parameters
+            # bounds on single parameters
+            for row in np.flatnonzero(np.count_nonzero(normals, axis=1) == 1):
                 place = int(np.flatnonzero(normals[row])[0])
                 values[place] = sides[row] / normals[row, place]
             slope = self.upper.T @ (self.upper @ (values / self.unit) - self.target)
@@ -221,11 +236,13 @@ class _Planes:
 
         As the solver has it where that is degenerate: a multiplier would change its sign, or another be violated.
         """
-        c, p = self.count, len(self.free)
+        c = self.count
+        p = len(self.free)
         found = self.definite(Definite(np.zeros((0, 1, 1, p)), 1.0))
         exact = self.optimum(found.binding[:c])
         away = np.linalg.norm(self.upper @ ((exact.values - found.values) / self.unit))
-        max_move = 1e-3  # of ‖z‖, by which the optimum on the constraints that bind may be off the solver's
+        # of ‖z‖, by which the optimum on the constraints that bind may be off the solver's
+        max_move = 1e-3
         good = (exact.slack >= 0.0).all() and (exact.multipliers[:c] >= 0.0).all() and away <= max_move
         return exact if good else found
 
@@ -235,18 +252,26 @@ class _Planes:
         Of many matrices few bind: those most indefinite enter, until all others are definite; what does not bind may
         go, since the least misfit rises from one set to the next and none comes back (our choice).
         """
-        c, rows, edges = self.count, self.scaled, self.edges
+        c = self.count
+        rows = self.scaled
+        edges = self.edges
         small = Definite(matrices.matrices * self.unit, matrices.least)
         used = np.zeros(0, dtype=int) if matrices.likely is None else matrices.likely
-        min_multiplier = 1e-6  # of the scaled problem, multipliers of matrices above which bind
-        max_entering = 8  # matrices that enter at once, the most indefinite (our choice)
-        max_drops = 30  # rounds in which what does not bind may go: rounding could let it come back
+        # of the scaled problem, multipliers of matrices above which bind
+        min_multiplier = 1e-6
+        # matrices that enter at once, the most indefinite (our choice)
+        max_entering = 8
+        # rounds in which what does not bind may go: rounding could let it come back
+        max_drops = 30
         for rounds in count():
             if not len(used):
                 used = np.argsort(small.least_eigenvalues(self.free / self.unit)[0])[:max_entering]
             goal = self.upper, self.target, rows[:c], -edges[:c]
             solved = minimise(*goal, small.matrices[used], small.least, rows[c:], edges[c:])
-            b, mu, pushes, rates = solved.values, solved.rows, solved.matrices, solved.equalities
+            b = solved.values
+            mu = solved.rows
+            pushes = solved.matrices
+            rates = solved.equalities
             sizes, normals = small.least_eigenvalues(b)
             traces = np.einsum("kii->k", pushes)
             bind = traces > min_multiplier

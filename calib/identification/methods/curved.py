@@ -32,7 +32,8 @@ _OPERATIONS = {
     ast.Pow: operator.pow,
 }
 _KNOWN = {name: getattr(np, name) for name in ("pi", "sqrt", "exp", "log", "sin", "cos", "tanh")}
-MAX_FORMULA = 1000  # characters
+# characters
+MAX_FORMULA = 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,9 +89,12 @@ class Curved:
         return self.rows.T @ (0.5 * np.nan_to_num(bend + bend.T)) @ self.rows
 
     def _compare(self, u: np.ndarray, slope: np.ndarray) -> None:
-        differences, size = np.ravel(_differences(lambda x: np.array([self.h(x)]), u)), _sizes(u)
-        stated, found = slope * size, differences * size
-        max_error, max_rounding = 1e-4, 1e-6  # of the derivative; of the largest one, what differences lose
+        differences = np.ravel(_differences(lambda x: np.array([self.h(x)]), u))
+        size = _sizes(u)
+        stated = slope * size
+        found = differences * size
+        # of the derivative; of the largest one, what differences lose
+        max_error, max_rounding = 1e-4, 1e-6
         allowed = max_error * np.maximum(np.abs(stated), np.abs(found)) + max_rounding * np.abs(found).max()
         worst = int(np.argmax(np.abs(stated - found) - allowed))
         if abs(stated[worst] - found[worst]) > allowed[worst]:
@@ -133,14 +137,16 @@ def make_curved(asked: CurvedConstraint, row: Callable[[Mapping[str, float]], np
     if callable(h) == (asked.slope is None):
         refuse_option(place, "'slope' states the derivatives of a function; a formula has its own")
     if callable(h) and asked.slope is not None:
-        function, slope = _called(h, place, 1), _called(asked.slope, place, len(names))
+        function = _called(h, place, 1)
+        slope = _called(asked.slope, place, len(names))
         return Curved(name, names, _rows(names, row), lambda u: float(function(u)[0]), slope, True)
     tree, names = _parsed(str(h), place)
 
     def value(u: np.ndarray) -> Any:
         return evaluated(tree, _KNOWN | dict(zip(names, u)), _OPERATIONS)
 
-    def derivatives(u: np.ndarray) -> np.ndarray:  # by complex steps, without rounding (Squire & Trapp 1998)
+    # by complex steps, without rounding (Squire & Trapp 1998)
+    def derivatives(u: np.ndarray) -> np.ndarray:
         step = 1e-30
         return np.array([np.imag(value(u + 1j * step * one)) / step for one in np.eye(len(u))])
 
@@ -188,8 +194,10 @@ def _parsed(text: str, place: str) -> tuple[ast.expr, tuple[str, ...]]:
     return tree, names
 
 
-MAX_ROUNDS, MAX_PRICE = 100, 1e4  # quadratic programs; price of a violation in the scaled problem (our choices)
-SETTLED = 1e-9  # of ‖z‖: movement, and violation of h, in the scaled problem
+# quadratic programs; price of a violation in the scaled problem (our choices)
+MAX_ROUNDS, MAX_PRICE = 100, 1e4
+# of ‖z‖: movement, and violation of h, in the scaled problem
+SETTLED = 1e-9
 
 
 def tangents(
@@ -209,14 +217,18 @@ def tangents(
         UsageError: for a derivative that is not that of h.
         NotConverged: where no estimate satisfies them.
     """
-    p, m, price = len(start), len(curved), 1.0
+    p = len(start)
+    m = len(curved)
+    price = 1.0
     length = float(np.linalg.norm(factor[:p, p])) or 1.0
     unit = length / np.linalg.norm(factor[:p, :p], axis=0)
-    b, multipliers = np.asarray(start), np.zeros(m)
+    b = np.asarray(start)
+    multipliers = np.zeros(m)
     normals = np.array([one.normal(b) for one in curved])
     size = np.linalg.norm(normals * unit, axis=1)
     size = np.where(size > 0.0, size, 1.0)
-    min_gain = 1e-6  # of the violation's price, below which it is at its least
+    # of the violation's price, below which it is at its least
+    min_gain = 1e-6
 
     def merit(x: np.ndarray) -> float:
         rest = (factor[:p, :p] @ x - factor[:p, p]) / length
@@ -224,7 +236,8 @@ def tangents(
         return float(0.5 * rest @ rest + price * violated.sum() + 0.5 * violated @ violated)
 
     for _ in range(MAX_ROUNDS):
-        normals, heights = np.array([one.normal(b) for one in curved]), np.array([one.value(b) for one in curved])
+        normals = np.array([one.normal(b) for one in curved])
+        heights = np.array([one.value(b) for one in curved])
         bend = -np.sum([mu / each * one.curvature(b) for mu, each, one in zip(multipliers, size, curved)], axis=0)
         planes = np.hstack([normals / size[:, None], np.eye(m)])
         rows = np.vstack([planes, np.eye(p + m)[p:]])
@@ -233,11 +246,14 @@ def tangents(
             rows,
             np.append((normals @ b - heights) / size, np.zeros(m)),
         )
-        multipliers, moved, slack = found.multipliers[:m], found.values[:p] - b, found.values[p:]
+        multipliers = found.multipliers[:m]
+        moved = found.values[:p] - b
+        slack = found.values[p:]
         satisfied = bool((slack < SETTLED).all())
         if satisfied and np.linalg.norm(factor[:p, :p] @ moved) < SETTLED * length:
             return normals, normals @ b - heights
-        share, now = _share(merit, b, moved), merit(b)
+        share = _share(merit, b, moved)
+        now = merit(b)
         b = b + share * moved
         if not satisfied and price >= MAX_PRICE and now - merit(b) < min_gain * now:
             break
@@ -248,7 +264,9 @@ def tangents(
 
 def _share(merit: Callable[[np.ndarray], float], b: np.ndarray, moved: np.ndarray) -> float:
     """Return the share of a step, halved until the merit does not rise."""
-    share, now, max_halvings = 1.0, merit(b), 30
+    share = 1.0
+    now = merit(b)
+    max_halvings = 30
     while not merit(b + share * moved) <= now + 1e-12 * abs(now) and share > 0.5**max_halvings:
         share *= 0.5
     return share
@@ -256,7 +274,9 @@ def _share(merit: Callable[[np.ndarray], float], b: np.ndarray, moved: np.ndarra
 
 def _elastic(factor: np.ndarray, b: np.ndarray, bend: np.ndarray, unit: np.ndarray, price: np.ndarray) -> np.ndarray:
     """Return the triangle of ½ ‖R x - z‖² + ½ (x - b)ᵀ K₊ (x - b) + Σ price t + ½ ‖length t‖², unknowns x and t."""
-    p, m, length = len(b), len(price), float(np.linalg.norm(factor[:-1, -1])) or 1.0
+    p = len(b)
+    m = len(price)
+    length = float(np.linalg.norm(factor[:-1, -1])) or 1.0
     values, vectors = np.linalg.eigh(bend * np.outer(unit, unit))
     root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T / unit
     stacked = np.zeros((2 * p + 1 + m, p + m + 1))

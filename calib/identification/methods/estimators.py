@@ -45,7 +45,8 @@ def tls(
     Raises:
         Unidentifiable: if the noise, not the data, determines the solution.
     """
-    p, count = data.parameters, int(data.rows.sum())
+    p = data.parameters
+    count = int(data.rows.sum())
     noise = shaped(noise, (p + 1,), "noise of the columns and of y")
     if (noise < 0.0).any() or not noise.any():
         raise CalibError("noise of the columns and of y: no entry may be negative and at least one must be positive")
@@ -57,7 +58,8 @@ def tls(
     variance = singular**2 / (count - p) if count > p else np.nan
     if not np.isfinite(variance):
         raise Unidentifiable(f"{count} rows for {p} parameters: no residual is left to check them", data.names)
-    more, independent = np.zeros((0, p)), count
+    more = np.zeros((0, p))
+    independent = count
     if inflation is not None:
         scale = np.sqrt(inflation - 1.0) / (1.0 if std is None else std)
         more = (data.factors[:, :, :p] * np.broadcast_to(scale, (data.groups,))[:, None, None]).reshape(-1, p)
@@ -76,7 +78,8 @@ def _null_direction(
     Singular values of pure noise spread between 1 ± sqrt(columns / rows) (Marchenko & Pastur 1967): when the second
     smallest is within that band of the smallest, the noise picks the solution.
     """
-    exact, noisy = np.flatnonzero(noise == 0.0), np.flatnonzero(noise > 0.0)
+    exact = np.flatnonzero(noise == 0.0)
+    noisy = np.flatnonzero(noise > 0.0)
     upper = retriangulate(factor[:, np.concatenate([exact, noisy])])
     k = len(exact)
     _, values, vt = np.linalg.svd(upper[k:, k:] / noise[noisy])
@@ -108,7 +111,9 @@ def _covariance(
 ) -> np.ndarray:
     """Return V (p, p) of `tls`, computed on columns of unit norm; `more` (k, p): rows √(τ - 1) W."""
     norms = np.linalg.norm(upper, axis=0)
-    scaled, own, x = upper / norms, variance * (noise[:-1] / norms) ** 2, values * norms
+    scaled = upper / norms
+    own = variance * (noise[:-1] / norms) ** 2
+    x = values * norms
     gram = scaled.T @ scaled - rows * np.diag(own)
     eigenvalues = np.linalg.eigvalsh(gram)
     if eigenvalues[0] <= 0.0:
@@ -121,7 +126,8 @@ def _covariance(
 
 
 CONSISTENT, CONSTRAINED = "; parameters satisfy [constraints]", " under constraints on its parameters"
-COLUMN_NOISE = 0.01  # of a column's rms: what filtered derivatives miss (our choice)
+# of a column's rms: what filtered derivatives miss (our choice)
+COLUMN_NOISE = 0.01
 
 
 def scaled_tls(pooled: Triangles, std: np.ndarray, exact: np.ndarray, inflation: np.ndarray | None = None) -> LinearFit:
@@ -168,7 +174,8 @@ class _ConstrainedLeastSquares(Method):
 
     def _estimate(self, problem: IdentificationProblem, constraints: Constraints) -> MethodEstimate:
         std, tau = weighed(problem)
-        pooled, free = problem.pooled, self.free.solve(problem, std, tau)
+        pooled = problem.pooled
+        free = self.free.solve(problem, std, tau)
         weights = std if self.free.weighted else np.ones(len(std))
         factor = combine(pooled, weights)
         if self.free is IRLS:

@@ -30,8 +30,10 @@ from calib.identification.methods.curved import Curved, make_curved, tangents
 from calib.identification.methods.method import IdentificationProblem
 from calib.records import Frozen, frozen
 
-MIN_EIGENVALUE = 1e-3  # of the smallest eigenvalue of S M(q) S (our choice): what falls below moves at no torque at all
-RAISED_BY, MAX_EIGENVALUE = 10**0.5, 0.4  # factor and limit of it where an estimate cannot be simulated (our choice)
+# of the smallest eigenvalue of S M(q) S (our choice): what falls below moves at no torque at all
+MIN_EIGENVALUE = 1e-3
+# factor and limit of it where an estimate cannot be simulated (our choice)
+RAISED_BY, MAX_EIGENVALUE = 10**0.5, 0.4
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +90,9 @@ class Constraints(Frozen):
         A robot may have a definite inertia, and yet so little in a direction that a sampled controller cannot hold it.
         """
         least = self.least * RAISED_BY
-        return replace(self, least=least) if len(self.inertia) and least <= MAX_EIGENVALUE else None
+        if len(self.inertia) and least <= MAX_EIGENVALUE:
+            return replace(self, least=least)
+        return None
 
     def touched(self, factor: np.ndarray) -> Constraints:
         """Return the constraints with curved ones and the cone of consistent bodies replaced by planes at the optimum.
@@ -117,7 +121,8 @@ class Constraints(Frozen):
 
     def _flattened(self, factor: np.ndarray) -> Constraints:
         """Return the constraints with the curved ones replaced by their tangent planes at the optimum."""
-        others, m = replace(self, curved=()), len(self.curved)
+        others = replace(self, curved=())
+        m = len(self.curved)
         start = others.solve(factor).values
         free = np.append(np.linalg.solve(factor[:-1, :-1], factor[:-1, -1]), np.zeros(m))
 
@@ -251,8 +256,10 @@ def _binding(constraints: Constraints, found: Constrained, free: LinearFit) -> H
     for k in np.flatnonzero(found.binding & (places >= 0)):
         row = constraints.matrix[places[k]]
         bound = (constraints.upper if upper[k] else constraints.lower)[places[k]]
-        name, origin = constraints.names[places[k]], 0.0
-        if name in constraints.tangents:  # told as h, by its plane, above zero
+        name = constraints.names[places[k]]
+        origin = 0.0
+        # told as h, by its plane, above zero
+        if name in constraints.tangents:
             origin = bound
         binding.append(
             Binding(
@@ -271,7 +278,8 @@ def _binding(constraints: Constraints, found: Constrained, free: LinearFit) -> H
 
 def _findings(constraints: Constraints, binding: Sequence[Binding], postures: int) -> Iterator[Finding]:
     """Yield the findings on binding constraints, and on the `postures` in which M(q) is on its bound."""
-    max_sigmas = 3.0  # standard deviations by which the data speak against an equality that is named (our choice)
+    # standard deviations by which the data speak against an equality that is named (our choice)
+    max_sigmas = 3.0
     for one in binding:
         sigmas = abs(one.free - one.bound) / max(one.sigma, 1e-300)
         if one.name == constraints.plane:
@@ -290,7 +298,9 @@ def _words(name: str, low: float, high: float) -> str:
         return f"{name} = {low:g}"
     if np.isinf(low):
         return f"{name} <= {high:g}"
-    return f"{name} >= {low:g}" if np.isinf(high) else f"{low:g} <= {name} <= {high:g}"
+    if np.isinf(high):
+        return f"{name} >= {low:g}"
+    return f"{low:g} <= {name} <= {high:g}"
 
 
 def _row(weights: Mapping[str, float], base: Base, names: Sequence[str]) -> np.ndarray:
@@ -299,7 +309,8 @@ def _row(weights: Mapping[str, float], base: Base, names: Sequence[str]) -> np.n
     Raises:
         UsageError: where the torques do not identify the sum.
     """
-    row, standard = np.zeros(len(names)), np.zeros(len(base.standard))
+    row = np.zeros(len(names))
+    standard = np.zeros(len(base.standard))
     for name, weight in weights.items():
         if name in names:
             row[list(names).index(name)] += weight
@@ -309,7 +320,8 @@ def _row(weights: Mapping[str, float], base: Base, names: Sequence[str]) -> np.n
             similar = suggestion(name, (*names, *base.standard))
             words = f"'{name}' is not a parameter of this model{similar}; its parameters: {', '.join(names)}"
             refuse_option("[constraints]", words)
-    own = standard[base.kept]  # T of the kept columns is the identity
+    # T of the kept columns is the identity
+    own = standard[base.kept]
     if np.abs(base.transform.T @ own - standard).max() > 1e-6 * max(np.abs(standard).max(), 1e-300):
         refuse_option("[constraints]", _without_effect(weights, base))
     row[: base.b] += own

@@ -27,7 +27,8 @@ from calib.estimation.robust import weights
 from calib.estimation.triangles import Triangles, absorb, combine, empty, solve_triangle
 from calib.records import frozen, shaped
 
-GATE = 0.999  # probability of a good sample to stay in
+# probability of a good sample to stay in
+GATE = 0.999
 
 
 @lru_cache
@@ -80,15 +81,19 @@ def variance_factor(size: np.ndarray, joints: np.ndarray) -> float:
     w = weigh(size, joints)
     h = 1e-4
     bent = [np.where(w > 0.0, weigh(size * (1.0 + k * h), joints, False), 0.0) for k in (1, -1)]
-    slope = (bent[0] - bent[1]) / (2.0 * h)  # w' d
+    # w' d
+    slope = (bent[0] - bent[1]) / (2.0 * h)
     share = joints / joints.sum()
-    a, b = np.sum(share * w**2 * size**2 / n), np.sum(share * (w + slope / n))
+    a = np.sum(share * w**2 * size**2 / n)
+    b = np.sum(share * (w + slope / n))
     return float(a / b**2 * np.sum(share * w))
 
 
 def _weights(size: np.ndarray, joints: int, gated: bool = True) -> np.ndarray:
     w = weights(size, "huber", tuning(joints))
-    return np.where(size**2 <= chdtri(joints, 1.0 - GATE), w, 0.0) if gated else w
+    if gated:
+        return np.where(size**2 <= chdtri(joints, 1.0 - GATE), w, 0.0)
+    return w
 
 
 @lru_cache
@@ -97,7 +102,8 @@ def _quantiles(joints: int) -> np.ndarray:
     return np.asarray(chdtri(joints, 1.0 - (np.arange(4000) + 0.5) / 4000))
 
 
-CHUNK = 2000  # samples whitened at a time
+# samples whitened at a time
+CHUNK = 2000
 ROUNDS = 200
 
 
@@ -181,13 +187,15 @@ def irls(data: Samples, inflation: float = 1.0, solve: Callable[[np.ndarray], np
     """
     start = row_irls(data)
     left = np.sqrt(_share_left(data, start.group_std))
-    covariance, values = np.diag(start.group_std**2), start.estimate.values
+    covariance = np.diag(start.group_std**2)
+    values = start.estimate.values
     for _ in range(ROUNDS):
         residual = np.where(data.present, data.target - data.matrix @ values, 0.0) / left
         size = _sizes(residual, covariance, data.present)
         weights = weigh(size, data.joints)
         covariance = _scatter(data, residual, weights * _consistent(data), weights)
-        factor, last = _factor(data, covariance, weights), values
+        factor = _factor(data, covariance, weights)
+        last = values
         values = solve_triangle(factor, data.names)[0] if solve is None else solve(factor)
         if np.sum((factor[:-1, :-1] @ (values - last)) ** 2) <= 1e-8 * len(values):
             return _pack(data, values, covariance, size, weights, factor, inflation)
@@ -205,7 +213,8 @@ def row_irls(data: Samples) -> LinearFit:
         residual = data.target - data.matrix @ values
         std = _spreads(data, residual)
         fit = wls(_triangles(data, robust.weights(np.abs(residual) / std, "cauchy")), std)
-        step, values = fit.estimate.values - values, fit.estimate.values
+        step = fit.estimate.values - values
+        values = fit.estimate.values
         if np.all(np.abs(step) <= 1e-3 * fit.estimate.sigma):
             return LinearFit(fit.estimate, std, fit.condition, fit.condition_normalised)
     raise NotConverged("the weights of the rows do not converge", values)
@@ -306,4 +315,5 @@ def _scatter(data: Samples, residual: np.ndarray, scaled: np.ndarray, weights: n
     values, vectors = np.linalg.eigh(noise / np.outer(std, std))
     if values[0] >= 1e-8:
         return noise
-    return (vectors * np.maximum(values, 1e-8)) @ vectors.T * np.outer(std, std)  # pairs of unlike rows: not positive
+    # pairs of unlike rows: not positive
+    return (vectors * np.maximum(values, 1e-8)) @ vectors.T * np.outer(std, std)

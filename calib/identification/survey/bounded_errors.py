@@ -37,10 +37,13 @@ class _GeneralisedTLS(Method):
 
     def _estimate(self, problem: IdentificationProblem, model: IdentificationModel) -> MethodEstimate:
         std, tau = weighed(problem)
-        states, plain = noisy_states(problem, model), wls(problem.pooled, std)
-        factor, p = combine(problem.pooled, std), problem.pooled.parameters
+        states = noisy_states(problem, model)
+        plain = wls(problem.pooled, std)
+        factor = combine(problem.pooled, std)
+        p = problem.pooled.parameters
         norms = np.linalg.norm(factor[:p, :p], axis=0)
-        upper, noise = factor[:p, :p] / norms, column_noise(states, std) / np.outer(norms, norms)
+        upper = factor[:p, :p] / norms
+        noise = column_noise(states, std) / np.outer(norms, norms)
         gram = upper.T @ upper - noise
         eigenvalues, vectors = np.linalg.eigh(gram)
         if eigenvalues[0] <= 0.0:
@@ -72,7 +75,8 @@ def column_noise(states: NoisyStates, std: np.ndarray) -> np.ndarray:
         scale = np.where(states.present[part.own], 1.0 / std, 0.0)[:, :, None]
         for joint, covariance in enumerate(part.noise):
             sizes, axes = np.linalg.eigh(covariance)
-            for direction in (np.sqrt(np.maximum(sizes, 0.0)) * axes).T:  # of one standard deviation
+            # of one standard deviation
+            for direction in (np.sqrt(np.maximum(sizes, 0.0)) * axes).T:
                 error = np.zeros((len(part.q), 3, states.model.n))
                 error[:, :, joint] = direction
                 moved = (scale * changed(states, part, error)).reshape(-1, p)
@@ -80,7 +84,8 @@ def column_noise(states: NoisyStates, std: np.ndarray) -> np.ndarray:
     return total
 
 
-ROUNDS = 4  # in which rows are added (our choice): fewer leave the intervals wider, and never wrong
+# in which rows are added (our choice): fewer leave the intervals wider, and never wrong
+ROUNDS = 4
 
 
 @dataclass(frozen=True)
@@ -98,10 +103,12 @@ class _SetMembership(Method):
 
     def _estimate(self, problem: IdentificationProblem) -> MethodEstimate:
         std, tau = weighed(problem)
-        plain, data = wls(problem.pooled, std), samples_of(problem)
+        plain = wls(problem.pooled, std)
+        data = samples_of(problem)
         left = np.where(data.present, data.target - data.matrix @ plain.estimate.values, 0.0)
         bound = np.maximum(np.abs(left).max(axis=0), 1e-9 * std)
-        rows, ends = (data.matrix / bound[:, None])[data.present], (left / bound)[data.present]
+        rows = (data.matrix / bound[:, None])[data.present]
+        ends = (left / bound)[data.present]
         lower, upper, count = intervals(rows, ends)
         values = plain.estimate.values + 0.5 * (lower + upper)
         covariance = np.diag((upper - lower) ** 2 / 12.0)
@@ -127,18 +134,26 @@ def intervals(rows: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
     count, p = rows.shape
     q, upper = np.linalg.qr(rows)
-    goals = np.linalg.inv(upper)  # x = goals u, with |u| <= 2 √r wherever all rows are within the bound
+    # x = goals u, with |u| <= 2 √r wherever all rows are within the bound
+    goals = np.linalg.inv(upper)
     goals = np.vstack([goals, -goals]) / np.tile(np.linalg.norm(goals, axis=1), 2)[:, None]
-    used, ahead, found = np.argsort(-np.abs(ends))[: 2 * p], np.arange(2 * p), np.zeros((2 * p, p))
-    reach, max_violation = 2.0 * np.sqrt(count), 1e-6  # of u; of the bound, by which rounding may miss it
+    used = np.argsort(-np.abs(ends))[: 2 * p]
+    ahead = np.arange(2 * p)
+    found = np.zeros((2 * p, p))
+    # of u; of the bound, by which rounding may miss it
+    reach = 2.0 * np.sqrt(count)
+    max_violation = 1e-6
     rounds = 0
     while len(ahead) and rounds < ROUNDS:
-        system, limit = np.vstack([q[used], -q[used]]), np.concatenate([1.0 + ends[used], 1.0 - ends[used]])
+        system = np.vstack([q[used], -q[used]])
+        limit = np.concatenate([1.0 + ends[used], 1.0 - ends[used]])
         for k in ahead:
             found[k] = linprog(goals[k], system, limit, bounds=[(-reach, reach)] * p, method="highs-ds").x
         violated = np.abs(q @ found[ahead].T - ends[:, None])
         left = violated.max(axis=0) > 1.0 + max_violation
-        used, ahead, rounds = np.union1d(used, np.argmax(violated[:, left], axis=0)), ahead[left], rounds + 1
+        used = np.union1d(used, np.argmax(violated[:, left], axis=0))
+        ahead = ahead[left]
+        rounds = rounds + 1
     best = np.einsum("kp,kp->k", np.tile(np.linalg.inv(upper), (2, 1)), found)
     return best[:p], best[p:], rounds
 

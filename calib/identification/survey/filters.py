@@ -30,7 +30,8 @@ from calib.identification.rows import Case, segments
 from calib.identification.survey.kalman import Belief, Filter, believe, corrected, linearly_predicted, points, predicted
 from calib.identification.survey.simulated_robot import BelievedRobot, Stepper, believed_robot, start_of, stepper
 
-NARROWER = (1.0, 0.5, 0.25, 0.1, 0.03)  # of a rule's points, where the wider ones are no robots
+# of a rule's points, where the wider ones are no robots
+NARROWER = (1.0, 0.5, 0.25, 0.1, 0.03)
 
 
 @dataclass(frozen=True)
@@ -59,17 +60,21 @@ class _KalmanFilter(Method):
         return attempted(self.name, problem, lambda: self._estimate(problem, plain, believed_robot(problem, self)))
 
     def _estimate(self, problem: IdentificationProblem, plain: MethodEstimate, robot: BelievedRobot) -> MethodEstimate:
-        values, sigma = plain.estimate.values, plain.estimate.sigma
+        values = plain.estimate.values
+        sigma = plain.estimate.sigma
         start = start_of(problem, values, _inertia(problem), lambda x: _moves(robot, problem, x))
-        start_sigmas = 5.0  # standard deviations of least squares that the parameters are uncertain by at first
+        # standard deviations of least squares that the parameters are uncertain by at first
+        start_sigmas = 5.0
         wide = np.maximum(start_sigmas * sigma, np.abs(start - values))
-        noise = plain.std / np.sqrt(np.sum(np.square(problem.decimator.taps)))  # of one sample of the torques
+        # of one sample of the torques
+        noise = plain.std / np.sqrt(np.sum(np.square(problem.decimator.taps)))
         state = _State(robot, self.kind, start, np.diag(wide**2), [], 0)
         for case in problem.cases:
             for first, last in segments(case.motion.segment):
                 state = _pass(state, case, slice(first, last), noise)
         innovation = float(np.mean(state.sizes)) if state.sizes else np.inf
-        max_innovation = 30.0  # times the stated mean square: innovations of a filter that has lost the robot
+        # times the stated mean square: innovations of a filter that has lost the robot
+        max_innovation = 30.0
         if not np.isfinite(innovation) or innovation > max_innovation:
             raise Diverged(
                 f"{self.name} diverged: its innovations are {np.sqrt(innovation):.3g} times the predicted ones",
@@ -106,9 +111,11 @@ class _State:
 def _inertia(problem: IdentificationProblem) -> np.ndarray:
     """Return the mean inertia (n,) of each joint, from the regression of torques on accelerations."""
     n = problem.cases[0].motion.n
-    cross, size = np.zeros(n), np.full(n, 1e-12)
+    cross = np.zeros(n)
+    size = np.full(n, 1e-12)
     for case in problem.cases:
-        a, tau = case.motion.a - case.motion.a.mean(axis=0), case.target - case.target.mean(axis=0)
+        a = case.motion.a - case.motion.a.mean(axis=0)
+        tau = case.target - case.target.mean(axis=0)
         cross += np.sum(a * tau, axis=0)
         size += np.sum(a**2, axis=0)
     return np.maximum(cross / size, 0.1 * np.max(np.abs(cross) / size))
@@ -118,7 +125,8 @@ def _moves(robot: BelievedRobot, problem: IdentificationProblem, values: np.ndar
     """Compute accelerations along the recordings; raise if the robot cannot be simulated."""
     for case in problem.cases:
         part = slice(None, None, max(1, len(case.motion) // 200))
-        q, v = case.motion.q[part], case.motion.v[part]
+        q = case.motion.q[part]
+        v = case.motion.v[part]
         forward_dynamics(robot.at(values, case), q, v, np.zeros_like(q))
 
 
@@ -129,7 +137,9 @@ def _steps(case: Case, part: slice, max_step: float = 2.5e-3) -> Iterator[tuple[
     """
     motion = case.motion
     thin = _thin(case)
-    q, tau = motion.q[part], low_passed(case.target[part], motion)  # as the positions were: the same band on both sides
+    # as the positions were: the same band on both sides
+    q = motion.q[part]
+    tau = low_passed(case.target[part], motion)
     whole = np.concatenate([np.zeros((1, motion.n)), np.cumsum(0.5 * (tau[1:] + tau[:-1]), axis=0)])
     steps = max(1, int(np.ceil(thin / (motion.rate * max_step) - 1e-6)))
     place = np.arange(len(q), dtype=float)
@@ -147,10 +157,13 @@ def _thin(case: Case, rate_factor: float = 4.0) -> int:
 
 def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
     """Return the state after a segment of a recording."""
-    motion, thin, n = case.motion, _thin(case), case.motion.n
+    motion = case.motion
+    thin = _thin(case)
+    n = case.motion.n
     if part.stop - part.start <= 2 * thin:
         return before
-    columns, p = before.robot.columns, len(before.mean)
+    columns = before.robot.columns
+    p = len(before.mean)
     made = stepper(before.robot.at(before.mean, case), columns)
     there = before.robot.carried(case)
     seen = np.maximum(motion.cutoffs.noise / np.sqrt(thin), 1e-9 * np.ptp(motion.q, axis=0).max())
@@ -203,8 +216,10 @@ class _Stepping:
         """
         n = self.n
         if self.kind.rule == "ekf":
-            mean, values = np.array(before.mean), self._values(before.mean[None])[0]
-            slopes, gain = np.eye(len(mean)), np.eye(n)
+            mean = np.array(before.mean)
+            values = self._values(before.mean[None])[0]
+            slopes = np.eye(len(mean))
+            gain = np.eye(n)
             for own in tau:
                 made = self.made.linearised(values, mean[:n], mean[n : 2 * n], own, period, len(self.columns))
                 mean[:n], mean[n : 2 * n], gain, part = made
@@ -217,7 +232,9 @@ class _Stepping:
         for narrower in NARROWER:
             spread = points(before, self.kind, narrower)
             values = self._values(spread)
-            q, v, gain = spread[:, :n], spread[:, n : 2 * n], np.eye(n)
+            q = spread[:, :n]
+            v = spread[:, n : 2 * n]
+            gain = np.eye(n)
             try:
                 for own in tau:
                     q, v, gain = self.made.points(values, q, v, own, period)

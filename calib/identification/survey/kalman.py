@@ -19,8 +19,10 @@ import scipy.linalg
 
 from calib.errors import Diverged
 
-ALPHA, BETA = 0.1, 2.0  # spread of the unscented points, and what is known of the distribution (Gaussian)
-STEP = np.sqrt(3.0)  # h of central differences, for Gaussian kurtosis
+# spread of the unscented points, and what is known of the distribution (Gaussian)
+ALPHA, BETA = 0.1, 2.0
+# h of central differences, for Gaussian kurtosis
+STEP = np.sqrt(3.0)
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,8 @@ def believe(mean: np.ndarray, sigma: np.ndarray, kind: Filter) -> Belief:
 
 def points(before: Belief, kind: Filter, narrower: float = 1.0) -> np.ndarray:
     """Return the sigma points (2 L + 1, L) of a belief, the mean first; `narrower` scales their distance."""
-    deviations, gamma = before.deviations, narrower * _gamma(kind, len(before.mean))
+    deviations = before.deviations
+    gamma = narrower * _gamma(kind, len(before.mean))
     return np.concatenate([before.mean[None], before.mean + gamma * deviations.T, before.mean - gamma * deviations.T])
 
 
@@ -84,7 +87,9 @@ def predicted(images: np.ndarray, noise: np.ndarray, kind: Filter, narrower: flo
     """Return the predicted belief from the propagated `points` (2 L + 1, L) and noise N (L, k)."""
     size = images.shape[1]
     gamma = narrower * _gamma(kind, size)
-    middle, ahead, behind = images[0], images[1 : size + 1] - images[0], images[size + 1 :] - images[0]
+    middle = images[0]
+    ahead = images[1 : size + 1] - images[0]
+    behind = images[size + 1 :] - images[0]
     share = 0.5 / gamma**2
     shift = share * (ahead + behind).sum(axis=0)
     if kind.rule == "cdkf":
@@ -107,7 +112,8 @@ def corrected(before: Belief, seen: np.ndarray, rows: int, std: np.ndarray) -> t
 
     The size is eᵀ (H P Hᵀ + R)⁻¹ e, on average `rows` where the filter knows its noise.
     """
-    innovation, size = seen - before.mean[:rows], len(before.mean)
+    innovation = seen - before.mean[:rows]
+    size = len(before.mean)
     if before.root:
         array = np.zeros((rows + size, rows + size))
         array[:rows, :rows] = np.diag(std)

@@ -34,7 +34,8 @@ from calib.identification.prior import residual_inflation
 from calib.identification.survey.score_covariance import scatter
 from calib.identification.survey.simulated_robot import serial_arm, with_friction
 
-BLOCK = 1000  # samples at a time
+# samples at a time
+BLOCK = 1000
 
 
 @dataclass(frozen=True)
@@ -57,11 +58,14 @@ class _MaximumLikelihood(Method):
     def _estimate(self, problem: IdentificationProblem, model: IdentificationModel) -> MethodEstimate:
         std, _ = weighed(problem)
         task = noisy_states(problem, model)
-        values, noise = wls(problem.pooled, std).estimate.values, std**2
+        values = wls(problem.pooled, std).estimate.values
+        noise = std**2
         steps: list[float] = []
-        min_noise = 1e-4  # of the residuals' standard deviation: torques are not free of noise
+        # of the residuals' standard deviation: torques are not free of noise
+        min_noise = 1e-4
         max_steps = 40
-        tolerance = 0.01  # standard deviations of the estimate
+        # standard deviations of the estimate
+        tolerance = 0.01
         for count in range(1, max_steps + 1):
             noise = _torque_noise(task, values, noise, (min_noise * std) ** 2)
             found = _step(task, values, noise)
@@ -125,7 +129,8 @@ def noisy_states(problem: IdentificationProblem, model: IdentificationModel) -> 
     """Return all samples of a problem, with the covariance of the noise in q, v and a."""
     samples, (model, columns) = samples_of(problem), with_friction(problem, model)
     smooth = np.array([one is None or one.form.slopes for one in problem.terms], dtype=bool)
-    parts, first = [], 0
+    parts = []
+    first = 0
     for case in problem.cases:
         motion = case.motion
         index = kept(motion.segment, problem.decimator)
@@ -160,7 +165,8 @@ def _slopes(task: NoisyStates, part: _Recording, values: np.ndarray) -> np.ndarr
     """Return B (M, n, 3, n), the Jacobian of W β with respect to q, v and a of each joint."""
     used = task.smooth & (part.present > 0.0)
     order = np.argsort(task.columns[used])
-    columns, own = task.columns[used][order], values[used][order]
+    columns = task.columns[used][order]
+    own = values[used][order]
     n = task.model.n
     out = np.empty((len(part.q), n, 3, n))
     for start in range(0, len(part.q), BLOCK):
@@ -192,13 +198,15 @@ def _torque_noise(task: NoisyStates, values: np.ndarray, noise: np.ndarray, leas
     """Return the maximum likelihood torque noise Σ_τ (n,) for fixed parameters and position noise."""
     parts = [_residuals(task, part, values) for part in task.parts]
     residual, other = (np.concatenate(x) for x in zip(*((r, more) for r, _, more in parts)))
-    left = max(1.0 - len(values) / task.present.sum(), 0.1)  # of the residuals, after the fit
+    # of the residuals, after the fit
+    left = max(1.0 - len(values) / task.present.sum(), 0.1)
     seen = task.present.any(axis=0)
     for _ in range(50):
         inverse = _inverse(other, noise, task.present)
         score = np.sum(np.einsum("mij,mj->mi", inverse, residual) ** 2, axis=0) / left
         ratio = np.clip(score / np.maximum(np.einsum("mii->i", inverse), 1e-300), 0.1, 10.0)
-        before, noise = noise, np.where(seen, np.maximum(noise * ratio, least), noise)
+        before = noise
+        noise = np.where(seen, np.maximum(noise * ratio, least), noise)
         if np.max(np.abs(noise / before - 1.0)) < 1e-3:
             break
     return noise
@@ -222,7 +230,10 @@ class _Round:
 def _step(task: NoisyStates, values: np.ndarray, noise: np.ndarray) -> _Round:
     """Return the next round of the iteration, from parameters (p,) and torque noise (n,)."""
     p = len(values)
-    cross, score, white, left = np.zeros((p, p)), np.zeros(p), [], []
+    cross = np.zeros((p, p))
+    score = np.zeros(p)
+    white = []
+    left = []
     for part in task.parts:
         residual, spread, other = _residuals(task, part, values)
         used = task.present[part.own]
@@ -256,7 +267,8 @@ def changed(task: NoisyStates, part: _Recording, error: np.ndarray) -> np.ndarra
 def _packed(problem: IdentificationProblem, found: _Round, noise: np.ndarray) -> LinearFit:
     """Return the fit of the last round; its covariance allows for residuals correlated in time."""
     plain = wls(problem.pooled, np.sqrt(noise))
-    p, rows = len(found.values), int(problem.pooled.rows.sum())
+    p = len(found.values)
+    rows = int(problem.pooled.rows.sum())
     meat = sum(scatter(own, left) for own, left in zip(found.white, found.residual))
     covariance = rows / (rows - p) * found.bread @ meat @ found.bread.T
     estimate = replace(plain.estimate, values=found.values, covariance=covariance, residual_std=1.0)

@@ -19,7 +19,8 @@ from calib.identification.methods.least_squares import weighed
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
 from calib.identification.methods.samples import Samples
 
-STEPS = 10_000  # of either network, as the survey's
+# of either network, as the survey's
+STEPS = 10_000
 
 
 def adaline(data: Samples, start: np.ndarray, rate: float = 1.0, steps: int = STEPS, seed: int = 0) -> np.ndarray:
@@ -38,13 +39,16 @@ def adaline(data: Samples, start: np.ndarray, rate: float = 1.0, steps: int = ST
     """
     matrix = np.where(data.present[:, :, None], data.matrix, 0.0)
     target = np.where(data.present, data.target, 0.0)
-    rng, x = np.random.default_rng(seed), np.array(start, dtype=float)
+    rng = np.random.default_rng(seed)
+    x = np.array(start, dtype=float)
     rounds = -(-steps // len(target))
-    with np.errstate(over="ignore", invalid="ignore"):  # of a rate that diverges
+    # of a rate that diverges
+    with np.errstate(over="ignore", invalid="ignore"):
         for k in np.concatenate([rng.permutation(len(target)) for _ in range(rounds)])[:steps]:
             slope = (target[k] - matrix[k] @ x) @ matrix[k]
             moved = matrix[k] @ slope
-            if size := moved @ moved:
+            size = moved @ moved
+            if size:
                 x += rate * (slope @ slope) / size * slope
     return x
 
@@ -69,18 +73,24 @@ def hopfield(
         NotConverged: where a neuron saturates: x is then a bound and no estimate.
     """
     p = len(start)
-    weights, bias = factor[:p, :p].T @ factor[:p, :p], factor[:p, :p].T @ factor[:p, p]
-    width = 5.0  # of the sigmoid, as the survey's
+    weights = factor[:p, :p].T @ factor[:p, :p]
+    bias = factor[:p, :p].T @ factor[:p, p]
+    # of the sigmoid, as the survey's
+    width = 5.0
     step = rate * width / bound / np.linalg.norm(factor[:p, :p], 2) ** 2
     u = width * np.arctanh(np.asarray(start) / bound)
-    x, count = np.asarray(start, dtype=float), 0
-    max_rest = 1e-9  # of the first slope
+    x = np.asarray(start, dtype=float)
+    count = 0
+    # of the first slope
+    max_rest = 1e-9
     slope = first = bias - weights @ x
     while np.linalg.norm(slope) > max_rest * np.linalg.norm(first) and count < steps:
         u += step * slope
         x = bound * np.tanh(u / width)
-        slope, count = bias - weights @ x, count + 1
-    saturation = 0.95  # of α
+        slope = bias - weights @ x
+        count = count + 1
+    # of α
+    saturation = 0.95
     full = np.flatnonzero(np.abs(x) > saturation * bound)
     numbers = ", ".join(str(k + 1) for k in full[:5])
     require(not len(full), f"neurons saturate at {bound:.3g}: parameters {numbers}", NotConverged)
@@ -134,7 +144,8 @@ class _Hopfield(_Network):
     def trained(self, problem: IdentificationProblem, start: np.ndarray) -> tuple[np.ndarray, int]:
         factor = combine(problem.pooled)
         largest = float(np.abs(start).max())
-        if not largest:  # without start values: what the weakest column needs to explain all torques
+        # without start values: what the weakest column needs to explain all torques
+        if not largest:
             largest = float((np.linalg.norm(factor[:-1, -1]) / np.linalg.norm(factor[:-1, :-1], axis=0)).max())
         return hopfield(factor, start, 1.5 * largest, self.rate, self.steps)
 

@@ -77,7 +77,8 @@ class _OutputError(Method):
         plain = WLS.estimate(problem)
         if not plain.found:
             return replace(plain, method=self.name)
-        step = 0.01  # of the differences of a robot without tangents, in standard deviations (our choice)
+        # of the differences of a robot without tangents, in standard deviations (our choice)
+        step = 0.01
         robot = believed_robot(problem, self, step * np.asarray(plain.estimate.sigma))
         loops = close_loops(robot.model, problem.cases, problem.decimator, problem.loop, problem.cad)
         task = _Comparison(problem, robot, loops, self.torques)
@@ -91,13 +92,17 @@ class _OutputError(Method):
         values = start_of(problem, plain.estimate.values, inertia, lambda x: task.simulated(task.whole(x, inertia)))
         values = task.whole(values, inertia)
         first, _ = task.linearised(values)
-        std, count = task.spread(first, 0), 1
-        rounds = 3  # of weighing joints by what the last estimate leaves
+        std = task.spread(first, 0)
+        count = 1
+        # of weighing joints by what the last estimate leaves
+        rounds = 3
         for _ in range(rounds):
             found = task.solved(values, std)
-            values, count = found.state, count + found.iterations
+            values = found.state
+            count = count + found.iterations
             residual, slopes = task.linearised(values)
-            before, std = std, task.spread(residual, len(values))
+            before = std
+            std = task.spread(residual, len(values))
             if np.all(np.abs(std / before - 1.0) < 0.1):
                 break
         fit = _packed(task, plain, values, residual, slopes, std)
@@ -149,7 +154,8 @@ class _Comparison:
     def simulated(self, values: np.ndarray) -> None:
         """Simulate all loops with the parameters (p,); raise if that fails."""
         for case, loop in self.loops.pairs:
-            plant, controller = self.robot.at(values, case), loop.controller
+            plant = self.robot.at(values, case)
+            controller = loop.controller
             if loop.design is not None:
                 controller = controller.scaled(plant.inertia_diagonal(loop.reference.q[::200]) / loop.design)
             self.count[0] += 1
@@ -157,16 +163,20 @@ class _Comparison:
 
     def linearised(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return residuals (M, r), zero at samples not compared, and the Jacobian (M, r, p) of simulated signals."""
-        residuals, slopes = [], []
+        residuals = []
+        slopes = []
         for case, loop in self.loops.pairs:
-            plant, controller, relative = self.robot.at(values, case), loop.controller, None
+            plant = self.robot.at(values, case)
+            controller = loop.controller
+            relative = None
             if loop.design is not None:
                 diagonal = plant.inertia_diagonal(loop.reference.q[::200])
                 controller = controller.scaled(diagonal / loop.design)
                 relative = self._inertia_slopes(loop.reference.q[::200]) / diagonal[:, None]
             self.count[0] += 1
             run = self.robot.sensitivities(values, case, controller, loop.reference, loop.every, relative)
-            index, motion = simulated_samples(case, run.t, loop), case.motion
+            index = simulated_samples(case, run.t, loop)
+            motion = case.motion
             parts = [self._sensed(plant, case, run, index)] if self.rows.sensed else []
             if not self.torques:
                 moved, slope = (low_passed(x, motion)[index] for x in (run.q, run.by_q))
@@ -191,7 +201,8 @@ class _Comparison:
         seen = [*range(plant.inertial), *(plant.inertial + k for k, x in enumerate(plant.terms) if x in link.columns)]
         place = np.full(len(plant.parameters), -1)
         place[seen] = np.arange(len(seen))
-        own, values = place[self.robot.columns], plant.parameters[seen]
+        own = place[self.robot.columns]
+        values = plant.parameters[seen]
         moved, slopes = (followed(x, case.motion, index) for x in (run.q, run.by_q))
         regressor = link.regressor(*moved, None, case.carried)
         jacobian = np.where(own >= 0, regressor[:, :, own], 0.0)
@@ -208,7 +219,8 @@ class _Comparison:
     def whitened(self, values: np.ndarray, std: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return residuals (M r,) and Jacobian (M r, p) divided by std (r,); huge residuals if the simulation fails."""
         p = len(values)
-        impossible = 1e60  # residual of parameters that cannot be simulated: any step that can is better
+        # residual of parameters that cannot be simulated: any step that can is better
+        impossible = 1e60
         try:
             residual, slopes = self.linearised(values)
         except CalibError:
@@ -217,9 +229,12 @@ class _Comparison:
 
     def solved(self, values: np.ndarray, std: np.ndarray) -> nonlinear.Solution[np.ndarray]:
         """Return the parameters that minimise the residuals divided by std (r,)."""
-        first_damping = 1e-3  # at first
-        max_simulations = 25  # simulations with tangents per round
-        step_tolerance = 0.05  # standard deviations of the estimate
+        # at first
+        first_damping = 1e-3
+        # simulations with tangents per round
+        max_simulations = 25
+        # standard deviations of the estimate
+        step_tolerance = 0.05
         return nonlinear.solve(
             lambda x: nonlinear.triangle(*self.whitened(x, std)),
             lambda x, step: x + step,
@@ -235,7 +250,8 @@ class _Comparison:
         share = max(1.0 - p / count.sum(), 0.1)
         std = np.sqrt(np.sum(residual**2, axis=0) / count / share)
         n = self.problem.cases[0].motion.n
-        kinds = [std[k : k + n] for k in range(0, len(std), n)]  # of torques and of positions: other units
+        # of torques and of positions: other units
+        kinds = [std[k : k + n] for k in range(0, len(std), n)]
         return np.concatenate([np.maximum(one, 1e-6 * max(float(one.max()), 1e-300)) for one in kinds])
 
 
@@ -258,9 +274,12 @@ def _packed(
     Raises:
         Unidentifiable: where the simulated motion does not distinguish parameters.
     """
-    white, left = slopes / std[:, None], residual / std
-    p, rows = len(values), int(np.sum(residual != 0.0))
-    own, plant = len(plain.pooled.names), task.robot.plant
+    white = slopes / std[:, None]
+    left = residual / std
+    p = len(values)
+    rows = int(np.sum(residual != 0.0))
+    own = len(plain.pooled.names)
+    plant = task.robot.plant
     names = (*plain.pooled.names, *(plant.terms[k - plant.inertial].name for k in task.robot.columns[own:]))
     flat = white.reshape(-1, p)
     size = np.linalg.norm(flat, axis=0)
@@ -268,7 +287,8 @@ def _packed(
     require_rank(factor, names, "the simulated motion does not distinguish them")
     inverse = scipy.linalg.solve_triangular(factor, np.eye(p)) / size[:, None]
     bread = inverse @ inverse.T
-    covariance, rounds = rows / max(rows - p, 1) * bread @ scatter(white, left) @ bread, 5
+    covariance = rows / max(rows - p, 1) * bread @ scatter(white, left) @ bread
+    rounds = 5
     for _ in range(rounds):
         covariance = bread @ scatter(white, left, covariance) @ bread
     estimate = replace(plain.estimate, values=values[:own], covariance=covariance[:own, :own], residual_std=1.0)

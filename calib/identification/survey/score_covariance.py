@@ -22,10 +22,12 @@ def scatter(white: np.ndarray, residual: np.ndarray, covariance: np.ndarray | No
     """
     white = shaped(white, (None, None, None), "rows")
     residual = shaped(residual, white.shape[:2], "residuals")
-    count, p = len(white), white.shape[2]
+    count = len(white)
+    p = white.shape[2]
     size = 1 << (2 * count - 1).bit_length()
     result = np.zeros((p, p))
-    min_lags = 12  # at least, of the residuals' autocorrelation
+    # at least, of the residuals' autocorrelation
+    min_lags = 12
     root = np.zeros((p, 0)) if covariance is None else np.linalg.cholesky(covariance)
     for row in range(white.shape[1]):
         values = white[:, row]

@@ -78,13 +78,19 @@ def simulate_tangents(
     for one in plant.terms:
         words = f"term '{one.name}' ({one.shape}): no derivatives of friction that hangs on past motion or on torques"
         require(one.form.slopes, f"{words}; iv and didim take it")
-    n, count, c = plant.bodies.n, len(reference.t), len(columns)
+    n = plant.bodies.n
+    count = len(reference.t)
+    c = len(columns)
     find = np.full(len(plant.parameters), -1)
     find[np.asarray(columns, dtype=int)] = np.arange(c)
     tick = sample_ticks(count, every)
-    out, slopes = np.empty((3, len(tick), n)), np.empty((3, len(tick), n, c))
+    out = np.empty((3, len(tick), n))
+    slopes = np.empty((3, len(tick), n, c))
     model = np.empty((0, 0)) if controller.model is None else body_rows(plant.bodies, controller.model)
-    scale = np.zeros((n, c)) if relative is None else np.ascontiguousarray(shaped(relative, (n, c), "relative"))
+    if relative is None:
+        scale = np.zeros((n, c))
+    else:
+        scale = np.ascontiguousarray(shaped(relative, (n, c), "relative"))
     status, reached = tangent_kernels.closed_loop_tangent(
         packed(plant),
         (*layout_of(plant), find),
@@ -106,7 +112,8 @@ def simulate_tangents(
         raise failure(status, reached * reference.period)
     # slope of the last sample by a parameter, in SI units, from which on the loop is unstable (our choice)
     max_slope = 1e20
-    if not np.abs(slopes[:, -1]).max(initial=0.0) < max_slope:  # saturated torques keep only the motion finite
+    # saturated torques keep only the motion finite
+    if not np.abs(slopes[:, -1]).max(initial=0.0) < max_slope:
         raise Diverged(f"the loop is unstable, its derivatives diverge: {LOWER}", None)
     t = reference.t[0] + tick * reference.period
     return Sensitivities(t, *(frozen(x) for x in out), *(frozen(x) for x in slopes))
@@ -127,7 +134,8 @@ def simulate_differences(
         return np.array([run.q, run.v, run.torque])
 
     values = np.array(plant.parameters)
-    here, shifts = moved(values), np.eye(len(values))[columns] * steps[:, None]
+    here = moved(values)
+    shifts = np.eye(len(values))[columns] * steps[:, None]
     slopes = np.stack([(moved(values + shift) - here) / step for shift, step in zip(shifts, steps)], axis=-1)
     tick = sample_ticks(len(reference.t), every)
     return Sensitivities(reference.t[0] + tick * reference.period, *map(frozen, (*here, *slopes)))
@@ -169,7 +177,9 @@ class Stepper:
         from calib.identification.survey import tangent_kernels
 
         n = len(q)
-        q, v, gain = np.array(q), np.array(v), np.empty((n, n))
+        q = np.array(q)
+        v = np.array(v)
+        gain = np.empty((n, n))
         slopes = np.empty((2, n, 2 * n + columns))
         args = (self.parts, self.layout, np.ascontiguousarray(parameters), q, v, tau, period, gain)
         status = tangent_kernels.advance_linearised(*args, slopes[0], slopes[1])
@@ -265,7 +275,8 @@ def believed_robot(problem: IdentificationProblem, method: Method, steps: np.nda
         columns = np.array(problem.base.kept)
         return BelievedRobot(problem.model, columns, plant_of(problem.model, np.zeros(problem.model.p)), steps)
     model, columns = with_friction(problem, serial_arm(problem, method))
-    terms, size = model.columns, model.p
+    terms = model.columns
+    size = model.p
     if not model.torque_rows.with_motors:
         widths = {one.acts[0][0]: one.settings[-1] for one in terms if one.shape == "sign"}
         width = [widths.get(joint, V0) for joint in range(model.n)]
@@ -300,7 +311,8 @@ def start_of(
     if problem.start is not None:
         return np.array(problem.start, dtype=float)
     model: Any = problem.model
-    own, standard = problem.base.b, np.zeros(model.p)
+    own = problem.base.b
+    standard = np.zeros(model.p)
     serial = isinstance(model, IdentificationModel)
     motors = {one.joint: k for k, one in enumerate(model.columns, model.inertial) if one.shape == "acceleration"}
     for joint, own_inertia in zip(range(model.n) if serial else model.known.robot.actuated, inertia):

@@ -60,7 +60,8 @@ def replay(
     Raises:
         CalibError: where the rows are not the motors', or the loop is unstable.
     """
-    model, n = dynamics.model, chain.n
+    model = dynamics.model
+    n = chain.n
     require(model.torque_rows.with_motors, f"rows '{model.torque_rows.name}' do not contain the whole motor torque")
     part = _stretch(case)
     motion = case.motion
@@ -126,8 +127,11 @@ def _possible(robot: Plant, reference: Reference, min_eigenvalue: float = 0.05) 
 
     `min_eigenvalue`: least eigenvalue of a possible robot's inertia, scaled by its diagonal.
     """
-    bodies, first, inertia = robot.bodies, robot.inertial, robot.inertia(reference.q[::50])
-    min_inertia = 1e-3  # [kg m² or kg] least inertia of a joint
+    bodies = robot.bodies
+    first = robot.inertial
+    inertia = robot.inertia(reference.q[::50])
+    # [kg m² or kg] least inertia of a joint
+    min_inertia = 1e-3
     size = np.maximum(np.abs(np.einsum("kii->i", inertia)) / len(inertia), min_inertia)
     least = float(np.linalg.eigvalsh(inertia / np.sqrt(np.outer(size, size)))[:, 0].min())
     added = max(0.0, min_eigenvalue - least) * size
@@ -150,7 +154,8 @@ def _softer(one: DriveTerm, value: float, size: np.ndarray, reference: Reference
 
 
 def _default(robot: Plant, reference: Reference) -> Controller:
-    omega, inertia = 2.0 * np.pi * FREQUENCY, robot.inertia_diagonal(reference.q[::200])
+    omega = 2.0 * np.pi * FREQUENCY
+    inertia = robot.inertia_diagonal(reference.q[::200])
     return pd(omega**2 * inertia, 2.0 * DAMPING * omega * inertia)
 
 
@@ -166,7 +171,9 @@ def track(
         predictions: case name → torques by the model.
         controller: that was identified, where the loop's is not stated.
     """
-    chain, loop, max_replays = inputs.chain, inputs.options.settings.loop, 3
+    chain = inputs.chain
+    loop = inputs.options.settings.loop
+    max_replays = 3
     chosen = inputs.unseen[:max_replays] or inputs.cases[:1]
     try:
         if loop is None or loop.controller != "identify":

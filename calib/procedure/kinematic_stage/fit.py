@@ -213,7 +213,7 @@ def _found_of(
         model=found.chosen,
         loss=found.loss,
         cross_validated=left,
-        nominal_cross_validated=next((r.cross_validated for r in found.rungs if r.model == "frames"), None),
+        nominal_cross_validated=found.nominal_step.cross_validated,
         outlier_share=len({(each.file, each.row) for each in named}) / sum(len(block) for block in inputs.fit),
         reach=reach,
         noticed=settle([*odd, *notes, *blind], accepted),

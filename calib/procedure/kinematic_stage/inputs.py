@@ -123,7 +123,9 @@ def gather(
     require(measured, "no measurement file given", UsageError)
     files = [_path(each) for each in measured]
     check_files(options, [*files, *map(_path, validate)])
-    chain, source = load_robot(robot, files[0], options, base, tip)
+    # the joints of a table tell where a URDF's arm ends; measurements in memory have no table
+    table = None if isinstance(measured[0], PoseMeasurements) else files[0]
+    chain, source = load_robot(robot, table, options, base, tip)
     stored = source.suffix == ".toml"
     earlier = robot if isinstance(robot, CalibratedChain) else calibrated.read(source) if stored else None
     masses = None

@@ -26,8 +26,10 @@ from calib.records import frozen
 from calib.rooms.parallel.mechanism.closure import compiled
 from calib.rooms.parallel.mechanism.velocities import loop_jacobians
 
-FAR = 0.3  # [rad or m] between encoders and reference at which a run has diverged
-SHAPES = {"acceleration": 0, "velocity": 1, "sign": 2, "one": 3}  # drive terms that can be simulated, and their places
+# [rad or m] between encoders and reference at which a run has diverged
+FAR = 0.3
+# drive terms that can be simulated, and their places
+SHAPES = {"acceleration": 0, "velocity": 1, "sign": 2, "one": 3}
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,12 +90,16 @@ class ParallelPlant:
         """
         from calib.rooms.parallel.mechanism import simulation_kernels
 
-        known, sensing, n = self.model.known, sensing or Sensing(), self.model.n
-        rng, shape = np.random.default_rng(seed), reference.q.shape
+        known = self.model.known
+        sensing = sensing or Sensing()
+        n = self.model.n
+        rng = np.random.default_rng(seed)
+        shape = reference.q.shape
         encoder, heard = (rng.normal(size=shape) * size for size in (sensing.sigma_q, sensing.sigma_tau))
         start = known.locate(reference.q[:1])
         rate = np.linalg.pinv(loop_jacobians(known, start).readings[0]) @ reference.v[0]
-        out, period = np.empty((3, *shape)), reference.period
+        out = np.empty((3, *shape))
+        period = reference.period
         status, reached = simulation_kernels.run(
             _robot(self.model),
             self._values(),
@@ -122,7 +128,8 @@ class ParallelPlant:
 
     def _values(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the parameters of legs, platform and drives as `simulation_kernels.run` takes them."""
-        model, values = self.model, self.parameters
+        model = self.model
+        values = self.parameters
         drives = np.zeros((int(model.known.robot.starts[-1]), 5))
         drives[:, 4] = 1.0
         for one, value in zip(model.terms, model.spread(values)[-len(model.terms) :] if model.terms else ()):
