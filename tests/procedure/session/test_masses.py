@@ -11,9 +11,10 @@ from without_figures import run
 import calib
 from calib.data.poses.measurements import Poses
 from calib.errors import UsageError
+from calib.identification.model_file import identified_masses
 from calib.procedure.session.commands import new_session
 from calib.procedure.session.folder import MASSES, open_session, read_state
-from calib.procedure.session.masses import ROUNDS, identified_masses, largest_move
+from calib.procedure.session.masses import ROUNDS, largest_move
 from calib.records import read_json
 from calib.robot import calibrated, description
 from calib.robot.calibrated import CalibratedChain
