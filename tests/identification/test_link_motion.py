@@ -11,11 +11,11 @@ from calib.data.recordings.recording import Recording
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics import rigid_body
 from calib.identification.identify import Identification, identify
-from calib.identification.link_motion import deflection_sensitivity, with_link_motion
+from calib.identification.link_motion import with_link_motion
 from calib.identification.prediction import predict
 from calib.identification.rows import Case, make_case
 from calib.identification.settings import IdentificationSettings
-from calib.identification.uncertainty.geometry_uncertainty import propagate
+from calib.identification.uncertainty.geometry_uncertainty import deflection_sensitivity, propagate
 from calib.robot import calibrated
 from calib.robot.calibrated import CalibratedChain, CorrectedChain, Deflection, Term
 
