@@ -31,15 +31,15 @@ HOMES = {
     ],
     "yourdfpy": ["calib.robot.formats.simulators"],
     "cv2": [
-        "calib.rooms.camera.pictures.detection",
-        "calib.rooms.camera.pictures.images",
-        "calib.rooms.camera.board_and_lens",
-        "calib.rooms.camera.pictures.board_print",
+        "calib.data.images.detection",
+        "calib.data.images.images",
+        "calib.data.images.board_and_lens",
+        "calib.data.images.board_print",
         "calib.rooms.cells.rendered_camera",
     ],
-    "ruamel": ["calib.rooms.camera.lens", "calib.procedure.measuring.moveit"],
-    "mcap": ["calib.data.", "calib.rooms.camera."],
-    "rosbags": ["calib.data.recordings.bags", "calib.rooms.camera."],
+    "ruamel": ["calib.data.images.lens", "calib.procedure.measuring.moveit"],
+    "mcap": ["calib.data."],
+    "rosbags": ["calib.data.recordings.bags", "calib.data.images."],
     "pandas": ["calib.api.rendering"],
     "starlette": ["calib.rooms.serve.pages"],
     "uvicorn": ["calib.rooms.serve.commands"],
@@ -149,7 +149,7 @@ def test_the_rooms_can_be_shut(monkeypatch):
     monkeypatch.setattr(extensions, "_offers", dict)
     assert extensions.Point("commands", "").all() == []
     with pytest.raises(UsageError):
-        extensions.Point("camera_guess", "").one()
+        extensions.Point("optics", "").one()
     code = "import sys; sys.modules['calib.rooms'] = sys.modules['calib.apps'] = None; "
     code += "import calib; from calib.cli import run; "
     code += "from calib.data.poses.measurements import PoseMeasurements as Measured; import numpy as np; "

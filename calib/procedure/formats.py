@@ -45,6 +45,11 @@ TOPICS: Mapping[str, tuple[str, str]] = {
         "recordings of motion, for calib identify",
         "calib.data.recordings.recording_options calib.data.recordings.recording_files calib.data.recordings.archives",
     ),
+    "images": (
+        "a folder of images of a board, its board.toml, camera.yaml, corners.csv",
+        "calib.data.images.image_folders calib.data.images.board calib.data.images.lens calib.data.images.pixels "
+        "calib.data.images.image_bags",
+    ),
     "logs": (
         "logs of robot controllers, by brand, and ROS bags",
         "calib.data.recordings.controller_logs calib.data.recordings.bags",

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -30,11 +29,9 @@ from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.kinematics import gravity_torques
 from calib.robot.library import load, resolve
 
-IMAGE_FOLDERS: Point[Any] = Point("image_folders", "a module: `read_images` reads a folder of images as a block")
 PLANNED_POSES: Point[Callable[[Path, Chain, FileOptions], list[PoseMeasurements]]] = Point(
     "planned_poses", "points without joints, with those of planned poses"
 )
-CAMERA_GUESS: Point[Any] = Point("camera_guess", "a module: completes images' lenses, and takes images as poses")
 
 
 @dataclass(frozen=True)
@@ -272,11 +269,16 @@ def read_file(
         fits = tuple(each.joint_names) == chain.joint_names or len(each.joint_names) == chain.n
         blocks = [check_block(each, own, joints) if fits else each]
     elif is_image_folder(path):
-        blocks = [IMAGE_FOLDERS.one().read_images(path, joints, own)]
+        from calib.data.images.image_folders import read_images
+
+        blocks = [read_images(path, joints, own)]
     else:
         rooms = PLANNED_POSES.all() if own.planned else ()
         blocks = [block for room in rooms for block in room(path, chain, own)] or read_measurements(path, joints, own)
-    blocks = [CAMERA_GUESS.one().complete_camera(chain, b, like) if b.kind == IMAGES else b for b in blocks]
+    if any(block.kind == IMAGES for block in blocks):
+        from calib.geometry.camera.camera_guess import complete_camera
+
+        blocks = [complete_camera(chain, block, like) if block.kind == IMAGES else block for block in blocks]
     for block in blocks:
         check_scale(block, chain)  # unseen files, too: the fit looks at its own only
         check_orientations(chain, block)

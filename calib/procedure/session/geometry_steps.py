@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from calib import files
+from calib.data.images.coverage import image_words
 from calib.data.poses import IMAGES
 from calib.data.poses.fit_options import FileOptions, FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
@@ -64,7 +65,6 @@ WRITE_PROGRAM: Point[Callable[[Path, Path, str], Any]] = Point(
 DRIFT: Point[Callable[[Session, Chain, Any, Any], list[Finding]]] = Point(
     "drift", "drift of targets measured more than once"
 )
-IMAGE_WORDS: Point[Callable[[PoseMeasurements], str]] = Point("image_words", "what is said of images as they arrive")
 
 HOW = "add [camera] to the limits file, see `calib formats constraints`"
 
@@ -240,7 +240,7 @@ def notes_on(session: Session, chain: Chain, blocks: Sequence[tuple[str, PoseMea
         if measures == Poses.kind and isinstance(block, Positions) and not isinstance(block, Poses):
             found.append("only positions, although the instrument measures poses")
         if block.kind == IMAGES:
-            found.append(IMAGE_WORDS.one()(block))
+            found.append(image_words(block))
         elif measures == IMAGES:
             found.append("contains no images, although the instrument is a camera; the file is fitted nevertheless")
         found += block.notes

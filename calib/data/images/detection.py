@@ -13,11 +13,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from calib.data.images.board import DICTIONARIES, MIN_CORNERS, Board, corners
+from calib.data.images.board_print import charuco, dictionary
+from calib.data.images.images import quiet, read_image
+from calib.data.images.pixels import Detection, Found
 from calib.errors import MeasurementError
-from calib.rooms.camera.board import DICTIONARIES, MIN_CORNERS, Board, corners
-from calib.rooms.camera.pictures.board_print import charuco, dictionary
-from calib.rooms.camera.pictures.images import quiet, read_image
-from calib.rooms.camera.pixels import Detection, Found
 
 MIN_MARKERS = 4  # markers that tell a dictionary
 FLOOR = {"charuco": 0.02, "chessboard": 0.02, "apriltag": 0.2}  # of a corner's sigma [px]; tags' wander with blur

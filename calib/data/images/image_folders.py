@@ -23,15 +23,15 @@ from pathlib import Path
 import numpy as np
 
 from calib.data.csv_table import Table, read_table
+from calib.data.images.board import Board, corners, read_board
+from calib.data.images.coverage import coverage_words
+from calib.data.images.lens import LENS, Lens, read_lens
+from calib.data.images.pixels import Found, Pixels, read_corners, write_corners
 from calib.data.poses import BOARD, CORNERS, JOINTS, plausible
 from calib.data.poses.columns import Sheet
 from calib.data.poses.fit_options import FileOptions
 from calib.data.schema import Joints
 from calib.errors import CalibError, MeasurementError, UsageError, counted, listing, require
-from calib.rooms.camera.board import Board, corners, read_board
-from calib.rooms.camera.image_findings import coverage_words
-from calib.rooms.camera.lens import LENS, Lens, read_lens
-from calib.rooms.camera.pixels import Found, Pixels, read_corners, write_corners
 
 MEASURED = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?![\w.]*_)")  # a number, no part of a name
 Progress = Callable[[int, int, str], None]
@@ -130,7 +130,7 @@ def find_corners(path: Path, board: Board, names: Sequence[str], progress: Progr
     if not images:
         missing = f"'{names[0]}' and the others" if len(names) > 1 else f"'{names[0]}'" if names else "images"
         raise MeasurementError(f"none of the images named in {JOINTS} exists ({missing})", path)
-    from calib.rooms.camera.pictures.detection import detected  # loads OpenCV: only where images are looked at
+    from calib.data.images.detection import detected  # loads OpenCV: only where images are looked at
 
     found = detected(((each.name, each) for each in images), board, len(images), progress)
     with suppress(CalibError):  # a folder that cannot be written into is read all the same
@@ -215,7 +215,7 @@ def look(folder: Path, show: Callable[[str], None]) -> list[str]:
 
 
 def _images(folder: Path) -> list[str]:
-    from calib.rooms.camera.pictures.images import SUFFIXES
+    from calib.data.images.images import SUFFIXES
 
     names = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
     require(names, f"{folder}: there is neither a {JOINTS} nor an image ({', '.join(SUFFIXES)})", UsageError)

@@ -8,10 +8,10 @@ import numpy as np
 
 from calib import files
 from calib.config import parse
+from calib.data.images.board import KINDS, MIN_CORNERS, Board, corners, read_board, write_board
+from calib.data.images.images import quiet
 from calib.data.poses import BOARD
 from calib.errors import CalibError, UsageError, require
-from calib.rooms.camera.board import KINDS, MIN_CORNERS, Board, corners, read_board, write_board
-from calib.rooms.camera.pictures.images import quiet
 
 PAPERS = {"a4": (0.210, 0.297), "a3": (0.297, 0.420), "a2": (0.420, 0.594), "a1": (0.594, 0.841), "a0": (0.841, 1.189)}
 EDGE = 0.008  # printers leave this free [m]
@@ -180,7 +180,7 @@ def make(
 
     Args:
         out: folder.
-        kind, columns, rows, words, paper: see `calib.rooms.camera.board`; a dictionary, and the paper's name. None: the
+        kind, columns, rows, words, paper: see `calib.data.images.board`; a dictionary, and the paper's name. None: the
             usual ones.
         square, marker: [mm].
         overwrite: replace another board that is there, whose squares somebody may have measured.

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 
 from calib import files
+from calib.data.images.board import Board, read_board, write_board
+from calib.data.images.detection import detected
+from calib.data.images.image_folders import detection_summary
+from calib.data.images.pixels import Found, write_corners
 from calib.data.poses import BOARD, CORNERS, JOINTS
 from calib.data.recordings.bags import JOINT_STATE, connections_of, header_stamp, joint_states, opened
 from calib.errors import MeasurementError, require
-from calib.rooms.camera.board import Board, read_board, write_board
-from calib.rooms.camera.pictures.detection import detected
-from calib.rooms.camera.pictures.image_folders import detection_summary
-from calib.rooms.camera.pixels import Found, write_corners
 
 IMAGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/Image", "sensor_msgs/CompressedImage")
 
@@ -90,7 +90,7 @@ def _images(reader: Any, connections: list[Any], wanted: set[int]) -> Any:
 
 
 def _grey(message: Any) -> np.ndarray:
-    from calib.rooms.camera.pictures.images import decode, to_grey
+    from calib.data.images.images import decode, to_grey
 
     if hasattr(message, "format"):
         return decode(bytes(message.data))
@@ -143,7 +143,7 @@ def _at_rest(images: np.ndarray, stamps: np.ndarray, q: np.ndarray) -> tuple[np.
 
 
 def write_image_folder(found: ImageBag, board: Board, folder: Path) -> Path:
-    """Write a bag's images as a folder for `calib.rooms.camera.pictures.image_folders`."""
+    """Write a bag's images as a folder for `calib.data.images.image_folders`."""
     write_board(board, folder / BOARD)
     rows = [[name, *map(float, joints)] for name, joints in zip(found.names, found.q)]
     files.write_table(folder / JOINTS, ["image", *(f"{name} [rad]" for name in found.joint_names)], rows)

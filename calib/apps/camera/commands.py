@@ -40,7 +40,7 @@ def board(
         dictionary: marker dictionary: 4x4_50 to 7x7_1000, apriltag_36h11
         paper: a4, a3, a2, a1 or a0; by default the smallest that fits
     """
-    from calib.rooms.camera.pictures.board_print import make
+    from calib.data.images.board_print import make
 
     for line in make(out, kind, columns, rows, square, marker, dictionary, paper, overwrite):
         say(line)
@@ -72,7 +72,7 @@ def images(
 
     with progress() as show:
         if source.is_dir() and (source / "board.toml").exists():
-            from calib.rooms.camera.pictures.image_folders import look
+            from calib.data.images.image_folders import look
 
             lines = look(source, show)
         elif not source.exists():
@@ -80,7 +80,7 @@ def images(
         elif board is None or out is None:
             raise UsageError(f"{source} has no board.toml; for a bag give --board and --out")
         else:
-            from calib.rooms.camera.pictures.image_bags import from_bag
+            from calib.data.images.image_bags import from_bag
 
             lines = from_bag(source, board, out, image_topic, joint_topic, show)
     for line in lines:

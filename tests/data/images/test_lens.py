@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from differences import check
 
+from calib.data.images.lens import Lens, rays, read_lens, write_lens
 from calib.errors import CalibError, MeasurementError
-from calib.rooms.camera.lens import Lens, rays, read_lens, write_lens
 
 SIZE = (800, 600)
 BASE = [780.0, 782.0, 400.0, 298.0]

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from calib.data.images.board import Board, corners
+from calib.data.images.lens import Lens, rays
 from calib.errors import CalibError, counted, refuse_data
 from calib.records import evenly
-from calib.rooms.camera.board import Board, corners
-from calib.rooms.camera.lens import Lens, rays
 from calib.transforms import orthonormal, pose
 
 STEPS = 12  # of Gauss–Newton

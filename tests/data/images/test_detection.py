@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from calib.data.images.board import Board, corners
+from calib.data.images.detection import detect
+from calib.data.images.images import decode, read_image
+from calib.data.images.lens import Lens
+from calib.data.images.pixels import Detection
 from calib.errors import MeasurementError
-from calib.rooms.camera.board import Board, corners
-from calib.rooms.camera.lens import Lens
-from calib.rooms.camera.pictures.detection import detect
-from calib.rooms.camera.pictures.images import decode, read_image
-from calib.rooms.camera.pixels import Detection
 from calib.rooms.cells.rendered_camera import Imaging, render
 from calib.transforms import pose
 

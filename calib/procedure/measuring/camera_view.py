@@ -12,8 +12,13 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from calib.data.images.board import Board, corners, read_board
+from calib.data.images.lens import Lens, read_lens
+from calib.data.images.optics import BoardShape, Optics
+from calib.data.images.pixels import Pixels
 from calib.data.poses import IN_HAND
 from calib.errors import UsageError, require
+from calib.geometry.camera.pixel_residuals import ImageNoise
 from calib.geometry.installation import Installation, see
 from calib.geometry.inverse import Goal, reach, seen_at
 from calib.geometry.observability import Observation, base_columns
@@ -21,11 +26,6 @@ from calib.geometry.observation import Block, layout, observe, prepare, target_j
 from calib.procedure.measuring.constraints_file import CameraTable
 from calib.robot.chain import Chain
 from calib.robot.tables import placement
-from calib.rooms.camera.board import Board, corners, read_board
-from calib.rooms.camera.lens import Lens, read_lens
-from calib.rooms.camera.optics import BoardShape, Optics
-from calib.rooms.camera.pixel_residuals import ImageNoise
-from calib.rooms.camera.pixels import Pixels
 from calib.transforms import invert, pose
 from poses.space import PoseConstraint
 

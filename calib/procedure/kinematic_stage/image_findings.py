@@ -5,17 +5,16 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.data.poses import IN_HAND
+from calib.data.images.coverage import coverage, coverage_words
+from calib.data.images.pixels import Pixels
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import Finding, finding
+from calib.geometry.camera.pixel_residuals import PixelPart
 from calib.geometry.installation import Installation
 from calib.geometry.observation import observe, prepare
 from calib.geometry.weighing import GeometricFit
 from calib.procedure.kinematic_stage.metrics import ImageCoverage
-from calib.rooms.camera.pixel_residuals import PixelPart
-from calib.rooms.camera.pixels import Pixels
 
-GRID = (12, 9)  # cells of the image that coverage counts (our choice)
 MAX_NOISE = 4.0  # corner noise over its stated sigma from which on it is remarked on (our choice)
 
 
@@ -46,15 +45,6 @@ def reprojection(cell: Installation, blocks: Sequence[PoseMeasurements]) -> floa
     return float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else None
 
 
-def image_words(block: Pixels) -> str:
-    """Return a summary sentence of newly read images: corners, mounting, lens, coverage."""
-    lens = block.lens
-    focal = "" if lens is None else f", focal length {lens.values[0]:.0f} px {'given' if block.known else 'found'}"
-    seen = f"{block.seen.sum(axis=1).mean():.1f} of {block.seen.shape[1]} corners each"
-    carried = "the arm carries the camera" if block.mounting == IN_HAND else "the arm carries the board"
-    return f"{seen}; {carried}{focal}; {coverage_words(block.pixel[block.seen], block.size)}"
-
-
 def image_notes(found: GeometricFit) -> list[Finding]:
     """Return the findings on the images of a fit; empty without images."""
     result: list[Finding] = []
@@ -74,16 +64,3 @@ def image_notes(found: GeometricFit) -> list[Finding]:
         if "scale" not in block.free:
             result.append(finding("board-scale", file=name, square=block.board.square, others=others))
     return result
-
-
-def coverage(pixels: np.ndarray, size: tuple[int, int], weights: np.ndarray | None = None) -> np.ndarray:
-    """Return the number (or total weight) of corners in each cell of the image grid (`GRID`), as (rows, columns)."""
-    bins = [np.linspace(0, length, count + 1) for length, count in zip(size, GRID)]
-    return np.histogram2d(pixels[:, 0], pixels[:, 1], bins, weights=weights)[0].T
-
-
-def coverage_words(pixels: np.ndarray, size: tuple[int, int]) -> str:
-    """Return a sentence on the share of the image covered by corners, with advice if it is small."""
-    share = float(np.mean(coverage(pixels, size) > 0))
-    few = "; the lens is not identifiable in the rest: bring the board closer and into the image's corners"
-    return f"corners lie in {share:.0%} of the image{few if share < 0.6 else ''}"

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
+from calib.data.images.board import Board, corners, read_board, write_board
+from calib.data.images.board_print import POINT, charuco, dictionary, page_size, pdf, raster, svg
 from calib.errors import UsageError
-from calib.rooms.camera.board import Board, corners, read_board, write_board
-from calib.rooms.camera.pictures.board_print import POINT, charuco, dictionary, page_size, pdf, raster, svg
 
 BOARDS = {
     "charuco": Board("charuco", 9, 7, 0.03, 0.021),

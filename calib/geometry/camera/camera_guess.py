@@ -1,7 +1,7 @@
 """Initial values for a fit of images: lens, mounting (camera or board on the arm), and placements.
 
-Each image gives the board's pose from its corners alone (`calib.rooms.camera.board_and_lens`); with the arm's poses a
-closed form places camera and board (`calib.rooms.camera.robust_placement`). Both ways of mounting are tried.
+Each image gives the board's pose from its corners alone (`calib.data.images.board_and_lens`); with the arm's poses a
+closed form places camera and board (`calib.geometry.camera.robust_placement`). Both ways of mounting are tried.
 """
 
 from collections.abc import Sequence
@@ -10,20 +10,20 @@ from itertools import product
 
 import numpy as np
 
+from calib.data.images.board import corners
+from calib.data.images.board_and_lens import board_poses, estimate_lens
+from calib.data.images.lens import Lens
+from calib.data.images.optics import BoardShape, Optics
+from calib.data.images.pixels import Pixels
 from calib.data.poses import IN_HAND, TO_HAND
 from calib.data.poses.measurements import PoseMeasurements, Poses, take
 from calib.errors import MeasurementError, counted, listing, refuse_data
+from calib.geometry.camera import pixel_residuals  # noqa: F401  # registers what images say of the geometry
+from calib.geometry.camera.robust_placement import Placement, place_robustly
 from calib.geometry.first_guess import average_pose, guess, misfit
 from calib.records import evenly
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
-from calib.rooms.camera import pixel_residuals  # noqa: F401  # registers what images say of the geometry
-from calib.rooms.camera.board import corners
-from calib.rooms.camera.board_and_lens import board_poses, estimate_lens
-from calib.rooms.camera.lens import Lens
-from calib.rooms.camera.optics import BoardShape, Optics
-from calib.rooms.camera.pixels import Pixels
-from calib.rooms.camera.robust_placement import Placement, place_robustly
 from calib.transforms import invert, pose, to_quaternion
 
 ODD = 8.0  # robust deviations from which on a corner does not fit into its image, and is left out

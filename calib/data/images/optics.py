@@ -21,12 +21,12 @@ from typing import Any
 
 import numpy as np
 
+from calib.data.images.board import Board
+from calib.data.images.lens import Lens
+from calib.data.images.pixels import Pixels
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import refuse_option
 from calib.records import read_record
-from calib.rooms.camera.board import Board
-from calib.rooms.camera.lens import Lens
-from calib.rooms.camera.pixels import Pixels
 
 SHAPE = ("scale", "bend_xx", "bend_xy", "bend_yy")
 UNITS = ("", "1/m", "1/m", "1/m")

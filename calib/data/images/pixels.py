@@ -14,11 +14,11 @@ from typing import ClassVar
 import numpy as np
 
 from calib import files
+from calib.data.images.board import Board, corners
+from calib.data.images.lens import Lens
 from calib.data.poses import IMAGES, IN_HAND
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import MeasurementError, refuse_data, refused_as
-from calib.rooms.camera.board import Board, corners
-from calib.rooms.camera.lens import Lens
 
 
 @dataclass(frozen=True, eq=False)

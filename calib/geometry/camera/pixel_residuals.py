@@ -23,15 +23,15 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from calib.data.images.board import corners
+from calib.data.images.optics import shape_slopes
+from calib.data.images.pixels import Pixels
 from calib.data.poses import IN_HAND
 from calib.errors import refuse_data
 from calib.estimation import robust
 from calib.geometry.installation import Seen
 from calib.geometry.residuals import Part, parts
 from calib.records import Frozen
-from calib.rooms.camera.board import corners
-from calib.rooms.camera.optics import shape_slopes
-from calib.rooms.camera.pixels import Pixels
 
 # change of a noise that repeats no fit, as a share, and of its [m, rad] (our choice)
 MAX_NOISE_CHANGE, MIN_NOISE = 0.05, 2e-6
