@@ -52,7 +52,7 @@ HOMES = {
     "cvxpy": [],  # the tests' independent solver
     "matplotlib": ["calib.procedure.", "calib.api.", "calib.rooms.", "calib.apps."],
     "jinja2": ["calib.procedure.report.templates", "calib.apps.controller_programs.program"],
-    "typst": ["calib.rooms.certificate.rendering"],
+    "typst": ["calib.procedure.report.certificate.rendering"],
     "dask": ["calib.workers.cluster"],
     "distributed": ["calib.workers.cluster"],
     "fsspec": ["calib.rooms.fleet.stores"],

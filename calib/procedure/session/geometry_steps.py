@@ -49,7 +49,7 @@ from calib.procedure.measuring.run import same_turn, write_run
 from calib.procedure.report import fit_report
 from calib.procedure.report.geometry_section import error_words, outlier_sentences, parameter_words
 from calib.procedure.report.outputs import write_fit
-from calib.procedure.session import folder
+from calib.procedure.session import drift, folder
 from calib.procedure.session.folder import Say, Session
 from calib.robot import calibrated
 from calib.robot.chain import Chain, joint_kinds
@@ -61,9 +61,6 @@ from poses.space import is_feasible
 
 WRITE_PROGRAM: Point[Callable[[Path, Path, str], Any]] = Point(
     "write_program", "files of a program of the poses in a CSV"
-)
-DRIFT: Point[Callable[[Session, Chain, Any, Any], list[Finding]]] = Point(
-    "drift", "drift of targets measured more than once"
 )
 
 HOW = "add [camera] to the limits file, see `calib formats constraints`"
@@ -210,8 +207,7 @@ def arrive(session: Session, say: Say) -> list[str]:
     chain = chain_of(session)
     blocks, again = (read_measured(session, chain, session.brought(kind)) for kind in ("measured", "drift"))
     notes = notes_on(session, chain, blocks, folder.POSES)
-    for drift in DRIFT.all():
-        notes += lines_of(drift(session, chain, *([block for _, block in own] for own in (blocks, again))))
+    notes += lines_of(drift.of_session(session, chain, *([block for _, block in own] for own in (blocks, again))))
     files.write(session.path(folder.POSES_CHECKED), "\n".join(notes) + "\n")
     return notes
 

@@ -15,8 +15,8 @@ from calib.data.images.board import read_board
 from calib.data.images.lens import read_lens
 from calib.data.poses import BOARD, IMAGES, IN_HAND, TO_HAND
 from calib.errors import UsageError, one_of, refused_as, require
+from calib.procedure.answers import CAMERA, CELL, Answers, CertificateSection
 from calib.procedure.measuring.constraints_file import AXES, ConstraintsFile
-from calib.procedure.session.answers import CAMERA, CELL, Answers, CertificateSection
 from calib.procedure.session.settings import NOTHING, InstrumentSection
 from calib.robot.library import resolve
 from calib.transforms import pose, to_xyz_rpy
@@ -195,7 +195,7 @@ def cell_tables(**answers: str | Sequence[str] | None) -> dict[str, Any]:
     means that it does not exist, so that nothing has to be checked.
 
     Args:
-        answers: by the names of `calib.procedure.session.answers.Answers`.
+        answers: by the names of `calib.procedure.answers.Answers`.
 
     Raises:
         UsageError: for an invalid answer, with the valid form.

@@ -16,7 +16,6 @@ from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.report import fit_report
 from calib.procedure.report.fit_report import CorrelatedPair, FittedParameter, Report, RowErrors
-from calib.procedure.report.outputs import FIT_PAGES
 from calib.rooms.parallel.mechanism.geometric_fit import LEFT_OUT, LoopFit, LoopParameter
 from calib.rooms.parallel.mechanism.parallel_robot import ParallelRobot
 from calib.rooms.parallel.robots import ParallelMechanism
@@ -92,8 +91,9 @@ def write(fit: ReportedFit, folder: Path, plots: bool) -> None:
     report = report_of(fit)
     fit_report.write(report, folder / REPORT)
     drawn = saved(captioned(report), folder) if plots else {}
-    for pages in FIT_PAGES.all():
-        pages(report, drawn, folder)
+    from calib.procedure.report.certificate import results
+
+    results.write_fit(report, drawn, folder)
 
 
 def _metrics(fit: ReportedFit) -> FitMetrics:

@@ -8,11 +8,11 @@ import pytest
 from calib import cli
 from calib.errors import UsageError
 from calib.procedure.findings import level_of
+from calib.procedure.session.drift import trends
 from calib.robot.library import load_calibrated
 from calib.rooms.cells.cell import measure, wandering, write_measured
 from calib.rooms.cells.virtual_cells import perturbed_cell
 from calib.rooms.over_time import drift_page
-from calib.rooms.over_time.drift import trends
 from calib.rooms.over_time.settings import DriftSettings
 
 MOVES = 4e-4  # over the measurement [m]

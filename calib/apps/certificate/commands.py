@@ -6,7 +6,7 @@ import typer
 
 from calib.cli.shared import command, say
 from calib.errors import UsageError, command_line, require
-from calib.procedure.session.answers import CertificateSection
+from calib.procedure.answers import CertificateSection
 
 app = typer.Typer()
 
@@ -25,8 +25,9 @@ def certificate(folder: Path, details: CertificateSection, svg: Path | None = No
         svg: folder for all figures of the report as SVG
     """
     from calib.folders import PAGES, SESSION
+    from calib.procedure.report.certificate import rendering, results
+    from calib.procedure.session import certificate as session
     from calib.procedure.session.folder import open_session
-    from calib.rooms.certificate import rendering, results, session
 
     if (folder / SESSION).exists():
         redo = command_line("redo", folder, "certificate")

@@ -5,20 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from calib.errors import UsageError, command_line, require
 from calib.folders import SESSION
+from calib.procedure.answers import CertificateSection
+from calib.procedure.report.certificate import rendering
+from calib.procedure.report.certificate.record import NO_DETAILS, Certificate, Entry, Page, records, report
 from calib.procedure.report.page import Picture
 from calib.procedure.report.templates import versions
-from calib.procedure.session.answers import CertificateSection
 from calib.result_kinds import refusal
-from calib.rooms.certificate import rendering
-from calib.rooms.certificate.record import NO_DETAILS, Certificate, Entry, Page, records, report
 from calib.units import DEG
 
 if TYPE_CHECKING:
-    from calib.api.rendering import Judged
     from calib.procedure.kinematic_stage.metrics import FitMetrics
     from calib.procedure.report.dynamics_section import DynamicReport
     from calib.procedure.report.fit_report import Report
@@ -62,7 +61,7 @@ def of_fit(
     found: Report, drawn: Mapping[str, Picture], details: CertificateSection = NO_DETAILS
 ) -> tuple[Certificate, Page]:
     """Return certificate and report of a fit."""
-    from calib.rooms.certificate import geometry  # slow to load, as all that belongs to a fit
+    from calib.procedure.report.certificate import geometry  # slow to load, as all that belongs to a fit
 
     metrics, title = found.metrics, f"Calibration of {found.robot}"
     measured = ", ".join(name for name, role, *_ in found.files if role != "nominal robot")
@@ -126,7 +125,7 @@ def of_model(
 ) -> tuple[Certificate, Page]:
     """Return certificate and report of an identification."""
     from calib.procedure.report import dynamics_section
-    from calib.rooms.certificate import dynamics
+    from calib.procedure.report.certificate import dynamics
 
     unseen, metrics = found.unseen, found.metrics
     setup = [
@@ -143,7 +142,7 @@ def of_model(
     return records(f"Calibration of {unseen.robot}", "Dynamics", setup, stages, unchecked, details=details)
 
 
-def notebook(result: Judged) -> str:
+def notebook(result: Any) -> str:
     """Return a result as a page for a notebook: the first page of a fit's certificate, else its section of a report."""
     from calib.procedure.kinematic_stage.fit import Outcome
     from calib.procedure.report import fit_report

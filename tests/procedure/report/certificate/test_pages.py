@@ -11,12 +11,11 @@ import pytest
 from pypdf import PdfReader
 from rich.console import Console
 
+from calib.procedure.answers import MAX_LETTERS, CertificateSection
 from calib.procedure.findings import PREDICTION_ONLY
 from calib.procedure.report import page
-from calib.procedure.report.page import KeyFigure, Picture, Pictures, Section, Table, Text
-from calib.procedure.session.answers import MAX_LETTERS, CertificateSection
-from calib.rooms.certificate import rendering
-from calib.rooms.certificate.record import (  # fmt: skip
+from calib.procedure.report.certificate import rendering
+from calib.procedure.report.certificate.record import (  # fmt: skip
     KNOWN,
     MAX_LINES,
     MAX_PAGES,
@@ -27,6 +26,7 @@ from calib.rooms.certificate.record import (  # fmt: skip
     records,
     report,
 )
+from calib.procedure.report.page import KeyFigure, Picture, Pictures, Section, Table, Text
 
 HOSTILE = "[bold]<script>alert(1)</script> & \"quoted\" 'one'[/]"
 ROWS = [(HOSTILE,), ("nominal", "1.5"), ("calibrated", "0.25")]

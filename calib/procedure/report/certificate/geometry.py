@@ -8,6 +8,7 @@ import numpy as np
 from calib.procedure.findings import sentence
 from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics
 from calib.procedure.kinematic_stage.validation import ARM
+from calib.procedure.report.certificate.record import Stage
 from calib.procedure.report.fit_report import Report, RowErrors
 from calib.procedure.report.geometry_section import (
     deciding,
@@ -18,7 +19,6 @@ from calib.procedure.report.geometry_section import (
     report_section,
 )
 from calib.procedure.report.page import Block, Picture, Pictures, Text
-from calib.rooms.certificate.record import Stage
 from calib.units import ERRORS, JOINT
 
 UNCERTAINTY = ("interval-coverage", "outside-fitted-range", "sigma-ratio")  # findings that belong to it

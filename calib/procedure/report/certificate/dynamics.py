@@ -12,11 +12,11 @@ import numpy as np
 from calib.folders import METRICS
 from calib.procedure.excitation import coefficients
 from calib.procedure.findings import sentence
+from calib.procedure.report.certificate.record import Stage
 from calib.procedure.report.dynamics_section import DynamicReport, percent, proof_of, rms_words, warnings_of
 from calib.procedure.report.page import Picture, Pictures, Section, Table, Text
 from calib.records import read_json
 from calib.robot.chain import Joint
-from calib.rooms.certificate.record import Stage
 
 if TYPE_CHECKING:
     from calib.procedure.report.charts import Captioned

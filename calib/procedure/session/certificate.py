@@ -14,6 +14,9 @@ from calib.procedure.export.delivery import prediction
 from calib.procedure.kinematic_stage.folder import SCHEMA, URDF
 from calib.procedure.kinematic_stage.metrics import FitMetrics
 from calib.procedure.report import fit_report
+from calib.procedure.report.certificate import dynamics, geometry, rendering
+from calib.procedure.report.certificate.record import EDITED, Certificate, Entry, Page, Stage, records
+from calib.procedure.report.certificate.results import measured_range, tolerance
 from calib.procedure.report.fit_report import RowErrors, file_row, unseen_role
 from calib.procedure.report.page import FileRow, Text
 from calib.procedure.report.templates import versions
@@ -31,9 +34,6 @@ from calib.procedure.session.folder import (
 from calib.procedure.session.geometry_steps import chain_of
 from calib.procedure.session.steps import SessionStep
 from calib.records import read_json, read_lines
-from calib.rooms.certificate import dynamics, geometry, rendering
-from calib.rooms.certificate.record import EDITED, Certificate, Entry, Page, Stage, records
-from calib.rooms.certificate.results import measured_range, tolerance
 
 RECORDINGS: Point[Callable[[Path], str]] = Point(
     "recordings", "writes a recording of a session for Rerun, and returns its name"

@@ -1,4 +1,5 @@
-"""What a certificate and a report say, as records; `calib.rooms.certificate.rendering` makes HTML and PDF of them.
+"""What a certificate and a report say, as records; `calib.procedure.report.certificate.rendering` makes HTML and PDF
+of them.
 
 Every word is in the record, so that HTML and PDF say the same. A certificate has at most `MAX_PAGES` pages: lists and
 texts that have no bound of their own are cut at a stated number here, and the report has the whole.
@@ -11,9 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 from calib.config import described
+from calib.procedure.answers import CertificateSection
 from calib.procedure.report.page import Block, FileRow, KeyFigure, Section, Table, Text, shortened
 from calib.procedure.report.templates import issued
-from calib.procedure.session.answers import CertificateSection
 
 MAX_PAGES = 4
 MAX_REASON = 420  # letters of a verdict's reason on the certificate

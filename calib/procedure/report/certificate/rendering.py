@@ -15,12 +15,12 @@ from typing import Any
 
 from calib import files
 from calib.folders import PAGES
+from calib.procedure.report.certificate.record import MAX_PAGES, Certificate, Page
 from calib.procedure.report.page import Pictures
 from calib.procedure.report.templates import filled, read
 from calib.records import plain
-from calib.rooms.certificate.record import MAX_PAGES, Certificate, Page
 
-HERE = "calib.rooms.certificate"
+HERE = "calib.procedure.report.certificate"
 FONT = "DejaVu Sans"
 OURS = str(Path(find_spec("matplotlib").origin or "").parent / "mpl-data/fonts/ttf")  # type: ignore[union-attr]
 STANDARD = "a-2b"  # refuses letters that no font shows
