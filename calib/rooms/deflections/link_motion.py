@@ -45,16 +45,16 @@ def with_link_motion(robot: CalibratedChain, case: Case, settings: Identificatio
     terms = joint_terms(robot.complete, robot.deflection)
     if rigid or not terms.terms or len(chain.driven) != chain.n:
         return case
-    own = target_elements(chain, terms)
+    elements = target_elements(chain, terms)
     torque = _torques(terms, case, settings)
-    moved = np.zeros((3, *case.motion.q.shape))
-    for j, place in enumerate(chain.moving):
-        chosen = _chosen(terms, own == place)
+    positions = np.zeros((3, *case.motion.q.shape))
+    for j, element in enumerate(chain.moving):
+        chosen = _chosen(terms, elements == element)
         if len(chosen.terms):
             bases = _bases(chosen, case.motion, torque)
-            moved[:, :, j] = np.einsum("e,sen->sn", np.asarray(chosen.coefficients), bases)
+            positions[:, :, j] = np.einsum("e,sen->sn", np.asarray(chosen.coefficients), bases)
     motion = case.motion
-    return replace(case, link=tuple(x + dx for x, dx in zip((motion.q, motion.v, motion.a), moved)))
+    return replace(case, link=tuple(x + dx for x, dx in zip((motion.q, motion.v, motion.a), positions)))
 
 
 def joint_terms(chain: Chain, deflection: Deflection) -> Deflection:
@@ -63,7 +63,7 @@ def joint_terms(chain: Chain, deflection: Deflection) -> Deflection:
 
 
 def _chosen(deflection: Deflection, mask: np.ndarray) -> Deflection:
-    terms = tuple(term for term, kept in zip(deflection.terms, mask) if kept)
+    terms = tuple(term for term, chosen in zip(deflection.terms, mask) if chosen)
     return replace(deflection, terms=terms, coefficients=np.asarray(deflection.coefficients)[mask])
 
 
@@ -73,10 +73,10 @@ def _torques(terms: Deflection, case: Case, settings: IdentificationSettings) ->
         return None
     model = make_model(terms.reference, settings)
     values = np.zeros(10 * model.bodies.count)
-    known = standard_parameters(terms.reference)
-    values[: len(known)] = known
-    for label, stated in settings.payloads.items():
-        load = settings.payload_values.get(label, stated.parameters)
+    parameters = standard_parameters(terms.reference)
+    values[: len(parameters)] = parameters
+    for label, payload in settings.payloads.items():
+        load = settings.payload_values.get(label, payload.parameters)
         if load is not None:
             first = 10 * model.bodies.labels.index(label)
             values[first : first + 10] = load
@@ -94,7 +94,7 @@ def _bases(terms: Deflection, motion: Motion, torque: np.ndarray | None) -> np.n
     return result
 
 
-def deflection_sensitivity(found: Identification, robot: CalibratedChain, cases: Sequence[Case]) -> np.ndarray:
+def deflection_sensitivity(identification: Identification, robot: CalibratedChain, cases: Sequence[Case]) -> np.ndarray:
     """Return the derivative (p, E) of the estimate by the corrections' coefficients, zero for those left out.
 
         dφ/dc = -(Wᵀ R⁻¹ W)⁻¹ Wᵀ R⁻¹ Σ_s ∂τ/∂s b_s,    s one of q, v, a of the joint, b_s the basis or its derivative
@@ -104,33 +104,35 @@ def deflection_sensitivity(found: Identification, robot: CalibratedChain, cases:
     """
     terms = robot.deflection
     chain = robot.complete
-    settings = found.settings
+    settings = identification.settings
     where = target_elements(chain, terms)
-    how = estimator(found)
-    inverse = estimate(how, found.rows)[1]
-    decimator = common_decimator(cases, found.settings)
-    model = found.dynamics.model
-    standard = found.base.to_standard(found.fitted.estimate.values[: found.base.b])[: model.inertial]
+    estimator_ = estimator(identification)
+    inverse = estimate(estimator_, identification.rows)[1]
+    decimator = common_decimator(cases, identification.settings)
+    model = identification.dynamics.model
+    standard = identification.base.to_standard(identification.fitted.estimate.values[: identification.base.b])[
+        : model.inertial
+    ]
     pull = np.zeros((len(inverse), len(terms.terms)))
-    seen = 0
-    every = -(-sum(len(case.motion) for case in cases) // SAMPLES)
-    for rows, case in zip(found.rows, cases):
+    row = 0
+    step = -(-sum(len(case.motion) for case in cases) // SAMPLES)
+    for rows, case in zip(identification.rows, cases):
         torque = _torques(joint_terms(chain, terms), case, settings)
         values = standard * model.carried_columns(case.carried)
         spans = []
-        for chosen, span in pieces(case, decimator, every):
+        for chosen, span in pieces(case, decimator, step):
             part = cut(rows, chosen)
-            white = part.matrix * (weights(how, part) ** 2).reshape(part.present.shape)[:, :, None]
+            white = part.matrix * (weights(estimator_, part) ** 2).reshape(part.present.shape)[:, :, None]
             back = spread(white, decimator, span.stop - span.start)
             spans.append((span, model.torque_rows.fold(back, (BODIES,) * back.shape[2])))
-            seen += np.count_nonzero(part.present)
+            row += np.count_nonzero(part.present)
         for j in np.flatnonzero(np.isin(chain.moving, where)):
-            own = where == chain.moving[j]
-            bases = _bases(_chosen(terms, own), case.motion, torque)
+            at_joint = where == chain.moving[j]
+            bases = _bases(_chosen(terms, at_joint), case.motion, torque)
             for span, felt in spans:
                 slopes = _torque_slopes(model.bodies, values, [x[span] for x in case.links], int(j))
-                pull[:, own] += np.einsum("nip,sni,sen->pe", felt, slopes, bases[:, :, span], optimize=True)
-    return -inverse @ pull * (sum(np.count_nonzero(part.present) for part in found.rows) / seen)
+                pull[:, at_joint] += np.einsum("nip,sni,sen->pe", felt, slopes, bases[:, :, span], optimize=True)
+    return -inverse @ pull * (sum(np.count_nonzero(part.present) for part in identification.rows) / row)
 
 
 def _torque_slopes(bodies: Bodies, values: np.ndarray, states: Sequence[np.ndarray], joint: int) -> np.ndarray:
@@ -138,7 +140,7 @@ def _torque_slopes(bodies: Bodies, values: np.ndarray, states: Sequence[np.ndarr
     result = np.zeros((3, *states[0].shape))
     for order in range(3):
         for sign in (1.0, -1.0):
-            moved = [np.array(x) for x in states]
-            moved[order][:, joint] += sign * STEP
-            result[order] += sign / (2.0 * STEP) * rigid_body.inverse_dynamics(bodies, values, *moved)
+            states_ = [np.array(x) for x in states]
+            states_[order][:, joint] += sign * STEP
+            result[order] += sign / (2.0 * STEP) * rigid_body.inverse_dynamics(bodies, values, *states_)
     return result

@@ -70,4 +70,4 @@ def geometry_spread(
         if index is None:
             return None
         before = (np.column_stack(columns[: len(errors)]) @ errors)[index]
-    return GeometrySpread(tuple((moved(one), moved(-one)) for one in errors.T), before)
+    return GeometrySpread(tuple((moved(error), moved(-error)) for error in errors.T), before)
