@@ -256,7 +256,10 @@ class _Planes:
         rows = self.scaled
         edges = self.edges
         small = Definite(matrices.matrices * self.unit, matrices.least)
-        active = np.zeros(0, dtype=int) if matrices.likely is None else matrices.likely
+        if matrices.likely is None:
+            active = np.zeros(0, dtype=int)
+        else:
+            active = matrices.likely
         # of the scaled problem, multipliers of matrices above which bind
         min_multiplier = 1e-6
         # matrices that enter at once, the most indefinite (our choice)

@@ -131,7 +131,10 @@ def make_curved(constraint: CurvedConstraint, row: Callable[[Mapping[str, float]
         UsageError: for a formula of anything but names, numbers, + - * / ** and a few functions.
     """
     h = constraint.h
-    names = tuple(signature(h).parameters) if callable(h) else ()
+    if callable(h):
+        names = tuple(signature(h).parameters)
+    else:
+        names = ()
     name = constraint.name or (f"h({', '.join(names)}) >= 0" if callable(h) else h)
     location = f"[constraints] curved '{name}'"
     if callable(h) == (constraint.slope is None):
@@ -260,7 +263,8 @@ def tangents(
         b = b + share * step
         if not satisfied and price >= MAX_PRICE and merit_now - merit(b) < min_gain * merit_now:
             break
-        price = price if satisfied else min(10.0 * price, MAX_PRICE)
+        if not satisfied:
+            price = min(10.0 * price, MAX_PRICE)
     heights_text = "; ".join(f"h of '{constraint.name}' = {constraint.value(b):.3g}" for constraint in curved)
     raise NotConverged(f"the nearest found has {heights_text}", b)
 

@@ -55,7 +55,10 @@ def tls(
     if abs(direction[p]) <= 1e-10 * np.abs(direction).max():
         raise Unidentifiable("no combination of the columns explains y: the columns depend on each other", data.names)
     values = -direction[:p] / direction[p]
-    variance = singular**2 / (count - p) if count > p else np.nan
+    if count > p:
+        variance = singular**2 / (count - p)
+    else:
+        variance = np.nan
     if not np.isfinite(variance):
         raise Unidentifiable(f"{count} rows for {p} parameters: no residual is left to check them", data.names)
     prior_rows = np.zeros((0, p))
@@ -176,7 +179,10 @@ class _ConstrainedLeastSquares(Method):
         std, tau = weighed(problem)
         pooled = problem.pooled
         free = self.free.solve(problem, std, tau)
-        weights = std if self.free.weighted else np.ones(len(std))
+        if self.free.weighted:
+            weights = std
+        else:
+            weights = np.ones(len(std))
         factor = combine(pooled, weights)
         if self.free is IRLS:
             factor = _reweighted(problem, tau, lambda triangle: constraints.solve(triangle).values).factor
@@ -219,16 +225,31 @@ TLS = LeastSquares(
     source="Golub & Van Loan 1980; Van Huffel & Vandewalle 1991",
     tunes=("ratio of the columns' noise to the torques'",),
 )
-PC_OLS, PC_WLS, PC_IRLS = (
-    _ConstrainedLeastSquares(
-        f"pc-{one.name}",
-        one.assumes + CONSISTENT,
-        one,
-        tunes=one.tunes,
-        version=one.version,
-        description=one.name + CONSTRAINED,
-        source="Sousa & Cortesão 2014; Wensing et al. 2018",
-    )
-    for one in (OLS, WLS, IRLS)
+PC_OLS = _ConstrainedLeastSquares(
+    f"pc-{OLS.name}",
+    OLS.assumes + CONSISTENT,
+    OLS,
+    tunes=OLS.tunes,
+    version=OLS.version,
+    description=OLS.name + CONSTRAINED,
+    source="Sousa & Cortesão 2014; Wensing et al. 2018",
+)
+PC_WLS = _ConstrainedLeastSquares(
+    f"pc-{WLS.name}",
+    WLS.assumes + CONSISTENT,
+    WLS,
+    tunes=WLS.tunes,
+    version=WLS.version,
+    description=WLS.name + CONSTRAINED,
+    source="Sousa & Cortesão 2014; Wensing et al. 2018",
+)
+PC_IRLS = _ConstrainedLeastSquares(
+    f"pc-{IRLS.name}",
+    IRLS.assumes + CONSISTENT,
+    IRLS,
+    tunes=IRLS.tunes,
+    version=IRLS.version,
+    description=IRLS.name + CONSTRAINED,
+    source="Sousa & Cortesão 2014; Wensing et al. 2018",
 )
 METHODS = (IRLS, TLS, PC_OLS, PC_WLS, PC_IRLS)

@@ -75,7 +75,8 @@ class Constraints(Frozen):
         if self.cone is not None or self.curved:
             return self.touched(factor).solve(factor, free)
         p = len(factor) - 1
-        free = np.linalg.solve(factor[:p, :p], factor[:p, p]) if free is None else free
+        if free is None:
+            free = np.linalg.solve(factor[:p, :p], factor[:p, p])
         postures = f"M(q) positive definite in {len(self.inertia)} postures"
         with _unsatisfied(f"no estimate satisfies {self} with {postures}: remove bounds, or record other motion"):
             definite = _definite(self.inertia, free, self.least, self.likely)
@@ -190,14 +191,20 @@ def make_constraints(
         requests += [(name, {name: 1.0}, 0.0, np.inf) for name in signed if name not in settings.bounds]
     descriptions = [_words(label, low, high) for label, _, low, high in requests]
     matrix = np.reshape([_row(weights, base, names) for _, weights, _, _ in requests], (-1, len(names)))
-    low, high = (np.array([sum_[k] for sum_ in requests], dtype=float) for k in (2, 3))
-    against = contradicting(matrix, low, high) if len(matrix) else ()
+    low = np.array([sum_[2] for sum_ in requests], dtype=float)
+    high = np.array([sum_[3] for sum_ in requests], dtype=float)
+    if len(matrix):
+        against = contradicting(matrix, low, high)
+    else:
+        against = ()
     if against:
         label = "; ".join(descriptions[k] for k in against)
         refuse_option(
             "[constraints] contradict each other", f"{label}: no estimate satisfies them together; remove one of them"
         )
-    cone = cone_of(model, base) if settings.bodies and model.inertial else None
+    cone = None
+    if settings.bodies and model.inertial:
+        cone = cone_of(model, base)
     inertia = _inertia(settings if cone is None else replace(settings, inertia=0), model, base, len(names))
     curved = tuple(make_curved(sum_, lambda weights: _row(weights, base, names)) for sum_ in settings.curved)
     return Constraints(tuple(descriptions), matrix, low, high, inertia, cone, curved=curved)
@@ -231,8 +238,12 @@ def hold(
     constraints = constraints.touched(factor)
     solution = constraints.solve(factor)
     normals = solution.normals[solution.binding]
-    before, after = (data.residual_squares(values) for values in (free.values, solution.values))
-    dof = free.dof + int(np.linalg.matrix_rank(normals)) if len(normals) else free.dof
+    before = data.residual_squares(free.values)
+    after = data.residual_squares(solution.values)
+    if len(normals):
+        dof = free.dof + int(np.linalg.matrix_rank(normals))
+    else:
+        dof = free.dof
     ratio = float(np.sum(after / std**2) / dof / max(np.sum(before / std**2) / free.dof, 1e-300))
     covariance = restricted(np.asarray(free.covariance), factor, normals) * (1.0 if stated_noise else ratio)
     estimate = replace(

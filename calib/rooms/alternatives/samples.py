@@ -163,7 +163,10 @@ def stack(
     """Return samples checked for shape and finiteness, without a copy; see `Samples`."""
     matrix = shaped(matrix, (None, None, None), "observation matrices W")
     target = shaped(target, matrix.shape[:2], "target y")
-    present = np.ones(target.shape, dtype=bool) if present is None else np.asarray(present, dtype=bool)
+    if present is None:
+        present = np.ones(target.shape, dtype=bool)
+    else:
+        present = np.asarray(present, dtype=bool)
     if present.shape != target.shape:
         raise CalibError(f"rows present: expected an array of shape {target.shape}, found {present.shape}")
     names_ = empty([f"x{k + 1}" for k in range(matrix.shape[2])] if names is None else names, units)
@@ -196,7 +199,10 @@ def irls(data: Samples, inflation: float = 1.0, solve: Callable[[np.ndarray], np
         covariance = _scatter(data, residual, weights * _consistent(data), weights)
         factor = _factor(data, covariance, weights)
         last = values
-        values = solve_triangle(factor, data.names)[0] if solve is None else solve(factor)
+        if solve is None:
+            values = solve_triangle(factor, data.names)[0]
+        else:
+            values = solve(factor)
         if np.sum((factor[:-1, :-1] @ (values - last)) ** 2) <= 1e-8 * len(values):
             return _pack(data, values, covariance, size, weights, factor, inflation)
     raise NotConverged("the weights of the samples do not converge", values)

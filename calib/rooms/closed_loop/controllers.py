@@ -47,7 +47,10 @@ class Reference:
 
     def sampled(self, ahead: np.ndarray | None) -> np.ndarray:
         """Return position, velocity, feedforward torque `ahead` (N, n) and acceleration as one array (4, N, n)."""
-        torque = np.zeros_like(self.q) if ahead is None else shaped(ahead, self.q.shape, "torque ahead")
+        if ahead is None:
+            torque = np.zeros_like(self.q)
+        else:
+            torque = shaped(ahead, self.q.shape, "torque ahead")
         return np.array([self.q, self.v, torque, self.a])
 
     def at(self, tick: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -57,7 +60,9 @@ class Reference:
             return self.q[index], self.v[index], self.a[index]
         from scipy.interpolate import CubicSpline
 
-        q, v, a = (CubicSpline(np.arange(len(self.t)), x)(tick) for x in (self.q, self.v, self.a))
+        q = CubicSpline(np.arange(len(self.t)), self.q)(tick)
+        v = CubicSpline(np.arange(len(self.t)), self.v)(tick)
+        a = CubicSpline(np.arange(len(self.t)), self.a)(tick)
         return q, v, a
 
 
@@ -127,7 +132,9 @@ def stated_controller(loop: LoopSettings, n: int) -> Controller:
         UsageError: where the length of a list is not the number of joints.
     """
     if loop.controller == "cascade":
-        first, second, third = (loop.per_joint(key, n) for key in ("position", "velocity", "reset"))
+        first = loop.per_joint("position", n)
+        second = loop.per_joint("velocity", n)
+        third = loop.per_joint("reset", n)
         return completed(cascade(first, second, third, share=loop.share), loop, n)
     return completed(pd(loop.per_joint("kp", n), loop.per_joint("kd", n), ki=loop.per_joint("ki", n)), loop, n)
 
@@ -247,5 +254,6 @@ def _explained(error: np.ndarray, tau: np.ndarray, gains: np.ndarray, rate: floa
     """Return the share of the low-passed torque explained by the gains (n,) [%]."""
     feedback = gains[0] * error + gains[1] * np.gradient(error, 1.0 / rate) + gains[2] * np.cumsum(error) / rate
     edge = border(rate, band)
-    residual, torque = (x[edge:-edge] - x[edge:-edge].mean() for x in (tau - feedback, tau))
+    residual = (tau - feedback)[edge:-edge] - (tau - feedback)[edge:-edge].mean()
+    torque = tau[edge:-edge] - tau[edge:-edge].mean()
     return float(100.0 * (1.0 - np.linalg.norm(residual) / np.linalg.norm(torque)))

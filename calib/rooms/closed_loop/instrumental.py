@@ -152,7 +152,10 @@ class Instrumental:
         # the torques' share that is unsure makes e_s = q_ref - q_s unsure, too
         unsure = np.sqrt(np.einsum("gij,jk,gik->g", simulated, estimate.covariance, simulated) / sizes)
         # rows of the motors
-        unsure = unsure[-len(self.stray) :] if len(unsure) >= len(self.stray) else unsure.max()
+        if len(unsure) >= len(self.stray):
+            unsure = unsure[-len(self.stray) :]
+        else:
+            unsure = unsure.max()
         away = np.abs(np.log(np.maximum(np.nan_to_num(self.stray, nan=1.0), 1e-3)))
         return np.flatnonzero(away > np.log(MAX_GAIN_RATIO) + 5.0 * unsure)
 
@@ -281,7 +284,9 @@ def identify_instrumental(
         before = estimate.fit
         std = estimate.fit.group_std
         tau = estimate.tau
-    kind = Diverged if len(rounds) > 2 and rounds[-1].change > rounds[1].change else NotConverged
+    kind = NotConverged
+    if len(rounds) > 2 and rounds[-1].change > rounds[1].change:
+        kind = Diverged
     raise kind(
         f"instruments from simulation: parameters still change by {100 * rounds[-1].change:.3g} % after {limit} "
         f"iterations; estimate fewer (essential ones), or check the controller's gains{_if_weak(task, estimate, std)}",
@@ -377,9 +382,8 @@ def _with_signs(
         return rows
     motion = case.motion
     band = 0.5 * case.motion.band
-    measured, expected = (
-        slope(low_pass(case_.motion.q, motion.rate, band), motion.rate) for case_ in (case, simulated_case)
-    )
+    measured = slope(low_pass(case.motion.q, motion.rate, band), motion.rate)
+    expected = slope(low_pass(simulated_case.motion.q, motion.rate, band), motion.rate)
     away = np.sqrt(np.nanmean((measured - expected) ** 2, axis=0))
     followed = away <= MAX_FOLLOWING * motion.velocity_noise(band)
     if not followed.all():
@@ -421,7 +425,10 @@ def _result(
     runs: Runs,
 ) -> Instrumental:
     """Return the result of the last iteration: σ with the variance inflation of its residuals, and the tests."""
-    problem = estimate.problem if task.estimator.measured else _stack(estimate.observed, estimate.simulated)
+    if task.estimator.measured:
+        problem = estimate.problem
+    else:
+        problem = _stack(estimate.observed, estimate.simulated)
     fit, bound = _held_fit(task, problem, std, estimate.tau)
     verdict = instrumental_variables.exogeneity(problem, std, estimate.tau)
     strength = instrumental_variables.strength(problem, std)
@@ -544,9 +551,15 @@ def _stack(observed: Sequence[ObservationRows], simulated: Sequence[np.ndarray],
     for rows, z in zip(observed, simulated, strict=True):
         for row in range(count):
             # no copy of all
-            in_use = slice(None) if rows.present[:, row].all() else rows.present[:, row]
+            if rows.present[:, row].all():
+                in_use = slice(None)
+            else:
+                in_use = rows.present[:, row]
             instruments = z[in_use, row]
-            w = rows.matrix[in_use, row] if measured else np.zeros_like(instruments)
+            if measured:
+                w = rows.matrix[in_use, row]
+            else:
+                w = np.zeros_like(instruments)
             problem = instrumental_variables.instrument(instruments, w, rows.target[in_use, row], row, before=problem)
     return problem
 
@@ -569,7 +582,10 @@ def _held_fit(task: _Fixed, problem: Instruments, std: np.ndarray, tau: float) -
     estimator = task.estimator
     if task.constraints is None:
         return fit, None
-    data = problem.least_squares() if estimator.measured else _simulated(problem)
+    if estimator.measured:
+        data = problem.least_squares()
+    else:
+        data = _simulated(problem)
     return hold(fit, estimator.triangle(problem, std), data, std, task.constraints, stated_noise=not estimator.measured)
 
 
@@ -597,7 +613,8 @@ def _stray(runs: Runs) -> np.ndarray:
         motion = case.motion
         samples = simulated_samples(case, run.t, loop)
         reference = loop.reference.at(np.arange(len(run.t)) * loop.every)[0]
-        reference, position = (low_passed(x, motion)[samples] for x in (reference, run.q))
+        reference = low_passed(reference, motion)[samples]
+        position = low_passed(run.q, motion)[samples]
         pairs.append((reference - motion.q, reference - position))
     measured, expected = (np.concatenate(x) for x in zip(*pairs))
     size = np.maximum(np.sum(expected**2, axis=0), 1e-300)

@@ -83,7 +83,9 @@ class Instruments:
             fit: the result of `iv`.
         """
         p = len(self.names)
-        sigma = np.ones(self.data.groups) if std is None else std
+        sigma = std
+        if std is None:
+            sigma = np.ones(self.data.groups)
         squares = self.data.residual_squares(np.concatenate([np.zeros(p), fit.estimate.values]))
         factor = np.zeros((1, p + 1, p + 1))
         factor[0, :p] = projected(self, sigma)[:p]
@@ -113,7 +115,10 @@ def instrument(
     matrix = shaped(matrix, (None, None), "observation matrix W")
     instruments = shaped(instruments, matrix.shape, "instruments Z")
     if before is None:
-        column_names = tuple(names) if names is not None else tuple(f"x{k + 1}" for k in range(matrix.shape[1]))
+        if names is not None:
+            column_names = tuple(names)
+        else:
+            column_names = tuple(f"x{k + 1}" for k in range(matrix.shape[1]))
         before = unseen(
             column_names, units if units is not None else ("",) * len(column_names), int(np.max(group, initial=0)) + 1
         )
@@ -226,7 +231,10 @@ def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: f
     target = factor[:, -1]
     first = _rss(instrument_rows, target)
     second = _rss(columns[:, split.kept], target)
-    f = (first - second) / k / (second / (rows - p - k)) / inflation if second > 0.0 else np.inf
+    if second > 0.0:
+        f = (first - second) / k / (second / (rows - p - k)) / inflation
+    else:
+        f = np.inf
     return ExogeneityTest(float(f), (k, dof), float(fdtrc(k, dof, f)))
 
 

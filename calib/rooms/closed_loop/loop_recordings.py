@@ -100,7 +100,9 @@ def close_loops(
         if part.name not in shifts and loop.timing != "stated":
             shifts[part.name], note = _shift(part, loop, partial(_fed_forward, controller, loop, cad, model))
             notes += note
-    design = loop.per_joint("design", model.n) if loop.design else None
+    design = None
+    if loop.design:
+        design = loop.per_joint("design", model.n)
     pairs = []
     for part in stretches:
         reference, every = _make_reference(part.motion, loop.rate, shifts.get(part.name, 0.0))
@@ -151,7 +153,9 @@ def _compare(motion: Motion, reference: np.ndarray, joint: int, max_difference: 
     if away < max_difference:
         return
     name = f"{motion.joint_names[joint]} (joint {joint + 1})"
-    alike = abs(float(np.corrcoef(q, reference)[0, 1])) > 0.95 if size > 0.0 else False
+    alike = False
+    if size > 0.0:
+        alike = abs(float(np.corrcoef(q, reference)[0, 1])) > 0.95
     if alike and abs(size / spread / DEGREES - 1.0) < 0.1:
         refuse_data(
             motion.file,
@@ -284,7 +288,10 @@ def _controller(loop: LoopSettings, case: Case) -> tuple[Controller, IdentifiedC
 
     def identified(shift: float) -> IdentifiedController:
         reference, _ = _make_reference(motion, loop.rate, shift)
-        orders = (1, 2) if loop.integral else (0, 1)
+        if loop.integral:
+            orders = (1, 2)
+        else:
+            orders = (0, 1)
         return identify_controller(reference, motion.q, tau, motion.rate, band, orders, loop.integral)
 
     identified_controller = identified(
@@ -357,7 +364,8 @@ def followed(q: np.ndarray, motion: Motion, index: np.ndarray) -> tuple[np.ndarr
         q: (N, n, ...) of the whole simulation.
         index: (M,) samples to return.
     """
-    positions, less = (low_passed(q, motion, at) for at in (motion.cutoff, motion.velocity_cutoff))
+    positions = low_passed(q, motion, motion.cutoff)
+    less = low_passed(q, motion, motion.velocity_cutoff)
     return positions[index], slope(less, motion.rate)[index], curvature(positions, motion.rate)[index]
 
 

@@ -68,7 +68,10 @@ def replay(
     robot, left_out = _robot(dynamics, case)
     reference, every = _reference(take(case, part), rate)
     robot, added = _possible(robot, reference)
-    control = _default(robot, reference) if controller is None else replace(controller, ahead=None)
+    if controller is None:
+        control = _default(robot, reference)
+    else:
+        control = replace(controller, ahead=None)
     sampled = np.arange(part.stop - part.start)
 
     def controlled(torque: np.ndarray) -> np.ndarray:
@@ -178,7 +181,10 @@ def track(
     try:
         if loop is None or loop.controller != "identify":
             controller = loop and stated_controller(loop, chain.n)
-        rate = None if controller is None or loop is None else loop.rate
+        if controller is None or loop is None:
+            rate = None
+        else:
+            rate = loop.rate
         replays = (replay(chain, dynamics, case, predictions[case.name], controller, rate) for case in chosen)
         return {replay.name: replace(replay, unseen=bool(inputs.unseen)) for replay in replays}, ""
     except CalibError as error:

@@ -91,7 +91,9 @@ class _Simulated(Method):
         if loop is None or not simulable(model):
             raise UsageError("instruments from simulation need a [loop], and a robot that can be simulated")
         loops = close_loops(model, problem.cases, problem.decimator, loop, problem.cad)
-        inertia = loop.per_joint("inertia", model.n) if loop.inertia else None
+        inertia = None
+        if loop.inertia:
+            inertia = loop.per_joint("inertia", model.n)
 
         def estimate() -> LoopEstimate:
             identification = identify_instrumental(
@@ -136,17 +138,23 @@ DIDIM = _Simulated(
     description="least squares on the simulated motion alone (the slides' CLIE)",
     source="Gautier, Janot & Vandanjon 2013",
 )
-PC_IV, PC_DIDIM = (
-    replace(
-        one,
-        name=f"pc-{one.name}",
-        assumes=one.assumes + CONSISTENT,
-        instruments=one.name,
-        takes_constraints=True,
-        description=one.name + CONSTRAINED,
-        source=source,
-    )
-    for one, source in ((IV, "Janot & Wensing 2021"), (DIDIM, "Leboutet et al. 2021"))
+PC_IV = replace(
+    IV,
+    name=f"pc-{IV.name}",
+    assumes=IV.assumes + CONSISTENT,
+    instruments=IV.name,
+    takes_constraints=True,
+    description=IV.name + CONSTRAINED,
+    source="Janot & Wensing 2021",
+)
+PC_DIDIM = replace(
+    DIDIM,
+    name=f"pc-{DIDIM.name}",
+    assumes=DIDIM.assumes + CONSISTENT,
+    instruments=DIDIM.name,
+    takes_constraints=True,
+    description=DIDIM.name + CONSTRAINED,
+    source="Leboutet et al. 2021",
 )
 METHODS = (IV, DIDIM, PC_IV, PC_DIDIM)
 
@@ -178,7 +186,9 @@ def compare_with_loop(problem: IdentificationProblem, estimate: MethodEstimate) 
 
     An estimate that came from them is the comparison itself; beside another method's, their failure is reported.
     """
-    loop_estimate = estimate if isinstance(estimate, LoopEstimate) and estimate.instrumental is not None else None
+    loop_estimate = None
+    if isinstance(estimate, LoopEstimate) and estimate.instrumental is not None:
+        loop_estimate = estimate
     if loop_estimate is None:
         try:
             loop_estimate = IV.beside(problem, estimate)
@@ -210,7 +220,9 @@ def _distance(identification: Instrumental) -> list[Finding]:
 def _gains(identification: Instrumental) -> list[Finding]:
     """Return the finding on joints whose given gains differ from the gains in the recording."""
     joints = [f"{identification.stray[j]:.2g} times at joint {j + 1}" for j in identification.off]
-    return [finding("loop-gains-off", joints=joints)] if joints else []
+    if joints:
+        return [finding("loop-gains-off", joints=joints)]
+    return []
 
 
 def _torques(identification: Instrumental) -> list[Finding]:
@@ -220,7 +232,9 @@ def _torques(identification: Instrumental) -> list[Finding]:
     iv_torques = identification.own
     labels = case.torque_rows.numbered(case.motion.n)
     rows = [f"{direct[k]:.3g} % for {iv_torques[k]:.3g} % at joint {labels[k]}" for k in identification.unexplained]
-    return [finding("loop-unexplained", rows=rows)] if rows else []
+    if rows:
+        return [finding("loop-unexplained", rows=rows)]
+    return []
 
 
 def _biased(identification: Instrumental) -> list[Finding]:
@@ -249,7 +263,9 @@ def _blurred(identification: Instrumental, loops: ClosedLoops) -> list[Finding]:
     signs = [term for term in identification.plant.terms if term.shape == "sign"]
     blurred = {sign.name: noise[sign.acts[0][0]] / sign.settings[-1] for sign in signs}
     joints = [f"{size:.2g} at {name}" for name, size in blurred.items() if size > max_blur]
-    return [finding("noisy-signs", joints=joints)] if joints else []
+    if joints:
+        return [finding("noisy-signs", joints=joints)]
+    return []
 
 
 # of both together, by which a parameter differs surely (our choice)
@@ -276,7 +292,8 @@ def disagreement(problem: IdentificationProblem, estimate: MethodEstimate, test:
         name = instruments.estimator.name
         iv_estimate = instruments.fit.estimate
         limit = max_beside_instruments
-        own_errors, beside = (instruments.simulated_error(x.values) for x in (own_estimate, iv_estimate))
+        own_errors = instruments.simulated_error(own_estimate.values)
+        beside = instruments.simulated_error(iv_estimate.values)
     else:
         plain = WLS.estimate(problem)
         if not plain.found:
@@ -284,7 +301,8 @@ def disagreement(problem: IdentificationProblem, estimate: MethodEstimate, test:
         name = "wls"
         iv_estimate = plain.estimate
         limit = max_beside_wls
-        own_errors, beside = (problem.pooled.relative_errors(x.values) for x in (own_estimate, iv_estimate))
+        own_errors = problem.pooled.relative_errors(own_estimate.values)
+        beside = problem.pooled.relative_errors(iv_estimate.values)
     away = np.abs(own_estimate.values - iv_estimate.values) / np.maximum(
         np.hypot(own_estimate.sigma, iv_estimate.sigma), 1e-300
     )

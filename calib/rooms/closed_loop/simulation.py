@@ -188,7 +188,10 @@ def simulate(
     q, v = (np.array(x, dtype=float) for x in (start if start is not None else (reference.q[0], reference.v[0])))
     tick = sample_ticks(count, sensing.every)
     out = np.empty((5, len(tick), n))
-    model = np.empty((0, 0)) if controller.model is None else body_rows(plant.bodies, controller.model)
+    if controller.model is None:
+        model = np.empty((0, 0))
+    else:
+        model = body_rows(plant.bodies, controller.model)
     status, reached = loop_kernels.closed_loop(
         *packed(plant),
         model,
@@ -207,9 +210,14 @@ def simulate(
     )
     if status != loop_kernels.FINE:
         raise failure(status, reached * reference.period)
-    heard = drawn["sigma_tau"][tick.astype(int)] if len(drawn["sigma_tau"]) else 0.0
+    heard = 0.0
+    if len(drawn["sigma_tau"]):
+        heard = drawn["sigma_tau"][tick.astype(int)]
     on_ticks = np.all(tick == tick.astype(int))
-    t = reference.t[tick.astype(int)] if on_ticks else reference.t[0] + tick * reference.period
+    if on_ticks:
+        t = reference.t[tick.astype(int)]
+    else:
+        t = reference.t[0] + tick * reference.period
     motion = [frozen(x) for x in out]
     return SimulatedRun(t, motion[0], motion[1], motion[2], motion[3], frozen(out[4] + heard), motion[4])
 
@@ -276,7 +284,9 @@ def layout_of(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
             if term.shape not in LINEAR:
                 owners.append(first + k)
                 continue
-            motion_entries = ((2 * n, 1.0),) if term.shape == "one" else motion
+            motion_entries = motion
+            if term.shape == "one":
+                motion_entries = ((2 * n, 1.0),)
             start = n if term.shape == "velocity" else 0
             entries += [(row, start + offset, first + k) for offset, _ in motion_entries]
             shares += [weight for _, weight in motion_entries]
@@ -302,7 +312,10 @@ def body_rows(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:
     result[-1, :3] = -bodies.gravity
     turns = [upright_turn(axis)[:3, :3] for axis in bodies.axes]
     for i, parent in enumerate(bodies.parents):
-        before = np.eye(3) if parent < 0 else turns[parent].T
+        if parent < 0:
+            before = np.eye(3)
+        else:
+            before = turns[parent].T
         result[i, :9] = (before @ bodies.placements[i, :3, :3] @ turns[i]).ravel()
         result[i, 9:12] = before @ bodies.placements[i, :3, 3]
         result[i, 12:22] = parameters[10 * i : 10 * i + 10][bodies.order[i]]

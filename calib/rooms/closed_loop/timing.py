@@ -71,7 +71,8 @@ def reference_shift(
             raise NotConverged(f"{case.name}: no shift of the reference in time explains the torques: check [loop]")
     tau = np.mean([inflation(column) for column in residual.T])
     sigma = float(np.sqrt(tau / max(information, 1e-300)))
-    torque, rise = (law.torque(law.t, order)[law.rows] for order in (0, 1))
+    torque = law.torque(law.t, 0)[law.rows]
+    rise = law.torque(law.t, 1)[law.rows]
     effect = float(sigma * np.sqrt(np.mean(rise.var(axis=0) / np.maximum(torque.var(axis=0), 1e-300))))
     return ReferenceShift(shift, sigma, *law.left(shift), effect)
 
@@ -97,7 +98,10 @@ class _Law:
         is_inside = (np.arange(len(self.t)) >= edge) & (np.arange(len(self.t)) < len(self.t) - edge)
         self.rows = np.flatnonzero(is_inside & free)
         self.late = controller.delay * reference.period
-        lag = 0.0 if controller.cutoff is None else 1.0 / (2 * np.pi * controller.cutoff)
+        if controller.cutoff is None:
+            lag = 0.0
+        else:
+            lag = 1.0 / (2 * np.pi * controller.cutoff)
         # the measured speed is a backward difference
         self.speed_late = self.late + 0.5 * reference.period + lag
 
@@ -115,7 +119,8 @@ class _Law:
             + controller.kd * controller.share * reference[2]
             + controller.ki * reference[0]
         )
-        residual, slopes = ((x[self.rows]) for x in (self.torque(self.t) - law, slopes))
+        residual = (self.torque(self.t) - law)[self.rows]
+        slopes = slopes[self.rows]
         return residual - residual.mean(axis=0), slopes - slopes.mean(axis=0)
 
     def left(self, shift: float) -> tuple[float, float]:
@@ -161,7 +166,9 @@ def motor_torques(case: Case) -> np.ndarray | None:
     if case.torque_rows.with_motors:
         return case.target[:, -case.motion.n :]
     projected = case.torque_rows.projection is not None and case.motion.kind == "torque"
-    return np.asarray(case.motion.effort) if projected else None
+    if projected:
+        return np.asarray(case.motion.effort)
+    return None
 
 
 def check_no_copy(motion: Motion, reference_: np.ndarray) -> None:
@@ -182,7 +189,8 @@ def check_no_copy(motion: Motion, reference_: np.ndarray) -> None:
     rows = t[edge:-edge]
     if len(rows) < 10 or not moves.any():
         return
-    measured, reference = (CubicSpline(t, x[:, moves]) for x in (motion.q, reference_))
+    measured = CubicSpline(t, motion.q[:, moves])
+    reference = CubicSpline(t, reference_[:, moves])
     shift = _by_positions(reference, measured, rows)
     residual = measured(rows) - reference(np.clip(rows - shift, t[0], t[-1]))
     # of the positions' noise in the band; no commanded motion has that of the encoders

@@ -57,7 +57,8 @@ def largest_move(before: Path, after: Path) -> float:
     """Return the largest |Δ| / σ of the parameters of two folders with an estimate; infinite for other parameters."""
     if not (before / ESTIMATE).is_file():
         return float("inf")
-    old, new = ({row.name: row for row in read_estimate(folder)} for folder in (before, after))
+    old = {row.name: row for row in read_estimate(before)}
+    new = {row.name: row for row in read_estimate(after)}
     moves = [
         abs(parameter.value - old[name].value) / parameter.sigma
         for name, parameter in new.items()
@@ -81,7 +82,9 @@ def return_masses(session: Session) -> list[str]:
     if not {"torque", "lever"} & {term.basis for term in calibrated.read(session.fit.path).deflection.terms}:
         return []
     record = record_path / ROUNDS
-    rounds = read_json(record, "calib redo fit", dict[str, int])["rounds"] if record.is_file() else 0
+    rounds = 0
+    if record.is_file():
+        rounds = read_json(record, "calib redo fit", dict[str, int])["rounds"]
     geometry = largest_move(record_path / "geometry", session.fit.path)
     dynamics = largest_move(record_path, identification)
     message = f"the geometry has moved by {geometry:.2g} σ, the dynamics by {dynamics:.2g} σ"

@@ -50,7 +50,9 @@ def geometry_spread(
     if after is None and isinstance(robot, CalibratedChain):
         covariance = robot.covariance
     else:
-        covariance = calibrated.read(path).covariance if path.suffix == ".toml" else None
+        covariance = None
+        if path.suffix == ".toml":
+            covariance = calibrated.read(path).covariance
     if covariance is None or values is None:
         return None
     if after is not None and not all((after / name).is_file() for name in (SENSITIVITY, TORQUE_COVARIANCE)):

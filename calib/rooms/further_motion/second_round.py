@@ -50,7 +50,8 @@ class _Short(NamedTuple):
 
     def left(self, before: np.ndarray, after: np.ndarray) -> float:
         """Return the error [%] that remains once the torques' σ (n,) by the parameters has fallen."""
-        then, after_ = (100.0 * errors[self.joint] / self.size for errors in (before, after))
+        then = 100.0 * before[self.joint] / self.size
+        after_ = 100.0 * after[self.joint] / self.size
         return float(np.sqrt(max(self.error**2 - then**2 + after_**2, 0.0)))
 
 
@@ -175,9 +176,16 @@ def _short_of_default(session: Session) -> tuple[str, ...]:
     weak = _weak_parameters(session, NEED)
     names = load_calibrated(session.fit.path).chain.joint_names
     parts = [f"torque of {names[joint.joint]} ({joint.error:.2g} %)" for joint in joints]
-    deviations = {short_joint.name: short_joint.rsd or 0.0 for short_joint in read_estimate(session.identification.path, _Parameter)}
+    deviations = {
+        short_joint.name: short_joint.rsd or 0.0
+        for short_joint in read_estimate(session.identification.path, _Parameter)
+    }
     worst = listing(
-        (f"{name} ({deviations[name]:.2g} %)" for name in sorted(weak, key=lambda short_joint: -deviations[short_joint])), 4
+        (
+            f"{name} ({deviations[name]:.2g} %)"
+            for name in sorted(weak, key=lambda short_joint: -deviations[short_joint])
+        ),
+        4,
     )
     parts += [f"σ of essential parameters {worst}"] if weak else []
     if not parts:

@@ -301,7 +301,8 @@ def actuator_bounds(mechanism: ClosedRobot) -> MotionBounds:
         UsageError: where nothing limits one.
     """
     joints = mechanism.robot.joints
-    velocity, effort = (np.array([getattr(joint, key) for joint in joints]) for key in ("velocity", "effort"))
+    velocity = np.array([joint.velocity for joint in joints])
+    effort = np.array([joint.effort for joint in joints])
     free = np.full(len(joints), np.inf)
     origin: dict[str, str] = dict.fromkeys(("velocity", "torque"), "robot's file")
     location = "in the robot's file: velocity and effort of the actuated joints"

@@ -228,7 +228,10 @@ class OpenedRobot:
             tie = {"name": leg.name, "site1": name, "site2": f"{leg.name}_end_tip", **CLOSED}
             ET.SubElement(ties, "weld" if leg.end == "rigid" else "connect", tie)
         for name, joint in zip(self.actuated, robot.joints):
-            limit = {"ctrlrange": f"{-joint.effort!r} {joint.effort!r}"} if np.isfinite(joint.effort) else {}
+            if np.isfinite(joint.effort):
+                limit = {"ctrlrange": f"{-joint.effort!r} {joint.effort!r}"}
+            else:
+                limit = {}
             ET.SubElement(motors, "motor", {"name": name, "joint": name, **limit})
         ET.SubElement(ET.SubElement(root, "keyframe"), "key", name="home", qpos=home)
         return xml_text(root)
@@ -356,7 +359,10 @@ def export_parallel(robot: ParallelMechanism, folder: Path, into: Path, prior: s
     check_export_target(
         into, [robot.source, *(folder / name for name in (ROBOT, METRICS, MODEL, ESTIMATE, COVARIANCE))]
     )
-    source = _identified(robot, folder, prior) if (folder / MODEL).is_file() else _calibrated(robot, folder)
+    if (folder / MODEL).is_file():
+        source = _identified(robot, folder, prior)
+    else:
+        source = _calibrated(robot, folder)
     opened, (level, verdict) = source.opened, _verdict(folder)
     remark = verdict if level in ("marginal", "fail") else ""
     texts = {URDF: opened.urdf(), MJCF: opened.mjcf()}
@@ -423,7 +429,10 @@ def _check(opened: OpenedRobot, text: str, where: str, postures: int = 5) -> Non
         expected += np.einsum("ntr,nt->nr", motion.jacobians.joints, opened.drives.values[:, 0] * motion.a)
     forces = np.zeros_like(expected)
     gap_size = 0.0
-    parts = _models(text) if mjcf else [pinocchio_model(text)]
+    if mjcf:
+        parts = _models(text)
+    else:
+        parts = [pinocchio_model(text)]
     for m in range(postures):
         frames: dict[str, np.ndarray] = {}
         for model in parts:

@@ -57,7 +57,8 @@ def propagate(
     matrix, felt, residual = solve_sensitivity(identification, cases, differences, SAMPLES, progress)
     slopes = matrix[:, : len(parameters)]
     deviations = np.sqrt(np.clip(np.diag(covariance.matrix), 0.0, None))
-    names, units = (tuple(getattr(parameter, key) for parameter in parameters) for key in ("name", "unit"))
+    names = tuple(parameter.name for parameter in parameters)
+    units = tuple(parameter.unit for parameter in parameters)
     return GeometryUncertainty(
         identification.names,
         (*names, *TILTS),
@@ -138,7 +139,9 @@ class _Differences:
         if model.torque_rows.name == POWER.name:
             segment = next(slice(a, b) for a, b in segments(case.motion.segment) if a <= span.start < b)
             return power_block(model, columns, case, span, np.zeros((0, len(case.motion))), segment).T[:, None], 0.0
-        q, v, a = (np.asarray(x[span]) for x in (case.motion.q, case.motion.v, case.motion.a))
+        q = np.asarray(case.motion.q[span])
+        v = np.asarray(case.motion.v[span])
+        a = np.asarray(case.motion.a[span])
         motion = model.moved(q, v, a, posture)
         W = model.on_rows(model.platform_regressor(motion, case.carried), motion)[:, :, columns]
         if model.torque_rows.name != PLATFORM:

@@ -46,7 +46,9 @@ def legs_differ(
     added = data.parameters - fitted.pooled.parameters
     dof = fits[1].dof
     f = (squares[0] - squares[1]) / max(added, 1) / (squares[1] / dof)
-    p = float(fdtrc(added, dof, max(f, 0.0))) if added else 1.0
+    p = 1.0
+    if added:
+        p = float(fdtrc(added, dof, max(f, 0.0)))
     if p >= level:
         return []
     alike = base.transform @ model.spread(identification.base.to_standard(fits[0].values[: identification.base.b]))

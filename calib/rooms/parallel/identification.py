@@ -155,7 +155,9 @@ def _preload(mechanism: ClosedRobot, inputs: IdentificationInputs, case: Case) -
     jacobians = loop_jacobians(mechanism, mechanism.locate(case.motion.q))
     forces = overconstraint(mechanism, jacobians, actuator_torques(inputs, case))
     forces = case.motion.in_band(forces)[:: case.motion.decimator.factor]
-    unit = "N" if mechanism.robot.joints[0].kind == "prismatic" else "N m"
+    unit = "N m"
+    if mechanism.robot.joints[0].kind == "prismatic":
+        unit = "N"
     return [
         finding(
             "preload",
@@ -220,7 +222,9 @@ def _driven_joints(
         if case.torque_rows.name == PLATFORM:
             speeds = motion.rate
         else:
-            speeds = v if target.shape[1] == model.n else 1.0
+            speeds = 1.0
+            if target.shape[1] == model.n:
+                speeds = v
         total += np.abs((target * speeds).sum(axis=1)).sum()
         energy += (model.tree_torque(values, motion) * motion.v).sum(axis=0)
     return tuple(name for name, joint_energy in zip(joints, energy) if joint_energy < MIN_ENERGY_SHARE * total)

@@ -93,7 +93,10 @@ def write(fit: ReportedFit, folder: Path, plots: bool) -> None:
 
     report = report_of(fit)
     fit_report.write(report, folder / REPORT)
-    drawn = saved(captioned(report), folder) if plots else {}
+    if plots:
+        drawn = saved(captioned(report), folder)
+    else:
+        drawn = {}
     for pages in offered("fit_pages"):
         pages(report, drawn, folder)
 
@@ -135,9 +138,12 @@ def _errors(fit: ReportedFit, joint_errors: np.ndarray) -> Errors:
     if not fit.measured:
         return Errors(None, None, None)
     places = fit.nominal.chain.selected < 3
-    position, orientation = (
-        np.linalg.norm(joint_errors[:, columns], axis=1) if columns.any() else None for columns in (places, ~places)
-    )
+    position = None
+    if places.any():
+        position = np.linalg.norm(joint_errors[:, places], axis=1)
+    orientation = None
+    if (~places).any():
+        orientation = np.linalg.norm(joint_errors[:, ~places], axis=1)
     return Errors(position, orientation, None)
 
 

@@ -139,7 +139,10 @@ def of_options(
     """Return the model of an identification's options, its values (p,) where known, the loads, and notes."""
     if options is None:
         return *read_model(robot, None, settings.drives or "Fv Fc off"), loads_of(settings.loads, (), False), ()
-    identify_options = options_of(options) if isinstance(options, IdentifySettings) else read_options(options)
+    if isinstance(options, IdentifySettings):
+        identify_options = options_of(options)
+    else:
+        identify_options = read_options(options)
     refuse_options_of_arms(identify_options.settings, identify_options)
     settings_ = identify_options.settings
     rows = rows_named(robot.mechanism, "" if settings_.torque_rows.name == MOTOR.name else settings_.torque_rows.name)
@@ -186,13 +189,23 @@ def purpose_of(
         base_columns = np.array([standard.index(standard_name(name, standard)) for name in names])
         units = tuple(model.units[k] for k in base_columns)
         chosen = values[base_columns]
-    exact, smooth = (
-        LoadedPlatform(replace(model, terms=terms), base_columns, values, names=names, units=units, loads=loads)
-        for terms in (model.terms, tuple(_smoothed(term) for term in model.terms))
+    exact = LoadedPlatform(
+        replace(model, terms=model.terms), base_columns, values, names=names, units=units, loads=loads
+    )
+    smooth = LoadedPlatform(
+        replace(model, terms=tuple(_smoothed(term) for term in model.terms)),
+        base_columns,
+        values,
+        names=names,
+        units=units,
+        loads=loads,
     )
     excited: Any = ExcitedModel(cast(Any, smooth), cast(Any, exact), chosen, covariance, folder is not None, notes)
     prior = read_prior((), excited, cast(Any, model.mechanism.robot), after)
-    sigmas = np.ones(model.rows * len(loads)) if prior is None else prior.sigmas
+    if prior is None:
+        sigmas = np.ones(model.rows * len(loads))
+    else:
+        sigmas = prior.sigmas
     columns = selected_columns(IdentifiableColumns(None, sigmas, names), excited, settings, folder)
     return Purpose(excited, columns, prior)
 

@@ -106,7 +106,10 @@ def find(robot: object) -> ParallelMechanism | None:
     """
     if not isinstance(robot, (str, Path)):
         return None
-    path = Path(robot) / ROBOT if Path(robot).is_dir() else Path(robot)
+    if Path(robot).is_dir():
+        path = Path(robot) / ROBOT
+    else:
+        path = Path(robot)
     if not path.is_file():
         path = parallel_robot.library().get(str(robot))
     elif path.suffix != ".toml" or not parallel_robot.is_parallel(path):

@@ -80,11 +80,12 @@ class Picture:
         turned = np.full((len(q), 3), np.nan)
         places = [calibrated[:, :3, 3]] * 3
         if robot.freedom[0] in table:
-            at, after, before = (
-                np.column_stack([table.numbers(head + name, DIMENSIONS[name]) for name in robot.freedom])
-                for head in ("", "d", "nominal d")
-            )
-            measured_pose, nominal, still = (pose_of(self.mechanism, x) for x in (at, at - before, at - after))
+            at = np.column_stack([table.numbers("" + name, DIMENSIONS[name]) for name in robot.freedom])
+            after = np.column_stack([table.numbers("d" + name, DIMENSIONS[name]) for name in robot.freedom])
+            before = np.column_stack([table.numbers("nominal d" + name, DIMENSIONS[name]) for name in robot.freedom])
+            measured_pose = pose_of(self.mechanism, at)
+            nominal = pose_of(self.mechanism, at - before)
+            still = pose_of(self.mechanism, at - after)
             places = [
                 pose[:, :3, 3] - still[:, :3, 3] + calibrated[:, :3, 3] for pose in (measured_pose, nominal, still)
             ]

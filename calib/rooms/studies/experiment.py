@@ -124,7 +124,10 @@ def _set_up(robot: str, duration: float, motion: str) -> Setup:
     if motion == "random":
         training = _best_random_motion(robot, chain, duration, rate)
     else:
-        folder = LIBRARY / robot if motion == "designed" else Path(motion)
+        if motion == "designed":
+            folder = LIBRARY / robot
+        else:
+            folder = Path(motion)
         series = coefficients.read(folder)
         t = np.arange(round(duration * rate) + 1) / rate
         training = Reference(t, *series.orders(t))
@@ -213,7 +216,10 @@ def data_set(condition: Condition, seed: int) -> Experiment:
     validation = Reference(other.t[part], other.q[part], other.v[part], other.a[part])
     matrix = model.regressor(validation.q, validation.v, validation.a)[:, :, base.kept]
     # A payload that nobody knows of is no part of the robot that the model shall predict.
-    predicted = robots.truth if condition.mismatch == "payload" else robots.true
+    if condition.mismatch == "payload":
+        predicted = robots.truth
+    else:
+        predicted = robots.true
     torque = feed_forward(predicted, validation)
     return Experiment(problem, model, base.transform @ robots.truth.parameters, matrix, torque)
 

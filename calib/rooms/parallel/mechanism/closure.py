@@ -93,7 +93,8 @@ def links_of(leg: Leg, q: np.ndarray, pose: np.ndarray) -> LegLinks:
     full, inverse, carried, gap, lever = (np.zeros((count, *shape)) for shape in shapes)
     bodies, tail = compiled(leg)
     # numba compiles per kind of array
-    q, pose = (np.require(x, requirements=["C", "W"]) for x in (q, pose))
+    q = np.require(q, requirements=["C", "W"])
+    pose = np.require(pose, requirements=["C", "W"])
     closure_kernels.legs(
         bodies.links, bodies.constants, tail, leg.attachment, q, pose, full, inverse, carried, gap, lever
     )

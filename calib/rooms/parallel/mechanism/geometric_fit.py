@@ -176,7 +176,8 @@ def fit_loops(
         if not rank or len(residual) <= rank:
             raise Unidentifiable(f"{len(residual)} residuals for {rank} parameters of the loops: measure more poses")
         total = float(residual @ residual)
-        before = float(np.sqrt(total / len(residual))) if iteration == 1 else before
+        if iteration == 1:
+            before = float(np.sqrt(total / len(residual)))
         std = float(np.sqrt(total / (len(residual) - rank)))
         if total < 1e-24 or (np.isfinite(square) and abs(square - total) <= loss * square):
             break
@@ -192,7 +193,8 @@ def fit_loops(
     out = tuple(
         parameter.name for parameter, sigma in zip(parameters, np.sqrt(np.diag(covariance))) if sigma > 0.5 * SPREAD
     )
-    names, units = (tuple(getattr(parameter, key) for parameter in parameters) for key in ("name", "unit"))
+    names = tuple(parameter.name for parameter in parameters)
+    units = tuple(parameter.unit for parameter in parameters)
     estimate = Estimate(names, units, changes, covariance, std, len(residual) - rank)
     return LoopFit(mechanism, parameters, estimate, out, before, float(np.sqrt(np.mean(residual**2))), iteration)
 
@@ -237,7 +239,10 @@ def _observed(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return residuals (m n or m (n - r),) and their Jacobian with respect to the parameters: r ≈ W δg."""
     robot = mechanism.robot
-    posture = mechanism.place(coordinates) if coordinates is not None else mechanism.locate(readings)
+    if coordinates is not None:
+        posture = mechanism.place(coordinates)
+    else:
+        posture = mechanism.locate(readings)
     links = leg_links(robot, posture)
     residual = readings - posture.q[:, robot.actuated]
     W = np.zeros((len(readings), robot.n, len(parameters)))
@@ -284,7 +289,10 @@ def _changed_leg(leg: Leg, parameter: LoopParameter, value: float) -> Leg:
     elements = list(leg.chain.elements)
     if parameter.part == "base":
         first = elements[0]
-        placement = np.eye(4) if first.placement is None else first.placement
+        if first.placement is None:
+            placement = np.eye(4)
+        else:
+            placement = first.placement
         elements[0] = replace(first, placement=displace(placement, value * np.eye(6)[parameter.index]))
     else:
         element = elements[parameter.index]

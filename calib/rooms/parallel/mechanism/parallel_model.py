@@ -50,7 +50,9 @@ def wrench_regressor(pose: np.ndarray, twist: np.ndarray, change: np.ndarray, gr
         gravity: (3,) [m/s²].
     """
     R = pose[:, :3, :3]
-    a, w, b = (np.einsum("nji,nj->ni", R, x) for x in (change[:, :3] - gravity, twist[:, 3:], change[:, 3:]))
+    a = np.einsum("nji,nj->ni", R, change[:, :3] - gravity)
+    w = np.einsum("nji,nj->ni", R, twist[:, 3:])
+    b = np.einsum("nji,nj->ni", R, change[:, 3:])
     regressor = np.zeros((len(R), 6, 10))
     spin = _skew(w)
     regressor[:, :3, 9] = a
@@ -63,7 +65,8 @@ def wrench_regressor(pose: np.ndarray, twist: np.ndarray, change: np.ndarray, gr
 def energy_columns(pose: np.ndarray, twist: np.ndarray, gravity: np.ndarray) -> np.ndarray:
     """Return kinetic and potential energy (N, 10) per unit of each standard parameter; see `wrench_regressor`."""
     R = pose[:, :3, :3]
-    u, w = (np.einsum("nji,nj->ni", R, x) for x in (twist[:, :3], twist[:, 3:]))
+    u = np.einsum("nji,nj->ni", R, twist[:, :3])
+    w = np.einsum("nji,nj->ni", R, twist[:, 3:])
     result = np.empty((len(R), 10))
     result[:, :6] = 0.5 * np.einsum("ni,nik->nk", w, _inertia_columns(w))
     down = np.einsum("nji,j->ni", R, gravity)
@@ -359,7 +362,8 @@ class ParallelModel:
         Of bodies next to the platform, inertia and mass regroup on it and on the links before (Khalil & Ibrahim 2007).
         """
         body_order = [(bodies, (columns.stop - columns.start) // 10) for bodies, _, columns in self.legs]
-        order, kinds = (np.concatenate([getattr(b, key)[:k] for b, k in body_order]) for key in ("order", "kinds"))
+        order = np.concatenate([b.order[:k] for b, k in body_order])
+        kinds = np.concatenate([b.kinds[:k] for b, k in body_order])
         ranks: dict[str, list[int]] = {"moments": [], "inertias": [], "late": []}
         for i, (body_order, kind) in enumerate(zip(order, kinds)):
             last = KEPT_LAST["prismatic" if kind == PRISMATIC else "revolute"]
@@ -391,7 +395,9 @@ class ParallelModel:
         return np.sqrt((at_home.joints[0] @ np.linalg.pinv(at_home.readings[0])) ** 2 @ noise**2)
 
     def load_cases(self) -> Loads:
-        return (None, ()) if self.payloads else (None,)
+        if self.payloads:
+            return (None, ())
+        return (None,)
 
     def sample(
         self, count: int, rng: np.random.Generator, lower: np.ndarray | None = None, upper: np.ndarray | None = None
@@ -470,7 +476,8 @@ def make_parallel_model(
     """
     robot = mechanism.robot
     drive_sets = list(sets) or ["Ia Fv Fc off"]
-    drive_sets = drive_sets * robot.n if len(drive_sets) == 1 else drive_sets
+    if len(drive_sets) == 1:
+        drive_sets = drive_sets * robot.n
     if len(drive_sets) != robot.n:
         raise UsageError(
             f"drives: {len(drive_sets)} texts for the {robot.n} actuated joints; give one, or one per joint"
@@ -547,7 +554,9 @@ def _beside(mechanism: ClosedRobot, *motion: bytes) -> list[tuple[LoopMotion, Lo
             ends = []
             for shifted in ([*states], [*states]):
                 shifted[order] = shifted[order] + (-shift if ends else shift)
-                posture = mechanism.place(shifted[0], start) if order == 0 else start
+                posture = start
+                if order == 0:
+                    posture = mechanism.place(shifted[0], start)
                 twist = _twist_of(mechanism, *shifted)
                 ends.append(of_platform(mechanism, posture, *twist, None if order == 0 else still))
             result.append(tuple(ends))

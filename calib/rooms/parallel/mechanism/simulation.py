@@ -95,7 +95,8 @@ class ParallelPlant:
         n = self.model.n
         rng = np.random.default_rng(seed)
         shape = reference.q.shape
-        encoder, heard = (rng.normal(size=shape) * size for size in (sensing.sigma_q, sensing.sigma_tau))
+        encoder = rng.normal(size=shape) * sensing.sigma_q
+        heard = rng.normal(size=shape) * sensing.sigma_tau
         start = mechanism.locate(reference.q[:1])
         rate = np.linalg.pinv(loop_jacobians(mechanism, start).readings[0]) @ reference.v[0]
         out = np.empty((3, *shape))

@@ -96,7 +96,10 @@ def of_readings(mechanism: ClosedRobot, posture: Posture, v: np.ndarray, a: np.n
         v, a: (N, n) of the actuated joints.
     """
     loop = loop_jacobians(mechanism, posture)
-    back = np.linalg.pinv(loop.readings) if mechanism.robot.redundant else np.linalg.inv(loop.readings)
+    if mechanism.robot.redundant:
+        back = np.linalg.pinv(loop.readings)
+    else:
+        back = np.linalg.inv(loop.readings)
     rate = times(back, v)
     still = of_platform(mechanism, posture, rate, np.zeros_like(rate), loop)
     change = times(back, a - still.a[:, mechanism.robot.actuated])

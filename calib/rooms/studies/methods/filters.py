@@ -72,7 +72,10 @@ class _KalmanFilter(Method):
         for case in problem.cases:
             for first, last in segments(case.motion.segment):
                 state = _pass(state, case, slice(first, last), noise)
-        innovation = float(np.mean(state.sizes)) if state.sizes else np.inf
+        if state.sizes:
+            innovation = float(np.mean(state.sizes))
+        else:
+            innovation = np.inf
         # times the stated mean square: innovations of a filter that has lost the robot
         max_innovation = 30.0
         if not np.isfinite(innovation) or innovation > max_innovation:
@@ -193,7 +196,10 @@ def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
 def _joined(belief: Belief, parameters: np.ndarray, first: int) -> np.ndarray:
     """Return a belief's spread (covariance or root) with its parameter block replaced by that of a covariance."""
     spread = np.array(belief.spread)
-    spread[first:, first:] = np.linalg.cholesky(parameters) if belief.root else parameters
+    if belief.root:
+        spread[first:, first:] = np.linalg.cholesky(parameters)
+    else:
+        spread[first:, first:] = parameters
     return spread
 
 

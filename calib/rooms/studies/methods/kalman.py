@@ -54,7 +54,9 @@ class Belief:
 
     @property
     def covariance(self) -> np.ndarray:
-        return self.spread @ self.spread.T if self.root else self.spread
+        if self.root:
+            return self.spread @ self.spread.T
+        return self.spread
 
     @property
     def deviations(self) -> np.ndarray:

@@ -137,7 +137,9 @@ def noisy_states(problem: IdentificationProblem, model: IdentificationModel) -> 
         carried = np.append(model.carried_columns(case.carried), np.ones(model.p - model.inertial))
         noise = noise_of_states(motion, problem.decimator)
         part = slice(first, first + len(index))
-        q, v, a = (x[index] for x in (motion.q, motion.v, motion.a))
+        q = motion.q[index]
+        v = motion.v[index]
+        a = motion.a[index]
         parts.append(_Recording(part, q, v, a, noise, case.carried, carried[columns]))
         first += len(index)
     return NoisyStates(model, columns, smooth, samples.matrix, samples.target, samples.present, tuple(parts))
@@ -154,7 +156,8 @@ def noise_of_states(motion: Motion, decimator: Decimator) -> np.ndarray:
         reach = int(np.ceil(6.0 * motion.rate / cutoff)) + decimator.reach + 16
         impulse = np.zeros(2 * reach + 1)
         impulse[reach] = 1.0
-        q, less = (low_pass(impulse, motion.rate, float(f)) for f in (cutoff, faster))
+        q = low_pass(impulse, motion.rate, float(cutoff))
+        less = low_pass(impulse, motion.rate, float(faster))
         states = np.stack([q, slope(less, motion.rate), curvature(q, motion.rate)])
         response = np.array([np.convolve(state, decimator.taps) for state in np.nan_to_num(states)])
         result[np.all(cutoffs == (cutoff, faster), axis=1)] = response @ response.T
@@ -171,7 +174,9 @@ def _slopes(task: NoisyStates, part: _Recording, values: np.ndarray) -> np.ndarr
     out = np.empty((len(part.q), n, 3, n))
     for start in range(0, len(part.q), BLOCK):
         block = slice(start, start + BLOCK)
-        q, v, a = (np.ascontiguousarray(x[block]) for x in (part.q, part.v, part.a))
+        q = np.ascontiguousarray(part.q[block])
+        v = np.ascontiguousarray(part.v[block])
+        a = np.ascontiguousarray(part.a[block])
         for row in range(n):
             weights = np.zeros((len(q), n, len(columns)))
             weights[:, row] = column_values
@@ -258,8 +263,12 @@ def changed(task: NoisyStates, part: _Recording, error: np.ndarray) -> np.ndarra
         block = slice(start, start + BLOCK)
         state = np.stack([part.q[block], part.v[block], part.a[block]])
         shifted = state + error[block].transpose(1, 0, 2)
-        load = None if task.smooth.all() else np.zeros_like(state[0])
-        before, after = (task.model.regressor(x[0], x[1], x[2], load, part.carried) for x in (state, shifted))
+        if task.smooth.all():
+            load = None
+        else:
+            load = np.zeros_like(state[0])
+        before = task.model.regressor(state[0], state[1], state[2], load, part.carried)
+        after = task.model.regressor(shifted[0], shifted[1], shifted[2], load, part.carried)
         out[block][:, :, smooth] = (after - before)[:, :, task.columns[smooth]]
     return out
 

@@ -120,7 +120,10 @@ class _Network(Method):
         pooled = problem.pooled
         std, tau = weighed(problem)
         fit = ols(pooled, tau)
-        start = np.zeros(pooled.parameters) if problem.start is None else problem.start
+        if problem.start is None:
+            start = np.zeros(pooled.parameters)
+        else:
+            start = problem.start
         values, count = self.trained(problem, start)
         require(
             np.isfinite(values).all(), f"the network diverges: take a smaller rate than {self.rate:g}", NotConverged

@@ -171,9 +171,13 @@ class _Comparison:
             run = self.robot.sensitivities(values, case, controller, loop.reference, loop.every, relative)
             index = simulated_samples(case, run.t, loop)
             motion = case.motion
-            parts = [self._sensed(plant, case, run, index)] if self.rows.sensed else []
+            if self.rows.sensed:
+                parts = [self._sensed(plant, case, run, index)]
+            else:
+                parts = []
             if not self.torques:
-                position, slope = (low_passed(x, motion)[index] for x in (run.q, run.by_q))
+                position = low_passed(run.q, motion)[index]
+                slope = low_passed(run.by_q, motion)[index]
                 parts.append((motion.q - position, slope))
             elif self.rows.projection is not None:
                 torques = np.dstack([run.torque, run.by_torque])[index]
@@ -184,7 +188,8 @@ class _Comparison:
             residual, slope = (np.concatenate(blocks, axis=1) for blocks in zip(*parts))
             present = case.present[:, np.arange(residual.shape[1]) % min(motion.n, case.present.shape[1])]
             in_use = thinned(present, motion.segment, self.problem.decimator)
-            residual, slope = (decimate(x, self.problem.decimator, motion.segment) for x in (residual, slope))
+            residual = decimate(residual, self.problem.decimator, motion.segment)
+            slope = decimate(slope, self.problem.decimator, motion.segment)
             residuals.append(np.where(in_use, residual, 0.0))
             slopes.append(np.where(in_use[:, :, None], slope, 0.0))
         return np.concatenate(residuals), np.concatenate(slopes)
@@ -200,7 +205,8 @@ class _Comparison:
         position[link_columns] = np.arange(len(link_columns))
         columns = position[self.robot.columns]
         values = plant.parameters[link_columns]
-        states, slopes = (followed(x, case.motion, index) for x in (run.q, run.by_q))
+        states = followed(run.q, case.motion, index)
+        slopes = followed(run.by_q, case.motion, index)
         regressor = link.regressor(*states, None, case.carried)
         jacobian = np.where(columns >= 0, regressor[:, :, columns], 0.0)
         for row in np.eye(case.motion.n, dtype=bool):

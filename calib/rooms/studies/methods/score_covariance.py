@@ -28,7 +28,10 @@ def scatter(white: np.ndarray, residual: np.ndarray, covariance: np.ndarray | No
     result = np.zeros((p, p))
     # at least, of the residuals' autocorrelation
     min_lags = 12
-    root = np.zeros((p, 0)) if covariance is None else np.linalg.cholesky(covariance)
+    if covariance is None:
+        root = np.zeros((p, 0))
+    else:
+        root = np.linalg.cholesky(covariance)
     for row in range(white.shape[1]):
         values = white[:, row]
         row_residuals = np.column_stack([residual[:, row], values @ root])

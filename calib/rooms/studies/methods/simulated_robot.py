@@ -88,7 +88,10 @@ def simulate_tangents(
     tick = sample_ticks(count, every)
     out = np.empty((3, len(tick), n))
     slopes = np.empty((3, len(tick), n, c))
-    model = np.empty((0, 0)) if controller.model is None else body_rows(plant.bodies, controller.model)
+    if controller.model is None:
+        model = np.empty((0, 0))
+    else:
+        model = body_rows(plant.bodies, controller.model)
     if relative is None:
         scale = np.zeros((n, c))
     else:
@@ -223,7 +226,9 @@ class BelievedRobot:
         parameters = np.zeros(len(self.plant.parameters))
         parameters[self.columns] = values
         plant = self.plant.with_parameters(parameters)
-        return plant if case is None else plant.carrying(case.carried)
+        if case is None:
+            return plant
+        return plant.carrying(case.carried)
 
     def sensitivities(
         self,
@@ -344,6 +349,9 @@ def _hubs(model: IdentificationModel, inertia: np.ndarray) -> np.ndarray:
     result = np.zeros(model.p)
     for i, (coordinate, axis) in enumerate(zip(model.bodies.coordinates, model.bodies.axes)):
         if coordinate >= 0:
-            entry = 9 if model.prismatic[coordinate] else (0, 3, 5)[int(axis)]
+            if model.prismatic[coordinate]:
+                entry = 9
+            else:
+                entry = (0, 3, 5)[int(axis)]
             result[10 * i + entry] = inertia[coordinate]
     return result
