@@ -437,8 +437,8 @@ def _align(points: np.ndarray, measured: np.ndarray) -> np.ndarray:
     for _ in range(2):
         mean = points[trusted].mean(axis=0)
         measured_mean = measured[trusted].mean(axis=0)
-        rotation, _ = Rotation.align_vectors(measured[trusted] - measured_mean, points[trusted] - mean)
-        matrix = rotation.as_matrix()
+        alignment = Rotation.align_vectors(measured[trusted] - measured_mean, points[trusted] - mean)
+        matrix = alignment[0].as_matrix()
         placement = pose(matrix, measured_mean - matrix @ mean)
         error = np.linalg.norm(measured - points @ matrix.T - placement[:3, 3], axis=1)
         trusted = error <= max(np.quantile(error, TRUSTED_SHARE), 1e-12)
