@@ -171,7 +171,8 @@ def solve(
 
     Converged (our choice): the next Gauss–Newton step is shorter than ``tolerance`` standard deviations of the
     estimate, ‖Qᵀr‖ <= tolerance · ‖r‖ / sqrt(dof); or ‖r‖ has fallen to rounding, 1e-11 of where it started; or no step
-    is better any more, and what is left is `exact_cost` standard deviations of a measurement rms, as of computed ones.
+    is better any more, or the limit is reached, with residuals of `exact_cost` standard deviations rms, as of computed
+    measurements: what they do not determine then lies in valleys too narrow to follow.
 
     Args:
         linearise: state -> the whitened problem, reduced.
@@ -189,10 +190,10 @@ def solve(
     while status is None:
         if now.target @ now.target <= tolerance**2 * now.cost / dof or now.cost <= floor:
             status = Status.CONVERGED
-        elif count >= limit:
-            status = Status.ITERATIONS
-        elif lam > 1e10:
-            status = Status.CONVERGED if now.cost <= exact_cost**2 * now.rows else Status.STALLED
+        elif count >= limit or lam > 1e10:
+            exact = now.cost <= exact_cost**2 * now.rows
+            failure = Status.ITERATIONS if count >= limit else Status.STALLED
+            status = Status.CONVERGED if exact else failure
         else:
             trial = retract(state, damped_step(now.factor, now.target, lam))
             found = linearise(trial)

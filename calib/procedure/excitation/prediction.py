@@ -33,6 +33,7 @@ from calib.procedure.excitation.settings import ExcitationSettings
 from calib.procedure.findings import sentence
 from calib.procedure.measuring.prediction import sigma_ratio
 from calib.records import Array, read_json, read_rows
+from calib.result_kinds import refusal
 from trajectories.basis import Family, SampledMotion
 from trajectories.design.problem import ExcitationProblem
 from trajectories.design.search import STAGES, SearchResult, one_start
@@ -300,7 +301,7 @@ def lines(one: MotionOutlook, predicted: Sequence[PredictedSigma] = ()) -> list[
 
 def check_folder(folder: Path) -> None:
     """Raise an error if a folder contains no prediction of `calib excite`."""
-    require((folder / NAME).is_file(), f"{folder} has no {NAME}: give the folder that calib excite wrote", UsageError)
+    require((folder / NAME).is_file(), refusal(folder, "recall"), UsageError)
 
 
 @dataclass(frozen=True)

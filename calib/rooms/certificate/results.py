@@ -12,6 +12,7 @@ from calib.folders import SESSION
 from calib.procedure.report.page import Picture
 from calib.procedure.report.templates import versions
 from calib.procedure.session.answers import CertificateSection
+from calib.result_kinds import refusal
 from calib.rooms.certificate import rendering
 from calib.rooms.certificate.record import NO_DETAILS, Certificate, Entry, Page, records, report
 from calib.units import DEG
@@ -47,7 +48,7 @@ def read(folder: Path, plots: bool, details: CertificateSection) -> tuple[Certif
     require(not (folder.absolute().parent / SESSION).exists(), words, UsageError)
     if IdentificationFolder(folder).model.exists():
         return _read_model(folder, plots, details)
-    require(FitFolder(folder).report.exists(), f"{folder} is neither of a fit nor of an identification", UsageError)
+    require(FitFolder(folder).report.exists(), refusal(folder, "certificate"), UsageError)
     found, drawn = fit_report.read(FitFolder(folder).report), {}
     if plots:
         from calib.procedure.report.charts import pictures

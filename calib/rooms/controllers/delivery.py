@@ -41,7 +41,7 @@ def delivery_text(
         UsageError: for a folder without a fit.
     """
     fit = folder / IN_SESSION if FitFolder(folder / IN_SESSION).robot.is_file() else folder
-    robot, (cell, nominal) = read(fit), read_arms(fit)
+    robot, (cell, nominal) = read(fit, "deliver"), read_arms(fit)
     arm = Description.of_fit(fit, nominal.chain)
     frames = base_frame(controller, arm, world), flange_frame(controller, arm, flange)
     lines = [f"{controller.title}: calibration of {robot.chain.name}", str(verdicts(fit)), ""]

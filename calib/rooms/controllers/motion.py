@@ -13,6 +13,7 @@ import numpy as np
 from calib.data.csv_table import read_header, read_table
 from calib.errors import UsageError, require
 from calib.procedure.excitation.coefficients import PLANNED, RUN, SAMPLES
+from calib.result_kinds import refusal
 from calib.rooms.controllers.table import Controller
 from calib.rooms.controllers.targets import number
 
@@ -29,8 +30,7 @@ def motion_file(path: Path) -> Path:
         return path
     names = (RUN, PLANNED, SAMPLES)
     found = [path / name for name in names if (path / name).is_file()]
-    words = f"{path} is a folder without a motion ({', '.join(names)}); give a list of poses, or a program"
-    require(found, words, UsageError)
+    require(found, refusal(path, "program"), UsageError)
     return found[0]
 
 
