@@ -26,7 +26,7 @@ from calib.procedure.excitation.settings import ExcitationSettings
 from calib.procedure.findings import limit
 from calib.procedure.session.dynamics_steps import next_round, options_of
 from calib.procedure.session.folder import ROUND, Say, Session, read_state
-from calib.procedure.session.steps import SessionStep
+from calib.procedure.session.steps import FITTED_ROBOT, IDENTIFY_OPTIONS, NamedFile, SessionFile, SessionStep, Setting
 from calib.robot.library import load_calibrated
 
 # [%] of torques and σ, where none is stated
@@ -201,8 +201,20 @@ STEP = SessionStep(
     "extend",
     "see whether more motion is needed",
     extend,
-    "fit/robot.toml dynamics:limits dynamics:options 8-dynamics/estimate.csv 8-dynamics/unseen/report.json",
-    f"6-excitation/{ROUND}*/*",
-    "dynamics.tolerance_percent,sigma_percent,period,harmonics,rate,starts,evaluations,repeats seed",
-    "need",
+    reads=(
+        FITTED_ROBOT,
+        NamedFile("dynamics", "limits"),
+        IDENTIFY_OPTIONS,
+        SessionFile("8-dynamics/estimate.csv"),
+        SessionFile("8-dynamics/unseen/report.json"),
+    ),
+    makes=(f"6-excitation/{ROUND}*/*",),
+    settings=(
+        Setting(
+            "dynamics",
+            ("tolerance_percent", "sigma_percent", "period", "harmonics", "rate", "starts", "evaluations", "repeats"),
+        ),
+        Setting("seed"),
+    ),
+    stage="need",
 )
