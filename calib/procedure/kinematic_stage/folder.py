@@ -213,7 +213,7 @@ def metrics(outcome: Outcome) -> FitMetrics:
         seed=outcome.settings.seed,
         status=outcome.selection.fit.solution.status.name.lower(),
         tolerance_mm=None if tolerance is None else 1e3 * tolerance,
-        not_identifiable=tuple(lines_of(outcome.unclear)),
+        not_identifiable=tuple(lines_of(outcome.undetermined)),
         outliers=tuple(outcome.outliers),
         findings=outcome.findings,
     )
