@@ -208,7 +208,7 @@ def plan(
         raise UsageError(f"payloads {', '.join(settings.payloads)}: need an identified model; name it (--model)")
     found, source = load_rigid(robot, waypoints if isinstance(waypoints, Path) else None, base, tip)
     chain = found.chain
-    known = read_motion_limits(limits, chain, source, given_way=True, predicted=model is not None)
+    known = read_motion_limits(limits, chain, source, stated_path=True, predicted=model is not None)
     law, notes, uncertain = _law(chain, model, settings.payloads, drives, known)
     lower, upper, free = known.positions.lower, known.positions.upper, 1.0 - (known.margin or 0.0)
     bounds = TimingLimits(known.bounds.velocity, known.bounds.acceleration, known.bounds.torque * free)
