@@ -18,15 +18,15 @@ from calib.dynamics.torque_rows import POWER
 from calib.errors import MeasurementError, UsageError, refuse_data, require
 from calib.estimation.essential import Elimination, Rule, eliminate
 from calib.estimation.triangles import condition_numbers
-from calib.extensions import needed
+from calib.identification.closed_loop.simulated import loop_results
 from calib.identification.friction.friction_ladder import FrictionCandidates, FrictionSelection, select_friction
 from calib.identification.friction.ripple import Ripple, find_all
 from calib.identification.loop import LoopResults, per_joint
 from calib.identification.methods.least_squares import LeastSquares
 from calib.identification.methods.method import IdentificationProblem, Method, MethodEstimate
-from calib.identification.methods.registry import METHODS, method_named
 from calib.identification.prediction import Dynamics, Model, predict
 from calib.identification.prior import TEMPERING, FirstFit, Prior, find_prior, first_fit, rods, tempered_prior
+from calib.identification.registry import METHODS, method_named
 from calib.identification.rows import Case, ObservationRows, observe, observe_terms, with_blocks
 from calib.identification.settings import IdentificationSettings, make_model, require_usable
 from calib.identification.standstill import with_standstills, with_weights
@@ -261,7 +261,7 @@ def _identified(
     if settings.loop is not None:
         if not method.needs_controller:
             say("simulating the closed loop")
-        loop = needed("loop_results")(problem, fit)
+        loop = loop_results(problem, fit)
 
     if _has_drives(model):
         model = model.with_terms(*friction.terms)

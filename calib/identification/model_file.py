@@ -213,3 +213,26 @@ def _term(entry: Mapping[str, Any]) -> DriveTerm:
         acts.append((int(row), weights))
     settings = tuple(float(setting) for setting in entry["settings"])
     return DriveTerm(entry["name"], entry["shape"], tuple(acts), settings, entry["side"], bool(entry["linear"]))
+
+
+def identified_masses(folder: str | Path, chain: Chain) -> np.ndarray:
+    """Return the standard parameters (n, 10) of an arm's bodies from an identification's folder.
+
+    Their gravity torques are right on the geometry that they were identified on, single parameters are not
+    (`calib.dynamics.base.to_standard`); payloads are left out.
+
+    Raises:
+        UsageError: for an identification of another arm, in amperes, or without bodies.
+    """
+    folder = Path(folder)
+    refuse_currents(folder, "a fit of the compliance")
+    refuse_other_arm(folder, chain)
+    _, dynamics = read_dynamics(folder)
+    bodies = dynamics.model.bodies
+    result = np.zeros((chain.n, 10))
+    if not dynamics.model.inertial:
+        refuse_option(folder, "has identified no bodies, hence no gravity torques; identify with motor or link torques")
+    for row, label in enumerate(bodies.labels):
+        if label.isdigit():
+            result[int(label) - 1] = dynamics.values[10 * row : 10 * row + 10]
+    return result

@@ -98,7 +98,9 @@ def test_regimes_hold_each_joints_extremes_and_with_the_rest_are_everything():
     np.testing.assert_allclose(share[:2], 0.1, atol=0.01)
     np.testing.assert_allclose(share[2:4], 0.15, atol=0.01)
     np.testing.assert_allclose(share[4] + share[5], 1.0, atol=0.01)
-    np.testing.assert_allclose(own.squares[4] + own.squares[5], own.total_squares, rtol=0.02, atol=1e-3 * own.total_squares.max())
+    np.testing.assert_allclose(
+        own.squares[4] + own.squares[5], own.total_squares, rtol=0.02, atol=1e-3 * own.total_squares.max()
+    )
 
 
 def test_friction_drives_a_joint_only_where_it_moves():
