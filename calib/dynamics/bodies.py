@@ -144,6 +144,7 @@ def with_payload(bodies: Bodies, placement: np.ndarray, label: str | None = None
         label = str(bodies.n + 1)
     if label in bodies.labels:
         raise RobotError(f"a body '{label}' exists already; give the payload another label")
+    placement = shaped(placement, (4, 4), "payload placement")
     return _assemble(
         labels=[*bodies.labels, label],
         parents=[*bodies.parents, parent],
@@ -151,7 +152,7 @@ def with_payload(bodies: Bodies, placement: np.ndarray, label: str | None = None
         axes=[*bodies.axes, 2],
         scales=[*bodies.scales, 0.0],
         coordinates=[*bodies.coordinates, -1],
-        placements=[*bodies.placements, shaped(placement, (4, 4), "payload placement")],
+        placements=[*bodies.placements, placement],
         gravity=bodies.gravity,
         n=bodies.n,
     )
@@ -225,6 +226,8 @@ def _assemble(
         constants[body, :12] = upright[:3].ravel()
     constants[:-1, 12] = scales
     constants[-1, :3] = gravity
+    links = np.column_stack([parents, kinds, coordinates, depths, paths])
+    order = [_kernel_order(axis) for axis in axes]
     return Bodies(
         labels=tuple(labels),
         parents=frozen(parents, np.int64),
@@ -235,9 +238,9 @@ def _assemble(
         placements=frozen(placements),
         gravity=frozen(gravity),
         paths=frozen(paths, np.int64),
-        links=frozen(np.column_stack([parents, kinds, coordinates, depths, paths]), np.int64),
+        links=frozen(links, np.int64),
         constants=frozen(constants),
-        order=frozen([_kernel_order(axis) for axis in axes], np.int64),
+        order=frozen(order, np.int64),
     )
 
 

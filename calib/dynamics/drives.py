@@ -120,7 +120,9 @@ class DriveTerm:
 
 def term(name: str, shape: str, joint: int, *settings: float, side: str = "motor", linear: bool = False) -> DriveTerm:
     """Return a drive term of one joint that depends on that joint's motion."""
-    return DriveTerm(name, shape, ((joint, ((joint, 1.0),)),), tuple(map(float, settings)), side, linear)
+    motion = ((joint, 1.0),)
+    numbers = tuple(float(setting) for setting in settings)
+    return DriveTerm(name, shape, ((joint, motion),), numbers, side, linear)
 
 
 def standard(

@@ -169,7 +169,8 @@ class IdentificationModel:
         terms = [drive_terms[column - self.inertial] for column in columns[body_count:]]
         term_weights = weights[:, :, body_count:].transpose(2, 1, 0)
         by_q, by_v, by_a = gradients
-        drives.slopes(terms, _columns_of(q, v, a), term_weights, [by_q.T, by_v.T, by_a.T])
+        motions = _columns_of(q, v, a)
+        drives.slopes(terms, motions, term_weights, [by_q.T, by_v.T, by_a.T])
         return by_q, by_v, by_a
 
     def torque_gradient(
@@ -184,7 +185,8 @@ class IdentificationModel:
         """
         side_weights = {}
         for side in set(self.sides):
-            side_weights[side] = self.torque_rows.fold(weights[:, :, None], (side,))[:, :, 0]
+            joint_weights = self.torque_rows.fold(weights[:, :, None], (side,))
+            side_weights[side] = joint_weights[:, :, 0]
         gradients = np.zeros((3, *np.shape(q)))
         body_values = values[: self.inertial]
         if self.inertial and body_values.any():
@@ -195,7 +197,8 @@ class IdentificationModel:
                 terms.append(term)
                 term_weights.append(value * side_weights[term.side].T)
         by_q, by_v, by_a = gradients
-        drives.slopes(terms, _columns_of(q, v, a), np.array(term_weights), [by_q.T, by_v.T, by_a.T])
+        motions = _columns_of(q, v, a)
+        drives.slopes(terms, motions, np.array(term_weights), [by_q.T, by_v.T, by_a.T])
         return by_q, by_v, by_a
 
     def acting(self) -> np.ndarray:
@@ -246,12 +249,14 @@ class IdentificationModel:
             if term.side not in torques:
                 torques[term.side] = np.zeros(np.shape(q))
             state_count = len(term.acts) if term.form.remembers else 0
-            for row, column in term.acting(motions, states[first : first + state_count]):
+            term_states = states[first : first + state_count]
+            for row, column in term.acting(motions, term_states):
                 torques[term.side][:, row] += value * column
             first += state_count
         result = np.zeros((len(q), self.rows))
         for side, joint_torques in torques.items():
-            result += self.torque_rows.observe(joint_torques[:, :, None], (side,), q, v)[:, :, 0]
+            rows = self.torque_rows.observe(joint_torques[:, :, None], (side,), q, v)
+            result += rows[:, :, 0]
         return result
 
     def transmitted(

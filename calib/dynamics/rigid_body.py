@@ -32,7 +32,8 @@ def fill_regressor(bodies: Bodies, q: np.ndarray, v: np.ndarray, a: np.ndarray, 
     """Write the regressor into out (10 B, n or more, N), initially zero; q, v, a (N, n) must be checked."""
     from calib.dynamics import kernels
 
-    amount = q.T[bodies.coordinates] * bodies.scales[:, None]
+    coordinates = q.T[bodies.coordinates]
+    amount = coordinates * bodies.scales[:, None]
     if np.abs(amount).max(initial=0.0) >= MAX_ANGLE:
         is_angle = bodies.kinds[:, None] == REVOLUTE
         amount = np.where(is_angle, np.remainder(amount, 2 * np.pi), amount)
@@ -57,9 +58,11 @@ def energies(bodies: Bodies, q: np.ndarray, v: np.ndarray) -> np.ndarray:
     momentum = regressor(weightless, q, zero, v)
     result = 0.5 * np.einsum("nj,njc->nc", v, momentum)
     for body, T_base_body in enumerate(_frames(bodies, q)):
-        first_moment = slice(10 * body + 6, 10 * body + 9)
-        result[:, first_moment] -= np.einsum("nji,j->ni", T_base_body[:, :3, :3], bodies.gravity)
-        result[:, 10 * body + 9] -= T_base_body[:, :3, 3] @ bodies.gravity
+        mass = 10 * body + 9
+        rotation = T_base_body[:, :3, :3]
+        position = T_base_body[:, :3, 3]
+        result[:, mass - 3 : mass] -= np.einsum("nji,j->ni", rotation, bodies.gravity)
+        result[:, mass] -= position @ bodies.gravity
     return result
 
 
@@ -102,12 +105,14 @@ def regressor_gradient(
     from calib.dynamics import gradient_kernels
 
     q, v, a = _states(bodies, q=q, v=v, a=a)
-    weights = _plain(shaped(weights, (len(q), bodies.n, 10 * bodies.count), "weights of the regressor"))
-    slopes = np.zeros((3, *q.shape))
+    shape = (len(q), bodies.n, 10 * bodies.count)
+    weights = _plain(shaped(weights, shape, "weights of the regressor"))
+    amount, cosine, sine = _placed(bodies, q)
+    by_q, by_v, by_a = np.zeros((3, *q.shape))
     gradient_kernels.regressor_gradient(
-        bodies.links, bodies.constants, bodies.order, *_placed(bodies, q), v, a, weights, *slopes
+        bodies.links, bodies.constants, bodies.order, amount, cosine, sine, v, a, weights, by_q, by_v, by_a
     )
-    return slopes[0], slopes[1], slopes[2]
+    return by_q, by_v, by_a
 
 
 def torque_gradient(
@@ -124,13 +129,16 @@ def torque_gradient(
 
     q, v, a = _states(bodies, q=q, v=v, a=a)
     weights = _plain(shaped(weights, q.shape, "weights of the torques"))
-    chi = _plain(shaped(parameters, (10 * bodies.count,), "standard parameters")).reshape(1, -1)
-    slopes = np.zeros((3, *q.shape))
-    links = bodies.links, gradient_kernels.hung_on_one(bodies.links)
+    chi = shaped(parameters, (10 * bodies.count,), "standard parameters")
+    chi = _plain(chi).reshape(1, -1)
+    links, constants, order = bodies.links, bodies.constants, bodies.order
+    chain = gradient_kernels.hung_on_one(links)
+    amount, cosine, sine = _placed(bodies, q)
+    by_q, by_v, by_a = np.zeros((3, *q.shape))
     gradient_kernels.torque_gradient(
-        *links, bodies.constants, bodies.order, *_placed(bodies, q), v, a, chi, weights, *slopes
+        links, chain, constants, order, amount, cosine, sine, v, a, chi, weights, by_q, by_v, by_a
     )
-    return slopes[0], slopes[1], slopes[2]
+    return by_q, by_v, by_a
 
 
 def inverse_dynamics(bodies: Bodies, parameters: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
@@ -142,11 +150,11 @@ def inverse_dynamics(bodies: Bodies, parameters: np.ndarray, q: np.ndarray, v: n
     from calib.dynamics import kernels
 
     q, v, a = _states(bodies, q=q, v=v, a=a)
-    out = np.zeros_like(q)
-    kernels.inverse_dynamics(
-        bodies.links, bodies.constants, kernel_parameters(bodies, parameters), *_placed(bodies, q), v, a, out
-    )
-    return out
+    chi = kernel_parameters(bodies, parameters)
+    amount, cosine, sine = _placed(bodies, q)
+    torques = np.zeros_like(q)
+    kernels.inverse_dynamics(bodies.links, bodies.constants, chi, amount, cosine, sine, v, a, torques)
+    return torques
 
 
 def mass_matrix(bodies: Bodies, parameters: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -163,7 +171,8 @@ def mass_matrix(bodies: Bodies, parameters: np.ndarray, q: np.ndarray) -> np.nda
 
 def kernel_parameters(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:
     """Return standard parameters (10 B,) in the kernels' frames, whose z is the joint axis."""
-    rows = shaped(parameters, (10 * bodies.count,), "standard parameters").reshape(bodies.count, 10)
+    parameters = shaped(parameters, (10 * bodies.count,), "standard parameters")
+    rows = parameters.reshape(bodies.count, 10)
     return np.take_along_axis(rows, bodies.order, axis=1).ravel()
 
 
@@ -175,8 +184,9 @@ def _states(bodies: Bodies, **arrays: np.ndarray) -> list[np.ndarray]:
     rows: int | None = None
     checked = []
     for key, array in arrays.items():
-        checked.append(_plain(shaped(array, (rows, bodies.n), _NAMES[key])))
-        rows = len(checked[0])
+        series = shaped(array, (rows, bodies.n), _NAMES[key])
+        checked.append(_plain(series))
+        rows = len(series)
     return checked
 
 
