@@ -21,7 +21,7 @@ from typing import Any, Generic, TypeVar
 
 from calib.errors import CalibError, UsageError, suggestion
 
-HOSTS = ("calib", "calib.apps", "calib.rooms")
+HOSTS = ("calib", "calib.apps")
 POINTS = (
     "commands",
     "descriptions",

@@ -61,9 +61,9 @@ from calib.procedure.excitation.settings import ExcitationSettings
 from calib.procedure.report.style import save
 from calib.robot.chain import Chain, random_joints
 from calib.robot.tables import dumps
-from calib.rooms.cells import lwr4plus
-from calib.rooms.cells.cell import measure
-from calib.rooms.cells.virtual_cells import lwr4plus_cell
+from calib.simulation import lwr4plus
+from calib.simulation.cell import measure
+from calib.simulation.virtual_cells import lwr4plus_cell
 from calib.workers.threads import one_blas_thread
 from trajectories.design.objectives import condition_numbers
 

@@ -30,9 +30,9 @@ from calib.geometry.observation import prepare
 from calib.robot import mdh
 from calib.robot.chain import Chain, random_joints
 from calib.robot.kinematics import jacobian, jacobian_product
-from calib.rooms.cells import lwr4plus
-from calib.rooms.cells.cell import SimulatedInstrument, measure, true_poses
-from calib.rooms.cells.virtual_cells import lwr4plus_cell, rigid
+from calib.simulation import lwr4plus
+from calib.simulation.cell import SimulatedInstrument, measure, true_poses
+from calib.simulation.virtual_cells import lwr4plus_cell, rigid
 from calib.transforms import invert
 from poses.candidates import draw_candidates
 from poses.continuous.tabu import TabuRule

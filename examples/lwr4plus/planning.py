@@ -30,7 +30,7 @@ from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.path_dynamics import PathDynamics, of_standard
 from calib.robot import description, library
 from calib.robot.chain import Chain, random_joints
-from calib.rooms.cells.known_robots import truth
+from calib.simulation.known_robots import truth
 from trajectories.errors import BadInput
 from trajectories.timing.limits import TimingLimits
 from trajectories.timing.path import Path as JointPath

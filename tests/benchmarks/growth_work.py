@@ -149,7 +149,7 @@ def log(chain, samples: int):
     """Return t, q, v, a and tau of a chain of seven joints at 1 kHz, a minute of random motion over and over."""
     from calib.dynamics.bodies import bodies_of, standard_parameters
     from calib.dynamics.rigid_body import inverse_dynamics
-    from calib.rooms.cells.known_robots import random_fourier
+    from calib.simulation.known_robots import random_fourier
 
     wide = np.full(7, 1.5)
     minute = random_fourier(-wide, wide, wide, 60.0, 1000.0, 60, acceleration=6.0)

@@ -17,7 +17,7 @@ from calib.identification.model_file import to_table
 from calib.identification.prediction import Dynamics
 from calib.robot import description
 from calib.robot.library import load
-from calib.rooms.cells.known_robots import truth
+from calib.simulation.known_robots import truth
 from trajectories.timing.limits import TimingLimits
 
 CHAIN = load("lwr4plus")

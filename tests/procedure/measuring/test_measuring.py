@@ -9,6 +9,7 @@ import pytest
 from differences import check
 
 import calib
+from calib.apps.viewer.scene import is_run, rehearsed_samples
 from calib.cli import run
 from calib.config import parse
 from calib.errors import UsageError
@@ -21,7 +22,6 @@ from calib.procedure.measuring.run import Exchange, RunSettings, drivable, plan_
 from calib.procedure.session.questions import cell_tables
 from calib.robot.chain import Chain, random_joints
 from calib.robot.library import load
-from calib.rooms.viewer.scene import is_run, rehearsed_samples
 from poses.candidates import draw_candidates
 from poses.space import is_feasible
 

@@ -12,10 +12,10 @@ import pytest
 from sessions import edit
 from without_figures import run
 
+from calib.apps.fleet import fleet
 from calib.errors import MeasurementError, NotConverged, TaskLost, Unidentifiable, UsageError, exit_code
 from calib.procedure.session import steps
 from calib.procedure.session.folder import locked, open_session
-from calib.rooms.fleet import fleet
 from calib.workers import Workers
 
 

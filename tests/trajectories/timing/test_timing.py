@@ -7,7 +7,7 @@ from pinocchio_model import model as pinocchio_model
 from planned import CHAIN, WAYPOINTS, Cart, cart_limits, limits, lwr
 
 from calib.robot.chain import random_joints
-from calib.rooms.cells.known_robots import truth
+from calib.simulation.known_robots import truth
 from trajectories.errors import BadInput, NothingFeasible
 from trajectories.timing.path import spline
 from trajectories.timing.profile import track
