@@ -25,17 +25,13 @@ HOSTS = ("calib", "calib.apps")
 POINTS = (
     "commands",
     "descriptions",
-    "drive_gains",
     "exports",
-    "library",
+    "formats",
     "optics",
     "planned_poses",
     "recordings",
     "robots",
-    "schemas",
-    "stages",
     "steps",
-    "topics",
     "write_program",
 )
 T = TypeVar("T")

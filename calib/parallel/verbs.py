@@ -22,12 +22,10 @@ from calib.procedure.dynamic_stage.folder import check_identification_target
 from calib.procedure.robot_kinds import Stage
 
 STAGES = {
-    "parallel robot": {
-        "fit": Stage(fit_parallel, check_fit_target),
-        "identify": Stage(identify_parallel, check_identification_target, assess),
-        "excite": Stage(excite_parallel, check_motion_target),
-        "plan": Stage(plan_parallel, check_motion_target),
-        "export": Stage(export_parallel, check_export_target),
-        "view": Stage(picture, check_motion_target),
-    }
+    "fit": Stage(fit_parallel, check_fit_target),
+    "identify": Stage(identify_parallel, check_identification_target, assess),
+    "excite": Stage(excite_parallel, check_motion_target),
+    "plan": Stage(plan_parallel, check_motion_target),
+    "export": Stage(export_parallel, check_export_target),
+    "view": Stage(picture, check_motion_target),
 }

@@ -5,6 +5,5 @@ condition, a method and a seed (`trial`); rows are keyed and kept (`rows`), run 
 up so that methods can be ranked (`summary`).
 """
 
-OFFERS = {"commands": "commands:app", "topics": ":TOPICS", "schemas": ":SCHEMAS"}
-TOPICS = {"study": ("the TOML file of calib study", "calib.apps.studies.conditions")}
-SCHEMAS = {"study": ("calib.apps.studies.conditions", "StudyFile")}
+OFFERS = {"commands": "commands:app", "formats": ":FORMATS"}
+FORMATS = {"study": ("the TOML file of calib study", "calib.apps.studies.conditions", "StudyFile")}
