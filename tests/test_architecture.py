@@ -45,9 +45,9 @@ HOMES = {
     "uvicorn": ["calib.apps.serve.commands"],
     "python_multipart": ["calib.apps.serve.uploads"],
     "rerun": ["calib.apps.viewer.viewer"],
-    "nlopt": ["poses.", "trajectories."],
-    "toppra": ["trajectories."],
-    "ruckig": ["trajectories."],
+    "nlopt": ["calib.poses.", "calib.trajectories."],
+    "toppra": ["calib.trajectories."],
+    "ruckig": ["calib.trajectories."],
     "clarabel": ["calib.estimation."],
     "cvxpy": [],  # the tests' independent solver
     "matplotlib": ["calib.procedure.", "calib.api.", "calib.apps."],
@@ -65,7 +65,8 @@ HOMES = {
 
 
 def module_of(path: Path) -> str:
-    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+    name = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+    return name if path.is_relative_to(ROOT / "calib") else f"calib.{name}"
 
 
 def imports(path: Path) -> Iterator[tuple[str, int]]:

@@ -28,11 +28,11 @@ from calib.procedure.excitation.settings import COARSE, DEFAULT_DESIGN, Excitati
 from calib.robot.calibrated import COVARIANCE, ROBOT
 from calib.robot.chain import Joint
 from calib.robot.tables import dumps
+from calib.trajectories.basis import SampledMotion
+from calib.trajectories.constraints import BoxLimit, MotionConstraint, TwoSided
+from calib.trajectories.design.verify import dense_motion
+from calib.trajectories.setpoints import Setpoints
 from calib.units import headings
-from trajectories.basis import SampledMotion
-from trajectories.constraints import BoxLimit, MotionConstraint, TwoSided
-from trajectories.design.verify import dense_motion
-from trajectories.setpoints import Setpoints
 
 # instants over the period while searching
 SAMPLES = 100

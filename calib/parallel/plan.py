@@ -3,7 +3,8 @@
 Waypoints are a CSV, a row each, in order: the platform's coordinates (``x [mm]``, ``rz [deg]``), counted from home in
 the base's axes; or readings of all actuators under their names. The path is a spline through them in the platform's
 coordinates (a straight line between each two, where asked for); its timing is that of serial arms
-(`trajectories.timing.time_scaling`) on the actuators' own motion along it, redundant torques those of least norm with
+(`calib.trajectories.timing.time_scaling`) on the actuators' own motion along it, redundant torques those of least norm
+with
 the identified preload.
 """
 
@@ -26,12 +27,12 @@ from calib.parallel.robots import ParallelMechanism, refuse_unread
 from calib.procedure.excitation.settings import DEFAULT_PLAN, PlanSettings
 from calib.procedure.robot_kinds import joints_of
 from calib.records import shaped
-from trajectories.setpoints import joined
-from trajectories.timing.limits import TimingLimits
-from trajectories.timing.path import Path as JointPath
-from trajectories.timing.path import check_within, spline, through
-from trajectories.timing.profile import track
-from trajectories.timing.time_scaling import time_optimal
+from calib.trajectories.setpoints import joined
+from calib.trajectories.timing.limits import TimingLimits
+from calib.trajectories.timing.path import Path as JointPath
+from calib.trajectories.timing.path import check_within, spline, through
+from calib.trajectories.timing.profile import track
+from calib.trajectories.timing.time_scaling import time_optimal
 
 FRICTIONLESS = "friction unknown (no model): a real robot needs more torque than planned"
 # of the settings

@@ -275,7 +275,7 @@ def lapack_joints(n: int) -> Callable:
 def select_candidates(count: int) -> Callable:
     import library_arm
 
-    from poses.select import select_poses
+    from calib.poses.select import select_poses
 
     jacobians = library_arm.point_jacobian(library_arm.random_poses(count, 0))
     return lambda: select_poses(jacobians, 40)

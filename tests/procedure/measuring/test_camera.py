@@ -18,6 +18,7 @@ from calib.data.poses.measurements import Distances, PoseMeasurements
 from calib.data.poses.pose_lists import read_poses
 from calib.errors import UsageError
 from calib.geometry.observability import targets_of
+from calib.poses.space import is_feasible
 from calib.procedure.kinematic_stage import selection
 from calib.procedure.kinematic_stage.settings import SelectionSettings
 from calib.procedure.measuring.pose_limits import read_limits
@@ -30,7 +31,6 @@ from calib.simulation import camera_cell as camera
 from calib.simulation.cell import SimulatedInstrument
 from calib.simulation.virtual_cells import rigid, virtual_cell
 from calib.transforms import from_xyz_rpy, pose
-from poses.space import is_feasible
 
 SILENT = partial(lambda *words: None)
 

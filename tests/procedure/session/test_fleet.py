@@ -107,7 +107,7 @@ def test_what_workers_get_pickles(cells: Path) -> None:
 
 
 def test_exit_codes_by_error() -> None:
-    from poses.errors import NotIdentifiable
+    from calib.poses.errors import NotIdentifiable
 
     assert [exit_code(error) for error in (UsageError("x"), MeasurementError("x", "f"))] == [2, 2]
     assert [exit_code(error) for error in (Unidentifiable("x"), NotConverged("x"))] == [3, 3]
