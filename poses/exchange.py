@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from poses.design import Design, Pool, best_addition, best_removal, design_of, with_added, with_removed
+from calib.poses.design import Design, Pool, best_addition, best_removal, design_of, with_added, with_removed
 
 Report = Callable[[Design], None]
 """Called with each design of the requested size that is better than all before."""

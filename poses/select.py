@@ -8,20 +8,20 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from poses.by_index import exchanged_by_index, merits
-from poses.candidates import draw_candidates
-from poses.continuous.global_local import mlsl_search
-from poses.continuous.local import Improved, improved
-from poses.continuous.multistart import multistart_search, random_starts
-from poses.continuous.tabu import DEFAULT_RULE, TabuRule, tabu_search
-from poses.convex import Bound, relaxed
-from poses.design import Design, Pool, design_of
-from poses.errors import BadInput, NotIdentifiable
-from poses.exchange import detmax, exchanged, greedy, kicked
-from poses.indices import Index, merit, observability
-from poses.information import Candidates, checked, log_det, prepared
-from poses.space import SearchSpace, is_feasible
-from poses.whole_space import Ceiling, bound_over_space
+from calib.poses.by_index import exchanged_by_index, merits
+from calib.poses.candidates import draw_candidates
+from calib.poses.continuous.global_local import mlsl_search
+from calib.poses.continuous.local import Improved, improved
+from calib.poses.continuous.multistart import multistart_search, random_starts
+from calib.poses.continuous.tabu import DEFAULT_RULE, TabuRule, tabu_search
+from calib.poses.convex import Bound, relaxed
+from calib.poses.design import Design, Pool, design_of
+from calib.poses.errors import BadInput, NotIdentifiable
+from calib.poses.exchange import detmax, exchanged, greedy, kicked
+from calib.poses.indices import Index, merit, observability
+from calib.poses.information import Candidates, checked, log_det, prepared
+from calib.poses.space import SearchSpace, is_feasible
+from calib.poses.whole_space import Ceiling, bound_over_space
 
 Method = Literal["detmax", "polish", "local", "multistart", "mlsl", "tabu"]
 Progress = Callable[[int, int, str], None]
@@ -42,7 +42,7 @@ class SearchSettings:
         evaluations: largest number of evaluations of one local search.
         rule: settings of the tabu search.
         seconds: processor time after which the search stops; bounds and baseline not counted.
-        climbs: local searches for poses that exceed the bound, see `poses.whole_space`; 0: the bound covers the
+        climbs: local searches for poses that exceed the bound, see `calib.poses.whole_space`; 0: the bound covers the
             candidates and the chosen poses only.
     """
 
@@ -152,12 +152,12 @@ def select_poses(
     """Return m poses that make the parameters as observable as possible.
 
     * ``detmax`` chooses among the candidates: rounded relaxation and greedy start, pair exchange, DETMAX excursions,
-      kicks (`poses.exchange`); other indices than O1 go on from there by `poses.by_index`.
-    * ``polish`` moves all joint values of that set at once (`poses.continuous.local`).
+      kicks (`calib.poses.exchange`); other indices than O1 go on from there by `calib.poses.by_index`.
+    * ``polish`` moves all joint values of that set at once (`calib.poses.continuous.local`).
     * ``local`` does so from one random set of the candidates, ``multistart`` from `starts` of them
-      (`poses.continuous.multistart`): the study's deterministic search and its remedy.
-    * ``mlsl`` looks for the best start everywhere, by NLopt's MLSL (`poses.continuous.global_local`).
-    * ``tabu`` is IMHATR, the two-stage meta-heuristic (`poses.continuous.tabu`).
+      (`calib.poses.continuous.multistart`): the study's deterministic search and its remedy.
+    * ``mlsl`` looks for the best start everywhere, by NLopt's MLSL (`calib.poses.continuous.global_local`).
+    * ``tabu`` is IMHATR, the two-stage meta-heuristic (`calib.poses.continuous.tabu`).
 
     Args:
         jacobians: (N, rows, p) whitened observation Jacobians of the candidates in base columns; None takes them at q,

@@ -1,6 +1,7 @@
 """An upper bound over all poses within limits and constraints, not only over the candidates.
 
-The relaxation of `poses.convex`, with poses allowed to repeat, over all feasible poses: a design is a measure ξ of mass
+The relaxation of `calib.poses.convex`, with poses allowed to repeat, over all feasible poses: a design is a measure ξ
+of mass
 m. By the general equivalence theorem (Kiefer & Wolfowitz 1960), for any M = M_known + ∫ JᵀJ dξ ≻ 0 and any m poses
 
     det M(q_1 ... q_m)^(1/p)  ≤  det M^(1/p) · (tr(M⁻¹ M_known) + m max_q d(q)) / p,    d(q) = tr(J(q) M⁻¹ J(q)ᵀ),
@@ -19,11 +20,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from poses.candidates import draw_candidates
-from poses.continuous.local import climb, restored
-from poses.convex import information_of, relaxed, scores_of
-from poses.information import log_det, prepared
-from poses.space import SearchSpace, is_feasible, product
+from calib.poses.candidates import draw_candidates
+from calib.poses.continuous.local import climb, restored
+from calib.poses.convex import information_of, relaxed, scores_of
+from calib.poses.information import log_det, prepared
+from calib.poses.space import SearchSpace, is_feasible, product
 
 BLOCK = 8
 """Poses optimised together: few for a fast SLSQP, many for an efficient Jacobian. Our choice."""

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from trajectories.errors import BadInput, require
-from trajectories.setpoints import Setpoints
+from calib.trajectories.errors import BadInput, require
+from calib.trajectories.setpoints import Setpoints
 
 KINDS: tuple[str, ...] = ("velocity", "acceleration", "jerk")
 

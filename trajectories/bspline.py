@@ -1,4 +1,4 @@
-"""Periodic B-splines, with the interface of `trajectories.fourier`.
+"""Periodic B-splines, with the interface of `calib.trajectories.fourier`.
 
 q_j(t) = Σ_{i=1}^{C} c_ji B_i(t),    uniform knots over one period, B_i periodic of a stated degree (5: smooth jerk)
 """
@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import BSpline as ScipyBSpline
 
-from trajectories.basis import Basis, Freedom, aligned_period, assemble, freedom, holding, joined, projected
-from trajectories.errors import BadInput, require
+from calib.trajectories.basis import Basis, Freedom, aligned_period, assemble, freedom, holding, joined, projected
+from calib.trajectories.errors import BadInput, require
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +90,7 @@ def bspline_family(
 
     Args:
         degree: 5 or more, so that the jerk has no kinks.
-        period, joints, rest, start, held, rate: as of `trajectories.fourier.fourier_family`.
+        period, joints, rest, start, held, rate: as of `calib.trajectories.fourier.fourier_family`.
     """
     counts = tuple(int(k) for k in (np.full(joints or 0, points) if np.ndim(points) == 0 else points))  # type: ignore[arg-type]
     if not counts or any(c != 1 and c <= degree for c in counts) or max(counts) == 1:

@@ -7,7 +7,7 @@ function,
 
     c_r = (1/ρ) log Σ_{i, k in r} exp(ρ g_ik / scale_k)  ≥  max g / scale      (Kreisselmeier & Steinhauser 1979)
 
-so a feasible c means feasible samples; what happens between the samples is `trajectories.design.verify`'s.
+so a feasible c means feasible samples; what happens between the samples is `calib.trajectories.design.verify`'s.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,8 +16,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from trajectories.basis import ORDERS, SampledMotion
-from trajectories.errors import BadInput, require
+from calib.trajectories.basis import ORDERS, SampledMotion
+from calib.trajectories.errors import BadInput, require
 
 Regressor = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 Slopes = tuple[np.ndarray, np.ndarray, np.ndarray]

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trajectories.basis import Basis, Freedom, aligned_period, assemble, freedom, holding, joined, projected
-from trajectories.errors import BadInput, require
+from calib.trajectories.basis import Basis, Freedom, aligned_period, assemble, freedom, holding, joined, projected
+from calib.trajectories.errors import BadInput, require
 
 
 @dataclass(frozen=True, eq=False)

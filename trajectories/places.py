@@ -1,6 +1,7 @@
 """Constraints on the arm's place: positions of the tool and of named points, and distances between bodies.
 
-Places and distances come from callables with derivative products; see `trajectories.constraints` for what a constraint
+Places and distances come from callables with derivative products; see `calib.trajectories.constraints` for what a
+constraint
 has.
 """
 
@@ -9,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trajectories.basis import SampledMotion
+from calib.trajectories.basis import SampledMotion
 
 
 @dataclass(frozen=True, eq=False)

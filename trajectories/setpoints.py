@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from trajectories.errors import BadInput, require
+from calib.trajectories.errors import BadInput, require
 
 
 @dataclass(frozen=True, eq=False)

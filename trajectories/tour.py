@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from trajectories.errors import BadInput
+from calib.trajectories.errors import BadInput
 
 
 def move_times(one: np.ndarray, two: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray) -> np.ndarray:

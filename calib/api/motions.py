@@ -20,7 +20,7 @@ from calib.procedure.excitation import design, folder, planning
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, DEFAULT_PLAN, ExcitationSettings, PlanSettings
 from calib.procedure.robot_kinds import Mechanism, MechanismResult, stage_of
 from calib.robot.calibrated import CalibratedChain
-from trajectories.setpoints import Setpoints
+from calib.trajectories.setpoints import Setpoints
 
 if TYPE_CHECKING:
     from calib.procedure.report.charts import Chart

@@ -20,7 +20,7 @@ an inverse, which no placement S, X brings to the arm's S A_i X.
 import math
 from collections.abc import Callable, Sequence
 from functools import singledispatch
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -36,7 +36,10 @@ from calib.robot.kinematics import forward
 from calib.transforms import from_quaternion, invert, orthonormal, pose
 from calib.units import DEG
 
-OPTICS: Point[Callable[[list[PoseMeasurements]], Any]] = Point(
+if TYPE_CHECKING:
+    from calib.data.images.optics import Optics
+
+OPTICS: "Point[Callable[[Sequence[Any]], Optics]]" = Point(
     "optics", "optics of kinds that are not the core's; loading it registers guesses and residuals"
 )
 

@@ -9,8 +9,9 @@ from calib.config import schema
 from calib.errors import UsageError, one_of
 from calib.extensions import Point, merged
 
-TOPICS_OF_ROOMS: Point[Mapping[str, tuple[str, str]]] = Point("topics", "topics of `calib formats`")
-SCHEMAS_OF_ROOMS: Point[Mapping[str, tuple[str, str]]] = Point("schemas", "their JSON schemas")
+FORMATS: Point[Mapping[str, tuple[str, str, str]]] = Point(
+    "formats", "topic of `calib formats` → description, modules, dataclass of the first module's TOML file or empty"
+)
 
 TOPICS: Mapping[str, tuple[str, str]] = {
     "measurements": ("CSV files of measured poses, positions, distances", "calib.data.poses.pose_files"),
@@ -62,7 +63,7 @@ TOPICS: Mapping[str, tuple[str, str]] = {
     "ros2": ("ROS 2 package of a calibrated robot, of calib export --ros2", "calib.procedure.export.ros2_package"),
     "robodk": ("CSV of RoboDK, and of three reflectors without a header", "calib.data.poses.robodk"),
     "instruments": ("text exports of trackers, CMMs and motion capture", "calib.data.poses.exports"),
-    **merged(TOPICS_OF_ROOMS),
+    **{topic: (words, modules) for topic, (words, modules, _) in merged(FORMATS).items()},
 }
 """Topic → short description, and the modules whose docstrings document the topic."""
 
@@ -72,7 +73,7 @@ SCHEMAS: Mapping[str, tuple[str, str]] = {
     "constraints": ("calib.procedure.measuring.constraints_file", "ConstraintsFile"),
     "limits": ("calib.procedure.excitation.limits", "LimitsFile"),
     "session": ("calib.procedure.session.settings", "SessionSettings"),
-    **merged(SCHEMAS_OF_ROOMS),
+    **{topic: (modules.split()[0], kind) for topic, (_, modules, kind) in merged(FORMATS).items() if kind},
 }
 """Topic → module and dataclass of the TOML files that people write."""
 _KINDS = {"string": "text", "integer": "whole number", "boolean": "true or false", "object": "table"}

@@ -7,20 +7,43 @@ from dataclasses import dataclass, replace
 from functools import partial
 from inspect import signature
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
-import numpy as np
-
-from calib.data.schema import Joints
 from calib.errors import UsageError
-from calib.extensions import Point, merged
-from calib.procedure.findings import Verdict
-from calib.robot.chain import joint_kinds
+from calib.extensions import Point
 
-ROBOTS: Point[Callable[[object], Mechanism | None]] = Point(
-    "robots", "the robot that a person names, if it is no serial arm"
-)
-STAGES: Point[Mapping[str, Mapping[str, Stage]]] = Point("stages", "kind of robot → verb → stage")
+if TYPE_CHECKING:
+    from calib.data.schema import Joints
+    from calib.procedure.findings import Verdict
+
+
+class RobotKind(Protocol):
+    """A kind of robot that is not a serial arm, as a package or module.
+
+    Attributes:
+        KIND: `Mechanism.kind` of its robots.
+        LIBRARY: folder of those that go by a name.
+    """
+
+    KIND: str
+    LIBRARY: Path
+
+    def find(self, robot: object) -> Mechanism | None:
+        """Return the robot that a person names; None where it is none of this kind."""
+        ...
+
+    def stages(self) -> Mapping[str, Stage]:
+        """Return the implementation of each command."""
+        ...
+
+    def drive_gains(
+        self, robot: Any, cases: Sequence[Any], settings: Any, known: Mapping[str, float], reference: int | None
+    ) -> Any:
+        """Return the drive gains (`calib.identification.gains.DriveGains`) of a robot's recordings in amperes."""
+        ...
+
+
+ROBOTS: Point[RobotKind] = Point("robots", "kinds of robot other than serial arms")
 
 
 @dataclass(frozen=True)
@@ -40,7 +63,7 @@ class Stage:
 
 @runtime_checkable
 class Mechanism(Protocol):
-    """Robot that is not a serial arm, provided by a plug-in package (``robots`` of `calib.extensions`).
+    """Robot that is not a serial arm, found by a `RobotKind`.
 
     Attributes:
         kind: what it is, in words: ``parallel robot``.
@@ -91,7 +114,10 @@ def mechanism(robot: object) -> Mechanism | None:
     """
     if isinstance(robot, Mechanism):
         return robot
-    return next((found for find in ROBOTS.all() if (found := find(robot)) is not None), None)
+    for kind in ROBOTS.all():
+        if (found := kind.find(robot)) is not None:
+            return found
+    return None
 
 
 def stage_of(robot: object, verb: str, base: str | None = None, tip: str | None = None) -> Stage | None:
@@ -106,7 +132,7 @@ def stage_of(robot: object, verb: str, base: str | None = None, tip: str | None 
     found = mechanism(robot)
     if found is None:
         return None
-    stages: Mapping[str, Stage] = merged(STAGES)[found.kind]
+    stages = next(kind for kind in ROBOTS.all() if found.kind == kind.KIND).stages()
     if verb not in stages:
         instead = found.instead.get(verb, f"{', '.join(stages)} take it")
         named = robot if isinstance(robot, (str, Path)) else found.source
@@ -129,5 +155,11 @@ def _run(run: Callable[..., Any], found: Mechanism, *args: Any, **given: Any) ->
 
 def joints_of(chain: Any) -> Joints:
     """Return the names and limits of the joints of an arm or mechanism, for checking measurements and recordings."""
+    # slow to load, and the shell's completion asks this module for the kinds of robot
+    import numpy as np
+
+    from calib.data.schema import Joints
+    from calib.robot.chain import joint_kinds
+
     limits = (np.array([getattr(joint, key) for joint in chain.joints]) for key in ("lower", "upper", "effort"))
     return Joints(chain.joint_names, tuple(joint_kinds(chain)), *limits)

@@ -3,7 +3,7 @@
 MLSL (Rinnooy Kan & Timmer 1987; Sobol points as in Kucherenko & Sytsko 2005) starts a local search at a sampled point
 only if no better point lies near it, so that no optimum is searched twice. NLopt's knows bounds but no constraints:
 their violation is charged quadratically. The best set is brought back onto the constraints; poses that break them even
-so, or a predicate, are those of the start. Half of the effort is for MLSL, the rest for `poses.continuous.local`.
+so, or a predicate, are those of the start. Half of the effort is for MLSL, the rest for `calib.poses.continuous.local`.
 """
 
 import time
@@ -13,9 +13,9 @@ from dataclasses import replace
 import nlopt
 import numpy as np
 
-from poses.continuous.local import FEASIBLE, SHARPNESS, Improved, improved, merit_of, restored
-from poses.indices import Index
-from poses.space import SearchSpace, constraint_gradients, constraint_values, is_feasible
+from calib.poses.continuous.local import FEASIBLE, SHARPNESS, Improved, improved, merit_of, restored
+from calib.poses.indices import Index
+from calib.poses.space import SearchSpace, constraint_gradients, constraint_values, is_feasible
 
 CHARGE = 100.0  # of the merit, per squared unit of a violated constraint (our choice)
 POINTS = 4  # sampled between local searches (our choice)

@@ -1,7 +1,8 @@
 """Deterministic local search over all m · n joint values at once, under constraints, with exact gradients.
 
 Sequential quadratic programming (SLSQP, Kraft 1988, in SciPy) on a smoothed index that is sharpened stage by stage (see
-`poses.indices.merit`), each stage ended by stagnation. An iterate may leave the constraints a little, so that every
+`calib.poses.indices.merit`), each stage ended by stagnation. An iterate may leave the constraints a little, so that
+every
 stage ends with a restoration: Newton steps of least norm back onto what is violated, pose by pose. What is handed back
 is the best restored set by the index itself, unsmoothed.
 """
@@ -13,8 +14,8 @@ from functools import partial
 
 import numpy as np
 
-from poses.indices import Index, has_kinks, merit
-from poses.space import SearchSpace, constraint_gradients, constraint_values, is_feasible, product
+from calib.poses.indices import Index, has_kinks, merit
+from calib.poses.space import SearchSpace, constraint_gradients, constraint_values, is_feasible, product
 
 Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
 
@@ -50,14 +51,14 @@ def merit_of(
 ) -> tuple[float, np.ndarray]:
     """Return the merit log O of poses together with those measured before, and its gradient by q.
 
-    ∂ log O/∂q_ik = Σ_rp G[i,r,p] ∂J[i,r,p]/∂q_ik with G = ∂ log O/∂W (see `poses.indices`).
+    ∂ log O/∂q_ik = Σ_rp G[i,r,p] ∂J[i,r,p]/∂q_ik with G = ∂ log O/∂W (see `calib.poses.indices`).
 
     Args:
         space: gives the Jacobian and its derivative product.
         q: (m, n) poses [rad or m].
         index: "O1" ... "O5", "cond".
         existing: (k, rows, p) Jacobians (or stacked, (k rows, p)) that count but do not move.
-        sharpness: of the smoothing, see `poses.indices.merit`.
+        sharpness: of the smoothing, see `calib.poses.indices.merit`.
 
     Returns:
         The merit and its gradient (m, n).

@@ -7,14 +7,14 @@ import library_arm
 import numpy as np
 import pytest
 
-from poses.candidates import draw_candidates
-from poses.convex import bound, certificate
-from poses.design import Pool, best_addition, design_of, gains_of, with_added, with_removed
-from poses.errors import BadInput, NothingFeasible, NotIdentifiable, TooFewCandidates
-from poses.exchange import detmax, exchanged, greedy
-from poses.indices import observability
-from poses.information import prepared
-from poses.select import SearchSettings, random_baseline, select_poses
+from calib.poses.candidates import draw_candidates
+from calib.poses.convex import bound, certificate
+from calib.poses.design import Pool, best_addition, design_of, gains_of, with_added, with_removed
+from calib.poses.errors import BadInput, NothingFeasible, NotIdentifiable, TooFewCandidates
+from calib.poses.exchange import detmax, exchanged, greedy
+from calib.poses.indices import observability
+from calib.poses.information import prepared
+from calib.poses.select import SearchSettings, random_baseline, select_poses
 
 ARM = library_arm.jacobian(library_arm.random_poses(400, 0))
 

@@ -1,7 +1,8 @@
 """Search for exciting motions: sequential quadratic programming from several feasible starts, gradients exact.
 
-A start is a random motion inside the joint limits (`trajectories.design.starts`); if it breaks another constraint it is
-repaired (the squared excess is minimised), then searched from (`trajectories.design.search`).
+A start is a random motion inside the joint limits (`calib.trajectories.design.starts`); if it breaks another
+constraint it is
+repaired (the squared excess is minimised), then searched from (`calib.trajectories.design.search`).
 """
 
 import time
@@ -13,9 +14,9 @@ from typing import get_args
 
 import numpy as np
 
-from trajectories.design.problem import ExcitationProblem, exact_values, stretched, unmet
-from trajectories.design.search import STAGES, Method, SearchResult, Stage, Stuck, one_start
-from trajectories.errors import BadInput, NotExciting, NothingFeasible, require
+from calib.trajectories.design.problem import ExcitationProblem, exact_values, stretched, unmet
+from calib.trajectories.design.search import STAGES, Method, SearchResult, Stage, Stuck, one_start
+from calib.trajectories.errors import BadInput, NotExciting, NothingFeasible, require
 
 KEPT = 1 / 3  # of the starts, which the last stages are for (our choice)
 

@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from trajectories.design.objectives import Objective
-from trajectories.design.optimise import design
-from trajectories.design.problem import AttainmentGoal, ExcitationProblem, exact_values, stretched
-from trajectories.design.search import STAGES, SearchResult, one_start
+from calib.trajectories.design.objectives import Objective
+from calib.trajectories.design.optimise import design
+from calib.trajectories.design.problem import AttainmentGoal, ExcitationProblem, exact_values, stretched
+from calib.trajectories.design.search import STAGES, SearchResult, one_start
 
 
 @dataclass(frozen=True, eq=False)

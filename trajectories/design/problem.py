@@ -11,10 +11,10 @@ from functools import cached_property
 
 import numpy as np
 
-from trajectories.basis import Basis, Family, SampledMotion, sample_times
-from trajectories.constraints import MotionConstraint, Product, Regressor, Smoothed, smoothed
-from trajectories.design.objectives import Excitation, FrictionCoverage, Objective, Observed, TorqueSlack, Value
-from trajectories.errors import BadInput, require
+from calib.trajectories.basis import Basis, Family, SampledMotion, sample_times
+from calib.trajectories.constraints import MotionConstraint, Product, Regressor, Smoothed, smoothed
+from calib.trajectories.design.objectives import Excitation, FrictionCoverage, Objective, Observed, TorqueSlack, Value
+from calib.trajectories.errors import BadInput, require
 
 _Matrix = tuple[int, int, int]
 INSTANTS = 2000  # over a period at which a motion is looked at between its samples (our choice)
@@ -59,7 +59,7 @@ class ExcitationProblem:
         regressor, product: (N, n, b) of q, v, a, and its derivative product: (q, v, a, G) -> slopes of Σ G · Y.
         objectives: pairs (objective, weight) of the sum to minimise (a condition number enters by its logarithm);
             ignored where there are goals.
-        constraints: of `trajectories.constraints`.
+        constraints: of `calib.trajectories.constraints`.
         goals: of goal attainment.
         samples: instants over the period at which all is evaluated.
         stretch: (least, most) factor on the period; equal ends fix it.

@@ -15,8 +15,8 @@ import nlopt
 import numpy as np
 from scipy.optimize import minimize
 
-from trajectories.basis import Basis
-from trajectories.design.problem import (
+from calib.trajectories.basis import Basis
+from calib.trajectories.design.problem import (
     Evaluation,
     ExcitationProblem,
     critical_times,
@@ -25,8 +25,8 @@ from trajectories.design.problem import (
     merit,
     unmet,
 )
-from trajectories.design.starts import random_start, shrunk
-from trajectories.errors import NotExciting
+from calib.trajectories.design.starts import random_start, shrunk
+from calib.trajectories.errors import NotExciting
 
 Method = Literal["slsqp", "auglag", "mma", "ccsaq"]
 

@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from trajectories.basis import Family, SampledMotion
-from trajectories.constraints import BoxLimit, MotionConstraint
-from trajectories.design.problem import ExcitationProblem, critical_times
-from trajectories.design.search import STAGES, SearchResult, one_start
-from trajectories.design.starts import shrunk
-from trajectories.errors import NothingFeasible
+from calib.trajectories.basis import Family, SampledMotion
+from calib.trajectories.constraints import BoxLimit, MotionConstraint
+from calib.trajectories.design.problem import ExcitationProblem, critical_times
+from calib.trajectories.design.search import STAGES, SearchResult, one_start
+from calib.trajectories.design.starts import shrunk
+from calib.trajectories.errors import NothingFeasible
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from trajectories.errors import BadInput, NothingFeasible
-from trajectories.timing.limits import Law, TimingLimits
-from trajectories.timing.path import Path
-from trajectories.timing.profile import Profile
+from calib.trajectories.errors import BadInput, NothingFeasible
+from calib.trajectories.timing.limits import Law, TimingLimits
+from calib.trajectories.timing.path import Path
+from calib.trajectories.timing.profile import Profile
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class ConstraintRows:
         s: (K + 1,) the grid.
         q, slope, curvature: (2, K, n) at both ends of the intervals.
         A, B, G: (2, K, n) the dynamics there; zero without.
-        limits: see `trajectories.timing.time_scaling.Limits`.
+        limits: see `calib.trajectories.timing.time_scaling.Limits`.
     """
 
     s: np.ndarray

@@ -17,11 +17,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from trajectories.errors import BadInput, NothingFeasible
-from trajectories.timing.limits import Law, TimingLimits
-from trajectories.timing.path import Path, reversals
-from trajectories.timing.profile import Profile, Sampled, dense, moved
-from trajectories.timing.reachability import ConstraintRows, fastest
+from calib.trajectories.errors import BadInput, NothingFeasible
+from calib.trajectories.timing.limits import Law, TimingLimits
+from calib.trajectories.timing.path import Path, reversals
+from calib.trajectories.timing.profile import Profile, Sampled, dense, moved
+from calib.trajectories.timing.reachability import ConstraintRows, fastest
 
 GRID, PER_SPAN, MAX_INTERVALS = 400, 200, 2400  # intervals, in all and between two knots
 ACTIVE = 0.01  # of a limit: nearer than that it is active

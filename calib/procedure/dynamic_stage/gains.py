@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -13,18 +12,15 @@ from calib.data.schema import Joints
 from calib.data.signals.motion import Motion, make_motion
 from calib.dynamics.bodies import STANDARD
 from calib.errors import UsageError
-from calib.extensions import Point
 from calib.identification.gains import DriveGains, identify_gains, identify_relative_gains
 from calib.identification.identify import chain_states, common_decimator, find_base
 from calib.identification.identify_options import FileSettings, GainPair, IdentifyOptions
 from calib.identification.prior import first_fit
 from calib.identification.rows import Case, make_case, observe, pool, triangulate, with_blocks
 from calib.identification.settings import IdentificationSettings, make_model
+from calib.procedure.robot_kinds import ROBOTS
 from calib.robot.chain import Chain
 from calib.units import TORQUE, without_gains
-
-Gains = Callable[[Any, Sequence[Case], IdentificationSettings, Mapping[str, float], int | None], DriveGains]
-DRIVE_GAINS: Point[Gains] = Point("drive_gains", "gains of a robot that is no serial arm")
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +145,7 @@ def _identify(
     reference: int | None,
 ) -> DriveGains:
     if not isinstance(chain, Chain):
-        return DRIVE_GAINS.one()(chain, cases, settings, known, reference)
+        return ROBOTS.one().drive_gains(chain, cases, settings, known, reference)
     model = make_model(chain, settings)
     base = find_base(model, cases, chain_states(chain, model, settings.seed))
     missing = [name for name in known if name not in [model.names[k] for k in base.kept]]

@@ -47,11 +47,11 @@ from calib.data.signals.resampling import resample
 from calib.errors import MeasurementError, UsageError, refused_as, require
 from calib.folders import METRICS
 from calib.result_kinds import refusal
+from calib.trajectories.bspline import bspline_family
+from calib.trajectories.errors import BadInput
+from calib.trajectories.fourier import evaluate
+from calib.trajectories.recall import Averaged, Recalled, average, find_periods
 from calib.units import headings, motion_units
-from trajectories.bspline import bspline_family
-from trajectories.errors import BadInput
-from trajectories.fourier import evaluate
-from trajectories.recall import Averaged, Recalled, average, find_periods
 
 NAME = "trajectory.toml"
 ARM = "arm.toml"  # the robot that the motion was made for

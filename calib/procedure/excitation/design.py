@@ -20,18 +20,18 @@ from calib.procedure.excitation.playback import Playback, check_start, play
 from calib.procedure.excitation.prediction import MotionOutlook, PredictedSigma, foretell
 from calib.procedure.excitation.settings import COARSE, DEFAULT_DESIGN, HARMONICS, ExcitationSettings, split_goal
 from calib.robot.calibrated import CalibratedChain
+from calib.trajectories.basis import Family
+from calib.trajectories.bspline import bspline_family
+from calib.trajectories.constraints import MotionConstraint, TorqueLimit
+from calib.trajectories.design.objectives import Excitation, TorqueSlack, condition_numbers
+from calib.trajectories.design.optimise import design
+from calib.trajectories.design.pareto import Front, proposed_goals, sweep
+from calib.trajectories.design.problem import AttainmentGoal, ExcitationProblem, exact_values, merit
+from calib.trajectories.design.search import SearchResult
+from calib.trajectories.design.verify import Verification, dense_motion, ensured
+from calib.trajectories.errors import NothingFeasible
+from calib.trajectories.fourier import fourier_family
 from calib.workers import finishing
-from trajectories.basis import Family
-from trajectories.bspline import bspline_family
-from trajectories.constraints import MotionConstraint, TorqueLimit
-from trajectories.design.objectives import Excitation, TorqueSlack, condition_numbers
-from trajectories.design.optimise import design
-from trajectories.design.pareto import Front, proposed_goals, sweep
-from trajectories.design.problem import AttainmentGoal, ExcitationProblem, exact_values, merit
-from trajectories.design.search import SearchResult
-from trajectories.design.verify import Verification, dense_motion, ensured
-from trajectories.errors import NothingFeasible
-from trajectories.fourier import fourier_family
 
 
 @dataclass(frozen=True)

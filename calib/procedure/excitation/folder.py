@@ -23,12 +23,12 @@ from calib.records import plain
 from calib.robot import description
 from calib.robot.chain import Chain
 from calib.robot.tables import dumps
+from calib.trajectories.design.pareto import Front
+from calib.trajectories.design.verify import dense_motion
+from calib.trajectories.messages import joint_trajectory, to_json, to_yaml
+from calib.trajectories.setpoints import Setpoints
+from calib.trajectories.timing.time_scaling import ACTIVE
 from calib.units import headings, motion_units
-from trajectories.design.pareto import Front
-from trajectories.design.verify import dense_motion
-from trajectories.messages import joint_trajectory, to_json, to_yaml
-from trajectories.setpoints import Setpoints
-from trajectories.timing.time_scaling import ACTIVE
 
 # files that identify the folder of an earlier run
 DESIGN = (METRICS, coefficients.SAMPLES, coefficients.NAME)

@@ -13,7 +13,7 @@ from calib.errors import UsageError, require
 from calib.procedure.excitation.inputs import ExcitationInputs
 from calib.procedure.excitation.prediction import task_states
 from calib.procedure.excitation.settings import AIMS, ExcitationSettings, split_goal
-from trajectories.design.objectives import (
+from calib.trajectories.design.objectives import (
     Duration,
     Excitation,
     FrictionCoverage,
@@ -22,7 +22,7 @@ from trajectories.design.objectives import (
     Scaling,
     TorqueSlack,
 )
-from trajectories.design.problem import AttainmentGoal
+from calib.trajectories.design.problem import AttainmentGoal
 
 SCALINGS: tuple[Scaling, ...] = ("raw", "normalised")
 GUARD = 0.2  # share of the torque limits kept free where no friction is known (our choice)

@@ -20,7 +20,7 @@ from calib.procedure.excitation.settings import ExcitationSettings
 from calib.procedure.kinematic_stage.inputs import load_rigid
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
-from trajectories.constraints import BoxLimit
+from calib.trajectories.constraints import BoxLimit
 
 
 @dataclass(frozen=True, eq=False)

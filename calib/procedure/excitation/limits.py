@@ -40,18 +40,18 @@ from calib.config import Tables, check_keys, read, strict
 from calib.config_types import Name, NotNegative, Numeric, Real, Spread, Whole, number
 from calib.errors import UsageError, require
 from calib.geometry.observability import targets_of
+from calib.poses.space import PoseConstraint
 from calib.procedure.measuring.constraints_file import DEFAULTS, ConstraintsFile, Point
 from calib.procedure.measuring.pose_limits import Limits, limits_of, tables_of
 from calib.robot.chain import Chain, Joint
 from calib.robot.description import impossible_bodies
 from calib.robot.kinematics import joint_frames, joint_jacobian, sweep
+from calib.trajectories.basis import SampledMotion
+from calib.trajectories.constraints import BoxLimit, MotionConstraint, box_limits
+from calib.trajectories.errors import NothingFeasible
+from calib.trajectories.places import Clearance, Workspace
+from calib.trajectories.setpoints import Setpoints
 from calib.units import motion_units
-from poses.space import PoseConstraint
-from trajectories.basis import SampledMotion
-from trajectories.constraints import BoxLimit, MotionConstraint, box_limits
-from trajectories.errors import NothingFeasible
-from trajectories.places import Clearance, Workspace
-from trajectories.setpoints import Setpoints
 
 # [rad or m, s, N m or N] a number above is no limit of a joint; direct drives of fast robots reach 1300 (our choice)
 MAX = {"velocity": 100.0, "acceleration": 3000.0, "torque": 1e5, "effort": 1e5}
@@ -455,7 +455,7 @@ class _PoseLimit:
         return np.asarray(self.of.function(motion.q), dtype=float)
 
     def slopes(self, motion: SampledMotion, weights: np.ndarray) -> np.ndarray:
-        from poses.space import constraint_gradient
+        from calib.poses.space import constraint_gradient
 
         result = np.zeros((4, *motion.q.shape))
         result[0] = np.einsum("mk,mkn->mn", weights, constraint_gradient(self.of, motion.q))

@@ -39,16 +39,16 @@ from calib.procedure.kinematic_stage.inputs import load_rigid
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, joint_kinds
 from calib.robot.kinematics import forward, tip_jacobian
+from calib.trajectories.basis import SampledMotion
+from calib.trajectories.setpoints import Setpoints, joined, slowed
+from calib.trajectories.timing.limits import TimingLimits
+from calib.trajectories.timing.lines import line
+from calib.trajectories.timing.path import Path as JointPath
+from calib.trajectories.timing.path import check_within, checked, spline
+from calib.trajectories.timing.profile import track
+from calib.trajectories.timing.shape import Shaped, shorten
+from calib.trajectories.timing.time_scaling import Timing, time_optimal
 from calib.transforms import pose
-from trajectories.basis import SampledMotion
-from trajectories.setpoints import Setpoints, joined, slowed
-from trajectories.timing.limits import TimingLimits
-from trajectories.timing.lines import line
-from trajectories.timing.path import Path as JointPath
-from trajectories.timing.path import check_within, checked, spline
-from trajectories.timing.profile import track
-from trajectories.timing.shape import Shaped, shorten
-from trajectories.timing.time_scaling import Timing, time_optimal
 
 Progress = Callable[[str], None]
 

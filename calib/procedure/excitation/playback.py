@@ -15,13 +15,13 @@ from calib.procedure.excitation.limits import DEFAULT_RISE, MotionLimits
 from calib.procedure.excitation.settings import ExcitationSettings
 from calib.records import evenly
 from calib.robot.chain import Chain
-from trajectories.approach import straight_approach
-from trajectories.basis import Family, SampledMotion
-from trajectories.constraints import BoxLimit
-from trajectories.design.search import SearchResult
-from trajectories.design.verify import dense_motion
-from trajectories.places import Clearance
-from trajectories.setpoints import Setpoints, joined, slowed
+from calib.trajectories.approach import straight_approach
+from calib.trajectories.basis import Family, SampledMotion
+from calib.trajectories.constraints import BoxLimit
+from calib.trajectories.design.search import SearchResult
+from calib.trajectories.design.verify import dense_motion
+from calib.trajectories.places import Clearance
+from calib.trajectories.setpoints import Setpoints, joined, slowed
 
 # [1/s, 1/s^2] acceleration and jerk of an approach over its speed, where none is stated
 APPROACH_RISE = DEFAULT_RISE

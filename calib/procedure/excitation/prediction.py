@@ -35,10 +35,10 @@ from calib.procedure.findings import sentence
 from calib.procedure.measuring.prediction import sigma_ratio
 from calib.records import Array, read_json, read_rows
 from calib.result_kinds import refusal
-from trajectories.basis import Family, SampledMotion
-from trajectories.design.problem import ExcitationProblem
-from trajectories.design.search import STAGES, SearchResult, one_start
-from trajectories.design.verify import dense_motion
+from calib.trajectories.basis import Family, SampledMotion
+from calib.trajectories.design.problem import ExcitationProblem
+from calib.trajectories.design.search import STAGES, SearchResult, one_start
+from calib.trajectories.design.verify import dense_motion
 
 NAME = "prediction.csv"
 # of the search for a motion of another period, which only informs the user (our choice)

@@ -15,6 +15,11 @@ from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.pose_lists import read_poses, write_poses
 from calib.errors import UsageError, require
 from calib.geometry.observability import Observation, observation, targets_of
+from calib.poses.candidates import draw_candidates
+from calib.poses.errors import NothingFeasible
+from calib.poses.indices import observability
+from calib.poses.select import SearchSettings, Selection, select_poses
+from calib.poses.space import SearchSpace, is_feasible
 from calib.procedure.kinematic_stage.inputs import load_robot
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
 from calib.procedure.measuring import prediction as forecast
@@ -25,11 +30,6 @@ from calib.procedure.measuring.run import lines as run_lines
 from calib.procedure.robot_kinds import joints_of
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, joint_kinds
-from poses.candidates import draw_candidates
-from poses.errors import NothingFeasible
-from poses.indices import observability
-from poses.select import SearchSettings, Selection, select_poses
-from poses.space import SearchSpace, is_feasible
 
 Progress = Callable[[int, int, str], None]
 # postures that see a camera's board, to choose from (our choice)
@@ -65,7 +65,7 @@ class Chosen:
 
     Attributes:
         chain: the nominal arm.
-        selection: see `poses.select`.
+        selection: see `calib.poses.select`.
         parameters: how many are identifiable from the measurements.
         existing: index of the existing poses alone; None without them, or if they are too few.
         checked, unchecked: constraints that were checked, and those that could not be, as text.

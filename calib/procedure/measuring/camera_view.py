@@ -23,11 +23,11 @@ from calib.geometry.installation import Installation, see
 from calib.geometry.inverse import Goal, reach, seen_at
 from calib.geometry.observability import Observation, base_columns
 from calib.geometry.observation import Block, layout, observe, prepare, target_jacobian
+from calib.poses.space import PoseConstraint
 from calib.procedure.measuring.constraints_file import CameraTable
 from calib.robot.chain import Chain
 from calib.robot.tables import placement
 from calib.transforms import invert, pose
-from poses.space import PoseConstraint
 
 CORNER, DISPLACEMENT, TURN = 0.05, 2e-5, 2e-5  # noise that a pose is judged by [px], [m], [rad]; our choice
 ASSUMED = (

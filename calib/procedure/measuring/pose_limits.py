@@ -18,6 +18,8 @@ from calib.config_types import number
 from calib.errors import RobotError, UsageError, listing, one_of, refused_as, require
 from calib.geometry.installation import Installation
 from calib.geometry.observability import Observation, Target, TargetJacobian
+from calib.poses import constraints
+from calib.poses.space import PoseConstraint, SearchSpace
 from calib.procedure.measuring import constraints_file
 from calib.procedure.measuring.camera_view import camera_view
 from calib.procedure.measuring.constraints_file import CameraTable, CollisionTable, ConstraintsFile, InstrumentTable
@@ -31,8 +33,6 @@ from calib.robot.formats.urdf_tree import is_urdf, text
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.tables import load as load_table
 from calib.robot.tables import placement
-from poses import constraints
-from poses.space import PoseConstraint, SearchSpace
 
 MAX_REACHES = 100.0  # times the arm's reach: no cell is that large (our choice)
 BODY = 1.2  # of the reach is where a link's body ends (our choice)

@@ -18,11 +18,11 @@ from calib.errors import Finding, UsageError, finding, require
 from calib.geometry.observability import Observation
 from calib.geometry.observation import layout
 from calib.geometry.weighing import GeometricFit
+from calib.poses.design import Pool
+from calib.poses.errors import NotIdentifiable, TooFewCandidates
+from calib.poses.exchange import greedy
+from calib.poses.information import prepared
 from calib.records import Array, read_json
-from poses.design import Pool
-from poses.errors import NotIdentifiable, TooFewCandidates
-from poses.exchange import greedy
-from poses.information import prepared
 
 SUFFIX = "_prediction.json"
 COUNTS = (10, 20, 40, 80)

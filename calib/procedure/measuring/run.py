@@ -24,13 +24,13 @@ import numpy as np
 
 from calib import files
 from calib.data.poses.pose_lists import joint_columns
+from calib.poses.by_index import merits
+from calib.poses.indices import Index, observability
+from calib.poses.information import log_det
 from calib.procedure.measuring import DEFAULT_RUN, RunSettings
 from calib.robot.chain import Chain
-from poses.by_index import merits
-from poses.indices import Index, observability
-from poses.information import log_det
-from trajectories.tour import move_times, tour
-from trajectories.ways import Room, way
+from calib.trajectories.tour import move_times, tour
+from calib.trajectories.ways import Room, way
 
 # full speed of a joint whose limit nobody knows [rad/s, m/s]; our choice
 LEISURE = {"revolute": 1.0, "prismatic": 0.25}

@@ -12,10 +12,10 @@ import numpy as np
 
 from calib.geometry.installation import Installation
 from calib.geometry.observability import Observation, Target, TargetJacobian
+from calib.poses import constraints
+from calib.poses.space import PoseConstraint, constraint_gradient
 from calib.robot.capsules import ALWAYS, SAMPLES
 from calib.robot.chain import Chain, random_joints
-from poses import constraints
-from poses.space import PoseConstraint, constraint_gradient
 
 BEAM = 0.01
 """Least distance of a link from the line of sight [m]: about the radius of a tracker's beam. Our choice."""

@@ -33,6 +33,8 @@ from calib.extensions import Point
 from calib.folders import write_staged
 from calib.geometry.observability import SIGMA_ORIENTATION, observation, targets_of
 from calib.identification.model_file import MODEL
+from calib.poses.candidates import draw_candidates
+from calib.poses.space import is_feasible
 from calib.procedure.findings import UNJUDGED, Warned, lines_of
 from calib.procedure.kinematic_stage import fit as fitting
 from calib.procedure.kinematic_stage import folder as outputs
@@ -55,8 +57,6 @@ from calib.robot.chain import Chain, joint_kinds
 from calib.robot.formats.urdf_tree import is_urdf
 from calib.robot.library import load_calibrated
 from calib.units import JOINT
-from poses.candidates import draw_candidates
-from poses.space import is_feasible
 
 WRITE_PROGRAM: Point[Callable[[Path, Path, str], Any]] = Point(
     "write_program", "files of a program of the poses in a CSV"
