@@ -7,10 +7,10 @@ import pytest
 from platform_sines import fitted, recorded
 
 from calib.folders import read_covariance
-from calib.identification.geometry_uncertainty import estimate, estimator
 from calib.identification.identify import common_decimator
 from calib.identification.identify_options import parse_options
 from calib.identification.rows import make_case, observe
+from calib.identification.uncertainty.geometry_uncertainty import estimate, estimator
 from calib.rooms.parallel.identification import ParallelDynamics, identify_parallel
 from calib.rooms.parallel.mechanism.closure import ClosedRobot, closed
 from calib.rooms.parallel.mechanism.geometric_fit import changed, visible_directions

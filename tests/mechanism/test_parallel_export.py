@@ -119,7 +119,7 @@ def test_mujoco_moves_as_planned_the_closer_the_shorter_its_steps(name):
 def test_masses_are_needed_and_the_folder_of_a_result(tmp_path, capsys):
     robot = find("fivebar")
     assert cli.run(["export", "fivebar", "--into", str(tmp_path / "a")]) == 2
-    assert "neither of a fit nor of an identification" in capsys.readouterr().err
+    assert "give the folder of a fit or of an identification" in capsys.readouterr().err
     (tmp_path / "estimate.csv").write_text("name,unit,value,sigma\n")
     chain = robot.chain
 

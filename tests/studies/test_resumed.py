@@ -13,7 +13,7 @@ import pytest
 from study_rows import ROW
 
 from calib.errors import UsageError
-from calib.identification.methods.registry import VERSIONS
+from calib.identification.registry import VERSIONS
 from calib.rooms.studies.conditions import read_study
 from calib.rooms.studies.report import run_study
 from calib.rooms.studies.store import ROWS, opened, read_rows

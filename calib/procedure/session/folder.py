@@ -41,13 +41,14 @@ from calib.config import parse
 from calib.config_types import Text
 from calib.data.poses import CORNERS, is_image_folder
 from calib.errors import Busy, SessionError, command_line, refused_as
-from calib.folders import CERTIFICATE, METRICS, PARAMETERS, STATE, write_staged
+from calib.folders import PARAMETERS, STATE, write_staged
 from calib.folders import SESSION as SETTINGS
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.findings import Verdict, Verdicts
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.session.settings import NOTHING, SCHEMA, SessionSettings, check_schema, read_settings, written
 from calib.records import plain
+from calib.result_kinds import refusal
 from calib.robot import tables
 from calib.robot.calibrated import ROBOT
 from calib.robot.formats.urdf_tree import converter, is_urdf, text
@@ -249,19 +250,6 @@ def create(folder: Path, robot_file: Path, settings: SessionSettings, copied: Ma
         write_staged(folder, (), fill)
 
 
-def _no_session(folder: Path) -> str:
-    """Return the message for a folder that is not a session: what the folder contains, and the command to use."""
-    identified = IdentificationFolder(folder).model.exists()
-    if not identified and not FitFolder(folder).report.exists():
-        return f"{folder} is not a session (no session.toml); make one with: {command_line('new', folder)}"
-    what, where = ("an identification", METRICS) if identified else ("a fit", CERTIFICATE)
-    return (
-        f"{folder} is the result of {what}, not a session: verdict and figures are in its {where}; "
-        f"{command_line('view', folder)} shows it, {command_line('export', folder, '--into', 'DIR')} writes the robot "
-        "for other programs"
-    )
-
-
 def open_session(folder: Path, plots: bool = True) -> Session:
     """Read the session in `folder`.
 
@@ -270,7 +258,7 @@ def open_session(folder: Path, plots: bool = True) -> Session:
     """
     path = folder / SETTINGS
     if not path.exists():
-        raise SessionError(_no_session(folder))
+        raise SessionError(refusal(folder, "session"))
     return Session(folder, read_settings(path), plots=plots)
 
 

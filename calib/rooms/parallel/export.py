@@ -46,15 +46,16 @@ from calib.folders import (
     write_staged,
 )
 from calib.identification.model_file import MODEL, refuse_currents
-from calib.identification.possible import information
-from calib.identification.possible.problem import find_prior_bodies
-from calib.identification.possible.solve import PossibleBodies, find_possible
+from calib.identification.physical_consistency import information
+from calib.identification.physical_consistency.problem import find_prior_bodies
+from calib.identification.physical_consistency.solve import PossibleBodies, find_possible
 from calib.identification.prediction import Dynamics
 from calib.identification.prior import RADIUS
 from calib.procedure.export.delivery import DRIVES, MJCF, README, TO_SIMULATE, write_drives
 from calib.procedure.export.identified import Drives, drive_table
 from calib.procedure.findings import LEVELS
 from calib.procedure.kinematic_stage.folder import URDF
+from calib.result_kinds import refusal
 from calib.robot.calibrated import ROBOT
 from calib.robot.chain import Chain, Element, Joint
 from calib.robot.formats.simulators import mjcf_text, pinocchio_model, pose_attributes
@@ -378,7 +379,7 @@ def export_parallel(robot: ParallelMechanism, folder: Path, into: Path, prior: s
         RobotError: where Pinocchio reads other loops or other forces; nothing is written.
     """
     if not any((folder / name).is_file() for name in (MODEL, ESTIMATE)):
-        raise UsageError(f"{folder} is neither of a fit nor of an identification of a parallel robot; give one")
+        raise UsageError(refusal(folder, "export"))
     check_export_target(
         into, [robot.source, *(folder / name for name in (ROBOT, METRICS, MODEL, ESTIMATE, COVARIANCE))]
     )

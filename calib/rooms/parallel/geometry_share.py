@@ -1,6 +1,7 @@
 """Share of the geometry's uncertainty in the identified dynamics of a parallel robot.
 
-The estimator and its implicit derivative are those of serial arms (`calib.identification.geometry_uncertainty`). What
+The estimator and its implicit derivative are those of serial arms
+(`calib.identification.uncertainty.geometry_uncertainty`). What
 differs: a changed geometry moves every joint of the loops at the same encoder readings, and the torques' projection on
 the platform's coordinates,
 
@@ -19,9 +20,9 @@ import scipy.linalg
 
 from calib.data.signals.filtering import Decimator, decimate, spread
 from calib.dynamics.torque_rows import POWER
-from calib.identification.geometry_uncertainty import TILTS, GeometryUncertainty, solve_sensitivity
 from calib.identification.identify import Identification
 from calib.identification.rows import Case, power_block, segments
+from calib.identification.uncertainty.geometry_uncertainty import TILTS, GeometryUncertainty, solve_sensitivity
 from calib.records import frozen
 from calib.rooms.parallel.mechanism.closure import Posture, closed
 from calib.rooms.parallel.mechanism.geometric_fit import LoopCovariance, LoopParameter, changed, visible_directions

@@ -19,7 +19,7 @@ from calib.identification.identify import Identification, identify_model
 from calib.identification.identify_options import IdentifyOptions
 from calib.identification.loop import per_joint
 from calib.identification.methods.method import Method
-from calib.identification.methods.registry import METHODS, method_named
+from calib.identification.registry import METHODS, method_named
 from calib.identification.rows import Case
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.identify import Assessment, Errors, ModelFindings, errors_of

@@ -9,7 +9,6 @@ from typing import Protocol
 import numpy as np
 
 from calib.estimation.estimate import Estimate
-from calib.extensions import offered
 from calib.folders import REPORT
 from calib.geometry.accuracy import Errors
 from calib.procedure.findings import Verdict
@@ -92,6 +91,7 @@ def report_of(fit: ReportedFit) -> Report:
 
 def write(fit: ReportedFit, folder: Path, plots: bool) -> None:
     """Write ``report.json``, figures (if `plots`) and the pages that rooms make of them into a fit's folder."""
+    from calib.procedure.report.certificate import results
     from calib.procedure.report.charts import saved
     from calib.procedure.report.geometry_figures import captioned
 
@@ -100,8 +100,7 @@ def write(fit: ReportedFit, folder: Path, plots: bool) -> None:
     drawn = {}
     if plots:
         drawn = saved(captioned(report), folder)
-    for pages in offered("fit_pages"):
-        pages(report, drawn, folder)
+    results.write_fit(report, drawn, folder)
 
 
 def _metrics(fit: ReportedFit) -> FitMetrics:

@@ -49,7 +49,7 @@ def study(
         list_methods: list all methods with their requirements
         list_studies: list the studies shipped with the toolkit
     """
-    from calib.identification.methods.registry import METHODS
+    from calib.identification.registry import METHODS
     from calib.procedure.report import page
     from calib.rooms.fleet import stores
     from calib.rooms.studies import report
@@ -161,7 +161,7 @@ def compare(
 
 def _names(text: str | None) -> list[str] | None:
     """Return the methods of a comma-separated list after a check of their names; None for all."""
-    from calib.identification.methods.registry import METHODS
+    from calib.identification.registry import METHODS
 
     if text is None:
         return None

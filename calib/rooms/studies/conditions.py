@@ -52,7 +52,7 @@ from annotated_types import MinLen
 from calib.config import parse, read_toml, strict
 from calib.config_types import Name, OneOf, Real, Spread, Text, Whole
 from calib.errors import UsageError, require, suggestion
-from calib.identification.methods.registry import METHODS, method_named
+from calib.identification.registry import METHODS, method_named
 
 ROBOTS = ("tx40", "rv2sq")
 MOTIONS = ("random", "designed")

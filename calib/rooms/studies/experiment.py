@@ -27,8 +27,10 @@ from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.pseudo_inertia import ball, margin
 from calib.geometry import fit as geometry
 from calib.geometry.first_guess import install
-from calib.identification.constraint_settings import ConstraintSettings
+from calib.identification.closed_loop.controllers import Reference
+from calib.identification.closed_loop.simulation import Plant, Sensing, SimulatedRun, feed_forward, simulate
 from calib.identification.loop import Controller, LoopSettings
+from calib.identification.methods.constraint_settings import ConstraintSettings
 from calib.identification.methods.method import IdentificationProblem
 from calib.identification.rows import Case, make_case, observe
 from calib.procedure.excitation import coefficients
@@ -38,8 +40,6 @@ from calib.rooms.cells import known_robots
 from calib.rooms.cells.cell import SimulatedInstrument, measure
 from calib.rooms.cells.known_robots import random_fourier
 from calib.rooms.cells.virtual_cells import perturbed_cell, rigid
-from calib.rooms.closed_loop.controllers import Reference
-from calib.rooms.closed_loop.simulation import Plant, Sensing, SimulatedRun, feed_forward, simulate
 from calib.rooms.studies.conditions import LIBRARY, Condition
 
 # The numbers below are our choices.

@@ -22,8 +22,8 @@ from calib import files
 from calib.errors import CalibError, UsageError, require
 from calib.identification.identify import Identification, identify
 from calib.identification.methods.method import Method
-from calib.identification.methods.registry import METHODS, method_named
 from calib.identification.prediction import predict
+from calib.identification.registry import METHODS, method_named
 from calib.identification.rows import Case
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.identify import judged, overlaps, repeated_motion

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 from calib.errors import TaskLost
-from calib.identification.methods.registry import method_named
+from calib.identification.registry import method_named
 from calib.rooms.fleet.throughput import Throughput
 from calib.rooms.studies.conditions import Study
 from calib.rooms.studies.store import RowStore

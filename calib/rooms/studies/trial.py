@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from calib.errors import CalibError
+from calib.identification.closed_loop.simulation import Plant, Sensing, simulate
 from calib.identification.methods.method import EstimateStatus, MethodEstimate
-from calib.identification.methods.registry import VERSIONS, method_named
 from calib.identification.prediction import Dynamics, predict
+from calib.identification.registry import VERSIONS, method_named
 from calib.rooms.cells import known_robots
-from calib.rooms.closed_loop.simulation import Plant, Sensing, simulate
 from calib.rooms.studies.conditions import Condition
 from calib.rooms.studies.experiment import Experiment, make_experiment, set_up
 

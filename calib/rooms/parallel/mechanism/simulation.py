@@ -3,8 +3,8 @@
     M(x) v̇ + h(x, v) = J_p^invᵀ tau,    v̇ of the platform's coordinates, tau held for one control period,
 
 M and h with all legs, drives and payloads (`simulation_kernels`): the robot that `ParallelModel` describes. Each
-actuator has a controller of its own (`calib.rooms.closed_loop.controllers`); those of redundant ones share the force
-as their errors have it.
+actuator has a controller of its own (`calib.identification.closed_loop.controllers`); those of redundant ones share the
+force as their errors have it.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from scipy.interpolate import CubicSpline
 from calib.dynamics import rigid_body
 from calib.dynamics.drives import DriveTerm
 from calib.errors import CannotSimulate, UsageError, require
+from calib.identification.closed_loop.controllers import Reference
+from calib.identification.closed_loop.simulation import Sensing, SimulatedRun, failure, sample_ticks
 from calib.identification.loop import Controller
 from calib.records import frozen
-from calib.rooms.closed_loop.controllers import Reference
-from calib.rooms.closed_loop.simulation import Sensing, SimulatedRun, failure, sample_ticks
 from calib.rooms.parallel.mechanism.closure import compiled
 from calib.rooms.parallel.mechanism.velocities import loop_jacobians
 
@@ -34,7 +34,7 @@ SHAPES = {"acceleration": 0, "velocity": 1, "sign": 2, "one": 3}
 
 @dataclass(frozen=True, eq=False)
 class ParallelPlant:
-    """A parallel robot to simulate, in place of a serial arm's `calib.rooms.closed_loop.simulation.Plant`.
+    """A parallel robot to simulate, in place of a serial arm's `calib.identification.closed_loop.simulation.Plant`.
 
     Attributes:
         model: `ParallelModel` of the robot with its drive terms, which makes this robot; parameters (p,) of it.
