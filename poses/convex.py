@@ -79,22 +79,22 @@ def bound(
 
 def relaxed(candidates: Candidates, m: int, *, capped: bool = True, tolerance: float = 1e-3, rounds: int = 12) -> Bound:
     """Return the solved relaxation over prepared candidates; see `bound`."""
-    z, known = candidates.z, candidates.known
+    z, known_information = candidates.z, candidates.known
     count, _, p = z.shape
     cap = 1.0 if capped else float(m)
-    x, scores = _warm(z, known, m, cap)
-    best = _certify(z, known, x, m, capped)
+    x, scores = _warm(z, known_information, m, cap)
+    best = _certify(z, known_information, x, m, capped)
     active, iterations = _largest(scores, min(count, max(2 * m, 3 * p) + p)), 0
     for _ in range(rounds):
         if best.log_upper - best.logdet <= p * np.log1p(tolerance):
             break
-        weights, price, steps = _interior(z[active], known, x[active], m, cap, tolerance)
+        weights, price, steps = _interior(z[active], known_information, x[active], m, cap, tolerance)
         iterations += steps
         x = np.zeros(count)
         x[active] = weights
-        now = _certify(z, known, x, m, capped)
-        best = _tighter(best, now)
-        active = _priced(now.scores, x, active, price, 2 * p)
+        certified = _certify(z, known_information, x, m, capped)
+        best = _tighter(best, certified)
+        active = _priced(certified.scores, x, active, price, 2 * p)
     gap = float(np.expm1((best.log_upper - best.logdet) / p))
     log_upper = best.log_upper + candidates.shift
     logdet = best.logdet + candidates.shift
@@ -106,11 +106,11 @@ def certificate(candidates: Candidates, x: np.ndarray, m: int, capped: bool = Tr
     return _certify(candidates.z, candidates.known, x, m, capped).log_upper + candidates.shift
 
 
-def information_of(z: np.ndarray, known: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return M = known + Σ x_i z_iᵀz_i (p, p) from z (N, rows, p) and weights x (N,)."""
+def information_of(z: np.ndarray, known_information: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return M = M_known + Σ x_i z_iᵀz_i (p, p) from z (N, rows, p) and weights x (N,)."""
     chosen = np.flatnonzero(x)
     rows = z[chosen].reshape(-1, z.shape[2])
-    return known + rows.T @ (rows * np.repeat(x[chosen], z.shape[1])[:, None])
+    return known_information + rows.T @ (rows * np.repeat(x[chosen], z.shape[1])[:, None])
 
 
 def scores_of(z: np.ndarray, matrix: np.ndarray) -> np.ndarray:
@@ -120,33 +120,35 @@ def scores_of(z: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     return np.einsum("ij,ij->i", *(2 * (spread.reshape(len(z), -1),)))
 
 
-def _certify(z: np.ndarray, known: np.ndarray, x: np.ndarray, m: int, capped: bool) -> _Certified:
-    matrix = information_of(z, known, x)
+def _certify(z: np.ndarray, known_information: np.ndarray, x: np.ndarray, m: int, capped: bool) -> _Certified:
+    matrix = information_of(z, known_information, x)
     logdet, p = float(log_det(matrix)), len(matrix)
     if not np.isfinite(logdet) or np.linalg.eigvalsh(matrix)[0] <= 1e-12 * np.trace(matrix):
         return _Certified(x, np.einsum("nrp,nrp->n", z, z), -np.inf, np.inf)
     scores = scores_of(z, matrix)
     top = np.partition(scores, len(scores) - m)[-m:].sum() if capped else m * scores.max()
-    total = float(np.trace(np.linalg.solve(matrix, known)) + top)
+    total = float(np.trace(np.linalg.solve(matrix, known_information)) + top)
     return _Certified(x, scores, logdet, logdet + p * float(np.log(total / p)))
 
 
-def _tighter(one: _Certified, other: _Certified) -> _Certified:
+def _tighter(first: _Certified, second: _Certified) -> _Certified:
     """Return the better weights of two, and the tighter bound of two."""
-    upper = min(one.log_upper, other.log_upper)
-    better = other if other.logdet >= one.logdet else one
+    upper = min(first.log_upper, second.log_upper)
+    better = second if second.logdet >= first.logdet else first
     return _Certified(better.x, better.scores, better.logdet, upper)
 
 
-def _warm(z: np.ndarray, known: np.ndarray, m: int, cap: float, steps: int = 6) -> tuple[np.ndarray, np.ndarray]:
+def _warm(
+    z: np.ndarray, known_information: np.ndarray, m: int, cap: float, steps: int = 6
+) -> tuple[np.ndarray, np.ndarray]:
     """Return initial weights by a few multiplicative steps, and their scores."""
     x = np.full(len(z), m / len(z))
-    scores = scores_of(z, information_of(z, known, x))
+    scores = scores_of(z, information_of(z, known_information, x))
     for _ in range(steps if len(z) * cap > m else 0):  # with no choice left x = 1 is the answer
         x = x * scores**1.5
         for _ in range(3):
             x = np.minimum(x * (m / x.sum()), cap)
-        scores = scores_of(z, information_of(z, known, x))
+        scores = scores_of(z, information_of(z, known_information, x))
     return x, scores
 
 
@@ -155,19 +157,25 @@ def _largest(values: np.ndarray, count: int) -> np.ndarray:
     return np.sort(np.argpartition(values, len(values) - count)[-count:])
 
 
-def _priced(scores: np.ndarray, x: np.ndarray, active: np.ndarray, price: float, most: int) -> np.ndarray:
+def _priced(scores: np.ndarray, x: np.ndarray, active: np.ndarray, price: float, max_count: int) -> np.ndarray:
     """Return the next active set: candidates with weight or near the price, and the worst violators."""
     keep = active[(x[active] > 1e-4) | (scores[active] > 0.9 * price)]
     if len(keep) < x.sum() + 2:  # all at the cap: leave the interior point room to move
         keep = active
-    outside = scores.copy()
-    outside[keep] = -np.inf
-    wanted = min(most, int((outside > price).sum()))
-    return np.sort(np.concatenate([keep, _largest(outside, wanted)])) if wanted else keep
+    candidates = scores.copy()
+    candidates[keep] = -np.inf
+    count = min(max_count, int((candidates > price).sum()))
+    return np.sort(np.concatenate([keep, _largest(candidates, count)])) if count else keep
 
 
 def _interior(
-    z: np.ndarray, known: np.ndarray, x: np.ndarray, m: int, cap: float, tolerance: float, most: int = 30
+    z: np.ndarray,
+    known_information: np.ndarray,
+    x: np.ndarray,
+    m: int,
+    cap: float,
+    tolerance: float,
+    max_steps: int = 30,
 ) -> tuple[np.ndarray, float, int]:
     """Return optimal weights (K,) over few candidates, the price λ of the sum, and the steps taken.
 
@@ -180,8 +188,8 @@ def _interior(
     x = np.minimum(x, 0.95 * cap + 0.05 * m / count)
     tau = 0.1 * p / count
     u, v, price = tau / x, tau / (cap - x), 0.0
-    for step in range(1, most + 1):
-        scores, curvature = _newton_terms(z, information_of(z, known, x))
+    for step in range(1, max_steps + 1):
+        scores, curvature = _newton_terms(z, information_of(z, known_information, x))
         slack = cap - x
         hessian = curvature + np.diag(u / x + v / slack)
         right = scores + tau / x - tau / slack
@@ -196,7 +204,7 @@ def _interior(
         if complementarity < 0.3 * p * tolerance and abs(x.sum() - m) < 1e-9 * m and primal > 0.5:
             return x, price, step
         tau = 0.1 * complementarity / (2 * count) if min(primal, dual) > 0.5 else 0.5 * complementarity / (2 * count)
-    return x * (m / x.sum()), price, most
+    return x * (m / x.sum()), price, max_steps
 
 
 def _newton_terms(z: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -76,9 +76,14 @@ def prepared(jacobians: ArrayLike, m: int, existing: ArrayLike | None = None) ->
     mean = (gram + past / count) / np.outer(scale, scale)
     _check_rank(mean)
     transform = solve_triangular(np.linalg.cholesky(mean).T, np.eye(p)) / scale[:, None]
-    known = transform.T @ past @ transform
+    known_information = transform.T @ past @ transform
     z = (stacked @ transform).reshape(array.shape)
-    return Candidates(z, (known + known.T) / 2, transform, -2.0 * float(np.log(np.abs(np.diag(transform))).sum()))
+    return Candidates(
+        z,
+        (known_information + known_information.T) / 2,
+        transform,
+        -2.0 * float(np.log(np.abs(np.diag(transform))).sum()),
+    )
 
 
 def log_det(matrices: np.ndarray) -> np.ndarray:

@@ -123,8 +123,8 @@ def _table(times: np.ndarray, period: float, count: int) -> np.ndarray:
 
 def evaluate(coefficients: Sequence[np.ndarray], period: float, times: np.ndarray, order: int = 0) -> np.ndarray:
     """Return d^r q / dt^r (N, n) directly from eq. 23, independent of tables and null spaces."""
-    most = max(len(c) // 2 for c in coefficients)
-    rates = 2 * np.pi / period * np.arange(1, most + 1)
+    max_order = max(len(c) // 2 for c in coefficients)
+    rates = 2 * np.pi / period * np.arange(1, max_order + 1)
     angle = np.outer(times, rates) + order * np.pi / 2  # each derivative turns sine and cosine by π/2
     sine, cosine = rates**order * np.sin(angle), rates**order * np.cos(angle)
     result = np.zeros((len(times), len(coefficients)))
@@ -151,9 +151,9 @@ def _check_frequencies(counts: Sequence[int], period: float, resonance: float | 
     require(np.isfinite(period) and period > 0, f"period {period} s: expected a positive number")
     top = max(counts) * 2 * np.pi / period
     if resonance is not None and not top < resonance:
-        least = 2 * np.pi * max(counts) / resonance
+        min_period = 2 * np.pi * max(counts) / resonance
         raise BadInput(
             f"the highest frequency, {max(counts)} · 2π/{period:g} s = {top:.4g} rad/s, is not below the resonance at "
             f"{resonance:.4g} rad/s: it would excite unmodelled dynamics; take fewer harmonics or a period "
-            f"above {least:.4g} s"
+            f"above {min_period:.4g} s"
         )

@@ -5,18 +5,18 @@ import numpy as np
 from trajectories.errors import BadInput
 
 
-def move_times(one: np.ndarray, two: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray) -> np.ndarray:
+def move_times(start: np.ndarray, end: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray) -> np.ndarray:
     """Return the durations (...) [s] of straight joint moves from rest to rest: trapezoids, all joints in proportion.
 
     A joint that goes by d takes d/v + v/a where it reaches its speed (d ≥ v²/a), else 2 √(d/a); the slowest one rules.
 
     Args:
-        one, two: (..., n) joint values [rad or m].
+        start, end: (..., n) joint values [rad or m].
         velocity, acceleration: (n,) largest moduli, above zero.
     """
-    way = np.abs(two - one)
-    full = way >= velocity**2 / acceleration
-    times = np.where(full, way / velocity + velocity / acceleration, 2.0 * np.sqrt(way / acceleration))
+    distance = np.abs(end - start)
+    full = distance >= velocity**2 / acceleration
+    times = np.where(full, distance / velocity + velocity / acceleration, 2.0 * np.sqrt(distance / acceleration))
     return times.max(axis=-1)
 
 
@@ -54,10 +54,10 @@ def tour(times: np.ndarray, first: int | None = None) -> np.ndarray:
 
 
 def _nearest_first(cost: np.ndarray, start: int) -> list[int]:
-    left, order = set(range(len(cost))) - {start}, [start]
-    while left:
-        order.append(min(left, key=lambda place: (cost[order[-1], place], place)))
-        left.remove(order[-1])
+    unvisited, order = set(range(len(cost))) - {start}, [start]
+    while unvisited:
+        order.append(min(unvisited, key=lambda stop: (cost[order[-1], stop], stop)))
+        unvisited.remove(order[-1])
     return order
 
 
@@ -87,15 +87,15 @@ def _relocated(order: np.ndarray, cost: np.ndarray) -> np.ndarray | None:
     for size in range(1, min(3, count - 2) + 1):
         before, last, behind = np.roll(order, 1), np.roll(order, 1 - size), np.roll(order, -size)
         saved = cost[before, order] + cost[last, behind] - cost[before, behind]
-        own = (np.arange(count) - np.arange(count)[:, None] + 1) % count <= size  # edges at the part itself
-        for turned, (one, two) in enumerate(((order, last), (last, order))):
-            gains = saved[:, None] + edge - cost[one[:, None], order] - cost[two[:, None], after]
-            gains[own] = 0.0
+        inside = (np.arange(count) - np.arange(count)[:, None] + 1) % count <= size  # edges at the part itself
+        for turned, (first, second) in enumerate(((order, last), (last, order))):
+            gains = saved[:, None] + edge - cost[first[:, None], order] - cost[second[:, None], after]
+            gains[inside] = 0.0
             i, k = divmod(int(gains.argmax()), count)
             best = max(best, (float(gains[i, k]), size, i, (k - i - size) % count, bool(turned)))
     _, size, i, k, turned = best
     if not size:
         return None
-    own = np.roll(order, -i)
-    part, rest = own[:size], own[size:]
-    return np.concatenate([rest[: k + 1], part[::-1] if turned else part, rest[k + 1 :]])
+    inside = np.roll(order, -i)
+    part, remaining = inside[:size], inside[size:]
+    return np.concatenate([remaining[: k + 1], part[::-1] if turned else part, remaining[k + 1 :]])

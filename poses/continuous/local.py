@@ -102,18 +102,18 @@ def improved(
     deadline = time.process_time() + seconds
     start = np.clip(np.asarray(q, dtype=float), space.lower, space.upper)
     value = merit_of(space, start, index, existing)[0] if is_feasible(space, start, FEASIBLE).all() else -np.inf
-    found, free, spent, interrupted = start, np.ones(len(start), dtype=bool), 1, False
+    best, free, spent, interrupted = start, np.ones(len(start), dtype=bool), 1, False
     history = [value] if np.isfinite(value) else []
     for _ in range(3):
-        held = _with_rows(space, found[~free], existing)
-        run = _search(space, found[free], index, held, evaluations - spent, tolerance, sharpness, deadline)
-        trial, spent, interrupted = found.copy(), spent + run.evaluations, run.interrupted
+        fixed_rows = _with_rows(space, best[~free], existing)
+        run = _search(space, best[free], index, fixed_rows, evaluations - spent, tolerance, sharpness, deadline)
+        trial, spent, interrupted = best.copy(), spent + run.evaluations, run.interrupted
         trial[free] = run.q
         bad = ~is_feasible(space, trial, FEASIBLE)
         trial[bad] = start[bad]
-        now = merit_of(space, trial, index, existing)[0]
-        if now > value or (now == value and not bad.any()):
-            found, value = trial, now
+        trial_value = merit_of(space, trial, index, existing)[0]
+        if trial_value > value or (trial_value == value and not bad.any()):
+            best, value = trial, trial_value
             history += [h for h in run.history if max(history, default=-np.inf) < h < value] + [value]
             if report:
                 report(value)
@@ -122,7 +122,7 @@ def improved(
         free &= ~bad
         if not free.any():
             break
-    return Improved(found, value, tuple(history), spent + 1, interrupted)
+    return Improved(best, value, tuple(history), spent + 1, interrupted)
 
 
 def _objective(
@@ -146,26 +146,28 @@ def _search(
     deadline: float,
 ) -> Improved:
     """Run the stages from one start and return the best feasible set; the predicate is not checked."""
-    kept = bool(_keeps(space, start).all())
-    best, value = start, merit_of(space, start, index, existing)[0] if kept else -np.inf
-    history, spent, now, interrupted = [value], 0, start, False
+    feasible = bool(_keeps(space, start).all())
+    best, value = start, merit_of(space, start, index, existing)[0] if feasible else -np.inf
+    history, spent, iterate, interrupted = [value], 0, start, False
     stages = list(sharpness if has_kinks(index) else (np.inf,))
     max_block = 300
     blocks = -(-start.size // max_block)
     while stages and spent < evaluations and time.process_time() < deadline and not interrupted:
         sharp = stages.pop(0)
         for block in np.array_split(np.random.default_rng(len(history)).permutation(len(start)), blocks):
-            rest = np.setdiff1d(np.arange(len(start)), block)
-            held = _with_rows(space, now[rest], existing)
-            objective = partial(_objective, space, index, held, sharp)
+            others = np.setdiff1d(np.arange(len(start)), block)
+            fixed_rows = _with_rows(space, iterate[others], existing)
+            objective = partial(_objective, space, index, fixed_rows, sharp)
             patient = tolerance * (10 if stages else 1)
-            moved, steps, interrupted = climb(space, now[block], objective, evaluations - spent, patient, deadline)
-            now, spent = now.copy(), spent + steps
-            now[block] = moved
+            block_poses, steps, interrupted = climb(
+                space, iterate[block], objective, evaluations - spent, patient, deadline
+            )
+            iterate, spent = iterate.copy(), spent + steps
+            iterate[block] = block_poses
             if interrupted or spent >= evaluations or time.process_time() > deadline:
                 break
-        trial = restored(space, now)
-        if kept:
+        trial = restored(space, iterate)
+        if feasible:
             bad = ~_keeps(space, trial)
             trial[bad] = best[bad]
         reached, last = merit_of(space, trial, index, existing)[0], value
@@ -175,7 +177,7 @@ def _search(
         if (
             not stages and 10 * tolerance < value - last < np.inf
         ):  # blocks, and stages cut short by a failed line search
-            stages, now = [sharp], best
+            stages, iterate = [sharp], best
     return Improved(best, value, tuple(history), spent, interrupted)
 
 
@@ -232,7 +234,7 @@ def climb(
     import scipy.optimize  # slow to load
 
     bounds = list(zip(np.tile(space.lower, m), np.tile(space.upper, m), strict=True))
-    kept = [{"type": "ineq", "fun": values, "jac": slopes}] if space.constraints else []
+    constraints = [{"type": "ineq", "fun": values, "jac": slopes}] if space.constraints else []
     options = {"maxiter": evaluations, "ftol": 1e-2 * tolerance}
     try:
         run = scipy.optimize.minimize(
@@ -241,7 +243,7 @@ def climb(
             jac=True,
             method="SLSQP",
             bounds=bounds,
-            constraints=kept,
+            constraints=constraints,
             callback=accepted,
             options=options,
         )
@@ -265,11 +267,11 @@ def restored(space: SearchSpace, q: np.ndarray, steps: int = 20) -> np.ndarray:
             break
         values, slopes = constraint_values(space, q[broken]), constraint_gradients(space, q[broken])
         for pose, value, slope in zip(broken, values, slopes, strict=True):
-            near = value > -1e-6
+            binding = value > -1e-6
             free = np.ones(q.shape[1], dtype=bool)
             for _ in range(q.shape[1]):
                 step = np.zeros(q.shape[1])
-                step[free] = np.linalg.lstsq(slope[near][:, free], -value[near] - 0.05 * FEASIBLE, rcond=1e-9)[0]
+                step[free] = np.linalg.lstsq(slope[binding][:, free], -value[binding] - 0.05 * FEASIBLE, rcond=1e-9)[0]
                 out = free & ((q[pose] + step < space.lower) | (q[pose] + step > space.upper))
                 if not out.any() or out.sum() == free.sum():
                     break

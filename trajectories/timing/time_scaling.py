@@ -99,13 +99,13 @@ def time_optimal(
         sampled = dense(path, rounded, None if law is None else law.torque)
         last = Timing(path, rounded, limits, sampled, 0, 0.0)
         excess = {name: _per_interval(values, len(s) - 1) - 1 for name, values in _shares(sampled, limits).items()}
-        kept = all(values.max() <= 0 for values in excess.values())
+        shares = all(values.max() <= 0 for values in excess.values())
         settled = x is not None and np.abs(profile.x - x).mean() <= max_change * x.mean()
         history.append(profile.duration)
         x, before = profile.x, x
-        if kept and (best is None or rounded.duration < best.duration):
+        if shares and (best is None or rounded.duration < best.duration):
             best = last
-        if settled and kept:
+        if settled and shares:
             break
         if settled or len(history) > max_rounds // 2:
             for name, values in excess.items():
@@ -148,11 +148,11 @@ def _round(
 
 def _shares(sampled: Sampled, limits: TimingLimits) -> dict[str, np.ndarray]:
     """Return the shares of the limits in use, (N, n) each, without kinds of limit that no joint has."""
-    found = {"velocity": sampled.v, "acceleration": sampled.a, "torque": sampled.tau}
+    shares = {"velocity": sampled.v, "acceleration": sampled.a, "torque": sampled.tau}
     sizes = {"velocity": limits.velocity, "acceleration": limits.acceleration, "torque": limits.torque}
     return {
         name: np.abs(values) / sizes[name]
-        for name, values in found.items()
+        for name, values in shares.items()
         if values is not None and np.isfinite(sizes[name]).any()
     }
 
