@@ -26,8 +26,8 @@ HOMES = {
         "calib.rooms.parallel.mechanism.closure_kernels",
         "calib.rooms.parallel.mechanism.simulation_kernels",
         "calib.robot.capsule_kernels",
-        "calib.rooms.closed_loop.loop_kernels",
-        "calib.rooms.studies.methods.tangent_kernels",
+        "calib.identification.closed_loop.loop_kernels",
+        "calib.identification.survey.tangent_kernels",
     ],
     "yourdfpy": ["calib.robot.formats.simulators"],
     "cv2": [
@@ -53,7 +53,6 @@ HOMES = {
     "matplotlib": ["calib.procedure.", "calib.api.", "calib.rooms."],
     "jinja2": ["calib.procedure.report.templates", "calib.rooms.controllers.program"],
     "typst": ["calib.rooms.certificate.rendering"],
-    "pyarrow": ["calib.rooms.studies.store"],
     "dask": ["calib.workers.cluster"],
     "distributed": ["calib.workers.cluster"],
     "fsspec": ["calib.rooms.fleet.stores"],
@@ -149,9 +148,9 @@ def test_the_rooms_can_be_shut(monkeypatch):
     from calib.errors import UsageError
 
     monkeypatch.setattr(extensions, "_offers", dict)
-    assert extensions.offered("commands") == [] and extensions.merged("stages") == {}
+    assert extensions.Point("commands", "").all() == []
     with pytest.raises(UsageError):
-        extensions.needed("camera_guess")
+        extensions.Point("camera_guess", "").one()
     code = "import sys; sys.modules['calib.rooms'] = None; import calib; from calib.cli import run; "
     code += "from calib.data.poses.measurements import PoseMeasurements as Measured; import numpy as np; "
     code += "rng = np.random.default_rng(0); q = rng.uniform(-1, 1, (40, 6)); robot = calib.load('tx40'); "

@@ -23,10 +23,14 @@ import numpy as np
 
 from calib.data.schema import refuse
 from calib.errors import MeasurementError, refuse_data, require, suggestion
-from calib.extensions import offered
+from calib.extensions import Point
 from calib.files import check_regular
 from calib.records import frozen, plain_text, read_only
 from calib.units import ANGLES, LENGTHS, QUANTITIES, TIMES, is_number
+
+EXPORTS: Point[Callable[[str | Path], IO[str] | None]] = Point(
+    "exports", "a file of another program as a stream of our text; None where it is our table"
+)
 
 _HEADING = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
 _UNIT_APART = re.compile(r"[ ]+([\[(])")  # q1 [deg], where blanks part the names
@@ -181,7 +185,7 @@ def opened(path: str | Path, headed: bool) -> Iterator[tuple[IO[str], str, list[
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise MeasurementError(f"cannot be read: {getattr(error, 'strerror', None) or error}", path) from error
     with raw as own:
-        exports = (export for room in offered("exports") if headed and (export := room(path)) is not None)
+        exports = (export for room in EXPORTS.all() if headed and (export := room(path)) is not None)
         file = next(exports, own)
         yield file, *_first_line(file, path, headed)
 

@@ -201,7 +201,8 @@ def solve(
 
     Converged (our choice): the next Gauss–Newton step is shorter than ``tolerance`` standard deviations of the
     estimate, ‖Qᵀr‖ <= tolerance · ‖r‖ / sqrt(dof); or ‖r‖ has fallen to rounding, 1e-11 of where it started; or no step
-    is better any more, and the residual is `EXACT_RMS` standard deviations of a measurement rms, as of computed ones.
+    is better any more, or the limit is reached, with residuals of `EXACT_RMS` standard deviations rms, as of computed
+    measurements: what they do not determine then lies in valleys too narrow to follow.
 
     Args:
         linearise: state -> the whitened problem, reduced.
@@ -223,11 +224,10 @@ def solve(
         short = problem.target @ problem.target <= tolerance**2 * problem.cost / dof
         if short or problem.cost <= rounding:
             status = Status.CONVERGED
-        elif count >= limit:
-            status = Status.ITERATIONS
-        elif lam > MAX_DAMPING:
+        elif count >= limit or lam > MAX_DAMPING:
             exact = problem.cost <= EXACT_RMS**2 * problem.rows
-            status = Status.CONVERGED if exact else Status.STALLED
+            failure = Status.ITERATIONS if count >= limit else Status.STALLED
+            status = Status.CONVERGED if exact else failure
         else:
             trial = retract(state, damped_step(problem.factor, problem.target, lam))
             trial_problem = linearise(trial)

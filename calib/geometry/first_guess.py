@@ -18,15 +18,16 @@ an inverse, which no placement S, X brings to the arm's S A_i X.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import singledispatch
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.data.poses.measurements import KINDS, PoseMeasurements, Poses, Positions, Sockets, take
 from calib.errors import refuse_data
-from calib.extensions import needed
+from calib.extensions import Point
 from calib.geometry.installation import Installation, NoOptics
 from calib.records import evenly
 from calib.robot.calibrated import Deflection
@@ -34,6 +35,10 @@ from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 from calib.transforms import from_quaternion, invert, orthonormal, pose
 from calib.units import DEG
+
+OPTICS: Point[Callable[[list[PoseMeasurements]], Any]] = Point(
+    "optics", "optics of kinds that are not the core's; loading it registers guesses and residuals"
+)
 
 # what a turn counts as [m/rad] (our choice)
 LEVER = 0.3
@@ -243,7 +248,7 @@ def install(chain: Chain, measured: Sequence[PoseMeasurements], known: Deflectio
     optics = NoOptics()
     if foreign:
         # registers guesses and residuals, too
-        optics = needed("optics")(foreign)
+        optics = OPTICS.one()(foreign)
     stations: dict[str, np.ndarray] = {}
     tools: dict[str, np.ndarray] = {}
     for block in sorted(measured, key=lambda block: (block.placing, -_turning(chain, block), -len(block))):

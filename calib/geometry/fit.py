@@ -43,6 +43,8 @@ ROUNDING = 1e-12
 WIDTH_ROUNDS = 30
 # share of its largest coefficient from which a parameter counts as merged with another
 MERGED = 0.1
+# relative deviation of a column's coefficients from those of a common scale (our choice)
+SCALE_DEVIATION = 0.2
 # poses with which the fit of many more begins, and that widths are estimated from (our choice)
 WARM_POSES = 2000
 # passes at most until the noise of images settles (our choice)
@@ -163,45 +165,53 @@ def _estimated(cell: Installation, split: ColumnSplit, candidates: np.ndarray) -
     return np.union1d(np.intersect1d(effective, arm), candidates[split.kept])
 
 
-def _enough(cell: Installation, blocks: list[Block], unknowns: int, min_numbers: float = 1.5) -> None:
-    """Raise an error for fewer than `min_numbers` measured numbers per unknown: such a fit could not be checked.
-
-    `min_numbers`: measured numbers per unknown at least (our choice).
-    """
-    parts = [part for block in blocks for part in observe(cell, block, np.array([], dtype=int))]
-    numbers = sum(part.value.size - part.nuisances for part in parts)
-    if numbers < min_numbers * unknowns:
-        poses = sum(len(block.measured) for block in blocks)
-        needed = math.ceil(min_numbers * unknowns * poses / max(numbers, 1))
-        refuse_data(
-            blocks[0].measured.file,
-            f"{poses} poses are too few: {unknowns} unknowns and a check of the fit need at least {needed} poses, "
-            "the full geometry 20 to 40; measure more, or choose a smaller model ('offsets' or "
-            "'frames')",
-        )
-
-
 def _scale_reference(cell: Installation, split: ColumnSplit, candidates: np.ndarray) -> np.ndarray:
     """Return the arm's longest length and the parameters that merge with it; empty for an arm without lengths.
 
     Sockets and planes are as well explained by a smaller arm, in the limit by none at all, so that the scale has to
-    come from the nominal: this length stays. What others merge with a column counts with it.
+    come from the nominal: this length stays, and what can replace it stays with it.
     """
-    elements = cell.chain.elements
     lengths = np.zeros(len(candidates))
-    translates = np.zeros(len(candidates), dtype=bool)
     for column, parameter in enumerate(candidates):
-        if parameter < len(elements):
+        if parameter < len(cell.chain.elements):
             lengths[column] = element_length(cell.chain, int(parameter))
-            translates[column] = elements[parameter].axis[0] == "t"
-    total = lengths[split.kept] + split.coefficients @ lengths[split.dropped]
-    total = np.where(translates[split.kept], np.abs(total), 0.0)
-    if total.max(initial=0.0) == 0.0:
+    lengths[split.without_effect] = 0.0
+    longest = int(np.argmax(np.abs(lengths)))
+    if lengths[longest] == 0.0:
         return candidates[:0]
-    longest = int(np.argmax(total))
-    share = np.abs(split.coefficients)
-    merged = share[longest] > MERGED * share.max(axis=0, initial=0.0)
-    return np.append(candidates[split.dropped[merged]], candidates[split.kept[longest]])
+    # columns that depend on others by the scale alone do not replace any of them
+    merges = ~_depend_by_scale(lengths, split)
+    share = np.abs(split.coefficients[:, merges])
+    dropped = split.dropped[merges]
+    merged = share > MERGED * share.max(axis=0, initial=0.0)
+    if longest in split.kept:
+        base = int(np.flatnonzero(split.kept == longest)[0])
+    elif longest in dropped:
+        base = int(np.argmax(share[:, np.flatnonzero(dropped == longest)[0]]))
+    else:
+        return candidates[[longest]]
+    return candidates[np.union1d([longest, split.kept[base]], dropped[merged[base]]).astype(int)]
+
+
+def _depend_by_scale(lengths: np.ndarray, split: ColumnSplit) -> np.ndarray:
+    """Return which dropped columns (p - b,) depend on the kept ones as one factor on all lengths makes them depend.
+
+    Args:
+        lengths: (p,) of the candidate columns [m]; zero for those that are none.
+        split: of the candidate columns.
+    """
+    base_lengths = lengths[split.kept]
+    lengths_kept = base_lengths != 0.0
+    result = np.zeros(len(split.dropped), dtype=bool)
+    if lengths_kept.sum() < 2:
+        return result
+    for number, column in enumerate(split.dropped):
+        if lengths[column] == 0.0:
+            continue
+        expected = -base_lengths[lengths_kept] / lengths[column]
+        difference = split.coefficients[lengths_kept, number] - expected
+        result[number] = np.linalg.norm(difference) < SCALE_DEVIATION * np.linalg.norm(expected)
+    return result
 
 
 def _making(

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.errors import UsageError, one_of, refuse_data
+from calib.errors import Unidentifiable, UsageError, one_of, refuse_data
 from calib.estimation import robust
 from calib.estimation.base_columns import ColumnSplit
 from calib.estimation.estimate import Estimate
@@ -23,8 +23,8 @@ from calib.records import frozen
 from calib.robot.calibrated import CalibratedChain, CorrectedChain
 from calib.robot.chain import Chain
 
-# [m, rad, px] of estimated sigmas: computed positions are no more exact, nor is a fit of them
-MIN_SIGMA = 1e-9
+# [m, rad, px] of estimated sigmas: no instrument of an arm is more exact, though computed positions are
+MIN_SIGMA = 1e-6
 # residuals over their sigmas: computed positions leave less
 MIN_NOISE = 1e-6
 # [m, rad, px] sigmas that a fit begins with, by label of the residual part
@@ -427,6 +427,14 @@ class Weigher:
     def result(self, solution: Solution) -> GeometricFit:
         """Return the fit at a solution, with the posterior covariance of its parameters."""
         state = solution.state
+        undetermined = self.free[np.diag(solution.factor) == 0.0]
+        if len(undetermined):
+            names = [layout(state).names[parameter] for parameter in undetermined]
+            raise Unidentifiable(
+                f"{self.blocks[0].measured.file}: these rows no longer determine {', '.join(names)} where the search "
+                "ended; measure at more different joint values",
+                names,
+            )
         table = layout(state)
         rows = sum(piece.part.value.size - piece.part.nuisances for piece in self.pieces)
         # parameters that rest on their prior take nothing from the measurements' degrees of freedom

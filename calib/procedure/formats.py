@@ -7,7 +7,10 @@ from typing import Any
 
 from calib.config import schema
 from calib.errors import UsageError, one_of
-from calib.extensions import merged
+from calib.extensions import Point, merged
+
+TOPICS_OF_ROOMS: Point[Mapping[str, tuple[str, str]]] = Point("topics", "topics of `calib formats`")
+SCHEMAS_OF_ROOMS: Point[Mapping[str, tuple[str, str]]] = Point("schemas", "their JSON schemas")
 
 TOPICS: Mapping[str, tuple[str, str]] = {
     "measurements": ("CSV files of measured poses, positions, distances", "calib.data.poses.pose_files"),
@@ -42,7 +45,7 @@ TOPICS: Mapping[str, tuple[str, str]] = {
         "recordings of motion, for calib identify",
         "calib.data.recordings.recording_options calib.data.recordings.recording_files calib.data.recordings.archives",
     ),
-    **merged("topics"),
+    **merged(TOPICS_OF_ROOMS),
 }
 """Topic → short description, and the modules whose docstrings document the topic."""
 
@@ -52,7 +55,7 @@ SCHEMAS: Mapping[str, tuple[str, str]] = {
     "constraints": ("calib.procedure.measuring.constraints_file", "ConstraintsFile"),
     "limits": ("calib.procedure.excitation.limits", "LimitsFile"),
     "session": ("calib.procedure.session.settings", "SessionSettings"),
-    **merged("schemas"),
+    **merged(SCHEMAS_OF_ROOMS),
 }
 """Topic → module and dataclass of the TOML files that people write."""
 _KINDS = {"string": "text", "integer": "whole number", "boolean": "true or false", "object": "table"}

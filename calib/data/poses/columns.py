@@ -10,9 +10,8 @@ import numpy as np
 from calib.data.csv_table import Table
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.measurements import KINDS
-from calib.data.schema import BOUNDS, Column
+from calib.data.schema import AS_DESCRIBED, BOUNDS, Column
 from calib.errors import MeasurementError, one_of, suggestion
-from calib.extensions import needed
 
 SUFFIXES = ("", "_meas", "_measured")
 POSITION = Column(("x", "y", "z"), "length", "position", BOUNDS.max_length, "mm")
@@ -84,7 +83,7 @@ class Sheet:
         names = self.find_joints(joints)
         q = self.numbers(names, Column(tuple(joints), "joint", "joints"))
         name = self.options.controller
-        return needed("as_described")(name, q) if name else q, names
+        return AS_DESCRIBED.one()(name, q) if name else q, names
 
     def check_names(self, joints: Sequence[str]) -> None:
         """Refuse options that name a column unknown to both the toolkit and the file."""

@@ -28,7 +28,7 @@ between series. Both measurements are noisy, and the base's orientation noise ac
 Rows that belong together: sockets, planes, pairs and bars.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -65,7 +65,11 @@ from calib.data.poses.measurements import (
     Sockets,
 )
 from calib.data.schema import Joints, refuse
-from calib.extensions import merged
+from calib.extensions import Point, merged
+
+POSE_FORMS: Point[Mapping[str, Any]] = Point(
+    "pose_forms", "files of poses that are no standard table: whether a header is of that form, and its reader"
+)
 
 
 def read_groups(sheet: Sheet, layout: Layout, q: np.ndarray) -> GroupedMeasurements:
@@ -220,7 +224,7 @@ def read_measurements(
     """
     robot, options = Joints.of(joints), options or FileOptions()
     table, path, notes = (source, source.file, ()) if isinstance(source, Table) else (None, source, ())
-    forms = merged("pose_forms")
+    forms = merged(POSE_FORMS)
     header = () if options.format or table is not None else read_header(path)[0]
     form = options.format or next((name for name, (known, _) in forms.items() if known(header)), "csv")
     if form in forms:

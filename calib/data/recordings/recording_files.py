@@ -28,10 +28,12 @@ from calib.data.recordings.recording_options import (
     plain_stems,
     stem_of,
 )
-from calib.data.schema import Joints
+from calib.data.schema import AS_DESCRIBED, MOTORS_AS_DESCRIBED, Joints
 from calib.errors import MeasurementError, refuse_data, suggestion
-from calib.extensions import needed
+from calib.extensions import Point
 from calib.files import check_regular
+
+READ_BAG: "Point[Reader]" = Point("read_bag", "a ROS bag's recording")
 
 
 def read_log(path: Path, joints: Joints | None, options: RecordingOptions, ends: Ends = (None, None)) -> Recording:
@@ -207,11 +209,11 @@ def _described(recording: Recording, controller: str) -> Recording:
     if not controller:
         return recording
     parts = {
-        "as_described": ("q", "v", "q_link", "q_ref"),
-        "motors_as_described": ("effort", "tau_link", "tau_motor", "tau_ff"),
+        AS_DESCRIBED: ("q", "v", "q_link", "q_ref"),
+        MOTORS_AS_DESCRIBED: ("effort", "tau_link", "tau_motor", "tau_ff"),
     }
     series = {name: (how, getattr(recording, name)) for how, names in parts.items() for name in names}
-    changed = {name: needed(how)(controller, own) for name, (how, own) in series.items() if own is not None}
+    changed = {name: how.one()(controller, own) for name, (how, own) in series.items() if own is not None}
     return replace(recording, **changed)
 
 
@@ -221,7 +223,7 @@ def _reader(path: Path, ends: Ends) -> Reader:
         if path.exists():
             check_regular(path)
         if path.is_dir() or path.suffix in (".bag", ".mcap", ".db3"):
-            return needed("read_bag")
+            return READ_BAG.one()
         with open(path, "rb") as file:
             head = file.read(1 << 16)
     except OSError as error:

@@ -42,7 +42,7 @@ import numpy as np
 
 from calib import files
 from calib.errors import UsageError
-from calib.extensions import offered
+from calib.extensions import Point
 from calib.folders import OFFSETS, PARAMETERS, check_target, write_staged
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.export import geometry, identified
@@ -64,6 +64,13 @@ from calib.robot.chain import Joint
 from calib.robot.description import impossible_bodies
 from calib.robot.formats import urdf_write
 from calib.robot.formats.urdf_tree import is_urdf, text, with_comment
+
+UR_KINEMATICS_YAML: Point[Callable[[CalibratedChain], tuple[str, str]]] = Point(
+    "ur_kinematics", "YAML for ur_description, and a remark"
+)
+JOINT_ORIGINS: Point[Callable[[str, str, str], str]] = Point(
+    "joint_origins", "YAML for tesseract of a nominal and a calibrated URDF"
+)
 
 README, UR_KINEMATICS, MJCF, DRIVES = "README.txt", "ur_kinematics.yaml", "robot.xml", "drives.csv"
 GEOMETRY, DYNAMICS = "geometry", "dynamics"
@@ -178,7 +185,7 @@ def _offsets(export: Export, path: Path) -> list[str]:
 
 def _ur_kinematics(export: Export, path: Path) -> list[str]:
     notes = []
-    for kinematics in offered("ur_kinematics"):
+    for kinematics in UR_KINEMATICS_YAML.all():
         content, flange = kinematics(export.robot, FitFolder(export.fit or Path()).urdf)
         files.write(path, _remarked(content.encode(), export.remark))
         notes.append(f"{path.name}: for kinematics_params_file of ur_description" + (f"; {flange}" if flange else ""))
@@ -209,7 +216,7 @@ def _drives(export: Export, path: Path) -> list[str]:
 
 def _joint_origins(export: Export, path: Path) -> list[str]:
     if export.urdf is not None:
-        for origins in offered("joint_origins"):
+        for origins in JOINT_ORIGINS.all():
             files.write(path, origins(text(export.urdf)[0], export.with_masses[0], str(export.urdf)))
     return []
 

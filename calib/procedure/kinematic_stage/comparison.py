@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements, Positions
-from calib.extensions import offered
+from calib.extensions import Point
 from calib.geometry.accuracy import Errors, errors, pair_errors, statistics
 from calib.geometry.error_model import ErrorModel, outside
 from calib.geometry.fit import placed_on
@@ -18,6 +18,8 @@ from calib.geometry.repeatability import ARMS, RepeatedPoses, repeated_poses
 from calib.geometry.weighing import Settings
 from calib.procedure.kinematic_stage.inputs import Unseen, pose_count
 from calib.procedure.kinematic_stage.metrics import ComparedRows, IntervalCoverage
+
+REPROJECTION: Point[Callable[[Installation, Any], Any]] = Point("reprojection", "how far corners are off")
 
 # of unseen rows: the standard deviation that the fit expects of the calibrated arm's position error there, all axes
 # together; the radius within which 95 % of such errors are to be; 1 where a joint is outside the range learnt from
@@ -143,7 +145,7 @@ def compare(
     """Return the errors of the nominal arm, the calibrated arm and (if given) the URDF alone on the same rows."""
     (one, two, *alone), both = [errors(cell, blocks) for cell in cells], (cells[0], cells[1])
     first, second = (pair_errors(cell, blocks, seed=seed) for cell in both)
-    corners: Any = tuple(room(cell, blocks) for room in offered("reprojection") for cell in both)
+    corners: Any = tuple(room(cell, blocks) for room in REPROJECTION.all() for cell in both)
     return Comparison(
         tuple(blocks),
         both,

@@ -8,7 +8,7 @@ from typing import TypeVar
 from calib.data.poses.fit_options import FitOptions
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import Finding, NotConverged, finding
-from calib.extensions import offered
+from calib.extensions import Point
 from calib.geometry.accuracy import errors
 from calib.geometry.checks.joint_range import joint_range
 from calib.geometry.checks.row_changes import row_changes
@@ -32,6 +32,8 @@ from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.validation import Arms, Assessment, assess
 from calib.procedure.measuring.prediction import SelectionPrediction, compared_with_fit
 from calib.robot.calibrated import CalibratedChain
+
+FIT_NOTES: Point[Callable[[GeometricFit], list[Finding]]] = Point("fit_notes", "findings on a fit")
 
 Progress = Callable[[str], None]
 MOVED = 3.0  # nominal errors fall by this factor when each file gets a station of its own: it was moved (our choice)
@@ -171,7 +173,7 @@ def run(
         *([rigid_misfit] if rigid_misfit else []),
         *_moved_between(found.nominal.cell, inputs.fit, settings),
         *diagnose(found.fit, with_changes=not changed),
-        *(note for notes in offered("fit_notes") for note in notes(found.fit)),
+        *(note for notes in FIT_NOTES.all() for note in notes(found.fit)),
     ]
     if selection is not None and (ratio := compared_with_fit(selection, found.fit)) is not None:
         notes.append(ratio)

@@ -1,8 +1,9 @@
 """Inputs of a fit: the robot, the rows to fit, and the unseen rows."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from calib.data.poses.measurements import PoseMeasurements, take
 from calib.data.poses.plausible import check_block
 from calib.data.poses.pose_files import joint_columns, read_measurements
 from calib.errors import CalibError, MeasurementError, UsageError, require
-from calib.extensions import needed, offered
+from calib.extensions import Point
 from calib.geometry.first_guess import check_orientations, check_scale
 from calib.geometry.fit import plain_fit
 from calib.geometry.installation import Installation
@@ -28,6 +29,15 @@ from calib.robot.formats.urdf_tree import is_urdf, text
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.kinematics import gravity_torques
 from calib.robot.library import load, resolve
+
+IDENTIFIED_MASSES: Point[Callable[[str, Chain], np.ndarray]] = Point(
+    "identified_masses", "standard parameters (n, 10) in the folder of an identification"
+)
+IMAGE_FOLDERS: Point[Any] = Point("image_folders", "a module: `read_images` reads a folder of images as a block")
+PLANNED_POSES: Point[Callable[[Path, Chain, FileOptions], list[PoseMeasurements]]] = Point(
+    "planned_poses", "points without joints, with those of planned poses"
+)
+CAMERA_GUESS: Point[Any] = Point("camera_guess", "a module: completes images' lenses, and takes images as poses")
 
 
 @dataclass(frozen=True)
@@ -116,10 +126,12 @@ def gather(
     require(measured, "no measurement file given", UsageError)
     files = [_path(each) for each in measured]
     check_files(options, [*files, *map(_path, validate)])
-    chain, source = load_robot(robot, files[0], options, base, tip)
+    # the joints of a table tell where a URDF's arm ends; measurements in memory have no table
+    table = None if isinstance(measured[0], PoseMeasurements) else files[0]
+    chain, source = load_robot(robot, table, options, base, tip)
     stored = source.suffix == ".toml"
     earlier = robot if isinstance(robot, CalibratedChain) else calibrated.read(source) if stored else None
-    masses = needed("identified_masses")(settings.masses, chain) if settings.masses else None
+    masses = IDENTIFIED_MASSES.one()(settings.masses, chain) if settings.masses else None
     weighed = chain if masses is None else replace(chain, inertias=masses)
     blocks = _named(
         [(path, block) for path, each in zip(files, measured) for block in read_file(each, weighed, options)],
@@ -259,11 +271,11 @@ def read_file(
         fits = tuple(each.joint_names) == chain.joint_names or len(each.joint_names) == chain.n
         blocks = [check_block(each, own, joints) if fits else each]
     elif is_image_folder(path):
-        blocks = [needed("image_folders").read_images(path, joints, own)]
+        blocks = [IMAGE_FOLDERS.one().read_images(path, joints, own)]
     else:
-        rooms = offered("planned_poses") if own.planned else ()
+        rooms = PLANNED_POSES.all() if own.planned else ()
         blocks = [block for room in rooms for block in room(path, chain, own)] or read_measurements(path, joints, own)
-    blocks = [needed("camera_guess").complete_camera(chain, b, like) if b.kind == IMAGES else b for b in blocks]
+    blocks = [CAMERA_GUESS.one().complete_camera(chain, b, like) if b.kind == IMAGES else b for b in blocks]
     for block in blocks:
         check_scale(block, chain)  # unseen files, too: the fit looks at its own only
         check_orientations(chain, block)

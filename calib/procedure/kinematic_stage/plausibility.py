@@ -11,7 +11,6 @@ from calib.column_changes import Explanation
 from calib.data.poses import IMAGES
 from calib.data.poses.measurements import PoseMeasurements, take
 from calib.errors import Finding, finding
-from calib.extensions import needed
 from calib.geometry.accuracy import NATURE, errors
 from calib.geometry.checks.joint_range import JointRange
 from calib.geometry.checks.readings import repeated_readings
@@ -22,6 +21,7 @@ from calib.geometry.model_choice.ladder import MAX_RESIDUAL, ModelSelection
 from calib.geometry.observation import sampled
 from calib.geometry.weighing import GeometricFit
 from calib.procedure.findings import level_of, limit
+from calib.procedure.kinematic_stage.inputs import CAMERA_GUESS
 from calib.procedure.kinematic_stage.metrics import Outlier
 from calib.records import evenly
 from calib.units import DEG, ERRORS
@@ -164,7 +164,7 @@ def _as_positions(block: PoseMeasurements) -> PoseMeasurements:
     if block.kind != IMAGES:
         return block
     rows = evenly(len(block), MAX_IMAGES)
-    return needed("camera_guess").pnp_poses(take(block, rows))
+    return CAMERA_GUESS.one().pnp_poses(take(block, rows))
 
 
 def _wrong_way(nominal: Installation, blocks: Sequence[PoseMeasurements], before: float, reach: float) -> list[Finding]:

@@ -5,7 +5,7 @@ between the arm's own links, and the floor that the arm stands on: `Limits.check
 `Limits.unchecked` names what could not be, since nobody has stated it.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,7 @@ import numpy as np
 from calib.config import Tables, check_keys, read
 from calib.config_types import number
 from calib.errors import RobotError, UsageError, listing, one_of, refused_as, require
-from calib.extensions import needed, offered
+from calib.extensions import Point
 from calib.geometry.installation import Installation
 from calib.geometry.observability import Observation, Target, TargetJacobian
 from calib.procedure.measuring import constraints_file
@@ -31,6 +31,13 @@ from calib.robot.tables import load as load_table
 from calib.robot.tables import placement
 from poses import constraints
 from poses.space import PoseConstraint, SearchSpace
+
+LIMIT_TABLES: Point[Callable[[Path, Chain, Path | None], Tables | None]] = Point(
+    "limit_tables", "tables of `calib formats limits` from other programs' files"
+)
+CAMERA_VIEW: Point[Callable[[CameraTable, Chain, str, Path], Any]] = Point(
+    "camera_view", "what the camera of a constraints file sees"
+)
 
 MAX_REACHES = 100.0  # times the arm's reach: no cell is that large (our choice)
 BODY = 1.2  # of the reach is where a link's body ends (our choice)
@@ -123,7 +130,7 @@ def tables_of(given: Tables | None, chain: Chain, source: Path | None, name: str
         chain, source: the arm, and its file.
     """
     if isinstance(given, str | Path):
-        for room in offered("limit_tables"):
+        for room in LIMIT_TABLES.all():
             if (found := room(Path(given), chain, source)) is not None:
                 return found, str(given)
     return given, name
@@ -138,7 +145,7 @@ def _with_camera(
         words = f"{constraints_file.VIEW_UNCHECKED} (not known: {', '.join(stated.unknown)})"
         return replace(limits, unchecked=(*unchecked, words))
     with refused_as(UsageError, RobotError, "{}"):
-        view = needed("camera_view")(stated, cell.chain, where, folder)
+        view = CAMERA_VIEW.one()(stated, cell.chain, where, folder)
     arm = replace(view.cell, stations=np.eye(4)[None])
     model = None if "view" in absent else limits.collision
     sight = sight_of(arm, view.stand, [[0.0, 0.0, 1.0]], None, (0.0, np.inf), model)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,7 @@ from calib import files
 from calib.data.poses import IMAGES
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import UsageError
-from calib.extensions import offered
+from calib.extensions import Point
 from calib.geometry.observation import layout, positions, prepare
 from calib.procedure.kinematic_stage.comparison import Comparison
 from calib.procedure.kinematic_stage.fit import Outcome
@@ -26,6 +26,8 @@ from calib.procedure.kinematic_stage.validation import ARM
 from calib.procedure.report.page import FileRow
 from calib.records import read_json
 from calib.transforms import invert
+
+IMAGE_COVERAGE: Point[Callable[[Any], list[Any]]] = Point("image_coverage", "how a fit's images cover the view")
 
 SCHEMA = 2
 READ = (1, SCHEMA)  # 1 kept the findings here, too
@@ -172,7 +174,7 @@ def collect(outcome: Outcome) -> Report:
         rank=len(values) if fit.split is None else fit.split.rank,
         sets=tuple(sets),
         noise=_noise(outcome.fit.blocks),
-        images=tuple(each for coverage in offered("image_coverage") for each in coverage(fit)),
+        images=tuple(each for coverage in IMAGE_COVERAGE.all() for each in coverage(fit)),
         files=_files(outcome.inputs),
         source=str(outcome.inputs.source),
     )

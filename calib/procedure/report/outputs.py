@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from calib.extensions import offered
+from calib.extensions import Point
 from calib.files import write_json
+
+FIT_PAGES: Point[Callable[[Any, Mapping[str, Any], Path], None]] = Point(
+    "fit_pages", "writes a fit's certificate into its folder"
+)
+MODEL_PAGES: Point[Callable[[Any, Mapping[str, Any], Path], None]] = Point(
+    "model_pages", "writes an identification's certificate into its folder"
+)
 
 if TYPE_CHECKING:
     from calib.procedure.dynamic_stage.identify import IdentificationOutcome
@@ -28,7 +35,7 @@ def write_fit(outcome: Outcome, folder: Path, plots: bool = True, pages: bool = 
         from calib.procedure.report.geometry_figures import captioned
 
         drawn = saved(captioned(report), folder)
-    for write in offered("fit_pages") if pages else ():
+    for write in FIT_PAGES.all() if pages else ():
         write(report, drawn, folder)
 
 
@@ -51,5 +58,5 @@ def write_model(outcome: IdentificationOutcome, folder: Path, plots: bool = True
     write_json(UnseenFolder(folder).report, report.unseen)
     if plots:
         drawn = charts.saved(dynamics_figures.captioned(report, folder), folder)
-    for write in offered("model_pages"):
+    for write in MODEL_PAGES.all():
         write(report, drawn, folder)

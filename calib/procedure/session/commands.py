@@ -3,7 +3,7 @@
 A waiting session prints two lines: what to do at the robot, and which file to provide in which format.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from calib.config import parse
 from calib.data.csv_table import read_table
 from calib.data.poses import IMAGES
 from calib.errors import UsageError, command_line, require
-from calib.extensions import needed, offered
+from calib.extensions import Point
 from calib.folders import CERTIFICATE, PAGES, SESSION
 from calib.geometry.observability import targets_of
 from calib.procedure.excitation.coefficients import RUN, SAMPLES
@@ -37,6 +37,11 @@ from calib.robot.chain import Chain
 from calib.robot.collision import meshes_beside
 from calib.robot.library import load, resolve
 from calib.robot.tables import dumps
+
+CHECK_CONTROLLER: Point[Callable[[str, int], None]] = Point(
+    "check_controller", "raises where a controller takes no arm of n joints"
+)
+ENDINGS: Point[Callable[[Session], list[str]]] = Point("endings", "lines on a complete session")
 
 
 def asks(session: Session, state: State) -> tuple[str, str]:
@@ -208,7 +213,7 @@ def new_session(
     require(dynamics or device.measures != NOTHING, words, UsageError)
     chain = load(robot, base or None, tip or None)
     if program:
-        needed("check_controller")(program, chain.n)
+        CHECK_CONTROLLER.one()(program, chain.n)
     copied, named = _limits(limits, chain, source, dynamics)
     table = {
         "name": chain.name,
@@ -270,7 +275,7 @@ def _ending(session: Session) -> tuple[str, ...]:
     """Return the closing lines of a complete session: the verdict, where certificate and robot are."""
     first, *others = PAGES
     page = f"{session.path(first)} ({', '.join(others)})"
-    found, further = session.verdicts(), [line for ending in offered("endings") for line in ending(session)]
+    found, further = session.verdicts(), [line for ending in ENDINGS.all() for line in ending(session)]
     robot = session.path(f"{session.export}/{URDF}")
     corrected = session.path(f"{session.export}/{CORRECTED_URDF}")
     use = ""

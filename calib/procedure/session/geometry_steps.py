@@ -4,7 +4,7 @@ A session asks for two sets of poses: optimised ones for the fit, and random one
 """
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
@@ -28,7 +28,7 @@ from calib.data.poses.pose_lists import (
 )
 from calib.data.schema import Joints
 from calib.errors import CalibError, Finding, UsageError, finding
-from calib.extensions import needed, offered
+from calib.extensions import Point
 from calib.folders import write_staged
 from calib.geometry.observability import SIGMA_ORIENTATION, observation, targets_of
 from calib.geometry.weighing import Settings
@@ -57,6 +57,14 @@ from calib.robot.library import load_calibrated
 from calib.units import JOINT
 from poses.candidates import draw_candidates
 from poses.space import is_feasible
+
+WRITE_PROGRAM: Point[Callable[[Path, Path, str], Any]] = Point(
+    "write_program", "files of a program of the poses in a CSV"
+)
+DRIFT: Point[Callable[[Session, Chain, Any, Any], list[Finding]]] = Point(
+    "drift", "drift of targets measured more than once"
+)
+IMAGE_WORDS: Point[Callable[[PoseMeasurements], str]] = Point("image_words", "what is said of images as they arrive")
 
 HOW = "add [camera] to the limits file, see `calib formats constraints`"
 
@@ -98,7 +106,7 @@ def _choose(session: Session, chain: Chain, say: Say) -> list[str]:
     for name, joints in sets.items():
         path = write_poses(session.path(f"2-poses/{name}"), joints, chain.joint_names, joint_kinds(chain))
         if settings.robot.controller:
-            needed("write_program")(path, path.with_suffix(""), settings.robot.controller)
+            WRITE_PROGRAM.one()(path, path.with_suffix(""), settings.robot.controller)
     write_run(session.path(f"2-poses/{folder.WAYS}"), chosen.run, chain)
     if chosen.prediction is not None:
         write_prediction(chosen.prediction, session.path(f"2-poses/{folder.POSES}"))
@@ -202,7 +210,7 @@ def arrive(session: Session, say: Say) -> list[str]:
     chain = chain_of(session)
     blocks, again = (read_measured(session, chain, session.brought(kind)) for kind in ("measured", "drift"))
     notes = notes_on(session, chain, blocks, folder.POSES)
-    for drift in offered("drift"):
+    for drift in DRIFT.all():
         notes += lines_of(drift(session, chain, *([block for _, block in own] for own in (blocks, again))))
     files.write(session.path(folder.POSES_CHECKED), "\n".join(notes) + "\n")
     return notes
@@ -232,7 +240,7 @@ def notes_on(session: Session, chain: Chain, blocks: Sequence[tuple[str, PoseMea
         if measures == Poses.kind and isinstance(block, Positions) and not isinstance(block, Poses):
             found.append("only positions, although the instrument measures poses")
         if block.kind == IMAGES:
-            found.append(needed("image_words")(block))
+            found.append(IMAGE_WORDS.one()(block))
         elif measures == IMAGES:
             found.append("contains no images, although the instrument is a camera; the file is fitted nevertheless")
         found += block.notes

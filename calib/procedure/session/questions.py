@@ -1,6 +1,6 @@
 """Questions of `calib new`: known instruments, questions at a terminal, and checks of the answers."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
@@ -13,12 +13,15 @@ from calib.config import described, parse
 from calib.config_types import OneOf, Real
 from calib.data.poses import BOARD, IMAGES, IN_HAND, TO_HAND
 from calib.errors import UsageError, one_of, refused_as, require
-from calib.extensions import needed
+from calib.extensions import Point
 from calib.procedure.measuring.constraints_file import AXES, ConstraintsFile
 from calib.procedure.session.answers import CAMERA, CELL, Answers, CertificateSection
 from calib.procedure.session.settings import NOTHING, InstrumentSection
 from calib.robot.library import resolve
 from calib.transforms import pose, to_xyz_rpy
+
+READ_LENS: Point[Callable[[Path], object]] = Point("read_lens", "a camera's file")
+READ_BOARD: Point[Callable[[Path], object]] = Point("read_board", "a board's file")
 
 MAX_MASS = 2000.0  # [kg]: of a payload (our choice)
 
@@ -262,12 +265,12 @@ def _mounting(text: str) -> str:
     return OneOf((IN_HAND, TO_HAND)).read(text.lower().replace("-", " ").replace("_", " "))
 
 
-def _file(read: str, text: str) -> str:
+def _file(read: "Point[Callable[[Path], object]]", text: str) -> str:
     """Return the path of a lens or board file, after checking that it can be read."""
     path = Path(text).expanduser()
-    path = path / BOARD if read == "read_board" and path.is_dir() else path
+    path = path / BOARD if read is READ_BOARD and path.is_dir() else path
     require(path.is_file(), "no such file; give an existing one", ValueError)
-    needed(read)(path)
+    read.one()(path)
     return str(path)
 
 
@@ -298,8 +301,8 @@ _KEYS: dict[str, tuple[str, Any]] = {  # of the limits file, and how the answer 
     "box": ("collision.box", _box),
     "obstacles": ("obstacle", _obstacles),
     "mounting": ("camera.mounting", _mounting),
-    "lens": ("camera.lens", partial(_file, "read_lens")),
-    "board": ("camera.board", partial(_file, "read_board")),
+    "lens": ("camera.lens", partial(_file, READ_LENS)),
+    "board": ("camera.board", partial(_file, READ_BOARD)),
     "carried": ("camera.carried", partial(_turned, "carried", MAX_HELD)),
     "stands": ("camera.stands", partial(_turned, "stands", MAX_FAR)),
 }

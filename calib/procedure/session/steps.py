@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.errors import SessionError
-from calib.extensions import offered
+from calib.extensions import Point
 from calib.files import fingerprint
 from calib.procedure.excitation.coefficients import NAME as MOTION
 from calib.procedure.findings import Warned
@@ -26,6 +26,8 @@ from calib.procedure.session import dynamics_steps, folder, geometry_steps
 from calib.procedure.session.folder import Say, Session, StateFile, StepRecord, read_state
 from calib.procedure.session.geometry_steps import clear_staging
 from calib.procedure.session.settings import default_keys
+
+MORE_STEPS: "Point[SessionStep]" = Point("steps", "steps after the export")
 
 FOLDERS = {"geometry": ("2-", "3-", "4-", "5-", "export/"), "dynamics": ("6-", "7-", "8-")}  # of one stage alone
 
@@ -207,7 +209,7 @@ class State:
 def steps_of(session: Session) -> tuple[SessionStep, ...]:
     """Return the steps of a session, without those of stages that the settings exclude."""
     left_out = {"dynamics": not session.dynamic, "geometry": not session.geometric, "need": not session.needs}
-    return tuple(step for step in (*STEPS, *offered("steps")) if not left_out.get(step.stage))
+    return tuple(step for step in (*STEPS, *MORE_STEPS.all()) if not left_out.get(step.stage))
 
 
 def find(session: Session, name: str) -> SessionStep:
@@ -220,7 +222,7 @@ def find(session: Session, name: str) -> SessionStep:
     for number, step in enumerate(there, 1):
         if name in (step.name, str(number)):
             return step
-    if stage := next((step.stage for step in (*STEPS, *offered("steps")) if step.name == name), ""):
+    if stage := next((step.stage for step in (*STEPS, *MORE_STEPS.all()) if step.name == name), ""):
         keys = {"dynamics": "wanted = true under [dynamics]", "need": "sigma_percent under [dynamics]"}
         key = keys.get(stage, "what measures under [instrument]")
         raise SessionError(f"this session does not include the {stage}; for '{name}' write {key} in session.toml")

@@ -1,13 +1,13 @@
 """The certificate of a session: the results of geometry and dynamics, read from the session's folders."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from calib import files
 from calib.data.poses import CORNERS, JOINTS
 from calib.errors import command_line
-from calib.extensions import offered
+from calib.extensions import Point
 from calib.folders import CERTIFICATE, PAGES
 from calib.procedure.excitation import coefficients
 from calib.procedure.export.delivery import prediction
@@ -35,6 +35,10 @@ from calib.rooms.certificate import dynamics, geometry, rendering
 from calib.rooms.certificate.record import EDITED, Certificate, Entry, Page, Stage, records
 from calib.rooms.certificate.results import measured_range, tolerance
 
+RECORDINGS: Point[Callable[[Path], str]] = Point(
+    "recordings", "writes a recording of a session for Rerun, and returns its name"
+)
+
 ROLES = {
     "1-robot": "nominal robot",
     "3-measured": "measured",
@@ -59,7 +63,7 @@ def certify(session: Session, say: Say) -> list[str]:
     judged = [section for section in whole.sections if section.verdict]
     notes = [f"{section.title.lower()} {section.verdict}: {section.reason}" for section in judged]
     written = rendering.write(session.folder, one, whole)
-    recordings = [write(session.folder) for write in offered("recordings") if session.plots]
+    recordings = [write(session.folder) for write in RECORDINGS.all() if session.plots]
     return [*notes, CERTIFICATE, *written, *recordings]
 
 

@@ -9,7 +9,6 @@ from typing import Protocol
 import numpy as np
 
 from calib.estimation.estimate import Estimate
-from calib.extensions import offered
 from calib.folders import REPORT
 from calib.geometry.accuracy import Errors
 from calib.procedure.findings import Verdict
@@ -17,6 +16,7 @@ from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.report import fit_report
 from calib.procedure.report.fit_report import CorrelatedPair, FittedParameter, Report, RowErrors
+from calib.procedure.report.outputs import FIT_PAGES
 from calib.rooms.parallel.mechanism.geometric_fit import LEFT_OUT, LoopFit, LoopParameter
 from calib.rooms.parallel.mechanism.parallel_robot import ParallelRobot
 from calib.rooms.parallel.robots import ParallelMechanism
@@ -45,7 +45,8 @@ class ReportedFit(Protocol):
     def measured(self) -> bool: ...
 
 
-MODEL = "loops"  # the one model of a parallel robot's geometry
+# the one model of a parallel robot's geometry
+MODEL = "loops"
 
 
 def report_of(fit: ReportedFit) -> Report:
@@ -53,7 +54,9 @@ def report_of(fit: ReportedFit) -> Report:
 
     Encoders that contradict each other measure neither position nor orientation: of readings alone it states no errors.
     """
-    robot, found, estimate = fit.nominal.chain, fit.found, fit.estimate
+    robot = fit.nominal.chain
+    found = fit.found
+    estimate = fit.estimate
     sets = {"fit": fit.own} | _unseen(fit)
     parameters = []
     for one, change, sigma in zip(found.parameters, estimate.values.tolist(), estimate.sigma.tolist()):
@@ -89,12 +92,13 @@ def write(fit: ReportedFit, folder: Path, plots: bool) -> None:
     report = report_of(fit)
     fit_report.write(report, folder / REPORT)
     drawn = saved(captioned(report), folder) if plots else {}
-    for pages in offered("fit_pages"):
+    for pages in FIT_PAGES.all():
         pages(report, drawn, folder)
 
 
 def _metrics(fit: ReportedFit) -> FitMetrics:
-    verdict, tolerance = fit.verdict, fit.settings.tolerance
+    verdict = fit.verdict
+    tolerance = fit.settings.tolerance
     vague = fit.found.vague
     return FitMetrics(
         validation={name: _compared(fit, both) for name, both in _unseen(fit).items()},
@@ -149,7 +153,9 @@ def _row_errors(fit: ReportedFit, name: str, both: np.ndarray) -> RowErrors:
 
 def _nominal_value(robot: ParallelRobot, one: LoopParameter) -> float:
     """Return a constant's nominal value; 0 for a displacement of a leg's base or attachment."""
-    return float(robot.legs[one.leg].chain.elements[one.index].value) if one.part == "element" else 0.0
+    if one.part == "element":
+        return float(robot.legs[one.leg].chain.elements[one.index].value)
+    return 0.0
 
 
 def _relative(sigma: float, value: float) -> float | None:
