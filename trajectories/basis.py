@@ -148,7 +148,10 @@ def holding(
     Raises:
         BadInput: for a joint that is not there, a value that is none, or one that the start contradicts.
     """
-    values, first = list(counts), [None if start is None else float(start[j]) for j in range(len(counts))]
+    values = list(counts)
+    first: list[float | None] = [None] * len(counts)
+    if start is not None:
+        first = [float(start[j]) for j in range(len(counts))]
     for j, value in (held or {}).items():
         if not 0 <= j < len(values) or not np.isfinite(value):
             raise BadInput(f"joint {j + 1} of {len(values)} cannot be held at {value:g}")
@@ -160,14 +163,24 @@ def holding(
 
 def assemble(times: np.ndarray, tables: Sequence[np.ndarray], freedoms: Sequence[Freedom]) -> Basis:
     """Return the basis from the joints' coefficient tables (4, N, C_j) and equations."""
-    n, widest = len(tables), max(max(f.null.shape[1] for f in freedoms), 1)
+    n = len(tables)
+    widest = max(1, *(free.null.shape[1] for free in freedoms))
     offsets = np.zeros((4, len(times), n))
-    stacked, used = np.zeros((n, 4, len(times), widest)), np.zeros((n, widest), dtype=bool)
+    stacked = np.zeros((n, 4, len(times), widest))
+    used = np.zeros((n, widest), dtype=bool)
     for j, (table, free) in enumerate(zip(tables, freedoms, strict=True)):
+        width = free.null.shape[1]
         offsets[:, :, j] = table @ free.particular
-        stacked[j, :, :, : free.null.shape[1]] = table @ free.null
-        used[j, : free.null.shape[1]] = True
+        stacked[j, :, :, :width] = table @ free.null
+        used[j, :width] = True
     return Basis(np.asarray(times, dtype=float), offsets, stacked, used)
+
+
+def counts_of_joints(counts: int | Sequence[int], joints: int | None) -> tuple[int, ...]:
+    """Return the count of each joint, of one number for all of them or one for each."""
+    if isinstance(counts, Sequence | np.ndarray):
+        return tuple(int(count) for count in counts)
+    return (int(counts),) * (joints or 0)
 
 
 def joined(freedoms: Sequence[Freedom], x: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -178,7 +191,10 @@ def joined(freedoms: Sequence[Freedom], x: np.ndarray) -> tuple[np.ndarray, ...]
 
 def projected(freedoms: Sequence[Freedom], coefficients: Sequence[np.ndarray]) -> np.ndarray:
     """Return the variables whose coefficients are nearest to the given ones."""
-    return np.concatenate([f.null.T @ (np.asarray(c) - f.particular) for f, c in zip(freedoms, coefficients)])
+    variables = []
+    for free, values in zip(freedoms, coefficients):
+        variables.append(free.null.T @ (np.asarray(values) - free.particular))
+    return np.concatenate(variables)
 
 
 def sample_times(period: float, count: int, shift: float = 0.0) -> np.ndarray:

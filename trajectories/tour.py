@@ -4,6 +4,9 @@ import numpy as np
 
 from trajectories.errors import BadInput
 
+# starts of a tour that may begin anywhere, about (our choice)
+STARTS = 12
+
 
 def move_times(start: np.ndarray, end: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray) -> np.ndarray:
     """Return the durations (...) [s] of straight joint moves from rest to rest: trapezoids, all joints in proportion.
@@ -38,34 +41,53 @@ def tour(times: np.ndarray, first: int | None = None) -> np.ndarray:
         raise BadInput(f"times: expected a symmetric (m, m) matrix of finite numbers, found shape {cost.shape}")
     count = len(cost)
     if count < 3:
-        return np.arange(count) if not first else np.arange(count)[::-1]
+        order = np.arange(count)
+        return order[::-1] if first else order
     # A place that costs nothing to go to closes the tour, so that its two neighbours are the free ends.
     closed = np.zeros((count + 1, count + 1))
     closed[:count, :count] = cost
+    starts = list(range(0, count, max(1, count // STARTS)))
     if first is not None:
+        starts = [first]
         closed[count, :count] = closed[:count, count] = cost.sum() + 1.0
         closed[count, first] = closed[first, count] = 0.0
         closed[count, :count] = np.minimum(closed[count, :count], cost.sum() + 1.0)
-    starts = [first] if first is not None else range(0, count, max(1, count // 12))
-    tours = (_improved(np.array([*_nearest_first(cost, start), count]), closed) for start in starts)
-    best = min(tours, key=lambda order: closed[order, np.roll(order, -1)].sum())
+    best = None
+    shortest = np.inf
+    for start in starts:
+        order = _improved(np.array([*_nearest_first(cost, start), count]), closed)
+        length = closed[order, np.roll(order, -1)].sum()
+        if length < shortest:
+            best = order
+            shortest = length
+    assert best is not None
     order = np.roll(best, -int(np.argmax(best == count)))[1:]
-    return order if first is None or order[0] == first else order[::-1]
+    if first is not None and order[0] != first:
+        return order[::-1]
+    return order
 
 
 def _nearest_first(cost: np.ndarray, start: int) -> list[int]:
-    unvisited, order = set(range(len(cost))) - {start}, [start]
+    """Return the tour that goes from each place to the nearest one not yet visited."""
+    order = [start]
+    unvisited = set(range(len(cost))) - {start}
     while unvisited:
-        order.append(min(unvisited, key=lambda stop: (cost[order[-1], stop], stop)))
-        unvisited.remove(order[-1])
+        last = order[-1]
+        nearest = min(unvisited, key=lambda stop: (cost[last, stop], stop))
+        order.append(nearest)
+        unvisited.remove(nearest)
     return order
 
 
 def _improved(order: np.ndarray, cost: np.ndarray) -> np.ndarray:
     """Return a closed tour that no reversal or relocation shortens, by repeating the move that saves most."""
-    while (shorter := _reversed(order, cost)) is not None or (shorter := _relocated(order, cost)) is not None:
+    while True:
+        shorter = _reversed(order, cost)
+        if shorter is None:
+            shorter = _relocated(order, cost)
+        if shorter is None:
+            return order
         order = shorter
-    return order
 
 
 def _reversed(order: np.ndarray, cost: np.ndarray) -> np.ndarray | None:
