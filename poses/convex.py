@@ -84,7 +84,8 @@ def relaxed(candidates: Candidates, m: int, *, capped: bool = True, tolerance: f
     cap = 1.0 if capped else float(m)
     x, scores = _warm(z, known_information, m, cap)
     best = _certify(z, known_information, x, m, capped)
-    active, iterations = _largest(scores, min(count, max(2 * m, 3 * p) + p)), 0
+    active = _largest(scores, min(count, max(2 * m, 3 * p) + p))
+    iterations = 0
     for _ in range(rounds):
         if best.log_upper - best.logdet <= p * np.log1p(tolerance):
             break
@@ -117,7 +118,8 @@ def scores_of(z: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     """Return the scores d_i = tr(z_i M⁻¹ z_iᵀ) (N,) of candidates."""
     root = np.linalg.inv(np.linalg.cholesky(matrix))
     spread = z.reshape(-1, z.shape[2]) @ root.T
-    return np.einsum("ij,ij->i", *(2 * (spread.reshape(len(z), -1),)))
+    spread = spread.reshape(len(z), -1)
+    return np.einsum("ij,ij->i", spread, spread)
 
 
 def _certify(z: np.ndarray, known_information: np.ndarray, x: np.ndarray, m: int, capped: bool) -> _Certified:
@@ -126,7 +128,9 @@ def _certify(z: np.ndarray, known_information: np.ndarray, x: np.ndarray, m: int
     if not np.isfinite(logdet) or np.linalg.eigvalsh(matrix)[0] <= 1e-12 * np.trace(matrix):
         return _Certified(x, np.einsum("nrp,nrp->n", z, z), -np.inf, np.inf)
     scores = scores_of(z, matrix)
-    top = np.partition(scores, len(scores) - m)[-m:].sum() if capped else m * scores.max()
+    top = m * scores.max()
+    if capped:
+        top = np.partition(scores, len(scores) - m)[-m:].sum()
     total = float(np.trace(np.linalg.solve(matrix, known_information)) + top)
     return _Certified(x, scores, logdet, logdet + p * float(np.log(total / p)))
 
@@ -144,7 +148,10 @@ def _warm(
     """Return initial weights by a few multiplicative steps, and their scores."""
     x = np.full(len(z), m / len(z))
     scores = scores_of(z, information_of(z, known_information, x))
-    for _ in range(steps if len(z) * cap > m else 0):  # with no choice left x = 1 is the answer
+    if len(z) * cap <= m:
+        # with no choice left x = 1 is the answer
+        return x, scores
+    for _ in range(steps):
         x = x * scores**1.5
         for _ in range(3):
             x = np.minimum(x * (m / x.sum()), cap)
@@ -160,7 +167,8 @@ def _largest(values: np.ndarray, count: int) -> np.ndarray:
 def _priced(scores: np.ndarray, x: np.ndarray, active: np.ndarray, price: float, max_count: int) -> np.ndarray:
     """Return the next active set: candidates with weight or near the price, and the worst violators."""
     keep = active[(x[active] > 1e-4) | (scores[active] > 0.9 * price)]
-    if len(keep) < x.sum() + 2:  # all at the cap: leave the interior point room to move
+    if len(keep) < x.sum() + 2:
+        # all at the cap: leave the interior point room to move
         keep = active
     candidates = scores.copy()
     candidates[keep] = -np.inf
@@ -187,7 +195,9 @@ def _interior(
     x = 0.9 * np.clip(x * (m / max(x.sum(), 1e-12)), 0.0, cap) + 0.1 * (m / count)
     x = np.minimum(x, 0.95 * cap + 0.05 * m / count)
     tau = 0.1 * p / count
-    u, v, price = tau / x, tau / (cap - x), 0.0
+    u = tau / x
+    v = tau / (cap - x)
+    price = 0.0
     for step in range(1, max_steps + 1):
         scores, curvature = _newton_terms(z, information_of(z, known_information, x))
         slack = cap - x
@@ -196,14 +206,18 @@ def _interior(
         solved = np.linalg.solve(hessian, np.stack([right, np.ones(count)], axis=1))
         price = float((solved[:, 0].sum() - (m - x.sum())) / solved[:, 1].sum())
         dx = solved[:, 0] - price * solved[:, 1]
-        du, dv = tau / x - u - u / x * dx, tau / slack - v + v / slack * dx
+        du = tau / x - u - u / x * dx
+        dv = tau / slack - v + v / slack * dx
         primal = min(1.0, 0.99 * _longest(x, dx), 0.99 * _longest(slack, -dx))
         dual = min(1.0, 0.99 * _longest(u, du), 0.99 * _longest(v, dv))
-        x, u, v = x + primal * dx, u + dual * du, v + dual * dv
+        x = x + primal * dx
+        u = u + dual * du
+        v = v + dual * dv
         complementarity = float(x @ u + (cap - x) @ v)
         if complementarity < 0.3 * p * tolerance and abs(x.sum() - m) < 1e-9 * m and primal > 0.5:
             return x, price, step
-        tau = 0.1 * complementarity / (2 * count) if min(primal, dual) > 0.5 else 0.5 * complementarity / (2 * count)
+        factor = 0.1 if min(primal, dual) > 0.5 else 0.5
+        tau = factor * complementarity / (2 * count)
     return x * (m / x.sum()), price, max_steps
 
 
@@ -213,12 +227,15 @@ def _newton_terms(z: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.nda
     root = np.linalg.inv(np.linalg.cholesky(matrix))
     spread = (z.reshape(-1, p) @ root.T).reshape(count, rows, p)
     inner = np.einsum("nrp,nrq->npq", spread, spread, optimize=True).reshape(count, -1)
-    upper = np.triu_indices(p)
-    packed = inner.reshape(count, p, p)[:, upper[0], upper[1]] * np.where(upper[0] == upper[1], 1.0, np.sqrt(2.0))
+    i, j = np.triu_indices(p)
+    weights = np.where(i == j, 1.0, np.sqrt(2.0))
+    packed = inner.reshape(count, p, p)[:, i, j] * weights
     return np.einsum("nrp,nrp->n", spread, spread), packed @ packed.T
 
 
 def _longest(value: np.ndarray, step: np.ndarray) -> float:
     """Return the largest t with value + t step ≥ 0."""
     falling = step < 0
-    return float((-value[falling] / step[falling]).min()) if falling.any() else np.inf
+    if not falling.any():
+        return np.inf
+    return float((-value[falling] / step[falling]).min())

@@ -13,8 +13,9 @@ import numpy as np
 
 from poses.information import log_det
 
-"""Information added to every design, relative to the unit mean information of one candidate, so that sets without
-full rank can be compared: our choice; values reported to the user never contain it."""
+# information added to every design, relative to the unit mean information of one candidate, so that sets without full
+# rank can be compared (our choice); values reported to the user never contain it
+RIDGE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -48,8 +49,7 @@ def design_of(pool: Pool, members: tuple[int, ...]) -> Design:
     """Return the design of given members, recomputed (this removes rounding errors of many updates)."""
     p = pool.z.shape[2]
     rows = pool.z[list(members)].reshape(-1, p)
-    ridge = 1e-6
-    matrix = pool.known + ridge * np.eye(p) + rows.T @ rows
+    matrix = pool.known + RIDGE * np.eye(p) + rows.T @ rows
     root = np.linalg.inv(np.linalg.cholesky(matrix))
     spread = (pool.z.reshape(-1, p) @ root.T).reshape(len(pool.z), -1)
     is_member = np.zeros(len(pool.z), dtype=bool)

@@ -7,11 +7,11 @@ import numpy as np
 
 from poses.design import Design, Pool, best_addition, best_removal, design_of, with_added, with_removed
 
+# called with each design of the requested size that is better than all before
 Report = Callable[[Design], None]
-"""Called with each design of the requested size that is better than all before."""
 
+# smallest gain of log det that counts (our choice)
 TOLERANCE = 1e-9
-"""Smallest gain of log det that counts: our choice."""
 
 
 def greedy(pool: Pool, m: int) -> Design:

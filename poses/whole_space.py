@@ -25,8 +25,10 @@ from poses.convex import information_of, relaxed, scores_of
 from poses.information import log_det, prepared
 from poses.space import SearchSpace, is_feasible, product
 
+# poses optimised together: few for a fast SLSQP, many for an efficient Jacobian (our choice)
 BLOCK = 8
-"""Poses optimised together: few for a fast SLSQP, many for an efficient Jacobian. Our choice."""
+# poses that differ by less in all joints are one start [rad or m] (our choice)
+MIN_DIFFERENCE = 0.1
 
 
 @dataclass(frozen=True)
@@ -153,10 +155,10 @@ def _starts(
     )
 
 
-def _apart(q: np.ndarray, min_difference: float = 0.1) -> np.ndarray:
-    """Return the poses that differ pairwise by at least `min_difference` [rad or m] in some joint; our choice."""
+def _apart(q: np.ndarray) -> np.ndarray:
+    """Return the poses that differ pairwise by at least `MIN_DIFFERENCE` in some joint."""
     distinct = np.zeros((0, q.shape[1]))
     for pose in q:
-        if not len(distinct) or (np.abs(distinct - pose).max(1) > min_difference).all():
+        if not len(distinct) or (np.abs(distinct - pose).max(1) > MIN_DIFFERENCE).all():
             distinct = np.concatenate([distinct, pose[None]])
     return distinct

@@ -18,12 +18,14 @@ from poses.space import SearchSpace, constraint_gradients, constraint_values, is
 
 Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
 
-"""Above this number of variables, poses are searched in blocks, the others fixed: SLSQP's cost is cubic."""
+# above this number of variables, poses are searched in blocks, the others fixed: SLSQP's cost is cubic
+MAX_BLOCK = 300
+# the stages of a smoothed search (our choice): at the last one the smoothing costs at most log(p)/1024 of the merit
 SHARPNESS = (16.0, 64.0, 256.0, 1024.0)
-"""The stages of a smoothed search. Our choice: at the last one the smoothing costs at most log(p)/1024 of the merit."""
-"""Iterations within which a stage must improve. Our choice."""
+# iterations within which a stage must improve (our choice)
+PATIENCE = 25
+# largest accepted constraint violation in a result [unit of the constraint]
 FEASIBLE = 1e-8
-"""Largest accepted constraint violation in a result [unit of the constraint]."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,7 @@ def improved(
         index: what to improve.
         existing: (k, rows, p) Jacobians of poses already measured.
         evaluations: most evaluations of index and gradient; a search stops by itself long before.
-        tolerance: gain of the merit over `patience` iterations to stop at; ten times that in all stages but the last.
+        tolerance: gain of the merit over `PATIENCE` iterations to stop at; ten times that in all stages but the last.
         seconds: of processor time to end after, whatever was reached by then.
         sharpness: of the stages, for indices with kinks.
         report: called with every improved merit.
@@ -150,8 +152,7 @@ def _search(
     best, value = start, merit_of(space, start, index, existing)[0] if feasible else -np.inf
     history, spent, iterate, interrupted = [value], 0, start, False
     stages = list(sharpness if has_kinks(index) else (np.inf,))
-    max_block = 300
-    blocks = -(-start.size // max_block)
+    blocks = -(-start.size // MAX_BLOCK)
     while stages and spent < evaluations and time.process_time() < deadline and not interrupted:
         sharp = stages.pop(0)
         for block in np.array_split(np.random.default_rng(len(history)).permutation(len(start)), blocks):
@@ -189,7 +190,7 @@ def climb(
     tolerance: float,
     deadline: float = np.inf,
 ) -> tuple[np.ndarray, int, bool]:
-    """Maximise a smooth function of poses by SLSQP, until it gains less than `tolerance` over `patience` iterations.
+    """Maximise a smooth function of poses by SLSQP, until it gains less than `tolerance` over `PATIENCE` iterations.
 
     Args:
         space: limits and constraints; its Jacobian and predicate are not looked at.
@@ -217,8 +218,7 @@ def climb(
         nonlocal last
         last = x.reshape(m, n).copy()
         merits.append(latest)
-        patience = 25
-        stalled = len(merits) > patience and merits[-1] - merits[-1 - patience] < tolerance
+        stalled = len(merits) > PATIENCE and merits[-1] - merits[-1 - PATIENCE] < tolerance
         if stalled or count >= evaluations or time.process_time() > deadline:
             raise _Ended
 
@@ -231,7 +231,8 @@ def climb(
         result[np.arange(m), :, np.arange(m)] = -blocks
         return result.reshape(-1, m * n)
 
-    import scipy.optimize  # slow to load
+    # slow to load
+    import scipy.optimize
 
     bounds = list(zip(np.tile(space.lower, m), np.tile(space.upper, m), strict=True))
     constraints = [{"type": "ineq", "fun": values, "jac": slopes}] if space.constraints else []
