@@ -17,7 +17,6 @@ from calib.parallel.mechanism.closure import ClosedRobot
 from calib.parallel.mechanism.parallel_model import ParallelModel, PlatformRegressor
 from calib.parallel.mechanism.parallel_robot import ParallelRobot
 from calib.parallel.mechanism.velocities import LoopMotion
-from calib.parallel.purpose import Purpose, foretold, of_folder, of_options, purpose_of, read_model, whole
 from calib.parallel.robots import ParallelMechanism, refuse_unread
 from calib.procedure.excitation import coefficients, folder, prediction
 from calib.procedure.excitation.coefficients import PLANNED
