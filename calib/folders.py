@@ -40,7 +40,7 @@ class InFolder:
 
 
 def check_target(
-    out: Path, ours: Collection[str], marks: Collection[str], what: str, inputs: Iterable[str | Path | None] = ()
+    out: Path, ours: Collection[str], marks: Collection[str], kind: str, inputs: Iterable[str | Path | None] = ()
 ) -> None:
     """Raise an error, before any work is done, for a folder that cannot be written or contains other files.
 
@@ -63,7 +63,7 @@ def check_target(
         raise UsageError(f"{out} contains {foreign[0]} of another result or session; choose another folder (--out)")
     present = files_of(out, ours)
     if present and not all((out / name).exists() for name in marks):
-        raise UsageError(f"{out} contains {', '.join(present)}, not from an earlier {what}; choose another (--out)")
+        raise UsageError(f"{out} contains {', '.join(present)}, not from an earlier {kind}; choose another (--out)")
 
 
 def files_of(folder: Path, ours: Collection[str]) -> list[str]:
