@@ -14,7 +14,6 @@ from calib.api.kinematic import GeometryFit, Measured, Several
 from calib.api.rendering import listed, optional, saved
 from calib.arguments import checked
 from calib.errors import CalibWarning, RobotError, UsageError, refused_as, require
-from calib.extensions import needed
 from calib.procedure.dynamic_stage import identify as arm_identify
 from calib.procedure.export import delivery, geometry
 from calib.procedure.export.identified import is_identified
@@ -108,7 +107,9 @@ def export(
             remark = delivery.verdicts(folder).of("urdf", dynamics=True).remark
             order = replace(order, remark=remark)
             moveit_paths = [*map(Path, moveit)]
-            return needed("ros2_package")(order, ros2, into, moveit=moveit_paths, control=control, overwrite=overwrite)
+            from calib.procedure.export.ros2_package import write_package
+
+            return write_package(order, ros2, into, moveit=moveit_paths, control=control, overwrite=overwrite)
         delivery.check_into(order, into, folder)
         lines = delivery.deliver(order, into)
         verdict_lines = delivery.mark(into, delivery.verdicts(folder))

@@ -23,10 +23,14 @@ import numpy as np
 
 from calib.data.schema import refuse
 from calib.errors import MeasurementError, refuse_data, require, suggestion
-from calib.extensions import offered
+from calib.extensions import Point
 from calib.files import check_regular
 from calib.records import frozen, plain_text, read_only
 from calib.units import ANGLES, LENGTHS, QUANTITIES, TIMES, is_number
+
+EXPORTS: Point[Callable[[str | Path], IO[str] | None]] = Point(
+    "exports", "a file of another program as a stream of our text; None where it is our table"
+)
 
 _HEADING = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
 # q1 [deg], where blanks separate the names
@@ -217,8 +221,8 @@ def opened(path: str | Path, headed: bool) -> Iterator[tuple[IO[str], str, list[
 
 def _as_our_text(path: str | Path) -> IO[str] | None:
     """Return another program's export as a stream of our text; None where the file is our table already."""
-    for room in offered("exports"):
-        export = room(path)
+    for read_export in EXPORTS.all():
+        export = read_export(path)
         if export is not None:
             return export
     return None

@@ -7,12 +7,12 @@ from typing import NoReturn
 
 import numpy as np
 
+from calib.controllers.table import as_described
 from calib.data.csv_table import Table
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.measurements import KINDS
 from calib.data.schema import BOUNDS, Column
 from calib.errors import MeasurementError, one_of, suggestion
-from calib.extensions import needed
 
 SUFFIXES = ("", "_meas", "_measured")
 POSITION = Column(("x", "y", "z"), "length", "position", BOUNDS.max_length, "mm")
@@ -91,7 +91,7 @@ class Sheet:
         names = self.find_joints(joints)
         q = self.numbers(names, Column(tuple(joints), "joint", "joints"))
         if self.options.controller:
-            q = needed("as_described")(self.options.controller, q)
+            q = as_described(self.options.controller, q)
         return q, names
 
     def check_names(self, joints: Sequence[str]) -> None:

@@ -64,8 +64,8 @@ from calib.data.poses.measurements import (
     Positions,
     Sockets,
 )
+from calib.data.poses.robodk import FORMS
 from calib.data.schema import Joints, refuse
-from calib.extensions import merged
 
 
 def read_groups(sheet: Sheet, layout: Layout, q: np.ndarray) -> GroupedMeasurements:
@@ -242,14 +242,13 @@ def read_measurements(
     table = source if isinstance(source, Table) else None
     path = source.file if isinstance(source, Table) else source
     notes: tuple[str, ...] = ()
-    forms = merged("pose_forms")
     form = options.format
     if not form:
         header = read_header(path)[0] if table is None else ()
-        matching = [name for name, (matches, _) in forms.items() if matches(header)]
+        matching = [name for name, (matches, _) in FORMS.items() if matches(header)]
         form = matching[0] if matching else "csv"
-    if form in forms:
-        reader: Callable[..., tuple[Table, FileOptions, tuple[str, ...]]] = forms[form][1]
+    if form in FORMS:
+        reader: Callable[..., tuple[Table, FileOptions, tuple[str, ...]]] = FORMS[form][1]
         table, options, notes = reader(path, len(robot.names), options)
     table = table or read_table(path)
     # Names that the reader of the form has understood need no map.

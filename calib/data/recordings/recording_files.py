@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from calib.controllers.table import as_described, motors_as_described
 from calib.data.csv_table import Table, read_table
 from calib.data.recordings.archives import read_archive
 from calib.data.recordings.checks import check_recording
@@ -30,7 +31,6 @@ from calib.data.recordings.recording_options import (
 )
 from calib.data.schema import Joints
 from calib.errors import MeasurementError, refuse_data, suggestion
-from calib.extensions import needed
 from calib.files import check_regular
 
 
@@ -235,15 +235,15 @@ def _described(recording: Recording, controller: str) -> Recording:
     if not controller:
         return recording
     series_of = {
-        "as_described": ("q", "v", "q_link", "q_ref"),
-        "motors_as_described": ("effort", "tau_link", "tau_motor", "tau_ff"),
+        as_described: ("q", "v", "q_link", "q_ref"),
+        motors_as_described: ("effort", "tau_link", "tau_motor", "tau_ff"),
     }
     changes: dict[str, Any] = {}
     for conversion, names in series_of.items():
         for name in names:
             values = getattr(recording, name)
             if values is not None:
-                changes[name] = needed(conversion)(controller, values)
+                changes[name] = conversion(controller, values)
     return replace(recording, **changes)
 
 
@@ -253,7 +253,9 @@ def _reader(path: Path, ends: Ends) -> Reader:
         if path.exists():
             check_regular(path)
         if path.is_dir() or path.suffix in (".bag", ".mcap", ".db3"):
-            return needed("read_bag")
+            from calib.data.recordings.bags import read_bag
+
+            return read_bag
         with open(path, "rb") as file:
             head = file.read(1 << 16)
     except OSError as error:

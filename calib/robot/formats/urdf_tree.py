@@ -15,15 +15,30 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Protocol
 from xml.parsers import expat
 
 import numpy as np
 
 from calib.errors import RobotError, listing, refuse_robot, refused_as, require, suggestion
-from calib.extensions import offered
+from calib.extensions import Point
 from calib.robot.chain import MIN_LIMIT, Joint
 from calib.transforms import from_xyz_rpy
+
+
+class DescriptionReader(Protocol):
+    """Reader of robots that another program describes, as URDF."""
+
+    def takes(self, path: str) -> bool:
+        """Return whether `urdf` converts this file."""
+        ...
+
+    def urdf(self, path: str) -> str:
+        """Return the URDF text of a file."""
+        ...
+
+
+DESCRIPTIONS: Point[DescriptionReader] = Point("descriptions", "readers of robots' descriptions that are no URDF")
 
 XACRO = "this is a xacro file; name it so (robot.urdf.xacro)"
 _DECLARED = re.compile(rb"""^\s*<\?xml[^>]*?encoding\s*=\s*["']([A-Za-z0-9._-]+)["']""")
@@ -51,11 +66,11 @@ class Node:
         return next(self.all(tag), None)
 
 
-def converter(path: str | Path) -> Any:
-    """Return the module of a room that converts this file to a URDF (``descriptions``); None where there is none."""
-    for room in offered("descriptions"):
-        if room.takes(str(path)):
-            return room
+def converter(path: str | Path) -> DescriptionReader | None:
+    """Return the reader that converts this file to a URDF; None where there is none."""
+    for reader in DESCRIPTIONS.all():
+        if reader.takes(str(path)):
+            return reader
     return None
 
 

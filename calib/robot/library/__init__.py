@@ -6,6 +6,7 @@ from importlib import resources
 from pathlib import Path
 
 from calib.errors import RobotError, refuse_robot, require, suggestion
+from calib.result_kinds import refusal
 from calib.robot import calibrated, description
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
@@ -80,7 +81,9 @@ def resolve(robot: str | Path) -> Path:
     if location.is_dir():
         if (location / calibrated.ROBOT).is_file():
             return location / calibrated.ROBOT
-        require(str(robot) in library, f"folder {location} has no robot.toml; give {choices}", RobotError)
+        require(
+            str(robot) in library, f"{refusal(location, 'robot')}; the library has {', '.join(library)}", RobotError
+        )
     elif location.is_file() or converter(location):
         is_robot = location.suffix == ".toml" or is_urdf(location)
         require(is_robot, f"{location} is no robot file; give {choices}", RobotError)
