@@ -23,17 +23,13 @@ from calib.identification.rows import Case
 from calib.procedure.dynamic_stage import plain, plausibility
 from calib.procedure.dynamic_stage import verdict as judging
 from calib.procedure.dynamic_stage.hypotheses import gravity_hypotheses
-from calib.procedure.dynamic_stage.inputs import IdentificationInputs, Progress
+from calib.procedure.dynamic_stage.inputs import IdentificationInputs, Progress, silent
 from calib.procedure.findings import Verdict, lines_of
 from calib.procedure.robot_kinds import stage_of
 from calib.units import TORQUE, without_gains
 
 # share of states met in training from which on a validation file proves nothing (our choice)
 REPEAT = 0.5
-
-
-def _silent(words: str) -> None:
-    """Show no progress."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +130,7 @@ def errors_of(
     inputs: IdentificationInputs,
     dynamics: Dynamics[Any],
     errors: torque_errors.TorqueErrorModel | None = None,
-    say: Progress = _silent,
+    say: Progress = silent,
 ) -> Errors:
     """Return the predictions of every recording by a model, and their errors.
 
@@ -184,7 +180,7 @@ def assess(
         errors: what errors its torques are expected to have.
         wrong: joints that friction drives, where that is known already (`friction.passivity.driven`).
     """
-    say = progress or _silent
+    say = progress or silent
     if wrong is None:
         wrong = driven(dynamics, inputs.cases)
     scored = errors_of(inputs, dynamics, errors, say)
@@ -299,7 +295,7 @@ def judged(
     Raises:
         MeasurementError: where friction would drive most joints.
     """
-    say = progress or _silent
+    say = progress or silent
     # refused before hours go into the geometry's share
     wrong = driven(found.dynamics, inputs.cases)
     carried, geometries = _carry(inputs, found, say)
