@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,11 +13,11 @@ from calib import files
 from calib.data.poses import IMAGES
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import UsageError
-from calib.extensions import Point
 from calib.geometry.observation import layout, positions, prepare
 from calib.procedure.kinematic_stage.comparison import Comparison
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.folder import metrics
+from calib.procedure.kinematic_stage.image_findings import image_coverage
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import FitMetrics, ImageCoverage, ValidationMetrics
 from calib.procedure.kinematic_stage.tables import estimate_table
@@ -25,8 +25,6 @@ from calib.procedure.kinematic_stage.validation import ARM
 from calib.procedure.report.page import FileRow
 from calib.records import read_json
 from calib.transforms import invert
-
-IMAGE_COVERAGE: Point[Callable[[Any], list[Any]]] = Point("image_coverage", "how a fit's images cover the view")
 
 # version of ``report.json``, and those that can be read: 1 kept the findings in it, too
 SCHEMA = 2
@@ -191,7 +189,7 @@ def collect(outcome: Outcome) -> Report:
         rank=rank,
         sets=tuple(sets),
         noise=_noise(outcome.fit.blocks),
-        images=tuple(each for coverage in IMAGE_COVERAGE.all() for each in coverage(fit)),
+        images=image_coverage(fit),
         files=_file_rows(outcome.inputs),
         source=str(outcome.inputs.source),
     )

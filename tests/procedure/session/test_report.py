@@ -21,8 +21,8 @@ from without_figures import run
 from calib.errors import CalibError
 from calib.geometry.model_choice.ladder import ModelStep
 from calib.procedure.report import charts, fit_report, geometry_figures, style
+from calib.procedure.report.certificate import rendering, results
 from calib.procedure.session.folder import Session
-from calib.rooms.certificate import rendering, results
 
 
 class References(HTMLParser):
