@@ -80,10 +80,11 @@ class Sight:
 
     def _values(self, q: np.ndarray) -> np.ndarray:
         """Return the constraint violations (m, T, k) of each target."""
-        values = []
-        for parts in self.targets:
-            values.append(np.concatenate([constraint.function(q) for constraint in parts], axis=1))
-        return np.stack(values, axis=1)
+
+        def violations(parts: Sequence[PoseConstraint]) -> np.ndarray:
+            return np.concatenate([constraint.function(q) for constraint in parts], axis=1)
+
+        return np.stack([violations(parts) for parts in self.targets], axis=1)
 
     def _best(self, q: np.ndarray) -> np.ndarray:
         values = self._values(q)
