@@ -45,8 +45,6 @@ POINTS = (
     "library",
     "limit_tables",
     "link_motion",
-    "loop_results",
-    "methods",
     "model_pages",
     "motors_as_described",
     "notebook",
@@ -66,7 +64,6 @@ POINTS = (
     "stages",
     "steps",
     "topics",
-    "track",
     "ur_kinematics",
     "write_program",
 )

@@ -26,8 +26,8 @@ HOMES = {
         "calib.rooms.parallel.mechanism.closure_kernels",
         "calib.rooms.parallel.mechanism.simulation_kernels",
         "calib.robot.capsule_kernels",
-        "calib.rooms.closed_loop.loop_kernels",
-        "calib.rooms.studies.methods.tangent_kernels",
+        "calib.identification.closed_loop.loop_kernels",
+        "calib.identification.survey.tangent_kernels",
     ],
     "yourdfpy": ["calib.robot.formats.simulators"],
     "cv2": [
@@ -53,7 +53,6 @@ HOMES = {
     "matplotlib": ["calib.procedure.", "calib.api.", "calib.rooms."],
     "jinja2": ["calib.procedure.report.templates", "calib.rooms.controllers.program"],
     "typst": ["calib.rooms.certificate.rendering"],
-    "pyarrow": ["calib.rooms.studies.store"],
     "dask": ["calib.workers.cluster"],
     "distributed": ["calib.workers.cluster"],
     "fsspec": ["calib.rooms.fleet.stores"],

@@ -53,6 +53,23 @@ from calib.robot.chain import Chain
 DEFLECTION_SENSITIVITY: Point[Callable[[Any, Any, Any], np.ndarray]] = Point(
     "deflection_sensitivity", "derivative of an estimate by the joint corrections' coefficients"
 )
+STEP = 1e-5
+"""Step of the central differences [m or rad]."""
+SAMPLES = 30_000
+"""Samples at the full rate; longer recordings are represented by pieces spread over them (our choice)."""
+MIN_PIECE = 32
+"""Decimated samples of such a piece, at least."""
+PIECE = 4096
+"""Samples of such a piece at the full rate, about."""
+BLOCK = 256
+"""Samples at a time: the regressor of so many stays in the processor's cache."""
+CHUNK = 2000
+"""Decimated samples at a time, where each needs its own line of a matrix."""
+NOTHING = 0.01
+"""Share below which a growth of σ is no change (our choice)."""
+TILTS = ("gravity.rx", "gravity.ry")
+
+Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,54 +87,61 @@ class _Estimator:
     pull: np.ndarray
 
 
-def estimator(found: Identification[Any]) -> _Estimator:
+def estimator(identification: Identification[Any]) -> _Estimator:
     """Return an identification's estimator: weights of its rows and prior."""
-    fitted = found.fitted
+    fitted = identification.fitted
     p = fitted.pooled.parameters
     deviation = np.array(fitted.std) if fitted.weighted else np.ones(len(fitted.std))
-    if fitted.beforehand is None:
+    prior_rows = fitted.beforehand
+    if prior_rows is None:
         return _Estimator(deviation, np.zeros((0, p)), np.zeros(p))
     deviation = deviation * np.sqrt(fitted.inflation)
     factors = (fitted.pooled.factors / deviation[:, None, None]).reshape(-1, p + 1)
-    known, values = fitted.beforehand, fitted.estimate.values
-    pull = factors[:, :p].T @ (factors[:, :p] @ values - factors[:, p]) + known.T @ (known @ values)
-    return _Estimator(deviation, known, pull)
+    matrix, target = factors[:, :p], factors[:, p]
+    values = fitted.estimate.values
+    pull = matrix.T @ (matrix @ values - target) + prior_rows.T @ (prior_rows @ values)
+    return _Estimator(deviation, prior_rows, pull)
 
 
-def estimate(how: _Estimator, all_rows: Sequence[ObservationRows]) -> tuple[np.ndarray, np.ndarray]:
+def estimate(estimator: _Estimator, all_rows: Sequence[ObservationRows]) -> tuple[np.ndarray, np.ndarray]:
     """Return φ (p,) from rows, and A⁻¹ (p, p); by QR of the whitened rows."""
-    p = len(how.pull)
-    factor = np.hstack([how.beforehand, np.zeros((len(how.beforehand), 1))])
-    for part in all_rows:
-        white = np.column_stack([stacked(part), part.target.ravel()]) * weights(how, part)[:, None]
-        factor = retriangulate(np.vstack([factor, white]))
-    inverse, solution = inverted(factor[:p, :p]), factor[:p, p]
-    return inverse @ (solution + inverse.T @ how.pull), inverse @ inverse.T
+    p = len(estimator.pull)
+    factor = np.hstack([estimator.beforehand, np.zeros((len(estimator.beforehand), 1))])
+    for rows in all_rows:
+        augmented = np.column_stack([stacked(rows), rows.target.ravel()])
+        whitened = augmented * weights(estimator, rows)[:, None]
+        factor = retriangulate(np.vstack([factor, whitened]))
+    inverse = inverted(factor[:p, :p])
+    solution = factor[:p, p]
+    return inverse @ (solution + inverse.T @ estimator.pull), inverse @ inverse.T
 
 
-def rows_on(found: Identification, chain: Chain, cases: Sequence[Case]) -> list[ObservationRows]:
+def rows_on(identification: Identification, chain: Chain, cases: Sequence[Case]) -> list[ObservationRows]:
     """Return the rows of an identification recomputed for another geometry; friction columns are unchanged."""
-    model, decimator = make_model(chain, found.settings), common_decimator(cases, found.settings)
+    model = make_model(chain, identification.settings)
+    decimator = common_decimator(cases, identification.settings)
+    base_count = identification.base.b
     result = []
-    for part, case in zip(found.rows, cases):
-        own = observe(model, found.base.kept, case, decimator)
-        at_rest = (part.standing > 0.0)[:, :, None] & part.coulomb[:, : found.base.b]
-        bodies = np.where(at_rest, 0.0, own.matrix)
-        matrix = np.concatenate([bodies, part.matrix[:, :, found.base.b :]], axis=2)
-        result.append(replace(part, matrix=matrix))
+    for rows, case in zip(identification.rows, cases):
+        observed = observe(model, identification.base.kept, case, decimator)
+        # In a standstill nothing decides Coulomb's friction: its column is zero there.
+        at_rest = (rows.standing > 0.0)[:, :, None] & rows.coulomb[:, :base_count]
+        base_columns = np.where(at_rest, 0.0, observed.matrix)
+        matrix = np.concatenate([base_columns, rows.matrix[:, :, base_count:]], axis=2)
+        result.append(replace(rows, matrix=matrix))
     return result
 
 
-def cut(rows: ObservationRows, own: slice) -> ObservationRows:
+def cut(rows: ObservationRows, part: slice) -> ObservationRows:
     """Return the part of the rows in a slice."""
     return replace(
         rows,
-        matrix=rows.matrix[own],
-        target=rows.target[own],
-        present=rows.present[own],
-        block=rows.block[own],
-        standing=rows.standing[own],
-        swing=rows.swing[own],
+        matrix=rows.matrix[part],
+        target=rows.target[part],
+        present=rows.present[part],
+        block=rows.block[part],
+        standing=rows.standing[part],
+        swing=rows.swing[part],
     )
 
 
@@ -128,20 +152,15 @@ def inverted(upper: np.ndarray) -> np.ndarray:
 
 
 def stacked(rows: ObservationRows) -> np.ndarray:
+    """Return the matrix of the rows (M rows, p), sample by sample."""
     return rows.matrix.reshape(-1, rows.matrix.shape[2])
 
 
-def weights(how: _Estimator, rows: ObservationRows, by: np.ndarray | None = None) -> np.ndarray:
-    """Return the weight of each stacked row, 1 / deviation (or 1 / `by`); zero for rows not used in training."""
-    return (rows.weight / (how.deviation if by is None else by)).ravel()
-
-
-STEP = 1e-5  # of the central differences [m or rad]
-SAMPLES = 30_000  # at the full rate; longer recordings are represented by pieces spread over them (our choice)
-NOTHING = 0.01  # a σ that grows by a smaller share has not changed (our choice)
-TILTS = ("gravity.rx", "gravity.ry")
-
-Progress = Callable[[str], None]
+def weights(estimator: _Estimator, rows: ObservationRows, divisor: np.ndarray | None = None) -> np.ndarray:
+    """Return the weight of each stacked row, 1 / deviation (or 1 / `divisor`); zero for rows not used in training."""
+    if divisor is None:
+        divisor = estimator.deviation
+    return (rows.weight / divisor).ravel()
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,6 +195,7 @@ class GeometryUncertainty(Frozen):
 
     @property
     def sigma_torque(self) -> np.ndarray:
+        """Standard deviation (p,) of the parameters due to the torques' noise."""
         return np.sqrt(np.clip(np.diag(self.torque), 0.0, None))
 
     @property
@@ -187,6 +207,7 @@ class GeometryUncertainty(Frozen):
 
     @property
     def sigma(self) -> np.ndarray:
+        """Standard deviation (p,) of the parameters due to both."""
         return np.hypot(self.sigma_torque, self.sigma_geometry)
 
     @property
@@ -201,57 +222,68 @@ class GeometryUncertainty(Frozen):
 
 
 def propagate(
-    found: Identification, robot: Chain | CalibratedChain, cases: Sequence[Case], progress: Progress | None = None
+    identification: Identification,
+    robot: Chain | CalibratedChain,
+    cases: Sequence[Case],
+    progress: Progress | None = None,
 ) -> GeometryUncertainty:
     """Return the share of the identified parameters' covariance that comes from the covariance of the geometry.
 
     Args:
-        found: the identification.
+        identification: the model and its rows.
         robot: the one it was made on; where it brings no covariance (K, K), the geometry is taken as exact. Where
             joint corrections move the links, their coefficients' uncertainty takes part.
         cases: its training data.
+        progress: called with a few words at each part.
     """
     robot = as_calibrated(robot)
-    chain, covariance, deflected = robot.chain, robot.covariance, cases[0].link is not None
+    chain, covariance = robot.chain, robot.covariance
+    deflected = cases[0].link is not None
     if deflected and robot.corrections is not None:
         chain, covariance = robot.complete, robot.corrections.covariance
-    matrix, felt, left = sensitivity(found, chain, cases, progress)
-    count = len(chain.elements)
-    geometry, deviations, felt_by = None, np.full(count + len(TILTS), np.nan), matrix[:, :count]
+    matrix, felt, left = sensitivity(identification, chain, cases, progress)
+
+    element_count = len(chain.elements)
+    deviations = np.full(element_count + len(TILTS), np.nan)
+    geometry = None
     if covariance is not None:
+        by_geometry = matrix[:, :element_count]
         if deflected:
-            felt_by = np.hstack([felt_by, DEFLECTION_SENSITIVITY.one()(found, robot, cases)])
-        geometry = frozen(felt_by @ covariance @ felt_by.T)
-        own = np.sqrt(np.clip(np.diag(covariance)[:count], 0.0, None))
-        deviations[:count] = np.where(own > 0.0, own, np.nan)
+            by_deflection = DEFLECTION_SENSITIVITY.one()(identification, robot, cases)
+            by_geometry = np.hstack([by_geometry, by_deflection])
+        geometry = frozen(by_geometry @ covariance @ by_geometry.T)
+        element_deviations = np.sqrt(np.clip(np.diag(covariance)[:element_count], 0.0, None))
+        deviations[:element_count] = np.where(element_deviations > 0.0, element_deviations, np.nan)
     return GeometryUncertainty(
-        found.names,
-        (*chain.names, *TILTS),
-        (*chain.units, *("rad" for _ in TILTS)),
-        matrix,
-        found.fitted.estimate.covariance,
-        deviations,
-        geometry,
-        felt,
-        left,
+        names=identification.names,
+        elements=(*chain.names, *TILTS),
+        units=(*chain.units, *(["rad"] * len(TILTS))),
+        sensitivity=matrix,
+        torque=identification.fitted.estimate.covariance,
+        deviations=deviations,
+        geometry=geometry,
+        felt=felt,
+        left=left,
     )
 
 
 def sensitivity(
-    found: Identification, chain: Chain, cases: Sequence[Case], progress: Progress | None = None
+    identification: Identification, chain: Chain, cases: Sequence[Case], progress: Progress | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return dφ/dg (p, K + 2), and rms changes of the rigid torque per unit, with φ fixed or re-estimated (K + 2,).
 
     The last two columns turn gravity about the base's x and y axes [per rad].
     """
-    p, count = len(found.names), len(chain.elements) + len(TILTS)
-    if not found.dynamics.model.torque_rows.has_bodies:  # no bodies: rows that no geometry reaches
-        return np.zeros((p, count)), np.zeros(count), np.zeros(count)
-    return solve_sensitivity(found, cases, partial(_differences, found, _neighbours(found, chain)), SAMPLES, progress)
+    if not identification.dynamics.model.torque_rows.has_bodies:
+        # Without bodies, no geometry affects the rows.
+        count = len(chain.elements) + len(TILTS)
+        return np.zeros((len(identification.names), count)), np.zeros(count), np.zeros(count)
+    differences = partial(_differences, identification, _neighbours(identification, chain))
+    return solve_sensitivity(identification, cases, differences, SAMPLES, progress)
 
 
 def solve_sensitivity(
-    found: Identification[Any],
+    identification: Identification[Any],
     cases: Sequence[Case],
     differences: Callable[..., tuple[np.ndarray, np.ndarray]],
     samples: int,
@@ -260,82 +292,111 @@ def solve_sensitivity(
     """Return the results of `sensitivity` for any robot, K changes of whose geometry `differences` evaluates.
 
     Args:
+        identification: the model and its rows.
+        cases: its training data.
         differences: takes a case, samples of it, R⁻¹ (y - W φ) and the decimator; returns ∂(W φ - y)/∂g (M, rows, K)
             and (∂W/∂g)ᵀ R⁻¹ (y - W φ) (b, K).
         samples: at the full rate; longer recordings are represented by pieces.
+        progress: called with a few words at each part.
     """
-    say, how = progress or (lambda words: None), estimator(found)
-    p, decimator = len(how.pull), common_decimator(cases, found.settings)
-    step = -(-sum(len(case.motion) for case in cases) // samples)
-    used: list[ObservationRows] = []
-    parts: list[tuple[np.ndarray, np.ndarray]] = []
-    instruments: list[np.ndarray] = []
-    own_rows = found.fitted.instruments or tuple((case, part, None) for part, case in zip(found.rows, cases))
-    for case, part, z in own_rows:
-        for number, (own, span) in enumerate(pieces(case, decimator, step)):
-            say(f"sensitivity to the geometry: {case.name}, part {number + 1}")
-            used.append(cut(part, own))
-            residual = used[-1].target - used[-1].matrix @ found.fitted.estimate.values
-            change, pull = differences(case, span, residual * used[-1].weight ** 2 / how.deviation**2, decimator)
-            all_rows = np.broadcast_to(change, (*residual.shape, change.shape[2]))  # power: rows by recording
-            parts.append((all_rows.reshape(-1, change.shape[2]), pull))
-            instruments += [] if z is None else [z[own].reshape(-1, p)]
-    matrix, scale = (np.concatenate(x) for x in zip(*[(stacked(part), weights(how, part)) for part in used]))
-    change, pulled = np.concatenate([x for x, _ in parts]), sum(pull for _, pull in parts)
-    share = float(np.count_nonzero(scale) / sum(np.count_nonzero(part.present) for _, part, _ in own_rows))
-    known = np.sqrt(share) * np.pad(how.beforehand, ((0, 0), (0, change.shape[1])))
+    weighting = estimator(identification)
+    p = len(weighting.pull)
+    decimator = common_decimator(cases, identification.settings)
+    values = identification.fitted.estimate.values
+    total_samples = sum(len(case.motion) for case in cases)
+    step = -(-total_samples // samples)
+    recordings = identification.fitted.instruments
+    if not recordings:
+        recordings = tuple((case, rows, None) for rows, case in zip(identification.rows, cases))
+
+    # Whitened columns, changes of the residuals and instruments of all pieces.
+    matrices, row_weights, changes, instruments = [], [], [], []
+    pull: np.ndarray | float = 0.0
+    present_rows = 0
+    for case, rows, instrument in recordings:
+        present_rows += np.count_nonzero(rows.present)
+        for number, (part, span) in enumerate(pieces(case, decimator, step)):
+            if progress is not None:
+                progress(f"sensitivity to the geometry: {case.name}, part {number + 1}")
+            piece = cut(rows, part)
+            residual = piece.target - piece.matrix @ values
+            weighted_residual = residual * piece.weight**2 / weighting.deviation**2
+            change, piece_pull = differences(case, span, weighted_residual, decimator)
+            # Power has a row per recording, of which each piece fills one.
+            change = np.broadcast_to(change, (*residual.shape, change.shape[2]))
+            matrices.append(stacked(piece))
+            row_weights.append(weights(weighting, piece))
+            changes.append(change.reshape(-1, change.shape[2]))
+            pull = pull + piece_pull
+            if instrument is not None:
+                instruments.append(instrument[part].reshape(-1, p))
+    matrix = np.concatenate(matrices)
+    scale = np.concatenate(row_weights)
+    change = np.concatenate(changes)
+
     if instruments:
-        factor = retriangulate(np.hstack([np.concatenate(instruments), matrix, change]) * scale[:, None])[:p, p:]
+        augmented = np.hstack([np.concatenate(instruments), matrix, change])
+        factor = retriangulate(augmented * scale[:, None])[:p, p:]
         unit = np.linalg.norm(factor[:, :p], axis=0)
-        again = -np.linalg.solve(factor[:, :p] / unit, factor[:, p:]) / unit[:, None]
+        slopes = -np.linalg.solve(factor[:, :p] / unit, factor[:, p:]) / unit[:, None]
     else:
-        factor = retriangulate(np.vstack([known, np.hstack([matrix, change]) * scale[:, None]]))
+        # The prior counts as much beside the pieces as it did beside all rows.
+        share = float(np.count_nonzero(scale) / present_rows)
+        prior_rows = np.sqrt(share) * np.pad(weighting.beforehand, ((0, 0), (0, change.shape[1])))
+        whitened = np.hstack([matrix, change]) * scale[:, None]
+        factor = retriangulate(np.vstack([prior_rows, whitened]))
         inverse = inverted(factor[:p, :p])
-        again = inverse @ (inverse[: found.base.b].T @ pulled - factor[:p, p:])
-    seen = scale > 0.0
-    after = change + matrix @ again
-    return again, _rms(change[seen]), _rms(after[seen])
+        slopes = inverse @ (inverse[: identification.base.b].T @ pull - factor[:p, p:])
+    used = scale > 0.0
+    after = change + matrix @ slopes
+    return slopes, _rms(change[used]), _rms(after[used])
 
 
-def _neighbours(found: Identification, chain: Chain) -> list[tuple[Bodies, Bodies]]:
+def _neighbours(identification: Identification, chain: Chain) -> list[tuple[Bodies, Bodies]]:
     """Return pairs of bodies with one geometric element or one tilt of gravity changed by `STEP` up and down."""
+    settings = identification.settings
+    values = np.array(chain.values)
+    pairs = []
+    for step in STEP * np.eye(len(chain.elements)):
+        up = make_bodies(chain.with_values(values + step), settings)
+        down = make_bodies(chain.with_values(values + -step), settings)
+        pairs.append((up, down))
+    gravity = np.array(identification.dynamics.model.bodies.gravity)
+    for turn in STEP * np.eye(3)[:2]:
+        gravity_up = Rotation.from_rotvec(turn).apply(gravity)
+        gravity_down = Rotation.from_rotvec(-turn).apply(gravity)
+        up = make_bodies(chain, replace(settings, gravity=tuple(gravity_up.tolist())))
+        down = make_bodies(chain, replace(settings, gravity=tuple(gravity_down.tolist())))
+        pairs.append((up, down))
+    return pairs
 
-    def moved(step: np.ndarray) -> Bodies:
-        return make_bodies(chain.with_values(np.array(chain.values) + step), found.settings)
 
-    def tilted(turn: np.ndarray) -> Bodies:
-        gravity = Rotation.from_rotvec(turn).apply(np.array(found.dynamics.model.bodies.gravity))
-        return make_bodies(chain, replace(found.settings, gravity=tuple(gravity.tolist())))
-
-    elements, tilts = STEP * np.eye(len(chain.elements)), STEP * np.eye(3)[:2]
-    return [*((moved(one), moved(-one)) for one in elements), *((tilted(one), tilted(-one)) for one in tilts)]
-
-
-def pieces(case: Case, decimator: Decimator, step: int = 1, min_piece: int = 32) -> list[tuple[slice, slice]]:
+def pieces(case: Case, decimator: Decimator, step: int = 1) -> list[tuple[slice, slice]]:
     """Return (decimated rows, full-rate samples that they depend on) of every `step`-th piece of a case.
 
     With step 1 each segment is one piece.
-
-    `min_piece`: thinned samples of such a piece at least.
     """
-    result, first, h, r = [], 0, decimator.reach, decimator.factor
-    size = max(4096 // r, min_piece)
+    factor = decimator.factor
+    size = max(PIECE // factor, MIN_PIECE)
+    result = []
+    first = 0
     for start, stop in segments(case.motion.segment):
         count = len(kept(np.zeros(stop - start, dtype=int), decimator))
         length = max(count, 1) if step == 1 else size
-        for number, i in enumerate(range(0, count, length)):
+        for number, row in enumerate(range(0, count, length)):
             if number % step:
                 continue
-            rows = min(length, count - i)
-            begin = start + i * r
-            result.append((slice(first + i, first + i + rows), slice(begin, begin + (rows - 1) * r + 2 * h + 1)))
+            row_count = min(length, count - row)
+            begin = start + row * factor
+            end = begin + (row_count - 1) * factor + 2 * decimator.reach + 1
+            result.append((slice(first + row, first + row + row_count), slice(begin, end)))
         first += count
     return result
 
 
 def _differences(
-    found: Identification,
-    moved: Sequence[tuple[Bodies, Bodies]],
+    identification: Identification,
+    pairs: Sequence[tuple[Bodies, Bodies]],
     case: Case,
     span: slice,
     residual: np.ndarray,
@@ -344,38 +405,47 @@ def _differences(
     """Return (∂W/∂g) φ (M, rows, K + 2), filtered and decimated, and (∂W/∂g)ᵀ R⁻¹ (y - W φ) (b, K + 2).
 
     Args:
+        pairs: bodies with a changed geometry, see `_neighbours`.
         residual: (M, rows) R⁻¹ (y - W φ) of the rows that the samples in `span` make.
     """
-    model, b = found.dynamics.model, found.base.b
-    bodies = model.inertial
+    model = identification.dynamics.model
+    base = identification.base
+    n = model.bodies.n
+    inertial = model.inertial
     onboard = model.carried_columns(case.carried)
-    parameters = found.base.to_standard(found.fitted.estimate.values[:b])[:bodies] * onboard
-    q, v, a = (np.asarray(x[span]) for x in case.links)
-    torque_rows, felt = model.torque_rows, spread(residual, decimator, len(q))[:, :, None]
-    if torque_rows.projection is not None:  # which no geometry changes
-        felt = np.einsum("nrk,nrc->nkc", torque_rows.projection.torques(q, v), felt)
-    felt = replace(torque_rows, projection=None).fold(felt, (BODIES,))[:, :, 0]
-    change = np.zeros((len(moved), model.bodies.n, len(q)))
-    pulled = np.zeros((bodies, len(moved)))
-    block = 256  # samples at a time: the regressor of so many stays in the processor's cache
-    for start in range(0, len(q), block):
-        part = slice(start, min(start + block, len(q)))
-        weights = np.ascontiguousarray(felt[part].T).ravel()
-        out = np.zeros((bodies, model.bodies.n, min(block, len(q) - start)))  # what is zero is so in all of them
-        regressor = out.reshape(bodies, -1)
-        for k, both in enumerate(moved):
-            for one, factor in zip(both, (0.5 / STEP, -0.5 / STEP)):
-                rigid_body.fill_regressor(one, q[part], v[part], a[part], out)
-                change[k, :, part] += factor * (parameters @ regressor).reshape(model.bodies.n, -1)
-                pulled[:, k] += factor * (regressor @ weights)
-    rows = model.torque_rows.observe(change.transpose(2, 1, 0), (BODIES,) * len(moved), q, v)
-    inertial = found.base.kept < bodies
-    result = np.zeros((b, len(moved)))
-    result[inertial] = (pulled * onboard[:, None])[found.base.kept[inertial]]
-    return decimate(rows, decimator), result
+    parameters = base.to_standard(identification.fitted.estimate.values[: base.b])[:inertial] * onboard
+    q, v, a = (np.asarray(series[span]) for series in case.links)
+
+    # The residuals as torques of the joints at the full rate.
+    torque_rows = model.torque_rows
+    joint_residual = spread(residual, decimator, len(q))[:, :, None]
+    if torque_rows.projection is not None:
+        # No geometry changes the projection.
+        joint_residual = np.einsum("nrk,nrc->nkc", torque_rows.projection.torques(q, v), joint_residual)
+    joint_residual = replace(torque_rows, projection=None).fold(joint_residual, (BODIES,))[:, :, 0]
+
+    change = np.zeros((len(pairs), n, len(q)))
+    pull = np.zeros((inertial, len(pairs)))
+    for start in range(0, len(q), BLOCK):
+        part = slice(start, min(start + BLOCK, len(q)))
+        block_residual = np.ascontiguousarray(joint_residual[part].T).ravel()
+        # One array for all pairs: what is zero in one regressor is so in all of them.
+        out = np.zeros((inertial, n, min(BLOCK, len(q) - start)))
+        regressor = out.reshape(inertial, -1)
+        for k, pair in enumerate(pairs):
+            for bodies, factor in zip(pair, (0.5 / STEP, -0.5 / STEP)):
+                rigid_body.fill_regressor(bodies, q[part], v[part], a[part], out)
+                change[k, :, part] += factor * (parameters @ regressor).reshape(n, -1)
+                pull[:, k] += factor * (regressor @ block_residual)
+    rows = torque_rows.observe(change.transpose(2, 1, 0), (BODIES,) * len(pairs), q, v)
+    of_bodies = base.kept < inertial
+    base_pull = np.zeros((base.b, len(pairs)))
+    base_pull[of_bodies] = (pull * onboard[:, None])[base.kept[of_bodies]]
+    return decimate(rows, decimator), base_pull
 
 
 def _rms(values: np.ndarray) -> np.ndarray:
+    """Return the root mean square of each column."""
     return np.sqrt(np.mean(values**2, axis=0))
 
 
@@ -400,38 +470,49 @@ class GeometryComparison:
     @property
     def relative(self) -> np.ndarray:
         """Relative difference (p,): 100 (nominal - calibrated) / |calibrated| [%]; NaN at zero."""
+        nominal, calibrated = self.values
         with np.errstate(divide="ignore", invalid="ignore"):
-            found = 100.0 * (self.values[0] - self.values[1]) / np.abs(self.values[1])
-        return np.where(self.values[1] == 0.0, np.nan, found)
+            percent = 100.0 * (nominal - calibrated) / np.abs(calibrated)
+        return np.where(calibrated == 0.0, np.nan, percent)
 
 
 def compare(
-    found: Identification, carried: GeometryUncertainty, nominal: Chain, cases: Sequence[Case]
+    identification: Identification, uncertainty: GeometryUncertainty, nominal: Chain, cases: Sequence[Case]
 ) -> GeometryComparison:
     """Return the comparison of the estimate with one from the same torques on the nominal geometry.
 
-    Both by weighted least squares with the same weights; the difference is added to the estimate that there is.
+    Both by weighted least squares with the same weights; the difference is added to the identification's estimate.
     """
-    how, noise = estimator(found), np.array(found.fitted.std) * np.sqrt(found.fitted.inflation)
-    both = (rows_on(found, nominal, [replace(case, link=None) for case in cases]), found.rows)
-    (first, inverse), (second, own) = (estimate(how, rows) for rows in both)
-    values = np.asarray(found.fitted.estimate.values)
-    alone, apart = np.zeros(len(values)), np.array(carried.sigma_geometry**2)
-    chunk = 2000  # thinned samples at a time, where each needs its own line of a matrix
-    for one, other in zip(*both):
-        for start in range(0, len(one.target), chunk):
-            part = slice(start, start + chunk)
-            gain, ours = (
-                matrix @ (stacked(cut(rows, part)) * weights(how, cut(rows, part), how.deviation**2)[:, None]).T
-                for matrix, rows in ((inverse, one), (own, other))
-            )
-            spread_of = np.tile(noise, len(one.target[part]))
-            alone += np.sum((gain * spread_of) ** 2, axis=1)
-            apart += np.sum(((gain - ours) * spread_of) ** 2, axis=1)
+    fitted = identification.fitted
+    weighting = estimator(identification)
+    undeflected = [replace(case, link=None) for case in cases]
+    nominal_rows = rows_on(identification, nominal, undeflected)
+    nominal_values, nominal_inverse = estimate(weighting, nominal_rows)
+    calibrated_values, calibrated_inverse = estimate(weighting, identification.rows)
+
+    # Variances of the nominal estimate, and of the difference: the noise of each sample acts on both estimates.
+    noise = np.array(fitted.std) * np.sqrt(fitted.inflation)
+    variance = np.zeros(len(nominal_values))
+    difference_variance = np.array(uncertainty.sigma_geometry**2)
+    for nominal_part, calibrated_part in zip(nominal_rows, identification.rows):
+        for start in range(0, len(nominal_part.target), CHUNK):
+            chunk = slice(start, start + CHUNK)
+            nominal_gain = _gain(nominal_inverse, weighting, cut(nominal_part, chunk))
+            calibrated_gain = _gain(calibrated_inverse, weighting, cut(calibrated_part, chunk))
+            row_noise = np.tile(noise, len(nominal_part.target[chunk]))
+            variance += np.sum((nominal_gain * row_noise) ** 2, axis=1)
+            difference_variance += np.sum(((nominal_gain - calibrated_gain) * row_noise) ** 2, axis=1)
+    values = np.asarray(fitted.estimate.values)
     return GeometryComparison(
-        found.names,
-        found.fitted.estimate.units,
-        frozen(np.stack([values + first - second, values])),
-        frozen(np.stack([np.sqrt(alone), carried.sigma])),
-        frozen(np.sqrt(apart)),
+        identification.names,
+        fitted.estimate.units,
+        frozen(np.stack([values + nominal_values - calibrated_values, values])),
+        frozen(np.stack([np.sqrt(variance), uncertainty.sigma])),
+        frozen(np.sqrt(difference_variance)),
     )
+
+
+def _gain(inverse: np.ndarray, weighting: _Estimator, rows: ObservationRows) -> np.ndarray:
+    """Return A⁻¹ Wᵀ R⁻¹ (p, M rows), the estimate's change by the torque of each row."""
+    weight = weights(weighting, rows, weighting.deviation**2)
+    return inverse @ (stacked(rows) * weight[:, None]).T

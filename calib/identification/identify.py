@@ -18,25 +18,21 @@ from calib.dynamics.torque_rows import POWER
 from calib.errors import MeasurementError, UsageError, refuse_data, require
 from calib.estimation.essential import Elimination, Rule, eliminate
 from calib.estimation.triangles import condition_numbers
-from calib.extensions import Point
+from calib.identification.closed_loop.simulated import loop_results
 from calib.identification.friction.friction_ladder import FrictionCandidates, FrictionSelection, select_friction
 from calib.identification.friction.ripple import Ripple, find_all
 from calib.identification.loop import LoopResults, per_joint
 from calib.identification.methods.least_squares import LeastSquares
 from calib.identification.methods.method import IdentificationProblem, Method, MethodEstimate
-from calib.identification.methods.registry import METHODS, method_named
 from calib.identification.prediction import Dynamics, Model, predict
 from calib.identification.prior import TEMPERING, FirstFit, Prior, find_prior, first_fit, rods, tempered_prior
+from calib.identification.registry import METHODS, method_named
 from calib.identification.rows import Case, ObservationRows, observe, observe_terms, with_blocks
 from calib.identification.settings import IdentificationSettings, make_model, require_usable
 from calib.identification.standstill import with_standstills, with_weights
 from calib.identification.time_folds import regimes
 from calib.robot.calibrated import CalibratedChain, as_calibrated
 from calib.robot.chain import Chain
-
-LOOP_RESULTS: Point[Callable[[IdentificationProblem, MethodEstimate], LoopResults]] = Point(
-    "loop_results", "results of simulating the recordings' closed loop"
-)
 
 Progress = Callable[[str], None]
 
@@ -166,13 +162,13 @@ def identify_model(
     say("first fit")
     whole, source = (shape, "sizes") if cad is None else (cad, "cad")
     prior = None
-    found = partial(find_prior, model, base, whole=whole, source=source, noise=noise, effort=effort)
+    found = partial(find_prior, model, base, robot=whole, source=source, noise=noise, effort=effort)
     if _takes_prior(method, model, settings, source):
         prior = found(rows)
-        rows = with_weights(rows, prior.first.rest)
+        rows = with_weights(rows, prior.first.rest_weights)
         prior = tempered_prior(found, prior, rows, regimes(rows, cases, decimator))
     first = first_fit(rows, noise) if prior is None else prior.first
-    rows = with_weights(rows, first.rest)
+    rows = with_weights(rows, first.rest_weights)
     friction, loads = _richer_friction(model, base, rows, cases, decimator, first, prior, settings, progress)
     own = [None if k < model.inertial else model.columns[k - model.inertial] for k in base.kept]
     full = tuple(
@@ -182,7 +178,7 @@ def identify_model(
     if prior is not None and friction.terms:
         say("sizes beside richer friction")
         prior = found(full, groups=np.array(friction.groups), start=prior, tempering=prior.tempering)
-        full = tuple(with_weights(full, prior.first.rest))
+        full = tuple(with_weights(full, prior.first.rest_weights))
     problem = IdentificationProblem(
         model,
         base,
@@ -215,7 +211,7 @@ def _identified(
     friction = friction.fitted(found.estimate.sigma[base.b :])
     if settings.loop is not None and not method.needs_controller:
         say("simulating the closed loop")
-    loop = LoopResults() if settings.loop is None else LOOP_RESULTS.one()(problem, found)
+    loop = LoopResults() if settings.loop is None else loop_results(problem, found)
     richer = model.with_terms(*friction.terms) if _sees_drives(model) else model
     dynamics = Dynamics(richer, np.concatenate([base.to_standard(values[: base.b]), values[base.b :]]))
     dynamics, ripples = _with_ripple(dynamics, cases, settings, say)

@@ -15,11 +15,11 @@ from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.shapes import V0
 from calib.dynamics.torque_rows import MOTOR, TorqueRows
 from calib.errors import UsageError, refuse_option, require
-from calib.identification.constraint_settings import ConstraintSettings
 from calib.identification.friction.friction_ladder import NAMES
 from calib.identification.loop import LoopSettings, check_loop, per_joint
+from calib.identification.methods.constraint_settings import ConstraintSettings
 from calib.identification.methods.method import Method
-from calib.identification.methods.registry import METHODS
+from calib.identification.registry import METHODS
 from calib.robot.chain import Chain
 
 RULES = ("none", "rsd", "f", "both")

@@ -42,6 +42,43 @@ from calib.records import evenly
 from trajectories.timing.profile import Sampled
 
 BLOCK = 4000
+"""Samples whose regressor is held in memory at a time."""
+COVERED, SIGMAS = 0.95, 1.96
+"""Share of errors that intervals are to contain, and their half width in standard deviations."""
+OPTIMISM = 0.6
+"""Factor on the deviations between blocks: errors on other motion exceed those on held-out time.
+
+Friction and filters were chosen on that time, too. It holds 95 % on average over two kinds of pairs that count alike:
+33 of parts of real recordings (1.35 to 50 s to learn from; 92.5 %) and 14 of simulated arms, which are the same on
+every motion (97.8 %).
+"""
+BORROWED = 4.0
+"""Blocks' worth of what the errors of all joints together say of those of one (our choice)."""
+CHANCES = (np.arange(41) + 0.5) / 41
+"""Probabilities at which the t distribution of the errors' size is evaluated."""
+SAME_STATE = 0.05
+"""Distance of two states that count as the same, per coordinate, in standard deviations of the states."""
+MIN_REPEATED = 0.5
+"""Share of a block's states in which another block has been, from which it is a repetition."""
+FINER_BY = 8
+"""Samples of the trajectory per decimated sample, at most, in which states are looked up."""
+DOUBLING, PRIOR = 2.0, 0.02
+"""The log(1 + d²) at which errors have twice their variance before any data; as share of all rows (our choice)."""
+MAX_ERROR = 5.0
+"""Standard deviations that an error counts as, at most."""
+MIN_ERROR = 1e-9
+"""Share of a joint's rms error, below which it counts as this share."""
+MAX_INTERVAL_SAMPLES = 5000
+"""Samples of a recording at which intervals are evaluated, at most."""
+MAX_WEIGHT_SAMPLES = 4000
+"""Errors of a torque row from which the weights of its variance are estimated, about."""
+MAX_OUTSIDE = 0.05
+"""Share of the training range by which a motion may leave it before it counts as extrapolation (our choice)."""
+EXTRAPOLATIONS = (
+    "outside the range of joint",
+    "faster than in training at joint",
+    "accelerating more than in training at joint",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,19 +131,27 @@ def parameter_variances(
         carried: labels of the payloads on board; None: all.
         states: (s, N) of friction with memory; None: q is one uninterrupted record.
     """
-    model, result = dynamics.model, []
-    loaded = bool(model.with_load())
-    states = friction_states(model, q) if states is None else states
+    model = dynamics.model
+    if states is None:
+        states = friction_states(model, q)
+    # A root of the covariance, computed in units in which its diagonal is 1.
     unit = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    values, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))
-    root = unit[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    eigenvalues, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))
+    root = unit[:, None] * vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
+
+    load_dependent = bool(model.with_load())
+    variances = []
     for start in range(0, len(q), BLOCK):
-        part = slice(start, start + BLOCK)
-        here, speed, change = (np.ascontiguousarray(x[part]) for x in (q, v, a))
-        load = model.transmitted(dynamics.values, here, speed, change, carried) if loaded else None
-        rows = model.regressor(here, speed, change, load, carried, states[:, part])[:, :, columns]
-        result.append(np.sum((rows @ root) ** 2, axis=2))
-    return np.concatenate(result)
+        block = slice(start, start + BLOCK)
+        q_block = np.ascontiguousarray(q[block])
+        v_block = np.ascontiguousarray(v[block])
+        a_block = np.ascontiguousarray(a[block])
+        load = None
+        if load_dependent:
+            load = model.transmitted(dynamics.values, q_block, v_block, a_block, carried)
+        regressor = model.regressor(q_block, v_block, a_block, load, carried, states[:, block])
+        variances.append(np.sum((regressor[:, :, columns] @ root) ** 2, axis=2))
+    return np.concatenate(variances)
 
 
 def read_uncertainty(folder: Path, dynamics: Dynamics, carried: Sequence[str]) -> Uncertainty | None:
@@ -117,23 +162,6 @@ def read_uncertainty(folder: Path, dynamics: Dynamics, carried: Sequence[str]) -
     with refused_as(UsageError, ValueError, f"{folder}/covariance.csv and dynamics.json do not match: {{}}"):
         columns = estimated_columns(dynamics, names)
     return Uncertainty(dynamics, tuple(carried), columns, covariance)
-
-
-COVERED, SIGMAS = 0.95, 1.96
-OPTIMISM = 0.6
-"""Factor on the deviations between blocks: errors on other motion exceed those on held-out time.
-
-Friction and filters were chosen on that time, too. It holds 95 % on average over two kinds of pairs that count alike:
-33 of parts of real recordings (1.35 to 50 s to learn from; 92.5 %) and 14 of simulated arms, which are the same on
-every motion (97.8 %).
-"""
-BORROWED = 4.0  # blocks' worth of what all joints say together of one's errors (our choice)
-CHANCES = (np.arange(41) + 0.5) / 41
-SAME_STATE, MIN_REPEATED, FINER_BY = 0.05, 0.5, 8  # of states' spread; share of states met; samples per thinned one
-DOUBLING, PRIOR = 2.0, 0.02
-"""The log(1 + d²) at which errors have twice their variance before any data; as share of all rows (our choice)."""
-MAX_ERROR, MIN_ERROR = 5.0, 1e-9  # sigmas that an error counts as; of a joint's error, below which it has none
-WAYS = ("outside the range of joint", "faster than in training at joint", "accelerating more than in training at joint")
 
 
 @dataclass(frozen=True)
@@ -163,29 +191,40 @@ class TorqueDiscrepancy:
         if not self.rest:
             return np.zeros((len(v), rows), dtype=bool)
         stands = np.abs(v) < np.array(self.standing)
-        times, partial = divmod(rows, stands.shape[1])
-        return np.zeros((len(v), rows), dtype=bool) if partial else np.tile(stands, times)
+        repetitions, remainder = divmod(rows, stands.shape[1])
+        if remainder:
+            # Rows that are not of single joints never stand.
+            return np.zeros((len(v), rows), dtype=bool)
+        return np.tile(stands, repetitions)
 
     def floors(self, v: np.ndarray, rows: int) -> np.ndarray:
         """Return the variance of unmodelled effects (N, rows) at velocities (N, n) [N² m² or N²]."""
         moving = np.broadcast_to(np.array(self.floor), (len(v), rows))
-        return np.where(self.at_rest(v, rows), np.array(self.rest), moving) if self.rest else moving
+        if not self.rest:
+            return moving
+        return np.where(self.at_rest(v, rows), np.array(self.rest), moving)
 
     def distance(self, q: np.ndarray, v: np.ndarray, a: np.ndarray, rows: int) -> np.ndarray:
         """Return log(1 + d²) (N, rows) of states q, v, a (N, n) each: of the row's joint, or of all joints."""
-        away = np.sum((self._outside(q, v, a) / np.array(self.scale)[:, None]) ** 2, axis=0)
-        own, left = divmod(rows, away.shape[1])
-        return np.log1p(np.broadcast_to(away.sum(axis=1)[:, None], (len(q), rows)) if left else np.tile(away, own))
+        scaled = self._excess(q, v, a) / np.array(self.scale)[:, None]
+        square = np.sum(scaled**2, axis=0)
+        repetitions, remainder = divmod(rows, square.shape[1])
+        if remainder:
+            total = square.sum(axis=1)[:, None]
+            return np.log1p(np.broadcast_to(total, (len(q), rows)))
+        return np.log1p(np.tile(square, repetitions))
 
     def extrapolated(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the mask (3, N, n) of states outside the training range, by q, v, a and joint."""
-        max_outside = 0.05  # of what was learnt from, by which a motion may leave it before that is said (our choice)
-        return self._outside(q, v, a) > max_outside * (np.array(self.upper) - np.array(self.lower))[:, None]
+        training_range = np.array(self.upper) - np.array(self.lower)
+        return self._excess(q, v, a) > MAX_OUTSIDE * training_range[:, None]
 
-    def _outside(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+    def _excess(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+        """Return how far states are outside the training range (3, N, n); zero within it."""
         states = np.stack([q, v, a])
-        low, high = np.array(self.lower)[:, None], np.array(self.upper)[:, None]
-        return np.maximum(low - states, 0.0) + np.maximum(states - high, 0.0)
+        lower = np.array(self.lower)[:, None]
+        upper = np.array(self.upper)[:, None]
+        return np.maximum(lower - states, 0.0) + np.maximum(states - upper, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,10 +258,12 @@ class TorqueErrorModel:
             carried: labels of the payloads on board; None: all.
             states: (s, N) of friction with memory; None: q is one uninterrupted record.
         """
-        found = self.discrepancy
-        own = parameter_variances(dynamics, self.columns, self.covariance, q, v, a, carried, states)
-        far = found.distance(q, v, a, own.shape[1]) * np.array(found.beyond)
-        return np.sqrt(np.array(found.parameters) * own + found.floors(v, own.shape[1]) + far)
+        discrepancy = self.discrepancy
+        by_parameters = parameter_variances(dynamics, self.columns, self.covariance, q, v, a, carried, states)
+        rows = by_parameters.shape[1]
+        by_distance = discrepancy.distance(q, v, a, rows) * np.array(discrepancy.beyond)
+        variance = np.array(discrepancy.parameters) * by_parameters + discrepancy.floors(v, rows) + by_distance
+        return np.sqrt(variance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,34 +273,34 @@ class TorqueIntervals:
     Attributes:
         index: (M,) indices of the samples.
         sigma: (M, rows) predicted standard deviations [N m or N].
-        inside: (M, rows) whether the actual errors are within 1.96 of them.
-        known: (M,) False at lost samples, which are not counted.
+        contains: (M, rows) whether the actual errors are within 1.96 of them.
+        valid: (M,) False at lost samples, which are not counted.
         standing: (M, rows) whether the row's joint stands.
         extrapolated: (3, M, n) whether the motion leaves the training range, by q, v, a and joint.
     """
 
     index: np.ndarray
     sigma: np.ndarray
-    inside: np.ndarray
-    known: np.ndarray
+    contains: np.ndarray
+    valid: np.ndarray
     standing: np.ndarray
     extrapolated: np.ndarray
 
     @property
     def covered(self) -> float:
         """Share of all errors within their interval."""
-        return float(np.mean(self.inside[self.known]))
+        return float(np.mean(self.contains[self.valid]))
 
     @property
     def joints(self) -> np.ndarray:
         """Share of the errors within their interval, by torque row (rows,)."""
-        return np.asarray(np.mean(self.inside[self.known], axis=0))
+        return np.asarray(np.mean(self.contains[self.valid], axis=0))
 
     @property
     def independent(self) -> np.ndarray:
-        """Number of independent errors (rows,), from the autocorrelation of `inside`."""
-        seen = self.inside[self.known].astype(float)
-        return np.array([len(seen) / inflation(column) for column in seen.T])
+        """Number of independent errors (rows,), from the autocorrelation of `contains`."""
+        contains = self.contains[self.valid].astype(float)
+        return np.array([len(contains) / inflation(column) for column in contains.T])
 
     @property
     def median(self) -> np.ndarray:
@@ -272,10 +313,14 @@ class TorqueIntervals:
         """Median half width of the interval at rest (rows,) [N m or N]; NaN where a joint does not stand."""
         return self._median(self.standing)
 
-    def _median(self, used: np.ndarray) -> np.ndarray:
+    def _median(self, selected: np.ndarray) -> np.ndarray:
         """Return the median half width (rows,) over some samples (M, rows); NaN without any."""
-        pairs = zip(self.sigma.T, used.T)
-        return np.array([SIGMAS * np.median(sigma[own]) if own.any() else np.nan for sigma, own in pairs])
+        medians = np.full(selected.shape[1], np.nan)
+        for row in range(selected.shape[1]):
+            sigma = self.sigma[selected[:, row], row]
+            if len(sigma):
+                medians[row] = SIGMAS * np.median(sigma)
+        return medians
 
     @property
     def beyond(self) -> np.ndarray:
@@ -288,72 +333,124 @@ class TorqueIntervals:
             100.0 * self.covered,
             100.0 * self.joints,
             self.median,
-            int(self.known.sum()),
+            int(self.valid.sum()),
             100.0 * float(self.beyond.mean()),
             self.median_at_rest,
         )
 
     def ways(self, joints: Sequence[str]) -> list[str]:
         """Return texts on how the motion leaves the training range: by q, v or a, and at which of the named joints."""
-        outside = np.asarray(self.extrapolated.any(axis=1))
-        return [
-            f"{words} {', '.join(name for name, out in zip(joints, own.tolist()) if out)}"
-            for words, own in zip(WAYS, outside)
-            if own.any()
-        ]
+        texts = []
+        for text, by_joint in zip(EXTRAPOLATIONS, self.extrapolated.any(axis=1)):
+            names = [name for name, extrapolated in zip(joints, by_joint.tolist()) if extrapolated]
+            if names:
+                texts.append(f"{text} {', '.join(names)}")
+        return texts
 
 
 def intervals(errors: TorqueErrorModel, dynamics: Dynamics, case: Case, predicted: np.ndarray) -> TorqueIntervals:
     """Return a model's 95 % error bounds on a recording, and which errors of `predicted` (N, rows) lie within them."""
     motion = case.motion
-    max_samples = 5000  # samples of a recording that intervals are evaluated at
-    index = evenly(len(motion), max_samples)
-    q, v, a = (np.asarray(x[index]) for x in (motion.q, motion.v, motion.a))
+    index = evenly(len(motion), MAX_INTERVAL_SAMPLES)
+    q = np.asarray(motion.q[index])
+    v = np.asarray(motion.v[index])
+    a = np.asarray(motion.a[index])
     states = segmented_states(dynamics.model.columns, case)[:, index]
     sigma = errors.sigma(dynamics, q, v, a, case.carried, states)
-    inside = np.abs(case.target[index] - predicted[index]) <= SIGMAS * sigma
-    known = np.asarray(motion.weight[index] > 0.5)
+    contains = np.abs(case.target[index] - predicted[index]) <= SIGMAS * sigma
+    valid = np.asarray(motion.weight[index] > 0.5)
     standing = errors.discrepancy.at_rest(v, sigma.shape[1])
-    return TorqueIntervals(index, sigma, inside, known, standing, errors.discrepancy.extrapolated(q, v, a))
+    extrapolated = errors.discrepancy.extrapolated(q, v, a)
+    return TorqueIntervals(index, sigma, contains, valid, standing, extrapolated)
+
+
+@dataclass(frozen=True, eq=False)
+class _HeldOut:
+    """Prediction errors on held-out time, and the terms of their expected variance.
+
+    Attributes:
+        errors: (m, rows) of the torques [N m or N].
+        variance_terms: (m, rows, 3) variance due to the parameters, 1, and log(1 + d²).
+        moves: (m, rows) whether the row's joint moves.
+    """
+
+    errors: np.ndarray
+    variance_terms: np.ndarray
+    moves: np.ndarray
 
 
 def learn_torque_errors(
-    found: Identification, cases: Sequence[Case], covariance: np.ndarray | None = None
+    identification: Identification, cases: Sequence[Case], covariance: np.ndarray | None = None
 ) -> TorqueErrorModel | None:
     """Return a model of the torque errors, estimated on held-out time; None if the recordings are too short.
 
     Args:
-        found: the model and its rows.
+        identification: the model and its rows.
         cases: the recordings it was identified from.
         covariance: (p, p) of its parameters; None: that of its estimate.
     """
-    if not isinstance(found.dynamics.model, IdentificationModel):
+    if not isinstance(identification.dynamics.model, IdentificationModel):
         return None
-    samples = _samples(found, cases)
-    rest = [block for block in range(samples.block.max(initial=-1) + 1) if (samples.block == block).sum() > 1]
-    if len(rest) < 2:
+    samples = _collect_samples(identification, cases)
+    numbers = range(samples.block.max(initial=-1) + 1)
+    blocks = [block for block in numbers if np.count_nonzero(samples.block == block) > 1]
+    if len(blocks) < 2:
         return None
-    count, rest = len(rest), _apart(samples, rest)
-    halves = [np.unique(np.concatenate(part)) for part in (rest[: len(rest) // 2], rest[len(rest) // 2 :])]
-    friction = _friction(found)
-    slow = _standing_speeds(found, friction)
-    runs = (*rest, *(one for one in halves if len(one) < count))
-    folds = [_left_out(found, samples, run, slow) for run in runs]
-    weights = _weights(folds, len(rest))
-    logs, sizes = zip(*(_in_units(folds, row, own) for row, own in enumerate(weights)))
-    spread = np.array([np.var(own[: len(rest)], ddof=1) for own in logs])
-    freedom = len(rest) - 1 + BORROWED
-    spread = ((len(rest) - 1) * spread + BORROWED * spread.mean()) / freedom * (1.0 + 1.0 / len(rest))
-    factors = [
-        np.quantile(np.outer(own, np.exp(log.mean() + np.sqrt(one) * (OPTIMISM + stdtrit(freedom, CHANCES)))), COVERED)
-        for own, log, one in zip(sizes, logs, spread)
-    ]
-    parts = weights * (np.array(factors)[:, None] / SIGMAS) ** 2
-    known = replace(samples.box(), **dict(zip(("parameters", "floor", "beyond"), map(tuple, parts.T.tolist()))))
-    at_rest = _rest_floors(folds[: len(rest)], friction, parts)
-    known = replace(known, rest=tuple(at_rest.tolist()), standing=tuple(slow.tolist()))
-    own = found.fitted.estimate.covariance if covariance is None else covariance
-    return TorqueErrorModel(estimated_columns(found.dynamics, found.names), own, known)
+
+    # Hold out each run of the motion, and each half of all runs.
+    runs = _independent_runs(samples, blocks)
+    middle = len(runs) // 2
+    halves = []
+    for half in (runs[:middle], runs[middle:]):
+        half_blocks = np.unique(np.concatenate(half))
+        if len(half_blocks) < len(blocks):
+            halves.append(half_blocks)
+    friction = _coulomb_friction(identification)
+    standing_speeds = _standing_speeds(identification, friction)
+    folds = [_hold_out(identification, samples, run, standing_speeds) for run in (*runs, *halves)]
+
+    weights = _variance_weights(folds, len(runs))
+    factors = _interval_factors(folds, weights, len(runs))
+    weights = weights * factors[:, None] ** 2
+    rest = _rest_floors(folds[: len(runs)], friction, weights)
+    parameters, floor, beyond = weights.T.tolist()
+    discrepancy = replace(
+        samples.training_range(),
+        parameters=tuple(parameters),
+        floor=tuple(floor),
+        beyond=tuple(beyond),
+        rest=tuple(rest.tolist()),
+        standing=tuple(standing_speeds.tolist()),
+    )
+    if covariance is None:
+        covariance = identification.fitted.estimate.covariance
+    columns = estimated_columns(identification.dynamics, identification.names)
+    return TorqueErrorModel(columns, covariance, discrepancy)
+
+
+def _interval_factors(folds: Sequence[_HeldOut], weights: np.ndarray, run_count: int) -> np.ndarray:
+    """Return the factors (rows,) on predicted sigmas with which 1.96 of them cover 95 % of errors on other motion.
+
+    The size of a row's normalised errors differs from run to run. The variance of its logarithm over runs, regularised
+    towards the mean of all rows, says how large errors on one more run may be: Student's t with that variance.
+    """
+    log_sizes, normalised = [], []
+    for row, row_weights in enumerate(weights):
+        row_log_sizes, row_errors = _normalised_errors(folds, row, row_weights)
+        log_sizes.append(row_log_sizes)
+        normalised.append(row_errors)
+    variance = np.array([np.var(log_size[:run_count], ddof=1) for log_size in log_sizes])
+    freedom = run_count - 1 + BORROWED
+    variance = ((run_count - 1) * variance + BORROWED * variance.mean()) / freedom
+    variance_of_next_run = variance * (1.0 + 1.0 / run_count)
+
+    quantiles = stdtrit(freedom, CHANCES)
+    factors = np.empty(len(weights))
+    for row, errors in enumerate(normalised):
+        deviation = np.sqrt(variance_of_next_run[row])
+        possible_sizes = np.exp(log_sizes[row].mean() + deviation * (OPTIMISM + quantiles))
+        factors[row] = np.quantile(np.outer(errors, possible_sizes), COVERED) / SIGMAS
+    return factors
 
 
 @dataclass(frozen=True, eq=False)
@@ -365,7 +462,8 @@ class _Samples:
         torque, error: (M, rows) recorded torque, and its prediction error by the final model.
         matrix: (M, rows, p) filtered columns.
         block: (M,) number of the time block; -1 for samples not compared.
-        whole, part: (K, 2 n) q and v at the full rate, or a sufficient part of it, and their time blocks.
+        trajectory, trajectory_block: (K, 2 n) q and v at the full rate, or a sufficient part of it, and their time
+            blocks.
         triangles: triangles of all rows, see `calib.identification.rows.triangulate`.
         values: (p,) estimated from all rows.
     """
@@ -375,218 +473,243 @@ class _Samples:
     error: np.ndarray
     matrix: np.ndarray
     block: np.ndarray
-    whole: np.ndarray
-    part: np.ndarray
+    trajectory: np.ndarray
+    trajectory_block: np.ndarray
     triangles: Triangles
     values: np.ndarray
 
-    def box(self, chosen: np.ndarray | slice = slice(None)) -> TorqueDiscrepancy:
+    def training_range(self, selected: np.ndarray | slice = slice(None)) -> TorqueDiscrepancy:
         """Return the range of the selected states with the standard deviation of all states; error terms are empty."""
-        own = self.states[:, chosen]
-        edges = own.min(axis=1), own.max(axis=1), np.maximum(self.states.std(axis=1), 1e-6)
-        lower, upper, scale = (tuple(map(tuple, one.tolist())) for one in edges)
+        states = self.states[:, selected]
+        lower = tuple(map(tuple, states.min(axis=1).tolist()))
+        upper = tuple(map(tuple, states.max(axis=1).tolist()))
+        deviation = np.maximum(self.states.std(axis=1), 1e-6)
+        scale = tuple(map(tuple, deviation.tolist()))
         return TorqueDiscrepancy((), (), (), lower, upper, scale)
 
 
-def _samples(found: Identification, cases: Sequence[Case]) -> _Samples:
-    decimator, dynamics = common_decimator(cases, found.settings), found.dynamics
-    states, torques, errors, blocks, whole, parts = [], [], [], [], [], []
-    for case, rows in zip(cases, found.rows):
-        motion, index = case.motion, kept(case.motion.segment, decimator)
-        q, v, a = own = np.stack([motion.q[index], motion.v[index], motion.a[index]])
+def _collect_samples(identification: Identification, cases: Sequence[Case]) -> _Samples:
+    """Return motion and residuals of all recordings at their decimated samples."""
+    dynamics = identification.dynamics
+    decimator = common_decimator(cases, identification.settings)
+    states, torques, errors, matrices, blocks, trajectories, trajectory_blocks = [], [], [], [], [], [], []
+    for case, rows in zip(cases, identification.rows):
+        motion = case.motion
+        index = kept(motion.segment, decimator)
+        q, v, a = motion.q[index], motion.v[index], motion.a[index]
         memory = segmented_states(dynamics.model.columns, case)[:, index]
-        torques.append(np.asarray(case.target[index]))
-        errors.append(torques[-1] - dynamics.model.torque(dynamics.values, q, v, a, case.carried, memory))
-        states.append(own)
+        torque = np.asarray(case.target[index])
+        error = torque - dynamics.model.torque(dynamics.values, q, v, a, case.carried, memory)
+        matrix = rows.matrix
+        if matrix.shape[1] != error.shape[1]:
+            # Drop the zero rows of the other recordings, see `ObservationRows.by_recording`.
+            matrix = matrix.sum(axis=1, keepdims=True)
+        states.append(np.stack([q, v, a]))
+        torques.append(torque)
+        errors.append(error)
+        matrices.append(matrix)
         blocks.append(np.where(motion.weight[index] > 0.5, rows.block, -1))
-        every = slice(None, None, max(1, decimator.factor // FINER_BY))
-        whole.append(np.hstack([motion.q, motion.v])[every])
-        near = np.searchsorted(index, np.arange(len(motion))[every]).clip(max=len(index) - 1)
-        parts.append(rows.block[near])
-    triangles = triangulate(found.rows)
-    matrices = [_together(rows.matrix, errors[0].shape[1]) for rows in found.rows]
-    everything = range(triangles.groups // len(found.fitted.std))
+
+        thinned = np.arange(0, len(motion), max(1, decimator.factor // FINER_BY))
+        nearest = np.searchsorted(index, thinned).clip(max=len(index) - 1)
+        trajectories.append(np.hstack([motion.q, motion.v])[thinned])
+        trajectory_blocks.append(rows.block[nearest])
+    triangles = triangulate(identification.rows)
+    all_blocks = range(triangles.groups // len(identification.fitted.std))
+    values, _ = _estimate(identification, triangles, all_blocks)
     return _Samples(
-        np.concatenate(states, axis=1),
-        np.concatenate(torques),
-        np.concatenate(errors),
-        np.concatenate(matrices),
-        np.concatenate(blocks),
-        np.concatenate(whole),
-        np.concatenate(parts),
-        triangles,
-        _estimate(found, triangles, everything)[0],
+        states=np.concatenate(states, axis=1),
+        torque=np.concatenate(torques),
+        error=np.concatenate(errors),
+        matrix=np.concatenate(matrices),
+        block=np.concatenate(blocks),
+        trajectory=np.concatenate(trajectories),
+        trajectory_block=np.concatenate(trajectory_blocks),
+        triangles=triangles,
+        values=values,
     )
 
 
-def _together(matrix: np.ndarray, rows: int) -> np.ndarray:
-    """Return columns (M, rows, p) without the zero rows of other recordings (`ObservationRows.by_recording`)."""
-    return matrix if matrix.shape[1] == rows else matrix.sum(axis=1, keepdims=True)
-
-
-def _apart(samples: _Samples, blocks: Sequence[int]) -> list[np.ndarray]:
+def _independent_runs(samples: _Samples, blocks: Sequence[int]) -> list[np.ndarray]:
     """Return the blocks to hold out together: each block with all blocks that repeat its motion.
 
     A block is repeated by another that has been in half of its states (see `calib.data.signals.persistency.repeats`).
-    Where that leaves fewer than two, the blocks as they are.
+    Where that leaves fewer than two runs, each block is a run of its own.
     """
-    spread = np.maximum(samples.whole.std(axis=0), 1e-6)
-    trees = {k: KDTree(samples.whole[samples.part == k] / spread) for k in blocks}
-    limit, runs = SAME_STATE * np.sqrt(len(spread)), []
+    spread = np.maximum(samples.trajectory.std(axis=0), 1e-6)
+    max_distance = SAME_STATE * np.sqrt(len(spread))
+    trees = {}
     for block in blocks:
-        own = samples.states[:2, samples.block == block].transpose(1, 0, 2).reshape(-1, len(spread)) / spread
-        met = [np.isfinite(tree.query(own, distance_upper_bound=limit)[0]).mean() for tree in trees.values()]
-        run = tuple(k for k, share in zip(trees, met) if k == block or share >= MIN_REPEATED)
-        if run not in runs and len(run) < len(blocks):
-            runs.append(run)
-    return [np.array(run) for run in (runs if len(runs) > 1 else [(block,) for block in blocks])]
+        trees[block] = KDTree(samples.trajectory[samples.trajectory_block == block] / spread)
+    runs: list[tuple[int, ...]] = []
+    for block in blocks:
+        positions_and_speeds = samples.states[:2, samples.block == block].transpose(1, 0, 2)
+        visited = positions_and_speeds.reshape(-1, len(spread)) / spread
+        run = []
+        for candidate, tree in trees.items():
+            distance, _ = tree.query(visited, distance_upper_bound=max_distance)
+            if candidate == block or np.isfinite(distance).mean() >= MIN_REPEATED:
+                run.append(candidate)
+        if tuple(run) not in runs and len(run) < len(blocks):
+            runs.append(tuple(run))
+    if len(runs) < 2:
+        return [np.array([block]) for block in blocks]
+    return [np.array(run) for run in runs]
 
 
-def _estimate(found: Identification, data: Triangles, blocks: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+def _estimate(identification: Identification, data: Triangles, blocks: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """Return the values (p,) estimated from some time blocks, and a root (p, k) of their covariance."""
-    fitted, b = found.fitted, found.base.b
-    group = np.concatenate([np.full(b, -1), np.asarray(found.friction.groups, dtype=int)])
-    prior = None if found.prior is None else found.prior.widened(len(group) - b)
+    fitted = identification.fitted
+    base_count = identification.base.b
+    group = np.concatenate([np.full(base_count, -1), np.asarray(identification.friction.groups, dtype=int)])
+    prior_rows, tempered_rows = None, None
+    if identification.prior is not None:
+        prior_rows = identification.prior.widened(len(group) - base_count)
+        if prior_rows is not None:
+            tempered_rows = np.sqrt(identification.prior.tempering) * prior_rows
     pooled = pool(data, len(fitted.std), blocks)
-    stronger = None if found.prior is None or prior is None else np.sqrt(found.prior.tempering) * prior
-    values, ridges = time_folds.estimate(pooled, fitted.std, fitted.inflation, group, stronger)
-    alive = np.flatnonzero(ridges > 0.0)
+    values, ridges = time_folds.estimate(pooled, fitted.std, fitted.inflation, group, tempered_rows)
+
+    # The covariance of the columns that no ridge has switched off, inverted in units of a diagonal of 1.
+    active = np.flatnonzero(ridges > 0.0)
     weight = 1.0 / (fitted.std * np.sqrt(fitted.inflation))
-    stacked = (pooled.factors[:, :, :-1] * weight[:, None, None]).reshape(-1, len(group))
-    stacked = stacked if prior is None else np.vstack([stacked, prior[:, :-1]])
-    square = (stacked.T @ stacked)[np.ix_(alive, alive)] + np.diag(ridges[alive] ** -2.0)
-    unit = 1.0 / np.sqrt(np.maximum(np.diag(square), 1e-300))
-    sizes, vectors = np.linalg.eigh(square * np.outer(unit, unit))
-    root = np.zeros((len(group), len(alive)))
-    root[alive] = unit[:, None] * vectors / np.sqrt(np.maximum(sizes, 1e-10))
+    whitened = (pooled.factors[:, :, :-1] * weight[:, None, None]).reshape(-1, len(group))
+    if prior_rows is not None:
+        whitened = np.vstack([whitened, prior_rows[:, :-1]])
+    information = (whitened.T @ whitened)[np.ix_(active, active)] + np.diag(ridges[active] ** -2.0)
+    unit = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    eigenvalues, vectors = np.linalg.eigh(information * np.outer(unit, unit))
+    root = np.zeros((len(group), len(active)))
+    root[active] = unit[:, None] * vectors / np.sqrt(np.maximum(eigenvalues, 1e-10))
     return values, root
 
 
-@dataclass(frozen=True, eq=False)
-class _Fold:
-    """Errors on held-out time.
-
-    Attributes:
-        error: (m, rows) of the torques [N m or N].
-        shapes: (m, rows, 3) terms of their variance.
-        moves: (m, rows) whether the row's joint moves.
-    """
-
-    error: np.ndarray
-    shapes: np.ndarray
-    moves: np.ndarray
-
-
-def _friction(found: Identification) -> np.ndarray:
+def _coulomb_friction(identification: Identification) -> np.ndarray:
     """Return Coulomb's friction (rows,) of the torque rows that hold a motor's; zero in others [N m or N]."""
-    coulomb = found.rows[0].coulomb[: found.dynamics.model.rows]  # recordings weighed apart repeat them
-    return np.sum(np.abs(found.fitted.estimate.values) * coulomb, axis=1)
+    # Recordings that are weighed apart repeat the rows of the model.
+    coulomb = identification.rows[0].coulomb[: identification.dynamics.model.rows]
+    return np.sum(np.abs(identification.fitted.estimate.values) * coulomb, axis=1)
 
 
-def _standing_speeds(found: Identification, friction: np.ndarray) -> np.ndarray:
+def _standing_speeds(identification: Identification, friction: np.ndarray) -> np.ndarray:
     """Return the speeds (n,) below which joints stand: Coulomb's sign is as wide; zero where no row has friction."""
-    n = found.dynamics.model.n
-    width = np.array(per_joint(found.settings.v0, n, "v0"), dtype=float)
-    return width if friction.any() else np.zeros(n)
+    n = identification.dynamics.model.n
+    if not friction.any():
+        return np.zeros(n)
+    return np.array(per_joint(identification.settings.v0, n, "v0"), dtype=float)
 
 
-def _left_out(found: Identification, samples: _Samples, run: Sequence[int] | np.ndarray, slow: np.ndarray) -> _Fold:
-    """Return errors on held-out blocks.
+def _hold_out(
+    identification: Identification, samples: _Samples, run: Sequence[int] | np.ndarray, standing_speeds: np.ndarray
+) -> _HeldOut:
+    """Return the errors on the blocks of a run, predicted by the parameters that all other blocks give.
 
     No error counts for more than the torque itself: a fold that fails wholly says nothing of how the whole model errs.
 
     Args:
-        slow: (n,) speeds below which a joint stands.
+        standing_speeds: (n,) speeds below which a joint stands.
     """
-    inside, size = np.isin(samples.block, run), np.sqrt(np.mean(samples.torque**2, axis=0))
-    others = [k for k in range(samples.triangles.groups // len(found.fitted.std)) if k not in run]
-    values, root = _estimate(found, samples.triangles, others)
-    rows, states = samples.matrix[inside], samples.states
-    error = samples.error[inside] + rows @ (samples.values - values)
-    own = np.sum((rows @ root) ** 2, axis=2)
-    box = samples.box(~inside)
-    far = box.distance(*states[:, inside], rows=own.shape[1])
-    known = replace(box, rest=(0.0,) * own.shape[1], standing=tuple(slow.tolist()))
-    moves = ~known.at_rest(states[1, inside], own.shape[1])
-    return _Fold(error.clip(-size, size), np.stack([own, np.ones_like(own), far], axis=2), moves)
+    block_count = samples.triangles.groups // len(identification.fitted.std)
+    remaining = [block for block in range(block_count) if block not in run]
+    values, covariance_root = _estimate(identification, samples.triangles, remaining)
+
+    held_out = np.isin(samples.block, run)
+    matrix = samples.matrix[held_out]
+    q, v, a = samples.states[:, held_out]
+    torque_rms = np.sqrt(np.mean(samples.torque**2, axis=0))
+    errors = samples.error[held_out] + matrix @ (samples.values - values)
+    by_parameters = np.sum((matrix @ covariance_root) ** 2, axis=2)
+    rows = by_parameters.shape[1]
+    training_range = samples.training_range(~held_out)
+    distance = training_range.distance(q, v, a, rows)
+    variance_terms = np.stack([by_parameters, np.ones_like(by_parameters), distance], axis=2)
+    with_rest = replace(training_range, rest=(0.0,) * rows, standing=tuple(standing_speeds.tolist()))
+    return _HeldOut(errors.clip(-torque_rms, torque_rms), variance_terms, ~with_rest.at_rest(v, rows))
 
 
-def _rest_floors(folds: Sequence[_Fold], friction: np.ndarray, parts: np.ndarray) -> np.ndarray:
+def _rest_floors(folds: Sequence[_HeldOut], friction: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Return the variance of unmodelled effects of standing joints (rows,) [N² m² or N²].
 
     Args:
-        folds: of time.
+        folds: held-out runs.
         friction: (rows,) Coulomb's.
-        parts: (rows, 3) κ, v and u in motion.
+        weights: (rows, 3) κ, v and u in motion.
     """
-    expected = parts[:, 1] + friction**2 / 3.0
-    total, standstills = BORROWED * expected, np.full(len(friction), BORROWED)
+    expected = weights[:, 1] + friction**2 / 3.0
+    total = BORROWED * expected
+    standstills = np.full(len(friction), BORROWED)
     for fold in folds:
         for row in range(len(friction)):
             rests = ~fold.moves[:, row]
-            if rests.any():
-                count = max(1, int(np.sum(rests[1:] & ~rests[:-1]) + rests[0]))
-                total[row] += count * float(np.mean(fold.error[rests, row] ** 2))
-                standstills[row] += count
+            if not rests.any():
+                continue
+            begins = rests[1:] & ~rests[:-1]
+            count = max(1, int(np.sum(begins) + rests[0]))
+            total[row] += count * float(np.mean(fold.errors[rests, row] ** 2))
+            standstills[row] += count
     return total / standstills
 
 
-def _weights(folds: Sequence[_Fold], blocks: int, errors_used: int = 4000) -> np.ndarray:
+def _variance_weights(folds: Sequence[_HeldOut], run_count: int) -> np.ndarray:
     """Return the weights (rows, 3) of the error variance's terms in motion, regularised towards those of all rows.
 
-    In units of a row's own mean square every row's κ, and its u over v, are of one kind. Behind a row's errors stand
-    those of all others, worth `BORROWED` blocks, and what is known beforehand: the covariance is as it says, worth a
-    block, and errors grow beyond the training range, which folds hardly leave where motion repeats itself.
-
-    Args:
-        folds: of time.
-        blocks: of time.
-
-    `errors_used`: errors of a joint that its weights are found from, about.
+    In units of a row's own mean square every row's κ, and its u over v, are of one kind. A row's own errors are
+    supplemented by those of all other rows, worth `BORROWED` blocks, and by two expectations: the covariance is as it
+    says (worth a block), and errors grow beyond the training range, which folds hardly leave where motion repeats.
     """
-    errors = np.concatenate([fold.error for fold in folds])
-    every = max(1, len(errors) // errors_used)
-    squares = errors[::every].T ** 2
-    shapes = np.concatenate([fold.shapes for fold in folds])[::every].transpose(1, 0, 2).copy()
-    moves = np.concatenate([fold.moves for fold in folds])[::every].T.astype(float)
-    moves[moves.sum(axis=1) < 0.5 * blocks] = 1.0  # a joint that never moves is judged at rest
-    size = np.maximum(np.sum(squares * moves, axis=1) / moves.sum(axis=1), 1e-300)
-    squares = np.maximum(squares / size[:, None], MIN_ERROR**2)
-    shapes[:, :, 0] /= size[:, None]
-    count, known = squares.shape[1], np.array([[1.0, 0.0, 0.0], [0.0, 1.0, DOUBLING]])
-    expected = np.array([1.0, 2.0]), known, np.array([count / blocks, max(1.0, PRIOR * count)])
-    result = []
-    for row in range(len(size)):
-        others = np.delete(np.arange(len(size)), row)
-        thinned = slice(None, None, max(1, len(others)))
-        parts = (
-            (squares[row], shapes[row], moves[row]),
-            (
-                squares[others, thinned].ravel(),
-                shapes[others, thinned].reshape(-1, 3),
-                BORROWED / blocks * moves[others, thinned].ravel(),
-            ),
-            expected,
+    errors = np.concatenate([fold.errors for fold in folds])
+    terms = np.concatenate([fold.variance_terms for fold in folds])
+    moves = np.concatenate([fold.moves for fold in folds])
+    step = max(1, len(errors) // MAX_WEIGHT_SAMPLES)
+    squares = errors[::step].T ** 2
+    terms = terms[::step].transpose(1, 0, 2).copy()
+    counts = moves[::step].T.astype(float)
+    # A joint that never moves is assessed at rest.
+    counts[counts.sum(axis=1) < 0.5 * run_count] = 1.0
+
+    mean_square = np.maximum(np.sum(squares * counts, axis=1) / counts.sum(axis=1), 1e-300)
+    squares = np.maximum(squares / mean_square[:, None], MIN_ERROR**2)
+    terms[:, :, 0] /= mean_square[:, None]
+
+    row_count, sample_count = squares.shape
+    expected_squares = np.array([1.0, 2.0])
+    expected_terms = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, DOUBLING]])
+    expected_counts = np.array([sample_count / run_count, max(1.0, PRIOR * sample_count)])
+    weights = np.empty((row_count, 3))
+    for row in range(row_count):
+        other_rows = np.delete(np.arange(row_count), row)
+        thinned = slice(None, None, max(1, len(other_rows)))
+        other_squares = squares[other_rows, thinned].ravel()
+        other_terms = terms[other_rows, thinned].reshape(-1, 3)
+        other_counts = BORROWED / run_count * counts[other_rows, thinned].ravel()
+        scale = np.array([max(float(terms[row, :, 0].mean()), 1e-300), 1.0, 1.0])
+        row_weights = variance_weights(
+            np.concatenate([squares[row], other_squares, expected_squares]),
+            np.concatenate([terms[row], other_terms, expected_terms]) / scale,
+            np.full(3, 1.0 / 3.0),
+            np.concatenate([counts[row], other_counts, expected_counts]),
         )
-        own, by, worth = zip(*((one, shape, np.broadcast_to(counts, len(one))) for one, shape, counts in parts))
-        scale = np.array([max(float(shapes[row, :, 0].mean()), 1e-300), 1.0, 1.0])
-        found = variance_weights(
-            np.concatenate(own), np.concatenate(by) / scale, np.full(3, 1.0 / 3.0), np.concatenate(worth)
-        )
-        result.append(found / scale * [1.0, size[row], size[row]])
-    return np.stack(result)
+        weights[row] = row_weights / scale * [1.0, mean_square[row], mean_square[row]]
+    return weights
 
 
-def _in_units(folds: Sequence[_Fold], row: int, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return for one row the log rms of error over predicted sigma in each fold, and the normalised errors.
+def _normalised_errors(folds: Sequence[_HeldOut], row: int, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return for one row the log rms of error over predicted sigma in each fold, and all errors over sigma and rms.
 
     In motion; of a fold in which its joint does not move, at rest.
     """
-    each = []
+    squares, variances = [], []
     for fold in folds:
-        used = fold.moves[:, row] if fold.moves[:, row].any() else slice(None)
-        each.append((fold.error[used, row] ** 2, fold.shapes[used, row] @ weights))
-    least = max(MIN_ERROR**2 * float(np.mean(np.concatenate([square for square, _ in each]))), 1e-30)
-    units = [np.sqrt(square / np.maximum(own, least)) for square, own in each]
-    logs = np.array([0.5 * np.log(np.mean(np.minimum(one, MAX_ERROR) ** 2) + 1e-12) for one in units])
-    return logs, np.concatenate([one / np.exp(log) for one, log in zip(units, logs)])
+        moves = fold.moves[:, row]
+        selected = moves if moves.any() else slice(None)
+        squares.append(fold.errors[selected, row] ** 2)
+        variances.append(fold.variance_terms[selected, row] @ weights)
+    min_variance = max(MIN_ERROR**2 * float(np.mean(np.concatenate(squares))), 1e-30)
+
+    log_sizes, normalised = [], []
+    for square, variance in zip(squares, variances):
+        ratio = np.sqrt(square / np.maximum(variance, min_variance))
+        log_size = 0.5 * np.log(np.mean(np.minimum(ratio, MAX_ERROR) ** 2) + 1e-12)
+        log_sizes.append(log_size)
+        normalised.append(ratio / np.exp(log_size))
+    return np.array(log_sizes), np.concatenate(normalised)

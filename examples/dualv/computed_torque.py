@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.dynamics import rigid_body
+from calib.identification.closed_loop.controllers import Reference
+from calib.identification.closed_loop.simulation import Sensing, added_inertia
 from calib.identification.loop import Controller
-from calib.rooms.closed_loop.controllers import Reference
-from calib.rooms.closed_loop.simulation import Sensing, added_inertia
 from calib.rooms.parallel.mechanism.parallel_model import ParallelModel, along, wrench_regressor
 from calib.rooms.parallel.mechanism.simulation import ParallelPlant
 from calib.rooms.parallel.mechanism.velocities import LoopMotion

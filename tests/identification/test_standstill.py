@@ -180,7 +180,7 @@ def test_intervals_have_two_widths_and_hold_in_both():
         assert errors is not None
         stated = intervals(errors, found.dynamics, other, predict(found.dynamics, other))
         assert (stated.median_at_rest > 1.5 * stated.median).all()
-        covered.append([stated.inside[~stated.standing].mean(), stated.inside[stated.standing].mean()])
+        covered.append([stated.contains[~stated.standing].mean(), stated.contains[stated.standing].mean()])
     moving, resting = np.mean(covered, axis=0)
     assert 0.92 < moving <= 1.0 and resting > 0.85
 

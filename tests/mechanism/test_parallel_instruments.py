@@ -8,10 +8,10 @@ from platform_sines import fitted, sines, truth
 
 from calib.data.recordings.recording import Recording
 from calib.errors import CannotSimulate, UsageError
+from calib.identification.closed_loop.controllers import Reference, pd
+from calib.identification.closed_loop.simulation import Sensing
 from calib.identification.identify_options import parse_options
 from calib.identification.loop import Controller
-from calib.rooms.closed_loop.controllers import Reference, pd
-from calib.rooms.closed_loop.simulation import Sensing
 from calib.rooms.parallel.identification import identify_parallel
 from calib.rooms.parallel.mechanism.closure import closed
 from calib.rooms.parallel.mechanism.geometric_fit import changed, visible_directions

@@ -22,8 +22,8 @@ from calib.errors import CannotSimulate, Diverged, NotConverged, Unidentifiable
 from calib.estimation.estimate import Estimate, whitened
 from calib.estimation.linear import LinearFit
 from calib.estimation.triangles import Triangles, empty, retriangulate
-from calib.identification.constraint_settings import ConstraintSettings, Held
 from calib.identification.loop import LoopSettings
+from calib.identification.methods.constraint_settings import ConstraintSettings, Held
 from calib.identification.prior import Prior
 from calib.identification.rows import Case, ObservationRows, pool, triangulate
 from calib.records import frozen

@@ -3,7 +3,7 @@
 `assess` returns the same result for a new model and for one read from its folder.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from os.path import realpath
@@ -13,7 +13,6 @@ import numpy as np
 
 from calib.data.signals.persistency import ExcitationReport, repeats, report_excitation
 from calib.errors import Finding, finding
-from calib.extensions import Point
 from calib.identification import geometry_uncertainty, torque_errors
 from calib.identification.friction.passivity import driven
 from calib.identification.identify import Identification, identify
@@ -28,10 +27,6 @@ from calib.procedure.dynamic_stage.inputs import IdentificationInputs, Progress
 from calib.procedure.findings import Verdict, lines_of
 from calib.procedure.robot_kinds import stage_of
 from calib.units import TORQUE, without_gains
-
-TRACK: "Point[Callable[[IdentificationInputs, Dynamics, Mapping[str, Any], Any], tuple[dict[str, Replay], str]]]" = (
-    Point("track", "replays with the model fed forward, and why there are none")
-)
 
 REPEAT = 0.5  # share of states met in training from which on a validation file proves nothing (our choice)
 
@@ -202,7 +197,9 @@ def assess(
     relative = inputs.unit != TORQUE
     amperes = [finding("torques-relative", unit=without_gains(inputs.unit))] if relative else []
     replays, failure = {}, ""
-    for track in TRACK.all() if inputs.replayed and not relative else ():
+    if inputs.replayed and not relative:
+        from calib.procedure.dynamic_stage.replay import track
+
         replays, failure = track(inputs, dynamics, found.predictions, findings.controller)
     if any(one.inertia_added.any() for one in replays.values()):
         use = lines_of([finding("prediction-not-simulation")])

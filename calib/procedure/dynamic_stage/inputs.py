@@ -22,7 +22,7 @@ from calib.identification.checks.recorded_motion import DesignedMotion, locate
 from calib.identification.friction.friction_ladder import NAMES
 from calib.identification.gains import DriveGains
 from calib.identification.identify_options import FileSettings, IdentifyOptions
-from calib.identification.methods.registry import METHODS
+from calib.identification.registry import METHODS
 from calib.identification.rows import Case, case_names, make_case
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.gains import FoundGains, find_gains

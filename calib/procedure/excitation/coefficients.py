@@ -141,7 +141,7 @@ def table(motion: Periodic, robot: str, limits: Sequence[str]) -> dict[str, Any]
         content["degree"] = motion.degree
     joints = []
     for name, kind, values in zip(motion.joint_names, motion.kinds, motion.coefficients):
-        joint = {"name": name, "kind": kind}
+        joint: dict[str, Any] = {"name": name, "kind": kind}
         if fourier:
             half = len(values) // 2
             joint |= {"q0": values[0], "a": values[1 : 1 + half], "b": values[1 + half :]}

@@ -366,7 +366,8 @@ def _constraints(
     dynamics: ExcitedModel, limits: MotionLimits
 ) -> tuple[tuple[MotionConstraint, ...], tuple[MotionConstraint, ...], tuple[str, ...]]:
     """Return the constraints for the search, those for the verification (Coulomb sign not smoothed), and notes."""
-    if dynamics.values is None or not np.isfinite(limits.torque).any():
+    values = dynamics.values
+    if values is None or not np.isfinite(limits.torque).any():
         return limits.constraints, limits.constraints, ()
     margin, notes = limits.margin, ()
     if margin is None:
@@ -379,7 +380,7 @@ def _constraints(
         return TorqueLimit(
             model.regressor,
             model.regressor_gradient,
-            dynamics.values,
+            values,
             model.of_rows(limits.torque),
             dynamics.covariance,
             limits.deviations,

@@ -139,7 +139,7 @@ def _objective(
         if not np.isfinite(speeds).all() or not 0 < value < 0.25:
             raise UsageError(f"goal '{text}': needs velocity limits, and a share of time above 0 and below 0.25")
         return FrictionCoverage(0.1 * speeds, 0.5 * speeds, value), 0.01
-    joints_of = {f"joint{j + 1}": (j,) for j in range(chain.n)}
+    joints_of: dict[str, tuple[int, ...]] = {f"joint{j + 1}": (j,) for j in range(chain.n)}
     joints_of["wrist"] = wrist(chain.n)
     if name not in joints_of:
         raise UsageError(f"goal '{text}': unknown; use raw, normalised, duration, coverage, wrist, joint1 …")

@@ -29,8 +29,6 @@ session.lock     there while a command works on the session
 from __future__ import annotations
 
 import json
-import os
-import socket
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -285,34 +283,11 @@ def read_state(session: Session) -> StateFile:
 def locked(session: Session, say: Say = print) -> Iterator[None]:
     """Lock the session for one command; the lock of a killed command is replaced.
 
-    The lock is the kernel's (flock), so that it ends with the process; the file says whose it is.
-
     Raises:
         Busy: while another command works on it.
     """
-    import fcntl
-
-    path = session.path("session.lock")
-    with refused_as(SessionError, OSError, f"cannot write in {session.folder}: {{}}"):
-        file = path.open("a+", errors="replace")
-    with file:
-        file.seek(0)
-        holder = file.read(200).strip()
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            words = f"{holder or 'another command'} works on it; wait for it to end"
-            raise Busy(f"{session.folder} is busy: {words}") from None
-        if not path.exists() or not os.path.samestat(path.stat(), os.fstat(file.fileno())):
-            raise Busy(f"{session.folder} was busy a moment ago; try again")
+    busy = f"{session.folder} is busy: {{}} works on it; wait for it to end"
+    with files.locked(session.path("session.lock"), busy, Busy) as holder:
         if holder:
             say(f"the last command ({holder}) was interrupted; continuing from there")
-        file.truncate(0)
-        file.write(f"process {os.getpid()} on {socket.gethostname()}")
-        file.flush()
-        try:
-            yield
-        except Exception:
-            path.unlink(missing_ok=True)
-            raise
-        path.unlink(missing_ok=True)
+        yield

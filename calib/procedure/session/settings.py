@@ -18,7 +18,7 @@ from calib.data.poses import Loss, Model
 from calib.data.poses.fit_options import FitOptions, MetresOrZero, RadiansOrZero
 from calib.errors import SessionError
 from calib.identification.friction.friction_ladder import NAMES as FRICTION
-from calib.identification.methods.registry import METHODS
+from calib.identification.registry import METHODS
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.excitation.settings import (
     DEFAULT_DESIGN,

@@ -27,20 +27,22 @@ from calib.dynamics.bodies import Bodies, standard_parameters
 from calib.dynamics.torque_rows import BODIES, POWER
 from calib.identification.geometry_uncertainty import STEP, cut, estimate, estimator, pieces, weights
 from calib.identification.identify import Identification, common_decimator
-from calib.identification.methods.registry import method_named
+from calib.identification.registry import method_named
 from calib.identification.rows import Case, segments
 from calib.identification.settings import IdentificationSettings, make_model
 from calib.robot.calibrated import CalibratedChain, Deflection, evaluate, target_elements
 from calib.robot.chain import Chain
 
-SAMPLES = 10_000  # at the full rate; longer recordings are represented by pieces spread over them (our choice)
+# at the full rate; longer recordings are represented by pieces spread over them (our choice)
+SAMPLES = 10_000
 
 
 def with_link_motion(robot: CalibratedChain, case: Case, settings: IdentificationSettings) -> Case:
     """Return a case with its links' motion (`Case.link`) by the robot's joint corrections; unchanged without any."""
     simulated = settings.loop is not None or method_named(settings.method).needs_simulation
     rigid = simulated or not settings.deflections or settings.torque_rows == POWER
-    chain, terms = robot.complete, joint_terms(robot.complete, robot.deflection)
+    chain = robot.complete
+    terms = joint_terms(robot.complete, robot.deflection)
     if rigid or not terms.terms or len(chain.driven) != chain.n:
         return case
     own = target_elements(chain, terms)
@@ -74,7 +76,8 @@ def _torques(terms: Deflection, case: Case, settings: IdentificationSettings) ->
     known = standard_parameters(terms.reference)
     values[: len(known)] = known
     for label, stated in settings.payloads.items():
-        if (load := settings.payload_values.get(label, stated.parameters)) is not None:
+        load = settings.payload_values.get(label, stated.parameters)
+        if load is not None:
             first = 10 * model.bodies.labels.index(label)
             values[first : first + 10] = load
     motion = case.motion
@@ -99,12 +102,17 @@ def deflection_sensitivity(found: Identification, robot: CalibratedChain, cases:
     as in `calib.identification.geometry_uncertainty`, of which the part by the residual is left out: it vanishes with
     the residual.
     """
-    terms, chain, settings = robot.deflection, robot.complete, found.settings
-    where, how = target_elements(chain, terms), estimator(found)
-    inverse, decimator = estimate(how, found.rows)[1], common_decimator(cases, found.settings)
+    terms = robot.deflection
+    chain = robot.complete
+    settings = found.settings
+    where = target_elements(chain, terms)
+    how = estimator(found)
+    inverse = estimate(how, found.rows)[1]
+    decimator = common_decimator(cases, found.settings)
     model = found.dynamics.model
     standard = found.base.to_standard(found.fitted.estimate.values[: found.base.b])[: model.inertial]
-    pull, seen = np.zeros((len(inverse), len(terms.terms))), 0
+    pull = np.zeros((len(inverse), len(terms.terms)))
+    seen = 0
     every = -(-sum(len(case.motion) for case in cases) // SAMPLES)
     for rows, case in zip(found.rows, cases):
         torque = _torques(joint_terms(chain, terms), case, settings)

@@ -25,7 +25,8 @@ from calib.robot import calibrated
 from calib.robot.chain import Chain
 from calib.units import TORQUE
 
-MAX_MOVE = 0.1  # of a parameter's σ
+# of a parameter's σ
+MAX_MOVE = 0.1
 ROUNDS = "rounds.json"
 
 
@@ -42,7 +43,8 @@ def identified_masses(folder: str | Path, chain: Chain) -> np.ndarray:
     refuse_currents(folder, "a fit of the compliance")
     refuse_other_arm(folder, chain)
     _, dynamics = read_dynamics(folder)
-    bodies, result = dynamics.model.bodies, np.zeros((chain.n, 10))
+    bodies = dynamics.model.bodies
+    result = np.zeros((chain.n, 10))
     if not dynamics.model.inertial:
         refuse_option(folder, "has identified no bodies, hence no gravity torques; identify with motor or link torques")
     for row, label in enumerate(bodies.labels):
@@ -57,7 +59,9 @@ def largest_move(before: Path, now: Path) -> float:
         return float("inf")
     old, new = ({row.name: row for row in read_estimate(folder)} for folder in (before, now))
     moves = [abs(one.value - old[name].value) / one.sigma for name, one in new.items() if name in old and one.sigma]
-    return max(moves, default=0.0) if old.keys() == new.keys() else float("inf")
+    if old.keys() == new.keys():
+        return max(moves, default=0.0)
+    return float("inf")
 
 
 def return_masses(session: Session) -> list[str]:
@@ -65,24 +69,29 @@ def return_masses(session: Session) -> list[str]:
 
     The fit takes them where it has compliance or sag; its step is then stale.
     """
-    limit, place, found = session.settings.fit.rounds, session.path(MASSES), session.identification.path
+    limit = session.settings.fit.rounds
+    place = session.path(MASSES)
+    found = session.identification.path
     if not limit or not session.geometric or read_table(found).get("unit", TORQUE) != TORQUE:
         return []
     if not {"torque", "lever"} & {term.basis for term in calibrated.read(session.fit.path).deflection.terms}:
         return []
     record = place / ROUNDS
     done = read_json(record, "calib redo fit", dict[str, int])["rounds"] if record.is_file() else 0
-    geometry, dynamics = largest_move(place / "geometry", session.fit.path), largest_move(place, found)
+    geometry = largest_move(place / "geometry", session.fit.path)
+    dynamics = largest_move(place, found)
     words = f"the geometry has moved by {geometry:.2g} σ, the dynamics by {dynamics:.2g} σ"
     if not (place / MODEL).is_file():
         words = "the compliance was fitted to the description's masses"
-    if (settled := max(geometry, dynamics) <= MAX_MOVE) or done >= limit:
+    settled = max(geometry, dynamics) <= MAX_MOVE
+    if settled or done >= limit:
         write_json(record, {"rounds": 0})
         end = "settled" if settled else f"not settled, stopped by rounds = {limit}"
         return [f"identified masses in the fit's gravity torques: after {done} rounds {words}: {end}"]
     (place / "geometry").mkdir(parents=True, exist_ok=True)
     shutil.copy(session.fit.path / ESTIMATE, place / "geometry")
     write_json(record, {"rounds": done + 1})
-    for name in (calibrated.ROBOT, ESTIMATE, MODEL):  # the last is what the fit depends on
+    # the last is what the fit depends on
+    for name in (calibrated.ROBOT, ESTIMATE, MODEL):
         shutil.copy(found / name, place)
     return [f"identified masses return into the fit, round {done + 1} of at most {limit}: {words}"]

@@ -43,8 +43,10 @@ def geometry_spread(
         model: that predicts the torques.
         after: folder of the identification; its geometry's covariance counts.
     """
-    stored, path = None if after is None else after / SENSITIVITY, source if after is None else after / calibrated.ROBOT
-    exact, values = model.exact, model.values
+    stored = None if after is None else after / SENSITIVITY
+    path = source if after is None else after / calibrated.ROBOT
+    exact = model.exact
+    values = model.values
     if after is None and isinstance(robot, CalibratedChain):
         covariance = robot.covariance
     else:
@@ -52,7 +54,8 @@ def geometry_spread(
     if covariance is None or values is None:
         return None
     if after is not None and not all((after / name).is_file() for name in (SENSITIVITY, TORQUE_COVARIANCE)):
-        return None  # an earlier version's
+        # an earlier version's
+        return None
     sizes, axes = np.linalg.eigh(covariance)
     errors = (axes * np.sqrt(np.maximum(sizes, 0.0)))[:, sizes > 1e-12 * sizes[-1]]
 
@@ -61,7 +64,8 @@ def geometry_spread(
 
     before = np.zeros((len(exact.names), errors.shape[1]))
     if stored is not None:
-        names, *columns = csv_table.read_table(stored).cells  # an element each, then two tilts
+        # an element each, then two tilts
+        names, *columns = csv_table.read_table(stored).cells
         index = places(exact.names, names.tolist(), exact.model.names)
         if index is None:
             return None

@@ -29,8 +29,10 @@ from calib.procedure.session.folder import ROUND, Say, Session, read_state
 from calib.procedure.session.steps import SessionStep
 from calib.robot.library import load_calibrated
 
-NEED = limit("torque-unexplained", "share", "marginal")  # [%] of torques and σ, where none is stated
-MIN_GAIN = 0.02  # of a joint's error: a smaller gain is no reason to record more (our choice)
+# [%] of torques and σ, where none is stated
+NEED = limit("torque-unexplained", "share", "marginal")
+# of a joint's error: a smaller gain is no reason to record more (our choice)
+MIN_GAIN = 0.02
 
 
 class _Parameter(NamedTuple):
@@ -54,7 +56,9 @@ class _Short(NamedTuple):
 
 def extend(session: Session, say: Say) -> list[str]:
     """Design a further motion where joints or parameters fall short, and return what it will bring as notes."""
-    section, place, round_name = session.settings.dynamics, session.identification, next_round(session)
+    section = session.settings.dynamics
+    place = session.identification
+    round_name = next_round(session)
     short = _short_joints(session, section.tolerance_percent)
     weak = _weak_parameters(session, section.sigma_percent or np.inf)
     if not short and not weak:
@@ -96,7 +100,9 @@ def _short_joints(session: Session, asked: float) -> list[_Short]:
     if not asked or worst.relative_error_percent.total <= asked:
         return []
     n = session.identification.dynamics().model.n
-    errors, rms = worst.relative_error_percent.joints[-n:], worst.rms[-n:]  # the motors' rows come last
+    # the motors' rows come last
+    errors = worst.relative_error_percent.joints[-n:]
+    rms = worst.rms[-n:]
     rows = enumerate(zip(errors.tolist(), (100.0 * rms / errors).tolist()))
     return [_Short(j, error, size) for j, (error, size) in rows if error > asked]
 
@@ -114,12 +120,15 @@ def _weak_parameters(session: Session, asked: float) -> tuple[str, ...]:
 def _unmodelled(given: ExcitationInputs, joints: list[_Short]) -> list[str]:
     """Return a note on the joints that more motion does not help."""
     words = listing(f"{given.chain.joint_names[one.joint]} {one.error:.2g} %" for one in joints)
-    return [f"more motion does not help {words}: what is left is not modelled (friction, elasticity)"] if joints else []
+    if joints:
+        return [f"more motion does not help {words}: what is left is not modelled (friction, elasticity)"]
+    return []
 
 
 def _gains(designed: design.Designed, joints: list[_Short], parameters: tuple[str, ...]) -> list[str]:
     """Return a note on what a motion will bring to joints and parameters, the worst first."""
-    outlook, names = designed.outlook, designed.inputs.chain.joint_names
+    outlook = designed.outlook
+    names = designed.inputs.chain.joint_names
     rows = sorted(designed.predicted, key=lambda one: -(one.rsd or 0.0))
     seconds = designed.playback.run.duration
     if outlook is None or outlook.torque_sigma_before is None:
@@ -141,7 +150,8 @@ def promised(session: Session) -> tuple[str, ...]:
     """
     if session.dynamic and session.settings.dynamics.plan and not session.needs:
         return _short_of_default(session)
-    name, notes = next_round(session), read_state(session).notes(STEP.name)
+    name = next_round(session)
+    notes = read_state(session).notes(STEP.name)
     folder = session.path(f"6-excitation/{name}")
     if not session.needs or not notes or not folder.exists():
         return ()
@@ -152,7 +162,8 @@ def promised(session: Session) -> tuple[str, ...]:
 
 def _short_of_default(session: Session) -> tuple[str, ...]:
     """Return a line on joints and parameters that fall short of the default needs, and what designs a motion."""
-    joints, weak = _short_joints(session, NEED), _weak_parameters(session, NEED)
+    joints = _short_joints(session, NEED)
+    weak = _weak_parameters(session, NEED)
     names = load_calibrated(session.fit.path).chain.joint_names
     parts = [f"torque of {names[one.joint]} ({one.error:.2g} %)" for one in joints]
     own = {one.name: one.rsd or 0.0 for one in read_estimate(session.identification.path, _Parameter)}

@@ -34,7 +34,8 @@ from trajectories.constraints import BoxLimit, MotionConstraint, TwoSided
 from trajectories.design.verify import dense_motion
 from trajectories.setpoints import Setpoints
 
-SAMPLES = 100  # instants over the period while searching
+# instants over the period while searching
+SAMPLES = 100
 READ = (
     "period",
     "harmonics",
@@ -85,7 +86,8 @@ class _ActuatorLimit(TwoSided):
         return np.concatenate([own - self.limits, -own - self.limits], axis=1)
 
     def slopes(self, motion: SampledMotion, weights: np.ndarray) -> np.ndarray:
-        k, result = len(self.limits), np.zeros((4, *motion.q.shape))
+        k = len(self.limits)
+        result = np.zeros((4, *motion.q.shape))
         result[:3] = self.plan.slopes(motion.q, motion.v, motion.a, self.of, weights[:, :k] - weights[:, k:])
         return result
 
@@ -136,7 +138,8 @@ class ParallelExcitation(ExcitationDesign):
         """Write the result folder of `calib excite`: one period at the controller's rate, and the actuators' series."""
         from calib.procedure.report import motion_figures
 
-        one, bounds = folder.one_period(self), self.inputs.limits.bounds
+        one = folder.one_period(self)
+        bounds = self.inputs.limits.bounds
 
         def more(place: Path) -> None:
             series = coefficients.table(self._series(), ROBOT, bounds.lines())
@@ -213,9 +216,10 @@ def excite_parallel(
         f"{folder} already states rows, drives and payloads; leave the options out",
         UsageError,
     )
-    made, values, loads, notes = (
-        of_options(robot, options, settings) if folder is None else of_folder(robot, folder, settings)
-    )
+    if folder is None:
+        made, values, loads, notes = of_options(robot, options, settings)
+    else:
+        made, values, loads, notes = of_folder(robot, folder, settings)
     purpose = purpose_of(made, values, loads, notes, settings, folder, after)
     found = design_parallel(robot, made, values, settings, purpose=purpose, map=map, progress=progress)
     return found if after is None else foretold(found)
@@ -248,7 +252,8 @@ def design_parallel(
         UsageError: where nothing limits an actuator's speed or torque.
         NothingFeasible: naming the limit that stands in the way.
     """
-    known, own = model.known, model.known.robot
+    known = model.known
+    own = model.known.robot
     bounds = actuator_bounds(known)
     purpose = purpose or whole(model, values)
     plan: Any = purpose.model.exact
@@ -262,7 +267,8 @@ def design_parallel(
         _ActuatorLimit(plan, plan.speeds, bounds.velocity, own.joint_names, "velocity", "rad/s"),
     ]
     joints = tuple(Joint(name, "revolute" if "r" in name else "prismatic") for name in own.freedom)
-    platform: Any = SimpleNamespace(name=own.name, n=own.r, joint_names=own.freedom, joints=joints)  # like an arm's
+    # like an arm's
+    platform: Any = SimpleNamespace(name=own.name, n=own.r, joint_names=own.freedom, joints=joints)
     free = np.full(own.r, np.inf)
     given = ExcitationInputs(
         platform,
@@ -272,7 +278,8 @@ def design_parallel(
         purpose.columns,
         purpose.prior,
     )
-    goals, harmonics = settings.goals or ("logdet",), settings.harmonics or COARSE
+    goals = settings.goals or ("logdet",)
+    harmonics = settings.harmonics or COARSE
     asked = replace(settings, goals=goals, harmonics=harmonics, samples=SAMPLES)
     return ParallelExcitation(**vars(search_motion(given, asked, map, progress)), robot=robot, plan=plan)
 

@@ -81,7 +81,8 @@ USES = {
     README: "",
 }
 """Files of an export, and the use of each."""
-MAX_DIFFERENCE = 1e-9  # of frames read back [m, and as rotation matrices], and of forces over the largest
+# of frames read back [m, and as rotation matrices], and of forces over the largest
+MAX_DIFFERENCE = 1e-9
 CLOSED = {"solref": "0.002 1", "solimp": "0.99 0.999 0.0001"}
 """MuJoCo's settings of the loops: with its default they give way by 5 mm (five-bar, 1 s motion), with these by 0.03."""
 
@@ -121,7 +122,8 @@ class OpenedRobot:
     @cached_property
     def chains(self) -> list[Chain]:
         """The legs under names of their own, the last link of each rigid one with its share of the platform."""
-        robot, rows = self.known.robot, self.model.leg_parameters(self.values)
+        robot = self.known.robot
+        rows = self.model.leg_parameters(self.values)
         every = [joint.name for leg in robot.legs for joint in leg.chain.joints]
         found = []
         for leg, row in zip(robot.legs, rows):
@@ -196,8 +198,10 @@ class OpenedRobot:
 
     def mjcf(self) -> str:
         """Return the text of ``robot.xml``."""
-        robot, root = self.known.robot, ET.Element("mujoco", model=self.known.robot.name)
-        world, home = ET.Element("worldbody"), numbers_text(self.known.home.q[0])
+        robot = self.known.robot
+        root = ET.Element("mujoco", model=self.known.robot.name)
+        world = ET.Element("worldbody")
+        home = numbers_text(self.known.home.q[0])
         for chain, drives in zip(self.chains, self.rows(self.drives.values)):
             own: Any = ET.fromstring(mjcf_text(chain, np.asarray(chain.inertias), *drives.T[:3]))
             if not len(root):
@@ -217,7 +221,8 @@ class OpenedRobot:
             home += " " + " ".join(pose_attributes(robot.home).values())
             place = np.eye(4)
         ET.SubElement(body, "site", {"name": PLATFORM, **pose_attributes(place)})
-        ties, motors = ET.SubElement(root, "equality"), ET.SubElement(root, "actuator")
+        ties = ET.SubElement(root, "equality")
+        motors = ET.SubElement(root, "actuator")
         for leg in self.closing:
             name = f"{leg.name}_attachment"
             ET.SubElement(body, "site", {"name": name, **pose_attributes(place @ leg.attachment)})
@@ -283,8 +288,10 @@ def _identified(robot: ParallelMechanism, folder: Path, prior: str) -> _Source:
     model, own = read_model(robot, folder)
     chain, named = _side_by_side(model, model.known_parameters())
     estimate = information.read(folder, (chain, Dynamics(named, own)))
-    found, single = find_possible(estimate, prior=prior), model.single
-    values, covariance = model.spread(found.dynamics.values), found.covariance[np.ix_(model.owners, model.owners)]
+    found = find_possible(estimate, prior=prior)
+    single = model.single
+    values = model.spread(found.dynamics.values)
+    covariance = found.covariance[np.ix_(model.owners, model.owners)]
     drives = drive_table(Dynamics(_side_by_side(single, single.known_parameters())[1], values), covariance)
     same = ("possible", "nearest", "distance", "allowed", "weight", "prior", "notes")
     table = {
@@ -315,13 +322,15 @@ def _calibrated(robot: ParallelMechanism, folder: Path) -> _Source:
         UsageError: where the file has none.
     """
     model = make_parallel_model(robot.known, ("",))
-    if (bodies := model.known_parameters()) is None:
+    bodies = model.known_parameters()
+    if bodies is None:
         raise UsageError(
             f"{robot.source} has no inertias, and simulators need masses: state them there, or export an identification"
         )
     chain, named = _side_by_side(model, bodies)
     known = next(find_prior_bodies(chain, named))
-    estimate, covariance = read_estimate(folder), read_covariance(folder / COVARIANCE)[1]
+    estimate = read_estimate(folder)
+    covariance = read_covariance(folder / COVARIANCE)[1]
     table = {key: [getattr(one, key[:-1]) for one in estimate] for key in ("names", "units", "values")}
     drives = drive_table(Dynamics(named, np.zeros(model.p)))
     notes = ("masses are those of the robot's file, not identified; no friction", *known.notes)
@@ -358,9 +367,10 @@ def export_parallel(robot: ParallelMechanism, folder: Path, into: Path, prior: s
     def write(place: Path) -> None:
         robot.write(place)
         for name, text in texts.items():
-            content = (
-                with_comment(text.encode(), "its loops are closed by robot.yaml") if name == URDF else text.encode()
-            )
+            if name == URDF:
+                content = with_comment(text.encode(), "its loops are closed by robot.yaml")
+            else:
+                content = text.encode()
             files.write(place / name, with_comment(content, remark) if remark else content)
         files.write(place / CLOSURES, opened.closures())
         write_drives(opened.joints, opened.drives, place / DRIVES)
@@ -384,9 +394,17 @@ def _uses() -> Iterator[str]:
 
 def _verdict(folder: Path) -> tuple[str, str]:
     """Return the verdict on a fit or an identification: its level, and a sentence; both empty where none is known."""
-    table = json.loads((folder / METRICS).read_text(encoding="utf-8")) if (folder / METRICS).is_file() else {}
+    if (folder / METRICS).is_file():
+        table = json.loads((folder / METRICS).read_text(encoding="utf-8"))
+    else:
+        table = {}
     own = table.get("verdict", "")
-    level, reason = (own["level"], own["reason"]) if isinstance(own, Mapping) else (own, table.get("reason", ""))
+    if isinstance(own, Mapping):
+        level = own["level"]
+        reason = own["reason"]
+    else:
+        level = own
+        reason = table.get("reason", "")
     if level not in LEVELS:
         return "", ""
     return level, f"verdict {level}: {reason}" + ("; do not use" if level == "fail" else "")
@@ -394,14 +412,19 @@ def _verdict(folder: Path) -> tuple[str, str]:
 
 def _check(opened: OpenedRobot, text: str, where: str, postures: int = 5) -> None:
     """Refuse a file if Pinocchio reads loops that do not close, or other forces on the platform, on random motion."""
-    known, rng, r, mjcf = opened.known, np.random.default_rng(0), opened.known.robot.r, where.endswith(".xml")
+    known = opened.known
+    rng = np.random.default_rng(0)
+    r = opened.known.robot.r
+    mjcf = where.endswith(".xml")
     posture = known.place(0.9 * rng.uniform(known.robot.lower, known.robot.upper, (postures, r)))
     motion = of_platform(known, posture, *rng.uniform(-1.0, 1.0, (2, postures, r)))
     rigid = np.concatenate([opened.values[: opened.model.inertial], np.zeros(len(opened.model.terms))])
     wanted = opened.model.platform_force(rigid, motion, ())
     if mjcf:
         wanted += np.einsum("ntr,nt->nr", motion.jacobians.joints, opened.drives.values[:, 0] * motion.a)
-    forces, apart, parts = np.zeros_like(wanted), 0.0, _models(text) if mjcf else [pinocchio_model(text)]
+    forces = np.zeros_like(wanted)
+    apart = 0.0
+    parts = _models(text) if mjcf else [pinocchio_model(text)]
     for m in range(postures):
         frames: dict[str, np.ndarray] = {}
         for model in parts:
@@ -441,27 +464,40 @@ def _forces(opened: OpenedRobot, model: Any, motion: LoopMotion, m: int, frames:
     import pinocchio
 
     pin: Any = pinocchio
-    data, known = model.createData(), opened.known
+    data = model.createData()
+    known = opened.known
     model.gravity = pin.Motion(np.array(known.robot.gravity), np.zeros(3))
-    q, v, a, J = pin.neutral(model), np.zeros(model.nv), np.zeros(model.nv), np.zeros((model.nv, known.robot.r))
+    q = pin.neutral(model)
+    v = np.zeros(model.nv)
+    a = np.zeros(model.nv)
+    J = np.zeros((model.nv, known.robot.r))
     for j, own in enumerate(opened.joints):
         if model.existJointName(own.name):
-            joint, value = model.joints[model.getJointId(own.name)], motion.posture.q[m, j]
-            q[joint.idx_q : joint.idx_q + joint.nq] = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
+            joint = model.joints[model.getJointId(own.name)]
+            value = motion.posture.q[m, j]
+            if joint.nq == 1:
+                q[joint.idx_q : joint.idx_q + joint.nq] = [value]
+            else:
+                q[joint.idx_q : joint.idx_q + joint.nq] = [np.cos(value), np.sin(value)]
             v[joint.idx_v], a[joint.idx_v] = motion.v[m, j], motion.a[m, j]
             J[joint.idx_v] = motion.jacobians.joints[m, j]
     for k, joint in enumerate(model.joints):
         if joint.nv == 6:
-            pose, own = motion.posture.pose[m], slice(joint.idx_v, joint.idx_v + 6)
+            pose = motion.posture.pose[m]
+            own = slice(joint.idx_v, joint.idx_v + 6)
             turn = np.kron(np.eye(2), pose[:3, :3].T)
-            placed = model.jointPlacements[k].homogeneous if "platform_floating" in model.names else np.eye(4)
+            if "platform_floating" in model.names:
+                placed = model.jointPlacements[k].homogeneous
+            else:
+                placed = np.eye(4)
             q[joint.idx_q : joint.idx_q + 7] = pin.SE3ToXYZQUAT(pin.SE3(invert(placed) @ pose))
             v[own], a[own], J[own] = (
                 turn @ motion.twist[m],
                 turn @ motion.change[m],
                 turn @ motion.jacobians.platform[m],
             )
-            a[own] -= [*np.cross(v[own][3:], v[own][:3]), 0.0, 0.0, 0.0]  # Pinocchio's accelerations are spatial
+            # Pinocchio's accelerations are spatial
+            a[own] -= [*np.cross(v[own][3:], v[own][:3]), 0.0, 0.0, 0.0]
     pin.framesForwardKinematics(model, data, q)
     frames.update({frame.name: data.oMf[k].homogeneous.copy() for k, frame in enumerate(model.frames)})
     return J.T @ pin.rnea(model, data, q, v, a)

@@ -65,9 +65,13 @@ def drive_gains(
     model = model_of(own, replace(settings, torque_rows=rows_named(own, PLATFORM)))
     base = find_base(model, cases, bases.random_samples(model, seed=settings.seed))
     names = [model.names[k] for k in base.kept]
-    if missing := [name for name in known if name not in names]:
+    missing = [name for name in known if name not in names]
+    if missing:
         raise UsageError(f"'{missing[0]}' is not separately identifiable here; was the payload attached?")
-    decimator, rows, squares, noises = common_decimator(cases, settings), [], [], []
+    decimator = common_decimator(cases, settings)
+    rows = []
+    squares = []
+    noises = []
     fixed = np.array([name in known for name in names])
     given = np.array([known.get(name, 0.0) for name in names])
     for case in cases:
@@ -94,12 +98,15 @@ def drive_gains(
         squares.append(np.mean(J**2, axis=0))
         noises.append(np.mean((case.target - motion.in_band(case.target)) ** 2, axis=0))
     noise = np.mean(noises, axis=0) + 1e-12 * np.mean(noises)
-    squares, folds = noise * np.mean(squares, axis=0), max(settings.folds, 2 * len(cases))
+    squares = noise * np.mean(squares, axis=0)
+    folds = max(settings.folds, 2 * len(cases))
     data = triangulate(with_blocks(rows, folds))
-    found, again = _total_least_squares(data, squares, rows), []
+    found = _total_least_squares(data, squares, rows)
+    again = []
     blocks = np.flatnonzero(data.rows.reshape(-1, len(squares)).any(axis=1)).tolist()
     for left in blocks:
-        with suppress(NotConverged, Unidentifiable):  # without the only run that carries the payload
+        # without the only run that carries the payload
+        with suppress(NotConverged, Unidentifiable):
             again.append(_total_least_squares(data, squares, rows, [k for k in blocks if k != left]).gains)
     jackknife = np.sqrt((len(again) - 1) * np.var(again, axis=0))
     wider = np.maximum(1.0, jackknife / np.sqrt(np.diag(found.covariance)))
@@ -140,7 +147,8 @@ def _total_least_squares(
     size = np.maximum(np.linalg.norm(factors, axis=(0, 1)), 1e-300)
     size[-1] = 1.0
     factors /= size
-    matrix, target = factors[:, :, :-1], factors[:, :, -1]
+    matrix = factors[:, :, :-1]
+    target = factors[:, :, -1]
     x = np.linalg.lstsq(matrix.reshape(-1, matrix.shape[2]), target.ravel(), rcond=1e-12)[0]
     tau = residual_inflation(rows, x / size[:-1])
     max_rounds = 100
@@ -151,7 +159,8 @@ def _total_least_squares(
         weigh = 1.0 / np.sqrt(scatter * tau)[:, None]
         slopes = matrix.copy()
         slopes[:, :, :n] -= left[:, :, None] * (gain * squares / scatter[:, None] / size[:n])[:, None]
-        flat, rest = (slopes * weigh[:, :, None]).reshape(-1, len(x)), (left * weigh).ravel()
+        flat = (slopes * weigh[:, :, None]).reshape(-1, len(x))
+        rest = (left * weigh).ravel()
         step = np.linalg.lstsq(flat, -rest, rcond=1e-12)[0]
         x = x + step
         if np.abs(step[:n]).max() < 1e-9 * np.abs(x[:n]).max():

@@ -28,8 +28,10 @@ from calib.rooms.parallel.mechanism.geometric_fit import LoopCovariance, LoopPar
 from calib.rooms.parallel.mechanism.parallel_model import PLATFORM, ParallelModel
 from calib.rooms.parallel.mechanism.parallel_robot import ParallelRobot
 
-STEP = 1e-5  # of the central differences [m or rad]
-SAMPLES = 6000  # at the full rate; longer recordings are represented by pieces spread over them (our choice)
+# of the central differences [m or rad]
+STEP = 1e-5
+# at the full rate; longer recordings are represented by pieces spread over them (our choice)
+SAMPLES = 6000
 
 
 def propagate(
@@ -99,7 +101,8 @@ class _Differences:
         def on(robot: ParallelRobot) -> ParallelModel:
             return replace(model, known=closed(robot))
 
-        robot, steps = model.known.robot, STEP * directions.T
+        robot = model.known.robot
+        steps = STEP * directions.T
         pairs = [(on(changed(robot, parameters, one)), on(changed(robot, parameters, -one))) for one in steps]
         pairs += [(on(robot.tilted(axis)), on(robot.tilted(-axis))) for axis in STEP * np.eye(3)[: len(TILTS)]]
         return cls(found, pairs, np.array(scipy.linalg.block_diag(directions.T, np.eye(len(TILTS)))), torques)
@@ -112,10 +115,13 @@ class _Differences:
         Args:
             weighed: (M, rows) R⁻¹ (y - W φ) of the rows that the samples make.
         """
-        kept, values, rows = self.found.base.kept, self.found.fitted.estimate.values, self.found.dynamics.model.rows
+        kept = self.found.base.kept
+        values = self.found.fitted.estimate.values
+        rows = self.found.dynamics.model.rows
         near = self.found.dynamics.model.known.locate(case.motion.q[span])
         felt = spread(weighed if weighed.shape[1] == rows else weighed.sum(axis=1)[:, None], decimator, len(near))
-        change, pulled = np.empty((len(near), rows, len(self.pairs))), np.empty((len(kept), len(self.pairs)))
+        change = np.empty((len(near), rows, len(self.pairs)))
+        pulled = np.empty((len(kept), len(self.pairs)))
         for k, pair in enumerate(self.pairs):
             ends = []
             for own in pair:

@@ -27,11 +27,13 @@ def legs_differ(found: Identification[ParallelModel], cases: Sequence[Case], lev
         found: identification with identical legs; cases: its training data.
         level: probability of a finding on legs that are identical (our choice).
     """
-    one, fitted = found.dynamics.model, found.fitted
+    one = found.dynamics.model
+    fitted = found.fitted
     base = find_base(one.single, cases, bases.random_samples(one.single, seed=found.settings.seed))
     decimator = common_decimator(cases, found.settings)
     rows = [observe(one.single, base.kept, case, decimator) for case in cases]
-    if len(fitted.std) != one.rows:  # power rows, weighed by recording
+    # power rows, weighed by recording
+    if len(fitted.std) != one.rows:
         rows = [part.by_recording(k, len(cases)) for k, part in enumerate(rows)]
     data = pool(triangulate(rows), len(fitted.std))
     fits = [wls(own, fitted.std, fitted.inflation).estimate for own in (fitted.pooled, data)]
@@ -39,7 +41,8 @@ def legs_differ(found: Identification[ParallelModel], cases: Sequence[Case], lev
         np.sum(own.residual_squares(fit.values) / fitted.std**2 / fitted.inflation)
         for own, fit in zip((fitted.pooled, data), fits)
     ]
-    more, left = data.parameters - fitted.pooled.parameters, fits[1].dof
+    more = data.parameters - fitted.pooled.parameters
+    left = fits[1].dof
     f = (squares[0] - squares[1]) / max(more, 1) / (squares[1] / left)
     p = float(fdtrc(more, left, max(f, 0.0))) if more else 1.0
     if p >= level:

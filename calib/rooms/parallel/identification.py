@@ -19,7 +19,7 @@ from calib.identification.identify import Identification, identify_model
 from calib.identification.identify_options import IdentifyOptions
 from calib.identification.loop import per_joint
 from calib.identification.methods.method import Method
-from calib.identification.methods.registry import METHODS, method_named
+from calib.identification.registry import METHODS, method_named
 from calib.identification.rows import Case
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.identify import Assessment, Errors, ModelFindings, errors_of
@@ -43,9 +43,12 @@ from calib.rooms.parallel.mechanism.velocities import loop_jacobians, overconstr
 from calib.rooms.parallel.robots import ParallelMechanism, refuse_unread
 from calib.workers.threads import one_blas_thread
 
-OF_ARMS = {"couplings", "terms", "gravity", "payload_values"}  # settings
-SIMULATED = ("iv", "didim", "pc-iv", "pc-didim", "cloe", "clie")  # methods that simulate any robot
-MAX_SAMPLES = 200  # of a recording, at which redundant encoders are compared
+# settings
+OF_ARMS = {"couplings", "terms", "gravity", "payload_values"}
+# methods that simulate any robot
+SIMULATED = ("iv", "didim", "pc-iv", "pc-didim", "cloe", "clie")
+# of a recording, at which redundant encoders are compared
+MAX_SAMPLES = 200
 
 Recorded = str | Path | Recording
 
@@ -90,7 +93,8 @@ def identify_parallel(
         UsageError: for options that only serial arms know.
         MeasurementError: for recordings that cannot be right.
     """
-    options, known = options or IdentifyOptions(), robot.known
+    options = options or IdentifyOptions()
+    known = robot.known
     asked = options.settings.torque_rows.name
     rows = rows_named(known, "" if asked == "motor" else asked)
     chosen = {key: value for key, value in (("method", method), ("friction", friction)) if value is not None}
@@ -165,7 +169,9 @@ def _preload(known: ClosedRobot, inputs: IdentificationInputs, case: Case) -> li
 
 def assess(inputs: IdentificationInputs, found: Identification[RegressorModel], findings: ModelFindings) -> Assessment:
     """Return the prediction errors of a model on all recordings, with the verdict and its findings."""
-    model, cases, unseen = found.dynamics.model, inputs.cases, inputs.unseen
+    model = found.dynamics.model
+    cases = inputs.cases
+    unseen = inputs.unseen
     assert isinstance(model, ParallelModel)
     errors = errors_of(inputs, found.dynamics)
     verdict, rules = _judged(model, found, cases, errors)
@@ -182,7 +188,8 @@ def assess(inputs: IdentificationInputs, found: Identification[RegressorModel], 
 def _judged(
     model: ParallelModel, found: Identification[RegressorModel], cases: Sequence[Case], errors: Errors
 ) -> tuple[Verdict, list[Finding]]:
-    if drives := friction_drives(_driven_joints(model, found, cases), "a payload that the options do not name"):
+    drives = friction_drives(_driven_joints(model, found, cases), "a payload that the options do not name")
+    if drives:
         return Verdict.of("", drives), drives
     labels = found.settings.torque_rows.titles(model.known.robot.joint_names)
     kind = "platform" if model.torque_rows.name == PLATFORM else "joint"
@@ -197,12 +204,18 @@ def _driven_joints(
     """Return the names of joints whose identified friction would drive the motion: a wrong sign of power."""
     joints = [joint.name for leg in model.known.robot.legs for joint in leg.chain.joints]
     friction = np.array([False] * model.inertial + [one.form.dissipative for one in model.columns])
-    values, taken, moved = np.where(friction, found.dynamics.values, 0.0), np.zeros(len(joints)), 0.0
+    values = np.where(friction, found.dynamics.values, 0.0)
+    taken = np.zeros(len(joints))
+    moved = 0.0
     for case in cases:
         every = max(1, len(case.motion) // (10 * MAX_SAMPLES))
         q, v, a = (getattr(case.motion, key)[::every] for key in "qva")
-        motion, target = model.moved(q, v, a), case.target[::every]
-        speeds = motion.rate if case.torque_rows.name == PLATFORM else v if target.shape[1] == model.n else 1.0
+        motion = model.moved(q, v, a)
+        target = case.target[::every]
+        if case.torque_rows.name == PLATFORM:
+            speeds = motion.rate
+        else:
+            speeds = v if target.shape[1] == model.n else 1.0
         moved += np.abs((target * speeds).sum(axis=1)).sum()
         taken += (model.tree_torque(values, motion) * motion.v).sum(axis=0)
     return tuple(name for name, own in zip(joints, taken) if own < MIN_ENERGY_SHARE * moved)
@@ -232,10 +245,14 @@ def _encoders(known: ClosedRobot, cases: Sequence[Case]) -> Iterator[Finding]:
     passive = [joint.name for leg in robot.legs for joint in leg.chain.joints if joint.name not in robot.joint_names]
     for case in cases:
         q = case.motion.q[:: max(1, len(case.motion) // MAX_SAMPLES)]
-        apart = float(np.sqrt(np.mean((q - known.locate(q).q[:, robot.actuated]) ** 2))) if robot.redundant else 0.0
+        if robot.redundant:
+            apart = float(np.sqrt(np.mean((q - known.locate(q).q[:, robot.actuated]) ** 2)))
+        else:
+            apart = 0.0
         yield finding("encoders-contradict", file=case.name, count=robot.n, rms=apart)
         unread = " ".join(note for note in case.motion.notes if note.startswith("not read: "))
-        if named := [name for name in passive if name in unread]:
+        named = [name for name in passive if name in unread]
+        if named:
             yield finding("passive-joints-unread", file=case.name, joints=named)
 
 

@@ -51,7 +51,8 @@ if TYPE_CHECKING:
     from calib.procedure.report.charts import Chart
     from calib.procedure.report.page import Section
 
-READ = ("holdout", "tolerance", "seed")  # of the settings
+# of the settings
+READ = ("holdout", "tolerance", "seed")
 FIGURES = "plot_*.png"
 FIT = (ROBOT, METRICS, ESTIMATE, COVARIANCE, calibrated.COVARIANCE, RESIDUALS, REPORT, *PAGES, FIGURES)
 HEADER = ("name", "unit", "value", "sigma")
@@ -96,19 +97,23 @@ class ParallelFit(Drawn, Judged):
     def verdict(self) -> Verdict:
         """Pass, marginal or fail, with the reason (rules: see the module; limits: catalogue of findings)."""
         kinds = {"contradictions": (np.ones(self.own.shape[2], dtype=bool), "mrad (or mm)")}
-        figures, rules = [], [finding("readings-alone")]
+        figures = []
+        rules = [finding("readings-alone")]
         if self.measured:
             places = self.nominal.chain.selected < 3
-            kinds, rules = {"position": (places, "mm"), "orientation": (~places, "mrad")}, []
+            kinds = {"position": (places, "mm"), "orientation": (~places, "mrad")}
+            rules = []
         for (where, errors), (kind, (columns, unit)) in product(self.unseen.items(), kinds.items()):
             if not columns.any():
                 continue
             before, after = (_rms(one[:, columns]) for one in errors)
             figures.append(f"{kind} {1e3 * after:.3g} {unit} rms on {where} rows (nominal {1e3 * before:.3g})")
-            if (tolerance := self.settings.tolerance) is not None and kind == "position":
+            tolerance = self.settings.tolerance
+            if tolerance is not None and kind == "position":
                 rules.append(finding("above-tolerance", tolerance=tolerance, times=after / tolerance))
                 figures[-1] += f", tolerance {1e3 * tolerance:g} mm"
-            left, times = after / max(before, 1e-300), after / max(_rms(self.own[1][:, columns]), 1e-300)
+            left = after / max(before, 1e-300)
+            times = after / max(_rms(self.own[1][:, columns]), 1e-300)
             rules += [
                 finding("worse-than-nominal", times=left),
                 finding("no-transfer", times=times, remedy=""),
@@ -136,12 +141,14 @@ class ParallelFit(Drawn, Judged):
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write the result folder of `calib fit`: either all files or none."""
-        from calib.rooms.parallel import loop_report  # slow to load, as all reports
+        # slow to load, as all reports
+        from calib.rooms.parallel import loop_report
 
         found = self.estimate
 
         def write(folder: Path) -> None:
-            words, read = f"calibrated from {self.nominal.source}", {"files": [str(each) for each in self.files]}
+            words = f"calibrated from {self.nominal.source}"
+            read = {"files": [str(each) for each in self.files]}
             parallel_robot.write(folder / ROBOT, self.robot.chain, words, read)
             files.write_table(folder / ESTIMATE, HEADER, list(self._table()))
             write_covariance(folder / COVARIANCE, found.names, found.covariance)
@@ -166,7 +173,9 @@ class ParallelFit(Drawn, Judged):
 
     def _residuals(self) -> tuple[list[str], list[list[object]]]:
         """Return header and rows of ``residuals.csv``: readings, measured coordinates, and errors of both robots."""
-        robot, scale, rows = self.nominal.chain, np.ones(self.own.shape[2]), []
+        robot = self.nominal.chain
+        scale = np.ones(self.own.shape[2])
+        rows = []
         head = ["set", *(f"{joint.name} [{joint.unit}]" for joint in robot.joints)]
         if self.measured:
             scale = np.where(robot.selected < 3, 1e3, np.degrees(1.0))
@@ -176,7 +185,8 @@ class ParallelFit(Drawn, Judged):
             head += [*self.columns, *(f"nominal {name}" for name in self.columns)]
         parts = {"fit": (self.rows, self.own)} | {name: (own, self.unseen[name]) for name, own in self.kept.items()}
         for name, (given, (before, after)) in parts.items():
-            readings, coordinates = given[:, : robot.n], scale * given[:, robot.n :]
+            readings = given[:, : robot.n]
+            coordinates = scale * given[:, robot.n :]
             table = np.hstack([readings, coordinates, scale * after, scale * before])
             rows += [[name, *row] for row in table.tolist()]
         return head, rows
@@ -187,7 +197,8 @@ class ParallelFit(Drawn, Judged):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of ``metrics.json``."""
-        found, verdict = self.found, self.verdict
+        found = self.found
+        verdict = self.verdict
         both = np.concatenate(list(self.judged.values()), axis=1)
         errors = {
             key: dict(zip(self.columns, row.tolist()))
@@ -209,7 +220,8 @@ class ParallelFit(Drawn, Judged):
         """Return errors on unseen rows and the verdict as a section of a report."""
         from calib.procedure.report.page import Section, Text
 
-        found, verdict = self.found, self.verdict
+        found = self.found
+        verdict = self.verdict
         identified = len(found.parameters) - len(found.vague)
         lines = [
             f"{self.nominal.chain.name}: {identified} of {len(found.parameters)} constants of the loops identified; "
@@ -217,7 +229,10 @@ class ParallelFit(Drawn, Judged):
         ]
         for where, errors in self.judged.items():
             for name, (before, after) in zip(self.columns, 1e3 * np.sqrt(np.mean(errors**2, axis=1)).T):
-                unit = "mm" if name in COORDINATES[:3] else "mrad" if name in COORDINATES else "mrad (or mm)"
+                if name in COORDINATES[:3]:
+                    unit = "mm"
+                else:
+                    unit = "mrad" if name in COORDINATES else "mrad (or mm)"
                 lines.append(f"  {name} on {where} rows: {before:.3g} -> {after:.3g} {unit} rms")
         return Section("", (Text("", lines),), verdict.level, verdict.reason)
 
@@ -227,7 +242,8 @@ class ParallelFit(Drawn, Judged):
     def with_unseen(self, unseen: Sequence[str | Path]) -> ParallelFit:
         """Return the same fit with a verdict on additional unseen files, without refitting."""
         validate = _paths(unseen)
-        proofs, kept = {name: self.unseen[name] for name in self.kept}, dict(self.kept)
+        proofs = {name: self.unseen[name] for name in self.kept}
+        kept = dict(self.kept)
         for path, rows in zip(validate, _read(self.nominal.chain, validate, self.rows.shape[1])):
             name = f"{path.name}, unseen"
             proofs[name], kept[name] = _errors(self.nominal.known, self.found.known, rows), rows
@@ -259,8 +275,11 @@ def fit_parallel(
         MeasurementError: for columns that are missing, or rows that no posture reaches.
         Unidentifiable: for readings alone of a robot without redundant encoders.
     """
-    say, settings, known = progress or (lambda words: None), settings or FitSettings(), robot.known
-    measured, validate = _paths(measured), _paths(validate)
+    say = progress or (lambda words: None)
+    settings = settings or FitSettings()
+    known = robot.known
+    measured = _paths(measured)
+    validate = _paths(validate)
     held = _held(known, settings, options or FitOptions())
     tables = _read(known.robot, (*measured, *validate))
     rows = np.concatenate(tables[: len(measured)])
@@ -270,7 +289,8 @@ def fit_parallel(
     if settings.holdout:
         order = np.random.default_rng(settings.seed).permutation(len(rows))
         count = len(rows) - round(settings.holdout * len(rows))
-        held_out, rows = rows[order[count:]], rows[order[:count]]
+        held_out = rows[order[count:]]
+        rows = rows[order[:count]]
         kept |= {"held out, unseen": held_out} if len(held_out) else {}
     say("fitting")
     try:
@@ -355,7 +375,8 @@ def _errors(nominal: ClosedRobot, calibrated: ClosedRobot, rows: np.ndarray) -> 
 
 def _cross_validated(known: ClosedRobot, rows: np.ndarray, held: Sequence[str], seed: int) -> dict[str, np.ndarray]:
     """Return the cross-validated errors of all rows; empty if a fold cannot be fitted."""
-    folds_wanted = 4  # of the rows, where none are unseen
+    # of the rows, where none are unseen
+    folds_wanted = 4
     folds = np.array_split(np.random.default_rng(seed).permutation(len(rows)), folds_wanted)
     found = []
     for k, own in enumerate(folds):

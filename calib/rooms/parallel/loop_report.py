@@ -45,7 +45,8 @@ class ReportedFit(Protocol):
     def measured(self) -> bool: ...
 
 
-MODEL = "loops"  # the one model of a parallel robot's geometry
+# the one model of a parallel robot's geometry
+MODEL = "loops"
 
 
 def report_of(fit: ReportedFit) -> Report:
@@ -53,7 +54,9 @@ def report_of(fit: ReportedFit) -> Report:
 
     Encoders that contradict each other measure neither position nor orientation: of readings alone it states no errors.
     """
-    robot, found, estimate = fit.nominal.chain, fit.found, fit.estimate
+    robot = fit.nominal.chain
+    found = fit.found
+    estimate = fit.estimate
     sets = {"fit": fit.own} | _unseen(fit)
     parameters = []
     for one, change, sigma in zip(found.parameters, estimate.values.tolist(), estimate.sigma.tolist()):
@@ -94,7 +97,8 @@ def write(fit: ReportedFit, folder: Path, plots: bool) -> None:
 
 
 def _metrics(fit: ReportedFit) -> FitMetrics:
-    verdict, tolerance = fit.verdict, fit.settings.tolerance
+    verdict = fit.verdict
+    tolerance = fit.settings.tolerance
     vague = fit.found.vague
     return FitMetrics(
         validation={name: _compared(fit, both) for name, both in _unseen(fit).items()},
@@ -149,7 +153,9 @@ def _row_errors(fit: ReportedFit, name: str, both: np.ndarray) -> RowErrors:
 
 def _nominal_value(robot: ParallelRobot, one: LoopParameter) -> float:
     """Return a constant's nominal value; 0 for a displacement of a leg's base or attachment."""
-    return float(robot.legs[one.leg].chain.elements[one.index].value) if one.part == "element" else 0.0
+    if one.part == "element":
+        return float(robot.legs[one.leg].chain.elements[one.index].value)
+    return 0.0
 
 
 def _relative(sigma: float, value: float) -> float | None:

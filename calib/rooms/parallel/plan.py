@@ -34,7 +34,8 @@ from trajectories.timing.profile import track
 from trajectories.timing.time_scaling import time_optimal
 
 FRICTIONLESS = "friction unknown (no model): a real robot needs more torque than planned"
-READ = ("payloads", "lines", "rate")  # of the settings
+# of the settings
+READ = ("payloads", "lines", "rate")
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +55,8 @@ class _PlatformDynamics:
         self, q: np.ndarray, slope: np.ndarray, curvature: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return A, B, Γ, each (N, n), as `calib.dynamics.path_dynamics.PathDynamics.along`."""
-        still, rigid = np.zeros_like(q), np.where(self._rubbing(), 0.0, self.values)
+        still = np.zeros_like(q)
+        rigid = np.where(self._rubbing(), 0.0, self.values)
         gravity = self._torque(rigid, q, still, still)
         moved = self._torque(rigid, q, slope, curvature)
         return self._torque(rigid, q, still, slope) - gravity, moved - gravity, gravity
@@ -62,7 +64,9 @@ class _PlatformDynamics:
     def friction(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the actuator torques (N, n) against friction, including that of passive joints."""
         rubbing = self._rubbing() & (self.values != 0.0)
-        return self._torque(np.where(rubbing, self.values, 0.0), q, v, a) if rubbing.any() else np.zeros_like(q)
+        if rubbing.any():
+            return self._torque(np.where(rubbing, self.values, 0.0), q, v, a)
+        return np.zeros_like(q)
 
     def torque(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the actuator torques (N, n) of a motion q, v, a (N, n) of the actuated joints."""
@@ -125,7 +129,8 @@ def plan_parallel(
         UsageError: for options that only serial arms know, waypoints out of the platform's box, no limits to keep.
         NoPosture: for a path that leaves the workspace, naming the place.
     """
-    say, known = progress or (lambda words: None), robot.known
+    say = progress or (lambda words: None)
+    known = robot.known
     refuse_unread(settings, DEFAULT_PLAN, READ)
     law = _law(robot, model, settings.payloads)
     bounds = actuator_bounds(known)
@@ -182,9 +187,11 @@ def _law(robot: ParallelMechanism, folder: Path | None, payloads: tuple[str, ...
     if folder is None and payloads:
         raise UsageError(f"payloads {', '.join(payloads)}: only an identified model has payloads; give --model")
     model, values = read_model(robot, folder)
-    if unknown := sorted(set(payloads) - set(model.payloads)):
+    unknown = sorted(set(payloads) - set(model.payloads))
+    if unknown:
         refuse_option(folder, f"no payload '{unknown[0]}' was identified; known: {', '.join(model.payloads) or 'none'}")
-    smoothing = 1e-9  # smoothing of Coulomb's sign: along a path its direction is known
+    # smoothing of Coulomb's sign: along a path its direction is known
+    smoothing = 1e-9
     terms = tuple(replace(one, settings=(smoothing,)) if one.shape == "sign" else one for one in model.terms)
     return _PlatformDynamics(replace(model, terms=terms), values, payloads)
 

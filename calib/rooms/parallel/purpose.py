@@ -94,7 +94,8 @@ def read_model(robot: ParallelMechanism, folder: Path | None, drives: str = "") 
     if folder is None:
         model = make_parallel_model(robot.known, (drives,), v0=0.05)
         return model, np.append(file_bodies(robot, model), np.zeros(len(model.terms)))
-    path, tree = folder / MODEL, robot.known.robot
+    path = folder / MODEL
+    tree = robot.known.robot
     table = read_table(folder)
     unreadable = f"{path} contains no model of a parallel robot ({{}}); give a folder of calib identify"
     with refused_as(RobotError, (ValueError, KeyError, TypeError, AttributeError), unreadable):
@@ -111,7 +112,8 @@ def read_model(robot: ParallelMechanism, folder: Path | None, drives: str = "") 
         model = replace(
             model, identical_legs=bool(table.get("identical_legs")), preload=tuple(map(float, table.get("preload", ())))
         )
-    if missing := [name for name in model.names[: model.inertial] if name not in known]:
+    missing = [name for name in model.names[: model.inertial] if name not in known]
+    if missing:
         raise RobotError(f"{path} is of another robot: parameter {missing[0]} is missing")
     return model, np.array([known.get(name, 0.0) for name in model.names])
 
@@ -171,15 +173,19 @@ def purpose_of(
 
     After an identification its own columns count; those of payloads that no load has rest on it alone.
     """
-    standard, covariance = model.names, None
+    standard = model.names
+    covariance = None
     if after is None:
         base = bases.find(model, loads=loads)
-        names, units, kept = base.names, base.units, base.kept
+        names = base.names
+        units = base.units
+        kept = base.kept
         chosen = base.transform @ values
     else:
         names, covariance = read_covariance(after)
         kept = np.array([standard.index(standard_name(name, standard)) for name in names])
-        units, chosen = tuple(model.units[k] for k in kept), values[kept]
+        units = tuple(model.units[k] for k in kept)
+        chosen = values[kept]
     exact, smooth = (
         LoadedPlatform(replace(model, terms=terms), kept, values, names=names, units=units, loads=loads)
         for terms in (model.terms, tuple(_smoothed(one) for one in model.terms))
@@ -192,7 +198,9 @@ def purpose_of(
 
 
 def _smoothed(one: DriveTerm) -> DriveTerm:
-    return replace(one, settings=(max(SMOOTH, one.settings[0]),)) if one.shape == "sign" else one
+    if one.shape == "sign":
+        return replace(one, settings=(max(SMOOTH, one.settings[0]),))
+    return one
 
 
 def foretold(found: Any, states: int = 400) -> Any:
@@ -200,9 +208,13 @@ def foretold(found: Any, states: int = 400) -> Any:
 
     States of the typical task are random: the platform in its box, actuators at up to half of their speeds.
     """
-    given, plan, known = found.inputs, cast(LoadedPlatform, found.plan), found.robot.known
+    given = found.inputs
+    plan = cast(LoadedPlatform, found.plan)
+    known = found.robot.known
     assert given.prior is not None and given.columns.sigmas is not None
-    robot, rng, sigmas = known.robot, np.random.default_rng([found.settings.seed, 3]), given.columns.sigmas
+    robot = known.robot
+    rng = np.random.default_rng([found.settings.seed, 3])
+    sigmas = given.columns.sigmas
     times = found.period / INSTANTS * np.arange(INSTANTS)
     Y = plan.regressor(*found.orders(times)) / sigmas[:, None]
     new = np.einsum("nri,nrj->ij", Y, Y, optimize=True) * (found.period / INSTANTS)
@@ -216,10 +228,8 @@ def foretold(found: Any, states: int = 400) -> Any:
     shares = [float(np.sqrt(np.mean((one / given.limits.bounds.torque) ** 2))) for one in torque]
     own = MotionPrediction(found.period, found.period, torque[1], shares[1])
     outlook = MotionOutlook(shares[0], torque[0], own, (), shares[0])
-    values, spread = (
-        cast(np.ndarray, plan.values)[plan.columns],
-        [np.linalg.norm(root, axis=1).tolist() for root in roots],
-    )
+    values = cast(np.ndarray, plan.values)[plan.columns]
+    spread = [np.linalg.norm(root, axis=1).tolist() for root in roots]
     rows = [
         PredictedSigma(name, unit, value or None, after, 100.0 * after / abs(value) if value else None, before)
         for name, unit, value, before, after in zip(plan.names, plan.units, values.tolist(), *spread)

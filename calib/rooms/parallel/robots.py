@@ -66,7 +66,8 @@ class ParallelMechanism:
 
     def model_table(self, dynamics: Dynamics[ParallelModel], base: Base, unit: str) -> dict[str, Any]:
         """Return the model as the content of ``dynamics.json``; `calib.rooms.parallel.purpose.read_model` reads it."""
-        from calib.dynamics.base import expressions  # slow to load, as are the others; finding a robot needs none
+        # slow to load, as are the others; finding a robot needs none
+        from calib.dynamics.base import expressions
         from calib.dynamics.shapes import V0
         from calib.folders import COVARIANCE as OF_PARAMETERS
         from calib.identification.model_file import regrouping
@@ -113,7 +114,10 @@ def find(robot: object) -> ParallelMechanism | None:
     if path is None:
         return None
     beside = path.with_name(COVARIANCE)
-    covariance = LoopCovariance(*read_covariance(beside)) if path.name == ROBOT and beside.is_file() else None
+    if path.name == ROBOT and beside.is_file():
+        covariance = LoopCovariance(*read_covariance(beside))
+    else:
+        covariance = None
     return ParallelMechanism(closed(parallel_robot.read(path)), path, covariance)
 
 
@@ -131,5 +135,6 @@ def refuse_unread(settings: Any, plain: Any, read: Collection[str], where: objec
     for each in fields(settings):
         value = getattr(settings, each.name)
         if each.name not in read and value is not False and value != getattr(plain, each.name):
-            place, shown = f"{where}: " if where else "", f" '{value}'" if isinstance(value, str) else ""
+            place = f"{where}: " if where else ""
+            shown = f" '{value}'" if isinstance(value, str) else ""
             raise UsageError(f"{place}{each.name}{shown} is for serial arms only, not for this kind of robot")

@@ -44,12 +44,15 @@ class Picture:
 
         A leg's line passes its joints, its end and its attachment: where the loop does not close, these are apart.
         """
-        robot, posture = self.known.robot, self.known.locate(q)
-        legs, ends = [], []
+        robot = self.known.robot
+        posture = self.known.locate(q)
+        legs = []
+        ends = []
         for leg, first in zip(robot.legs, robot.starts):
             own = posture.q[:, first : first + leg.chain.n]
             joints = joint_frames(leg.chain, own)[:, :, :3, 3].transpose(1, 0, 2)
-            end, held = forward(leg.chain, own)[:, :3, 3], (posture.pose @ leg.attachment)[:, :3, 3]
+            end = forward(leg.chain, own)[:, :3, 3]
+            held = (posture.pose @ leg.attachment)[:, :3, 3]
             legs.append(np.concatenate([joints, np.stack([end, held, posture.pose[:, :3, 3]], axis=1)], axis=1))
             ends.append(held)
         return [*legs, np.stack([*ends, ends[0]], axis=1)]
@@ -57,7 +60,10 @@ class Picture:
     def torque_rows(self, kind: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Return titles and units of the torque rows of an identification: platform, motor or power."""
         rows = rows_named(self.known, kind)
-        units = ("W",) if kind == "power" else rows.units([joint.kind == "prismatic" for joint in self.joints])
+        if kind == "power":
+            units = ("W",)
+        else:
+            units = rows.units([joint.kind == "prismatic" for joint in self.joints])
         return rows.titles(self.joint_names), units
 
     def measured(self, place: Path) -> tuple[np.ndarray, ...]:
@@ -67,10 +73,12 @@ class Picture:
         whether each was unseen (m,); rotation vectors from the calibrated to the measured orientation (m, 3) [rad], NaN
         where no angle was measured. Without measured coordinates all positions are the calibrated robot's.
         """
-        robot, table = self.known.robot, read_table(FitFolder(place).residuals)
+        robot = self.known.robot
+        table = read_table(FitFolder(place).residuals)
         q = np.column_stack([table.numbers(joint.name, "joint") for joint in robot.joints])
         calibrated = self.known.locate(q).pose
-        turned, places = np.full((len(q), 3), np.nan), [calibrated[:, :3, 3]] * 3
+        turned = np.full((len(q), 3), np.nan)
+        places = [calibrated[:, :3, 3]] * 3
         if robot.freedom[0] in table:
             at, after, before = (
                 np.column_stack([table.numbers(head + name, DIMENSIONS[name]) for name in robot.freedom])

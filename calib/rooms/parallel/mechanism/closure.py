@@ -92,7 +92,8 @@ def links_of(leg: Leg, q: np.ndarray, pose: np.ndarray) -> LegLinks:
     shapes = ((6, n), (n, leg.held), (leg.held, 6), (leg.held,), (3,))
     full, inverse, carried, gap, lever = (np.zeros((count, *shape)) for shape in shapes)
     bodies, tail = compiled(leg)
-    q, pose = (np.require(x, requirements=["C", "W"]) for x in (q, pose))  # numba compiles per kind of array
+    # numba compiles per kind of array
+    q, pose = (np.require(x, requirements=["C", "W"]) for x in (q, pose))
     closure_kernels.legs(
         bodies.links, bodies.constants, tail, leg.attachment, q, pose, full, inverse, carried, gap, lever
     )
@@ -107,9 +108,12 @@ def compiled(leg: Leg) -> tuple[Bodies, np.ndarray]:
     return bodies, frozen(turn.T @ leg.chain.tail)
 
 
-CLOSED = 1e-10  # gap and step [m or rad] below which a loop is closed
-BOUND = 0.5  # of one step [rad or m]
-SINGULAR = 1e-4  # reciprocal condition below which a posture is called singular (our choice)
+# gap and step [m or rad] below which a loop is closed
+CLOSED = 1e-10
+# of one step [rad or m]
+BOUND = 0.5
+# reciprocal condition below which a posture is called singular (our choice)
+SINGULAR = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,35 +163,41 @@ def closed(robot: ParallelRobot) -> ClosedRobot:
         RobotError: where a loop does not close there, home is singular, or the loops leave other freedoms than named.
     """
     start = Posture(np.concatenate([leg.home for leg in robot.legs])[None], robot.home[None])
-    for _ in range(10):  # each leg by itself, the platform at rest
+    # each leg by itself, the platform at rest
+    for _ in range(10):
         steps = [-times(one.inverse, one.gap) for one in leg_links(robot, start)]
         start = Posture(start.q + np.clip(np.concatenate(steps, axis=1), -BOUND, BOUND), start.pose)
     gap = max(float(np.abs(one.gap).max()) for one in leg_links(robot, start))
-    with suppress(NoPosture, np.linalg.LinAlgError):  # what the loops make of the platform's other coordinates
+    # what the loops make of the platform's other coordinates
+    with suppress(NoPosture, np.linalg.LinAlgError):
         if gap > CLOSED:
             free = ClosedRobot(robot, start, (), np.zeros(0), False)
             start = _newton(free, start, np.zeros((1, robot.r)), _from_coordinates)
     links = leg_links(robot, start)
     for leg, one in zip(robot.legs, links):
-        if (apart := float(np.abs(one.gap).max())) > 1e3 * CLOSED:
+        apart = float(np.abs(one.gap).max())
+        if apart > 1e3 * CLOSED:
             robot.refuse(
                 f"the loop of {leg.name} does not close at the platform's home: its end stays "
                 f"{1e3 * apart:.3g} mm (or mrad) from its attachment; check its home, base, attachment and lengths"
             )
-        if (rcond := float(_leg_rcond(one, one)[0])) < SINGULAR:
+        rcond = float(_leg_rcond(one, one)[0])
+        if rcond < SINGULAR:
             robot.refuse(f"{leg.name} {_why_singular(robot, start, leg)}: rcond {rcond:.1g}")
     minors = tuple(_best_rows(one.jacobian[0]) for one in links)
     fixed = _check_freedom(robot, start, links)
     opened = ClosedRobot(robot, start, minors, np.zeros(len(links) + 1), fixed)
     rows = _reading_rows(opened, links)
-    if (rcond := float(_platform_rcond(opened, rows, rows)[0])) < SINGULAR:
+    rcond = float(_platform_rcond(opened, rows, rows)[0])
+    if rcond < SINGULAR:
         robot.refuse(f"home is singular (type 2): locked actuators do not hold it, rcond {rcond:.1g}")
     return ClosedRobot(robot, start, minors, frozen(_determinants(opened, links)[0]), fixed)
 
 
 def _why_singular(robot: ParallelRobot, home: Posture, leg: Leg) -> str:
     """Return the reason why a leg is singular: at home only, or in all postures."""
-    rng, k = np.random.default_rng(0), robot.legs.index(leg)
+    rng = np.random.default_rng(0)
+    k = robot.legs.index(leg)
     elsewhere = [Posture(home.q + rng.uniform(-1.0, 1.0, home.q.shape), home.pose) for _ in range(4)]
     if all(float(_leg_rcond(one, one)[0]) < SINGULAR for one in (leg_links(robot, own)[k] for own in elsewhere)):
         return (
@@ -223,10 +233,12 @@ def twists(
     Args:
         shifts: (N, c) per leg, the right-hand side e in J q̇ = G t - e; None: zero.
     """
-    robot, count = known.robot, len(links[0].gap)
+    robot = known.robot
+    count = len(links[0].gap)
     if known.fixed:
         return np.broadcast_to(np.eye(6)[:, robot.selected], (count, 6, robot.r)), np.zeros((count, 6))
-    rows, right = [], []
+    rows = []
+    right = []
     for k, one in enumerate(links):
         across = np.eye(one.gap.shape[1]) - one.jacobian @ one.inverse
         rows.append(across @ one.carried)
@@ -254,7 +266,8 @@ def _check_postures(known: ClosedRobot, posture: Posture) -> None:
             actuators do not hold the platform).
     """
     links = leg_links(known.robot, posture)
-    home, signs = leg_links(known.robot, known.home), _determinants(known, links)
+    home = leg_links(known.robot, known.home)
+    signs = _determinants(known, links)
     for k, (leg, one, at_home) in enumerate(zip(known.robot.legs, links, home)):
         weak = _leg_rcond(one, at_home) < SINGULAR
         _refuse(known, posture, weak, f"{leg.name} is singular (type 1: stretched or folded)")
@@ -284,8 +297,10 @@ def _reached(known: ClosedRobot, goals: np.ndarray, own: np.ndarray, aim: _Aim, 
         return known.home[:0]
     if near is not None:
         return _newton(known, near, goals, aim)
-    every = 16  # samples of a record of which the first is reached from home, the others from it
-    max_stride = 0.25  # of a reading or coordinate between two solutions on the way from home [rad or m] (our choice)
+    # samples of a record of which the first is reached from home, the others from it
+    every = 16
+    # of a reading or coordinate between two solutions on the way from home [rad or m] (our choice)
+    max_stride = 0.25
     if len(goals) > 2 * every and np.abs(np.diff(goals, axis=0)).max() < max_stride / every:
         first = _reached(known, goals[::every], own, aim, None)
         nearest = np.minimum((np.arange(len(goals)) + every // 2) // every, len(first) - 1)
@@ -302,9 +317,11 @@ def _reached(known: ClosedRobot, goals: np.ndarray, own: np.ndarray, aim: _Aim, 
 
 def _newton(known: ClosedRobot, start: Posture, goals: np.ndarray, aim: _Aim, rough: bool = False) -> Posture:
     """Return the postures near `start` that meet the targets, by Newton's method (two steps if `rough`)."""
-    q, pose = np.array(start.q), np.array(start.pose)
+    q = np.array(start.q)
+    pose = np.array(start.pose)
     left = np.arange(len(q))
-    max_steps = 60  # Newton steps
+    # Newton steps
+    max_steps = 60
     for _ in range(2 if rough else max_steps):
         own = Posture(q[left], pose[left])
         links = leg_links(known.robot, own)
@@ -326,20 +343,19 @@ def _newton(known: ClosedRobot, start: Posture, goals: np.ndarray, aim: _Aim, ro
 
 def _tell_unreached(known: ClosedRobot, found: Posture, left: np.ndarray, max_rcond: float = 0.02) -> None:
     # max_rcond: the same, where Newton's steps fail: that explains it (our choice)
-    own, at_home = found[left[:1]], leg_links(known.robot, known.home)
+    own = found[left[:1]]
+    at_home = leg_links(known.robot, known.home)
     links = dict(zip((leg.name for leg in known.robot.legs), leg_links(known.robot, own)))
     worst = max(links, key=lambda name: float(np.abs(links[name].gap).max()))
     gap = 1e3 * float(np.abs(links[worst].gap).max())
     weak = [n for (n, one), home in zip(links.items(), at_home) if float(_leg_rcond(one, home)[0]) < max_rcond]
-    why = (
-        f"{worst} stays {gap:.3g} mm from its attachment: out of reach"
-        if gap > 1.0
-        else (
-            f"{weak[0]} is stretched or folded: a singularity (type 1), the end of its reach"
-            if weak
-            else "Newton's method does not converge: singularity (type 2) or contradictory readings"
-        )
-    )
+    if gap > 1.0:
+        why = f"{worst} stays {gap:.3g} mm from its attachment: out of reach"
+    else:
+        if weak:
+            why = f"{weak[0]} is stretched or folded: a singularity (type 1), the end of its reach"
+        else:
+            why = "Newton's method does not converge: singularity (type 2) or contradictory readings"
     more = f" ({len(left)} of {len(found)} samples)" if len(left) > 1 else ""
     raise NoPosture(
         f"sample {left[0] + 1}: the loops of '{known.robot.name}' cannot be closed (last try: platform at "
@@ -386,7 +402,8 @@ def _leg_rcond(one: LegLinks, home: LegLinks) -> np.ndarray:
 
 def _platform_rcond(known: ClosedRobot, rows: np.ndarray, home: np.ndarray) -> np.ndarray:
     """Return reciprocal conditions (N,) of J_p^inv; translations and rotations are scaled by their maxima at home."""
-    turns, size = known.robot.selected > 2, np.linalg.norm(home[0], axis=0)
+    turns = known.robot.selected > 2
+    size = np.linalg.norm(home[0], axis=0)
     scale = np.where(turns, size[turns].max(initial=0.0), size[~turns].max(initial=0.0))
     scaled = rows / scale / np.linalg.norm(home[0] / scale, axis=1)[:, None]
     return _rcond(scaled, pseudo_inverse(scaled))
@@ -419,8 +436,10 @@ def _check_freedom(robot: ParallelRobot, home: Posture, links: Sequence[LegLinks
     Raises:
         RobotError: for another number of freedoms than named, or names that do not distinguish them.
     """
-    named, fixed = np.eye(6)[:, robot.selected], True
-    rng, free = np.random.default_rng(0), ClosedRobot(robot, home, (), np.zeros(0), False)
+    named = np.eye(6)[:, robot.selected]
+    fixed = True
+    rng = np.random.default_rng(0)
+    free = ClosedRobot(robot, home, (), np.zeros(0), False)
     for trial in range(4):
         rows = [(np.eye(one.gap.shape[1]) - one.jacobian @ one.inverse) @ one.carried for one in links]
         values = np.linalg.svd(np.concatenate(rows, axis=1)[0])

@@ -37,12 +37,17 @@ from calib.rooms.parallel.mechanism.parallel_robot import COORDINATES, Leg, Para
 from calib.rooms.parallel.mechanism.velocities import loop_jacobians, preload_directions
 from calib.transforms import displace
 
-STEP = 1e-6  # of differences by a parameter [m or rad]
-OPENS = 1e-6  # of a parameter's effect on a gap that no joint and no freedom can follow (our choice)
+# of differences by a parameter [m or rad]
+STEP = 1e-6
+# of a parameter's effect on a gap that no joint and no freedom can follow (our choice)
+OPENS = 1e-6
 LIMIT = 30
-SPREAD = 0.01  # standard deviation of a parameter before anything is measured [m or rad] (our choice)
-LEFT_OUT = "left out"  # name of rows that folds of a fit left out in turn
-TOLERANCE = 1e-6  # of a column that no other explains, at unit norm: counts what the poses could tell
+# standard deviation of a parameter before anything is measured [m or rad] (our choice)
+SPREAD = 0.01
+# name of rows that folds of a fit left out in turn
+LEFT_OUT = "left out"
+# of a column that no other explains, at unit norm: counts what the poses could tell
+TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -52,7 +57,8 @@ class LoopParameter:
     name: str
     unit: str
     leg: int
-    part: str  # "element", "base" or "attachment"
+    # "element", "base" or "attachment"
+    part: str
     index: int
 
 
@@ -104,7 +110,8 @@ class LoopCovariance:
             RobotError: for a name that none of its loops has.
         """
         found = {one.name: one for one in loop_parameters(known)}
-        if missing := [name for name in self.names if name not in found]:
+        missing = [name for name in self.names if name not in found]
+        if missing:
             refuse_robot(known.robot.name, f"none of its loops has '{missing[0]}', which its covariance is of")
         return tuple(found[name] for name in self.names)
 
@@ -112,7 +119,8 @@ class LoopCovariance:
 def loop_parameters(known: ClosedRobot) -> tuple[LoopParameter, ...]:
     """Return the geometric constants of a robot that may change without opening a loop for good."""
     robot = known.robot
-    links, jacobians = leg_links(robot, known.home), loop_jacobians(known, known.home)
+    links = leg_links(robot, known.home)
+    jacobians = loop_jacobians(known, known.home)
     found = []
     for k, (leg, one) in enumerate(zip(robot.legs, links)):
         follows = np.hstack([one.jacobian[0], one.carried[0] @ jacobians.platform[0]])
@@ -155,8 +163,13 @@ def fit_loops(
             "measure platform poses"
         )
     parameters = tuple(one for one in loop_parameters(nominal) if one.name not in held)
-    count, known, square, before, std = len(parameters), nominal, np.inf, np.nan, np.nan
-    changes, W = np.zeros(count), np.zeros((0, count))
+    count = len(parameters)
+    known = nominal
+    square = np.inf
+    before = np.nan
+    std = np.nan
+    changes = np.zeros(count)
+    W = np.zeros((0, count))
     for iteration in range(1, LIMIT + 1):
         residual, W = _observed(known, readings, coordinates, parameters)
         rank = len(split_columns(W, tolerance=TOLERANCE).kept)
@@ -167,7 +180,8 @@ def fit_loops(
         std = float(np.sqrt(total / (len(residual) - rank)))
         if total < 1e-24 or (np.isfinite(square) and abs(square - total) <= loss * square):
             break
-        square, pull = total, max(std, 1e-12) / SPREAD
+        square = total
+        pull = max(std, 1e-12) / SPREAD
         rows = np.vstack([W, pull * np.eye(count)])
         changes = changes + np.linalg.lstsq(rows, np.concatenate([residual, -pull * changes]), rcond=None)[0]
         known = closed(changed(nominal.robot, parameters, changes))
@@ -230,13 +244,15 @@ def _observed(
         W[:, rows, p] = -times(inverse, _gap_slope(robot, posture, one))
     if coordinates is None:
         across = preload_directions(known, loop_jacobians(known, posture)).transpose(0, 2, 1)
-        residual, W = times(across, residual), across @ W
+        residual = times(across, residual)
+        W = across @ W
     return residual.ravel(), W.reshape(-1, len(parameters))
 
 
 def _gap_slope(robot: ParallelRobot, posture: Posture, one: LoopParameter) -> np.ndarray:
     """Return ∂gap/∂parameter (N, c) of the parameter's leg, by central differences."""
-    a, b = robot.starts[one.leg], robot.starts[one.leg + 1]
+    a = robot.starts[one.leg]
+    b = robot.starts[one.leg + 1]
     ends = []
     for step in (STEP, -STEP):
         leg = _changed_leg(robot.legs[one.leg], one, step)

@@ -67,7 +67,8 @@ def energy_columns(pose: np.ndarray, twist: np.ndarray, gravity: np.ndarray) -> 
     result = np.empty((len(R), 10))
     result[:, :6] = 0.5 * np.einsum("ni,nik->nk", w, _inertia_columns(w))
     down = np.einsum("nji,j->ni", R, gravity)
-    result[:, 6:9] = cross(u, w) - down  # u · (w × s) = s · (u × w)
+    # u · (w × s) = s · (u × w)
+    result[:, 6:9] = cross(u, w) - down
     result[:, 9] = 0.5 * np.sum(u**2, axis=1) - pose[:, :3, 3] @ gravity
     return result
 
@@ -89,7 +90,8 @@ def _inertia_columns(w: np.ndarray) -> np.ndarray:
     return result
 
 
-RATE = 3.0  # of random states: m/s or rad/s, and per s (as `IdentificationModel.sample`)
+# of random states: m/s or rad/s, and per s (as `IdentificationModel.sample`)
+RATE = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +120,8 @@ class ParallelModel:
         kinds = [(leg.bodies, [joint.kind for joint in leg.chain.joints]) for leg in legs]
         for leg, kind in zip(legs, kinds if self.identical_legs else ()):
             require(kind == kinds[0], f"identical_legs: {leg.name} is built unlike {legs[0].name}", UsageError)
-        if doubled := sorted({name for name in self.names if self.names.count(name) > 1}):
+        doubled = sorted({name for name in self.names if self.names.count(name) > 1})
+        if doubled:
             raise CalibError(f"parameter '{doubled[0]}' occurs twice; give the payload or term another name")
 
     @property
@@ -136,14 +139,17 @@ class ParallelModel:
     @cached_property
     def single(self) -> ParallelModel:
         """The model in which each leg has parameters of its own."""
-        return replace(self, identical_legs=False) if self.identical_legs else self
+        if self.identical_legs:
+            return replace(self, identical_legs=False)
+        return self
 
     @cached_property
     def _first(self) -> np.ndarray:
         """For each parameter of `single` (p_1,), which of them stands for it: itself, or the first leg's."""
         first = np.arange(self._bodies + len(self.terms))
         if self.identical_legs:
-            size, starts = self.legs[0][2].stop, self.known.robot.starts
+            size = self.legs[0][2].stop
+            starts = self.known.robot.starts
             first[: size * len(self.legs)] %= size
             inertias = [(one.joint, k) for k, one in enumerate(self.terms, self._bodies) if one.name.startswith("Ia")]
             motors = {joint: k for joint, k in inertias if joint is not None}
@@ -261,7 +267,8 @@ class ParallelModel:
 
     def platform_regressor(self, motion: LoopMotion, carried: Collection[str] | None = None) -> np.ndarray:
         """Return the regressor W (N, r, p) in platform coordinates, stored in the order (p, r, N)."""
-        robot, J = self.known.robot, motion.jacobians
+        robot = self.known.robot
+        J = motion.jacobians
         out = np.zeros((self._bodies + len(self.terms), robot.r, len(motion.v)))
         for bodies, joints, columns in self.legs:
             W = rigid_body.regressor(bodies, motion.posture.q[:, joints], motion.v[:, joints], motion.a[:, joints])
@@ -279,7 +286,8 @@ class ParallelModel:
         self, values: np.ndarray, motion: LoopMotion, carried: Collection[str] | None = None
     ) -> np.ndarray:
         """Return the forces and moments (N, r) in platform coordinates for parameters (p,)."""
-        robot, J = self.known.robot, motion.jacobians
+        robot = self.known.robot
+        J = motion.jacobians
         tree = self.tree_torque(values, motion)
         fixed = self.platform_parameters(values, carried)
         wrench = wrench_regressor(motion.posture.pose, motion.twist, motion.change, robot.gravity) @ fixed
@@ -354,7 +362,10 @@ class ParallelModel:
         for i, (own, kind) in enumerate(zip(order, kinds)):
             last = KEPT_LAST["prismatic" if kind == PRISMATIC else "revolute"]
             for c in range(10):
-                rank = "late" if c in last or c == 9 else "moments" if c > 5 else "inertias"
+                if c in last or c == 9:
+                    rank = "late"
+                else:
+                    rank = "moments" if c > 5 else "inertias"
                 ranks[rank].append(10 * i + int(own[c]))
         platform = 10 * len(order)
         drive = range(self._bodies, self._bodies + len(self.terms))
@@ -365,7 +376,8 @@ class ParallelModel:
 
     def plant(self, values: np.ndarray, terms: Sequence[DriveTerm] = ()) -> Any:
         """Return the robot to simulate with values of its parameters and of further terms of the actuated joints."""
-        from calib.rooms.parallel.mechanism.simulation import ParallelPlant  # stands on this module
+        # stands on this module
+        from calib.rooms.parallel.mechanism.simulation import ParallelPlant
 
         joints = [int(self.known.robot.actuated[one.acts[0][0]]) for one in terms]
         own = (replace(one, acts=((j, ((j, 1.0),)),)) for one, j in zip(terms, joints))
@@ -480,7 +492,8 @@ def _to_platform(known: ClosedRobot, q: np.ndarray, v: np.ndarray) -> np.ndarray
     return loop_jacobians(known, known.locate(q)).readings.transpose(0, 2, 1)
 
 
-STEPS = (1e-6, 1e-3, 1.0)  # of the differences by x, v and a
+# of the differences by x, v and a
+STEPS = (1e-6, 1e-3, 1.0)
 
 
 def along(known: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> LoopMotion:
@@ -510,7 +523,8 @@ def _twist_of(known: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarray) -
     return full[1][:, selected], full[2][:, selected]
 
 
-@lru_cache(maxsize=4)  # of a search, whose objectives and limits all ask for the same motion and for those beside it
+# of a search, whose objectives and limits all ask for the same motion and for those beside it
+@lru_cache(maxsize=4)
 def _moving(known: ClosedRobot, *motion: bytes) -> LoopMotion:
     """Return the motion of all joints for x, v, a (N, r) of the platform."""
     x, v, a = (np.frombuffer(one).reshape(-1, known.robot.r) for one in motion)
@@ -520,7 +534,8 @@ def _moving(known: ClosedRobot, *motion: bytes) -> LoopMotion:
 @lru_cache(maxsize=4)
 def _beside(known: ClosedRobot, *motion: bytes) -> list[tuple[LoopMotion, LoopMotion]]:
     """Return the motions of all joints beside x, v, a (N, r): each of their columns raised and lowered by its step."""
-    given, result = [np.frombuffer(one).reshape(-1, known.robot.r) for one in motion], []
+    given = [np.frombuffer(one).reshape(-1, known.robot.r) for one in motion]
+    result = []
     near = _moving(known, *motion).posture
     still = loop_jacobians(known, near)
     for order, step in enumerate(STEPS):
@@ -593,7 +608,8 @@ class PlatformRegressor:
         Args:
             of: the motion of N samples -> values (N, ...); weights: of the same shape.
         """
-        within, result = self._reachable(x), np.empty((3, *x.shape))
+        within = self._reachable(x)
+        result = np.empty((3, *x.shape))
         found = _beside(self.model.known, *(one.tobytes() for one in (within, v, a)))
         for k, (raised, lowered) in enumerate(found):
             order, j = divmod(k, x.shape[1])

@@ -73,7 +73,8 @@ class Leg(Frozen):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        place, n = f"leg '{self.name}'", self.chain.n
+        place = f"leg '{self.name}'"
+        n = self.chain.n
         if self.end not in ENDS:
             refuse_robot(place, f"its end '{self.end}' is neither {' nor '.join(ENDS)}")
         if self.home.shape != (n,):
@@ -127,13 +128,15 @@ class ParallelRobot(Frozen):
     upper: np.ndarray
     platform: np.ndarray | None = None
     gravity: np.ndarray = field(default_factory=lambda: np.array(GRAVITY))
-    links = ()  # names of a URDF's, which there is none of
+    # names of a URDF's, which there is none of
+    links = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
         freedom = ", ".join(self.freedom)
         names = [leg.name for leg in self.legs]
-        if twice := sorted({name for name in names if names.count(name) > 1}):
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
             self.refuse(f"two legs are called '{twice[0]}'")
         if not freedom or not set(self.freedom) <= set(COORDINATES) or len(set(self.freedom)) < self.r:
             self.refuse(
@@ -252,7 +255,8 @@ def _from_table(table: Mapping[str, Any], where: str) -> ParallelRobot:
             where, f'kind is {shown(table.get("kind"))}; for a robot with legs and a platform state kind = "parallel"'
         )
     gravity = vector(table.get("gravity", list(GRAVITY)), 3, f"{where}, gravity")
-    own, place = table.get("platform"), f"{where}, [platform]"
+    own = table.get("platform")
+    place = f"{where}, [platform]"
     if not isinstance(own, Mapping):
         refuse_robot(where, "no [platform] table found")
     check_keys(own, _PLATFORM, place)

@@ -71,7 +71,8 @@ def of_platform(
     found = jacobians or loop_jacobians(known, posture)
     v = np.einsum("ntr,nr->nt", found.joints, rate)
     twist = np.einsum("nkr,nr->nk", found.platform, rate)
-    shifts, starts = [], known.robot.starts
+    shifts = []
+    starts = known.robot.starts
     for one, a, b in zip(found.links, starts, starts[1:]):
         shifts.append(_end_bias(one, v[:, a:b]) - _attachment_bias(one, twist))
     _, still = twists(known, found.links, shifts)
@@ -113,9 +114,11 @@ def _end_bias(one: LegLinks, v: np.ndarray) -> np.ndarray:
     The columns [v_j; ω_j] of the Jacobian are those of axes fixed in link j - 1, see
     `calib.robot.kinematics.twist_product`.
     """
-    w, result = np.zeros((len(v), 3)), np.zeros(one.full.shape[:2])
+    w = np.zeros((len(v), 3))
+    result = np.zeros(one.full.shape[:2])
     for j in range(v.shape[1]):
-        moved, turned = one.full[:, :3, j] * v[:, j : j + 1], one.full[:, 3:, j] * v[:, j : j + 1]
+        moved = one.full[:, :3, j] * v[:, j : j + 1]
+        turned = one.full[:, 3:, j] * v[:, j : j + 1]
         result[:, :3] += cross(2.0 * w + turned, moved)
         result[:, 3:] += cross(w, turned)
         w = w + turned
