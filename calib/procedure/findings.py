@@ -70,11 +70,11 @@ class Verdict:
         advice = _filled(catalogue()[worst.code].advice, worst.values)
         return cls(level_of(worst), "; ".join(parts), worst.code, advice)
 
-    def for_prediction(self, why: str) -> Verdict:
+    def for_prediction(self, reason: str) -> Verdict:
         """Return the verdict of a model that cannot be exported for the reason `why`: pass becomes prediction only."""
         if self.level != "pass":
             return self
-        return Verdict(PREDICTION_ONLY, f"{self.reason}; {why}")
+        return Verdict(PREDICTION_ONLY, f"{self.reason}; {reason}")
 
 
 UNJUDGED = Verdict("", "judged by the session on unseen rows: see verdict.json in the session's folder")
@@ -110,7 +110,9 @@ class Verdicts:
         level = self.level
         reasons = [f"{stage}: {verdict.reason}" for stage, verdict in self.stages.items() if verdict.level == level]
         text = f"verdict {level}: {'; '.join(reasons)}"
-        return f"{text}; do not use" if level == "fail" else text
+        if level == "fail":
+            text += "; do not use"
+        return text
 
     def table(self) -> dict[str, Any]:
         """Return the worst verdict, and each stage's verdict and reason, as a table for JSON."""
@@ -242,8 +244,8 @@ def explain(code: str) -> str:
         meaning = terms.get(code.lower())
         if meaning:
             return meaning
-        near = suggestion(code, [*catalogue(), *glossary()])
-        raise UsageError(f"no finding or term is called '{code}'{near}; `calib explain` lists all")
+        hint = suggestion(code, [*catalogue(), *glossary()])
+        raise UsageError(f"no finding or term is called '{code}'{hint}; `calib explain` lists all")
     parts = [entry.says, f"level: {levels(entry)}", entry.means, entry.advice]
     if entry.accept:
         parts.append(f'accept = ["{entry.accept}"] in the options file lets the verdict pass')
@@ -267,8 +269,12 @@ class _Printer(Formatter):
     def format_field(self, value: Any, format_spec: str) -> str:
         number, _, unit = format_spec.partition(" ")
         if isinstance(value, list | tuple):
-            return listing(value, int(number)) if number else listing(value)
+            if number:
+                return listing(value, int(number))
+            return listing(value)
         if unit:
             value = value * UNITS.get(unit, 1.0)
-        separator = "" if unit in ("", "°") else " "
-        return format(value, number) + separator + unit
+        text = format(value, number)
+        if unit in ("", "°"):
+            return text + unit
+        return f"{text} {unit}"

@@ -116,7 +116,7 @@ def keys(topic: str) -> Iterator[tuple[str, str, str, str]]:
     return _keys(table, table.get("$defs", {}))
 
 
-def _keys(table: Mapping[str, Any], tables: Mapping[str, Any], place: str = "") -> Iterator[tuple[str, str, str, str]]:
+def _keys(table: Mapping[str, Any], tables: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str, str, str]]:
     for key, value in table.get("properties", {}).items():
         # the same keys, for one file
         if key == "files":
@@ -125,10 +125,12 @@ def _keys(table: Mapping[str, Any], tables: Mapping[str, Any], place: str = "") 
         reference = str(inner.get("$ref", value.get("$ref", "")))
         named_table = tables.get(reference.rpartition("/")[2])
         if named_table:
-            yield from _keys(named_table, tables, f"{place}{key}.")
+            yield from _keys(named_table, tables, f"{prefix}{key}.")
             continue
-        default = json.dumps(value["default"]) if "default" in value else ""
-        yield place + key, _allowed(value), default, value.get("description", "")
+        default = ""
+        if "default" in value:
+            default = json.dumps(value["default"])
+        yield prefix + key, _allowed(value), default, value.get("description", "")
 
 
 def _allowed(value: Mapping[str, Any]) -> str:
@@ -144,7 +146,7 @@ def _allowed(value: Mapping[str, Any]) -> str:
     if isinstance(kinds, str):
         kinds = [kinds]
     parts = [" or ".join(_KINDS.get(kind, kind) for kind in kinds)]
-    parts += [f"{word} {value[key]:g}" for key, word in _BOUNDS.items() if key in value]
+    parts += [f"{bound} {value[key]:g}" for key, bound in _BOUNDS.items() if key in value]
     return " ".join(parts)
 
 

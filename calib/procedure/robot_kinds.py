@@ -92,9 +92,9 @@ def mechanism(robot: object) -> Mechanism | None:
     if isinstance(robot, Mechanism):
         return robot
     for find in ROBOTS.all():
-        named = find(robot)
-        if named is not None:
-            return named
+        machine = find(robot)
+        if machine is not None:
+            return machine
     return None
 
 
@@ -113,7 +113,9 @@ def stage_of(robot: object, verb: str, base: str | None = None, tip: str | None 
     stages: Mapping[str, Stage] = merged(STAGES)[machine.kind]
     if verb not in stages:
         advice = machine.instead.get(verb, f"{', '.join(stages)} take it")
-        name = robot if isinstance(robot, (str, Path)) else machine.source
+        name = machine.source
+        if isinstance(robot, (str, Path)):
+            name = robot
         raise UsageError(f"{name} is a {machine.kind}, and {verb} is for serial arms only; {advice}")
     for key, link in (("base", base), ("tip", tip)):
         if link:
@@ -137,10 +139,7 @@ def _run(run: Callable[..., Any], machine: Mechanism, *args: Any, **options: Any
 
 def joints_of(chain: Any) -> Joints:
     """Return the names and limits of the joints of an arm or mechanism, for checking measurements and recordings."""
-    return Joints(
-        chain.joint_names,
-        tuple(joint_kinds(chain)),
-        np.array([joint.lower for joint in chain.joints]),
-        np.array([joint.upper for joint in chain.joints]),
-        np.array([joint.effort for joint in chain.joints]),
-    )
+    lower = np.array([joint.lower for joint in chain.joints])
+    upper = np.array([joint.upper for joint in chain.joints])
+    effort = np.array([joint.effort for joint in chain.joints])
+    return Joints(chain.joint_names, tuple(joint_kinds(chain)), lower, upper, effort)

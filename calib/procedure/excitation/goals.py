@@ -52,11 +52,13 @@ def objectives_of(
         if len(inputs.columns.aimed_names) == 1:
             raise UsageError("columns: a single parameter has no condition number; add --goal parameters")
         return tuple((replace(condition, scaling=scaling), 0.5) for scaling in SCALINGS)
-    stated = (*settings.goals, *settings.hard)
-    of_parameters = [text for text in stated if text.partition("=")[0] in (*SCALINGS, *AIMS)]
+    texts = (*settings.goals, *settings.hard)
+    of_parameters = [text for text in texts if text.partition("=")[0] in (*SCALINGS, *AIMS)]
     if len(of_parameters) > 1:
         raise UsageError(f"goals {', '.join(of_parameters)}: '{aims[0]}' replaces the others; leave them out")
-    aim = aims[0] if aims else AIMS[0]
+    aim = AIMS[0]
+    if aims:
+        aim = aims[0]
     if aim in get_args(Index):
         return ((replace(condition, index=cast(Index, aim)), 1.0),)
     return ((_predicted(aim, settings, condition, inputs), 1.0),)

@@ -27,8 +27,8 @@ def split_goal(text: str) -> tuple[str, float]:
     with refused_as(UsageError, ValueError, expected):
         value = float(amount)
     if name not in GOALS and not re.fullmatch(r"joint[1-9]\d*", name):
-        words = f"use {', '.join(GOALS)}, joint1 …, each with its number, or {' or '.join(AIMS)}"
-        raise UsageError(f"goal '{text}': '{name}' is unknown; {words}")
+        advice = f"use {', '.join(GOALS)}, joint1 …, each with its number, or {' or '.join(AIMS)}"
+        raise UsageError(f"goal '{text}': '{name}' is unknown; {advice}")
     return name, value
 
 

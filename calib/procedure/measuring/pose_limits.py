@@ -87,21 +87,21 @@ class Limits:
             sight: False leaves out what it takes to be seen, to tell what that costs.
         """
         # constraints that are quick to compute, and exclude most, come first
-        kept = [*self.constraints]
+        constraints = [*self.constraints]
         if sight:
-            kept += self.views
+            constraints += self.views
             if self.sight is not None:
-                kept += self.sight.constraints()
+                constraints += self.sight.constraints()
         if self.collision is not None and self.collision.pairs:
             shortfall = partial(_shortfall, self.collision, self.clearance)
             gradient = partial(_shortfall_gradient, self.collision)
-            kept.append(PoseConstraint("collision", shortfall, gradient))
+            constraints.append(PoseConstraint("collision", shortfall, gradient))
         rows: Observation | SeenOnly = observation
         targets = () if self.sight is None else self.sight.targets
         if self.sight is not None and sight and len(targets) > 1 and observation.product is not None:
             # rows of several targets count where these are seen
             rows = SeenOnly(observation, self.sight)
-        return SearchSpace(rows, self.lower, self.upper, rows.product, tuple(kept))
+        return SearchSpace(rows, self.lower, self.upper, rows.product, tuple(constraints))
 
 
 def _shortfall(model: Any, clearance: float, q: np.ndarray) -> np.ndarray:
@@ -132,12 +132,14 @@ def read_limits(
     if unknown:
         raise UsageError(f"without {unknown[0]}: expected one of {', '.join(names)}")
     content, name = tables_of(tables, cell.chain, source, "constraints")
-    stated, where = read(ConstraintsFile, content, name, constraints_file.MOTION)
-    limits = limits_of(stated, cell, source, where, without)
-    if stated.camera is None:
+    settings, where = read(ConstraintsFile, content, name, constraints_file.MOTION)
+    limits = limits_of(settings, cell, source, where, without)
+    if settings.camera is None:
         return limits
-    folder = tables.parent if isinstance(tables, Path) else Path()
-    return _with_camera(limits, stated.camera, cell, where, folder, {*stated.without, *without})
+    folder = Path()
+    if isinstance(tables, Path):
+        folder = tables.parent
+    return _with_camera(limits, settings.camera, cell, where, folder, {*settings.without, *without})
 
 
 def tables_of(tables: Tables | None, chain: Chain, source: Path | None, name: str) -> tuple[Tables | None, str]:
@@ -158,17 +160,19 @@ def tables_of(tables: Tables | None, chain: Chain, source: Path | None, name: st
 
 
 def _with_camera(
-    limits: Limits, stated: CameraTable, cell: Installation, where: str, folder: Path, absent: set[str]
+    limits: Limits, camera: CameraTable, cell: Installation, where: str, folder: Path, absent: set[str]
 ) -> Limits:
     """Return the limits with the camera's view of the board added, if camera and board are known."""
     unchecked = tuple(name for name in limits.unchecked if not name.startswith("line of sight"))
-    if stated.unknown:
-        name = f"{constraints_file.VIEW_UNCHECKED} (not known: {', '.join(stated.unknown)})"
+    if camera.unknown:
+        name = f"{constraints_file.VIEW_UNCHECKED} (not known: {', '.join(camera.unknown)})"
         return replace(limits, unchecked=(*unchecked, name))
     with refused_as(UsageError, RobotError, "{}"):
-        view = CAMERA_VIEW.one()(stated, cell.chain, where, folder)
+        view = CAMERA_VIEW.one()(camera, cell.chain, where, folder)
     arm = replace(view.cell, stations=np.eye(4)[None])
-    model = None if "view" in absent else limits.collision
+    model = limits.collision
+    if "view" in absent:
+        model = None
     sight = sight_of(arm, view.stand, [[0.0, 0.0, 1.0]], None, (0.0, np.inf), model)
     views = [view.constraint()]
     checked = [*limits.checked, "the whole board in the camera's view, its range and its tilt"]
@@ -179,29 +183,31 @@ def _with_camera(
 
 
 def limits_of(
-    stated: ConstraintsFile,
+    settings: ConstraintsFile,
     cell: Installation,
     source: Path | None = None,
     where: str = "constraints",
     without: Sequence[str] = (),
-    seen: bool = True,
+    measured: bool = True,
 ) -> Limits:
     """Return the pose limits of an arm from the content of a constraints file; see `read_limits`.
 
     Args:
-        seen: False for motions, which nothing measures: no lines of sight.
+        measured: False for motions, which nothing measures: no lines of sight.
     """
-    absent = {*stated.without, *without}
-    collision = stated.collision or CollisionTable()
+    absent = {*settings.without, *without}
+    collision = settings.collision or CollisionTable()
     with refused_as(UsageError, RobotError, "{}"):
-        margin = 0.0 if "joint-margin" in absent else _joint_margin(stated.joints, where)
-        lower, upper, joint_notes = _joints(stated.joints, cell, where, margin)
-        model, collision_checks, collision_notes, collision_unchecked = _collision(stated, cell, source, where, absent)
-        constraints_of_target = (*_target(stated, cell), *_orientation(stated, cell, where))
+        margin = 0.0
+        if "joint-margin" not in absent:
+            margin = _joint_margin(settings.joints, where)
+        lower, upper, joint_notes = _joints(settings.joints, cell, where, margin)
+        model, checks, collision_notes, not_checked = _collision(settings, cell, source, where, absent)
+        constraints_of_target = (*_target(settings, cell), *_orientation(settings, cell, where))
         sight = None
-        if seen:
-            sight = _sight(stated, cell, where, None if "view" in absent else model)
-    checked = [*collision_checks]
+        if measured:
+            sight = _sight(settings, cell, where, None if "view" in absent else model)
+    checked = [*checks]
     if margin:
         checked.insert(0, f"{100 * margin:g} % of each joint's range to its limits")
     if sight is not None:
@@ -217,24 +223,25 @@ def limits_of(
         clearance=collision.margin,
         sight=sight,
         checked=tuple(checked),
-        unchecked=(*_unchecked(stated, absent, seen), *collision_unchecked),
+        unchecked=(*_unchecked(settings, absent, measured), *not_checked),
     )
 
 
-def _unchecked(stated: ConstraintsFile, absent: set[str], seen: bool) -> tuple[str, ...]:
-    """Return the names of the limits that are not checked, for poses (if `seen`) or for motions."""
-    instrument = stated.instrument or InstrumentTable()
-    collision = stated.collision or CollisionTable()
+def _unchecked(settings: ConstraintsFile, absent: set[str], measured: bool) -> tuple[str, ...]:
+    """Return the names of the limits that are not checked, for poses (if `measured`) or for motions."""
+    instrument = settings.instrument or InstrumentTable()
+    collision = settings.collision or CollisionTable()
     placed = bool(instrument.stated)
+    no_instrument = not placed and "instrument" not in absent
     missing = {
         "margin to the joint limits (switched off)": "joint-margin" in absent,
         "self-collision (switched off)": "self-collision" in absent,
         "floor (switched off)": "floor" in absent and collision.floor is None,
-        "line of sight (the instrument's position is not known)": seen and not placed and "instrument" not in absent,
-        "cone of acceptance of the target (not known)": seen and placed and instrument.sight is None,
-        "links in the line of sight (switched off)": seen and placed and "view" in absent,
+        "line of sight (the instrument's position is not known)": measured and no_instrument,
+        "cone of acceptance of the target (not known)": measured and placed and instrument.sight is None,
+        "links in the line of sight (switched off)": measured and placed and "view" in absent,
         "walls of the cell (not known)": collision.box is None and "box" not in absent,
-        "obstacles (not known)": not stated.obstacle and "obstacles" not in absent,
+        "obstacles (not known)": not settings.obstacle and "obstacles" not in absent,
     }
     return tuple(name for name, is_missing in missing.items() if is_missing)
 
@@ -263,22 +270,22 @@ def _joints(
         if name == "margin" and name not in index:
             continue
         j = index[name]
-        place = f"{where}: joints.{name}"
+        key = f"{where}: joints.{name}"
         if not isinstance(span, tuple):
-            raise UsageError(f"{place}: expected a list of 2 numbers, lower and upper, found {span}")
+            raise UsageError(f"{key}: expected a list of 2 numbers, lower and upper, found {span}")
         revolute = chain.joints[j].unit != "m"
-        low, high = _span(span, place, "angle" if revolute else "length")
+        low, high = _span(span, key, "angle" if revolute else "length")
         # a range in degrees that was written without its unit
         in_degrees = revolute and max(-low, high) > MAX_TURN
         if in_degrees:
-            notes.append(f'{place}: {low:g} to {high:g} rad; if in degrees, write ["{low:g} deg", "{high:g} deg"]')
+            notes.append(f'{key}: {low:g} to {high:g} rad; if in degrees, write ["{low:g} deg", "{high:g} deg"]')
         joint_low, joint_high = chain.lower[j], chain.upper[j]
         wider = low <= joint_low and high >= joint_high and (low, high) != (joint_low, joint_high)
         if wider and not in_degrees:
-            notes.append(f"{place}: {low:g} to {high:g} has no effect: the joint has {joint_low:g} to {joint_high:g}")
+            notes.append(f"{key}: {low:g} to {high:g} has no effect: the joint has {joint_low:g} to {joint_high:g}")
         lower[j] = max(lower[j], low)
         upper[j] = min(upper[j], high)
-        require(lower[j] < upper[j], f"{place}: the range {lower[j]:g} to {upper[j]:g} is empty", UsageError)
+        require(lower[j] < upper[j], f"{key}: the range {lower[j]:g} to {upper[j]:g} is empty", UsageError)
     return lower, upper, tuple(notes)
 
 
@@ -291,8 +298,8 @@ def _span(value: tuple[Any, Any], where: str, quantity: str) -> tuple[float, flo
     return low, high
 
 
-def _target(stated: ConstraintsFile, cell: Installation) -> list[PoseConstraint]:
-    table = stated.target
+def _target(settings: ConstraintsFile, cell: Installation) -> list[PoseConstraint]:
+    table = settings.target
     target = Target(cell)
     jacobian = TargetJacobian(cell)
     result = []
@@ -306,8 +313,8 @@ def _target(stated: ConstraintsFile, cell: Installation) -> list[PoseConstraint]
     return result
 
 
-def _orientation(stated: ConstraintsFile, cell: Installation, where: str) -> list[PoseConstraint]:
-    table, where = stated.instrument, f"{where}: instrument"
+def _orientation(settings: ConstraintsFile, cell: Installation, where: str) -> list[PoseConstraint]:
+    table, where = settings.instrument, f"{where}: instrument"
     if table is None or (table.roll is None and table.pitch is None):
         return []
     stand = placement(table.stated, where)
@@ -316,12 +323,12 @@ def _orientation(stated: ConstraintsFile, cell: Installation, where: str) -> lis
     return [constraints.orientation(Target(cell), stand[:3, :3], roll, pitch, TargetJacobian(cell))]
 
 
-def _sight(stated: ConstraintsFile, cell: Installation, where: str, model: Any) -> Sight | None:
+def _sight(settings: ConstraintsFile, cell: Installation, where: str, model: Any) -> Sight | None:
     """Return the lines of sight: cone and range if given, and no link of the arm in between.
 
     An instrument with roll and pitch alone is a camera whose view these state.
     """
-    table, facing = stated.instrument, stated.target.facing
+    table, facing = settings.instrument, settings.target.facing
     if table is None:
         return None
     is_camera = table.roll is not None or table.pitch is not None
@@ -338,15 +345,15 @@ def _sight(stated: ConstraintsFile, cell: Installation, where: str, model: Any) 
 
 
 def _collision(
-    stated: ConstraintsFile, cell: Installation, source: Path | None, where: str, absent: set[str]
+    settings: ConstraintsFile, cell: Installation, source: Path | None, where: str, absent: set[str]
 ) -> tuple[Any, tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
     """Return the collision model, the names of its checks, notes, and what it does not check."""
-    table = stated.collision or CollisionTable()
+    table = settings.collision or CollisionTable()
     floor = table.floor
     if floor is None and "floor" not in absent:
         floor = cell.chain.floor
     obstacles = []
-    for k, obstacle in enumerate(stated.obstacle, 1):
+    for k, obstacle in enumerate(settings.obstacle, 1):
         T_base_obstacle = placement(obstacle.stated, f"{where}: [[obstacle]] number {k}")
         obstacles.append(Obstacle(obstacle.name, obstacle.kind, obstacle.size, T_base_obstacle))
     walls = _walls(table.box, f"{where}: collision.box")
@@ -478,23 +485,23 @@ def _model(
     return model, shapes, notes, unchecked
 
 
-def _posture(stated: Mapping[str, Any], chain: Chain, source: Path | None) -> dict[str, float]:
+def _posture(values: Mapping[str, Any], chain: Chain, source: Path | None) -> dict[str, float]:
     """Return the values [rad or m] of joints outside the arm.
 
     Raises:
         RobotError: for a joint of the arm, or one that its URDF does not have.
     """
-    if not stated:
+    if not values:
         return {}
     urdf = _description(source, chain)
     if urdf is None:
         raise RobotError("collision.posture: the links outside the arm are not known; give the URDF as the robot")
     joints = read_tree(text(urdf)[0], str(urdf)).joints
     actuated = [joint.name for joint in joints.values() if joint.actuated]
-    outside = [name for name in actuated if name not in chain.joint_names]
+    outside_joints = [name for name in actuated if name not in chain.joint_names]
     posture: dict[str, float] = {}
-    for name, value in stated.items():
-        one_of(name, outside, "collision.posture: joint outside the arm", RobotError)
+    for name, value in values.items():
+        one_of(name, outside_joints, "collision.posture: joint outside the arm", RobotError)
         quantity = "length" if joints[name].kind == "prismatic" else "angle"
         posture[name] = number(value, f"collision.posture: {name}", quantity)
     return posture

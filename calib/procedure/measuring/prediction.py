@@ -112,11 +112,13 @@ def predicted(
         root = np.full((parameter_count, 1), np.inf)
         spread = np.full(len(typical), np.inf)
     parameters = layout(observation.cell)
+    names = tuple(parameters.names[k] for k in observation.free)
+    units = tuple(parameters.units[k] for k in observation.free)
     return Prediction(
         joints=observation.cell.chain.joint_names,
         poses=len(jacobians) if poses is None else poses,
-        names=tuple(parameters.names[k] for k in observation.free),
-        units=tuple(parameters.units[k] for k in observation.free),
+        names=names,
+        units=units,
         sigmas=np.linalg.norm(root, axis=1),
         points=points,
         spread=spread,

@@ -122,13 +122,13 @@ class Run:
     @property
     def found_ways(self) -> Ways:
         """The collision-free paths, keyed by the input numbers of start and end pose."""
-        ways = {}
+        clear_ways = {}
         for k, (start, end) in enumerate(pairwise(self.order)):
             if k in self.blocked:
                 continue
             path = self.ways[k]
-            ways[_pair(start, end)] = path if start < end else path[::-1]
-        return ways
+            clear_ways[_pair(start, end)] = path if start < end else path[::-1]
+        return clear_ways
 
     @property
     def cut_off(self) -> tuple[int, ...]:
@@ -180,10 +180,10 @@ def plan_run(
     show("checking moves for collisions")
     cost = np.where(_clear_at_places(room, q), 1.0, BLOCKED) * seconds(q[:, None], q)
     # a pair of poses -> its clear way; None where none was found
-    ways: dict[tuple[int, int], np.ndarray | None] = {}
+    clear_ways_of: dict[tuple[int, int], np.ndarray | None] = {}
 
     def enter(pair: tuple[int, int], path: np.ndarray | None) -> None:
-        ways[pair] = path
+        clear_ways_of[pair] = path
         cost[pair] = cost[pair[::-1]] = FORBIDDEN if path is None else duration(path)
 
     for (start, end), path in (clear or {}).items():
@@ -192,35 +192,38 @@ def plan_run(
     for tries in (*[WAY_TRIES] * ROUNDS, LAST_WAY_TRIES):
         order = tour(cost)
         pairs = [_pair(start, end) for start, end in pairwise(order)]
-        searched = [pair for pair in pairs if ways.get(pair) is None]
+        searched = [pair for pair in pairs if clear_ways_of.get(pair) is None]
         for number, (start, end) in enumerate(searched, 1):
             show(f"path {number} of {len(searched)}")
             enter((start, end), way(room, q[start], q[end], seed=seed + number, most=tries))
-        if all(ways[pair] is not None for pair in pairs):
+        if all(clear_ways_of[pair] is not None for pair in pairs):
             break
     else:
         # no order has clear ways alone: go by way of third poses
-        clear_ways = {pair: path for pair, path in ways.items() if path is not None}
+        clear_ways = {pair: path for pair, path in clear_ways_of.items() if path is not None}
         order, joined_ways = _joined(clear_ways, cost)
-        ways = dict.fromkeys(ways) | joined_ways
+        clear_ways_of = dict.fromkeys(clear_ways_of) | joined_ways
 
     paths: list[np.ndarray] = []
     blocked = []
+    around = 0
     for number, (start, end) in enumerate(pairwise(order)):
-        path = ways.get(_pair(start, end))
+        path = clear_ways_of.get(_pair(start, end))
         if path is None:
             blocked.append(number)
             path = q[[start, end]]
         elif start > end:
             path = path[::-1]
         paths.append(path)
+        if len(path) > 2:
+            around += 1
     return Run(
         order=order,
         ways=tuple(paths),
         times=np.array([duration(path) for path in paths]),
         dwell=settings.dwell,
         found=float(duration(q)) + settings.dwell * len(q),
-        around=sum(len(path) > 2 for path in paths),
+        around=around,
         blocked=tuple(blocked),
     )
 
@@ -260,7 +263,7 @@ def _joined(clear: Ways, cost: np.ndarray) -> tuple[np.ndarray, Ways]:
         direct[start, end] = direct[end, start] = cost[start, end]
     total, before = shortest_path(direct, directed=False, return_predecessors=True)
     order = tour(np.where(np.isfinite(total), total, FORBIDDEN))
-    ways: Ways = {}
+    joined_ways: Ways = {}
     for start, end in (_pair(*pair) for pair in pairwise(order)):
         if not np.isfinite(total[start, end]):
             continue
@@ -275,8 +278,8 @@ def _joined(clear: Ways, cost: np.ndarray) -> tuple[np.ndarray, Ways]:
             if leg_start > leg_end:
                 leg = leg[::-1]
             path.append(leg if not path else leg[1:])
-        ways[start, end] = np.concatenate(path)
-    return order, ways
+        joined_ways[start, end] = np.concatenate(path)
+    return order, joined_ways
 
 
 def turns(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
@@ -367,7 +370,10 @@ def write_run(path: Path, run: Run, chain: Chain) -> Path:
                 clock += float(seconds)
                 add(0, via_point)
             clock += float(parts[-1])
-        posture = run.ways[k][0] if k < len(run.ways) else run.ways[-1][-1]
+        if k < len(run.ways):
+            posture = run.ways[k][0]
+        else:
+            posture = run.ways[-1][-1]
         add(k + 1, posture)
         clock += run.dwell
         add(k + 1, posture)
@@ -422,7 +428,10 @@ class Exchange:
         rows = self._rows(q)
         flat = rows.reshape(-1, rows.shape[2])
         matrices = flat.T @ flat + self._information
-        values = log_det(matrices) if self.index == "O1" else merits(matrices, self.index)
+        if self.index == "O1":
+            values = log_det(matrices)
+        else:
+            values = merits(matrices, self.index)
         return np.argsort(-values, kind="stable")
 
     @cached_property
@@ -462,7 +471,9 @@ class Drivable:
         if not self.replaced:
             return ""
         numbers = [f"{k}" for k, index in enumerate(self.run.order, 1) if index in self.replaced]
-        noun = "poses" if len(self.replaced) > 1 else "pose"
+        noun = "pose"
+        if len(self.replaced) > 1:
+            noun = "poses"
         before, after = self.value
         return (
             f"{noun} {', '.join(numbers)} replaced, since no clear path led to the original "
@@ -487,17 +498,17 @@ def drivable(
     """
     show = progress or _silent
     replaced: dict[int, int] = {}
-    ways: Ways = {}
+    clear_ways: Ways = {}
     original = same_turn(chain, q, limits.lower, limits.upper)
     q = original
-    run = plan_run(chain, q, limits, settings, seed, show, ways)
+    run = plan_run(chain, q, limits, settings, seed, show, clear_ways)
     for _ in range(EXCHANGES):
         if not run.cut_off:
             break
         show(f"{len(run.cut_off)} poses without a clear path")
-        q, replacements, ways = _rejoined(chain, q, run, exchange, limits, settings, seed)
+        q, replacements, clear_ways = _rejoined(chain, q, run, exchange, limits, settings, seed)
         replaced |= replacements
-        run = plan_run(chain, q, limits, settings, seed, show, ways)
+        run = plan_run(chain, q, limits, settings, seed, show, clear_ways)
     value_before, log_before = exchange.value(original)
     value_after, log_after = exchange.value(q)
     return Drivable(q, run, replaced, (value_before, value_after), log_after - log_before)
@@ -509,7 +520,7 @@ def _rejoined(
     """Return the poses (m, n) with unreachable ones replaced, the replacements (place -> candidate), and all paths."""
     q = q.copy()
     replacements: dict[int, int] = {}
-    ways = run.found_ways
+    clear_ways = run.found_ways
     joined = [k for k in range(len(q)) if k not in run.cut_off]
     for index in run.cut_off:
         # the pose itself on another turn, then candidates that are not in the list, best first
@@ -520,16 +531,18 @@ def _rejoined(
         trials += [(candidate, True) for candidate in fresh[:MAX_STRAIGHT_TRIES]]
         trials += [(candidate, False) for candidate in fresh[:MAX_VIA_TRIES]]
         for candidate, straight in trials:
-            posture = q[index] if candidate is None else exchange.candidates[candidate]
+            posture = q[index]
+            if candidate is not None:
+                posture = exchange.candidates[candidate]
             postures = turns(chain, posture, limits.lower, limits.upper)
             result = way_to(chain, limits, settings, postures, q[joined], straight=straight, seed=seed)
             if result is None:
                 continue
             start, path = joined[result[0]], result[1]
             q[index] = path[-1]
-            ways[_pair(start, index)] = path if start < index else path[::-1]
+            clear_ways[_pair(start, index)] = path if start < index else path[::-1]
             if candidate is not None:
                 replacements[index] = candidate
             joined.append(index)
             break
-    return q, replacements, ways
+    return q, replacements, clear_ways

@@ -52,7 +52,8 @@ class _Behind:
         position = self.target(q)[1]
         velocity = self.velocity(q)[:, :3]
         beam = self.arm.beam(q, position, velocity, self.instrument)
-        distances, gradients = (part[:, self.links] for part in beam)
+        distances = beam[0][:, self.links]
+        gradients = beam[1][:, self.links]
         nearest = np.argsort(distances, axis=1)[:, :DISTANCES]
         rows = np.arange(len(q))[:, None]
         return BEAM - distances[rows, nearest], -gradients[rows, nearest]
@@ -117,7 +118,9 @@ class SeenOnly:
         return self.of.product(q, G * self._mask(q))
 
     def _mask(self, q: np.ndarray) -> np.ndarray:
-        rows_per_target = 6 if self.of.full else 3
+        rows_per_target = 3
+        if self.of.full:
+            rows_per_target = 6
         return np.repeat(self.sight.visible(q), rows_per_target, axis=1)[:, :, None]
 
 
@@ -142,7 +145,7 @@ def sight_of(
     directions = [*facing]
     if len(facing) == 1:
         directions = directions * len(cell.tools)
-    least, largest = span
+    nearest, largest = span
     targets = []
     for number, direction in enumerate(directions):
         target = Target(cell, number)
@@ -150,8 +153,8 @@ def sight_of(
         parts: list[PoseConstraint] = []
         if half_angle is not None:
             parts.append(constraints.line_of_sight(target, instrument, direction, half_angle, velocity))
-        if least > 0.0 or np.isfinite(largest):
-            parts.append(constraints.distance(target, least or -np.inf, largest, instrument, velocity))
+        if nearest > 0.0 or np.isfinite(largest):
+            parts.append(constraints.distance(target, nearest or -np.inf, largest, instrument, velocity))
         if arm is not None:
             links = _blocking_links(arm, cell.chain, target)
             behind = _Behind(arm, target, velocity, np.asarray(instrument, dtype=float), links)
