@@ -13,10 +13,6 @@ DOCUMENTS = (
     "calib.identification.identify_options",
     "calib.identification.friction.friction_ladder",
 )
-    "calib.cli.dynamics",
-    "calib.identification.identify_options",
-    "calib.identification.friction.friction_ladder",
-)
 
 
 @pytest.mark.parametrize("module", DOCUMENTS)
