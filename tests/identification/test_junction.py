@@ -9,8 +9,8 @@ import pytest
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import UsageError
 from calib.geometry.weighing import calibrated_chain
-from calib.identification.geometry_uncertainty import propagate
 from calib.identification.identify import identify
+from calib.identification.uncertainty.geometry_uncertainty import propagate
 from calib.procedure.dynamic_stage import folder as identified
 from calib.procedure.dynamic_stage import identify as dynamic
 from calib.procedure.dynamic_stage.inputs import gather

@@ -31,7 +31,7 @@ from calib.geometry.installation import Installation
 from calib.geometry.inverse import Goal
 from calib.identification.model_file import read_dynamics, refuse_currents, refuse_other_arm
 from calib.identification.prediction import Dynamics
-from calib.identification.torque_errors import Uncertainty, read_uncertainty
+from calib.identification.uncertainty.torque_errors import Uncertainty, read_uncertainty
 from calib.procedure.excitation.limits import MotionBounds, MotionLimits, check_bodies, read_motion_limits
 from calib.procedure.excitation.playback import approach_to
 from calib.procedure.excitation.settings import DEFAULT_PLAN, DRIVES, PlanSettings

@@ -6,7 +6,8 @@ rows per joint leaves the base parameters with the covariance
     C = (R · mean over the period of Σ_j Y_jᵀ Y_j / σ_j²)⁻¹,
 
 and a torque on other motion with the variance Y C Yᵀ. On a calibrated robot an error g of the geometry, the same in all
-logs, adds to both (`calib.identification.geometry_uncertainty`): the parameters err by S g = -C Σ Yᵀ (∂Y/∂g φ) g / σ²,
+logs, adds to both (`calib.identification.uncertainty.geometry_uncertainty`): the parameters err by S g = -C Σ Yᵀ
+(∂Y/∂g φ) g / σ²,
 with earlier motions C (C_before⁻¹ S_before g - …), and torques by Y S g + (∂Y/∂g φ) g. A design minimises the part of
 the torques' errors alone. R counts the rows that `calib identify` keeps: twice the band
 that its own rules read from the accelerations. What is not known before a log is σ_j: noise, and friction that no term

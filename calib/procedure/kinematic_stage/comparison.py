@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements, Positions
-from calib.extensions import Point
 from calib.geometry.accuracy import Errors, errors, pair_errors, statistics
 from calib.geometry.error_model import ErrorModel, outside
 from calib.geometry.fit import placed_on
 from calib.geometry.installation import Installation
 from calib.geometry.repeatability import ARMS, RepeatedPoses, repeated_poses
 from calib.geometry.weighing import Settings
+from calib.procedure.kinematic_stage.image_findings import reprojection
 from calib.procedure.kinematic_stage.inputs import Unseen, pose_count
 from calib.procedure.kinematic_stage.metrics import ComparedRows, IntervalCoverage
-
-REPROJECTION: Point[Callable[[Installation, Any], Any]] = Point("reprojection", "how far corners are off")
 
 # Columns of unseen rows: the standard deviation that the fit expects of the calibrated arm's position error there, all
 # axes together; the radius within which 95 % of such errors are to be; 1 where a joint is outside the range learnt from
@@ -164,11 +162,7 @@ def compare(
     arms = (cells[0], cells[1])
     pairs_nominal = pair_errors(arms[0], blocks, seed=seed)
     pairs_calibrated = pair_errors(arms[1], blocks, seed=seed)
-    reprojection: Any = ()
-    for corner_errors in REPROJECTION.all():
-        reprojection += (corner_errors(arms[0], blocks), corner_errors(arms[1], blocks))
-    if None in reprojection or not reprojection:
-        reprojection = None
+    corners: Any = (reprojection(arms[0], blocks), reprojection(arms[1], blocks))
     return Comparison(
         blocks=tuple(blocks),
         cells=arms,
@@ -179,7 +173,7 @@ def compare(
         proves=proves,
         alone=urdf_alone[0] if urdf_alone else None,
         repeated=repeated_poses(arms, blocks),
-        reprojection=reprojection,
+        reprojection=None if None in corners else corners,
     )
 
 

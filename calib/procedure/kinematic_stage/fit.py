@@ -8,7 +8,6 @@ from typing import TypeVar
 from calib.data.poses.fit_options import FitOptions
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import Finding, NotConverged, finding
-from calib.extensions import Point
 from calib.geometry.accuracy import errors
 from calib.geometry.checks.joint_range import joint_range
 from calib.geometry.checks.row_changes import row_changes
@@ -25,6 +24,7 @@ from calib.geometry.weighing import GeometricFit, Settings, calibrated_chain
 from calib.procedure.findings import Verdict, level_of, sentence, settle
 from calib.procedure.kinematic_stage import plausibility
 from calib.procedure.kinematic_stage.comparison import Comparison
+from calib.procedure.kinematic_stage.image_findings import image_notes
 from calib.procedure.kinematic_stage.inputs import Inputs, plain_reference
 from calib.procedure.kinematic_stage.metrics import Findings, Outlier
 from calib.procedure.kinematic_stage.plausibility import gross_rows, misfit, named_outliers
@@ -32,8 +32,6 @@ from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.validation import Arms, Assessment, assess
 from calib.procedure.measuring.prediction import SelectionPrediction, compared_with_fit
 from calib.robot.calibrated import CalibratedChain
-
-FIT_NOTES: Point[Callable[[GeometricFit], list[Finding]]] = Point("fit_notes", "findings on a fit")
 
 Progress = Callable[[str], None]
 
@@ -190,8 +188,7 @@ def run(
         notes.append(rigid_misfit)
     notes += _moved_between(nominal, inputs.fit, weighing)
     notes += diagnose(selection.fit, with_changes=not changes)
-    for fit_notes in FIT_NOTES.all():
-        notes += fit_notes(selection.fit)
+    notes += image_notes(selection.fit)
     if prediction is not None:
         ratio = compared_with_fit(prediction, selection.fit)
         if ratio is not None:

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -30,14 +29,9 @@ from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.kinematics import gravity_torques
 from calib.robot.library import load, resolve
 
-IDENTIFIED_MASSES: Point[Callable[[str, Chain], np.ndarray]] = Point(
-    "identified_masses", "standard parameters (n, 10) in the folder of an identification"
-)
-IMAGE_FOLDERS: Point[Any] = Point("image_folders", "a module: `read_images` reads a folder of images as a block")
 PLANNED_POSES: Point[Callable[[Path, Chain, FileOptions], list[PoseMeasurements]]] = Point(
     "planned_poses", "points without joints, with those of planned poses"
 )
-CAMERA_GUESS: Point[Any] = Point("camera_guess", "a module: completes images' lenses, and takes images as poses")
 
 
 @dataclass(frozen=True)
@@ -145,7 +139,10 @@ def gather(
     masses = None
     weighed = chain
     if settings.masses:
-        masses = IDENTIFIED_MASSES.one()(settings.masses, chain)
+        # a fit alone loads no dynamics
+        from calib.identification.model_file import identified_masses
+
+        masses = identified_masses(settings.masses, chain)
         weighed = replace(chain, inertias=masses)
 
     read_blocks: list[tuple[Path, PoseMeasurements]] = []
@@ -302,7 +299,9 @@ def read_file(
         if tuple(source.joint_names) == chain.joint_names or len(source.joint_names) == chain.n:
             blocks = [check_block(source, file_options, joints)]
     elif is_image_folder(path):
-        blocks = [IMAGE_FOLDERS.one().read_images(path, joints, file_options)]
+        from calib.data.images.image_folders import read_images
+
+        blocks = [read_images(path, joints, file_options)]
     else:
         blocks = []
         if file_options.planned:
@@ -314,7 +313,9 @@ def read_file(
     result = []
     for block in blocks:
         if block.kind == IMAGES:
-            block = CAMERA_GUESS.one().complete_camera(chain, block, like)
+            from calib.geometry.camera.camera_guess import complete_camera
+
+            block = complete_camera(chain, block, like)
         result.append(block)
     for block in result:
         # of unseen files, too: the fit checks the rows that it fits only

@@ -22,7 +22,6 @@ from calib.geometry.model_choice.ladder import MAX_RESIDUAL, ModelSelection
 from calib.geometry.observation import sampled
 from calib.geometry.weighing import GeometricFit
 from calib.procedure.findings import level_of, limit
-from calib.procedure.kinematic_stage.inputs import CAMERA_GUESS
 from calib.procedure.kinematic_stage.metrics import Outlier
 from calib.records import evenly
 from calib.units import DEG, ERRORS
@@ -188,7 +187,9 @@ def _as_positions(block: PoseMeasurements) -> PoseMeasurements:
     if block.kind != IMAGES:
         return block
     rows = evenly(len(block), MAX_IMAGES)
-    return CAMERA_GUESS.one().pnp_poses(take(block, rows))
+    from calib.geometry.camera.camera_guess import pnp_poses
+
+    return pnp_poses(take(block, rows))
 
 
 def _wrong_columns(

@@ -5,7 +5,7 @@ between the arm's own links, and the floor that the arm stands on: `Limits.check
 `Limits.unchecked` names what could not be, since nobody has stated it.
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -16,12 +16,14 @@ import numpy as np
 from calib.config import Tables, check_keys, read
 from calib.config_types import number
 from calib.errors import RobotError, UsageError, listing, one_of, refused_as, require
-from calib.extensions import Point
 from calib.geometry.installation import Installation
 from calib.geometry.observability import Observation, Target, TargetJacobian
 from calib.procedure.measuring import constraints_file
+from calib.procedure.measuring.camera_view import camera_view
 from calib.procedure.measuring.constraints_file import CameraTable, CollisionTable, ConstraintsFile, InstrumentTable
+from calib.procedure.measuring.moveit import limit_tables
 from calib.procedure.measuring.sight import SeenOnly, Sight, sight_of
+from calib.robot.beside import links_of
 from calib.robot.capsules import Obstacle, Wall, signed_distance
 from calib.robot.chain import Chain
 from calib.robot.description import MAX_TURN, remarks
@@ -31,13 +33,6 @@ from calib.robot.tables import load as load_table
 from calib.robot.tables import placement
 from poses import constraints
 from poses.space import PoseConstraint, SearchSpace
-
-LIMIT_TABLES: Point[Callable[[Path, Chain, Path | None], Tables | None]] = Point(
-    "limit_tables", "tables of `calib formats limits` from other programs' files"
-)
-CAMERA_VIEW: Point[Callable[[CameraTable, Chain, str, Path], Any]] = Point(
-    "camera_view", "what the camera of a constraints file sees"
-)
 
 # times the arm's reach: no cell is that large (our choice)
 MAX_REACHES = 100.0
@@ -60,7 +55,7 @@ class Limits:
         collision: a `calib.robot.collision.Collision` or `calib.robot.capsules.Capsules`; None without one.
         clearance: the least distance it asks for [m].
         sight: lines of sight; None where nothing is asked.
-        camera: the view of a camera (`calib.rooms.camera.camera_view.CameraView`), where that is the instrument.
+        camera: the view of a camera (`calib.procedure.measuring.camera_view.CameraView`), where that is the instrument.
         views: what it takes to be seen by it.
         checked: names of the checked limits.
         unchecked: names of the limits that are not checked, since nobody has stated them.
@@ -143,7 +138,7 @@ def read_limits(
 
 
 def tables_of(tables: Tables | None, chain: Chain, source: Path | None, name: str) -> tuple[Tables | None, str]:
-    """Return limits as a file or tables, from other programs' files where one is named, and their name.
+    """Return limits as a file or tables, from MoveIt's files where they are such, and their name.
 
     Args:
         tables: a file, a folder, or tables, which are named by `name`.
@@ -152,10 +147,9 @@ def tables_of(tables: Tables | None, chain: Chain, source: Path | None, name: st
         name: of tables.
     """
     if isinstance(tables, str | Path):
-        for read_tables in LIMIT_TABLES.all():
-            content = read_tables(Path(tables), chain, source)
-            if content is not None:
-                return content, str(tables)
+        content = limit_tables(Path(tables), chain, source)
+        if content is not None:
+            return content, str(tables)
     return tables, name
 
 
@@ -168,7 +162,7 @@ def _with_camera(
         name = f"{constraints_file.VIEW_UNCHECKED} (not known: {', '.join(camera.unknown)})"
         return replace(limits, unchecked=(*unchecked, name))
     with refused_as(UsageError, RobotError, "{}"):
-        view = CAMERA_VIEW.one()(camera, cell.chain, where, folder)
+        view = camera_view(camera, cell.chain, where, folder)
     arm = replace(view.cell, stations=np.eye(4)[None])
     model = limits.collision
     if "view" in absent:
@@ -525,14 +519,6 @@ def _description(source: Path | None, chain: Chain) -> Path | None:
         if {chain.base, chain.tip} <= set(links_of(chain, path)):
             return path
     return None
-
-
-def links_of(chain: Chain, source: Path | None) -> Collection[str]:
-    """Return the names of a robot's links: of all in its URDF, else of the arm's capsules."""
-    if source is not None and is_urdf(source):
-        return read_tree(text(source)[0], str(source)).bodies
-    links = chain.links or [f"{name}_link" for name in chain.joint_names]
-    return (chain.base, *links, chain.tip)
 
 
 def _walls(box: tuple[Any, ...] | None, where: str) -> list[Wall]:
