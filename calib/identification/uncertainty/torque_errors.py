@@ -39,7 +39,7 @@ from calib.identification.loop import per_joint
 from calib.identification.prediction import Dynamics, IntervalCoverage
 from calib.identification.rows import Case, pool, segmented_states, triangulate
 from calib.records import evenly
-from trajectories.timing.profile import Sampled
+from calib.trajectories.timing.profile import Sampled
 
 BLOCK = 4000
 """Samples whose regressor is held in memory at a time."""
