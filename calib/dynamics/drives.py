@@ -147,7 +147,8 @@ def standard(
             settings = (smoothing[joint],) if shape == "sign" else ()
             side = "link" if name in LINK_SIDE else "motor"
             label = f"{name}{joint + 1}"
-            terms.append(term(label, shape, joint, *settings, side=side, linear=bool(linear[joint])))
+            is_linear = bool(linear[joint])
+            terms.append(term(label, shape, joint, *settings, side=side, linear=is_linear))
     return tuple(terms)
 
 
@@ -255,8 +256,13 @@ def _join(term: DriveTerm, motion: Motion, motions: Sequence[np.ndarray | None],
         raise CalibError(f"term '{term.name}' needs the transmitted torque; give load (N, n), measured or predicted")
     q, v, a, load = motions
     assert q is not None and v is not None and a is not None
-    joined_load = None if load is None else _weighted(motion, load)
-    return Joined(_weighted(motion, q), _weighted(motion, v), _weighted(motion, a), joined_load, state)
+    return Joined(
+        x=_weighted(motion, q),
+        v=_weighted(motion, v),
+        a=_weighted(motion, a),
+        load=None if load is None else _weighted(motion, load),
+        state=state,
+    )
 
 
 def _weighted(motion: Motion, series: np.ndarray) -> np.ndarray:

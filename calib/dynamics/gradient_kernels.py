@@ -224,7 +224,8 @@ def torque_gradient(links, chain, constants, order, amount, cosine, sine, v, a, 
             twists[i + 1] = 0.0
             carry(chain, constants, i, frames, twists)
             if c >= 0:
-                twists[i + 1, 0, 2 if links[i, KIND] == REVOLUTE else 5] += scale * weights[sample, c]
+                axis = 2 if links[i, KIND] == REVOLUTE else 5
+                twists[i + 1, 0, axis] += scale * weights[sample, c]
             _share(chain, order, i, parameters, motion, twists, slopes, bars)
         _back(
             links, chain, constants, v[sample], frames, motion, twists, slopes, bars, gq[sample], gv[sample], ga[sample]

@@ -129,7 +129,8 @@ class IdentificationModel:
         v = shaped(v, shape, "v")
         a = shaped(a, shape, "a")
         load_columns = None if load is None else shaped(load, q.shape, "load").T
-        out = np.zeros((self.p, self.n * len(self.torque_rows.blocks), len(q)))
+        row_count = self.n * len(self.torque_rows.blocks)
+        out = np.zeros((self.p, row_count, len(q)))
         if self.inertial:
             q_link, v_link, a_link = link or (q, v, a)
             rigid_body.fill_regressor(self.bodies, q_link, v_link, a_link, out[: self.inertial])
@@ -209,7 +210,8 @@ class IdentificationModel:
         if self.torque_rows.projection is not None:
             return np.ones((self.p, self.rows), dtype=bool)
         # What is zero at a random state is zero everywhere.
-        q, v, a = np.random.default_rng(0).uniform(0.5, 1.5, (3, 4, self.n))
+        random = np.random.default_rng(0)
+        q, v, a = random.uniform(0.5, 1.5, (3, 4, self.n))
         entries = np.zeros((1, self.n, self.p))
         if self.inertial:
             regressor = rigid_body.regressor(self.bodies, q, v, a)
@@ -305,7 +307,8 @@ class IdentificationModel:
                     kept_last.append(column)
                 else:
                     kept_first.append(column)
-        return np.array([*kept_first, *range(self.inertial, self.p), *kept_last, *payloads], dtype=int)
+        drive_columns = range(self.inertial, self.p)
+        return np.array([*kept_first, *drive_columns, *kept_last, *payloads], dtype=int)
 
     def load_cases(self) -> Loads:
         """Return the load cases: all payloads and none, or only one case without payloads in the model."""
@@ -383,4 +386,5 @@ def from_chain(
 
 def friction_states(model: RegressorModel, q: np.ndarray) -> np.ndarray:
     """Return the states (s, N) of friction with hysteresis along a gap-free record q (N, n), not cut into blocks."""
-    return drives.friction_states(model.columns, np.ascontiguousarray(shaped(q, (None, model.n), "q").T))
+    q = shaped(q, (None, model.n), "q")
+    return drives.friction_states(model.columns, np.ascontiguousarray(q.T))

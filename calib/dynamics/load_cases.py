@@ -25,7 +25,8 @@ class LoadCases(BaseModel):
     @property
     def joint_of_row(self) -> np.ndarray:
         """Joint of each row (loads x rows per sample,), from 0."""
-        return np.tile(np.arange(self.model.rows) % self.model.n, len(self.loads))
+        joints = np.arange(self.model.rows) % self.model.n
+        return np.tile(joints, len(self.loads))
 
     @property
     def limited(self) -> np.ndarray:
@@ -60,7 +61,8 @@ class LoadCases(BaseModel):
         if self._plain:
             return regressor
         rows = self.model.rows
-        columns = np.concatenate([regressor.transpose(2, 1, 0)] * len(self.loads), axis=1)
+        of_load = regressor.transpose(2, 1, 0)
+        columns = np.concatenate([of_load] * len(self.loads), axis=1)
         for k, absent in enumerate(self._absent):
             columns[absent, k * rows : (k + 1) * rows] = 0.0
         return columns.transpose(2, 1, 0)

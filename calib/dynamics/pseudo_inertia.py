@@ -42,8 +42,9 @@ def margin(parameters: np.ndarray) -> float:
     if not mass > 0.0:
         return -np.inf
     centre = pseudo[:3, 3] / mass
-    least = float(np.linalg.eigvalsh(pseudo[:3, :3] / mass - np.outer(centre, centre))[0])
-    return float(np.copysign(np.sqrt(abs(least)), least))
+    about_centre = pseudo[:3, :3] / mass - np.outer(centre, centre)
+    smallest = float(np.linalg.eigvalsh(about_centre)[0])
+    return float(np.copysign(np.sqrt(abs(smallest)), smallest))
 
 
 def divergence(pseudo: np.ndarray, reference: np.ndarray) -> float:
@@ -64,7 +65,8 @@ def ball(mass: float, radius: float, centre: np.ndarray | None = None) -> np.nda
         centre = np.zeros(3)
     centre = np.asarray(centre, dtype=float)
     pseudo = np.empty((4, 4))
-    pseudo[:3, :3] = mass * (radius**2 / 5.0 * np.eye(3) + np.outer(centre, centre))
+    about_centre = radius**2 / 5.0 * np.eye(3)
+    pseudo[:3, :3] = mass * (about_centre + np.outer(centre, centre))
     pseudo[:3, 3] = mass * centre
     pseudo[3, :3] = mass * centre
     pseudo[3, 3] = mass
@@ -110,5 +112,7 @@ BASIS, UNITS = _basis(), _units()
 
 def unknown_bodies(count: int, term_count: int) -> np.ndarray:
     """Return P of bodies linear in unknowns (count, 4, 4, 10 count + terms): ten per body in `UNITS`, then terms."""
-    bodies = np.einsum("ij,krs->irsjk", np.eye(count), UNITS).reshape(count, 4, 4, 10 * count)
-    return np.concatenate([bodies, np.zeros((count, 4, 4, term_count))], axis=3)
+    bodies = np.einsum("ij,krs->irsjk", np.eye(count), UNITS)
+    bodies = bodies.reshape(count, 4, 4, 10 * count)
+    terms = np.zeros((count, 4, 4, term_count))
+    return np.concatenate([bodies, terms], axis=3)

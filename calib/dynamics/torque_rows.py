@@ -143,7 +143,8 @@ class TorqueRows:
     def of_joints(self, mask: np.ndarray) -> np.ndarray:
         """Return flags of rows (N, rows) from flags of joints (N, n): those of all joints for projected rows."""
         if self.projection is not None:
-            return np.repeat(mask.all(axis=1, keepdims=True), len(self.projection.labels), axis=1)
+            of_sample = mask.all(axis=1, keepdims=True)
+            return np.repeat(of_sample, len(self.projection.labels), axis=1)
         return np.tile(mask, (1, len(self.blocks)))
 
     def observe(self, torques: np.ndarray, sides: Sequence[str], q: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -193,7 +194,10 @@ class TorqueRows:
         """
         if self.projection is not None:
             raise CalibError(f"rows '{self.name}' use a projection that depends on the state: no derivatives")
-        acting = [np.array([side in block.sides for side in sides], dtype=bool) for block in self.blocks]
+        acting = []
+        for block in self.blocks:
+            acts = [side in block.sides for side in sides]
+            acting.append(np.array(acts, dtype=bool))
         if len(acting) == 1 and acting[0].all():
             return weights
         n = weights.shape[1] // len(self.blocks)
