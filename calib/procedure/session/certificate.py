@@ -8,7 +8,7 @@ from calib import files
 from calib.data.poses import CORNERS, JOINTS
 from calib.errors import command_line
 from calib.extensions import Point
-from calib.folders import CERTIFICATE, PAGES
+from calib.folders import CERTIFICATE, ESTIMATE, METRICS, PAGES, REPORT
 from calib.procedure.excitation import coefficients
 from calib.procedure.export.delivery import prediction
 from calib.procedure.kinematic_stage.folder import SCHEMA, URDF
@@ -278,15 +278,15 @@ STEP = SessionStep(
     certify,
     reads=(
         SessionFile(VERDICT, without_geometry=True),
-        SessionFile("4-fit/report.json"),
-        SessionFile("5-validation/metrics.json"),
+        SessionFile(f"4-fit/{REPORT}"),
+        SessionFile(f"5-validation/{METRICS}"),
         ExportedFile("robot.urdf"),
         SessionFile(SELECTION, optional=True),
         SessionFile(POSES_CHECKED),
         SessionFile(MOTION_CHECKED),
-        SessionFile("8-dynamics/metrics.json"),
-        SessionFile("8-dynamics/estimate.csv"),
-        SessionFile("8-dynamics/unseen/report.json"),
+        SessionFile(f"8-dynamics/{METRICS}"),
+        SessionFile(f"8-dynamics/{ESTIMATE}"),
+        SessionFile(f"8-dynamics/unseen/{REPORT}"),
         SessionFile(MARK, optional=True),
     ),
     makes=PAGES,
