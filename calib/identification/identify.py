@@ -29,7 +29,7 @@ from calib.identification.prediction import Dynamics, Model, predict
 from calib.identification.prior import TEMPERING, FirstFit, Prior, find_prior, first_fit, rods, tempered_prior
 from calib.identification.rows import Case, ObservationRows, observe, observe_terms, with_blocks
 from calib.identification.settings import IdentificationSettings, make_model, require_usable
-from calib.identification.standstill import with_standstills, with_weights
+from calib.identification.standstill import CLEARLY_LESS, left_out_error, with_standstills, with_weights
 from calib.identification.time_folds import regimes
 from calib.robot.calibrated import CalibratedChain, as_calibrated
 from calib.robot.chain import Chain
@@ -155,6 +155,7 @@ def identify_model(
     rows = with_blocks([observe(model, base.kept, case, decimator) for case in cases], settings.folds)
     if model.torque_rows == POWER and len(cases) > 1:
         rows = [part.by_recording(k, len(cases)) for k, part in enumerate(rows)]
+    as_moving = rows
     if isinstance(method, LeastSquares) and isinstance(model, IdentificationModel):
         width = np.array(per_joint(settings.v0, cases[0].motion.n, "v0"))
         rows = with_standstills(rows, cases, decimator, model, base.kept, width)
@@ -166,8 +167,25 @@ def identify_model(
     if _takes_prior(method, model, settings, source):
         prior = found(rows)
         rows = with_weights(rows, prior.first.rest)
+        if any(part.standing.any() for part in rows):
+            say("standstills")
+            prior_as_moving = found(as_moving)
+            error = left_out_error(rows, rows, prior.first, prior.rows, settings.apart)
+            error_as_moving = left_out_error(
+                as_moving, rows, prior_as_moving.first, prior_as_moving.rows, settings.apart
+            )
+            if error_as_moving < CLEARLY_LESS**2 * error:
+                rows, prior = as_moving, prior_as_moving
         prior = tempered_prior(found, prior, rows, regimes(rows, cases, decimator))
-    first = first_fit(rows, noise) if prior is None else prior.first
+        first = prior.first
+    else:
+        first = first_fit(rows, noise)
+        if any(part.standing.any() for part in rows):
+            first_as_moving = first_fit(as_moving, noise)
+            error = left_out_error(with_weights(rows, first.rest), rows, first, None, settings.apart)
+            error_as_moving = left_out_error(as_moving, rows, first_as_moving, None, settings.apart)
+            if error_as_moving < CLEARLY_LESS**2 * error:
+                rows, first = as_moving, first_as_moving
     rows = with_weights(rows, first.rest)
     friction, loads = _richer_friction(model, base, rows, cases, decimator, first, prior, settings, progress)
     own = [None if k < model.inertial else model.columns[k - model.inertial] for k in base.kept]

@@ -18,12 +18,17 @@ values, reach = 2 √3 √(f² + τ s²), the width of an even distribution of t
 Reversals pass through zero speed and stay rows as others: shorter than `MIN_STANDSTILL`, or, of slow motion, as often
 at one small speed as at another, where a joint that stands is slower than `MAX_MEDIAN` for half of the time. Torques of
 sensors behind the gear have no such friction.
+
+Where the drive's friction is low, or the model of the motion is wrong (a torso whose effort holds no gravity), rows at
+rest say more than this. Both treatments predict the motion of time blocks that they were not fitted to; standing rows
+count as any others where that errs less than `CLEARLY_LESS` times as much.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -31,11 +36,13 @@ from calib.data.signals.filtering import Decimator, kept
 from calib.dynamics.regressor_model import RegressorModel
 from calib.dynamics.torque_rows import TorqueRows
 from calib.estimation.triangles import Triangles, absorb, empty, retriangulate
-from calib.identification.rows import Case, ObservationRows, RestWeights, segments, thinned
+from calib.identification.rows import Case, ObservationRows, RestWeights, pool, segments, thinned, triangulate
+from calib.identification.time_folds import estimate
 from calib.records import frozen
 
 MIN_STANDSTILL = 0.05  # [s] that a joint stands; shorter ones are reversals (our choice)
 MAX_MEDIAN = 0.25  # of the width of Coulomb's sign; of a speed that passes evenly through zero it is 0.5 (our choice)
+CLEARLY_LESS = 0.85  # of the error in motion on left-out time, for which standing rows count as any others (our choice)
 MIN_MOVING = 10  # rows in motion, below which a joint's standing rows count as any others: no friction is identified
 
 
@@ -223,3 +230,47 @@ def divided(all_rows: Sequence[ObservationRows]) -> DividedRows:
 def with_weights(all_rows: Sequence[ObservationRows], weights: RestWeights) -> list[ObservationRows]:
     """Return rows whose standstills have these weights."""
     return [replace(part, rest=weights) for part in all_rows]
+
+
+class RowWeights(Protocol):
+    """Standard deviation and variance inflation (rows,) of residuals."""
+
+    @property
+    def std(self) -> np.ndarray: ...
+
+    @property
+    def inflation(self) -> np.ndarray: ...
+
+
+def left_out_error(
+    learnt: Sequence[ObservationRows],
+    judged: Sequence[ObservationRows],
+    weights: RowWeights,
+    prior: np.ndarray | None = None,
+    apart: Sequence[int] = (),
+) -> float:
+    """Return Σ (τ - τ̂)² of the rows in motion, each time block predicted by a fit of the other blocks.
+
+    The sum is over torques as they are, as in the error that users read, so that no joint's fit is judged by its own
+    residuals' size.
+
+    Args:
+        learnt: rows with the treatment of standstills to be judged.
+        judged: the same samples with their standstills marked: only those in motion count.
+        prior: whitened rows (k, p + 1) of [W y]; None without one.
+        apart: rows in a unit of their own, which no total holds.
+    """
+    rows = learnt[0].target.shape[1]
+    data = triangulate(learnt)
+    blocks = data.groups // rows - 1  # the last one holds samples beside cuts
+    free = np.full(data.parameters, -1)
+    squares = np.zeros(rows)
+    for block in range(blocks):
+        others = [other for other in range(blocks + 1) if other != block]
+        values, _ = estimate(pool(data, rows, others), weights.std, weights.inflation, free, prior)
+        for part in judged:
+            moves = part.present & (part.standing == 0.0) & (part.block == block)[:, None]
+            residual = part.target - part.matrix @ values
+            squares += np.sum(residual**2 * moves, axis=0)
+    squares[list(apart)] = 0.0
+    return float(squares.sum())
