@@ -155,37 +155,28 @@ def identify_model(
     rows = with_blocks([observe(model, base.kept, case, decimator) for case in cases], settings.folds)
     if model.torque_rows == POWER and len(cases) > 1:
         rows = [part.by_recording(k, len(cases)) for k, part in enumerate(rows)]
-    as_moving = rows
+    rows_as_moving = rows
     if isinstance(method, LeastSquares) and isinstance(model, IdentificationModel):
         width = np.array(per_joint(settings.v0, cases[0].motion.n, "v0"))
         rows = with_standstills(rows, cases, decimator, model, base.kept, width)
     _require_enough(rows, base)
     say("first fit")
     whole, source = (shape, "sizes") if cad is None else (cad, "cad")
-    prior = None
     found = partial(find_prior, model, base, whole=whole, source=source, noise=noise, effort=effort)
-    if _takes_prior(method, model, settings, source):
-        prior = found(rows)
-        rows = with_weights(rows, prior.first.rest)
-        if any(part.standing.any() for part in rows):
-            say("standstills")
-            prior_as_moving = found(as_moving)
-            error = left_out_error(rows, rows, prior.first, prior.rows, settings.apart)
-            error_as_moving = left_out_error(
-                as_moving, rows, prior_as_moving.first, prior_as_moving.rows, settings.apart
-            )
-            if error_as_moving < CLEARLY_LESS**2 * error:
-                rows, prior = as_moving, prior_as_moving
+    takes_prior = _takes_prior(method, model, settings, source)
+    prior = found(rows) if takes_prior else None
+    first = first_fit(rows, noise) if prior is None else prior.first
+    rows = with_weights(rows, first.rest)
+    if any(part.standing.any() for part in rows):
+        prior_as_moving = found(rows_as_moving) if takes_prior else None
+        first_as_moving = first_fit(rows_as_moving, noise) if prior_as_moving is None else prior_as_moving.first
+        error = left_out_error(rows, rows, first, prior, settings.apart)
+        error_as_moving = left_out_error(rows_as_moving, rows, first_as_moving, prior_as_moving, settings.apart)
+        if error_as_moving < CLEARLY_LESS**2 * error:
+            rows, prior, first = rows_as_moving, prior_as_moving, first_as_moving
+    if prior is not None:
         prior = tempered_prior(found, prior, rows, regimes(rows, cases, decimator))
         first = prior.first
-    else:
-        first = first_fit(rows, noise)
-        if any(part.standing.any() for part in rows):
-            first_as_moving = first_fit(as_moving, noise)
-            error = left_out_error(with_weights(rows, first.rest), rows, first, None, settings.apart)
-            error_as_moving = left_out_error(as_moving, rows, first_as_moving, None, settings.apart)
-            if error_as_moving < CLEARLY_LESS**2 * error:
-                rows, first = as_moving, first_as_moving
     rows = with_weights(rows, first.rest)
     friction, loads = _richer_friction(model, base, rows, cases, decimator, first, prior, settings, progress)
     own = [None if k < model.inertial else model.columns[k - model.inertial] for k in base.kept]

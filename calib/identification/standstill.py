@@ -232,8 +232,8 @@ def with_weights(all_rows: Sequence[ObservationRows], weights: RestWeights) -> l
     return [replace(part, rest=weights) for part in all_rows]
 
 
-class RowWeights(Protocol):
-    """Standard deviation and variance inflation (rows,) of residuals."""
+class _Residuals(Protocol):
+    """Standard deviation and variance inflation (rows,) of a fit's residuals."""
 
     @property
     def std(self) -> np.ndarray: ...
@@ -242,33 +242,42 @@ class RowWeights(Protocol):
     def inflation(self) -> np.ndarray: ...
 
 
+class _Prior(Protocol):
+    """A prior as whitened rows (k, p + 1) of [W y]."""
+
+    @property
+    def rows(self) -> np.ndarray: ...
+
+
 def left_out_error(
-    learnt: Sequence[ObservationRows],
-    judged: Sequence[ObservationRows],
-    weights: RowWeights,
-    prior: np.ndarray | None = None,
-    apart: Sequence[int] = (),
+    training: Sequence[ObservationRows],
+    marked: Sequence[ObservationRows],
+    residuals: _Residuals,
+    prior: _Prior | None,
+    apart: Sequence[int],
 ) -> float:
     """Return Σ (τ - τ̂)² of the rows in motion, each time block predicted by a fit of the other blocks.
 
-    The sum is over torques as they are, as in the error that users read, so that no joint's fit is judged by its own
-    residuals' size.
+    The sum is over torques as they are, as in the error that users read: weighed by its own residuals, a joint whose
+    torques are fitted by wrong parameters would count most.
 
     Args:
-        learnt: rows with the treatment of standstills to be judged.
-        judged: the same samples with their standstills marked: only those in motion count.
-        prior: whitened rows (k, p + 1) of [W y]; None without one.
+        training: rows with the treatment of standstills that is judged.
+        marked: the same samples with their standstills marked.
+        residuals: of a fit of `training`.
+        prior: of the parameters; None without one.
         apart: rows in a unit of their own, which no total holds.
     """
-    rows = learnt[0].target.shape[1]
-    data = triangulate(learnt)
+    rows = training[0].target.shape[1]
+    data = triangulate(training)
     blocks = data.groups // rows - 1  # the last one holds samples beside cuts
     free = np.full(data.parameters, -1)
+    known = None if prior is None else prior.rows
     squares = np.zeros(rows)
     for block in range(blocks):
         others = [other for other in range(blocks + 1) if other != block]
-        values, _ = estimate(pool(data, rows, others), weights.std, weights.inflation, free, prior)
-        for part in judged:
+        values, _ = estimate(pool(data, rows, others), residuals.std, residuals.inflation, free, known)
+        for part in marked:
             moves = part.present & (part.standing == 0.0) & (part.block == block)[:, None]
             residual = part.target - part.matrix @ values
             squares += np.sum(residual**2 * moves, axis=0)
