@@ -114,6 +114,7 @@ def cut(rows: ObservationRows, own: slice) -> ObservationRows:
         block=rows.block[own],
         standing=rows.standing[own],
         swing=rows.swing[own],
+        slowness=rows.slowness[own],
     )
 
 

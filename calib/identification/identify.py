@@ -29,7 +29,7 @@ from calib.identification.prediction import Dynamics, Model, predict
 from calib.identification.prior import TEMPERING, FirstFit, Prior, find_prior, first_fit, rods, tempered_prior
 from calib.identification.rows import Case, ObservationRows, observe, observe_terms, with_blocks
 from calib.identification.settings import IdentificationSettings, make_model, require_usable
-from calib.identification.standstill import CLEARLY_LESS, left_out_error, with_standstills, with_weights
+from calib.identification.standstill import CLEARLY_LESS, left_out_error, with_slowness, with_standstills, with_weights
 from calib.identification.time_folds import regimes
 from calib.robot.calibrated import CalibratedChain, as_calibrated
 from calib.robot.chain import Chain
@@ -156,7 +156,8 @@ def identify_model(
     if model.torque_rows == POWER and len(cases) > 1:
         rows = [part.by_recording(k, len(cases)) for k, part in enumerate(rows)]
     rows_as_moving = rows
-    if isinstance(method, LeastSquares) and isinstance(model, IdentificationModel):
+    holds_standstills = isinstance(method, LeastSquares) and isinstance(model, IdentificationModel)
+    if holds_standstills:
         width = np.array(per_joint(settings.v0, cases[0].motion.n, "v0"))
         rows = with_standstills(rows, cases, decimator, model, base.kept, width)
     _require_enough(rows, base)
@@ -174,7 +175,13 @@ def identify_model(
         error_as_moving = left_out_error(rows_as_moving, rows, first_as_moving, prior_as_moving, settings.apart)
         if error_as_moving < CLEARLY_LESS**2 * error:
             rows, prior, first = rows_as_moving, prior_as_moving, first_as_moving
+            holds_standstills = False
     if prior is not None:
+        if holds_standstills:
+            rows = with_weights(rows, first.rest)
+            rows = with_slowness(rows, cases, decimator, model.torque_rows, first.values)
+            prior = found(rows, start=prior)
+            rows = with_weights(rows, prior.first.rest)
         prior = tempered_prior(found, prior, rows, regimes(rows, cases, decimator))
         first = prior.first
     rows = with_weights(rows, first.rest)

@@ -140,6 +140,7 @@ class ObservationRows:
         rate: sampling rate [Hz].
         standing: (M, rows) share of its standstill that each row is; 0 in motion.
         swing: (M, rows) range of the torque in that standstill [N m or N]; 0 in motion.
+        slowness: (M, rows) factor of each row in motion: less than 1 where its joint is slow and the model errs more.
         rest: weights of standstills.
         coulomb: (rows, p) columns that are Coulomb friction of a torque row.
     """
@@ -153,14 +154,15 @@ class ObservationRows:
     rate: float
     standing: np.ndarray
     swing: np.ndarray
+    slowness: np.ndarray
     rest: RestWeights
     coulomb: np.ndarray
 
     @property
     def weight(self) -> np.ndarray:
-        """Factor (M, rows) that rows are multiplied by in estimates: 1 in motion, less at rest, 0 where not used."""
+        """Factor (M, rows) of rows in estimates: 1 in motion, less where slow or at rest, 0 where not used."""
         at_rest = np.sqrt(self._frictions * self.rest.worth)
-        return np.where(self.standing > 0.0, at_rest, 1.0) * self.present
+        return np.where(self.standing > 0.0, at_rest, self.slowness) * self.present
 
     @property
     def counted(self) -> np.ndarray:
@@ -185,6 +187,7 @@ class ObservationRows:
             present=self.present & place,
             standing=np.repeat(self.standing, count, axis=1),
             swing=np.repeat(self.swing, count, axis=1),
+            slowness=np.repeat(self.slowness, count, axis=1),
             rest=_no_rest(count),
             coulomb=np.repeat(self.coulomb, count, axis=0),
         )
@@ -251,6 +254,7 @@ def observe(model: RegressorModel, columns: np.ndarray, case: Case, decimator: D
         rate,
         standing,
         np.zeros(target.shape),
+        np.ones(target.shape),
         _no_rest(model.rows),
         coulomb,
     )
@@ -333,7 +337,7 @@ def triangulate(all_rows: Sequence[ObservationRows]) -> Triangles:
             used = part.present[:, row]
             group = block[used] * rows + row
             matrix, target = part.matrix[used, row], part.target[used, row]
-            if part.standing[:, row].any():
+            if part.standing[:, row].any() or (part.slowness[:, row] < 1.0).any():
                 weight = part.weight[used, row]
                 matrix, target = matrix * weight[:, None], target * weight
             result = absorb(result, matrix, target, group)

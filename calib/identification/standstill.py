@@ -42,6 +42,8 @@ from calib.records import frozen
 
 MIN_STANDSTILL = 0.05  # [s] that a joint stands; shorter ones are reversals (our choice)
 MAX_MEDIAN = 0.25  # of the width of Coulomb's sign; of a speed that passes evenly through zero it is 0.5 (our choice)
+SLOW = 0.1  # of a joint's peak speed, below which its rows in motion have a variance of their own (our choice)
+MIN_SLOW = 20  # slow rows of a joint, below which they count as any others (our choice)
 CLEARLY_LESS = 0.85  # of the error in motion on left-out time, for which standing rows count as any others (our choice)
 MIN_MOVING = 10  # rows in motion, below which a joint's standing rows count as any others: no friction is identified
 
@@ -212,7 +214,9 @@ def divided(all_rows: Sequence[ObservationRows]) -> DividedRows:
             share = part.standing[:, row]
             rests = part.present[:, row] & (share > 0.0)
             moves = part.present[:, row] & (share == 0.0)
-            moving = absorb(moving, part.matrix[moves, row], part.target[moves, row], row)
+            slowness = part.slowness[moves, row]
+            in_motion = part.matrix[moves, row] * slowness[:, None]
+            moving = absorb(moving, in_motion, part.target[moves, row] * slowness, row)
             matrix, target = part.matrix[rests, row], part.target[rests, row]
             ranges = share[rests] * part.swing[rests, row]
             root, wider = np.sqrt(share[rests]), np.sqrt(ranges)
@@ -230,6 +234,42 @@ def divided(all_rows: Sequence[ObservationRows]) -> DividedRows:
 def with_weights(all_rows: Sequence[ObservationRows], weights: RestWeights) -> list[ObservationRows]:
     """Return rows whose standstills have these weights."""
     return [replace(part, rest=weights) for part in all_rows]
+
+
+def with_slowness(
+    all_rows: Sequence[ObservationRows],
+    cases: Sequence[Case],
+    decimator: Decimator,
+    torque_rows: TorqueRows,
+    values: np.ndarray,
+) -> list[ObservationRows]:
+    """Return rows in which slow ones count by the variance of their own residuals, where that is the larger one.
+
+    Near a reversal friction is on its way from one sign to the other, gears wind up, and the model errs more than in
+    fast motion.
+
+    Args:
+        values: (p,) of a fit, whose residuals are taken.
+    """
+    peak = np.max([np.abs(case.motion.v).max(axis=0) for case in cases], axis=0)
+    slow_masks = []
+    squares, counts = np.zeros((2, all_rows[0].target.shape[1])), np.zeros((2, all_rows[0].target.shape[1]))
+    for part, case in zip(all_rows, cases):
+        slow = torque_rows.of_joints(np.abs(case.motion.v) < SLOW * peak)
+        slow = thinned(slow, case.motion.segment, decimator)
+        moves = part.present & (part.standing == 0.0)
+        residual = part.target - part.matrix @ values
+        for place, mask in enumerate((moves & ~slow, moves & slow)):
+            squares[place] += np.sum(residual**2 * mask, axis=0)
+            counts[place] += mask.sum(axis=0)
+        slow_masks.append(slow)
+    fast, slow = squares / np.maximum(counts, 1.0)
+    differ = (counts.min(axis=0) >= MIN_SLOW) & (slow > fast)
+    factor = np.where(differ, np.sqrt(fast / np.where(differ, slow, 1.0)), 1.0)
+    return [
+        replace(part, slowness=frozen(np.where(slow_mask, factor, 1.0)))
+        for part, slow_mask in zip(all_rows, slow_masks)
+    ]
 
 
 class _Residuals(Protocol):
@@ -271,6 +311,8 @@ def left_out_error(
     rows = training[0].target.shape[1]
     data = triangulate(training)
     blocks = data.groups // rows - 1  # the last one holds samples beside cuts
+    if blocks < 2:  # nothing to learn from without the only block
+        return 0.0
     free = np.full(data.parameters, -1)
     known = None if prior is None else prior.rows
     squares = np.zeros(rows)
