@@ -27,10 +27,10 @@ from calib.identification.methods.method import IdentificationProblem, Method, M
 from calib.identification.methods.registry import METHODS, method_named
 from calib.identification.prediction import Dynamics, Model, predict
 from calib.identification.prior import TEMPERING, FirstFit, Prior, find_prior, first_fit, rods, tempered_prior
-from calib.identification.rows import Case, ObservationRows, observe, observe_terms, with_blocks
+from calib.identification.rows import Case, ObservationRows, observe, observe_terms, pool, triangulate, with_blocks
 from calib.identification.settings import IdentificationSettings, make_model, require_usable
 from calib.identification.standstill import CLEARLY_LESS, left_out_error, with_slowness, with_standstills, with_weights
-from calib.identification.time_folds import regimes
+from calib.identification.time_folds import estimate, regimes
 from calib.robot.calibrated import CalibratedChain, as_calibrated
 from calib.robot.chain import Chain
 
@@ -177,11 +177,6 @@ def identify_model(
             rows, prior, first = rows_as_moving, prior_as_moving, first_as_moving
             holds_standstills = False
     if prior is not None:
-        if holds_standstills:
-            rows = with_weights(rows, first.rest)
-            rows = with_slowness(rows, cases, decimator, model.torque_rows, first.values)
-            prior = found(rows, start=prior)
-            rows = with_weights(rows, prior.first.rest)
         prior = tempered_prior(found, prior, rows, regimes(rows, cases, decimator))
         first = prior.first
     rows = with_weights(rows, first.rest)
@@ -191,9 +186,17 @@ def identify_model(
         part.extend(friction.terms, observe_terms(friction.terms, case, decimator, load, model.torque_rows))
         for part, case, load in zip(rows, cases, loads)
     )
-    if prior is not None and friction.terms:
+    groups = np.array(friction.groups, dtype=int)
+    if prior is not None and holds_standstills:
+        # richer friction explains slow motion, too: what it leaves there counts
+        data = pool(triangulate(full), full[0].target.shape[1])
+        inflation = prior.tempering * first.inflation
+        every_group = np.concatenate([np.full(base.b, -1), groups])
+        values, _ = estimate(data, first.std, inflation, every_group, prior.widened(len(groups)))
+        full = tuple(with_slowness(full, cases, decimator, model.torque_rows, values))
+    if prior is not None and (friction.terms or holds_standstills):
         say("sizes beside richer friction")
-        prior = found(full, groups=np.array(friction.groups), start=prior, tempering=prior.tempering)
+        prior = found(full, groups=groups, start=prior, tempering=prior.tempering)
         full = tuple(with_weights(full, prior.first.rest))
     problem = IdentificationProblem(
         model,
