@@ -29,7 +29,14 @@ from calib.identification.prediction import Dynamics, Model, predict
 from calib.identification.prior import TEMPERING, FirstFit, Prior, find_prior, first_fit, rods, tempered_prior
 from calib.identification.rows import Case, ObservationRows, observe, observe_terms, pool, triangulate, with_blocks
 from calib.identification.settings import IdentificationSettings, make_model, require_usable
-from calib.identification.standstill import CLEARLY_LESS, left_out_error, with_slowness, with_standstills, with_weights
+from calib.identification.standstill import (
+    CLEARLY_LESS,
+    LESS,
+    left_out_error,
+    with_slowness,
+    with_standstills,
+    with_weights,
+)
 from calib.identification.time_folds import estimate, regimes
 from calib.robot.calibrated import CalibratedChain, as_calibrated
 from calib.robot.chain import Chain
@@ -171,8 +178,12 @@ def identify_model(
     if any(part.standing.any() for part in rows):
         prior_as_moving = found(rows_as_moving) if takes_prior else None
         first_as_moving = first_fit(rows_as_moving, noise) if prior_as_moving is None else prior_as_moving.first
-        error = left_out_error(rows, rows, first, prior, settings.apart)
-        error_as_moving = left_out_error(rows_as_moving, rows, first_as_moving, prior_as_moving, settings.apart)
+        known = None if prior is None else prior.rows
+        known_as_moving = None if prior_as_moving is None else prior_as_moving.rows
+        error = left_out_error(rows, rows, first.std, first.inflation, known, settings.apart)
+        error_as_moving = left_out_error(
+            rows_as_moving, rows, first_as_moving.std, first_as_moving.inflation, known_as_moving, settings.apart
+        )
         if error_as_moving < CLEARLY_LESS**2 * error:
             rows, prior, first = rows_as_moving, prior_as_moving, first_as_moving
             holds_standstills = False
@@ -192,9 +203,14 @@ def identify_model(
         data = pool(triangulate(full), full[0].target.shape[1])
         inflation = prior.tempering * first.inflation
         every_group = np.concatenate([np.full(base.b, -1), groups])
-        values, _ = estimate(data, first.std, inflation, every_group, prior.widened(len(groups)))
-        full = tuple(with_slowness(full, cases, decimator, model.torque_rows, values))
-    if prior is not None and (friction.terms or holds_standstills):
+        known = prior.widened(len(groups))
+        values, _ = estimate(data, first.std, inflation, every_group, known)
+        weighed = with_slowness(full, cases, decimator, model.torque_rows, values)
+        error = left_out_error(full, full, first.std, inflation, known, settings.apart)
+        error_weighed = left_out_error(weighed, full, first.std, inflation, known, settings.apart)
+        if error_weighed < LESS**2 * error:
+            full = tuple(weighed)
+    if prior is not None and (friction.terms or any((part.slowness < 1.0).any() for part in full)):
         say("sizes beside richer friction")
         prior = found(full, groups=groups, start=prior, tempering=prior.tempering)
         full = tuple(with_weights(full, prior.first.rest))

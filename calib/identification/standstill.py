@@ -28,7 +28,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -43,8 +42,9 @@ from calib.records import frozen
 MIN_STANDSTILL = 0.05  # [s] that a joint stands; shorter ones are reversals (our choice)
 MAX_MEDIAN = 0.25  # of the width of Coulomb's sign; of a speed that passes evenly through zero it is 0.5 (our choice)
 SLOW = 0.1  # of a joint's peak speed, below which its rows in motion have a variance of their own (our choice)
-MIN_SLOW = 20  # slow rows of a joint, below which they count as any others (our choice)
+MIN_SLOW = 20  # slow rows of a joint, below which their variance is not known (our choice)
 CLEARLY_LESS = 0.85  # of the error in motion on left-out time, for which standing rows count as any others (our choice)
+LESS = 0.98  # of that error, for which slow rows are weighed by their own variance (our choice)
 MIN_MOVING = 10  # rows in motion, below which a joint's standing rows count as any others: no friction is identified
 
 
@@ -272,28 +272,12 @@ def with_slowness(
     ]
 
 
-class _Residuals(Protocol):
-    """Standard deviation and variance inflation (rows,) of a fit's residuals."""
-
-    @property
-    def std(self) -> np.ndarray: ...
-
-    @property
-    def inflation(self) -> np.ndarray: ...
-
-
-class _Prior(Protocol):
-    """A prior as whitened rows (k, p + 1) of [W y]."""
-
-    @property
-    def rows(self) -> np.ndarray: ...
-
-
 def left_out_error(
     training: Sequence[ObservationRows],
     marked: Sequence[ObservationRows],
-    residuals: _Residuals,
-    prior: _Prior | None,
+    std: np.ndarray,
+    inflation: np.ndarray,
+    prior: np.ndarray | None,
     apart: Sequence[int],
 ) -> float:
     """Return Σ (τ - τ̂)² of the rows in motion, each time block predicted by a fit of the other blocks.
@@ -304,8 +288,8 @@ def left_out_error(
     Args:
         training: rows with the treatment of standstills that is judged.
         marked: the same samples with their standstills marked.
-        residuals: of a fit of `training`.
-        prior: of the parameters; None without one.
+        std, inflation: (rows,) standard deviation and variance inflation of the residuals.
+        prior: whitened rows (k, p + 1) of [W y]; None without one.
         apart: rows in a unit of their own, which no total holds.
     """
     rows = training[0].target.shape[1]
@@ -314,11 +298,10 @@ def left_out_error(
     if blocks < 2:  # nothing to learn from without the only block
         return 0.0
     free = np.full(data.parameters, -1)
-    known = None if prior is None else prior.rows
     squares = np.zeros(rows)
     for block in range(blocks):
         others = [other for other in range(blocks + 1) if other != block]
-        values, _ = estimate(pool(data, rows, others), residuals.std, residuals.inflation, free, known)
+        values, _ = estimate(pool(data, rows, others), std, inflation, free, prior)
         for part in marked:
             moves = part.present & (part.standing == 0.0) & (part.block == block)[:, None]
             residual = part.target - part.matrix @ values
