@@ -7,6 +7,7 @@ import planted_motion as planted
 import pytest
 
 from calib.data.recordings.recording import Recording
+from calib.data.signals.filtering import kept
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.errors import UsageError
 from calib.identification import standstill
@@ -218,15 +219,16 @@ def test_slow_rows_count_less_where_the_model_errs_more_there():
     settings, decimator = PLAIN, common_decimator([case], PLAIN)
     rows = rows_of(case)
     values = first_fit(rows).values
-    speed = case.motion.v[:: decimator.factor]
+    speed = np.abs(case.motion.v[kept(case.motion.segment, decimator)])
+    peak = np.abs(case.motion.v).max(axis=0)
     moves = rows[0].present & (rows[0].standing == 0.0)
-    slow = np.abs(speed[: len(moves)]) < standstill.SLOW * np.abs(case.motion.v).max(axis=0)
+    slow = speed < standstill.SLOW * peak
     residual = np.where(slow, 5.0, 1.0) * np.random.default_rng(0).normal(size=moves.shape)
     part = replace(rows[0], target=rows[0].matrix @ values + residual)
     torque_rows = make_model(planted.arm(), settings).torque_rows
     (weighed,) = with_slowness([part], [case], decimator, torque_rows, values)
     assert weighed.slowness.min() < 0.8
-    assert (weighed.slowness[np.abs(speed[: len(moves)]) > np.abs(case.motion.v).max(axis=0) * 0.3] == 1.0).all()
+    assert (weighed.slowness[speed > 3.0 * standstill.SLOW * peak] == 1.0).all()
     exact = replace(rows[0], target=rows[0].matrix @ values + np.where(slow, 0.1, 1.0) * residual)
     (alike,) = with_slowness([exact], [case], decimator, torque_rows, values)
     assert (alike.slowness == 1.0).all(), "slow rows never count more"
