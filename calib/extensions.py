@@ -1,100 +1,125 @@
-"""Extensions of the core by the packages in `calib.rooms`: listed by folder, loaded at first use.
+"""Extension points: where several packages add to one table, each loaded at first use.
 
-A room is a package of `calib.rooms` with a table ``OFFERS``: what it adds, and where, as ``module:name`` below the room
-(``:name`` for the package itself, ``module:`` for a module). The core asks for
+A package directly below one of `HOSTS` adds by a table ``OFFERS`` in its ``__init__.py``: name of a point →
+``module:name`` below the package (``:name`` for the package itself, ``module:`` for a module), or several of them. The
+module that asks declares the point with the type of what is offered there::
 
-    commands               typer apps of `calib`
-    topics, schemas        of `calib formats`: see `calib.procedure.formats`
-    methods                of identification: tuples of `calib.identification.methods.method.Method`
-    loop_results           function: problem, estimate → `calib.identification.loop.LoopResults`
-    link_motion            function: robot, case, settings → the case with its links' motion, moved by joint corrections
-    deflection_sensitivity function: identification, robot, cases → derivative of the estimate by their coefficients
-    identified_masses      function: folder of an identification, chain → standard parameters (n, 10) of its bodies
-    return_masses          function: session → notes; hands identified masses to its fit
-    track                  function: inputs, dynamics, predictions, controller → replays with the model fed forward
-    robots                 functions: what a person names → `calib.procedure.robot_kinds.Mechanism`, or None
-    descriptions           a module: `takes` tells by its name whether a file is another program's description of a
-                           robot, `urdf` returns it as the text of a URDF
-    limit_tables           functions: path, arm, its file → tables of `calib formats limits`, None for other files
-    ros2_package           function: see `calib.rooms.descriptions.ros2_package`
-    library                folder of the robots that go by a name
-    stages                 their verbs: tables of kind → verb → `calib.procedure.robot_kinds.Stage`
-    drive_gains            function: robot, cases of currents, settings, known parameters, reference joint → gains of
-                           a robot that is not a serial arm (`calib.identification.gains.DriveGains`)
-    image_folders          a module: `read_images` reads a folder of images as a block of measurements
-    exports                functions: path → the file as a stream of our text, None where it is our table already
-    read_bag               function: ROS bag, joints, options → `calib.data.recordings.recording.Recording`
-    pose_forms             files of poses that are no standard table: by ``format``, whether a header is of that form,
-                           and its reader
-    planned_poses          function: file of points, nominal arm, options → blocks with the joints of planned poses
-    camera_guess           a module: lenses of images completed, images as poses
-    optics                 of kinds of measurement that are not the core's: their instruments' parameters
-                           (`calib.geometry.installation.NoOptics`); loading it registers guesses and residuals
-    read_optics            the same from the tables of a fit's ``robot.toml``
-    camera_view            what a camera sees, of a constraints file; read_lens, read_board: its files
-    fit_notes              functions: a fit → findings on it; image_coverage, reprojection: figures of its images
-    image_words            what is said of images as they arrive
-    recordings             functions: a session's folder → the name of the recording written there
-    steps, endings         of a session: steps after the export; functions: a complete session → lines to print
-    fit_pages, model_pages functions that write the certificate of a fit and of an identification into its folder
-                           (report, figures by name, folder)
-    check_controller       function: controller's name, number of joints; raises where it takes no such arm
-    write_program          function: CSV of poses, path, controller's name → files of its program
-    joint_origins          function: texts of a nominal and a calibrated URDF, their name → YAML for tesseract
-    ur_kinematics          function: calibrated robot, its URDF → YAML for ur_description, and a remark
-    as_described           function: controller's name, joints as it shows them → the description's joints;
-    motors_as_described    the same of motors' torques and currents
-    notebook               function: a result → HTML
-    geometry_spread        function: see `calib.procedure.excitation.prior_motions.GeometrySpread`
+    METHODS: Point[Sequence[Method]] = Point("methods", "methods of identification")
+    methods = [method for methods in METHODS.all() for method in methods]
 
-A room that is deleted takes its commands, methods and robots along; the rest works without.
+A name that is none of `POINTS` is refused when the tables are read. A package that is deleted takes its offers along;
+the rest works without.
 """
 
 from __future__ import annotations
 
 import pkgutil
+from collections.abc import Mapping
 from functools import cache
 from importlib import import_module
-from typing import Any
+from typing import Any, Generic, TypeVar
 
-from calib.errors import UsageError
+from calib.errors import CalibError, UsageError, suggestion
 
-ROOMS = "calib.rooms"
+HOSTS = ("calib", "calib.apps", "calib.rooms")
+POINTS = (
+    "commands",
+    "descriptions",
+    "drive_gains",
+    "exports",
+    "library",
+    "optics",
+    "planned_poses",
+    "recordings",
+    "robots",
+    "schemas",
+    "stages",
+    "steps",
+    "topics",
+    "write_program",
+)
+T = TypeVar("T")
 
 
-def offered(what: str) -> list[Any]:
-    """Return the extensions that packages registered under the name `what`, in the order of the packages' names."""
-    return [_loaded(room, places[what]) for room, places in _offers().items() if what in places]
+class Point(Generic[T]):
+    """One place where packages add to the core; `T` is the type of what each of them offers there.
 
-
-def merged(what: str) -> dict[str, Any]:
-    """Return one table merged from the tables that packages registered under the name `what`."""
-    return {key: value for table in offered(what) for key, value in table.items()}
-
-
-def needed(what: str) -> Any:
-    """Return the extension that a package registered under the name `what`.
-
-    Raises:
-        UsageError: where no room offers it.
+    Attributes:
+        name: one of `POINTS`.
+        about: what is offered.
     """
-    for each in offered(what):
-        return each
-    raise UsageError(f"{what.replace('_', ' ')}: no package of {ROOMS} provides it; install the toolkit again")
+
+    def __init__(self, name: str, about: str) -> None:
+        if name not in POINTS:
+            raise ValueError(f"extension point '{name}' is none of calib.extensions.POINTS{suggestion(name, POINTS)}")
+        self.name = name
+        self.about = about
+
+    def all(self) -> list[T]:
+        """Return all offers, in the order of the packages' names; empty without any.
+
+        Raises:
+            UsageError: where a table names a point that does not exist, or what it offers cannot be loaded.
+        """
+        return [_load(package, place) for package, table in _offers().items() for place in table.get(self.name, ())]
+
+    def one(self) -> T:
+        """Return the first offer.
+
+        Raises:
+            UsageError: where there is none, and as `all`.
+        """
+        for offer in self.all():
+            return offer
+        words = f"{self.name.replace('_', ' ')}: no package provides it; install the toolkit again"
+        raise UsageError(words)
+
+
+def merged(point: Point[Mapping[str, T]]) -> dict[str, T]:
+    """Return one table merged from the tables offered at a point."""
+    return {key: value for table in point.all() for key, value in table.items()}
 
 
 @cache
-def _offers() -> dict[str, dict[str, str]]:
-    """Return each package's table of extensions, by the package's full name."""
-    try:
-        package = import_module(ROOMS)
-    except ImportError:
-        return {}
-    names = sorted(f"{ROOMS}.{each.name}" for each in pkgutil.iter_modules(package.__path__))
-    return {name: import_module(name).OFFERS for name in names}
+def _offers() -> dict[str, dict[str, tuple[str, ...]]]:
+    """Return each package's table of offers, by the package's full name; refuse misspelt names of points."""
+    tables = {}
+    for name in _packages():
+        table = getattr(_import(name), "OFFERS", {})
+        for point in table:
+            if point not in POINTS:
+                raise UsageError(f"{name}: OFFERS: there is no extension point '{point}'{suggestion(point, POINTS)}")
+        tables[name] = {point: (places,) if isinstance(places, str) else places for point, places in table.items()}
+    return tables
 
 
-def _loaded(room: str, place: str) -> Any:
+def _packages() -> list[str]:
+    """Return the full names of the packages directly below one of `HOSTS`, sorted by their own names."""
+    found = []
+    for host in HOSTS:
+        try:
+            folders = import_module(host).__path__
+        except ModuleNotFoundError:
+            continue
+        found += [f"{host}.{module.name}" for module in pkgutil.iter_modules(folders) if module.ispkg]
+    return sorted(set(found) - set(HOSTS), key=lambda name: name.rpartition(".")[2])
+
+
+def _load(package: str, place: str) -> Any:
     module, _, name = place.rpartition(":")
-    found = import_module(f"{room}.{module}" if module else room)
-    return getattr(found, name) if name else found
+    loaded = _import(f"{package}.{module}" if module else package)
+    if not name:
+        return loaded
+    if not hasattr(loaded, name):
+        raise UsageError(f"{package}: OFFERS: {place}: there is no '{name}'{suggestion(name, dir(loaded))}")
+    return getattr(loaded, name)
+
+
+def _import(module: str) -> Any:
+    try:
+        return import_module(module)
+    except (CalibError, MemoryError):
+        raise
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise UsageError(f"the extension {module} does not load: {reason}; mend it or remove its folder") from error

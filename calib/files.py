@@ -11,6 +11,7 @@ import math
 import os
 import re
 import shutil
+import socket
 import stat
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -99,6 +100,40 @@ def _written(path: Path) -> dict[str, str]:
     except (OSError, ValueError):
         return {}
     return found if isinstance(found, dict) else {}
+
+
+@contextmanager
+def locked(path: Path, busy: str, kind: type[CalibError] = UsageError) -> Iterator[str]:
+    """Hold a lock file for the block; yield who held it last, if that process was killed, else an empty text.
+
+    The lock is the kernel's (flock), so that it ends with the process; the file says whose it is.
+
+    Args:
+        busy: the message where another process holds it; ``{}`` stands for its name.
+        kind: of that error.
+    """
+    import fcntl
+
+    with refused_as(CalibError, OSError, f"cannot write in {path.parent}: {{}}"):
+        file = path.open("a+", errors="replace")
+    with file:
+        file.seek(0)
+        holder = file.read(200).strip()
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise kind(busy.replace("{}", holder or "another command")) from None
+        if not path.exists() or not os.path.samestat(path.stat(), os.fstat(file.fileno())):
+            raise kind(f"{path.parent} was busy a moment ago; try again")
+        file.truncate(0)
+        file.write(f"process {os.getpid()} on {socket.gethostname()}")
+        file.flush()
+        try:
+            yield holder
+        except Exception:
+            path.unlink(missing_ok=True)
+            raise
+        path.unlink(missing_ok=True)
 
 
 def write(path: str | Path, content: str | bytes | Iterable[str]) -> Path:
@@ -384,3 +419,10 @@ def umask() -> int:
     mask = os.umask(0)
     os.umask(mask)
     return mask
+
+
+def shipped_text(package: str, file: str) -> str:
+    """Return the text of a file that is shipped in a package."""
+    from importlib import resources  # 3 ms
+
+    return resources.files(package).joinpath(file).read_text(encoding="utf-8")

@@ -90,7 +90,7 @@ def _ours(files: Prepared, folder: Path) -> tuple[list[tuple[np.ndarray, np.ndar
     outcome = identified_pair(files, folder)
     predicted = [(case.motion.t, np.asarray(outcome.predictions[case.name])) for case in outcome.inputs.unseen]
     found = outcome.intervals.values()
-    inside = [one.inside[one.known].ravel() for one in found]
+    inside = [one.contains[one.valid].ravel() for one in found]
     return predicted, 100.0 * float(np.concatenate(inside).mean()) if inside else None
 
 

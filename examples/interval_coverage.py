@@ -28,7 +28,7 @@ from calib.data.poses.measurements import take
 from calib.geometry.model_choice.folds import region_folds
 from calib.identification.identify import Identification, identify
 from calib.identification.identify_options import parse_options
-from calib.identification.torque_errors import TorqueIntervals
+from calib.identification.uncertainty.torque_errors import TorqueIntervals
 from calib.procedure.dynamic_stage.inputs import gather as gather_logs
 from calib.procedure.kinematic_stage.inputs import gather
 from calib.procedure.kinematic_stage.settings import FitSettings
@@ -121,7 +121,7 @@ def ends(robot: Path, file: Path) -> Iterator[GeometryFit]:
 def torque_row(name: str, split: str, model: DynamicsModel) -> str:
     """Return a row of the torques' table: intervals on motion that the identification has not seen."""
     cases = model.intervals
-    series = ("index", "sigma", "inside", "known", "standing")
+    series = ("index", "sigma", "contains", "valid", "standing")
     joined = {key: np.concatenate([getattr(one, key) for one in cases.values()]) for key in series}
     found = TorqueIntervals(**joined, extrapolated=np.concatenate([x.extrapolated for x in cases.values()], axis=1))
     errors = [model.validation[case].raw.total for case in cases]

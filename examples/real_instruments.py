@@ -30,12 +30,12 @@ from calib.data.signals.motion import Motion
 from calib.errors import CalibError
 from calib.estimation.linear import settled_std, wls
 from calib.estimation.whiteness import inflation
+from calib.identification.closed_loop import instrumental_variables as instruments
 from calib.identification.identify import Identification, identify
 from calib.identification.identify_options import IdentifyOptions, parse_options
 from calib.identification.rows import Case, observe
 from calib.procedure.dynamic_stage import inputs as recordings
 from calib.records import frozen
-from calib.rooms.closed_loop import instrumental_variables as instruments
 from trajectories.basis import SampledMotion
 from trajectories.fourier import fourier_family
 

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import planted_motion as planted
 import pytest
-import typer
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -40,7 +39,7 @@ CHECKS = [HealthCheck.too_slow, HealthCheck.function_scoped_fixture]
 
 def options(command: str) -> list[str]:
     """Return the options of a command that take a value."""
-    known = typer.main.get_command(cli.app).commands[command].params  # type: ignore[attr-defined]
+    known = cli.command_tree().commands[command].params
     taking = [one for one in known if one.param_type_name == "option" and not one.is_flag]
     return sorted({max(one.opts, key=len) for one in taking} - ALONE)
 

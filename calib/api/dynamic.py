@@ -17,7 +17,7 @@ from calib.errors import UsageError, require
 from calib.estimation.estimate import Estimate
 from calib.identification.identify_options import IdentifyOptions, IdentifySettings, options_of, read_options
 from calib.identification.methods.method import Method
-from calib.identification.methods.registry import METHODS
+from calib.identification.registry import METHODS
 from calib.procedure.dynamic_stage import folder, identify, inputs, metrics
 from calib.procedure.excitation import coefficients
 from calib.procedure.robot_kinds import Mechanism, stage_of

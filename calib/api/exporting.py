@@ -14,7 +14,6 @@ from calib.api.kinematic import GeometryFit, Measured, Several
 from calib.api.rendering import listed, optional, saved
 from calib.arguments import checked
 from calib.errors import CalibWarning, RobotError, UsageError, refused_as, require
-from calib.extensions import needed
 from calib.procedure.dynamic_stage import identify as arm_identify
 from calib.procedure.export import delivery, geometry
 from calib.procedure.export.identified import is_identified
@@ -105,7 +104,9 @@ def export(
         if ros2:
             wanted = replace(wanted, remark=delivery.verdicts(place).of("urdf", dynamics=True).remark)
             own = {"moveit": [*map(Path, moveit)], "control": control, "overwrite": overwrite}
-            return needed("ros2_package")(wanted, ros2, into, **own)
+            from calib.procedure.export.ros2_package import write_package
+
+            return write_package(wanted, ros2, into, **own)
         delivery.check_into(wanted, into, place)
         lines = delivery.deliver(wanted, into)
         judged = delivery.mark(into, delivery.verdicts(place))

@@ -18,8 +18,10 @@ from typer.main import get_command
 import calib
 from calib.cli import dynamics, geometry, session
 from calib.cli.help import Group, spelt
-from calib.extensions import offered
+from calib.extensions import Point
 from calib.workers.threads import limit_process
+
+COMMANDS: Point[typer.Typer] = Point("commands", "commands of calib, one Typer application")
 
 # a command makes a million objects as it loads and hardly a cycle: walking all of them again and again for garbage was
 # 6 % of its time (numbers of new objects, of young and of middle-aged collections; Python's own are 700, 10, 10)
@@ -45,8 +47,6 @@ app = typer.Typer(
 _USAGE: Any = typer.BadParameter.__mro__[2]  # ClickException, of the click that this typer uses (or brings)
 
 codecs.register_error("spelt", spelt)
-for _commands in (*offered("commands"), geometry.app, dynamics.app, session.app):  # in the order of the help
-    app.add_typer(_commands)
 
 
 def _show_version(wanted: bool) -> None:
@@ -86,6 +86,8 @@ def main(arguments: list[str] | None = None) -> None:
 @lru_cache(maxsize=1)
 def command_tree() -> Any:
     """Return the Typer commands, built once per process from the functions' signatures."""
+    for commands in (*COMMANDS.all(), geometry.app, dynamics.app, session.app):  # in the order of the help
+        app.add_typer(commands)
     return get_command(app)
 
 

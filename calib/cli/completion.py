@@ -7,12 +7,14 @@ from typing import Annotated
 import typer
 
 from calib.config_types import OneOf
-from calib.extensions import offered
+from calib.extensions import Point
+
+LIBRARY: Point[Path] = Point("library", "folders of robots that go by a name")
 
 
 def robots(incomplete: str) -> Iterator[str]:
     """Yield the library's robots that begin with what is typed, and then files and folders that do, too."""
-    folders = (Path(__file__).parents[1] / "robot" / "library", *offered("library"))
+    folders = (Path(__file__).parents[1] / "robot" / "library", *LIBRARY.all())
     names = sorted(path.stem for folder in folders for path in folder.glob(f"{incomplete}*.toml"))
     known = [name for name in names if not name.endswith("_truth")]
     yield from known

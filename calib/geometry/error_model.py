@@ -29,12 +29,27 @@ from calib.geometry.model_choice.cross_validation import project_out, term_group
 from calib.geometry.model_choice.folds import Folds, random_folds
 from calib.geometry.model_choice.ladder import MAX_RESIDUAL, ModelSelection
 from calib.geometry.observation import layout, observe, prepare
+from calib.geometry.residuals import Part
+from calib.geometry.weighing import GeometricFit
 from calib.records import evenly
 from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 
-END_SHARE = 0.2  # share of the poses at each end of a joint's range that is left out (our choice)
+# share of the poses at each end of a joint's range that is left out (our choice)
+END_SHARE = 0.2
+# share of the poses within the distance from a joint's range (our choice)
+NEAR_SHARE = 0.02
+# poses from which errors on held-out rows are worth a model (our choice)
+MIN_POSES = 20
+# poses that folds are judged by (our choice)
+MAX_POSES = 1500
+# what is known beforehand of a parameter that a fold does not tell [m, rad] (our choice)
+PRIOR_SIGMA = 1.0
+# poses and step [rad or m] by which a joint's lever is measured, and the least lever [m/rad or 1]
+LEVER_POSES = 50
+LEVER_STEP = 1e-4
+MIN_LEVER = 0.05
 
 
 @dataclass(frozen=True)
@@ -96,8 +111,9 @@ class ErrorModel:
             station: index of the station of reference; -1 for the arm's base.
             tool: which of its tools, one or (m,).
         """
-        own = position_variances(self.cell, rows, self.free, self.covariance, station, tool)
-        return self._sigma(own, rows.q)
+        variance = position_variances(self.cell, rows, self.free, self.covariance, station, tool)
+        sigma, radius = self._sigma_and_radius(variance, rows.q, self.discrepancy.radii)
+        return sigma * (radius * self._widening(rows.q)) / self.discrepancy.radius
 
     def sigma_on(self, cell: Installation, block: Positions, placed_anew: bool = False) -> np.ndarray:
         """Return `position_sigma` at the poses of measured rows (m,) [m].
@@ -111,34 +127,53 @@ class ErrorModel:
         ready = prepare(cell, [block])[0]
         if not placed_anew:
             return self.position_sigma(block, ready.station, ready.tool)
-        own, now = layout(self.cell), layout(cell)
-        kinds = np.array(own.kinds)[self.free]
+        fit_layout = layout(self.cell)
+        new_layout = layout(cell)
+        kinds = np.array(fit_layout.kinds)[self.free]
         stays = ~np.isin(kinds, ("station", "tool"))
-        where = self.free[stays] + np.where(kinds[stays] == "arm", 0, len(now.names) - len(own.names))
-        columns = np.concatenate([now.frame_index, where])
-        jacobian = next(part.jacobian for part in observe(cell, ready, columns) if part.label == "position")
-        frames = len(now.frame_index)
+        shift = np.where(kinds[stays] == "arm", 0, len(new_layout.names) - len(fit_layout.names))
+        frames = len(new_layout.frame_index)
+        columns = np.concatenate([new_layout.frame_index, self.free[stays] + shift])
+        jacobian = _position_part(observe(cell, ready, columns)).jacobian
         jacobian = project_out(jacobian, np.arange(frames))[frames:]
         values, vectors = np.linalg.eigh(self.covariance[np.ix_(stays, stays)])
         root = vectors * np.sqrt(np.clip(values, 0.0, None))
-        spread = (root.T @ jacobian.reshape(len(root), 3 * len(block))).reshape(len(root), 3, len(block))
-        return self._sigma(np.sum(spread**2, axis=(0, 1)), block.q, self.discrepancy.placed)
+        spread = root.T @ jacobian.reshape(len(root), 3 * len(block))
+        variance = np.sum(spread.reshape(len(root), 3, len(block)) ** 2, axis=(0, 1))
+        radii = self.discrepancy.placed
+        if radii is not None:
+            sigma, radius = self._sigma_and_radius(variance, block.q, radii)
+            return sigma * radius / self.discrepancy.radius
+        sigma, radius = self._sigma_and_radius(variance, block.q, self.discrepancy.radii)
+        return sigma * (radius * self._widening(block.q)) / self.discrepancy.radius
 
-    def _sigma(self, own: np.ndarray, q: np.ndarray, radii: tuple[float, float] | None = None) -> np.ndarray:
-        """Return `position_sigma` (m,) [m] from the variance due to the parameters, trace J Σ Jᵀ (m,) [m²]."""
-        found, parts = self.discrepancy, _distances(q, self.learnt, np.array(self.discrepancy.levers))
-        rest = unevenness(found.profile, q) * found.floor + found.far * parts[0] + found.beyond * parts[1]
-        radius = np.interp(parts[0] + parts[1], found.reach, radii or found.radii)
-        radius *= self._wider(q) if radii is None else 1.0
-        return np.sqrt(found.parameters * own + rest) * radius / found.radius
+    def _sigma_and_radius(
+        self, parameter_variance: np.ndarray, q: np.ndarray, radii: tuple[float, float]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the standard deviation (m,) [m] and the number of them (m,) that holds 95 % of the errors.
 
-    def _wider(self, q: np.ndarray) -> np.ndarray:
+        Args:
+            parameter_variance: (m,) [m²] due to the parameters, trace J Σ Jᵀ.
+            q: (m, n) poses [rad or m].
+            radii: near and far.
+        """
+        model = self.discrepancy
+        from_poses, from_ranges = _distances(q, self.learnt, np.array(model.levers))
+        model_variance = (
+            unevenness(model.profile, q) * model.floor + model.far * from_poses + model.beyond * from_ranges
+        )
+        sigma = np.sqrt(model.parameters * parameter_variance + model_variance)
+        return sigma, np.interp(from_poses + from_ranges, model.reach, radii)
+
+    def _widening(self, q: np.ndarray) -> np.ndarray:
         """Return the widening factors (m,) of intervals outside the ranges: in full beyond half the width of an end."""
         result = np.ones(len(q))
-        for j, most in enumerate(self.discrepancy.wider):
-            low, first, last, high = np.quantile(self.learnt[:, j], [0.0, END_SHARE, 1.0 - END_SHARE, 1.0])
-            for far, end, factor in ((low - q[:, j], first - low, most[0]), (q[:, j] - high, high - last, most[1])):
-                share = np.clip(2.0 * far / max(end, 1e-9), 0.0, 1.0)
+        for joint, (below, above) in enumerate(self.discrepancy.wider):
+            values = self.learnt[:, joint]
+            low, first, last, high = np.quantile(values, [0.0, END_SHARE, 1.0 - END_SHARE, 1.0])
+            ends = ((low - q[:, joint], first - low, below), (q[:, joint] - high, high - last, above))
+            for distance, width, factor in ends:
+                share = np.clip(2.0 * distance / max(width, 1e-9), 0.0, 1.0)
                 result = np.maximum(result, 1.0 + (factor - 1.0) * share)
         return result
 
@@ -148,188 +183,272 @@ def outside(q: np.ndarray, learnt: np.ndarray) -> np.ndarray:
     return np.asarray((q < learnt.min(axis=0)) | (q > learnt.max(axis=0)))
 
 
+def _position_part(parts: Sequence[Part]) -> Part:
+    return next(part for part in parts if part.label == "position")
+
+
 def _variances(precision: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Return the diagonal (k,) of Jᵀ P⁻¹ J for columns J (p, k), from a precision matrix P with unit diagonal."""
     try:
         factor = np.linalg.cholesky(precision + 1e-12 * np.eye(len(precision)))
-    except np.linalg.LinAlgError:  # by rounding; Cholesky is five times as fast
+    except np.linalg.LinAlgError:
+        # not positive by rounding; the eigenvalues take five times as long
         values, vectors = np.linalg.eigh(precision)
         spread = columns.T @ vectors / np.sqrt(np.maximum(values, 1e-12 * values[-1]))
     else:
-        spread = dtrsm(1.0, factor.T, columns.T, side=1)  # rows (L⁻¹ J)ᵀ, without copies
+        # rows (L⁻¹ J)ᵀ, without copies
+        spread = dtrsm(1.0, factor.T, columns.T, side=1)
     return np.einsum("kp,kp->k", spread, spread)
 
 
 def _distances(q: np.ndarray, learnt: np.ndarray, levers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the squared distances (m,) [m²] of poses from the nearest fitted pose, and from each joint's range.
 
-    The latter is, joint by joint, the way to where `near_share` of the learnt poses are within reach: a few of them far
-    off the others do not say how a joint is there.
+    The latter is, joint by joint, the distance within which `NEAR_SHARE` of the fitted poses are: a few of them far off
+    the others do not say how a joint is there.
     """
-    nearest = np.asarray(KDTree(learnt * levers).query(q * levers)[0]) ** 2
-    alone, count = np.zeros(len(q)), len(learnt)
-    near_share = 0.02  # share of the poses (our choice)
-    some = int(np.clip(round(near_share * count), 1, count))
-    for j, lever in enumerate(levers):
-        values = np.sort(learnt[:, j])
-        low, high = values[: count - some + 1], values[some - 1 :]  # ends of all that are `some` values wide
-        middle = np.searchsorted(low + high, 2.0 * q[:, j])  # before it the low end is the further one
-        before, after = np.maximum(middle - 1, 0), np.minimum(middle, count - some)
-        way = np.minimum(*(np.maximum(np.abs(low[at] - q[:, j]), np.abs(high[at] - q[:, j])) for at in (before, after)))
-        alone += (lever * way) ** 2
-    return nearest, alone
+    nearest = KDTree(learnt * levers).query(q * levers)[0]
+    count = len(learnt)
+    neighbours = int(np.clip(round(NEAR_SHARE * count), 1, count))
+    from_ranges = np.zeros(len(q))
+    for joint, lever in enumerate(levers):
+        values = np.sort(learnt[:, joint])
+        position = q[:, joint]
+        # all intervals that hold as many of the poses; before the middle their low end is the further one
+        low = values[: count - neighbours + 1]
+        high = values[neighbours - 1 :]
+        middle = np.searchsorted(low + high, 2.0 * position)
+        before = np.maximum(middle - 1, 0)
+        after = np.minimum(middle, count - neighbours)
+        distance_before = np.maximum(np.abs(low[before] - position), np.abs(high[before] - position))
+        distance_after = np.maximum(np.abs(low[after] - position), np.abs(high[after] - position))
+        from_ranges += (lever * np.minimum(distance_before, distance_after)) ** 2
+    return np.asarray(nearest) ** 2, from_ranges
 
 
 def _joint_levers(chain: Chain, q: np.ndarray) -> np.ndarray:
     """Return how far the tip moves per unit of each joint (n,) [m/rad or 1], rms over poses."""
-    rows = q[evenly(len(q), 50)]
-    result, step = np.zeros(chain.n), 1e-4
-    for j in range(chain.n):
-        move = np.zeros(chain.n)
-        move[j] = step
-        way = forward(chain, rows + move)[:, :3, 3] - forward(chain, rows - move)[:, :3, 3]
-        result[j] = np.sqrt(np.mean(np.sum(way**2, axis=1))) / (2.0 * step)
-    return np.maximum(result, 0.05)
+    poses = q[evenly(len(q), LEVER_POSES)]
+    result = np.zeros(chain.n)
+    for joint in range(chain.n):
+        change = np.zeros(chain.n)
+        change[joint] = LEVER_STEP
+        motion = forward(chain, poses + change)[:, :3, 3] - forward(chain, poses - change)[:, :3, 3]
+        result[joint] = np.sqrt(np.mean(np.sum(motion**2, axis=1))) / (2.0 * LEVER_STEP)
+    return np.maximum(result, MIN_LEVER)
 
 
-def learn_errors(selected: ModelSelection, measured: Sequence[PoseMeasurements], seed: int = 0) -> ErrorModel | None:
+def learn_errors(selection: ModelSelection, measured: Sequence[PoseMeasurements], seed: int = 0) -> ErrorModel | None:
     """Return the error model, estimated from the errors on held-out rows; None if too few positions were measured.
 
     For every fold the geometry and the ridges of all chosen effects are estimated anew: ridges from all rows would
     depend on the held-out rows. With a robust loss, rows beyond `MAX_RESIDUAL` robust sigmas do not count.
 
     Args:
-        selected: the model and its fit of all rows.
+        selection: the model and its fit of all rows.
         measured: the blocks it was fitted to.
         seed: of the random folds.
     """
-    found = selected.fit
-    min_poses = 20  # poses from which errors on rows left out are worth a model (our choice)
-    if sum(len(block) for block in measured) < min_poses or not all(isinstance(block, Positions) for block in measured):
+    fit = selection.fit
+    poses = sum(len(block) for block in measured)
+    if poses < MIN_POSES or not all(isinstance(block, Positions) for block in measured):
         return None
     q = np.concatenate([block.q for block in measured])
-    levers = _joint_levers(found.cell.chain, q)
-    rows = _Rows(selected, measured)
-    near = [*rows.left_out(random_folds(measured, 5, seed), levers)]
-    groups = [(-1, selected.folds), *_range_folds(measured)]
-    far = [(joint, errors) for joint, each in groups for errors in rows.left_out(each, levers)]
-    left = LeftOut.of(near, [errors for _, errors in far], [joint for joint, _ in far])
-    left, profile = left.scaled(rows.poses)
-    weights, radii = left.learnt()
-    low, high = (float(np.median(left.away[of])) for of in (left.near, ~left.near))
-    reach = low, max(high, low * (1.0 + 1e-9) + 1e-12)
-    wider = left.surprise(weights, reach)
-    wide = radii[0] * wider[0], radii[1] * wider[1]
-    outside = left.wider(weights, wide, reach, rows.poses)
-    kappa, floor, near_by, beyond = weights
-    lengths = tuple(levers.tolist())
-    known = Discrepancy(kappa, floor, near_by, beyond, wide, reach, lengths, profile, radii, outside)
-    return ErrorModel(found.cell, found.free, found.estimate.covariance, q, known)
+    levers = _joint_levers(fit.cell.chain, q)
+    rows = _Rows(selection, measured)
+    near_errors = list(rows.left_out(random_folds(measured, 5, seed), levers))
+    far_errors = list(rows.left_out(selection.folds, levers))
+    joints = [-1] * len(far_errors)
+    for joint, folds in _range_folds(measured):
+        of_ends = list(rows.left_out(folds, levers))
+        far_errors += of_ends
+        joints += [joint] * len(of_ends)
+    samples, profile = LeftOut.of(near_errors, far_errors, joints).scaled(rows.poses)
+    weights, radii = samples.learnt()
+    near_reach = float(np.median(samples.away[samples.near]))
+    far_reach = float(np.median(samples.away[~samples.near]))
+    reach = near_reach, max(far_reach, near_reach * (1.0 + 1e-9) + 1e-12)
+    # an interval holds 95 % of a fold whose poses took no part in it
+    near_factor, far_factor = samples.surprise(weights, reach)
+    wide_radii = radii[0] * near_factor, radii[1] * far_factor
+    discrepancy = Discrepancy(
+        *weights,
+        radii=wide_radii,
+        reach=reach,
+        levers=tuple(levers.tolist()),
+        profile=profile,
+        placed=radii,
+        wider=samples.wider(weights, wide_radii, reach, rows.poses),
+    )
+    return ErrorModel(fit.cell, fit.free, fit.estimate.covariance, q, discrepancy)
 
 
 def _range_folds(measured: Sequence[PoseMeasurements]) -> list[tuple[int, Folds]]:
     """Return, for each joint, its index and the two folds that hold out the ends of its range."""
     q = np.concatenate([block.q for block in measured])
-    edges, result = np.cumsum([len(block) for block in measured])[:-1], []
-    for j in range(q.shape[1]):
-        low, high = np.quantile(q[:, j], [END_SHARE, 1.0 - END_SHARE])
+    edges = np.cumsum([len(block) for block in measured])[:-1]
+    result = []
+    for joint in range(q.shape[1]):
+        values = q[:, joint]
+        low, high = np.quantile(values, [END_SHARE, 1.0 - END_SHARE])
         if high - low < 1e-6:
             continue
-        fold = np.where(q[:, j] < low, 0, np.where(q[:, j] > high, 1, 2))
-        result.append((j, Folds("ranges", 2, tuple(np.split(fold, edges)))))
+        fold = np.full(len(values), 2)
+        fold[values > high] = 1
+        fold[values < low] = 0
+        result.append((joint, Folds("ranges", 2, tuple(np.split(fold, edges)))))
     return result
 
 
 class _Rows:
-    """Residuals and Jacobians of a fit's rows at the rigid geometry, from which folds are evaluated."""
+    """Residuals and Jacobians of a fit's rows at the rigid geometry, from which folds are evaluated.
 
-    def __init__(self, selected: ModelSelection, measured: Sequence[PoseMeasurements]):
-        found, terms = selected.fit, selected.offered
-        max_poses = 1500  # poses that folds are judged by (our choice)
-        every = max(1, -(-sum(map(len, measured)) // max_poses))
-        self.chosen = [np.arange(0, len(block), every) for block in measured]
-        self.measured = [take(block, rows) for block, rows in zip(measured, self.chosen)]
-        self.pose, poses = [], []
+    Attributes:
+        chosen: per block, the rows by which folds are judged.
+        measured: these rows.
+        pose: per block, (m,) number of each row's pose.
+        poses: (p, n) joint values of all poses.
+        counts: per block, (m,) mask of the rows that are not gross.
+        free: parameters of the fit but its corrections, then all terms on offer.
+        station: positions of the stations' placements among `free`.
+        prior: standard deviations of parameters that a fold does not tell.
+        coordinates: of the columns, in which the statistics are.
+        whitened: per block and residual part, residual and Jacobian.
+        metric: per block, residual and Jacobian of positions [m].
+        total: statistics of all rows.
+    """
+
+    def __init__(self, selection: ModelSelection, measured: Sequence[PoseMeasurements]):
+        fit = selection.fit
+        terms = selection.offered
+        self._choose(measured)
+        self._number_poses()
+        gross = set()
+        if selection.loss != "none":
+            gross = {(file, row) for file, row, *_ in fit.outliers(MAX_RESIDUAL)}
+        self.counts = []
         for block in self.measured:
-            _, first, which = np.unique(block.together, return_index=True, return_inverse=True)
-            self.pose.append(which + sum(map(len, poses)))
-            poses.append(block.q[first])
-        self.poses = np.concatenate(poses)
-        gross = set() if selected.loss == "none" else {(file, row) for file, row, *_ in found.outliers(MAX_RESIDUAL)}
-        self.counts = [np.array([(b.file, int(row)) not in gross for row in b.rows], bool) for b in self.measured]
-        cell = found.cell
+            good = [(block.file, int(row)) not in gross for row in block.rows]
+            self.counts.append(np.array(good, bool))
+        cell = fit.cell
         if terms:
-            cell = replace(cell, deflection=Deflection(terms, np.zeros(len(terms)), selected.nominal.cell.chain))
+            cell = replace(cell, deflection=Deflection(terms, np.zeros(len(terms)), selection.nominal.cell.chain))
         table = layout(cell)
         terms_index = table.index("deflection")
-        own = np.flatnonzero(~np.isin(found.free, terms_index))
-        self.free = np.concatenate([found.free[own], terms_index])
+        geometry = np.flatnonzero(~np.isin(fit.free, terms_index))
+        self.free = np.concatenate([fit.free[geometry], terms_index])
         self.station = np.flatnonzero(np.isin(self.free, table.index("station")))
-        wide = plausible_deviation(cell, self.free[: len(own)])
-        if found.prior is not None:
-            wide = np.minimum(wide, found.prior[own])
-        prior_sigma = 1.0  # what is known beforehand of a parameter that a fold does not tell [m, rad] (our choice)
-        self.prior = np.where(np.isfinite(wide), wide, prior_sigma)
-        scales, weights = found.used_sigmas(), found.row_weights()
+        width = plausible_deviation(cell, self.free[: len(geometry)])
+        if fit.prior is not None:
+            width = np.minimum(width, fit.prior[geometry])
+        self.prior = np.where(np.isfinite(width), width, PRIOR_SIGMA)
+        self._observe(fit, cell)
+        total = self._gram(0, slice(None))
+        for number in range(1, len(self.measured)):
+            total = total + self._gram(number, slice(None))
+        groups = np.concatenate([np.full(len(geometry), -1), term_groups(terms)]).astype(int)
+        sizes = np.concatenate([np.ones(len(geometry)), term_sizes(terms)])
+        self.coordinates = condensed(lambda columns: total.square[np.ix_(columns, columns)], groups, sizes)
+        self.total = self.coordinates.gram(total)
+        self._condense()
+
+    def _choose(self, measured: Sequence[PoseMeasurements]) -> None:
+        """Choose rows by which folds are judged: every k-th of very many."""
+        stride = max(1, -(-sum(map(len, measured)) // MAX_POSES))
+        self.chosen = [np.arange(0, len(block), stride) for block in measured]
+        self.measured = [take(block, rows) for block, rows in zip(measured, self.chosen)]
+
+    def _number_poses(self) -> None:
+        self.pose: list[np.ndarray] = []
+        poses: list[np.ndarray] = []
+        count = 0
+        for block in self.measured:
+            _, first, pose_of_row = np.unique(block.together, return_index=True, return_inverse=True)
+            self.pose.append(pose_of_row + count)
+            poses.append(block.q[first])
+            count += len(first)
+        self.poses = np.concatenate(poses)
+
+    def _observe(self, fit: GeometricFit, cell: Installation) -> None:
+        """Evaluate residuals and Jacobians, whitened and in metres."""
+        sigmas = fit.used_sigmas()
+        weights = fit.row_weights()
         self.whitened: list[list[tuple[np.ndarray, np.ndarray]]] = []
         self.metric: list[tuple[np.ndarray, np.ndarray]] = []
-        for number, ready in enumerate(prepare(cell, self.measured)):
-            parts = observe(cell, ready, self.free)
+        for number, block in enumerate(prepare(cell, self.measured)):
+            parts = observe(cell, block, self.free)
             root = np.sqrt(weights[number][self.chosen[number]])
-            self.whitened.append(
-                [
-                    (each.value * root / scales[number][each.label], each.jacobian * root / scales[number][each.label])
-                    for each in parts
-                ]
-            )
-            self.metric.append(next((each.value, each.jacobian) for each in parts if each.label == "position"))
-        total = sum((self._gram(k, slice(None)) for k in range(1, len(self.measured))), self._gram(0, slice(None)))
-        groups = np.concatenate([np.full(len(own), -1), term_groups(terms)]).astype(int)
-        start = np.concatenate([np.ones(len(own)), term_sizes(terms)])
-        self.coordinates = condensed(lambda columns: total.square[np.ix_(columns, columns)], groups, start)
-        self.total, columns = self.coordinates.gram(total), self.coordinates.columns
-        self.whitened = [[(value, columns(jacobian)) for value, jacobian in block] for block in self.whitened]
+            whitened = []
+            for part in parts:
+                sigma = sigmas[number][part.label]
+                whitened.append((part.value * root / sigma, part.jacobian * root / sigma))
+            self.whitened.append(whitened)
+            position = _position_part(parts)
+            self.metric.append((position.value, position.jacobian))
+
+    def _condense(self) -> None:
+        """Express all Jacobians in the coordinates of the statistics."""
+        columns = self.coordinates.columns
+        for number, block in enumerate(self.whitened):
+            self.whitened[number] = [(value, columns(jacobian)) for value, jacobian in block]
         self.metric = [(value, columns(jacobian)) for value, jacobian in self.metric]
 
     def _gram(self, block: int, rows: np.ndarray | slice) -> Gram:
-        each = [
-            gram(value[:, rows].ravel(), jacobian[:, :, rows].reshape(len(jacobian), -1).T)
-            for value, jacobian in self.whitened[block]
-        ]
-        return sum(each[1:], each[0])
+        statistics = []
+        for value, jacobian in self.whitened[block]:
+            matrix = jacobian[:, :, rows].reshape(len(jacobian), -1).T
+            statistics.append(gram(value[:, rows].ravel(), matrix))
+        return sum(statistics[1:], statistics[0])
 
     def left_out(self, folds: Folds, levers: np.ndarray) -> Iterator[np.ndarray]:
         """Yield each fold's rows (rows, 5): |e|², trace J Σ Jᵀ, two squared distances to other rows, pose number."""
-        free, sizes, space = np.arange(len(self.prior)), self.coordinates.sizes, self.coordinates
+        space = self.coordinates
+        diagonal = np.arange(len(self.prior))
+        sizes = space.sizes
         for fold in range(folds.count):
-            inside = [np.flatnonzero(members[rows] == fold) for members, rows in zip(folds.members, self.chosen)]
-            if not 0 < sum(map(len, inside)) < sum(map(len, self.measured)):
+            held_out = []
+            for members, rows in zip(folds.members, self.chosen):
+                held_out.append(np.flatnonzero(members[rows] == fold))
+            if not 0 < sum(map(len, held_out)) < sum(map(len, self.measured)):
                 continue
             data = self.total
-            for number, rows in enumerate(inside):
+            for number, rows in enumerate(held_out):
                 if len(rows):
                     data = data - self._gram(number, rows)
             square = data.square.copy()
-            square[free, free] += 1.0 / self.prior**2
-            found = relevance(replace(data, square=square), space.groups, sizes, 8, SETTLED, space.counts)
-            own = np.isfinite(found.ridge) & (found.ridge > 0.0)
-            sizes = np.where(own, found.ridge, space.sizes)  # where the next fold's search begins
-            alive = np.flatnonzero(found.ridge > 0.0)
-            precision = square[np.ix_(alive, alive)] / found.noise**2 + np.diag(found.ridge[alive] ** -2.0)
+            square[diagonal, diagonal] += 1.0 / self.prior**2
+            estimate = relevance(replace(data, square=square), space.groups, sizes, 8, SETTLED, space.counts)
+            # where the next fold's search begins
+            ridged = np.isfinite(estimate.ridge) & (estimate.ridge > 0.0)
+            sizes = np.where(ridged, estimate.ridge, space.sizes)
+            alive = np.flatnonzero(estimate.ridge > 0.0)
+            precision = square[np.ix_(alive, alive)] / estimate.noise**2
+            precision = precision + np.diag(estimate.ridge[alive] ** -2.0)
             scale = 1.0 / np.sqrt(np.diag(precision))
             precision *= np.outer(scale, scale)
-            learnt = np.concatenate([np.delete(b.q, rows, axis=0) for b, rows in zip(self.measured, inside)])
-            stays = {b.station for b, rows in zip(self.measured, inside) if len(rows) < len(b)}
-            for number, rows in enumerate(inside):
+            fitted_poses = []
+            fitted_stations = set()
+            for block, rows in zip(self.measured, held_out):
+                fitted_poses.append(np.delete(block.q, rows, axis=0))
+                if len(rows) < len(block):
+                    fitted_stations.add(block.station)
+            learnt = np.concatenate(fitted_poses)
+            for number, rows in enumerate(held_out):
                 if not len(rows):
                     continue
-                value, jacobian = (each[..., rows] for each in self.metric[number])
-                if self.measured[number].station not in stays:
-                    both = project_out(np.concatenate([jacobian, value[None]]), self.station)
-                    jacobian, value = both[:-1], both[-1]
-                error = value - np.einsum("f,fim->im", found.values, jacobian)
-                own = _variances(precision, scale[:, None] * jacobian[alive].reshape(len(alive), -1))
-                near = _distances(self.measured[number].q[rows], learnt, levers)
-                size, pose = np.sum(error**2, axis=0), self.pose[number][rows]
-                result = np.stack([size, own.reshape(3, -1).sum(axis=0), *near, pose], axis=1)
-                yield result[self.counts[number][rows]]
+                block = self.measured[number]
+                value, jacobian = self.metric[number]
+                value = value[..., rows]
+                jacobian = jacobian[..., rows]
+                if block.station not in fitted_stations:
+                    # its placement is fitted to the held-out rows
+                    stacked = project_out(np.concatenate([jacobian, value[None]]), self.station)
+                    jacobian = stacked[:-1]
+                    value = stacked[-1]
+                error = value - np.einsum("f,fim->im", estimate.values, jacobian)
+                variances = _variances(precision, scale[:, None] * jacobian[alive].reshape(len(alive), -1))
+                from_poses, from_ranges = _distances(block.q[rows], learnt, levers)
+                squares = np.sum(error**2, axis=0)
+                variance = variances.reshape(3, -1).sum(axis=0)
+                table = np.stack([squares, variance, from_poses, from_ranges, self.pose[number][rows]], axis=1)
+                yield table[self.counts[number][rows]]

@@ -1,7 +1,7 @@
 """Fit of the geometry: Levenberg–Marquardt on the whitened residuals of all kinds of measurements together."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -31,13 +31,28 @@ from calib.robot.chain import Chain, element_length
 
 # How far a parameter of a real arm may be from its nominal by making: one standard deviation (our choice)
 PLAUSIBLE = {"m": 0.01, "rad": 0.05}
-TYPICAL = {"m": 3e-3, "rad": 5e-3}  # widths of making of a usual arm: what one more parameter would say (our choice)
-WIDTH_UPDATES = 2  # fits with new widths of making, which then change by less than their uncertainty
-ROUNDING = 1e-12  # of WᵀW with its diagonal scaled to 1; its root of columns
-WIDTH_ROUNDS = 30  # of the fixed point of the widths between two fits
-MERGED = 0.1  # share of its largest coefficient from which a parameter counts as merged with another
-WARM_POSES = 2000  # poses with which the fit of many more begins, and that widths are estimated from (our choice)
-CRAWLS = 60  # linearisations after which a placement that has not settled does not tell itself (our choice)
+# widths of making of a usual arm: what one more parameter would say (our choice)
+TYPICAL = {"m": 3e-3, "rad": 5e-3}
+# measured numbers per unknown at least (our choice)
+MIN_NUMBERS = 1.5
+# fits with new widths of making, which then change by less than their uncertainty
+WIDTH_UPDATES = 2
+# of WᵀW with its diagonal scaled to 1; its root of columns
+ROUNDING = 1e-12
+# of the fixed point of the widths between two fits
+WIDTH_ROUNDS = 30
+# share of its largest coefficient from which a parameter counts as merged with another
+MERGED = 0.1
+# relative deviation of a column's coefficients from those of a common scale (our choice)
+SCALE_DEVIATION = 0.2
+# poses with which the fit of many more begins, and that widths are estimated from (our choice)
+WARM_POSES = 2000
+# passes at most until the noise of images settles (our choice)
+IMAGE_PASSES = 20
+# linearisations after which a placement that has not settled does not tell itself (our choice)
+CRAWLS = 60
+# relative size of a column of a placement that a block hardly tells (our choice)
+MIN_COLUMN = 1e-3
 
 
 def fit(
@@ -73,7 +88,9 @@ def fit(
     """
     settings = settings or Settings()
     table = layout(cell)
-    candidates = np.arange(len(table.names)) if candidates is None else np.asarray(candidates, dtype=int)
+    if candidates is None:
+        candidates = np.arange(len(table.names))
+    candidates = np.asarray(candidates, dtype=int)
     blocks = prepare(cell, measured)
     split = base_columns(cell, blocks, candidates, settings.tolerance)
     if not split.rank:
@@ -81,17 +98,40 @@ def fit(
             "these rows determine no parameter of the robot: each socket, bar, plane or pair needs several "
             "rows at different joint values; measure more rows of each"
         )
-    stated = np.full(len(table.names), np.inf) if prior is None else prior
-    _enough(cell, blocks, int(np.isinf(stated[candidates[split.kept]]).sum()))
+    stated_sigma = prior
+    if stated_sigma is None:
+        stated_sigma = np.full(len(table.names), np.inf)
+    without_prior = np.isinf(stated_sigma[candidates[split.kept]])
+    _require_enough(cell, blocks, int(without_prior.sum()))
     free = _estimated(cell, split, candidates)
     if not any(block.measures_length for block in measured):
         free = np.setdiff1d(free, _scale_reference(cell, split, candidates))
-    making = np.where(np.isfinite(stated[free]), stated[free], plausible_deviation(cell, free))
+    has_prior = np.isfinite(stated_sigma[free])
+    making = np.where(has_prior, stated_sigma[free], plausible_deviation(cell, free))
     start = cell
-    if widths and np.isfinite(making).any():
-        start, making = _making(cell, blocks, free, making, np.isfinite(stated[free]), settings)
-    result = fit_with_prior(start, blocks, free, making, settings=settings, nominal=cell, warm=start is not cell)
+    warm = widths and bool(np.isfinite(making).any())
+    if warm:
+        start, making = _making(cell, blocks, free, making, has_prior, settings)
+    result = fit_with_prior(start, blocks, free, making, settings=settings, nominal=cell, warm=warm)
     return replace(result, start=cell, split=split, candidates=candidates)
+
+
+def _require_enough(cell: Installation, blocks: list[Block], unknowns: int) -> None:
+    """Raise an error for fewer than `MIN_NUMBERS` measured numbers per unknown: such a fit could not be checked."""
+    numbers = 0
+    poses = 0
+    for block in blocks:
+        poses += len(block.measured)
+        for part in observe(cell, block, np.array([], dtype=int)):
+            numbers += part.value.size - part.nuisances
+    if numbers < MIN_NUMBERS * unknowns:
+        needed = math.ceil(MIN_NUMBERS * unknowns * poses / max(numbers, 1))
+        refuse_data(
+            blocks[0].measured.file,
+            f"{poses} poses are too few: {unknowns} unknowns and a check of the fit need at least {needed} poses, "
+            "the full geometry 20 to 40; measure more, or choose a smaller model ('offsets' or "
+            "'frames')",
+        )
 
 
 def plain_fit(cell: Installation, measured: Sequence[PoseMeasurements]) -> GeometricFit | None:
@@ -147,27 +187,58 @@ def _scale_reference(cell: Installation, split: ColumnSplit, candidates: np.ndar
     """Return the arm's longest length and the parameters that merge with it; empty for an arm without lengths.
 
     Sockets and planes are as well explained by a smaller arm, in the limit by none at all, so that the scale has to
-    come from the nominal: this length stays. What others merge with a column counts with it.
+    come from the nominal: this length stays, and what can replace it stays with it.
     """
-    elements = cell.chain.elements
     lengths = np.zeros(len(candidates))
-    translates = np.zeros(len(candidates), dtype=bool)
     for column, parameter in enumerate(candidates):
-        if parameter < len(elements):
+        if parameter < len(cell.chain.elements):
             lengths[column] = element_length(cell.chain, int(parameter))
-            translates[column] = elements[parameter].axis[0] == "t"
-    total = lengths[split.kept] + split.coefficients @ lengths[split.dropped]
-    total = np.where(translates[split.kept], np.abs(total), 0.0)
-    if total.max(initial=0.0) == 0.0:
+    lengths[split.without_effect] = 0.0
+    longest = int(np.argmax(np.abs(lengths)))
+    if lengths[longest] == 0.0:
         return candidates[:0]
-    longest = int(np.argmax(total))
-    share = np.abs(split.coefficients)
-    merged = share[longest] > MERGED * share.max(axis=0, initial=0.0)
-    return np.append(candidates[split.dropped[merged]], candidates[split.kept[longest]])
+    # columns that depend on others by the scale alone do not replace any of them
+    merges = ~_depend_by_scale(lengths, split)
+    share = np.abs(split.coefficients[:, merges])
+    dropped = split.dropped[merges]
+    merged = share > MERGED * share.max(axis=0, initial=0.0)
+    if longest in split.kept:
+        base = int(np.flatnonzero(split.kept == longest)[0])
+    elif longest in dropped:
+        base = int(np.argmax(share[:, np.flatnonzero(dropped == longest)[0]]))
+    else:
+        return candidates[[longest]]
+    return candidates[np.union1d([longest, split.kept[base]], dropped[merged[base]]).astype(int)]
+
+
+def _depend_by_scale(lengths: np.ndarray, split: ColumnSplit) -> np.ndarray:
+    """Return which dropped columns (p - b,) depend on the kept ones as one factor on all lengths makes them depend.
+
+    Args:
+        lengths: (p,) of the candidate columns [m]; zero for those that are none.
+        split: of the candidate columns.
+    """
+    base_lengths = lengths[split.kept]
+    lengths_kept = base_lengths != 0.0
+    result = np.zeros(len(split.dropped), dtype=bool)
+    if lengths_kept.sum() < 2:
+        return result
+    for number, column in enumerate(split.dropped):
+        if lengths[column] == 0.0:
+            continue
+        expected = -base_lengths[lengths_kept] / lengths[column]
+        difference = split.coefficients[lengths_kept, number] - expected
+        result[number] = np.linalg.norm(difference) < SCALE_DEVIATION * np.linalg.norm(expected)
+    return result
 
 
 def _making(
-    cell: Installation, blocks: list[Block], free: np.ndarray, prior: np.ndarray, stated: np.ndarray, settings: Settings
+    cell: Installation,
+    blocks: list[Block],
+    free: np.ndarray,
+    prior: np.ndarray,
+    has_stated_prior: np.ndarray,
+    settings: Settings,
 ) -> tuple[Installation, np.ndarray]:
     """Return a first fit and the prior (f,) with the most probable widths of making, from a sample of many poses.
 
@@ -176,23 +247,33 @@ def _making(
         blocks: measurements prepared for it.
         free: (f,) positions in the parameter vector.
         prior: (f,) standard deviations to begin with; infinite for none.
-        stated: (f,) mask of those that stay.
+        has_stated_prior: (f,) mask of those that stay.
         settings: see `Settings`.
     """
-    rows = sampled([block.measured for block in blocks], max(WARM_POSES, 4 * len(free)))
-    sample = [rows_of(cell, block, chosen) for block, chosen in zip(blocks, rows)]
-    family = _making_families(cell, free, stated)
+    sample = _sample(cell, blocks, _sampled_rows(blocks, len(free)))
+    family = _making_families(cell, free, has_stated_prior)
     nominal = parameter_values(cell)[free]
+    widest = plausible_deviation(cell, free)
+    typical = plausible_deviation(cell, free, TYPICAL)
     state = cell
-    for _ in range(WIDTH_UPDATES):
-        trial = fit_with_prior(state, sample, free, prior, settings=settings, nominal=cell, warm=state is not cell)
+    for update in range(WIDTH_UPDATES):
+        trial = fit_with_prior(state, sample, free, prior, settings=settings, nominal=cell, warm=update > 0)
         state = trial.cell
-        moved = np.where(np.isfinite(prior), parameter_values(state)[free] - nominal, 0.0)
-        data = trial.data().moved(moved).gram().scaled(trial.estimate.residual_std**-2.0)
-        prior = _most_probable_widths(
-            data, family, prior, plausible_deviation(cell, free), typical_deviation(cell, free)
-        )
+        deviation = parameter_values(state)[free] - nominal
+        deviation = np.where(np.isfinite(prior), deviation, 0.0)
+        about_nominal = trial.data().moved(deviation).gram()
+        data = about_nominal.scaled(trial.estimate.residual_std**-2.0)
+        prior = _most_probable_widths(data, family, prior, widest, typical)
     return state, prior
+
+
+def _sampled_rows(blocks: list[Block], parameters: int) -> list[np.ndarray]:
+    """Return random rows of each block, `WARM_POSES` or four per parameter; all where there are not as many."""
+    return sampled([block.measured for block in blocks], max(WARM_POSES, 4 * parameters))
+
+
+def _sample(cell: Installation, blocks: list[Block], block_rows: list[np.ndarray]) -> list[Block]:
+    return [rows_of(cell, block, rows) for block, rows in zip(blocks, block_rows)]
 
 
 def _most_probable_widths(
@@ -212,26 +293,32 @@ def _most_probable_widths(
     """
     width = prior.copy()
     scale = 1.0 / np.sqrt(np.maximum(np.diag(data.square), 1e-300))
+    scales = np.outer(scale, scale)
     for _ in range(WIDTH_ROUNDS):
-        system = (data.square + np.diag(width**-2.0)) * np.outer(scale, scale)
+        system = (data.square + np.diag(width**-2.0)) * scales
         np.fill_diagonal(system, np.diag(system) + ROUNDING)
-        inverse = np.linalg.inv(system) * np.outer(scale, scale)
-        change, variance = inverse @ data.cross, np.diag(inverse)
+        inverse = np.linalg.inv(system) * scales
+        change = inverse @ data.cross
+        variance = np.diag(inverse)
         for number in range(int(family.max(initial=-1)) + 1):
             members = np.flatnonzero(family == number)
+            first = members[0]
             determined = float(np.sum(1.0 - variance[members] / width[members] ** 2))
-            squares = float(change[members] @ change[members]) + typical[members[0]] ** 2
-            width[members] = min(np.sqrt(squares / (max(determined, 0.0) + 1.0)), widest[members[0]])
+            squares = float(change[members] @ change[members]) + typical[first] ** 2
+            most_probable = np.sqrt(squares / (max(determined, 0.0) + 1.0))
+            width[members] = min(most_probable, widest[first])
     return width
 
 
-def _making_families(cell: Installation, free: np.ndarray, stated: np.ndarray) -> np.ndarray:
+def _making_families(cell: Installation, free: np.ndarray, has_stated_prior: np.ndarray) -> np.ndarray:
     """Return the family (f,) of each parameter: joint offsets, other angles, lengths, numbered; -1 for no width."""
-    kinds = np.where(stated, "", families(cell)[free])
+    kinds = np.where(has_stated_prior, "", families(cell)[free])
     family = np.full(len(free), -1)
-    present = [kind for kind in ("offset", "rad", "m") if kind in kinds]
-    for number, kind in enumerate(present):
-        family[kinds == kind] = number
+    number = 0
+    for kind in ("offset", "rad", "m"):
+        if kind in kinds:
+            family[kinds == kind] = number
+            number += 1
     return family
 
 
@@ -260,37 +347,51 @@ def fit_with_prior(
         warm: `cell` is a fit already, so that its residuals tell the sigmas to begin with.
     """
     settings = settings or Settings()
-    state, solution = cell, None
-    rows = sampled([block.measured for block in blocks], max(WARM_POSES, 4 * len(free)))
-    few = 4 * sum(map(len, rows)) <= sum(len(block.measured) for block in blocks)
-    if few:
-        sample = [rows_of(cell, block, chosen) for block, chosen in zip(blocks, rows)]
+    state = cell
+    rows = _sampled_rows(blocks, len(free))
+    poses = sum(len(block.measured) for block in blocks)
+    sampled_first = 4 * sum(map(len, rows)) <= poses
+    if sampled_first:
+        sample = _sample(cell, blocks, rows)
         state = fit_with_prior(cell, sample, free, prior, settings=settings, nominal=nominal, warm=warm).cell
     weigher = Weigher(settings, nominal or cell, blocks, free, prior)
-    weigher.update(state, first=not (few or warm))
-    image_passes = 20  # at most, until the noise of images settles (our choice)
-    for _ in range(image_passes if any(weigher.noises) and settings.passes > 1 else settings.passes):
+    weigher.update(state, first=not (sampled_first or warm))
+    passes = settings.passes
+    if any(weigher.noises) and passes > 1:
+        passes = IMAGE_PASSES
+    solution = None
+    for _ in range(passes):
         solution = solve(
-            weigher.linearise, lambda s, dx: step(s, free, dx), state, damping=settings.damping, limit=settings.limit
+            weigher.linearise,
+            lambda state, change: step(state, free, change),
+            state,
+            damping=settings.damping,
+            limit=settings.limit,
         )
-        state, settled = solution.state, weigher.settle(solution)
+        state = solution.state
+        settled = weigher.settle(solution)
         if settled is not None:
             return weigher.result(settled)
     assert solution is not None
-    weigher.pieces = weigher.used
-    return weigher.result(solution)
+    return weigher.unsettled_result(solution)
 
 
-def typical_deviation(cell: Installation, columns: np.ndarray) -> np.ndarray:
-    """Return how far each parameter of a usual arm is from nominal (c,); infinite for frames and deflections."""
+def plausible_deviation(
+    cell: Installation, columns: np.ndarray, deviations: Mapping[str, float] = PLAUSIBLE
+) -> np.ndarray:
+    """Return how far each parameter may be from nominal by making (c,); infinite for frames and deflections.
+
+    Args:
+        cell: the installation.
+        columns: (c,) positions in the parameter vector.
+        deviations: of an arm's parameter, by its unit: `PLAUSIBLE`, or `TYPICAL` of a usual arm.
+    """
     table = layout(cell)
-    return np.array([TYPICAL[table.units[k]] if table.kinds[k] == "arm" else np.inf for k in columns])
-
-
-def plausible_deviation(cell: Installation, columns: np.ndarray) -> np.ndarray:
-    """Return how far each parameter may plausibly be from nominal (c,); infinite for frames and deflections."""
-    table = layout(cell)
-    return np.array([PLAUSIBLE[table.units[k]] if table.kinds[k] == "arm" else np.inf for k in columns])
+    result = np.full(len(columns), np.inf)
+    for number, parameter in enumerate(columns):
+        if table.kinds[parameter] == "arm":
+            result[number] = deviations[table.units[parameter]]
+    return result
 
 
 def polish_frames(
@@ -304,15 +405,14 @@ def placed_on(cell: Installation, block: PoseMeasurements, settings: Settings) -
     """Return the arm with base and tool placement fitted to one block, arm and deflections unchanged.
 
     Where that does not settle, since the block hardly identifies some of it (the turn about a line that is driven),
-    what it identifies by less than `min_column` stays where it is. Whether that settled is the solution's status.
+    what it identifies by less than `MIN_COLUMN` stays where it is. Whether that settled is the solution's status.
     """
     start = install(cell.chain, [block], cell.known)
     start = replace(start, deflection=cell.deflection, optics=start.optics.like(cell.optics))
-    found = polish_frames(start, [block], replace(settings, limit=CRAWLS))
-    if found.solution.status.good:
-        return found
-    min_column = 1e-3  # relative size of a column of a placement that a block hardly tells (our choice)
-    return polish_frames(found.cell, [block], replace(settings, tolerance=min_column))
+    placed = polish_frames(start, [block], replace(settings, limit=CRAWLS))
+    if placed.solution.status.good:
+        return placed
+    return polish_frames(placed.cell, [block], replace(settings, tolerance=MIN_COLUMN))
 
 
 def without_corrections(

@@ -28,20 +28,45 @@ from scipy.special import ndtri
 from calib.estimation.relevance import SETTLED, Gram, gram, relevance
 from calib.estimation.robust import ROUNDS, variance_weights
 
-KNOTS = 9  # values per joint, linear in between (our choice)
-CORRELATION_LENGTH = 0.5  # how far one value speaks for others, of the range (our choice)
-KNOT_MARGIN = 0.2  # how far the function is stated outside the range, of it (our choice)
-MIN_SQUARE = 0.02  # of the median squared error: smaller ones count as that (our choice)
-MIN_VARIANCE = 1e-4  # variance of a logarithm that is known best: copies of few poses would be fitted without any error
-MIN_MOTION = 1e-3  # a joint that moves by less tells nothing [rad or m]
-SEARCH_ROUNDS = 30  # of the search for the a_j
+# values per joint, linear in between (our choice)
+KNOTS = 9
+# how far one value speaks for others, of the range (our choice)
+CORRELATION_LENGTH = 0.5
+# how far the function is stated outside the range, of it (our choice)
+KNOT_MARGIN = 0.2
+# of the median squared error: smaller ones count as that (our choice)
+MIN_SQUARE = 0.02
+# variance of a logarithm that is known best: copies of few poses would be fitted without any error
+MIN_VARIANCE = 1e-4
+# a joint that moves by less tells nothing [rad or m]
+MIN_MOTION = 1e-3
+# a_j that the search begins with, and its rounds
+FIRST_SIZE = 0.5
+SEARCH_ROUNDS = 30
+# share of the errors that an interval holds
+COVERED = 0.95
+# share of an end's excess that lasts beyond it, and standard deviation of the rest, of logarithms (see above)
+LASTING = 0.5
+CHANGE = 0.33
+# rows of a kind that the poses outside a fold must have to tell an interval (our choice)
+MIN_ROWS = 5
+# ends of ranges that tell what is common to them (our choice)
+MIN_ENDS = 3
+# rounds of the search for variances without a fold's poses
+FOLD_ROUNDS = 100
+# [m²] of an expected squared error, at least
+SMALLEST_VARIANCE = 1e-30
 
-Profile = tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]  # per joint: its values, log s there
+# per joint: its values, log s there
+Profile = tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]
 
 
 def unevenness(profile: Profile, q: np.ndarray) -> np.ndarray:
     """Return the factor s (m,) of the error variance at poses q (m, n) [rad or m]; 1 for an empty profile."""
-    return np.exp(sum((np.interp(q[:, j], *each) for j, each in enumerate(profile)), np.zeros(len(q))))
+    log_factor = np.zeros(len(q))
+    for joint, (knots, values) in enumerate(profile):
+        log_factor = log_factor + np.interp(q[:, joint], knots, values)
+    return np.exp(log_factor)
 
 
 class Unevenness:
@@ -53,52 +78,54 @@ class Unevenness:
     """
 
     def __init__(self, q: np.ndarray, squares: np.ndarray):
-        low, high = q.min(axis=0), q.max(axis=0)
+        low = q.min(axis=0)
+        high = q.max(axis=0)
         grid = np.linspace(-KNOT_MARGIN, 1.0 + KNOT_MARGIN, KNOTS)
         self.moving = np.flatnonzero(high - low > MIN_MOTION)
         self.joints = q.shape[1]
         self.knots = low + np.outer(grid, high - low)
         root = np.linalg.cholesky(np.exp(-np.abs(grid[:, None] - grid) / CORRELATION_LENGTH))
-        hats = [
-            np.stack([np.interp(q[:, j], self.knots[:, j], one) for one in np.eye(KNOTS)], axis=1) for j in self.moving
-        ]
-        columns = np.concatenate([np.ones((len(q), 1)), *(each @ root for each in hats)], axis=1)
-        mean = columns[:, 1:].mean(axis=0)
-        columns[:, 1:] -= mean
-        self.bases = [root - each for each in mean.reshape(-1, KNOTS)]
+        # per joint, hat functions at its knots, times the root of their prior covariance
+        columns = [np.ones((len(q), 1))]
+        for joint in self.moving:
+            hats = [np.interp(q[:, joint], self.knots[:, joint], unit) for unit in np.eye(KNOTS)]
+            columns.append(np.stack(hats, axis=1) @ root)
+        self.columns = np.concatenate(columns, axis=1)
+        mean = self.columns[:, 1:].mean(axis=0)
+        self.columns[:, 1:] -= mean
+        self.bases = [root - means for means in mean.reshape(-1, KNOTS)]
         self.groups = np.concatenate([[-1], np.repeat(np.arange(len(self.moving)), KNOTS)])
-        self.columns, self.logs = columns, np.log(np.maximum(squares, max(MIN_SQUARE * np.median(squares), 1e-300)))
+        least = max(MIN_SQUARE * np.median(squares), 1e-300)
+        self.logs = np.log(np.maximum(squares, least))
         self.data = gram(self.logs, self.columns)
 
     def profile(self, left_out: np.ndarray | None = None) -> Profile:
         """Return log s as one function per joint, from all poses or without those of a mask (m,)."""
-        data = self.data if left_out is None else self.data - gram(self.logs[left_out], self.columns[left_out])
-        values = dict(zip(self.moving.tolist(), self._values(data)))
-        return tuple(
-            (tuple(self.knots[:, j].tolist()), tuple(values[j].tolist()))
-            if j in values and values[j].any()
-            else ((0.0,), (0.0,))
-            for j in range(self.joints)
-        )
+        data = self.data
+        if left_out is not None:
+            data = data - gram(self.logs[left_out], self.columns[left_out])
+        result = [((0.0,), (0.0,))] * self.joints
+        for joint, values in zip(self.moving, self._values(data)):
+            if values.any():
+                result[joint] = (tuple(self.knots[:, joint].tolist()), tuple(values.tolist()))
+        return tuple(result)
 
     def _values(self, data: Gram) -> list[np.ndarray]:
+        """Return E f + var f / 2 at the knots of each moving joint."""
         data = replace(data, total=data.total + MIN_VARIANCE * data.rows)
-        found = relevance(data, self.groups, np.full(len(self.groups), 0.5), SEARCH_ROUNDS, SETTLED)
-        alive = np.flatnonzero(found.ridge > 0.0)
-        precision = data.square[np.ix_(alive, alive)] / found.noise**2 + np.diag(found.ridge[alive] ** -2.0)
+        sizes = np.full(len(self.groups), FIRST_SIZE)
+        estimate = relevance(data, self.groups, sizes, SEARCH_ROUNDS, SETTLED)
+        alive = np.flatnonzero(estimate.ridge > 0.0)
+        information = data.square[np.ix_(alive, alive)] / estimate.noise**2
+        precision = information + np.diag(estimate.ridge[alive] ** -2.0)
         covariance = np.zeros_like(data.square)
         covariance[np.ix_(alive, alive)] = np.linalg.inv(precision)
         values = []
         for number, basis in enumerate(self.bases):
-            own = slice(1 + number * KNOTS, 1 + (number + 1) * KNOTS)
-            spread = np.einsum("ij,jk,ik->i", basis, covariance[own, own], basis)
-            values.append(basis @ found.values[own] + 0.5 * spread)
+            columns = slice(1 + number * KNOTS, 1 + (number + 1) * KNOTS)
+            variance = np.einsum("ij,jk,ik->i", basis, covariance[columns, columns], basis)
+            values.append(basis @ estimate.values[columns] + 0.5 * variance)
         return values
-
-
-COVERED = 0.95
-LASTING, CHANGE = 0.5, 0.33
-MIN_ROWS = 5  # rows of a kind that the poses outside a fold must have to tell an interval (our choice)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,15 +158,32 @@ class LeftOut:
             joints: joint whose range end was held out, for each of `far`; -1 for none.
         """
         folds = [*near, *far]
-        rows, number = np.concatenate(folds), np.repeat(np.arange(len(folds)), [len(each) for each in folds])
-        shapes = np.column_stack([rows[:, 1], np.ones(len(rows)), rows[:, 2:4]])
-        away, joint = rows[:, 2:4].sum(axis=1), np.array([*[-1] * len(near), *joints])[number]
-        return cls(rows[:, 0], shapes, away, rows[:, 4].astype(int), number, number < len(near), joint)
+        rows = np.concatenate(folds)
+        fold = np.repeat(np.arange(len(folds)), [len(errors) for errors in folds])
+        distances = rows[:, 2:4]
+        joint_of_fold = np.array([-1] * len(near) + list(joints))
+        return cls(
+            squares=rows[:, 0],
+            shapes=np.column_stack([rows[:, 1], np.ones(len(rows)), distances]),
+            away=distances.sum(axis=1),
+            pose=rows[:, 4].astype(int),
+            fold=fold,
+            near=fold < len(near),
+            joint=joint_of_fold[fold],
+        )
 
     def without(self, poses: np.ndarray) -> LeftOut:
         """Return the rows without those of the given poses."""
         rows = ~np.isin(self.pose, poses)
-        return LeftOut(*(each[rows] for each in vars(self).values()))
+        return LeftOut(
+            squares=self.squares[rows],
+            shapes=self.shapes[rows],
+            away=self.away[rows],
+            pose=self.pose[rows],
+            fold=self.fold[rows],
+            near=self.near[rows],
+            joint=self.joint[rows],
+        )
 
     def scaled(self, q: np.ndarray) -> tuple[LeftOut, Profile]:
         """Return the errors with their variance terms scaled by s (for each fold from the other poses), and s itself.
@@ -148,47 +192,58 @@ class LeftOut:
             q: (poses, n) [rad or m].
         """
         weights, _ = self.learnt()
-        squares = (self.squares / np.maximum(self.shapes @ weights, 1e-30))[self.near]
-        known, where = np.unique(self.pose[self.near], return_inverse=True)
-        found = Unevenness(q[known], np.bincount(where, squares) / np.bincount(where))
+        squares = (self.squares / self._variances(weights))[self.near]
+        poses, number = np.unique(self.pose[self.near], return_inverse=True)
+        mean_squares = np.bincount(number, squares) / np.bincount(number)
+        estimate = Unevenness(q[poses], mean_squares)
         shapes = self.shapes.copy()
         for fold in np.unique(self.fold):
             rows = self.fold == fold
-            profile = found.profile(np.isin(known, self.pose[rows]))
+            profile = estimate.profile(np.isin(poses, self.pose[rows]))
             shapes[rows, 1] = unevenness(profile, q[self.pose[rows]])
-        return replace(self, shapes=shapes), found.profile()
+        return replace(self, shapes=shapes), estimate.profile()
 
     def learnt(self, start: Sequence[float] = ()) -> tuple[list[float], tuple[float, float]]:
         """Return κ, v_0, v_1, v_2 of  |e|² ~ variance · χ²_3 / 3,  and the 95 % radii of near and far errors."""
-        fold_rounds = 100  # rounds of the search for variances without a fold's poses
-        near, rounds = self.near, fold_rounds
+        rounds = FOLD_ROUNDS
         if not start:
-            middle, rounds = float(np.median(self.squares)), ROUNDS
-            start = [1.0, middle, *0.3 * middle / np.maximum(self.shapes[:, 2:].mean(axis=0), 1e-12)]
-        counts = np.where(near, max(1, round(np.sum(~near) / np.sum(near))), 1.0)
+            rounds = ROUNDS
+            median = float(np.median(self.squares))
+            per_distance = 0.3 * median / np.maximum(self.shapes[:, 2:].mean(axis=0), 1e-12)
+            start = [1.0, median, *per_distance]
+        # both kinds of rows count alike
+        near_count = max(1, round(np.sum(~self.near) / np.sum(self.near)))
+        counts = np.where(self.near, near_count, 1.0)
         weights = variance_weights(self.squares, self.shapes, np.array(start), counts, rounds)
-        sizes = np.sqrt(self.squares / np.maximum(self.shapes @ weights, 1e-30))
+        sizes = np.sqrt(self.squares / self._variances(weights))
         return weights.tolist(), self.quantiles(sizes)
+
+    def _variances(self, weights: np.ndarray | Sequence[float]) -> np.ndarray:
+        """Return the expected variance (m,) [m²] of each error."""
+        return np.maximum(self.shapes @ np.asarray(weights), SMALLEST_VARIANCE)
 
     def quantiles(self, sizes: np.ndarray) -> tuple[float, float]:
         """Return the bounds that 95 % of future errors keep, near and far, from error magnitudes (m,) (conformal)."""
         poses = len(np.unique(self.pose))
         level = min(1.0, COVERED * (poses + 1) / poses)
-        first, second = (float(np.quantile(sizes[of], level)) for of in (self.near, ~self.near))
-        return first, second
+        near_bound = float(np.quantile(sizes[self.near], level))
+        far_bound = float(np.quantile(sizes[~self.near], level))
+        return near_bound, far_bound
 
     def surprise(self, weights: Sequence[float], reach: tuple[float, float]) -> tuple[float, float]:
         """Return the factors (near, far) by which intervals must widen to contain 95 % of a held-out fold's errors."""
         ratio = np.ones(len(self.squares))
         for fold in np.unique(self.fold):
             rows = self.fold == fold
-            rest = self.without(self.pose[rows])
-            if min(rest.near.sum(), (~rest.near).sum()) > MIN_ROWS:
-                own, radii = rest.learnt(weights)
-                sigma = np.sqrt(np.maximum(self.shapes[rows] @ own, 1e-30))
-                ratio[rows] = np.sqrt(self.squares[rows]) / (sigma * np.interp(self.away[rows], reach, radii))
-        first, second = self.quantiles(ratio)
-        return max(1.0, first), max(1.0, second)
+            others = self.without(self.pose[rows])
+            if min(others.near.sum(), (~others.near).sum()) <= MIN_ROWS:
+                continue
+            fold_weights, radii = others.learnt(weights)
+            sigma = np.sqrt(np.maximum(self.shapes[rows] @ fold_weights, SMALLEST_VARIANCE))
+            radius = np.interp(self.away[rows], reach, radii)
+            ratio[rows] = np.sqrt(self.squares[rows]) / (sigma * radius)
+        near_factor, far_factor = self.quantiles(ratio)
+        return max(1.0, near_factor), max(1.0, far_factor)
 
     def wider(
         self, weights: Sequence[float], radii: tuple[float, float], reach: tuple[float, float], q: np.ndarray
@@ -199,19 +254,25 @@ class LeftOut:
             weights, radii, reach: of the interval, as in `calib.geometry.error_model.Discrepancy`.
             q: (poses, n) [rad or m].
         """
-        sigma = np.sqrt(np.maximum(self.shapes @ np.array(weights), 1e-30))
+        sigma = np.sqrt(self._variances(weights))
         sizes = np.sqrt(self.squares) / (sigma * np.interp(self.away, reach, radii))
         side = (q > np.median(q, axis=0))[self.pose, self.joint].astype(int)
-        rows = {(j, k): sizes[(self.joint == j) & (side == k)] for j in range(q.shape[1]) for k in (0, 1)}
-        rows = {end: each for end, each in rows.items() if len(each) > MIN_ROWS}
-        min_ends = 3  # that tell what is common to them (our choice)
-        if len(rows) < min_ends:
+        joints, sides, sizes_of_ends = [], [], []
+        for joint in range(q.shape[1]):
+            for end in (0, 1):
+                end_sizes = sizes[(self.joint == joint) & (side == end)]
+                if len(end_sizes) > MIN_ROWS:
+                    joints.append(joint)
+                    sides.append(end)
+                    sizes_of_ends.append(end_sizes)
+        if len(sizes_of_ends) < MIN_ENDS:
             return ()
-        size = np.array([np.sqrt(np.mean(each**2)) for each in rows.values()])
-        mean = np.mean(np.log(size))
-        changed = np.exp(CHANGE * ndtri((np.arange(99) + 0.5) / 99))
-        shapes = np.concatenate([each / own for each, own in zip(rows.values(), size)])
-        expected = np.exp(mean + LASTING * (np.log(size) - mean)) * np.quantile(np.outer(shapes, changed), COVERED)
+        rms = np.array([np.sqrt(np.mean(end_sizes**2)) for end_sizes in sizes_of_ends])
+        mean = np.mean(np.log(rms))
+        changes = np.exp(CHANGE * ndtri((np.arange(99) + 0.5) / 99))
+        relative = [end_sizes / end_rms for end_sizes, end_rms in zip(sizes_of_ends, rms)]
+        quantile = np.quantile(np.outer(np.concatenate(relative), changes), COVERED)
+        expected = np.exp(mean + LASTING * (np.log(rms) - mean)) * quantile
         result = np.ones((q.shape[1], 2))
-        result[tuple(zip(*rows))] = np.maximum(expected, 1.0)
-        return tuple((float(low), float(high)) for low, high in result)
+        result[joints, sides] = np.maximum(expected, 1.0)
+        return tuple((float(below), float(above)) for below, above in result)

@@ -7,7 +7,7 @@ elements multiplied row by row first, a pose counts as one row, not as three, an
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,7 +18,10 @@ from calib.geometry.observation import Block, layout_counts, observe, pieces, pr
 from calib.geometry.residuals import Part
 from calib.robot.calibrated import target_elements
 
-MANY = 30  # corrections of one element from which on it pays to multiply elements first (our choice)
+# corrections of one element from which on it pays to multiply elements first (our choice)
+MANY = 30
+# poses at once: their bases stay in the processor's cache
+CHUNK = 500
 
 
 def separable(measured: PoseMeasurements) -> bool:
@@ -35,64 +38,102 @@ def row_statistics(
         cell, block, free: as of `calib.geometry.observation.observe`.
         scales: for each of its parts, the divisor (rows, m) of its residuals.
     """
-    few, single, groups, numbers = _grouped(cell, free)
-    places, done = np.append(single, len(free)), 0
+    grouping = _grouped(cell, free)
+    single = len(grouping.single)
+    # the last row and column of the statistics are those of the residual
+    positions = np.append(grouping.single, len(free))
+    start = 0
     for piece in pieces(cell, block):
-        bases = [np.asarray(piece.bases)[own] for own in numbers]
-        for part, scale in zip(observe(cell, piece, few), scales):
+        bases = [np.asarray(piece.bases)[numbers] for numbers in grouping.numbers]
+        for part, scale in zip(observe(cell, piece, grouping.observed), scales):
             m = part.value.shape[1]
-            residual, matrix = part.whitened(scale[:, done : done + m])
+            residual, matrix = part.whitened(scale[:, start : start + m])
             columns = np.concatenate([matrix.T, residual[None]]).reshape(-1, len(part.value), m)
-            elements, rest = columns[len(single) : -1], np.delete(columns, slice(len(single), -1), axis=0)
-            flat = rest.reshape(len(rest), -1)
-            found = np.empty((len(free) + 1, len(free) + 1))
-            found[np.ix_(places, places)] = flat @ flat.T
-            for k, own in enumerate(groups):
-                across = bases[k] @ np.einsum("im,cim->mc", elements[k], rest)
-                found[np.ix_(own, places)], found[np.ix_(places, own)] = across, across.T
+            elements = columns[single:-1]
+            singles = np.delete(columns, slice(single, -1), axis=0)
+            flat = singles.reshape(len(singles), -1)
+            square = np.empty((len(free) + 1, len(free) + 1))
+            square[np.ix_(positions, positions)] = flat @ flat.T
+            for k, group in enumerate(grouping.groups):
+                across = bases[k] @ np.einsum("im,cim->mc", elements[k], singles)
+                square[np.ix_(group, positions)] = across
+                square[np.ix_(positions, group)] = across.T
                 along = np.einsum("im,cim->cm", elements[k], elements)
-                for other, theirs in enumerate(groups[k:], k):
-                    across = (bases[k] * along[other]) @ bases[other].T
-                    found[np.ix_(own, theirs)], found[np.ix_(theirs, own)] = across, across.T
-            yield part, Gram(found[:-1, :-1], found[:-1, -1], float(found[-1, -1]), part.value.size)
-        done += len(piece.measured)
+                for j in range(k, len(grouping.groups)):
+                    second = grouping.groups[j]
+                    across = (bases[k] * along[j]) @ bases[j].T
+                    square[np.ix_(group, second)] = across
+                    square[np.ix_(second, group)] = across.T
+            yield part, Gram(square[:-1, :-1], square[:-1, -1], float(square[-1, -1]), part.value.size)
+        start += len(piece.measured)
 
 
 def position_variances(
-    cell: Installation, at: PoseMeasurements, free: np.ndarray, covariance: np.ndarray, station: int, tool: Any
+    cell: Installation,
+    measured: PoseMeasurements,
+    free: np.ndarray,
+    covariance: np.ndarray,
+    station: int,
+    tool: np.ndarray | int,
 ) -> np.ndarray:
     """Return the variance (m,) [m²] of a tool's position, trace J Σ Jᵀ; arguments: `observation.pose_sigmas`."""
-    few, single, groups, numbers = _grouped(cell, free)
-    whole, result = Block(at, station, np.broadcast_to(tool, len(at))), np.zeros(len(at))
-    chunk = 500  # poses at once: their bases stay in the processor's cache
-    for first in range(0, len(at), chunk):
-        rows = np.arange(first, min(first + chunk, len(at)))
-        block = rows_of(cell, whole, rows)
-        columns = target_jacobian(cell, predict(cell, block), few, station, block.tool, block.bases)[:, :3]
-        rest, elements = columns[: len(single)], columns[len(single) :]
-        own = (covariance[np.ix_(single, single)] @ rest.reshape(len(rest), -1)).reshape(rest.shape)
-        found = np.einsum("cim,cim->m", own, rest)
-        bases = [np.asarray(block.bases)[each] for each in numbers]
-        for k, own in enumerate(groups):
-            across = covariance[np.ix_(own, single)] @ np.einsum("im,cim->cm", elements[k], rest)
+    grouping = _grouped(cell, free)
+    single = grouping.single
+    poses = Block(measured, station, np.broadcast_to(tool, len(measured)))
+    result = np.zeros(len(measured))
+    for start in range(0, len(measured), CHUNK):
+        rows = np.arange(start, min(start + CHUNK, len(measured)))
+        block = rows_of(cell, poses, rows)
+        predicted = predict(cell, block)
+        jacobian = target_jacobian(cell, predicted, grouping.observed, station, block.tool, block.bases)
+        singles = jacobian[: len(single), :3]
+        elements = jacobian[len(single) :, :3]
+        spread = covariance[np.ix_(single, single)] @ singles.reshape(len(singles), -1)
+        variance = np.einsum("cim,cim->m", spread.reshape(singles.shape), singles)
+        bases = [np.asarray(block.bases)[numbers] for numbers in grouping.numbers]
+        for k, group in enumerate(grouping.groups):
+            across = covariance[np.ix_(group, single)] @ np.einsum("im,cim->cm", elements[k], singles)
             along = np.einsum("im,cim->cm", elements[k], elements)
-            for other, theirs in enumerate(groups[: k + 1]):
-                half = 0.5 if other == k else 1.0
-                across += half * along[other] * (covariance[np.ix_(own, theirs)] @ bases[other])
-            found += 2.0 * np.einsum("cm,cm->m", bases[k], across)
-        result[rows] = np.maximum(found, 0.0)
+            for j in range(k + 1):
+                # pairs of two groups count twice, those of one group once
+                factor = 0.5 if j == k else 1.0
+                across += factor * along[j] * (covariance[np.ix_(group, grouping.groups[j])] @ bases[j])
+            variance += 2.0 * np.einsum("cm,cm->m", bases[k], across)
+        result[rows] = np.maximum(variance, 0.0)
     return result
 
 
-def _grouped(cell: Installation, free: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], list[np.ndarray]]:
-    """Return parameters to observe: those at `single` places of `free`, and elements that many corrections move.
+@dataclass(frozen=True, eq=False)
+class Grouping:
+    """Parameters (f,) divided into corrections of elements that many of them move, and all others.
 
-    Then these single places, and for each such element the places of its corrections and their numbers.
+    Attributes:
+        observed: parameters whose columns are observed: the single ones, then the elements that many corrections move.
+        single: positions of the single parameters among the f.
+        groups: for each such element, positions of its corrections among the f.
+        numbers: for each such element, numbers of its corrections among the deflection's terms.
     """
-    numbers = free - sum(layout_counts(cell)[:4])  # of corrections; negative for all else
-    element = np.append(target_elements(cell.chain, cell.deflection), -1)[np.maximum(numbers, -1)]
-    known, count = np.unique(element[numbers >= 0], return_counts=True)
-    moved = known[count >= MANY]
-    groups = [np.flatnonzero(element == one) for one in moved]
-    single = np.flatnonzero(~np.isin(element, moved) | (numbers < 0))
-    return np.concatenate([free[single], moved]), single, groups, [numbers[own] for own in groups]
+
+    observed: np.ndarray
+    single: np.ndarray
+    groups: list[np.ndarray]
+    numbers: list[np.ndarray]
+
+
+def _grouped(cell: Installation, free: np.ndarray) -> Grouping:
+    """Return the parameters `free` (f,) grouped by the element that corrections move."""
+    # numbers of corrections; negative for all other parameters
+    numbers = free - sum(layout_counts(cell)[:4])
+    is_correction = numbers >= 0
+    targets = np.append(target_elements(cell.chain, cell.deflection), -1)
+    element = targets[np.maximum(numbers, -1)]
+    elements, counts = np.unique(element[is_correction], return_counts=True)
+    corrected_often = elements[counts >= MANY]
+    groups = [np.flatnonzero(element == number) for number in corrected_often]
+    single = np.flatnonzero(~np.isin(element, corrected_often) | ~is_correction)
+    return Grouping(
+        observed=np.concatenate([free[single], corrected_often]),
+        single=single,
+        groups=groups,
+        numbers=[numbers[group] for group in groups],
+    )

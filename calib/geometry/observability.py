@@ -22,102 +22,140 @@ from calib.robot.chain import Chain, random_joints
 from calib.robot.kinematics import element_jacobian, forward, joint_jacobian, twist_product
 from calib.transforms import pose, to_quaternion
 
-NEAR_PRIOR = 0.7  # ratio of a parameter's σ to that of its prior from which the data say little of it (our choice)
+# ratio of a parameter's σ to that of its prior from which the data say little of it (our choice)
+NEAR_PRIOR = 0.7
+# share of its largest coefficient from which a parameter counts as merged with another (our choice)
+MIN_SHARE = 0.1
+# parameters by which families of merged ones are distinguished
+MAX_NAMED = 4
+# [m] a placement known no better than this is worth a finding (our choice)
+MAX_PLACEMENT_SIGMA = 2e-3
+# [deg] below it "the wrist is held still" is the likely reason (our choice)
+MIN_ORIENTATION_RANGE = 45.0
+# canonical correlation of a tool's and a station's placement from which they are confused (our choice)
+MAX_CORRELATION = 0.95
+# [m] of an arm, at least
+MIN_REACH = 0.1
+# kinds of measurement that poses are selected for
+KINDS = (Poses.kind, Positions.kind)
+# random postures that decide what is identifiable
+SAMPLES = 300
+# [m], [rad]: our choice where none is stated
+SIGMA_POSITION = 1e-4
+SIGMA_ORIENTATION = 1e-4
 PLACES = {"station": "the placement of the instrument", "tool": "the mounting of the tool"}
 
 
-def unidentified(found: GeometricFit) -> list[Finding]:
+def unidentified(fit: GeometricFit) -> list[Finding]:
     """Return findings on the parameters and placements that a fit's poses do not identify, and on the rank."""
-    if (split := found.split) is None:
-        return _loose(found)
-    values, rank = split.singular_values, split.rank
-    below = float(values[rank]) if rank < len(values) else None
-    known = {"rank": rank, "parameters": len(values), "tolerance": split.tolerance}
-    first = finding("rank", last=values[rank - 1], next=below, **known)
-    return [first, *_merged(found, split), *_at_nominal(found), *_loose(found)]
+    split = fit.split
+    if split is None:
+        return _loose(fit)
+    values = split.singular_values
+    rank = split.rank
+    below = None
+    if rank < len(values):
+        below = float(values[rank])
+    numbers = {"rank": rank, "parameters": len(values), "tolerance": split.tolerance}
+    on_rank = finding("rank", last=values[rank - 1], next=below, **numbers)
+    return [on_rank, *_merged(fit, split), *_at_nominal(fit), *_loose(fit)]
 
 
-def _merged(found: GeometricFit, split: ColumnSplit, max_named: int = 4) -> list[Finding]:
-    """Return findings on arm parameters that depend linearly on others, grouped by these others.
-
-    `max_named`: parameters by which families of merged ones are distinguished.
-    """
-    table = layout(found.start)
-    families: dict[object, tuple[list[str], list[str]]] = {}
+def _merged(fit: GeometricFit, split: ColumnSplit) -> list[Finding]:
+    """Return findings on arm parameters that depend linearly on others, grouped by these others."""
+    table = layout(fit.start)
+    # per group: what they merge with, and their names
+    groups: dict[object, tuple[list[str], list[str]]] = {}
     for column, dropped in enumerate(split.dropped):
-        if table.kinds[found.candidates[dropped]] != "arm":
+        parameter = fit.candidates[dropped]
+        if table.kinds[parameter] != "arm":
             continue
-        key, into = None, list[str]()
+        key = None
+        partners: list[str] = []
         if dropped not in split.without_effect:
             weight = np.abs(split.coefficients[:, column])
-            partners = found.candidates[split.kept[weight > 0.1 * weight.max()]]
-            groups = {table.kinds[k] for k in partners}
-            arm = tuple(table.names[k] for k in partners if table.kinds[k] == "arm")
-            key = "station" in groups, "tool" in groups, arm[:max_named], len(arm)
-            into = [*(PLACES[group] for group in PLACES if group in groups), *arm]
-        families.setdefault(key, (into, []))[1].append(table.names[found.candidates[dropped]])
-    return [
-        finding("merged", names=names, into=into) if into else finding("no-effect", names=names)
-        for into, names in families.values()
-    ]
+            merged_with = fit.candidates[split.kept[weight > MIN_SHARE * weight.max()]]
+            kinds = {table.kinds[k] for k in merged_with}
+            arm = tuple(table.names[k] for k in merged_with if table.kinds[k] == "arm")
+            key = "station" in kinds, "tool" in kinds, arm[:MAX_NAMED], len(arm)
+            partners = [PLACES[kind] for kind in PLACES if kind in kinds]
+            partners += arm
+        groups.setdefault(key, (partners, []))[1].append(table.names[parameter])
+    findings = []
+    for partners, names in groups.values():
+        if partners:
+            findings.append(finding("merged", names=names, into=partners))
+        else:
+            findings.append(finding("no-effect", names=names))
+    return findings
 
 
-def _at_nominal(found: GeometricFit) -> list[Finding]:
+def _at_nominal(fit: GeometricFit) -> list[Finding]:
     """Return a finding on base parameters of the arm that the data determine hardly better than the prior does."""
-    if found.prior is None:
+    if fit.prior is None:
         return []
-    table = layout(found.start)
-    combinations = found.regrouping()
+    table = layout(fit.start)
+    combinations = fit.regrouping()
     # frames have no prior, and what merges with them is theirs
-    spread = np.where(np.isfinite(found.prior), found.prior, 0.0)
+    spread = np.where(np.isfinite(fit.prior), fit.prior, 0.0)
     prior_sigma = np.sqrt((combinations**2) @ spread**2)
-    base = found.base
-    loose = (found.base_sigma() > NEAR_PRIOR * prior_sigma) & np.isin(base, table.index("arm")) & (prior_sigma > 0.0)
+    base = fit.base
+    loose = (fit.base_sigma() > NEAR_PRIOR * prior_sigma) & np.isin(base, table.index("arm")) & (prior_sigma > 0.0)
     names = [table.names[k] for k in base[loose]]
-    return [finding("near-prior", names=names)] if names else []
+    if not names:
+        return []
+    return [finding("near-prior", names=names)]
 
 
-def _loose(found: GeometricFit, max_placement_sigma: float = 2e-3) -> list[Finding]:
-    """Return findings on tools with a poorly determined placement, with the station correlated with it.
-
-    `max_placement_sigma`: [m] a placement known no better than this is worth a word (our choice).
-    """
-    estimate = found.estimate
+def _loose(fit: GeometricFit) -> list[Finding]:
+    """Return findings on tools with a poorly determined placement, with the station correlated with it."""
+    estimate = fit.estimate
     index = {name: k for k, name in enumerate(estimate.names)}
-    result: list[Finding] = []
-    min_orientation_range = 45.0  # [deg] below it "the wrist is held still" is the likely reason (our choice)
-    for tool in found.cell.tool_names:
-        own = [index[f"{tool}.{axis}"] for axis in "xyz" if f"{tool}.{axis}" in index]
-        sigma = float(np.linalg.norm(estimate.sigma[own]))
-        if own and sigma >= max_placement_sigma:
-            spread = _orientation_range(found)
-            still = spread if spread is not None and spread < min_orientation_range else None
-            station = _confused(found, own, index)
-            result.append(finding("loose-tool", tool=tool, sigma=sigma, station=station, still=still))
-    return result
-
-
-def _confused(found: GeometricFit, own: list[int], index: dict[str, int]) -> str:
-    """Return the station whose estimate is correlated with the tool's (canonical correlation above 0.95); else ''."""
-    covariance = found.estimate.covariance
-    for station in found.cell.station_names:
-        theirs = [k for name, k in index.items() if name.rsplit(".", 1)[0] == station]
-        if not theirs:
+    findings: list[Finding] = []
+    for tool in fit.cell.tool_names:
+        names = [f"{tool}.{axis}" for axis in "xyz"]
+        position = [index[name] for name in names if name in index]
+        sigma = float(np.linalg.norm(estimate.sigma[position]))
+        if not position or sigma < MAX_PLACEMENT_SIGMA:
             continue
-        roots = [np.linalg.cholesky(covariance[np.ix_(part, part)]) for part in (own, theirs)]
-        cross = np.linalg.solve(roots[0], covariance[np.ix_(own, theirs)])
-        if np.linalg.norm(np.linalg.solve(roots[1], cross.T), 2) > 0.95:
+        still = _orientation_range(fit)
+        if still is not None and still >= MIN_ORIENTATION_RANGE:
+            still = None
+        station = _confused(fit, position, index)
+        findings.append(finding("loose-tool", tool=tool, sigma=sigma, station=station, still=still))
+    return findings
+
+
+def _confused(fit: GeometricFit, position: list[int], index: dict[str, int]) -> str:
+    """Return the station whose estimate is correlated with the tool's position; '' without one.
+
+    Args:
+        fit: the fit.
+        position: indices of the tool's position among the estimates.
+        index: of every estimate, by name.
+    """
+    covariance = fit.estimate.covariance
+    for station in fit.cell.station_names:
+        placement = [k for name, k in index.items() if name.rsplit(".", 1)[0] == station]
+        if not placement:
+            continue
+        root = np.linalg.cholesky(covariance[np.ix_(position, position)])
+        station_root = np.linalg.cholesky(covariance[np.ix_(placement, placement)])
+        cross = np.linalg.solve(root, covariance[np.ix_(position, placement)])
+        canonical_correlation = np.linalg.norm(np.linalg.solve(station_root, cross.T), 2)
+        if canonical_correlation > MAX_CORRELATION:
             return station
     return ""
 
 
-def _orientation_range(found: GeometricFit) -> float | None:
+def _orientation_range(fit: GeometricFit) -> float | None:
     """Return the range that holds 95 % of the flange's orientations [deg]; None without an instrument's poses."""
-    q = [block.measured.q for block in found.blocks if block.measured.has_instrument]
+    q = [block.measured.q for block in fit.blocks if block.measured.has_instrument]
     if not q:
         return None
-    turns = Rotation.from_matrix(forward(found.cell.chain, np.concatenate(q))[:, :3, :3])
-    return 2.0 * float(np.degrees(np.quantile((turns.mean().inv() * turns).magnitude(), 0.95)))
+    rotations = Rotation.from_matrix(forward(fit.cell.chain, np.concatenate(q))[:, :3, :3])
+    angles = (rotations.mean().inv() * rotations).magnitude()
+    return 2.0 * float(np.degrees(np.quantile(angles, 0.95)))
 
 
 def observation_matrix(cell: Installation, blocks: Sequence[Block], columns: np.ndarray) -> np.ndarray:
@@ -127,32 +165,36 @@ def observation_matrix(cell: Installation, blocks: Sequence[Block], columns: np.
 
     The reach (rms distance of targets from the arm's base) makes orientation rows comparable with position rows.
     """
-    rows = list[np.ndarray]()
+    rows: list[np.ndarray] = []
     for block in blocks:
         scales = []
         for part in observe(cell, block, columns[:0]):
-            scale = part.sigma
             if part.label == "pixel":
                 scale = np.asarray(part.per_length)
-            elif scale is None:
-                scale = np.full(part.value.shape, 1.0 / _reach(cell) if part.label == "orientation" else 1.0)
-            elif part.label != "orientation":
-                scale = scale / np.median(scale)
             else:
-                scale = scale / np.median(scale) / _reach(cell)
+                scale = np.ones(part.value.shape)
+                if part.sigma is not None:
+                    scale = part.sigma / np.median(part.sigma)
+                if part.label == "orientation":
+                    scale = scale / _reach(cell)
             scales.append(np.broadcast_to(scale, part.value.shape))
         for _, matrix in whitened(cell, block, columns, scales):
             rows.append(matrix)
-            if sum(each.size for each in rows) > MOST_NUMBERS:
+            if sum(matrix.size for matrix in rows) > MOST_NUMBERS:
                 rows = [np.asarray(np.linalg.qr(np.concatenate(rows), mode="r"))]
     return np.concatenate(rows)
 
 
 def _reach(cell: Installation) -> float:
     """Return a typical length of the arm [m]: the sum of its constant offsets."""
-    total = sum(abs(e.value) for e in cell.chain.elements if e.axis[0] == "t")
-    total += sum(float(np.linalg.norm(e.placement[:3, 3])) for e in cell.chain.elements if e.placement is not None)
-    return max(total, 0.1)
+    lengths = 0.0
+    offsets = 0.0
+    for element in cell.chain.elements:
+        if element.axis[0] == "t":
+            lengths += abs(element.value)
+        if element.placement is not None:
+            offsets += float(np.linalg.norm(element.placement[:3, 3]))
+    return max(lengths + offsets, MIN_REACH)
 
 
 def _preference(cell: Installation, columns: np.ndarray) -> list[np.ndarray]:
@@ -173,11 +215,6 @@ def base_columns(
     return split_columns(observation_matrix(cell, blocks, columns), _preference(cell, columns), tolerance)
 
 
-KINDS = (Poses.kind, Positions.kind)
-SAMPLES = 300  # random postures that decide what is identifiable
-SIGMA_POSITION, SIGMA_ORIENTATION = 1e-4, 1e-4  # [m], [rad]: our choice where none is stated
-
-
 @dataclass(frozen=True, eq=False)
 class Observation:
     """Whitened observation Jacobian in base columns: q (m, n) -> (m, rows, p).
@@ -195,33 +232,40 @@ class Observation:
     sigmas: tuple[float, float] = (SIGMA_POSITION, SIGMA_ORIENTATION)
 
     def __call__(self, q: np.ndarray) -> np.ndarray:
+        sigma_position, sigma_orientation = self.sigmas
         rows = []
         for number in range(len(self.cell.tools)):
             seen = see(self.cell, q, 0, number)
             jacobian = target_jacobian(self.cell, seen, self.free, 0, np.full(len(q), number))
-            rows.append(jacobian[:, :3] / self.sigmas[0])
+            rows.append(jacobian[:, :3] / sigma_position)
             if self.full:
-                rows.append(jacobian[:, 3:] / self.sigmas[1])
+                rows.append(jacobian[:, 3:] / sigma_orientation)
         return np.concatenate(rows, axis=1).transpose(2, 1, 0)
 
     def position(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the position of the first target (m, 3) [m] and its unwhitened Jacobian (m, 3, p)."""
-        return see(self.cell, q).point.T, self(q)[:, :3] * self.sigmas[0]
+        point = see(self.cell, q).point.T
+        return point, self(q)[:, :3] * self.sigmas[0]
 
     def product(self, q: np.ndarray, G: np.ndarray) -> np.ndarray:
         """Return Σ G[i] · ∂J[i]/∂q (m, n) for weights G (m, rows, p) of the whitened Jacobian; exact."""
-        chain, count = self.cell.chain, len(self.cell.chain.elements)
-        in_station = np.isin(self.free, layout(self.cell).index("station"))
-        places = np.where(self.free < count, self.free, np.where(in_station, -1, count))
-        weights, result = G.transpose(2, 1, 0), np.zeros((chain.n, len(q)))
+        chain = self.cell.chain
+        count = len(chain.elements)
+        # element of each parameter; -1 for the station, behind the last element for tools
+        places = np.full(len(self.free), count)
+        places[np.isin(self.free, layout(self.cell).index("station"))] = -1
+        in_arm = self.free < count
+        places[in_arm] = self.free[in_arm]
+        weights = G.transpose(2, 1, 0)
         rows = 6 if self.full else 3
+        result = np.zeros((chain.n, len(q)))
         for number in range(len(self.cell.tools)):
             seen = see(self.cell, q, 0, number)
             columns = target_jacobian(self.cell, seen, self.free, 0, np.full(len(q), number))
             weight = np.zeros(columns.shape)
-            for first, sigma in zip(range(0, rows, 3), self.sigmas):
-                at = rows * number + first
-                weight[:, first : first + 3] = weights[:, at : at + 3] / sigma
+            for start, sigma in zip(range(0, rows, 3), self.sigmas):
+                row = rows * number + start
+                weight[:, start : start + 3] = weights[:, row : row + 3] / sigma
             elements = element_jacobian(chain, seen.walked, seen.point)
             result += twist_product(chain, elements, columns, places, weight)
         return result.T
@@ -252,10 +296,13 @@ class TargetJacobian:
 
 
 def targets_of(chain: Chain, tools: Sequence[Sequence[float]] = ()) -> Installation:
-    """Return the arm with targets at places (3,) [m] in the tip's frame; one at the tip if none are given."""
-    places = [np.asarray(tool, dtype=float) for tool in tools] or [np.zeros(3)]
-    names = tuple(f"tool {k + 1}" for k in range(len(places))) if len(places) > 1 else ("tool",)
-    return Installation(chain, tools=np.array([pose(None, place) for place in places]), tool_names=names)
+    """Return the arm with targets at positions (3,) [m] in the tip's frame; one at the tip if none are given."""
+    positions = [np.asarray(tool, dtype=float) for tool in tools] or [np.zeros(3)]
+    names = ("tool",)
+    if len(positions) > 1:
+        names = tuple(f"tool {number}" for number in range(1, len(positions) + 1))
+    placements = np.array([pose(None, position) for position in positions])
+    return Installation(chain, tools=placements, tool_names=names)
 
 
 def observation(
@@ -273,9 +320,11 @@ def observation(
     full = kind == Poses.kind
     q = random_joints(cell.chain, SAMPLES, seed)
     blocks = prepare(cell, [_measured(q, cell, number, full) for number in range(len(cell.tools))])
-    columns = np.arange(len(layout(cell).names))
-    if not full:  # a point has no orientation of its own
-        turns = [k for k in layout(cell).index("tool") if layout(cell).units[k] == "rad"]
+    table = layout(cell)
+    columns = np.arange(len(table.names))
+    if not full:
+        # a point has no orientation of its own
+        turns = [k for k in table.index("tool") if table.units[k] == "rad"]
         columns = np.setdiff1d(columns, turns)
     split = base_columns(cell, blocks, columns)
     require(split.rank, f"robot '{cell.chain.name}': no parameter affects the measured quantities", Unidentifiable)
@@ -285,10 +334,13 @@ def observation(
 def _measured(q: np.ndarray, cell: Installation, number: int, full: bool) -> Positions:
     """Return noise-free measurements of one target at joint values q (m, n)."""
     poses = see(cell, q, 0, np.full(len(q), number)).poses()
+    quaternion = None
+    if full:
+        quaternion = to_quaternion(poses)
     return PoseMeasurements.of(
         q,
         poses[:, :3, 3],
-        to_quaternion(poses) if full else None,
+        quaternion,
         joint_names=cell.chain.joint_names,
         tool_names=(cell.tool_names[number],),
         station=cell.station_names[0],

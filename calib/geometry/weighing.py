@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.errors import UsageError, one_of, refuse_data
+from calib.errors import Unidentifiable, UsageError, one_of, refuse_data
 from calib.estimation import robust
 from calib.estimation.base_columns import ColumnSplit
 from calib.estimation.estimate import Estimate
@@ -22,6 +22,21 @@ from calib.geometry.residuals import Part
 from calib.records import frozen
 from calib.robot.calibrated import CalibratedChain, CorrectedChain
 from calib.robot.chain import Chain
+
+# [m, rad, px] of estimated sigmas: no instrument of an arm is more exact, though computed positions are
+MIN_SIGMA = 1e-6
+# residuals over their sigmas: computed positions leave less
+MIN_NOISE = 1e-6
+# [m, rad, px] sigmas that a fit begins with, by label of the residual part
+START_SIGMA = dict.fromkeys(("position", "orientation", "consistency", "distance", "plane"), 1e-3) | {"pixel": 0.3}
+# [m, rad, px] robust spread by which outliers are measured at least
+SMALLEST_SPREAD = 1e-15
+# share of the measured numbers that counts as free at least, however many unknowns there are
+MIN_FREE_SHARE = 0.05
+# change of a weight, and relative change of a sigma, that repeats no fit
+MAX_CHANGE = 0.02
+
+_NONE = np.array([], dtype=int)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,10 +116,10 @@ class GeometricFit:
         result = np.zeros((len(row), len(column)))
         for parameter, number in row.items():
             result[number, column[parameter]] = 1.0
-        kept = self.candidates[self.split.kept].tolist()
+        base = self.candidates[self.split.kept].tolist()
         dropped = self.candidates[self.split.dropped].tolist()
         for merged, coefficients in zip(dropped, self.split.coefficients.T):
-            for parameter, coefficient in zip(kept, coefficients):
+            for parameter, coefficient in zip(base, coefficients):
                 if merged in column and parameter in row:
                     result[row[parameter], column[merged]] = coefficient
         return result
@@ -122,14 +137,16 @@ class GeometricFit:
         """
         result = []
         for piece in self.pieces:
-            measured, part = self.blocks[piece.block].measured, piece.part.per_row()
-            size = np.sqrt(np.mean(part.value**2, axis=0)) / max(robust.spread(part.value), 1e-15)
-            rows, sizes = measured.rows[part.index], part.sizes()
-            result += [
-                (measured.file, int(rows[i]), part.label, float(size[i]), float(sizes[i]))
-                for i in np.flatnonzero(size > threshold)
-            ]
-        return sorted(result, key=lambda item: -item[3])
+            measured = self.blocks[piece.block].measured
+            part = piece.part.per_row()
+            rms = np.sqrt(np.mean(part.value**2, axis=0))
+            in_sigmas = rms / max(robust.spread(part.value), SMALLEST_SPREAD)
+            rows = measured.rows[part.index]
+            sizes = part.sizes()
+            for k in np.flatnonzero(in_sigmas > threshold):
+                outlier = (measured.file, int(rows[k]), part.label, float(in_sigmas[k]), float(sizes[k]))
+                result.append(outlier)
+        return sorted(result, key=lambda outlier: -outlier[3])
 
     def row_weights(self) -> list[np.ndarray]:
         """Return, for each block, the smallest robust weight of each row (m,); 1 without a robust loss."""
@@ -140,8 +157,11 @@ class GeometricFit:
 
     def used_noises(self) -> list[Any]:
         """Return the noise that each block's rows share; None for a block without shared noise."""
-        noises = {piece.block: piece.part.noise for piece in self.pieces if piece.part.noise}
-        return [noises.get(number) for number in range(len(self.blocks))]
+        result: list[Any] = [None] * len(self.blocks)
+        for piece in self.pieces:
+            if piece.part.noise:
+                result[piece.block] = piece.part.noise
+        return result
 
     def used_sigmas(self) -> list[dict[str, float]]:
         """Return, for each block, the rms of the standard deviations used for each label [m or rad]."""
@@ -152,44 +172,49 @@ class GeometricFit:
 
 
 def calibrated_chain(
-    found: GeometricFit, rigid: GeometricFit | None = None, nominal: Chain | None = None
+    fit: GeometricFit, rigid: GeometricFit | None = None, nominal: Chain | None = None
 ) -> CalibratedChain:
     """Return the calibrated robot of one or two fits, with the covariance of its element values.
 
     Args:
-        found: the fit that predicts best.
-        rigid: the best fit without joint corrections; None if `found` has no corrections.
+        fit: the fit that predicts best.
+        rigid: the best fit without joint corrections; None if `fit` has no corrections.
         nominal: the arm before any calibration; None for the one that the fit began with.
 
     Raises:
         UsageError: for a fit with joint corrections and no rigid one: without them its geometry is no robot's.
     """
-    whole, nominal = found.cell.merged(), nominal or found.start.chain
-    if not whole.deflection.terms:
-        rigid = found
+    merged = fit.cell.merged()
+    nominal = nominal or fit.start.chain
+    if not merged.deflection.terms:
+        rigid = fit
     if rigid is None:
         raise UsageError("a fit with joint corrections also needs the best fit without corrections")
     chain = rigid.cell.chain
-    own = np.flatnonzero(rigid.free < len(chain.elements))
+    fitted_elements = np.flatnonzero(rigid.free < len(chain.elements))
     covariance = None
-    if len(own):
+    if len(fitted_elements):
+        elements = rigid.free[fitted_elements]
         covariance = np.zeros((len(chain.elements), len(chain.elements)))
-        where = rigid.free[own]
-        covariance[np.ix_(where, where)] = rigid.estimate.covariance[np.ix_(own, own)]
+        block = rigid.estimate.covariance[np.ix_(fitted_elements, fitted_elements)]
+        covariance[np.ix_(elements, elements)] = block
     corrections = None
-    if whole.deflection.terms:
-        names = (*chain.names, *whole.deflection.names(chain))
-        fitted = [place for place, name in enumerate(found.estimate.names) if name in names]
-        where = [names.index(found.estimate.names[place]) for place in fitted]
-        spread = np.zeros((len(names), len(names)))
-        spread[np.ix_(where, where)] = found.estimate.covariance[np.ix_(fitted, fitted)]
-        corrections = CorrectedChain(whole.chain, whole.deflection, frozen(spread))
+    if merged.deflection.terms:
+        corrections = CorrectedChain(merged.chain, merged.deflection, _corrected_covariance(fit, chain, merged))
     return CalibratedChain(chain, nominal, covariance, corrections)
 
 
-MIN_SIGMA = 1e-9  # [m, rad, px] of estimated sigmas: computed positions are no more exact, nor is a fit of them
-MIN_NOISE = 1e-6  # residuals over their sigmas: computed positions leave less
-START_SIGMA = dict.fromkeys(("position", "orientation", "consistency", "distance", "plane"), 1e-3) | {"pixel": 0.3}
+def _corrected_covariance(fit: GeometricFit, chain: Chain, merged: Installation) -> np.ndarray:
+    """Return the covariance of a chain's elements and its corrections; zero for those that were not fitted."""
+    names = (*chain.names, *merged.deflection.names(chain))
+    source, target = [], []
+    for number, name in enumerate(fit.estimate.names):
+        if name in names:
+            source.append(number)
+            target.append(names.index(name))
+    covariance = np.zeros((len(names), len(names)))
+    covariance[np.ix_(target, target)] = fit.estimate.covariance[np.ix_(source, source)]
+    return frozen(covariance)
 
 
 @dataclass(frozen=True)
@@ -218,20 +243,31 @@ class Settings:
         one_of(self.loss, ("auto", *robust.LOSSES), "loss", UsageError)
 
 
-_NONE = np.array([], dtype=int)
-
-
 class Weigher:
-    """Sigmas and robust weights of every residual part, updated between passes of a fit."""
+    """Sigmas and robust weights of every residual part, updated between passes of a fit.
+
+    Attributes:
+        settings, nominal, blocks, free: of the fit.
+        prior: (f,) standard deviations about `nominal`; None where all are infinite.
+        pieces: residual parts with the sigmas and weights of the next pass.
+        pieces_of_pass: residuals at the end of the last pass, with the sigmas, weights and noise that it used.
+        noise: rms of the residuals over their sigmas, by which the prior is weighed against the measurements.
+        noise_of_pass: that of the last pass.
+    """
 
     def __init__(
         self, settings: Settings, nominal: Installation, blocks: list[Block], free: np.ndarray, prior: np.ndarray | None
     ):
-        self.settings, self.nominal, self.blocks, self.free = settings, nominal, blocks, free
-        self.prior = prior if prior is not None and np.isfinite(prior).any() else None
+        self.settings = settings
+        self.nominal = nominal
+        self.blocks = blocks
+        self.free = free
+        self.prior = None
+        if prior is not None and np.isfinite(prior).any():
+            self.prior = prior
         self.pieces: list[Piece] = []
-        self.used = self.pieces
-        self.noise = 1.0  # residuals over the sigmas used, by which the prior is weighed against the measurements
+        self.pieces_of_pass: list[Piece] = []
+        self.noise = self.noise_of_pass = 1.0
 
     @property
     def noises(self) -> list[Any]:
@@ -240,54 +276,90 @@ class Weigher:
 
     def update(self, state: Installation, first: bool, resting: float = 0.0) -> None:
         """Set sigmas and weights from the residuals at a state; `resting`: parameters that rest on the prior."""
-        determined = max(len(self.free) - round(resting), 0)
-        owned = [(number, part) for number, block in enumerate(self.blocks) for part in observe(state, block, _NONE)]
-        rows = sum(part.value.size for _, part in owned)
-        unknown = len(self.free) + sum(part.nuisances for _, part in owned)
-        if rows < unknown and self.prior is None:
+        parts: list[tuple[int, Part]] = []
+        for number, block in enumerate(self.blocks):
+            parts += [(number, part) for part in observe(state, block, _NONE)]
+        rows = sum(part.value.size for _, part in parts)
+        unknowns = len(self.free) + sum(part.nuisances for _, part in parts)
+        if rows < unknowns and self.prior is None:
             refuse_data(
                 self.blocks[0].measured.file,
-                f"{rows} measured numbers do not determine {unknown} unknowns; measure more poses, or fit a smaller "
+                f"{rows} measured numbers do not determine {unknowns} unknowns; measure more poses, or fit a smaller "
                 "model ('frames' or 'offsets')",
             )
-        share = max(1.0 - (unknown - resting) / rows, 0.05)
-        loss, scale = "none" if self.settings.loss == "auto" else self.settings.loss, self.settings.loss_scale
-        robustly, self.pieces = loss != "none", []
-        for number, part in owned:
-            sigma = _sigma(part, share, first and not robustly, robustly)
-            noise = part.common_noise(sigma, determined // len(owned), loss, scale, first and not robustly)
-            sigma = noise.factor * sigma if noise else sigma
+        determined = max(len(self.free) - round(resting), 0)
+        share = max(1.0 - (unknowns - resting) / rows, MIN_FREE_SHARE)
+        loss = self.settings.loss
+        if loss == "auto":
+            loss = "none"
+        scale = self.settings.loss_scale
+        robustly = loss != "none"
+        start = first and not robustly
+        self.pieces = []
+        for number, part in parts:
+            sigma = _sigma(part, share, start, robustly)
+            noise = part.common_noise(sigma, determined // len(parts), loss, scale, start)
+            if noise:
+                sigma = noise.factor * sigma
             weight = robust.weights(_size(part, sigma), loss, scale)
-            self.pieces.append(Piece(number, replace(part, noise=noise) if noise else part, sigma, weight))
+            if noise:
+                part = replace(part, noise=noise)
+            self.pieces.append(Piece(number, part, sigma, weight))
         if not first:
-            # what the rows of an image share has its own noise model, and says nothing of the common factor
-            squares = 0.0
-            for piece in self.pieces:
-                whitened_residual = piece.part.alone(piece.sigma) / piece.sigma
-                squares += float(np.sum(piece.weight * whitened_residual**2))
-            self.noise = float(np.sqrt(max(squares / rows / share, MIN_NOISE**2)))
+            self._update_noise(rows, share)
+
+    def _update_noise(self, rows: int, share: float) -> None:
+        """Set the noise from the weighted residuals of all parts.
+
+        What the rows of an image share has its own noise model, and says nothing of the common factor.
+        """
+        squares = 0.0
+        for piece in self.pieces:
+            whitened_residual = piece.part.alone(piece.sigma) / piece.sigma
+            squares += float(np.sum(piece.weight * whitened_residual**2))
+        self.noise = float(np.sqrt(max(squares / rows / share, MIN_NOISE**2)))
 
     def settle(self, solution: Solution) -> Solution | None:
         """Return the solution scaled to the sigmas of its residuals; None if new sigmas would change the estimate.
 
         A common factor on all sigmas changes only the scale, unless the fit has a prior.
         """
-        before, noises, noise = self.pieces, self.noises, self.noise
+        before = self.pieces
+        noises = self.noises
+        self.noise_of_pass = self.noise
         self.update(solution.state, first=False, resting=self._resting(solution))
-        both = list(zip(self.pieces, before))
-        self.used = [replace(old, part=replace(new.part, noise=old.part.noise)) for new, old in both]
-        ratios = [float(np.mean(new.sigma / old.sigma)) for new, old in both]
-        steady = all(np.abs(new.weight - old.weight).max(initial=0.0) < 0.02 for new, old in both)
-        common = ratios[0] if self.prior is None and not any(noises) else 1.0
-        steady = steady and all(a is None or b is None or a.near(b) for a, b in zip(self.noises, noises))
-        steady = steady and (self.prior is None or abs(self.noise / noise - 1.0) < 0.02)
-        if not steady or any(abs(ratio / common - 1.0) > 0.02 for ratio in ratios):
+        self.pieces_of_pass = []
+        ratios = []
+        for piece, earlier in zip(self.pieces, before):
+            part = replace(piece.part, noise=earlier.part.noise)
+            self.pieces_of_pass.append(replace(earlier, part=part))
+            ratios.append(float(np.mean(piece.sigma / earlier.sigma)))
+        keeps_metric = self.prior is not None or any(noises)
+        common = 1.0 if keeps_metric else ratios[0]
+        if not self._steady(before, noises) or any(abs(ratio / common - 1.0) > MAX_CHANGE for ratio in ratios):
             return None
-        self.noise = noise
-        if self.prior is not None or any(noises):
-            self.pieces = self.used
+        self.noise = self.noise_of_pass
+        if keeps_metric:
+            self.pieces = self.pieces_of_pass
             return solution
         return replace(solution, factor=solution.factor / common, cost=solution.cost / common**2)
+
+    def _steady(self, before: list[Piece], noises: list[Any]) -> bool:
+        """Return whether robust weights, shared noises and the prior's weight are those of the last pass."""
+        for piece, earlier in zip(self.pieces, before):
+            change = np.abs(piece.weight - earlier.weight).max(initial=0.0)
+            if not change < MAX_CHANGE:
+                return False
+        for noise, earlier_noise in zip(self.noises, noises):
+            if noise is not None and earlier_noise is not None and not noise.near(earlier_noise):
+                return False
+        return self.prior is None or abs(self.noise / self.noise_of_pass - 1.0) < MAX_CHANGE
+
+    def unsettled_result(self, solution: Solution) -> GeometricFit:
+        """Return the fit of the last pass, weighed as that pass was, though new sigmas would change it."""
+        self.pieces = self.pieces_of_pass
+        self.noise = self.noise_of_pass
+        return self.result(solution)
 
     def _resting(self, solution: Solution) -> float:
         """Return how many parameters rest on their prior: Σ σ² / σ_prior²."""
@@ -308,17 +380,21 @@ class Weigher:
 
     def linearise(self, state: Installation) -> Reduced:
         """Return the whitened problem at a state, reduced, with the prior."""
-        known, each, total = list[Rows](), list[Gram](), None
+        prior_rows = list[Rows]()
+        statistics = list[Gram]()
         if self.prior is not None:
-            held = np.isfinite(self.prior)
-            pull, weight = self._pull(state), np.sqrt(self._precision())
-            known.append((pull[held], np.diag(weight)[held]))
-            each.append(Gram(np.diag(weight**2), pull * weight, float(pull @ pull), int(held.sum())))
+            weight = np.sqrt(self._precision())
+            pull = self._pull(state)
+            weighed = np.isfinite(self.prior)
+            prior_rows.append((pull[weighed], np.diag(weight)[weighed]))
+            statistics.append(Gram(np.diag(weight**2), pull * weight, float(pull @ pull), int(weighed.sum())))
+        total = None
         if self._many:
             for number, block in enumerate(self.blocks):
-                each += [own for _, own in row_statistics(state, block, self.free, _scales(self.pieces, number))]
-            total = sum(each[1:], each[0])
-        return reduced(lambda: chain(_rows(state, self.free, self.blocks, self.pieces), known), total)
+                for _, gram in row_statistics(state, block, self.free, _scales(self.pieces, number)):
+                    statistics.append(gram)
+            total = sum(statistics[1:], statistics[0])
+        return reduced(lambda: chain(_rows(state, self.free, self.blocks, self.pieces), prior_rows), total)
 
     @property
     def _many(self) -> bool:
@@ -349,23 +425,42 @@ class Weigher:
         return inverse.T @ inverse
 
     def result(self, solution: Solution) -> GeometricFit:
+        """Return the fit at a solution, with the posterior covariance of its parameters."""
         state = solution.state
-        table, parts = layout(state), [piece.part for piece in self.pieces]
+        undetermined = self.free[np.diag(solution.factor) == 0.0]
+        if len(undetermined):
+            names = [layout(state).names[parameter] for parameter in undetermined]
+            raise Unidentifiable(
+                f"{self.blocks[0].measured.file}: these rows no longer determine {', '.join(names)} where the search "
+                "ended; measure at more different joint values",
+                names,
+            )
+        table = layout(state)
+        rows = sum(piece.part.value.size - piece.part.nuisances for piece in self.pieces)
         # parameters that rest on their prior take nothing from the measurements' degrees of freedom
-        pull, resting = self._pull(state), self._resting(solution)
-        rows = sum(part.value.size - part.nuisances for part in parts)
+        resting = self._resting(solution)
         dof = max(rows - len(self.free) + round(resting), 1)
+        pull = self._pull(state)
         variance = max(solution.cost - float(pull @ pull), 0.0) / dof
         estimate = Estimate(
-            tuple(table.names[k] for k in self.free),
-            tuple(table.units[k] for k in self.free),
-            parameter_values(state)[self.free],
-            self._posterior(solution.factor, variance),
-            float(np.sqrt(variance)),
-            dof,
+            names=tuple(table.names[k] for k in self.free),
+            units=tuple(table.units[k] for k in self.free),
+            values=parameter_values(state)[self.free],
+            covariance=self._posterior(solution.factor, variance),
+            residual_std=float(np.sqrt(variance)),
+            dof=dof,
         )
         return GeometricFit(
-            state, self.nominal, self.free, estimate, None, self.free, solution, self.blocks, self.pieces, self.prior
+            cell=state,
+            start=self.nominal,
+            free=self.free,
+            estimate=estimate,
+            split=None,
+            candidates=self.free,
+            solution=solution,
+            blocks=self.blocks,
+            pieces=self.pieces,
+            prior=self.prior,
         )
 
 
@@ -387,8 +482,11 @@ def _sigma(part: Part, share: float, start: bool, robustly: bool) -> np.ndarray:
         return part.sigma
     if start:
         return np.full(part.value.shape, START_SIGMA[part.label])
-    found = robust.spread(part.value) if robustly else float(np.sqrt(np.mean(part.value**2)))
-    return np.full(part.value.shape, max(found / np.sqrt(share), MIN_SIGMA))
+    if robustly:
+        spread = robust.spread(part.value)
+    else:
+        spread = float(np.sqrt(np.mean(part.value**2)))
+    return np.full(part.value.shape, max(spread / np.sqrt(share), MIN_SIGMA))
 
 
 def _size(part: Part, sigma: np.ndarray) -> np.ndarray:

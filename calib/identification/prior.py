@@ -14,10 +14,10 @@ is largest (MacKay 1992, automatic relevance of groups),
     log p(y | σ, κ) = -½ [log det K + zᵀ K⁻¹ z] + const,   K = I + R P Rᵀ,
 
 with [R z] the triangle of the whitened [W y] and P the prior covariance, times a wide prior of their logarithms: what a
-kind would be if it alone explained `explained_share` of all torque (offsets: `offset_share`), within a factor
-exp(`kind_width`) (our choice), and bounded: without a bound, motion that hardly shows a kind is explained by large
+kind would be if it alone explained `EXPLAINED_SHARE` of all torque (offsets: `OFFSET_SHARE`), within a factor
+exp(`KIND_WIDTH`) (our choice), and bounded: without a bound, motion that hardly shows a kind is explained by large
 parameters that cancel. Rows are weighed by their joint's residual, worth as many independent values as its
-autocorrelation lets it, but not fewer than one in `max_inflation`: residuals of a short record look like one wave
+autocorrelation lets it, but not fewer than one in `MAX_INFLATION`: residuals of a short record look like one wave
 whatever the model is. What the model lacks is no noise, and differs on other motion: where sizes are found residuals
 count `TEMPERING` times less, and the prior as many times more for the values than for their covariance; more where
 regimes left out ask for it (`calib.identification.prior`).
@@ -51,15 +51,46 @@ from calib.identification.time_folds import CrossValidation, Regimes, estimate
 from calib.records import frozen
 from calib.robot.chain import Chain
 
-RADIUS = 0.1  # [m] of the balls that rods are made of
-PAYLOAD = (2.0, 0.1)  # [kg, m]
-TEMPERING = 2.0  # weight of the prior for the values, at least: chosen on motion other than learnt from
-MIN_NOISE = 1e-9  # of the largest joint's torque: exact data must not turn into infinite weights
-NOISE = 0.03  # of a joint's torque: the residual at the start (our choice); larger ones start on the smooth side
+RADIUS = 0.1
+"""Radius of the balls that rods are made of [m]."""
+PAYLOAD = (2.0, 0.1)
+"""Mass and radius of a payload [kg, m]."""
+TEMPERING = 2.0
+"""Weight of the prior for the values, at least: chosen on motion other than that of the training data."""
+TEMPERINGS = (TEMPERING, 2.0 * TEMPERING, 4.0 * TEMPERING)
+"""Weights that are tried."""
+MIN_TEMPERING_GAIN = 0.08
+"""Decrease of the logarithm of squared errors that a stronger prior has to bring (our choice)."""
+MIN_NOISE = 1e-9
+"""Noise in units of the largest joint's torque, at least: exact data must not turn into infinite weights."""
+NOISE = 0.03
+"""Residual at the start in units of a joint's torque (our choice); larger ones start on the smooth side."""
+DRIVES = 3.0
+"""Standard deviation of terms without CAD, in units of what would explain all of the torque."""
+ROTOR = 0.15
+"""Radius of gyration [m]: motor inertias are of the order of the robot's mass times its square, seen from the joint."""
+MAX_INFLATION = 10.0
+"""Rows of a residual that count as one, at most, where they are weighed (our choice)."""
 ROUNDS = 12
-SETTLED = 0.03  # of every parameter's sigma, and of every residual
-DRIVES = 3.0  # terms without CAD: standard deviation in units of what would explain all of the torque
-ROTOR = 0.15  # [m]: motor inertias are of the order of the robot's mass times its square, seen from the joint
+"""Rounds of sizes, values and weights, at most."""
+SETTLED = 0.03
+"""Change of every parameter in units of its sigma, and relative change of every residual, that ends the rounds."""
+FIRST_FIT_ROUNDS = 4
+"""Rounds of values and weights of a fit without prior."""
+RESTING_SHARE = 0.5
+"""A parameter whose variance the data lower by less than this share rests on the prior."""
+MIN_CAD_DEVIATION = 0.03
+"""Least deviation in units of the robot's parameters of a kind, rms: no CAD is known to be nearer (our choice)."""
+MAX_DEVIATION = 3.0
+"""Largest deviation in the same units, or in those of what explains all torque (our choice)."""
+EXPLAINED_SHARE = 0.2
+"""Share of all torque that a kind of parameters explains before any data (our choice)."""
+OFFSET_SHARE = 0.01
+"""The same of constant torques: motors have friction rather than offsets (our choice)."""
+WHOLE_WIDTH = 1.0
+"""Deviation of the logarithm of κ, whose size is known: the whole robot explains all torque (our choice)."""
+KIND_WIDTH = 3.0
+"""Deviation of the logarithm of a kind's size (our choice)."""
 
 
 class FirstFit(NamedTuple):
@@ -71,7 +102,7 @@ class FirstFit(NamedTuple):
     std: np.ndarray
     inflation: np.ndarray
     values: np.ndarray
-    rest: RestWeights
+    rest_weights: RestWeights
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +111,7 @@ class Prior:
 
     Attributes:
         covariance: (b, b).
-        own: (b,) standard deviations about the common part of the whole robot, s u.
+        deviation: (b,) standard deviations about the common part of the whole robot, s u.
         sizes: kind → σ, and ``whole`` → κ.
         source: of u, ``cad`` or ``sizes``.
         first: the fit of the base parameters with this prior, without richer friction.
@@ -88,7 +119,7 @@ class Prior:
     """
 
     covariance: np.ndarray
-    own: np.ndarray
+    deviation: np.ndarray
     sizes: Mapping[str, float]
     source: str
     first: FirstFit
@@ -102,32 +133,39 @@ class Prior:
         inverse = scipy.linalg.solve_triangular(lower, np.diag(1.0 / unit), lower=True)
         return np.hstack([inverse, np.zeros((len(unit), 1))])
 
-    def widened(self, more: int) -> np.ndarray:
-        """Return the prior's rows with `more` zero columns inserted after the base columns."""
-        return np.insert(self.rows, [len(self.own)] * more, 0.0, axis=1)
+    def widened(self, count: int) -> np.ndarray:
+        """Return the prior's rows with `count` zero columns inserted after the base columns."""
+        return np.insert(self.rows, [len(self.deviation)] * count, 0.0, axis=1)
 
     def resting(self, covariance: np.ndarray) -> np.ndarray:
-        """Return the parameters (b,) that rest on the prior: data reduce their variance by less than `resting_share`.
+        """Return the parameters (b,) that rest on the prior: data reduce their variance by less than `RESTING_SHARE`.
 
         Counted about the whole robot's share: its factor s is one number, and soon identified.
         """
-        b = len(self.own)
-        resting_share = 0.5  # a parameter whose variance the data lower by less than this share rests on the prior
-        return np.diag(covariance)[:b] > (1.0 - resting_share) * self.own**2
+        variance = np.diag(covariance)[: len(self.deviation)]
+        return variance > (1.0 - RESTING_SHARE) * self.deviation**2
 
 
 @dataclass(frozen=True, eq=False)
 class _Sizes:
-    """Prior standard deviations exp(E t) of p parameters and k directions, as functions of log sizes t."""
+    """Prior standard deviations exp(E t) of p parameters and k directions, as functions of log sizes t.
+
+    Attributes:
+        names: of the sizes; empty for those of richer friction.
+        member: (p + k,) which size each parameter and direction has.
+        centre, width: (sizes,) mean and standard deviation of t before any data.
+        lower, upper: (sizes,) bounds of t.
+    """
 
     names: tuple[str, ...]
-    member: np.ndarray  # (p + k,) which size each has
-    centre: np.ndarray  # (k,) of t
-    width: np.ndarray  # (k,)
-    least: np.ndarray  # (k,) of t
-    most: np.ndarray  # (k,) of t
+    member: np.ndarray
+    centre: np.ndarray
+    width: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
 
     def deviations(self, t: np.ndarray) -> np.ndarray:
+        """Return the standard deviations (p + k,) at log sizes t."""
         return np.exp(np.clip(t, -40.0, 40.0))[self.member]
 
 
@@ -135,7 +173,7 @@ def find_prior(
     model: RegressorModel,
     base: Base,
     rows: Sequence[ObservationRows],
-    whole: np.ndarray | None = None,
+    robot: np.ndarray | None = None,
     source: str = "sizes",
     noise: np.ndarray | None = None,
     groups: np.ndarray | None = None,
@@ -146,75 +184,91 @@ def find_prior(
     """Return the prior of the base parameters with sizes that maximise the evidence.
 
     Args:
+        model: whose parameters they are.
+        base: the base columns of the model.
         rows: in the base columns, and those of richer friction behind them.
-        whole: u, the first of the model's parameters, up to a factor; None: nothing is known of the whole robot.
-        source: of `whole`: ``cad`` or ``sizes``.
+        robot: u, the first of the model's parameters, up to a factor; None: nothing is known of the whole robot.
+        source: of `robot`: ``cad`` or ``sizes``.
         noise: (rows,) of the torques up to a common factor; None: from the residuals.
         groups: (k,) of the columns of richer friction, each of a size of its own, which serves here alone.
         start: the prior without that friction, or of another tempering, to start from.
         effort: (n,) torque limits of the joints, up to a factor; None: joints alike.
         tempering: see `Prior`.
     """
-    n = rows[0].target.shape[1]
-    parts, rest = divided(rows), rows[0].rest
-    data = parts.joined(rest)
+    parts = divided(rows)
+    rest_weights = rows[0].rest
+    data = parts.joined(rest_weights)
+    if groups is None:
+        groups = np.zeros(0, int)
+
+    # Columns of the base parameters and richer friction, by each of χ, and by each s of a common direction.
     transform = base.transform
-    known = np.zeros(model.p)
-    if whole is not None:
-        known[: len(whole)] = whole
-    more = np.zeros(0, int) if groups is None else groups
-    shared = _shared(model, known, effort)
-    columns = np.asarray(scipy.linalg.block_diag(transform, np.eye(len(more))))  # by each of χ, and by each s
-    columns = np.column_stack([columns, np.vstack([transform @ shared, np.zeros((len(more), shared.shape[1]))])])
-    sizes = _sizes(model, data, columns, shared, more)
-    squares, count = np.sum(data.factors[:, :, -1] ** 2, axis=1), np.maximum(data.rows, 1)
-    std, tau = NOISE * np.sqrt(squares / count), np.full(n, 3.0)
+    robot_direction = np.zeros(model.p)
+    if robot is not None:
+        robot_direction[: len(robot)] = robot
+    shared = _shared_directions(model, robot_direction, effort)
+    direction_count = shared.shape[1]
+    single = np.asarray(scipy.linalg.block_diag(transform, np.eye(len(groups))))
+    common = np.vstack([transform @ shared, np.zeros((len(groups), direction_count))])
+    columns = np.column_stack([single, common])
+    sizes = _sizes(model, data, columns, shared, groups)
+
+    squares = np.sum(data.factors[:, :, -1] ** 2, axis=1)
+    std = NOISE * np.sqrt(squares / np.maximum(data.rows, 1))
     std = np.maximum(std, MIN_NOISE * max(float(std.max()), 1e-300))
-    t, values = np.array(sizes.centre), np.zeros(len(columns))
+    inflation = np.full(len(std), 3.0)
+    t = np.array(sizes.centre)
+    values = np.zeros(len(columns))
     if start is not None:
-        std, tau = start.first.std, start.first.inflation
+        std, inflation = start.first.std, start.first.inflation
         for name, size in start.sizes.items():
             t[sizes.names.index(name)] = np.log(size)
     for _ in range(ROUNDS):
-        tempered = tempering * tau
-        factor = retriangulate((data.factors / (std * np.sqrt(tempered))[:, None, None]).reshape(-1, len(columns) + 1))
+        previous_values, previous_std = values, std
+        tempered = tempering * inflation
+        noise_of_row = (std * np.sqrt(tempered))[:, None, None]
+        factor = retriangulate((data.factors / noise_of_row).reshape(-1, len(columns) + 1))
         t = _most_probable(factor, columns, sizes, t)
-        before, (values, covariance) = values, _posterior(factor, columns, sizes.deviations(t))
-        last, (std, tau) = std, weighing(rows, data, values, covariance, std, tempered, noise)
-        rest = parts.weights(values, std, tau)
-        data = parts.joined(rest)
-        still = np.abs(values - before) < SETTLED * np.sqrt(np.diag(covariance))
-        if still.all() and (np.abs(std / last - 1.0) < SETTLED).all():
+        values, covariance = _posterior(factor, columns, sizes.deviations(t))
+        std, inflation = weighing(rows, data, values, covariance, std, tempered, noise)
+        rest_weights = parts.weights(values, std, inflation)
+        data = parts.joined(rest_weights)
+        still = np.abs(values - previous_values) < SETTLED * np.sqrt(np.diag(covariance))
+        if still.all() and (np.abs(std / previous_std - 1.0) < SETTLED).all():
             break
-    deviation = sizes.deviations(t)
-    common = slice(-shared.shape[1], None)
-    spread, whole_part = transform * deviation[: model.p], columns[: base.b, common] * deviation[common]
-    own = spread @ spread.T
-    own[np.diag_indices(base.b)] *= 1.0 + 1e-9
+
+    deviations = sizes.deviations(t)
+    single_root = transform * deviations[: model.p]
+    common_root = columns[: base.b, -direction_count:] * deviations[-direction_count:]
+    single_covariance = single_root @ single_root.T
+    single_covariance[np.diag_indices(base.b)] *= 1.0 + 1e-9
     return Prior(
-        frozen(own + whole_part @ whole_part.T),
-        frozen(np.sqrt(np.diag(own))),
-        {name: float(np.exp(one)) for name, one in zip(sizes.names, t) if name},
-        source,
-        FirstFit(frozen(std), frozen(tau), frozen(values[: base.b]), rest),
-        tempering,
+        covariance=frozen(single_covariance + common_root @ common_root.T),
+        deviation=frozen(np.sqrt(np.diag(single_covariance))),
+        sizes={name: float(np.exp(log_size)) for name, log_size in zip(sizes.names, t) if name},
+        source=source,
+        first=FirstFit(frozen(std), frozen(inflation), frozen(values[: base.b]), rest_weights),
+        tempering=tempering,
     )
 
 
 def first_fit(rows: Sequence[ObservationRows], noise: np.ndarray | None = None) -> FirstFit:
     """Return a minimum-norm fit: standard deviation and inflation of its residuals (rows,), and values (b,)."""
-    count = rows[0].target.shape[1]
-    parts, rest = divided(rows), rows[0].rest
-    std, tau = np.ones(count), np.ones(count)
+    row_count = rows[0].target.shape[1]
+    parts = divided(rows)
+    rest_weights = rows[0].rest
+    std, inflation = np.ones(row_count), np.ones(row_count)
     values = np.zeros(parts.moving.parameters)
-    for _ in range(4):
-        data = parts.joined(rest)
-        values, _ = estimate(data, std, np.ones(count), np.full(data.parameters, -1))
+    for _ in range(FIRST_FIT_ROUNDS):
+        data = parts.joined(rest_weights)
+        no_ridges = np.full(data.parameters, -1)
+        values, _ = estimate(data, std, np.ones(row_count), no_ridges)
         std = np.sqrt(data.residual_squares(values) / np.maximum(data.rows, 1))
-        std = scaled(noise, np.maximum(std, 1e-9 * max(float(std.max()), 1e-300)), data.rows)
-        tau = residual_inflation(rows, values)
-        rest = parts.weights(values, std, tau)
-    return FirstFit(std, tau, values, rest)
+        std = np.maximum(std, 1e-9 * max(float(std.max()), 1e-300))
+        std = scaled(noise, std, data.rows)
+        inflation = residual_inflation(rows, values)
+        rest_weights = parts.weights(values, std, inflation)
+    return FirstFit(std, inflation, values, rest_weights)
 
 
 def weighing(
@@ -223,26 +277,28 @@ def weighing(
     values: np.ndarray,
     covariance: np.ndarray,
     std: np.ndarray,
-    tau: np.ndarray,
+    inflation: np.ndarray,
     noise: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return standard deviation and inflation of the residuals (rows,), by their degrees of freedom.
 
     Args:
+        rows: of all recordings.
         data: triangles of the rows, one group per torque row.
         values, covariance: (p,), (p, p) the estimate.
-        std, tau: (rows,) that it was weighed with.
+        std, inflation: (rows,) that it was weighed with.
         noise: (rows,) of the torques up to a common factor; None: from the residuals.
     """
     columns = data.factors[:, :, :-1]
-    taken = np.einsum("gik,gik->g", columns @ covariance, columns) / (std**2 * tau)  # of the parameters, by row
-    max_inflation = 10.0  # rows of a residual that count as one, at most, where they are weighed (our choice)
-    tau = np.minimum(residual_inflation(rows, values), max_inflation)
+    parameters_of_row = np.einsum("gik,gik->g", columns @ covariance, columns) / (std**2 * inflation)
+    inflation = np.minimum(residual_inflation(rows, values), MAX_INFLATION)
+    counts = np.maximum(data.rows, 1)
     squares = np.sum((data.factors @ np.append(values, -1.0)) ** 2, axis=1)
-    std = np.sqrt(squares / np.maximum(data.rows - tau * taken, 0.1 * np.maximum(data.rows, 1)))
-    size = np.sqrt(np.sum(data.factors[:, :, -1] ** 2, axis=1) / np.maximum(data.rows, 1))
-    std = np.maximum(std, MIN_NOISE * max(float(size.max()), 1e-300))
-    return scaled(noise, std, data.rows), tau
+    freedom = np.maximum(data.rows - inflation * parameters_of_row, 0.1 * counts)
+    std = np.sqrt(squares / freedom)
+    torque_rms = np.sqrt(np.sum(data.factors[:, :, -1] ** 2, axis=1) / counts)
+    std = np.maximum(std, MIN_NOISE * max(float(torque_rms.max()), 1e-300))
+    return scaled(noise, std, data.rows), inflation
 
 
 def scaled(noise: np.ndarray | None, std: np.ndarray, counts: np.ndarray) -> np.ndarray:
@@ -252,82 +308,97 @@ def scaled(noise: np.ndarray | None, std: np.ndarray, counts: np.ndarray) -> np.
     has alike, so as it stands it would promise too much; and the decimation filter's gain for white noise, one number
     for all joints, drops out.
     """
-    return std if noise is None else noise * np.sqrt(np.average((std / noise) ** 2, weights=np.maximum(counts, 1)))
+    if noise is None:
+        return std
+    mean_square_ratio = np.average((std / noise) ** 2, weights=np.maximum(counts, 1))
+    return noise * np.sqrt(mean_square_ratio)
 
 
 def residual_inflation(all_rows: Sequence[ObservationRows], values: np.ndarray) -> np.ndarray:
     """Return the integrated autocorrelation of each row's residuals in motion (rows,), averaged by length of cases."""
-    rows = all_rows[0].target.shape[1]
-    total, weight = np.zeros(rows), np.zeros(rows)
-    for part in all_rows:
-        residual, seen = part.target - part.matrix @ values, np.asarray(part.present.any(axis=0))
-        moves = part.standing == 0.0
-        for row in np.flatnonzero(seen & moves.any(axis=0)):
+    row_count = all_rows[0].target.shape[1]
+    total = np.zeros(row_count)
+    weight = np.zeros(row_count)
+    for rows in all_rows:
+        residual = rows.target - rows.matrix @ values
+        moves = rows.standing == 0.0
+        has_motion = rows.present.any(axis=0) & moves.any(axis=0)
+        for row in np.flatnonzero(has_motion):
             in_motion = residual[moves[:, row], row]
             total[row] += len(in_motion) * inflation(in_motion)
             weight[row] += len(in_motion)
     return np.maximum(total / np.maximum(weight, 1.0), 1.0)
 
 
-def _shared(model: RegressorModel, whole: np.ndarray, effort: np.ndarray | None) -> np.ndarray:
+def _shared_directions(model: RegressorModel, robot: np.ndarray, effort: np.ndarray | None) -> np.ndarray:
     """Return common directions (p, k) of the parameters: the whole robot, then drives by their torque limits.
 
     Args:
-        whole: (p,) of the robot's bodies, up to a factor.
+        model: whose parameters they are.
+        robot: (p,) parameters of the robot's bodies, up to a factor.
         effort: (n,) torque limits of the joints, up to a factor; None: joints alike.
     """
-    columns = {}
-    for k, one in enumerate(model.columns):
-        if one.nonnegative and one.joint is not None:
-            size = 1.0 if effort is None else effort[one.joint]
-            columns.setdefault(_kind(one), np.zeros(model.p))[model.inertial + k] = size
-    return np.column_stack([whole, *(own for own in columns.values() if np.count_nonzero(own) > 1)])
+    by_kind: dict[str, np.ndarray] = {}
+    for column, term in enumerate(model.columns):
+        if term.nonnegative and term.joint is not None:
+            direction = by_kind.setdefault(_kind(term), np.zeros(model.p))
+            direction[model.inertial + column] = 1.0 if effort is None else effort[term.joint]
+    directions = [direction for direction in by_kind.values() if np.count_nonzero(direction) > 1]
+    return np.column_stack([robot, *directions])
 
 
 def _kind(term: DriveTerm) -> str:
     return f"{term.shape} [{term.unit}]"
 
 
-def _sizes(model: RegressorModel, data: Triangles, columns: np.ndarray, shared: np.ndarray, more: np.ndarray) -> _Sizes:
-    """Return the kinds of parameters and the prior of each kind's size; groups in `more` have no names."""
+def _sizes(
+    model: RegressorModel, data: Triangles, columns: np.ndarray, shared: np.ndarray, groups: np.ndarray
+) -> _Sizes:
+    """Return the kinds of parameters and the prior of each kind's size; groups of richer friction have no names."""
+    # Names of the sizes of single parameters, then of the directions; and which parameter has which.
     kinds = [f"bodies [{unit}]" for unit in model.units[: model.inertial]]
-    kinds += [_kind(one) for one in model.columns]
-    own = tuple(dict.fromkeys(kinds))
-    found, group = np.unique(more, return_inverse=True)
-    common = [f"shared {kinds[np.flatnonzero(column)[0]]}" for column in shared.T[1:]]
-    names = (*own, *("" for _ in found), "whole", *common)
-    single = len(own) + len(found)  # sizes of single parameters; those of directions follow
-    member = np.array([*map(own.index, kinds), *(len(own) + group), *range(single, len(names))], int)
-    seen = data.factors[:, :, :-1] @ columns
-    squares = np.sum(seen**2, axis=(0, 1))  # of the torque, per unit of each parameter
+    kinds += [_kind(term) for term in model.columns]
+    distinct_kinds = list(dict.fromkeys(kinds))
+    distinct_groups, group = np.unique(groups, return_inverse=True)
+    single_count = len(distinct_kinds) + len(distinct_groups)
+    direction_names = [f"shared {kinds[np.flatnonzero(direction)[0]]}" for direction in shared.T[1:]]
+    names = (*distinct_kinds, *([""] * len(distinct_groups)), "whole", *direction_names)
+    member_of_kind = [distinct_kinds.index(kind) for kind in kinds]
+    members = [*member_of_kind, *(len(distinct_kinds) + group), *range(single_count, len(names))]
+    member = np.array(members, int)
+
+    # Logarithms of the sizes that explain all torque, each alone; of what no torque shows, nothing is known.
+    torque_columns = data.factors[:, :, :-1] @ columns
+    squares = np.sum(torque_columns**2, axis=(0, 1))
     total = max(float(np.sum(data.factors[:, :, -1] ** 2)), 1e-300)
-    each = np.bincount(member, squares, len(names))
-    least = max(1e-12 * float(each.max()), 1e-300)  # of what no torque tells, nothing is known
-    alone = 0.5 * np.log(total / np.maximum(each, least))  # log of the size that explains all torque
+    size_squares = np.bincount(member, squares, len(names))
+    min_squares = max(1e-12 * float(size_squares.max()), 1e-300)
+    explaining = 0.5 * np.log(total / np.maximum(size_squares, min_squares))
+
+    # Sizes of the bodies' parameters are within factors of the robot's own parameters of their kind.
     count = np.maximum(np.bincount(member, minlength=len(names)), 1)
     mean_square = np.bincount(member[: model.p], shared[:, 0] ** 2, len(names)) / count
-    body = alone[single] + 0.5 * np.log(np.maximum(mean_square, 1e-300))
-    known = mean_square > 0.0
-    # of the whole robot's parameters of a kind, rms: no CAD is known to be nearer (our choice)
-    min_cad_deviation = 0.03
-    near = np.where(known, body + np.log(min_cad_deviation), -np.inf)
-    max_deviation = 3.0  # of the whole robot's parameters of a kind, rms, or of what explains all torque (our choice)
-    far = np.where(known, body, alone) + np.log(max_deviation)
-    offset_share = 0.01  # the same of constant torques: motors have friction rather than offsets (our choice)
-    shares = {"one": offset_share, "whole": 1.0}
-    explained_share = 0.2  # of all torque, what a kind of parameters explains before any data (our choice)
-    share = np.array([shares.get(name.split(" ")[0], explained_share) for name in names])
-    whole_width = 1.0  # the same of κ, of which the size is known: the whole robot explains all torque (our choice)
-    kind_width = 3.0  # of a kind's logarithm of size, one standard deviation (our choice)
-    width = np.where([name == "whole" for name in names], whole_width, kind_width)
-    return _Sizes(names, member, np.clip(alone + np.log(share), near, far), width, near, far)
+    of_robot = explaining[single_count] + 0.5 * np.log(np.maximum(mean_square, 1e-300))
+    has_robot = mean_square > 0.0
+    lower = np.where(has_robot, of_robot + np.log(MIN_CAD_DEVIATION), -np.inf)
+    upper = np.where(has_robot, of_robot, explaining) + np.log(MAX_DEVIATION)
+
+    share_of_shape = {"one": OFFSET_SHARE, "whole": 1.0}
+    shares = [share_of_shape.get(name.split(" ")[0], EXPLAINED_SHARE) for name in names]
+    centre = np.clip(explaining + np.log(np.array(shares)), lower, upper)
+    is_robot = np.array([name == "whole" for name in names])
+    width = np.where(is_robot, WHOLE_WIDTH, KIND_WIDTH)
+    return _Sizes(names, member, centre, width, lower, upper)
 
 
 def _posterior(factor: np.ndarray, columns: np.ndarray, deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return posterior values (b,) and their covariance (b, b)."""
-    (b, p), whitened = columns.shape, columns * deviations
+    b, p = columns.shape
+    whitened = columns * deviations
     stacked = np.zeros((b + p, p + 1))
-    stacked[:b, :p], stacked[:b, p], stacked[b:, :p] = factor[:b, :b] @ whitened, factor[:b, b], np.eye(p)
+    stacked[:b, :p] = factor[:b, :b] @ whitened
+    stacked[:b, p] = factor[:b, b]
+    stacked[b:, :p] = np.eye(p)
     upper = retriangulate(stacked, overwrite=True)
     inverse = np.asarray(scipy.linalg.solve_triangular(upper[:p, :p], np.eye(p)))
     root = whitened @ inverse
@@ -337,76 +408,83 @@ def _posterior(factor: np.ndarray, columns: np.ndarray, deviations: np.ndarray) 
 def _most_probable(factor: np.ndarray, columns: np.ndarray, sizes: _Sizes, start: np.ndarray) -> np.ndarray:
     """Return the logarithms of the sizes (k,) that maximise evidence times their prior."""
     b = len(columns)
-    unscaled, target = factor[:b, :b] @ columns, factor[:b, b]
+    unscaled = factor[:b, :b] @ columns
+    target = factor[:b, b]
 
-    def lost(t: np.ndarray) -> tuple[float, np.ndarray]:
-        own = unscaled * sizes.deviations(t)
-        inverse, _ = dtrtri(np.linalg.cholesky(own @ own.T + np.eye(b)), lower=1)  # of the root of y's covariance
-        seen, whitened = inverse @ own, inverse @ target
-        away = (t - sizes.centre) / sizes.width
-        value = 0.5 * float(whitened @ whitened + away @ away) - float(np.log(np.diag(inverse)).sum())
-        slope = (whitened @ seen) ** 2 - np.einsum("ij,ij->j", seen, seen)  # of the evidence by each log deviation
-        return value, away / sizes.width - np.bincount(sizes.member, slope, len(t))
+    def cost(t: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return the negative logarithm of evidence times prior, and its gradient."""
+        root = unscaled * sizes.deviations(t)
+        # Inverse of the root of the covariance of y.
+        inverse, _ = dtrtri(np.linalg.cholesky(root @ root.T + np.eye(b)), lower=1)
+        whitened_root = inverse @ root
+        whitened = inverse @ target
+        deviation = (t - sizes.centre) / sizes.width
+        value = 0.5 * float(whitened @ whitened + deviation @ deviation)
+        value -= float(np.log(np.diag(inverse)).sum())
+        evidence_slope = (whitened @ whitened_root) ** 2 - np.einsum("ij,ij->j", whitened_root, whitened_root)
+        return value, deviation / sizes.width - np.bincount(sizes.member, evidence_slope, len(t))
 
-    found = scipy.optimize.minimize(
-        lost,
-        np.clip(start, sizes.least, sizes.most),
+    solution = scipy.optimize.minimize(
+        cost,
+        np.clip(start, sizes.lower, sizes.upper),
         jac=True,
         method="L-BFGS-B",
-        bounds=np.column_stack([sizes.least, sizes.most]),
+        bounds=np.column_stack([sizes.lower, sizes.upper]),
         options={"maxiter": 60, "ftol": 1e-8},
     )
-    return np.asarray(found.x)
+    return np.asarray(solution.x)
 
 
 def rods(chain: Chain, model: IdentificationModel, total: float = 1.0) -> np.ndarray:
     """Return parameters (B, 10) of rods from each body's frame to the next, mass by length and thickness."""
-    arm = model.bodies
-    ends = np.array([np.asarray(chain.tail)[:3, 3]] * arm.count)
-    for i, parent in enumerate(arm.parents):
-        if parent >= 0 and arm.coordinates[i] >= 0:
-            ends[parent] = arm.placements[i][:3, 3]
-    moving = arm.coordinates >= 0
-    share = np.where(moving, np.linalg.norm(ends, axis=1) + 2 * RADIUS, 0.0)
+    bodies = model.bodies
+    moves = bodies.coordinates >= 0
+    ends = np.array([np.asarray(chain.tail)[:3, 3]] * bodies.count)
+    for i, parent in enumerate(bodies.parents):
+        if parent >= 0 and moves[i]:
+            ends[parent] = bodies.placements[i][:3, 3]
+    length = np.linalg.norm(ends, axis=1) + 2 * RADIUS
+    share = np.where(moves, length, 0.0)
     masses = total * share / share.sum()
-    return np.array(
-        [
-            pseudo_inertia.rod(mass, end, RADIUS) if moves else pseudo_inertia.ball(*PAYLOAD)
-            for mass, end, moves in zip(masses, ends, moving)
-        ]
-    )
-
-
-STEPS = (TEMPERING, 2.0 * TEMPERING, 4.0 * TEMPERING)
+    parameters = []
+    for i in range(bodies.count):
+        if moves[i]:
+            parameters.append(pseudo_inertia.rod(masses[i], ends[i], RADIUS))
+        else:
+            parameters.append(pseudo_inertia.ball(*PAYLOAD))
+    return np.array(parameters)
 
 
 def tempered_prior(
-    find: Callable[..., Prior], found: Prior, rows: Sequence[ObservationRows], regimes: Regimes
+    find: Callable[..., Prior], prior: Prior, rows: Sequence[ObservationRows], regimes: Regimes
 ) -> Prior:
     """Return the prior with the tempering that best predicts held-out ranges of motion.
 
     Errors are squares of all rows, each in units of its residuals, and their geometric mean over the regimes: where
     one kind of extreme is hard for every prior it decides no more than the others. A stronger prior has to be better by
-    `min_gain`.
+    `MIN_TEMPERING_GAIN`.
 
     Args:
         find: `find_prior` of rows, a prior to start from, and a tempering.
-        found: the prior with the least of `STEPS`.
+        prior: the prior with the least of `TEMPERINGS`.
         rows: in the base columns.
         regimes: of these rows.
     """
-    data, columns, best = triangulate(rows), np.arange(len(rows[0].names)), None
-    std = found.first.std
-    min_gain = 0.08  # in the logarithm of squared errors, by which a stronger prior has to be better (our choice)
-    for tempering in STEPS:
-        own = found if tempering == STEPS[0] else find(rows, start=found, tempering=tempering)
-        inflation = tempering * own.first.inflation
+    data = triangulate(rows)
+    columns = np.arange(len(rows[0].names))
+    no_ridges = np.full(len(columns), -1)
+    std = prior.first.std
+    best, best_error = prior, np.inf
+    for tempering in TEMPERINGS:
+        candidate = prior
+        if tempering != TEMPERINGS[0]:
+            candidate = find(rows, start=prior, tempering=tempering)
+        inflation = tempering * candidate.first.inflation
         validation = CrossValidation(
-            data, len(std), 1, own.first.std, inflation, np.full(len(columns), -1), own.rows, regimes
+            data, len(std), 1, candidate.first.std, inflation, no_ridges, candidate.rows, regimes
         )
         squares = (validation.extrapolated(columns) / std**2).sum(axis=1)
         error = float(np.log(np.maximum(squares, 1e-300)).mean())
-        if best is None or error < best[0] - min_gain:
-            best = error, own
-    assert best is not None
-    return best[1]
+        if error < best_error - MIN_TEMPERING_GAIN:
+            best, best_error = candidate, error
+    return best

@@ -17,7 +17,13 @@ from calib.estimation.relevance import Gram, relevance
 from calib.estimation.triangles import Triangles
 from calib.identification.rows import Case, ObservationRows
 
-FAST_SHARE, END_SHARE = 0.1, 0.15  # of the rows: a joint's fastest, its hardest accelerated; at each end (our choice)
+FAST_SHARE = 0.1
+"""Share of the rows that are a joint's fastest, or its hardest accelerated (our choice)."""
+END_SHARE = 0.15
+"""Share of the rows at each end of a joint's travel (our choice)."""
+MAX_DEVIATION_RATIO = 10.0
+"""Largest ratio of the prior deviations of a group's parameters of one unit (our choice)."""
+RELEVANCE_ITERATIONS = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,13 +32,13 @@ class Regimes:
 
     Attributes:
         squares, counts: (k, rows, p + 1, p + 1) and (k, rows) of the k ranges.
-        whole, total: (rows, p + 1, p + 1) and (rows,) of all rows.
+        total_squares, total_counts: (rows, p + 1, p + 1) and (rows,) of all rows.
     """
 
     squares: np.ndarray
     counts: np.ndarray
-    whole: np.ndarray
-    total: np.ndarray
+    total_squares: np.ndarray
+    total_counts: np.ndarray
 
 
 def regimes(all_rows: Sequence[ObservationRows], cases: Sequence[Case], decimator: Decimator) -> Regimes:
@@ -40,39 +46,55 @@ def regimes(all_rows: Sequence[ObservationRows], cases: Sequence[Case], decimato
 
     Standstills belong to none: no model is judged by friction that nothing decides.
     """
-    motions = [case.motion for case in cases]
-    chosen = [kept(motion.segment, decimator) for motion in motions]
-    q, v, a = (
-        np.concatenate([getattr(motion, key)[own] for motion, own in zip(motions, chosen)]) for key in ("q", "v", "a")
-    )
-    rows, p = all_rows[0].matrix.shape[1:]
-    joint = np.arange(rows) % q.shape[1]
-    if rows % q.shape[1]:  # rows of the platform, or the power: of all joints together, and of the one that moves most
-        joint = np.full(rows, np.argmax(np.std(q, axis=0)))
-        v, a = (np.copysign(np.linalg.norm(x / (np.std(x, axis=0) + 1e-12), axis=1)[:, None], x) for x in (v, a))
+    positions, speeds, accelerations = [], [], []
+    for case in cases:
+        motion = case.motion
+        index = kept(motion.segment, decimator)
+        positions.append(motion.q[index])
+        speeds.append(motion.v[index])
+        accelerations.append(motion.a[index])
+    q, v, a = np.concatenate(positions), np.concatenate(speeds), np.concatenate(accelerations)
+
+    row_count, p = all_rows[0].matrix.shape[1:]
+    joint = np.arange(row_count) % q.shape[1]
+    if row_count % q.shape[1]:
+        # Rows of the platform, or the power: of all joints together, and of the one that moves most.
+        joint = np.full(row_count, np.argmax(np.std(q, axis=0)))
+        v = _signed_norm(v)
+        a = _signed_norm(a)
     low, high = np.quantile(q, [END_SHARE, 1.0 - END_SHARE], axis=0)
-    fastest, hardest = (np.abs(x) > np.quantile(np.abs(x), 1.0 - FAST_SHARE, axis=0) for x in (v, a))
-    inside = np.stack([fastest, hardest, q < low, q > high, v > 0.0, v < 0.0])[:, :, joint]
-    stacked = [
-        np.concatenate([part.matrix, part.target[:, :, None]], axis=2) * part.weight[:, :, None] for part in all_rows
-    ]
-    squares, counts = np.zeros((len(inside), rows, p + 1, p + 1)), np.zeros((len(inside), rows))
-    whole, total = np.zeros((rows, p + 1, p + 1)), np.zeros(rows)
+    fastest = np.abs(v) > np.quantile(np.abs(v), 1.0 - FAST_SHARE, axis=0)
+    hardest = np.abs(a) > np.quantile(np.abs(a), 1.0 - FAST_SHARE, axis=0)
+    in_range = np.stack([fastest, hardest, q < low, q > high, v > 0.0, v < 0.0])[:, :, joint]
+
+    range_count = len(in_range)
+    squares = np.zeros((range_count, row_count, p + 1, p + 1))
+    counts = np.zeros((range_count, row_count))
+    total_squares = np.zeros((row_count, p + 1, p + 1))
+    total_counts = np.zeros(row_count)
     start = 0
-    for part, both in zip(all_rows, stacked):
-        own = slice(start, start + len(both))
-        start += len(both)
-        for row in range(rows):
-            used = part.present[:, row]
-            whole[row] += both[used, row].T @ both[used, row]
-            counted, moves = part.counted[:, row], part.standing[:, row] == 0.0
-            total[row] += counted.sum()
-            for k in range(len(inside)):
-                chosen = used & moves & inside[k, own, row]
-                held = both[chosen, row]
-                squares[k, row] += held.T @ held
-                counts[k, row] += counted[chosen].sum()
-    return Regimes(squares, counts, whole, total)
+    for rows in all_rows:
+        augmented = np.concatenate([rows.matrix, rows.target[:, :, None]], axis=2) * rows.weight[:, :, None]
+        part = slice(start, start + len(augmented))
+        start += len(augmented)
+        for row in range(row_count):
+            present = rows.present[:, row]
+            total_squares[row] += augmented[present, row].T @ augmented[present, row]
+            counted = rows.counted[:, row]
+            total_counts[row] += counted.sum()
+            moves = rows.standing[:, row] == 0.0
+            for k in range(range_count):
+                selected = present & moves & in_range[k, part, row]
+                selected_rows = augmented[selected, row]
+                squares[k, row] += selected_rows.T @ selected_rows
+                counts[k, row] += counted[selected].sum()
+    return Regimes(squares, counts, total_squares, total_counts)
+
+
+def _signed_norm(rates: np.ndarray) -> np.ndarray:
+    """Return the norm of all joints' rates (N, n), each in units of its spread, with the signs of each (N, n)."""
+    norm = np.linalg.norm(rates / (np.std(rates, axis=0) + 1e-12), axis=1)
+    return np.copysign(norm[:, None], rates)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +120,7 @@ class CrossValidation:
     group: np.ndarray
     prior: np.ndarray | None = None
     regimes: Regimes | None = None
-    _known: dict[bytes, np.ndarray] = field(default_factory=dict, init=False)
+    _results: dict[bytes, np.ndarray] = field(default_factory=dict, init=False)
 
     def errors(self, columns: np.ndarray, folds: int | None = None) -> np.ndarray:
         """Return the squared errors (blocks, rows) on each held-out block of a model with these columns.
@@ -112,52 +134,58 @@ class CrossValidation:
         columns = np.asarray(columns, dtype=int)
         runs = np.array_split(np.arange(self.blocks), folds or self.blocks)
         key = len(runs).to_bytes(4, "little") + columns.tobytes()
-        if key not in self._known:
-            each = [own for run, own in zip(runs, self._regularised(columns, runs)) for _ in run]
-            self._known[key] = self._errors(columns, each)
-        return self._known[key].copy()
+        if key not in self._results:
+            self._results[key] = self._held_out_errors(columns, runs)
+        return self._results[key].copy()
 
     def extrapolated(self, columns: np.ndarray) -> np.ndarray:
         """Return the squared errors (ranges, rows) in each held-out range of motion of a model with these columns."""
         assert self.regimes is not None
-        if (key := b"ranges" + np.asarray(columns, dtype=int).tobytes()) in self._known:
-            return self._known[key]
-        index, weight = np.append(columns, self.data.parameters), 1.0 / (self.std**2 * self.inflation)
-        known = 0.0 if self.prior is None else self.prior[:, index].T @ self.prior[:, index]
-        rounding = 1e-9 * (weight @ self.regimes.whole.diagonal(axis1=1, axis2=2))[index]
+        key = b"ranges" + np.asarray(columns, dtype=int).tobytes()
+        if key in self._results:
+            return self._results[key]
+        index = np.append(columns, self.data.parameters)
+        weight = 1.0 / (self.std**2 * self.inflation)
+        prior_square = self._prior_square(index)
+        rounding = 1e-9 * (weight @ self.regimes.total_squares.diagonal(axis1=1, axis2=2))[index]
         result = np.zeros((len(self.regimes.squares), self.rows))
-        for k, (held, counts) in enumerate(zip(self.regimes.squares, self.regimes.counts)):
-            rest = np.tensordot(weight, self.regimes.whole - held, 1).take(index, 0).take(index, 1)
-            rest.flat[:: len(index) + 1] += rounding  # differences are positive definite but for that
-            rest += known
-            rows = int(np.sum((self.regimes.total - counts) / self.inflation))
-            values = np.append(_regularised(rest, rows, self.group[columns], self._kinds[columns])[0], -1.0)
-            result[k] = np.einsum("i,rij,j->r", values, held.take(index, 1).take(index, 2), values)
-        return self._known.setdefault(key, np.maximum(result, 0.0))
+        for k, (held_out, counts) in enumerate(zip(self.regimes.squares, self.regimes.counts)):
+            training = np.tensordot(weight, self.regimes.total_squares - held_out, 1).take(index, 0).take(index, 1)
+            # Differences of products are positive definite but for rounding.
+            training.flat[:: len(index) + 1] += rounding
+            training += prior_square
+            training_rows = int(np.sum((self.regimes.total_counts - counts) / self.inflation))
+            values, _ = _regularised(training, training_rows, self.group[columns], self._kinds[columns])
+            combination = np.append(values, -1.0)
+            selected = held_out.take(index, 1).take(index, 2)
+            result[k] = np.einsum("i,rij,j->r", combination, selected, combination)
+        return self._results.setdefault(key, np.maximum(result, 0.0))
 
-    def _errors(self, columns: np.ndarray, values: list[np.ndarray]) -> np.ndarray:
-        """Return the squared errors of parameter values (k,) per block."""
-        result = np.zeros((self.blocks, self.rows))
-        for block, own in enumerate(values):
-            x = np.zeros(self.data.parameters)
-            x[columns] = own
-            factors = self.data.factors[block * self.rows : (block + 1) * self.rows]
-            result[block] = np.sum((factors @ np.append(x, -1.0)) ** 2, axis=1)
-        return result
-
-    def _regularised(self, columns: np.ndarray, runs: list[np.ndarray]) -> list[np.ndarray]:
-        """Return for each run of blocks the ridge estimate from all other blocks."""
-        index, blocks = np.append(columns, self.data.parameters), np.arange(self.blocks)
+    def _held_out_errors(self, columns: np.ndarray, runs: list[np.ndarray]) -> np.ndarray:
+        """Return the squared errors (blocks, rows) of ridge estimates: each run of blocks from all others."""
+        index = np.append(columns, self.data.parameters)
         squares = self._squares.take(index, 1).take(index, 2)
-        known = 0.0 if self.prior is None else self.prior[:, index].T @ self.prior[:, index]
+        prior_square = self._prior_square(index)
         samples = self.data.rows.reshape(-1, self.rows)[: self.blocks]
-        found = []
+        errors = np.zeros((self.blocks, self.rows))
         for run in runs:
-            others = ~np.isin(blocks, run)
-            whole = squares[others].sum(axis=0) + known
-            rows = int(np.sum(samples[others].sum(axis=0) / self.inflation))
-            found.append(_regularised(whole, rows, self.group[columns], self._kinds[columns])[0])
-        return found
+            training_blocks = ~np.isin(np.arange(self.blocks), run)
+            training = squares[training_blocks].sum(axis=0) + prior_square
+            training_rows = int(np.sum(samples[training_blocks].sum(axis=0) / self.inflation))
+            values, _ = _regularised(training, training_rows, self.group[columns], self._kinds[columns])
+            combination = np.zeros(self.data.parameters + 1)
+            combination[columns] = values
+            combination[-1] = -1.0
+            for block in run:
+                factors = self.data.factors[block * self.rows : (block + 1) * self.rows]
+                errors[block] = np.sum((factors @ combination) ** 2, axis=1)
+        return errors
+
+    def _prior_square(self, index: np.ndarray) -> np.ndarray | float:
+        """Return the product [W y]ᵀ[W y] of the prior's rows in some columns; zero without a prior."""
+        if self.prior is None:
+            return 0.0
+        return self.prior[:, index].T @ self.prior[:, index]
 
     @cached_property
     def _kinds(self) -> np.ndarray:
@@ -181,21 +209,22 @@ def estimate(
     with none, this is weighted least squares. Directions without any data stay where they are: at zero.
     """
     weight = 1.0 / (std * np.sqrt(inflation))
-    stacked = (data.factors * weight[:, None, None]).reshape(-1, data.parameters + 1)
+    whitened = (data.factors * weight[:, None, None]).reshape(-1, data.parameters + 1)
     if prior is not None:
-        stacked = np.vstack([stacked, prior])
+        whitened = np.vstack([whitened, prior])
     if (group < 0).all():
-        size = np.sqrt(np.sum(stacked[:, :-1] ** 2, axis=0))
+        size = np.sqrt(np.sum(whitened[:, :-1] ** 2, axis=0))
         scale = np.where(size > 0.0, size, 1.0)
-        found = np.linalg.lstsq(stacked[:, :-1] / scale, stacked[:, -1], rcond=1e-10)[0]
-        return found / scale, np.full(len(group), np.inf)
-    return _regularised(stacked.T @ stacked, int(np.sum(data.rows / inflation)), group, _kinds(group, data.units))
+        scaled_values = np.linalg.lstsq(whitened[:, :-1] / scale, whitened[:, -1], rcond=1e-10)[0]
+        return scaled_values / scale, np.full(len(group), np.inf)
+    row_count = int(np.sum(data.rows / inflation))
+    return _regularised(whitened.T @ whitened, row_count, group, _kinds(group, data.units))
 
 
 def _kinds(group: np.ndarray, units: Sequence[str]) -> np.ndarray:
     """Return a number (p,) for columns with the same group and unit; -1 for columns without a group."""
-    found, unit = np.unique(units, return_inverse=True)
-    return np.where(group < 0, -1, group * len(found) + unit)
+    distinct, unit = np.unique(units, return_inverse=True)
+    return np.where(group < 0, -1, group * len(distinct) + unit)
 
 
 def _regularised(square: np.ndarray, rows: int, group: np.ndarray, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -203,17 +232,18 @@ def _regularised(square: np.ndarray, rows: int, group: np.ndarray, kinds: np.nda
 
     A group's ridge is in units of what each column explains, so that one is enough for different units; but parameters
     of one kind are about equally large. What the motion hardly shows (Stribeck's torque of a joint that never slows
-    down) has a prior deviation of `max_deviation_ratio` times that of the best shown at most, not one without end.
+    down) has a prior deviation of `MAX_DEVIATION_RATIO` times that of the best shown at most, not one without end.
     """
     size = np.sqrt(np.diag(square)[:-1])
-    seen = np.zeros(kinds.max(initial=-1) + 2)  # the last for -1
-    np.maximum.at(seen, kinds, size)
-    max_deviation_ratio = 10.0  # largest ratio of the prior deviations of a group's parameters of one unit (our choice)
-    size = np.where(group < 0, size, np.maximum(size, seen[kinds] / max_deviation_ratio))
+    # Largest size of each kind; the last entry is that of kind -1.
+    largest = np.zeros(kinds.max(initial=-1) + 2)
+    np.maximum.at(largest, kinds, size)
+    size = np.where(group < 0, size, np.maximum(size, largest[kinds] / MAX_DEVIATION_RATIO))
     scale = np.where(size > 0.0, size, 1.0) / np.sqrt(max(rows, 1))
     scaled = square[:-1, :-1] / (scale[:, None] * scale)
-    scaled[np.diag_indices(len(group))] += np.where(group < 0, 1e-9 * rows, 0.0)  # free, without data: stays at zero
+    # Free columns without data stay at zero.
+    scaled[np.diag_indices(len(group))] += np.where(group < 0, 1e-9 * rows, 0.0)
     data = Gram(scaled, square[:-1, -1] / scale, float(square[-1, -1]), rows)
-    iterations = 12
-    found = relevance(data, group, np.ones(len(group)), iterations)
-    return found.values / scale, np.where(np.isfinite(found.ridge), found.ridge / scale, np.inf)
+    fit = relevance(data, group, np.ones(len(group)), RELEVANCE_ITERATIONS)
+    ridge = np.where(np.isfinite(fit.ridge), fit.ridge / scale, np.inf)
+    return fit.values / scale, ridge

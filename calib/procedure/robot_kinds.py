@@ -13,9 +13,14 @@ import numpy as np
 
 from calib.data.schema import Joints
 from calib.errors import UsageError
-from calib.extensions import merged, offered
+from calib.extensions import Point, merged
 from calib.procedure.findings import Verdict
 from calib.robot.chain import joint_kinds
+
+ROBOTS: Point[Callable[[object], Mechanism | None]] = Point(
+    "robots", "the robot that a person names, if it is no serial arm"
+)
+STAGES: Point[Mapping[str, Mapping[str, Stage]]] = Point("stages", "kind of robot → verb → stage")
 
 
 @dataclass(frozen=True)
@@ -86,7 +91,7 @@ def mechanism(robot: object) -> Mechanism | None:
     """
     if isinstance(robot, Mechanism):
         return robot
-    return next((found for find in offered("robots") if (found := find(robot)) is not None), None)
+    return next((found for find in ROBOTS.all() if (found := find(robot)) is not None), None)
 
 
 def stage_of(robot: object, verb: str, base: str | None = None, tip: str | None = None) -> Stage | None:
@@ -101,7 +106,7 @@ def stage_of(robot: object, verb: str, base: str | None = None, tip: str | None 
     found = mechanism(robot)
     if found is None:
         return None
-    stages: Mapping[str, Stage] = merged("stages")[found.kind]
+    stages: Mapping[str, Stage] = merged(STAGES)[found.kind]
     if verb not in stages:
         instead = found.instead.get(verb, f"{', '.join(stages)} take it")
         named = robot if isinstance(robot, (str, Path)) else found.source

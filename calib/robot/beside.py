@@ -6,7 +6,8 @@ Links without masses, pictures and shapes are mere frames and take no space, unl
 them.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -14,8 +15,11 @@ from scipy.spatial.transform import Rotation
 from calib.robot.capsules import Attached
 from calib.robot.chain import Chain
 from calib.robot.formats.urdf import align
-from calib.robot.formats.urdf_tree import JointTag, UrdfTree, parse, read
+from calib.robot.formats.urdf_tree import JointTag, UrdfTree, is_urdf, parse, read, text
 from calib.transforms import invert, pose
+
+# Length [m] below which a capsule is a sphere.
+MIN_LENGTH = 1e-6
 
 
 def links_beside(
@@ -34,44 +38,53 @@ def links_beside(
     """
     tree = read(source, where)
     path = tree.path(tree.link(chain.base, "base"), tree.link(chain.tip, "tip"))
-    inside = {chain.base, *(joint.child for joint in path)}
-    bodies = {joint.child: number for number, joint in enumerate((one for one in path if one.moves), 1)}
-    taking_space = _with_space(tree, source, where, inside)
+    chain_links = {chain.base, *(joint.child for joint in path)}
+    body_numbers: dict[str, int] = {}
+    for joint in path:
+        if joint.moves:
+            body_numbers[joint.child] = len(body_numbers) + 1
+    taking_space = _with_space(tree, source, where, chain_links)
+    posture = posture or {}
     result: list[Attached] = []
     for link in tree.bodies:
-        above = tree.above.get(link)
-        if link in inside or link not in taking_space:
+        if link in chain_links or link not in taking_space:
             continue
-        carrier = _carrier(tree, link, bodies)
-        start = _place(tree, chain.base, above.parent if above else link, carrier, posture or {})
-        end = _place(tree, chain.base, link, carrier, posture or {})
-        number = bodies.get(carrier, 0)
-        ends = [joint for joint in tree.below[link] if joint.child in taking_space]
-        if above is not None and np.linalg.norm(end - start) > MIN_LENGTH:
-            result.append(Attached(link, number, start, end))
-        elif not ends:
-            result.append(Attached(link, number, end, end))
+        joint_above = tree.above.get(link)
+        parent = link if joint_above is None else joint_above.parent
+        carrier = _carrier(tree, link, body_numbers)
+        start = _position(tree, chain.base, parent, carrier, posture)
+        end = _position(tree, chain.base, link, carrier, posture)
+        body = body_numbers.get(carrier, 0)
+        followers = [joint for joint in tree.below[link] if joint.child in taking_space]
+        if joint_above is not None and np.linalg.norm(end - start) > MIN_LENGTH:
+            result.append(Attached(link, body, start, end))
+        elif not followers:
+            result.append(Attached(link, body, end, end))
     return tuple(result)
 
 
-MIN_LENGTH = 1e-6  # [m] of a capsule that is no sphere
-
-
-def _with_space(tree: UrdfTree, source: str, where: str, inside: set[str]) -> set[str]:
+def _with_space(tree: UrdfTree, source: str, where: str, chain_links: set[str]) -> set[str]:
     """Return the links that take space: with a mass or a shape, moved outside the chain, or before such a link."""
-    nodes = {node.attributes["name"]: node for node in parse(source, where).all("link")}
-    shaped = {name for name, node in nodes.items() if node.first("visual") or node.first("collision")}
-    solid = {name for name in tree.bodies if name in shaped or tree.bodies[name] is not None}
-    for name in tree.bodies:
-        outside = [joint for joint in tree.ancestry(name) if joint.moves and joint.child not in inside]
-        if outside and _parts(tree, inside, outside[-1]):
-            solid.add(name)
-    return solid | {joint.parent for name in solid for joint in tree.ancestry(name)}
+    solid = {link for link, body in tree.bodies.items() if body is not None}
+    for node in parse(source, where).all("link"):
+        if node.first("visual") or node.first("collision"):
+            solid.add(node.attributes["name"])
+    for link in tree.bodies:
+        moving = [joint for joint in tree.ancestry(link) if joint.moves and joint.child not in chain_links]
+        if moving and _is_beside(tree, chain_links, moving[-1]):
+            solid.add(link)
+    taking_space = set(solid)
+    for link in solid:
+        taking_space.update(joint.parent for joint in tree.ancestry(link))
+    return taking_space
 
 
-def _parts(tree: UrdfTree, inside: set[str], joint: JointTag) -> bool:
+def _is_beside(tree: UrdfTree, chain_links: set[str], joint: JointTag) -> bool:
     """Return whether a joint does not stand between the root and the chain."""
-    return not any(one.child == joint.child for link in inside for one in tree.ancestry(link))
+    before_chain: set[str] = set()
+    for link in chain_links:
+        before_chain.update(earlier.child for earlier in tree.ancestry(link))
+    return joint.child not in before_chain
 
 
 def _carrier(tree: UrdfTree, link: str, bodies: dict[str, int]) -> str:
@@ -80,21 +93,33 @@ def _carrier(tree: UrdfTree, link: str, bodies: dict[str, int]) -> str:
     return carriers[-1] if carriers else ""
 
 
-def _place(tree: UrdfTree, base: str, link: str, carrier: str, posture: Mapping[str, float]) -> np.ndarray:
+def _position(tree: UrdfTree, base: str, link: str, carrier: str, posture: Mapping[str, float]) -> np.ndarray:
     """Return the origin (3,) of a link in the frame of the chain's moving element that carries it, else in the base.
 
     The element's frame is turned where its axis is oblique (`calib.robot.formats.urdf`).
     """
     origin = invert(_still_pose(tree, carrier or base, posture)) @ _still_pose(tree, link, posture)
-    turn = align(tree.above[carrier].axis).T if carrier else np.eye(4)
-    return (turn @ origin)[:3, 3]
+    rotation = np.eye(4)
+    if carrier:
+        rotation = align(tree.above[carrier].axis).T
+    return (rotation @ origin)[:3, 3]
 
 
 def _still_pose(tree: UrdfTree, link: str, posture: Mapping[str, float]) -> np.ndarray:
     """Return the pose (4, 4) of a link in its root's frame with all joints at zero but those of a posture."""
     result = np.eye(4)
     for joint in tree.ancestry(link):
-        along = posture.get(joint.name, 0.0) * joint.axis
-        moved = pose(position=along) if joint.kind == "prismatic" else pose(Rotation.from_rotvec(along))
-        result = result @ joint.origin @ moved
+        displacement = posture.get(joint.name, 0.0) * joint.axis
+        if joint.kind == "prismatic":
+            motion = pose(position=displacement)
+        else:
+            motion = pose(Rotation.from_rotvec(displacement))
+        result = result @ joint.origin @ motion
     return result
+
+
+def links_of(chain: Chain, source: Path | None) -> Collection[str]:
+    """Return the names of a robot's links: of all in its URDF, else of the arm's capsules."""
+    if source is not None and is_urdf(source):
+        return read(text(source)[0], str(source)).bodies
+    return (chain.base, *(chain.links or [f"{name}_link" for name in chain.joint_names]), chain.tip)

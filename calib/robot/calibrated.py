@@ -53,6 +53,8 @@ from calib.robot.kinematics import forward, gravity_torques, joint_frames, sweep
 from calib.robot.tables import check_keys, number, vector
 
 LOG = logging.getLogger(__name__)
+ROBOT = "robot.toml"
+COVARIANCE = "chain_covariance.csv"
 BASES = ("torque", "lever", "joint", "cos", "sin")
 
 
@@ -122,24 +124,33 @@ def evaluate(deflection: Deflection, q: np.ndarray, torque: np.ndarray | None = 
     for term in deflection.terms:
         if term.basis in ("cos", "sin"):
             highest[term.source] = max(term.order, highest.get(term.source, 0))
-    powers = {j: np.cumprod(np.tile(np.exp(1j * q[:, j]), (order, 1)), axis=0) for j, order in highest.items()}
+    # exp(i k q) as products: a quarter of the time of cosines.
+    powers: dict[int, np.ndarray] = {}
+    for j, order in highest.items():
+        factors = np.tile(np.exp(1j * q[:, j]), (order, 1))
+        powers[j] = np.cumprod(factors, axis=0)
     for e, term in enumerate(deflection.terms):
         if term.basis == "torque" and torque is not None:
             result[e] = torque[:, term.source]
         elif term.basis == "joint":
             result[e] = q[:, term.source]
         elif term.basis in ("cos", "sin"):
-            turned = powers[term.source][term.order - 1]  # exp(i k q): a quarter of the time of cosines
-            result[e] = turned.real if term.basis == "cos" else turned.imag
-    if where := [e for e, term in enumerate(deflection.terms) if term.basis == "lever"]:
-        if (chain := deflection.reference) is None:
+            power = powers[term.source][term.order - 1]
+            result[e] = power.real if term.basis == "cos" else power.imag
+    lever_terms = [e for e, term in enumerate(deflection.terms) if term.basis == "lever"]
+    if lever_terms:
+        chain = deflection.reference
+        if chain is None:
             raise CalibError("sag terms need the chain that levers are taken from (reference)")
         gravity = chain.gravity / np.linalg.norm(chain.gravity)
-        across = np.cross(gravity, np.moveaxis(sweep(chain, q).directions, 1, -1))  # (z × u) · ĝ = (ĝ × z) · u
-        links, place = joint_frames(chain, q), {name: k for k, name in enumerate(chain.names)}
-        for e in where:
+        # (z × u) · ĝ = (ĝ × z) · u
+        gravity_cross_axis = np.cross(gravity, np.moveaxis(sweep(chain, q).directions, 1, -1))
+        frames = joint_frames(chain, q)
+        for e in lever_terms:
             term = deflection.terms[e]
-            result[e] = np.einsum("mi,mi->m", across[place[term.element]], links[term.source, :, :3, term.order])
+            element = chain.names.index(term.element)
+            link_axis = frames[term.source, :, :3, term.order]
+            result[e] = np.einsum("mi,mi->m", gravity_cross_axis[element], link_axis)
     return result
 
 
@@ -157,11 +168,14 @@ def extra_displacements(
     """Return the displacement (K, m) that the deflection adds to each element; None without terms."""
     if not deflection.terms:
         return None
-    bases = evaluate(deflection, q) if bases is None else bases
+    if bases is None:
+        bases = evaluate(deflection, q)
+    coefficients = np.asarray(deflection.coefficients)
+    targets = target_elements(chain, deflection)
     extra = np.zeros((len(chain.elements), len(q)))
-    where = target_elements(chain, deflection)
-    for place in np.unique(where):
-        extra[place] = np.asarray(deflection.coefficients)[where == place] @ bases[where == place]
+    for element in np.unique(targets):
+        of_element = targets == element
+        extra[element] = coefficients[of_element] @ bases[of_element]
     return extra
 
 
@@ -169,9 +183,6 @@ def target_elements(chain: Chain, deflection: Deflection) -> np.ndarray:
     """Return the indices (E,) of the elements moved by the terms."""
     table = {name: k for k, name in enumerate(chain.names)}
     return np.array([table[term.element] for term in deflection.terms], dtype=int)
-
-
-ROBOT, COVARIANCE = "robot.toml", "chain_covariance.csv"
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,18 +243,24 @@ class CalibratedChain:
     def __str__(self) -> str:
         rows: list[tuple[str, ...]] = [("joint", "", "from", "to", "speed", "effort")]
         for joint in self.chain.joints:
-            numbers = (joint.lower, joint.upper, joint.velocity, joint.effort)
-            rows.append((joint.name, f"{joint.kind} [{joint.unit}]", *(f"{number:.4g}" for number in numbers)))
+            limits = (joint.lower, joint.upper, joint.velocity, joint.effort)
+            rows.append((joint.name, f"{joint.kind} [{joint.unit}]", *(f"{limit:.4g}" for limit in limits)))
         widths = [max(map(len, column)) for column in zip(*rows)]
-        table = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in rows]
-        ends = [f"the arm ends at {self.chain.ends}"] if self.chain.ends else []
-        return "\n".join([f"{self.chain.name}: {self.chain.base} to {self.chain.tip}, {self._state}", *ends, *table])
+        lines = [f"{self.chain.name}: {self.chain.base} to {self.chain.tip}, {self._state}"]
+        if self.chain.ends:
+            lines.append(f"the arm ends at {self.chain.ends}")
+        for row in rows:
+            cells = [cell.ljust(width) for cell, width in zip(row, widths)]
+            lines.append("  ".join(cells).rstrip())
+        return "\n".join(lines)
 
     @property
     def _state(self) -> str:
         parts = ["calibrated" if self.moved else "nominal geometry"]
-        parts += [f"{len(self.deflection.terms)} joint corrections"] if self.corrections is not None else []
-        return ", ".join([*parts, "with masses" if self.chain.inertias is not None else "without masses"])
+        if self.corrections is not None:
+            parts.append(f"{len(self.deflection.terms)} joint corrections")
+        parts.append("without masses" if self.chain.inertias is None else "with masses")
+        return ", ".join(parts)
 
     @property
     def moved(self) -> bool:
@@ -297,25 +314,31 @@ def read(path: str | Path) -> CalibratedChain:
 
 def read_whole(path: str | Path) -> tuple[CalibratedChain, dict[str, Any]]:
     """Return the calibrated robot, as `read`, and the extra tables of its file (`calib.robot.description.EXTRA`)."""
-    path = Path(path) / ROBOT if Path(path).is_dir() else Path(path)
+    path = Path(path)
+    if path.is_dir():
+        path = path / ROBOT
     complete, extra = description.read_whole(path)
     where = str(path)
-    if complete.links:  # of a URDF, which leaves the choice
+    # Only a URDF leaves the choice of the arm's end.
+    if complete.links:
         LOG.info("%s: the arm ends at %s, as robot.toml says", complete.name, complete.tip)
-    known = extra.get("provenance", {})
+    provenance = extra.get("provenance", {})
 
-    def valued(key: str) -> Chain | None:
-        if known.get(key) is None:
+    def chain_of_values(key: str) -> Chain | None:
+        if provenance.get(key) is None:
             return None
-        return complete.with_values(vector(known[key], len(complete.elements), f"{where}, provenance.{key}"))
+        return complete.with_values(vector(provenance[key], len(complete.elements), f"{where}, provenance.{key}"))
 
-    chain = valued("rigid") or complete
+    chain = chain_of_values("rigid") or complete
     deflection = _deflection(extra.get("deflection", {}), complete, where)
-    beside, names = path.parent, (*complete.names, *deflection.names(complete))
-    own = _covariance(beside / COVARIANCE, chain.names)
-    whole = _covariance(beside / str(known.get("covariance", "")), names) if deflection.terms else None
-    corrections = CorrectedChain(complete, deflection, whole) if deflection.terms else None
-    robot = CalibratedChain(chain, valued("nominal"), own, corrections, str(known.get("robot", "")))
+    covariance = _covariance(path.parent / COVARIANCE, chain.names)
+    corrections = None
+    if deflection.terms:
+        covariance_file = path.parent / str(provenance.get("covariance", ""))
+        names = (*complete.names, *deflection.names(complete))
+        corrections = CorrectedChain(complete, deflection, _covariance(covariance_file, names))
+    nominal = chain_of_values("nominal")
+    robot = CalibratedChain(chain, nominal, covariance, corrections, str(provenance.get("robot", "")))
     return robot, extra
 
 
@@ -335,16 +358,19 @@ def write(
         record: more entries of its provenance.
         comment: where the numbers come from.
     """
+    nominal = None if robot.nominal is None else robot.nominal.values
     rigid = None if robot.corrections is None else robot.chain.values
-    known = {"robot": robot.source, "nominal": robot.nominal and robot.nominal.values, "rigid": rigid}
     extra: dict[str, Any] = dict(tables or {})
     if robot.corrections is not None:
         extra["deflection"] = _deflection_table(robot.corrections)
-    extra["provenance"] = {**(record or {}), **known}
+    extra["provenance"] = {**(record or {}), "robot": robot.source, "nominal": nominal, "rigid": rigid}
     description.write(folder / ROBOT, robot.complete, extra, source=comment)
-    if robot.covariance is not None and len(own := np.flatnonzero(np.diag(robot.covariance) > 0.0)):
-        names = [robot.chain.names[k] for k in own]
-        write_covariance(folder / COVARIANCE, names, robot.covariance[np.ix_(own, own)])
+    if robot.covariance is None:
+        return
+    fitted = np.flatnonzero(np.diag(robot.covariance) > 0.0)
+    if len(fitted):
+        names = [robot.chain.names[k] for k in fitted]
+        write_covariance(folder / COVARIANCE, names, robot.covariance[np.ix_(fitted, fitted)])
 
 
 def nominal_of(robot: CalibratedChain) -> Chain:
@@ -362,32 +388,38 @@ def _covariance(path: Path, names: tuple[str, ...]) -> np.ndarray | None:
     """Return the covariance (k, k) of named values, zero for those not in a file's table; None without that file."""
     if not path.is_file():
         return None
-    found, values = read_covariance(path)
-    own = [place for place, name in enumerate(found) if name in names]
-    index = [names.index(found[place]) for place in own]
+    file_names, values = read_covariance(path)
+    rows = [row for row, name in enumerate(file_names) if name in names]
+    index = [names.index(file_names[row]) for row in rows]
     result = np.zeros((len(names), len(names)))
-    result[np.ix_(index, index)] = values[np.ix_(own, own)]
+    result[np.ix_(index, index)] = values[np.ix_(rows, rows)]
     return result
 
 
 def _deflection_table(corrections: CorrectedChain) -> dict[str, Any]:
     deflection, names = corrections.deflection, corrections.chain.joint_names
-    terms = [
-        {
-            "element": term.element,
-            "basis": term.basis,
-            "joint": names[term.source],
-            "order": term.order,
-            "coefficient": float(value),
-        }
-        for term, value in zip(deflection.terms, np.asarray(deflection.coefficients))
-    ]
-    if (reference := deflection.reference) is None:
+    terms = []
+    for term, coefficient in zip(deflection.terms, np.asarray(deflection.coefficients)):
+        terms.append(
+            {
+                "element": term.element,
+                "basis": term.basis,
+                "joint": names[term.source],
+                "order": term.order,
+                "coefficient": float(coefficient),
+            }
+        )
+    reference = deflection.reference
+    if reference is None:
         return {"term": terms}
-    described, known = corrections.chain.inertias, reference.inertias
-    same = known is None or (described is not None and np.array_equal(known, described))
-    masses = {} if same else {"masses": np.asarray(known).tolist()}
-    return {"reference": reference.values.tolist(), **masses, "term": terms}
+    table: dict[str, Any] = {"reference": reference.values.tolist()}
+    # Masses are written only where they differ from those of the chain, which stand in the file already.
+    chain_masses = corrections.chain.inertias
+    masses = reference.inertias
+    if masses is not None and (chain_masses is None or not np.array_equal(masses, chain_masses)):
+        table["masses"] = masses.tolist()
+    table["term"] = terms
+    return table
 
 
 def _deflection(table: Any, chain: Chain, where: str) -> Deflection:
@@ -396,8 +428,8 @@ def _deflection(table: Any, chain: Chain, where: str) -> Deflection:
     terms, coefficients = [], []
     for entry in table.get("term", []):
         check_keys(entry, ("element", "basis", "joint", "order", "coefficient"), where)
-        for key, known in (("element", chain.names), ("joint", chain.joint_names)):
-            if entry.get(key) not in known:
+        for key, names in (("element", chain.names), ("joint", chain.joint_names)):
+            if entry.get(key) not in names:
                 refuse_robot(where, f"{key} {entry.get(key)!r} does not exist in the robot")
         source = chain.joint_names.index(entry["joint"])
         terms.append(Term(entry["element"], entry.get("basis", ""), source, int(entry.get("order", 0))))

@@ -3,10 +3,10 @@
 Path search tests a few postures at a time, thousands of times: NumPy's calls would cost more than the numbers.
 
     form      (K, 5): axis (0 to 5 as `calib.robot.chain.AXES`), sign, value, ratio, joint (-1: it does not move)
-    place     (K + 1, 12): rotation by rows and origin before each element; row K the tail
+    fixed     (K + 1, 12): rotation by rows and origin before each element; row K the tail
     attached  (E, 7): links outside the chain: number of moving elements before them; start and end in the last's frame
     targets   (T, 3) in the tip's frame [m]
-    own       (P, 2) capsules compared with each other, radii (C,) [m]
+    pairs     (P, 2) capsules compared with each other, radii (C,) [m]
     faces     (W, 5): capsule, normal, offset of a wall
 """
 
@@ -19,8 +19,8 @@ OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
 
 
 @njit(**OPTIONS)
-def clear(q, form, place, stand, attached, targets, own, radii, faces, margin):
-    """Return the mask (m,) of joint values q (m, n) with all distances of `own` pairs and `faces` above `margin` [m].
+def clear(q, form, fixed, stand, attached, targets, pairs, radii, faces, margin):
+    """Return the mask (m,) of joint values q (m, n) with all distances of `pairs` and `faces` above `margin` [m].
 
     Args:
         stand: height of the foot of the base's capsule [m].
@@ -29,65 +29,65 @@ def clear(q, form, place, stand, attached, targets, own, radii, faces, margin):
     for k in range(count):
         moving += form[k, 4] >= 0
     lines = np.empty((moving + 1 + len(attached) + len(targets), 6))
-    good = np.ones(len(q), dtype=np.bool_)
+    is_free = np.ones(len(q), dtype=np.bool_)
     for i in range(len(q)):
-        _lines(q[i], form, place, stand, attached, targets, lines)
+        _lines(q[i], form, fixed, stand, attached, targets, lines)
         for p in range(len(faces)):
             c = int(faces[p, 0])
-            one = faces[p, 1] * lines[c, 0] + faces[p, 2] * lines[c, 1] + faces[p, 3] * lines[c, 2]
-            two = faces[p, 1] * lines[c, 3] + faces[p, 2] * lines[c, 4] + faces[p, 3] * lines[c, 5]
-            if not min(one, two) - faces[p, 4] - radii[c] > margin:
-                good[i] = False
+            start_height = faces[p, 1] * lines[c, 0] + faces[p, 2] * lines[c, 1] + faces[p, 3] * lines[c, 2]
+            end_height = faces[p, 1] * lines[c, 3] + faces[p, 2] * lines[c, 4] + faces[p, 3] * lines[c, 5]
+            if not min(start_height, end_height) - faces[p, 4] - radii[c] > margin:
+                is_free[i] = False
                 break
-        if not good[i]:
+        if not is_free[i]:
             continue
-        for p in range(len(own)):
-            a, b = own[p, 0], own[p, 1]
+        for p in range(len(pairs)):
+            a, b = pairs[p, 0], pairs[p, 1]
             if not _apart(lines[a], lines[b]) - (radii[a] + radii[b]) > margin:
-                good[i] = False
+                is_free[i] = False
                 break
-    return good
+    return is_free
 
 
 @njit(**OPTIONS)
-def _lines(q, form, place, stand, attached, targets, lines):
+def _lines(q, form, fixed, stand, attached, targets, lines):
     """Write the lines of all capsules (base, moving bodies, links outside the chain, targets) into `lines`."""
-    r, x, turned = np.zeros((3, 3)), np.zeros(3), np.empty((3, 3))
+    r, x, rotated = np.zeros((3, 3)), np.zeros(3), np.empty((3, 3))
     r[0, 0] = r[1, 1] = r[2, 2] = 1.0
     lines[0] = 0.0
     lines[0, 2] = stand
     body, first = 0, len(lines) - len(attached) - len(targets)
     _carry(r, x, 0, attached, lines, first)
     for k in range(len(form) + 1):
-        fixed = place[k]
+        frame = fixed[k]
         for a in range(3):
-            x[a] += r[a, 0] * fixed[9] + r[a, 1] * fixed[10] + r[a, 2] * fixed[11]
-        for a in range(3):
-            for b in range(3):
-                turned[a, b] = r[a, 0] * fixed[b] + r[a, 1] * fixed[3 + b] + r[a, 2] * fixed[6 + b]
+            x[a] += r[a, 0] * frame[9] + r[a, 1] * frame[10] + r[a, 2] * frame[11]
         for a in range(3):
             for b in range(3):
-                r[a, b] = turned[a, b]
+                rotated[a, b] = r[a, 0] * frame[b] + r[a, 1] * frame[3 + b] + r[a, 2] * frame[6 + b]
+        for a in range(3):
+            for b in range(3):
+                r[a, b] = rotated[a, b]
         if k == len(form):
             break
         axis, sign, joint = int(form[k, 0]) % 3, form[k, 1], int(form[k, 4])
-        way = form[k, 2]
+        displacement = form[k, 2]
         if joint >= 0:
-            way += form[k, 3] * q[joint]
+            displacement += form[k, 3] * q[joint]
             _put(x, lines, body, 3)
             body += 1
             _put(x, lines, body, 0)
         if form[k, 0] < 3:
             for a in range(3):
-                x[a] += sign * way * r[a, axis]
+                x[a] += sign * displacement * r[a, axis]
             if joint >= 0:
                 _put(x, lines, body, 0)
         else:
-            co, si = cos(sign * way), sin(sign * way)
-            one, two = (axis + 1) % 3, (axis + 2) % 3
+            co, si = cos(sign * displacement), sin(sign * displacement)
+            next_axis, last_axis = (axis + 1) % 3, (axis + 2) % 3
             for a in range(3):
-                u, v = r[a, one], r[a, two]
-                r[a, one], r[a, two] = co * u + si * v, co * v - si * u
+                u, v = r[a, next_axis], r[a, last_axis]
+                r[a, next_axis], r[a, last_axis] = co * u + si * v, co * v - si * u
         if joint >= 0:
             _carry(r, x, body, attached, lines, first)
     _put(x, lines, body, 3)
@@ -119,11 +119,11 @@ def _put(x, lines, row, first):
 
 
 @njit(**OPTIONS)
-def _apart(one, two):
+def _apart(first, second):
     """Return the distance of two line segments (6,), given by start and end (Ericson 2005, 5.1.9)."""
     uu = vv = uv = uw = vw = 0.0
     for a in range(3):
-        u, v, w = one[3 + a] - one[a], two[3 + a] - two[a], one[a] - two[a]
+        u, v, w = first[3 + a] - first[a], second[3 + a] - second[a], first[a] - second[a]
         uu, vv, uv, uw, vw = uu + u * u, vv + v * v, uv + u * v, uw + u * w, vw + v * w
     uu, vv = max(uu, 1e-18), max(vv, 1e-18)
     across = uu * vv - uv**2
@@ -132,6 +132,6 @@ def _apart(one, two):
     s = min(max((uv * t - uw) / uu, 0.0), 1.0)
     total = 0.0
     for a in range(3):
-        away = two[a] + t * (two[3 + a] - two[a]) - one[a] - s * (one[3 + a] - one[a])
-        total += away * away
+        difference = second[a] + t * (second[3 + a] - second[a]) - first[a] - s * (first[3 + a] - first[a])
+        total += difference * difference
     return sqrt(total)

@@ -22,10 +22,32 @@ from calib.records import shaped
 from calib.robot.chain import AXES, Chain, random_joints
 from calib.robot.kinematics import moving_frames, sweep
 
-ALWAYS = 0.95
-SAMPLES = 200
+# Number of sizes by kind of obstacle.
 SIZES = {"box": 3, "sphere": 1, "cylinder": 2}
+
+# Random postures that show which pairs touch in nearly every posture, and the share of them that is nearly all.
+SAMPLES = 200
+ALWAYS = 0.95
+# Change of a distance [m] over the random postures below which no joint changes it.
+MIN_CHANGE = 1e-6
+# By how much a turret may reach into what it stands on [m] (our choice).
+MAX_OVERLAP = 0.01
+
+# Default radius of capsules: a least radius [m], and a share of the stretched arm's length (our choice).
+MIN_RADIUS = 0.05
+RADIUS_SHARE = 0.05
+# Radius of a target and its stem [m]; a 1.5 inch reflector has 0.019. Our choice.
+TARGET_RADIUS = 0.02
+
+# Length [m] below which a line is a point.
+MIN_LENGTH = 1e-6
+# Least squared length of a line [m²], so that a point can be divided by it.
+MIN_SQUARE = 1e-18
+# Least length [m] of a vector that is divided by its length.
+TINY = 1e-12
+
 _GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
+GOLDEN_STEPS = 44  # of the golden section: 0.618^44 is 6e-10 of the line
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,67 +98,87 @@ class Attached:
 
 def signed_distance(obstacle: Obstacle, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the distances (...) [m] of points (..., 3) from an obstacle, and the outward normals (..., 3)."""
-    rotation, local = obstacle.placement[:3, :3], _seen_from(obstacle, points)
+    rotation = obstacle.placement[:3, :3]
+    local = _in_obstacle_frame(obstacle, points)
     if obstacle.kind == "sphere":
         length = np.linalg.norm(local, axis=-1, keepdims=True)
-        return length[..., 0] - obstacle.size[0], (local / np.maximum(length, 1e-12)) @ rotation.T
-    beyond = _beyond(obstacle, local)
+        normal = local / np.maximum(length, TINY)
+        return length[..., 0] - obstacle.size[0], normal @ rotation.T
+
+    face_distances = _face_distances(obstacle, local)
     if obstacle.kind == "box":
-        slopes = np.sign(local)
+        face_normals = np.sign(local)
     else:
-        across = np.linalg.norm(local[..., :2], axis=-1)
-        slopes = np.concatenate(
-            [local[..., :2] / np.maximum(across, 1e-12)[..., None], np.sign(local[..., 2:])], axis=-1
-        )
-    out = np.maximum(beyond, 0.0)
-    length, deepest = np.linalg.norm(out, axis=-1), beyond.max(axis=-1)
-    inside = beyond == deepest[..., None]
-    share = np.where((deepest > 0.0)[..., None], out / np.maximum(length, 1e-12)[..., None], inside)
+        radial_distance = np.linalg.norm(local[..., :2], axis=-1)
+        radial = local[..., :2] / np.maximum(radial_distance, TINY)[..., None]
+        axial = np.sign(local[..., 2:])
+        face_normals = np.concatenate([radial, axial], axis=-1)
+
+    # Outside, the distance is that of an edge or corner; inside, the depth below the nearest face.
+    excess = np.maximum(face_distances, 0.0)
+    length = np.linalg.norm(excess, axis=-1)
+    deepest = face_distances.max(axis=-1)
+    is_outside = deepest > 0.0
+    nearest_face = face_distances == deepest[..., None]
+    weights = np.where(is_outside[..., None], excess / np.maximum(length, TINY)[..., None], nearest_face)
     if obstacle.kind == "cylinder":
-        share = np.repeat(share, (2, 1), axis=-1)
-    return np.where(deepest > 0.0, length, deepest), (share * slopes) @ rotation.T
+        weights = np.repeat(weights, (2, 1), axis=-1)
+    return np.where(is_outside, length, deepest), (weights * face_normals) @ rotation.T
 
 
-def _seen_from(obstacle: Obstacle, points: np.ndarray) -> np.ndarray:
+def _in_obstacle_frame(obstacle: Obstacle, points: np.ndarray) -> np.ndarray:
     return (points - obstacle.placement[:3, 3]) @ obstacle.placement[:3, :3]
 
 
-def _beyond(obstacle: Obstacle, local: np.ndarray) -> np.ndarray:
+def _face_distances(obstacle: Obstacle, local: np.ndarray) -> np.ndarray:
     """Return the signed distances (..., k) of points (..., 3) in the obstacle's frame from its faces."""
     if obstacle.kind == "box":
         return np.abs(local) - np.array(obstacle.size) / 2
-    across = np.linalg.norm(local[..., :2], axis=-1)
-    return np.stack([across - obstacle.size[0], np.abs(local[..., 2]) - obstacle.size[1] / 2], axis=-1)
+    radius, length = obstacle.size
+    from_shell = np.linalg.norm(local[..., :2], axis=-1) - radius
+    from_ends = np.abs(local[..., 2]) - length / 2
+    return np.stack([from_shell, from_ends], axis=-1)
 
 
 def _distance(obstacle: Obstacle, points: np.ndarray) -> np.ndarray:
     """Return the signed distances (...) [m] of points (..., 3) from an obstacle, without normals."""
-    local = _seen_from(obstacle, points)
+    local = _in_obstacle_frame(obstacle, points)
     if obstacle.kind == "sphere":
         return np.linalg.norm(local, axis=-1) - obstacle.size[0]
-    faces = np.moveaxis(_beyond(obstacle, local), -1, 0)
-    deepest, outside = reduce(np.maximum, faces), np.maximum(faces, 0.0)
-    return np.where(deepest > 0.0, np.sqrt(sum(one * one for one in outside)), deepest)
+    face_distances = np.moveaxis(_face_distances(obstacle, local), -1, 0)
+    deepest = reduce(np.maximum, face_distances)
+    squared_distance = np.zeros(deepest.shape)
+    for excess in np.maximum(face_distances, 0.0):
+        squared_distance += excess * excess
+    return np.where(deepest > 0.0, np.sqrt(squared_distance), deepest)
 
 
 def nearest_on_lines(obstacle: Obstacle, start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Return the positions (...) from 0 to 1 on lines from start to end (..., 3) that are nearest to an obstacle."""
-    low, high = np.zeros(start.shape[:-1]), np.ones(start.shape[:-1])
-    along = end - start
+    low = np.zeros(start.shape[:-1])
+    high = np.ones(start.shape[:-1])
+    direction = end - start
 
-    def far(place: np.ndarray) -> np.ndarray:
-        return _distance(obstacle, start + place[..., None] * along)
+    def distance_at(position: np.ndarray) -> np.ndarray:
+        return _distance(obstacle, start + position[..., None] * direction)
 
-    one, two = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-    far_one, far_two = far(one), far(two)
-    steps = 44  # of the golden section: 0.618^44 is 6e-10 of the line
-    for _ in range(steps):
-        left = far_one < far_two
-        low, high = np.where(left, low, one), np.where(left, two, high)
-        fresh = np.where(left, high - _GOLDEN * (high - low), low + _GOLDEN * (high - low))
-        value = far(fresh)
-        one, two = np.where(left, fresh, two), np.where(left, one, fresh)
-        far_one, far_two = np.where(left, value, far_two), np.where(left, far_one, value)
+    lower = high - _GOLDEN * (high - low)
+    upper = low + _GOLDEN * (high - low)
+    lower_distance = distance_at(lower)
+    upper_distance = distance_at(upper)
+    for _ in range(GOLDEN_STEPS):
+        # Each line keeps the side of its nearer trial point; that point serves again, and a new one joins it.
+        keep_low = lower_distance < upper_distance
+        low = np.where(keep_low, low, lower)
+        high = np.where(keep_low, upper, high)
+        trial = np.where(keep_low, high - _GOLDEN * (high - low), low + _GOLDEN * (high - low))
+        trial_distance = distance_at(trial)
+        next_upper = np.where(keep_low, lower, trial)
+        next_upper_distance = np.where(keep_low, lower_distance, trial_distance)
+        lower = np.where(keep_low, trial, upper)
+        lower_distance = np.where(keep_low, trial_distance, upper_distance)
+        upper = next_upper
+        upper_distance = next_upper_distance
     return (low + high) / 2
 
 
@@ -161,25 +203,23 @@ def inseparable(
     Raises:
         RobotError: for a floor or obstacle in permanent collision with a link (wrong size or place).
     """
-    near, highest = (distances <= margin).mean(axis=0) >= ALWAYS, distances.max(axis=0)
-    moves = np.ptp(distances, axis=0) >= 1e-6
-    max_overlap = 0.01  # by which a turret may reach into what it stands on [m] (our choice)
-    buried = np.flatnonzero(fixed & (highest <= np.where(moves, 0.0, -slack - max_overlap)))
+    nearly_always = (distances <= margin).mean(axis=0) >= ALWAYS
+    highest = distances.max(axis=0)
+    changes = np.ptp(distances, axis=0) >= MIN_CHANGE
+    depth_allowed = np.where(changes, 0.0, -slack - MAX_OVERLAP)
+    buried = np.flatnonzero(fixed & (highest <= depth_allowed))
     if len(buried):
-        shown = listing((f"link '{pairs[k][0]}' in '{pairs[k][1]}'" for k in buried.tolist()), 3)
+        collisions = listing((f"link '{pairs[k][0]}' in '{pairs[k][1]}'" for k in buried.tolist()), 3)
         raise RobotError(
-            f"in all of {len(distances)} random postures {shown} collide: no pose is free of collision. Sizes and "
+            f"in all of {len(distances)} random postures {collisions} collide: no pose is free of collision. Sizes and "
             "places are in m (or write \"20 mm\"), in the arm's base frame, maybe above the floor; an obstacle's xyz "
             "is its centre; if links are modelled by capsules, [collision] radius may be too large"
         )
-    gone = np.where(fixed, (highest <= margin) & ~moves, near | (highest <= margin + slack))
-    return gone, tuple(pair for pair, out in zip(pairs, gone, strict=True) if out)
-
-
-MIN_RADIUS, RADIUS_SHARE = 0.05, 0.05
-"""Default radius of capsules: a least radius [m], and a share of the stretched arm's length (our choice)."""
-TARGET_RADIUS = 0.02
-"""Radius of a target and its stem [m]; a 1.5 inch reflector has 0.019. Our choice."""
+    of_world = (highest <= margin) & ~changes
+    of_arm = nearly_always | (highest <= margin + slack)
+    touching = np.where(fixed, of_world, of_arm)
+    excluded = tuple(pairs[k] for k in np.flatnonzero(touching).tolist())
+    return touching, excluded
 
 
 def usual_radius(chain: Chain) -> float:
@@ -190,7 +230,8 @@ def usual_radius(chain: Chain) -> float:
     lines = _lines_of(chain, np.zeros((1, chain.n)), np.empty((0, 3)))
     lengths = np.linalg.norm(lines.end - lines.start, axis=2)[0]
     mount = float(np.linalg.norm(lines.end[0, 0]))
-    length = chain.stretched_length() - max(0.0, mount - float(lengths[1:].max()))
+    pillar = max(0.0, mount - float(lengths[1:].max()))
+    length = chain.stretched_length() - pillar
     return max(MIN_RADIUS, round(RADIUS_SHARE * length, 3))
 
 
@@ -200,13 +241,17 @@ class _Lines:
 
     Attributes:
         start, end: (m, C, 3) [m].
-        axes, places: (m, K, 3) of the K moving elements: direction, and where they stand.
+        axes, origins: (m, K, 3) of the K moving elements: direction, and where they stand.
     """
 
     start: np.ndarray
     end: np.ndarray
     axes: np.ndarray
-    places: np.ndarray
+    origins: np.ndarray
+
+    def of_postures(self, chosen: np.ndarray) -> _Lines:
+        """Return the lines in some of the postures: a mask (m,) or their numbers."""
+        return _Lines(self.start[chosen], self.end[chosen], self.axes[chosen], self.origins[chosen])
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,8 +266,8 @@ class Capsules:
         solid: (S,) capsules with a length; the others are ignored.
         targets: (T, 3) in the tip's frame [m]; their capsules are the last T.
         beside: links outside the chain; their capsules come before those of the targets.
-        own: (P, 2) pairs of capsules to compare.
-        world: (W, 2) pairs of capsule and wall or obstacle (walls first) to compare.
+        arm_pairs: (P, 2) pairs of capsules to compare.
+        world_pairs: (W, 2) pairs of capsule and wall or obstacle (walls first) to compare.
         walls: the floor among them.
         obstacles: in the base frame.
         excluded: pairs that are not compared, since they touch in nearly every posture.
@@ -234,8 +279,8 @@ class Capsules:
     radii: np.ndarray
     solid: np.ndarray
     targets: np.ndarray
-    own: np.ndarray
-    world: np.ndarray
+    arm_pairs: np.ndarray
+    world_pairs: np.ndarray
     walls: tuple[Wall, ...]
     obstacles: tuple[Obstacle, ...]
     excluded: tuple[tuple[str, str], ...] = ()
@@ -245,22 +290,24 @@ class Capsules:
     @cached_property
     def pairs(self) -> tuple[tuple[str, str], ...]:
         """Names of the compared pairs, in the order of the columns of `distances`."""
-        things = [one.name for one in (*self.walls, *self.obstacles)]
-        own = [(self.names[i], self.names[j]) for i, j in self.own]
-        return (*own, *((self.names[i], things[k]) for i, k in self.world))
+        world_names = [solid.name for solid in (*self.walls, *self.obstacles)]
+        arm_pairs = [(self.names[i], self.names[j]) for i, j in self.arm_pairs]
+        world_pairs = [(self.names[i], world_names[k]) for i, k in self.world_pairs]
+        return (*arm_pairs, *world_pairs)
 
     def distances(self, q: np.ndarray) -> np.ndarray:
         """Return the distances (m, pairs) [m] at joint values q (m, n); negative: depth of penetration."""
-        return self._measured(self.lines_at(q))[0]
+        return self._pair_distances(self.lines_at(q))[0]
 
     def gradients(self, q: np.ndarray) -> np.ndarray:
         """Return the derivatives (m, pairs, n) of `distances`: normal times the velocities of the nearest points."""
         lines = self.lines_at(q)
-        _, normal, one, two = self._measured(lines)
-        count = len(self.own)
-        second = np.concatenate([self.bodies[self.own[:, 1]], self.bodies[self.world[:, 0]]])
-        slope = self._closing(lines, normal, two, second)
-        slope[:, :count] -= self._closing(lines, normal[:, :count], one[:, :count], self.bodies[self.own[:, 0]])
+        _, normal, first_point, second_point = self._pair_distances(lines)
+        count = len(self.arm_pairs)
+        first_bodies = self.bodies[self.arm_pairs[:, 0]]
+        second_bodies = np.concatenate([self.bodies[self.arm_pairs[:, 1]], self.bodies[self.world_pairs[:, 0]]])
+        slope = self._closing_speed(lines, normal, second_point, second_bodies)
+        slope[:, :count] -= self._closing_speed(lines, normal[:, :count], first_point[:, :count], first_bodies)
         return slope
 
     def free(self, q: np.ndarray, margin: float = 0.0) -> np.ndarray:
@@ -268,38 +315,43 @@ class Capsules:
         from calib.robot.capsule_kernels import clear  # numba
 
         q = shaped(q, (None, self.chain.n), f"joint values of '{self.chain.name}'")
-        good = clear(q, *self._compiled, margin)
-        near_obstacles = self._with_obstacles
-        if near_obstacles is not None and good.any():
-            unsure = np.flatnonzero(good)
-            lines = self.lines_at(q[unsure])
-            near = ~np.all(near_obstacles._measured(lines, rough=True)[0] > margin, axis=1)
-            some = _Lines(*(part[near] for part in (lines.start, lines.end, lines.axes, lines.places)))
-            good[unsure[near]] = np.all(near_obstacles._measured(some)[0] > margin, axis=1)
-        return good
+        is_free = clear(q, *self._compiled, margin)
+        obstacle_model = self._with_obstacles
+        if obstacle_model is None or not is_free.any():
+            return is_free
+        # Rough distances first: only few postures come so near to an obstacle that it has to be measured exactly.
+        open_rows = np.flatnonzero(is_free)
+        lines = self.lines_at(q[open_rows])
+        rough_distances = obstacle_model._pair_distances(lines, rough=True)[0]
+        doubtful = ~np.all(rough_distances > margin, axis=1)
+        distances = obstacle_model._pair_distances(lines.of_postures(doubtful))[0]
+        is_free[open_rows[doubtful]] = np.all(distances > margin, axis=1)
+        return is_free
 
     @cached_property
     def _compiled(self) -> tuple[Any, Any, float, Any, Any, Any, Any, Any]:
         """Arguments of `calib.robot.capsule_kernels.clear` between q and margin."""
-        form = [
-            (AXES.index(e.axis), e.sign, e.value, e.ratio, -1.0 if e.joint is None else e.joint)
-            for e in self.chain.elements
-        ]
-        fixed = [np.eye(4) if e.placement is None else e.placement for e in self.chain.elements]
-        place = [np.concatenate([each[:3, :3].ravel(), each[:3, 3]]) for each in (*fixed, self.chain.tail)]
-        faces = [
-            (body, *self.walls[thing].normal, self.walls[thing].offset)
-            for body, thing in self.world
-            if thing < len(self.walls)
-        ]
-        attached = [np.concatenate([[one.body], one.start, one.end]) for one in self.beside]
+        motions = []
+        transforms = []
+        for element in self.chain.elements:
+            joint = -1.0 if element.joint is None else element.joint
+            motions.append((AXES.index(element.axis), element.sign, element.value, element.ratio, joint))
+            transforms.append(np.eye(4) if element.placement is None else element.placement)
+        transforms.append(self.chain.tail)
+        placements = [np.concatenate([transform[:3, :3].ravel(), transform[:3, 3]]) for transform in transforms]
+        faces = []
+        for body, number in self.world_pairs:
+            if number < len(self.walls):
+                wall = self.walls[number]
+                faces.append((body, *wall.normal, wall.offset))
+        attached = [np.concatenate([[link.body], link.start, link.end]) for link in self.beside]
         return (
-            np.array(form),
-            np.array(place),
+            np.array(motions),
+            np.array(placements),
             min(self.chain.floor, 0.0),
             np.array(attached).reshape(-1, 7),
             self.targets,
-            self.own,
+            self.arm_pairs,
             self.radii,
             np.array(faces).reshape(-1, 5),
         )
@@ -307,8 +359,10 @@ class Capsules:
     @cached_property
     def _with_obstacles(self) -> Capsules | None:
         """The same model with the pairs of arm and obstacles only; None without obstacles."""
-        world = self.world[self.world[:, 1] >= len(self.walls)]
-        return replace(self, own=self.own[:0], world=world) if len(world) else None
+        obstacle_pairs = self.world_pairs[self.world_pairs[:, 1] >= len(self.walls)]
+        if not len(obstacle_pairs):
+            return None
+        return replace(self, arm_pairs=self.arm_pairs[:0], world_pairs=obstacle_pairs)
 
     def beam(self, q: np.ndarray, start: np.ndarray, slope: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return the links' distances from lines of sight to a target on the last body, with their derivatives.
@@ -322,71 +376,90 @@ class Capsules:
             Distances (m, L) [m] of the L capsules of all other bodies, and their derivatives (m, L, n).
         """
         lines = self.lines_at(q)
-        others = self.solid[self.bodies[self.solid] < self.bodies.max()]
-        shape = (len(q), len(others), 3)
-        first, last = np.broadcast_to(start[:, None], shape), np.broadcast_to(np.atleast_2d(end)[:, None], shape)
-        along, place = _nearest(first, last, lines.start[:, others], lines.end[:, others])
-        seen = first + along[..., None] * (last - first)
-        link = lines.start[:, others] + place[..., None] * (lines.end - lines.start)[:, others]
-        distance, normal = _apart(seen, link)
-        gradient = self._closing(lines, normal, link, self.bodies[others]) - (1.0 - along)[..., None] * (normal @ slope)
-        return distance - self.radii[others], gradient
+        links = self.solid[self.bodies[self.solid] < self.bodies.max()]
+        shape = (len(q), len(links), 3)
+        sight_start = np.broadcast_to(start[:, None], shape)
+        sight_end = np.broadcast_to(np.atleast_2d(end)[:, None], shape)
+        sight_position, link_position = _nearest(sight_start, sight_end, lines.start[:, links], lines.end[:, links])
+        sight_point = sight_start + sight_position[..., None] * (sight_end - sight_start)
+        link_point = lines.start[:, links] + link_position[..., None] * (lines.end - lines.start)[:, links]
+        distance, normal = _point_distances(sight_point, link_point)
+        # Joints move the link, and the target's end of the line of sight with it.
+        link_speed = self._closing_speed(lines, normal, link_point, self.bodies[links])
+        sight_speed = (1.0 - sight_position)[..., None] * (normal @ slope)
+        return distance - self.radii[links], link_speed - sight_speed
 
     def lines_at(self, q: np.ndarray) -> _Lines:
         """Return the lines along the middles of the capsules at postures q (m, n)."""
         return _lines_of(self.chain, q, self.targets, self.beside)
 
-    def _measured(self, lines: _Lines, rough: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def _pair_distances(
+        self, lines: _Lines, rough: bool = False
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return distances (m, P + W), normals (m, P + W, 3) towards the second body, and the nearest points.
 
         For the W pairs with the world the second body is the arm's. `rough` takes from obstacles what they are at least
         away, by the middles of the lines.
         """
-        m, count = len(lines.start), len(self.own) + len(self.world)
-        normal, one, two = (np.empty((m, count, 3)) for _ in range(3))
+        m = len(lines.start)
+        count = len(self.arm_pairs) + len(self.world_pairs)
+        normal = np.empty((m, count, 3))
+        first_point = np.empty((m, count, 3))
+        second_point = np.empty((m, count, 3))
         distance = np.empty((m, count))
-        i, j = self.own.T
+        directions = lines.end - lines.start
+
+        i, j = self.arm_pairs.T
         s, t = _nearest(lines.start[:, i], lines.end[:, i], lines.start[:, j], lines.end[:, j])
-        own = slice(0, len(i))
-        one[:, own] = lines.start[:, i] + s[..., None] * (lines.end - lines.start)[:, i]
-        two[:, own] = lines.start[:, j] + t[..., None] * (lines.end - lines.start)[:, j]
-        distance[:, own], normal[:, own] = _apart(one[:, own], two[:, own])
-        distance[:, own] -= self.radii[i] + self.radii[j]
-        for thing in np.unique(self.world[:, 1]):
-            at = len(i) + np.flatnonzero(self.world[:, 1] == thing)
-            body = self.world[at - len(i), 0]
-            start, end = lines.start[:, body], lines.end[:, body]
-            if thing < len(self.walls):
-                wall = self.walls[thing]
-                two[:, at] = np.where((start @ wall.normal < end @ wall.normal)[..., None], start, end)
-                distance[:, at], normal[:, at] = two[:, at] @ wall.normal - wall.offset, wall.normal
+        of_arm = slice(0, len(i))
+        first_point[:, of_arm] = lines.start[:, i] + s[..., None] * directions[:, i]
+        second_point[:, of_arm] = lines.start[:, j] + t[..., None] * directions[:, j]
+        distance[:, of_arm], normal[:, of_arm] = _point_distances(first_point[:, of_arm], second_point[:, of_arm])
+        distance[:, of_arm] -= self.radii[i] + self.radii[j]
+
+        for number in np.unique(self.world_pairs[:, 1]):
+            rows = np.flatnonzero(self.world_pairs[:, 1] == number)
+            columns = len(i) + rows
+            bodies = self.world_pairs[rows, 0]
+            start, end = lines.start[:, bodies], lines.end[:, bodies]
+            if number < len(self.walls):
+                wall = self.walls[number]
+                start_is_nearer = start @ wall.normal < end @ wall.normal
+                second_point[:, columns] = np.where(start_is_nearer[..., None], start, end)
+                distance[:, columns] = second_point[:, columns] @ wall.normal - wall.offset
+                normal[:, columns] = wall.normal
             else:
-                obstacle = self.obstacles[thing - len(self.walls)]
-                place = np.full(start.shape[:2], 0.5) if rough else nearest_on_lines(obstacle, start, end)
-                two[:, at] = start + place[..., None] * (end - start)
-                distance[:, at], normal[:, at] = signed_distance(obstacle, two[:, at])
-                distance[:, at] -= np.linalg.norm(end - start, axis=-1) / 2 if rough else 0.0
-            distance[:, at] -= self.radii[body]
-        return distance, normal, one, two
+                obstacle = self.obstacles[number - len(self.walls)]
+                position = np.full(start.shape[:2], 0.5) if rough else nearest_on_lines(obstacle, start, end)
+                second_point[:, columns] = start + position[..., None] * (end - start)
+                distance[:, columns], normal[:, columns] = signed_distance(obstacle, second_point[:, columns])
+                if rough:
+                    distance[:, columns] -= np.linalg.norm(end - start, axis=-1) / 2
+            distance[:, columns] -= self.radii[bodies]
+        return distance, normal, first_point, second_point
 
-    def _closing(self, lines: _Lines, normal: np.ndarray, point: np.ndarray, bodies: np.ndarray) -> np.ndarray:
-        return closing(self.chain, lines.axes, lines.places, normal, point, bodies)
+    def _closing_speed(self, lines: _Lines, normal: np.ndarray, point: np.ndarray, bodies: np.ndarray) -> np.ndarray:
+        return closing_speed(self.chain, lines.axes, lines.origins, normal, point, bodies)
 
 
-def closing(
-    chain: Chain, axes: np.ndarray, places: np.ndarray, normal: np.ndarray, point: np.ndarray, bodies: np.ndarray
+def closing_speed(
+    chain: Chain, axes: np.ndarray, origins: np.ndarray, normal: np.ndarray, point: np.ndarray, bodies: np.ndarray
 ) -> np.ndarray:
     """Return the speed along the normals (m, P, n) of points (m, P, 3) on bodies (P,), per unit of each joint.
 
     Args:
-        axes, places: (m, K, 3) of the K moving elements: direction, and where they stand.
+        axes, origins: (m, K, 3) of the K moving elements: direction, and where they stand.
         bodies: how many moving elements stand before each point.
     """
-    z, o = axes.transpose(0, 2, 1), np.cross(axes, places).transpose(0, 2, 1)
-    turned = np.cross(point, normal) @ z - normal @ o  # u · (z × (p - o))
-    turns = np.array([chain.elements[k].axis[0] == "r" for k in chain.driven])
-    speed = np.where(turns, turned, normal @ z)
-    return speed * (np.arange(z.shape[2]) < bodies[:, None]) @ chain.rates
+    z = axes.transpose(0, 2, 1)
+    moment = np.cross(axes, origins).transpose(0, 2, 1)
+    # u · (z × (p - o))
+    rotation_speed = np.cross(point, normal) @ z - normal @ moment
+    translation_speed = normal @ z
+    is_rotation = np.array([chain.elements[k].axis[0] == "r" for k in chain.driven])
+    speed = np.where(is_rotation, rotation_speed, translation_speed)
+    carries_point = np.arange(z.shape[2]) < bodies[:, None]
+    return speed * carries_point @ chain.rates
 
 
 def from_chain(
@@ -420,63 +493,105 @@ def from_chain(
         beside: links outside the chain, compared with all that moves relative to them.
         seed: of the random postures that show which pairs those are.
     """
-    size = usual_radius(chain) if radius is None else radius
-    places = np.asarray(targets, dtype=float).reshape(-1, 3)
-    places = places[np.linalg.norm(places, axis=1) > 1e-6]
-    lines = _lines_of(chain, np.zeros((1, chain.n)), places, beside)
+    link_radius = usual_radius(chain) if radius is None else radius
+    target_positions = np.asarray(targets, dtype=float).reshape(-1, 3)
+    target_positions = target_positions[np.linalg.norm(target_positions, axis=1) > MIN_LENGTH]
+    lines = _lines_of(chain, np.zeros((1, chain.n)), target_positions, beside)
     length = np.linalg.norm(lines.end - lines.start, axis=2)[0]
-    moving, first = [chain.elements[k] for k in chain.driven], set(chain.moving.tolist())
-    links = chain.links or tuple(f"{name}_link" for name in chain.joint_names)
-    own_names = (
-        links[one.joint or 0] if k in first else f"{one.name}_link" for k, one in zip(chain.driven.tolist(), moving)
-    )
-    names = [chain.base, *own_names, *(one.name for one in beside)]
-    names += ["target"] if len(places) == 1 else [f"target {k + 1}" for k in range(len(places))]
-    others = np.zeros(len(names), dtype=bool)
-    others[len(moving) + 1 : len(moving) + 1 + len(beside)] = True
-    bodies = np.array([*range(len(moving) + 1), *(one.body for one in beside), *[len(moving)] * len(places)])
-    radii = np.array([*[size] * (len(moving) + 1 + len(beside)), *[TARGET_RADIUS] * len(places)])
-    there = np.flatnonzero((length > 1e-6) | others)
-    own = [(i, j) for i in there for j in there if bodies[j] > bodies[i] + (0 if others[i] or others[j] else 1)]
-    own = own if within else []
-    own = [(i, j) for i, j in own if frozenset((names[i], names[j])) not in ignored]
-    planes = (*([] if floor is None else [Wall("floor", np.array([0.0, 0.0, 1.0]), floor)]), *walls)
-    world = [(i, k) for k in range(len(planes) + len(obstacles)) for i in there if bodies[i]]
-    found = Capsules(
-        chain,
-        tuple(names),
-        bodies,
-        radii,
-        there,
-        places,
-        np.array(own, dtype=int).reshape(-1, 2),
-        np.array(world, dtype=int).reshape(-1, 2),
-        planes,
-        tuple(obstacles),
+
+    # Capsules in this order: base and moving bodies, links outside the chain, targets.
+    names = [*_body_names(chain), *(link.name for link in beside)]
+    if len(target_positions) == 1:
+        names.append("target")
+    else:
+        names += [f"target {number}" for number in range(1, len(target_positions) + 1)]
+    moving_count = len(chain.driven)
+    link_count = moving_count + 1 + len(beside)
+    is_attached = np.zeros(len(names), dtype=bool)
+    is_attached[moving_count + 1 : link_count] = True
+    attached_bodies = [link.body for link in beside]
+    target_bodies = [moving_count] * len(target_positions)
+    bodies = np.array([*range(moving_count + 1), *attached_bodies, *target_bodies])
+    radii = np.array([link_radius] * link_count + [TARGET_RADIUS] * len(target_positions))
+
+    solid = np.flatnonzero((length > MIN_LENGTH) | is_attached)
+    arm_pairs: list[tuple[int, int]] = []
+    if within:
+        for i in solid.tolist():
+            for j in solid.tolist():
+                # Neighbours in the chain overlap by construction.
+                gap = 0 if is_attached[i] or is_attached[j] else 1
+                if bodies[j] > bodies[i] + gap and frozenset((names[i], names[j])) not in ignored:
+                    arm_pairs.append((i, j))
+    planes = [] if floor is None else [Wall("floor", np.array([0.0, 0.0, 1.0]), floor)]
+    planes += walls
+    moving = [i for i in solid.tolist() if bodies[i]]
+    world_pairs = [(i, number) for number in range(len(planes) + len(obstacles)) for i in moving]
+    model = Capsules(
+        chain=chain,
+        names=tuple(names),
+        bodies=bodies,
+        radii=radii,
+        solid=solid,
+        targets=target_positions,
+        arm_pairs=np.array(arm_pairs, dtype=int).reshape(-1, 2),
+        world_pairs=np.array(world_pairs, dtype=int).reshape(-1, 2),
+        walls=tuple(planes),
+        obstacles=tuple(obstacles),
         beside=tuple(beside),
     )
-    if not found.pairs:
-        return found
-    fixed = np.arange(len(own) + len(world)) >= len(own)
-    distances = found.distances(random_joints(chain, SAMPLES, seed))
-    gone, excluded = inseparable(found.pairs, distances, fixed, margin, size)
-    return replace(found, own=found.own[~gone[: len(own)]], world=found.world[~gone[len(own) :]], excluded=excluded)
+    if not model.pairs:
+        return model
+
+    count = len(arm_pairs)
+    fixed = np.arange(count + len(world_pairs)) >= count
+    distances = model.distances(random_joints(chain, SAMPLES, seed))
+    touching, excluded = inseparable(model.pairs, distances, fixed, margin, link_radius)
+    return replace(
+        model,
+        arm_pairs=model.arm_pairs[~touching[:count]],
+        world_pairs=model.world_pairs[~touching[count:]],
+        excluded=excluded,
+    )
+
+
+def _body_names(chain: Chain) -> list[str]:
+    """Return the names of the base and of the body after each moving element."""
+    links = chain.links
+    if not links:
+        links = tuple(f"{name}_link" for name in chain.joint_names)
+    main_elements = set(chain.moving.tolist())
+    names = [chain.base]
+    for k in chain.driven.tolist():
+        element = chain.elements[k]
+        if k in main_elements:
+            names.append(links[element.joint or 0])
+        else:
+            names.append(f"{element.name}_link")
+    return names
 
 
 def _lines_of(chain: Chain, q: np.ndarray, targets: np.ndarray, beside: Sequence[Attached] = ()) -> _Lines:
     """Return the centre lines of base (from its foot), moving bodies, links beside and targets at q (m, n)."""
-    walked = sweep(chain, q)
-    axes, places = (part[chain.driven].transpose(2, 0, 1) for part in (walked.directions, walked.origins))
-    begins = places.copy()
-    for k, element in enumerate(chain.elements[index] for index in chain.driven):
+    walk = sweep(chain, q)
+    axes = walk.directions[chain.driven].transpose(2, 0, 1)
+    origins = walk.origins[chain.driven].transpose(2, 0, 1)
+    # The line of a body behind a sliding joint starts where the joint has moved it.
+    body_starts = origins.copy()
+    for number, k in enumerate(chain.driven):
+        element = chain.elements[k]
         if element.axis[0] == "t":
-            begins[:, k] += axes[:, k] * (element.value + element.ratio * q[:, element.joint])[:, None]
-    m, tip = len(q), walked.position.T[:, None]
-    seen = tip + np.einsum("tc,cdm->mtd", targets, walked.rotation)
-    stand = np.broadcast_to([0.0, 0.0, min(chain.floor, 0.0)], (m, 1, 3))
-    first, last = _attached_ends(chain, q, beside)
-    start = np.concatenate([stand, begins, first, np.repeat(tip, len(targets), axis=1)], axis=1)
-    return _Lines(start, np.concatenate([places, tip, last, seen], axis=1), axes, places)
+            travel = element.value + element.ratio * q[:, element.joint]
+            body_starts[:, number] += axes[:, number] * travel[:, None]
+
+    tip = walk.position.T[:, None]
+    target_points = tip + np.einsum("tc,cdm->mtd", targets, walk.rotation)
+    foot = np.broadcast_to([0.0, 0.0, min(chain.floor, 0.0)], (len(q), 1, 3))
+    attached_starts, attached_ends = _attached_ends(chain, q, beside)
+    target_starts = np.repeat(tip, len(targets), axis=1)
+    start = np.concatenate([foot, body_starts, attached_starts, target_starts], axis=1)
+    end = np.concatenate([origins, tip, attached_ends, target_points], axis=1)
+    return _Lines(start, end, axes, origins)
 
 
 def _attached_ends(chain: Chain, q: np.ndarray, beside: Sequence[Attached]) -> tuple[np.ndarray, np.ndarray]:
@@ -484,25 +599,35 @@ def _attached_ends(chain: Chain, q: np.ndarray, beside: Sequence[Attached]) -> t
     if not beside:
         return np.empty((len(q), 0, 3)), np.empty((len(q), 0, 3))
     base = np.broadcast_to(np.eye(4), (1, len(q), 4, 4))
-    frames = np.concatenate([base, moving_frames(chain, q)])[[one.body for one in beside]]
-    points = [np.array([getattr(one, end) for one in beside])[:, None, :, None] for end in ("start", "end")]
-    first, last = (((frames[..., :3, :3] @ each)[..., 0] + frames[..., :3, 3]).swapaxes(0, 1) for each in points)
-    return first, last
+    bodies = [link.body for link in beside]
+    frames = np.concatenate([base, moving_frames(chain, q)])[bodies]
+
+    def in_base(points: list[np.ndarray]) -> np.ndarray:
+        rotated = (frames[..., :3, :3] @ np.array(points)[:, None, :, None])[..., 0]
+        return (rotated + frames[..., :3, 3]).swapaxes(0, 1)
+
+    return in_base([link.start for link in beside]), in_base([link.end for link in beside])
 
 
 def _nearest(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the nearest positions (...), from 0 to 1, on the lines a to b and c to d (..., 3)."""
     u, v, w = b - a, d - c, a - c
-    uu, vv, uv = (np.maximum((x * y).sum(-1), least) for x, y, least in ((u, u, 1e-18), (v, v, 1e-18), (u, v, -np.inf)))
-    uw, vw = (u * w).sum(-1), (v * w).sum(-1)
-    across = uu * vv - uv**2
-    s = np.where(across > 1e-12 * uu * vv, np.clip((uv * vw - vv * uw) / np.maximum(across, 1e-30), 0, 1), 0.5)
+    uu = np.maximum((u * u).sum(-1), MIN_SQUARE)
+    vv = np.maximum((v * v).sum(-1), MIN_SQUARE)
+    uv = (u * v).sum(-1)
+    uw = (u * w).sum(-1)
+    vw = (v * w).sum(-1)
+    determinant = uu * vv - uv**2
+    # Parallel lines: any place will do, the middle of the first.
+    skew = determinant > 1e-12 * uu * vv
+    s = np.where(skew, np.clip((uv * vw - vv * uw) / np.maximum(determinant, 1e-30), 0, 1), 0.5)
     t = np.clip((uv * s + vw) / vv, 0, 1)
-    return np.clip((uv * t - uw) / uu, 0, 1), t
+    s = np.clip((uv * t - uw) / uu, 0, 1)
+    return s, t
 
 
-def _apart(one: np.ndarray, two: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _point_distances(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the distances (...) of points (..., 3), and the unit vectors from the first to the second."""
-    away = two - one
-    distance = np.linalg.norm(away, axis=-1)
-    return distance, away / np.maximum(distance, 1e-12)[..., None]
+    difference = end - start
+    distance = np.linalg.norm(difference, axis=-1)
+    return distance, difference / np.maximum(distance, TINY)[..., None]

@@ -19,18 +19,24 @@ from calib.records import frozen
 
 AXES = ("tx", "ty", "tz", "rx", "ry", "rz")
 GRAVITY = (0.0, 0.0, -9.81)
-MIN_LIMIT = 1e-6  # of a speed or effort that a description states [SI]; less is none (our choice)
+# Least speed or effort [SI] that a description states; less is none (our choice).
+MIN_LIMIT = 1e-6
+# Largest plausible gravity [m/s²] (our choice).
+MAX_GRAVITY = 100.0
+# Largest plausible mass, moment or length [SI] (our choice).
+MAX_NUMBER = 1e12
+# Least length [m] that a stretched arm counts as.
+MIN_STRETCHED_LENGTH = 0.1
 
 
-def check_gravity(gravity: np.ndarray, place: str = "") -> None:
-    """Refuse an implausible gravity vector (3,) [m/s²]; the message begins with `place`.
+def check_gravity(gravity: np.ndarray, where: str = "") -> None:
+    """Refuse an implausible gravity vector (3,) [m/s²]; the message begins with `where`.
 
     Raises:
-        RobotError: for one beyond `max_gravity`, or not finite.
+        RobotError: for one beyond `MAX_GRAVITY`, or not finite.
     """
-    max_gravity = 100.0  # [m/s²] (our choice)
-    if not math.hypot(*gravity) < max_gravity:
-        raise RobotError(f"{place}gravity {gravity.tolist()} is not plausible: expected about 9.81 m/s²")
+    if not math.hypot(*gravity) < MAX_GRAVITY:
+        raise RobotError(f"{where}gravity {gravity.tolist()} is not plausible: expected about 9.81 m/s²")
 
 
 @dataclass(frozen=True)
@@ -53,12 +59,13 @@ class Joint:
             refuse_robot(f"joint '{self.name}'", f"kind '{self.kind}' is neither 'revolute' nor 'prismatic'")
         if not self.lower < self.upper:
             refuse_robot(f"joint '{self.name}'", f"lower limit {self.lower:g} is not below the upper {self.upper:g}")
-        for what in ("velocity", "effort"):
-            if not getattr(self, what) >= 0.0:
-                refuse_robot(f"joint '{self.name}'", f"{what} {getattr(self, what):g} is wrong: expected 0 or more")
-            if getattr(self, what) < MIN_LIMIT:
-                object.__setattr__(self, "unstated", (*self.unstated, f"{what} {getattr(self, what):g}"))
-                object.__setattr__(self, what, np.inf)
+        for quantity in ("velocity", "effort"):
+            limit = getattr(self, quantity)
+            if not limit >= 0.0:
+                refuse_robot(f"joint '{self.name}'", f"{quantity} {limit:g} is wrong: expected 0 or more")
+            if limit < MIN_LIMIT:
+                object.__setattr__(self, "unstated", (*self.unstated, f"{quantity} {limit:g}"))
+                object.__setattr__(self, quantity, np.inf)
 
     @property
     def unit(self) -> str:
@@ -140,18 +147,18 @@ class Chain:
         object.__setattr__(self, "tail", frozen(self.tail))
         object.__setattr__(self, "gravity", frozen(self.gravity))
         check_gravity(self.gravity, f"'{self.name}': ")
-        max_number = 1e12  # of masses, moments and lengths [SI] (our choice)
-        for what in ("tail", "inertias"):
-            if (value := getattr(self, what)) is not None and not (np.abs(value) < max_number).all():
+        for field_name in ("tail", "inertias"):
+            value = getattr(self, field_name)
+            if value is not None and not (np.abs(value) < MAX_NUMBER).all():
                 raise RobotError(
-                    f"'{self.name}': {what} contains a number that is not finite or exceeds {max_number:g}"
+                    f"'{self.name}': {field_name} contains a number that is not finite or exceeds {MAX_NUMBER:g}"
                 )
         if self.inertias is not None:
             object.__setattr__(self, "inertias", frozen(self.inertias))
-        for what, names in (("joint", self.joint_names), ("element", self.names)):
+        for kind, names in (("joint", self.joint_names), ("element", self.names)):
             doubled = {name for name in names if names.count(name) > 1}
             if doubled:
-                refuse_robot(f"robot '{self.name}'", f"{what} name '{sorted(doubled)[0]}' occurs twice")
+                refuse_robot(f"robot '{self.name}'", f"{kind} name '{sorted(doubled)[0]}' occurs twice")
         driven = {element.joint for element in self.elements if element.joint is not None}
         if driven != set(range(len(self.joints))):
             refuse_robot(f"robot '{self.name}'", "every joint must move at least one element")
@@ -189,12 +196,15 @@ class Chain:
     @cached_property
     def driven(self) -> np.ndarray:
         """Indices of the elements moved by joints, including followers of mimic joints."""
-        return np.array([k for k, element in enumerate(self.elements) if element.joint is not None], dtype=int)
+        indices = [k for k, element in enumerate(self.elements) if element.joint is not None]
+        return np.array(indices, dtype=int)
 
     @cached_property
     def moving(self) -> np.ndarray:
         """(n,) indices of the first element moved by each joint (followers of mimic joints come later)."""
-        first = {self.elements[k].joint: k for k in reversed(self.driven.tolist())}
+        first: dict[int | None, int] = {}
+        for k in self.driven.tolist():
+            first.setdefault(self.elements[k].joint, k)
         return np.array([first[joint] for joint in range(self.n)], dtype=int)
 
     @cached_property
@@ -212,23 +222,29 @@ class Chain:
             if unknown:
                 raise RobotError(f"robot '{self.name}' has no element '{sorted(unknown)[0]}'")
             values = np.array([values.get(element.name, element.value) for element in self.elements])
-        elements = tuple(
-            replace(element, value=float(value)) for element, value in zip(self.elements, values, strict=True)
-        )
-        return replace(self, elements=elements)
+        elements = []
+        for element, value in zip(self.elements, values, strict=True):
+            elements.append(replace(element, value=float(value)))
+        return replace(self, elements=tuple(elements))
 
     def stretched_length(self) -> float:
         """Return the largest length of the stretched arm [m]: the sum of its constant offsets."""
-        total = sum(abs(e.value) for e in self.elements if e.axis[0] == "t" and e.joint is None)
-        placed = sum(float(np.linalg.norm(e.placement[:3, 3])) for e in self.elements if e.placement is not None)
-        return max(total + placed + float(np.linalg.norm(self.tail[:3, 3])), 0.1)
+        translations = 0.0
+        placements = 0.0
+        for element in self.elements:
+            if element.axis[0] == "t" and element.joint is None:
+                translations += abs(element.value)
+            if element.placement is not None:
+                placements += float(np.linalg.norm(element.placement[:3, 3]))
+        tail = float(np.linalg.norm(self.tail[:3, 3]))
+        return max(translations + placements + tail, MIN_STRETCHED_LENGTH)
 
     def sampling_limits(self) -> tuple[np.ndarray, np.ndarray]:
         """Return finite lower and upper joint limits (n,); ±π or ±1 m for joints without limits."""
         reach = np.array([np.pi if joint.kind == "revolute" else 1.0 for joint in self.joints])
-        return np.where(np.isfinite(self.lower), self.lower, -reach), np.where(
-            np.isfinite(self.upper), self.upper, reach
-        )
+        lower = np.where(np.isfinite(self.lower), self.lower, -reach)
+        upper = np.where(np.isfinite(self.upper), self.upper, reach)
+        return lower, upper
 
 
 def random_joints(chain: Chain, count: int, seed: int | np.random.Generator = 0) -> np.ndarray:
@@ -250,10 +266,11 @@ def element_length(chain: Chain, k: int) -> float:
     while first > 0 and chain.elements[first].placement is None and chain.elements[first - 1].owner == element.owner:
         first -= 1
     placement = chain.elements[first].placement
-    if placement is None or any(each.axis[0] == "r" for each in chain.elements[first:k]):
+    rotated = any(earlier.axis[0] == "r" for earlier in chain.elements[first:k])
+    if placement is None or rotated:
         return element.value
-    along = placement[:3, AXES.index(element.axis) % 3]
-    return element.value + float(along @ placement[:3, 3])
+    direction = placement[:3, AXES.index(element.axis) % 3]
+    return element.value + float(direction @ placement[:3, 3])
 
 
 def joint_kinds(chain: Chain) -> list[str]:

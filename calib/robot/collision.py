@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.errors import refuse_robot
 from calib.records import shaped
-from calib.robot.capsules import SAMPLES, TARGET_RADIUS, Obstacle, Wall, closing, inseparable
+from calib.robot.capsules import MIN_LENGTH, SAMPLES, TARGET_RADIUS, Obstacle, Wall, closing_speed, inseparable
 from calib.robot.chain import Chain, random_joints
 from calib.robot.formats import urdf
 from calib.robot.formats.simulators import configurations, driven_joints, link_frame
@@ -29,6 +29,8 @@ from calib.robot.kinematics import sweep
 from calib.transforms import pose
 
 PACKAGE_PATH = "ROS_PACKAGE_PATH"
+# Radius [m] of a line of sight, which coal takes for a thin capsule.
+SIGHT_RADIUS = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,12 +55,15 @@ class Collision:
     @property
     def links(self) -> set[str]:
         """Names of the links that have a shape."""
-        return {self._model.frames[shape.parentFrame].name for shape in self._geometry.geometryObjects[: self._links]}
+        shapes = self._geometry.geometryObjects[: self._links]
+        return {self._model.frames[shape.parentFrame].name for shape in shapes}
 
     def distances(self, q: np.ndarray) -> np.ndarray:
         """Return the distances (m, pairs) [m] at joint values q (m, n); negative: depth of penetration."""
-        found = [[one.min_distance for one in measured] for measured in self._measured(q)]
-        return np.array(found).reshape(len(q), len(self.pairs))
+        distances: list[float] = []
+        for results in self._distance_results(q):
+            distances += [result.min_distance for result in results]
+        return np.array(distances).reshape(len(q), len(self.pairs))
 
     def gradients(self, q: np.ndarray) -> np.ndarray:
         """Return the derivatives (m, pairs, n) of `distances` with respect to q (m, n).
@@ -66,48 +71,69 @@ class Collision:
         With the normal u from the first shape's nearest point to the second's: d' = u · (velocity of the second point -
         velocity of the first), the shapes' curvature being of second order. One-sided where nearest points jump.
         """
-        found = np.empty((3, len(q), len(self.pairs), 3))
-        for row, measured in enumerate(self._measured(q)):
-            for k, one in enumerate(measured):
-                found[:, row, k] = one.normal, one.getNearestPoint1(), one.getNearestPoint2()
-        turn, foot = self._stand.rotation, self._stand.translation
-        normal, first, second = found[0] @ turn, (found[1] - foot) @ turn, (found[2] - foot) @ turn
+        shape = (len(q), len(self.pairs), 3)
+        normals = np.empty(shape)
+        first_points = np.empty(shape)
+        second_points = np.empty(shape)
+        for row, results in enumerate(self._distance_results(q)):
+            for k, result in enumerate(results):
+                normals[row, k] = result.normal
+                first_points[row, k] = result.getNearestPoint1()
+                second_points[row, k] = result.getNearestPoint2()
+        # From Pinocchio's world to the arm's base.
+        rotation = self._base_pose.rotation
+        origin = self._base_pose.translation
+        normals = normals @ rotation
+        first_points = (first_points - origin) @ rotation
+        second_points = (second_points - origin) @ rotation
         pairs = self._geometry.collisionPairs
-        slope = self._closing(q, normal, second, [pair.second for pair in pairs])
-        return slope - self._closing(q, normal, first, [pair.first for pair in pairs])
+        second_speed = self._closing_speed(q, normals, second_points, [pair.second for pair in pairs])
+        first_speed = self._closing_speed(q, normals, first_points, [pair.first for pair in pairs])
+        return second_speed - first_speed
 
     def beam(self, q: np.ndarray, start: np.ndarray, slope: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return the links' distances from lines of sight; see `calib.robot.capsules.Capsules.beam`."""
         pin, coal = _libraries()
-        data, placed = self._model.createData(), pin.GeometryData(self._geometry)
+        data = self._model.createData()
+        geometry_data = pin.GeometryData(self._geometry)
         tip = self._model.frames[link_frame(self._model, self._chain.tip)].parentJoint
         shapes = self._geometry.geometryObjects
         links = [k for k in range(self._links) if shapes[k].parentJoint != tip]
         distances, shares = np.empty((2, len(q), len(links)))
         normals, points = np.empty((2, len(q), len(links), 3))
-        asked, ends = coal.DistanceRequest(True, coal.GJKInitialGuess.DefaultGuess), np.broadcast_to(end, start.shape)
+        request = coal.DistanceRequest(True, coal.GJKInitialGuess.DefaultGuess)
+        ends = np.broadcast_to(end, start.shape)
         for i, configuration in enumerate(self._configurations(q)):
-            pin.updateGeometryPlacements(self._model, data, self._geometry, placed, configuration)
-            away = ends[i] - start[i]
-            length = float(np.linalg.norm(away))
-            turned = Rotation.align_vectors(away[None] / length, [[0.0, 0.0, 1.0]])[0].as_matrix()
-            ray, middle = coal.Capsule(1e-4, length), coal.Transform3s(turned, start[i] + away / 2)
+            pin.updateGeometryPlacements(self._model, data, self._geometry, geometry_data, configuration)
+            sight = ends[i] - start[i]
+            length = float(np.linalg.norm(sight))
+            rotation = Rotation.align_vectors(sight[None] / length, [[0.0, 0.0, 1.0]])[0].as_matrix()
+            ray = coal.Capsule(SIGHT_RADIUS, length)
+            ray_pose = coal.Transform3s(rotation, start[i] + sight / 2)
             for column, k in enumerate(links):
-                found, there = coal.DistanceResult(), self._stand.actInv(placed.oMg[k])
-                there = coal.Transform3s(there.rotation, there.translation)
-                distances[i, column] = coal.distance(ray, middle, shapes[k].geometry, there, asked, found)
-                normals[i, column], points[i, column] = found.normal, found.getNearestPoint2()
-                shares[i, column] = np.clip((found.getNearestPoint1() - start[i]) @ away / length**2, 0.0, 1.0)
-        return distances, self._closing(q, normals, points, links) - (1.0 - shares)[..., None] * (normals @ slope)
+                result = coal.DistanceResult()
+                T_base_link = self._base_pose.actInv(geometry_data.oMg[k])
+                link_pose = coal.Transform3s(T_base_link.rotation, T_base_link.translation)
+                link_shape = shapes[k].geometry
+                distances[i, column] = coal.distance(ray, ray_pose, link_shape, link_pose, request, result)
+                normals[i, column] = result.normal
+                points[i, column] = result.getNearestPoint2()
+                share = (result.getNearestPoint1() - start[i]) @ sight / length**2
+                shares[i, column] = np.clip(share, 0.0, 1.0)
+        # Joints move the link, and the target's end of the line of sight with it.
+        link_speed = self._closing_speed(q, normals, points, links)
+        sight_speed = (1.0 - shares)[..., None] * (normals @ slope)
+        return distances, link_speed - sight_speed
 
-    def _measured(self, q: np.ndarray) -> Iterator[Any]:
+    def _distance_results(self, q: np.ndarray) -> Iterator[Any]:
         """Yield coal's distance results of all pairs, for each row of joint values q (m, n)."""
         pin, _ = _libraries()
-        data, measured = self._model.createData(), self._geometry.createData()
+        data = self._model.createData()
+        geometry_data = self._geometry.createData()
         q = shaped(q, (None, self._chain.n), f"joint values of '{self._chain.name}'")
         for configuration in self._configurations(q):
-            pin.computeDistances(self._model, data, self._geometry, measured, configuration)
-            yield measured.distanceResults
+            pin.computeDistances(self._model, data, self._geometry, geometry_data, configuration)
+            yield geometry_data.distanceResults
 
     def _configurations(self, q: np.ndarray) -> np.ndarray:
         """Return Pinocchio's configurations (m, nq) at joint values q (m, n), other joints at the posture."""
@@ -115,23 +141,27 @@ class Collision:
         set_still(self._model, result, self._posture)
         return result
 
-    def _closing(self, q: np.ndarray, normal: np.ndarray, point: np.ndarray, shapes: list[int]) -> np.ndarray:
+    def _closing_speed(self, q: np.ndarray, normal: np.ndarray, point: np.ndarray, shapes: list[int]) -> np.ndarray:
         """Return the speed along normals (m, P, n) of points (m, P, 3) on shapes (P,), per unit of each joint."""
-        walked = sweep(self._chain, q)
-        axes, places = (part[self._chain.driven].transpose(2, 0, 1) for part in (walked.directions, walked.origins))
-        return closing(self._chain, axes, places, normal, point, self._bodies[shapes])
+        walk = sweep(self._chain, q)
+        axes = walk.directions[self._chain.driven].transpose(2, 0, 1)
+        origins = walk.origins[self._chain.driven].transpose(2, 0, 1)
+        return closing_speed(self._chain, axes, origins, normal, point, self._bodies[shapes])
 
     @cached_property
-    def _stand(self) -> Any:
+    def _base_pose(self) -> Any:
         """Pose of the base in Pinocchio's world."""
-        return _stand(self._model, self._chain.base, self._posture)
+        return _link_pose(self._model, self._chain.base, self._posture)
 
     @cached_property
     def _bodies(self) -> np.ndarray:
         """Number of the chain's moving elements before each shape."""
         driven = {joint.id for joint in driven_joints(self._model, self._chain)}
-        carriers = [self._model.supports[shape.parentJoint] for shape in self._geometry.geometryObjects]
-        return np.array([sum(joint in driven for joint in above) for above in carriers], dtype=int)
+        counts = []
+        for shape in self._geometry.geometryObjects:
+            joints_above = self._model.supports[shape.parentJoint]
+            counts.append(sum(joint in driven for joint in joints_above))
+        return np.array(counts, dtype=int)
 
     def free(self, q: np.ndarray, margin: float = 0.0) -> np.ndarray:
         """Return the mask (m,) of joint values q (m, n) with all distances larger than `margin` [m]."""
@@ -178,55 +208,67 @@ def from_urdf(
     chain = urdf.parse(source, str(path), base, tip)
     model = pin.buildModelFromXML(source)
     folders = [*map(Path, mesh_folders), *Path(path).resolve().parents]
-    geometry, missing = pin.GeometryModel(), []
+    geometry = pin.GeometryModel()
+    missing: list[str] = []
     for link in parse(source, str(path)).all("link"):
+        link_name = link.attributes.get("name", "")
         for number, node in enumerate(link.all("collision")):
-            place = f"{path}, line {node.line}, link '{link.attributes['name']}'"
-            shape = _shape(node.first("geometry"), folders, missing, place)
+            where = f"{path}, line {node.line}, link '{link_name}'"
+            shape = _shape(node.first("geometry"), folders, missing, where)
             if shape is not None:
-                name = link.attributes["name"] + (f"_{number}" if number else "")
-                _attach(model, geometry, link.attributes["name"], name, origin(node, place), shape)
+                shape_name = f"{link_name}_{number}" if number else link_name
+                _attach(model, geometry, link_name, shape_name, origin(node, where), shape)
     if geometry.ngeoms == 0:
-        lost = f" ({len(missing)} meshes were not found, e.g. {missing[0]})" if missing else ""
-        refuse_robot(path, f"no usable <collision> shape{lost}; give mesh_folders, or use capsules")
+        hint = f" ({len(missing)} meshes were not found, e.g. {missing[0]})" if missing else ""
+        refuse_robot(path, f"no usable <collision> shape{hint}; give mesh_folders, or use capsules")
     _add_targets(model, geometry, chain, targets)
-    own = geometry.ngeoms
-    planes = [*([] if floor is None else [Wall("floor", np.array([0.0, 0.0, 1.0]), floor)]), *walls]
-    _surround(geometry, _stand(model, chain.base, posture or {}), planes, obstacles)
-    carriers = [shape.parentJoint for shape in geometry.geometryObjects]
+    arm_count = geometry.ngeoms
+
+    posture = posture or {}
+    planes = [] if floor is None else [Wall("floor", np.array([0.0, 0.0, 1.0]), floor)]
+    planes += walls
+    _surround(geometry, _link_pose(model, chain.base, posture), planes, obstacles)
+    joints = [shape.parentJoint for shape in geometry.geometryObjects]
     links = [model.frames[shape.parentFrame].name for shape in geometry.geometryObjects]
-    for one in range(own):
-        for two in range(one + 1, len(carriers)):
-            i, j = sorted((carriers[one], carriers[two]))
-            compared = within and model.parents[j] != i and frozenset((links[one], links[two])) not in ignored
-            if i != j and (two >= own or compared):
-                geometry.addCollisionPair(pin.CollisionPair(one, two))
-    found = Collision(_names(geometry), (), tuple(missing), model, geometry, chain, own, posture or {})
-    return _without_inseparable(found, margin, seed) if found.pairs else found
+    for first in range(arm_count):
+        for second in range(first + 1, len(joints)):
+            i, j = sorted((joints[first], joints[second]))
+            if i == j:
+                continue
+            link_pair = frozenset((links[first], links[second]))
+            compared = within and model.parents[j] != i and link_pair not in ignored
+            if second >= arm_count or compared:
+                geometry.addCollisionPair(pin.CollisionPair(first, second))
+    collision = Collision(_pair_names(geometry), (), tuple(missing), model, geometry, chain, arm_count, posture)
+    if not collision.pairs:
+        return collision
+    return _without_inseparable(collision, margin, seed)
 
 
 def _add_targets(model: Any, geometry: Any, chain: Chain, targets: np.ndarray | Sequence[Sequence[float]]) -> None:
     """Attach targets (T, 3) [m] to the tip's frame, as thin capsules."""
     _, coal = _libraries()
-    for number, place in enumerate(np.asarray(targets, dtype=float).reshape(-1, 3), 1):
-        if (length := float(np.linalg.norm(place))) > 1e-6:
-            along = Rotation.align_vectors(place[None] / length, [[0.0, 0.0, 1.0]])[0]
+    for number, position in enumerate(np.asarray(targets, dtype=float).reshape(-1, 3), 1):
+        length = float(np.linalg.norm(position))
+        if length > MIN_LENGTH:
+            rotation = Rotation.align_vectors(position[None] / length, [[0.0, 0.0, 1.0]])[0]
             name = "target" if len(targets) == 1 else f"target {number}"
-            _attach(model, geometry, chain.tip, name, pose(along, place / 2), coal.Capsule(TARGET_RADIUS, length))
+            shape = coal.Capsule(TARGET_RADIUS, length)
+            _attach(model, geometry, chain.tip, name, pose(rotation, position / 2), shape)
 
 
-def _without_inseparable(found: Collision, margin: float, seed: int) -> Collision:
+def _without_inseparable(collision: Collision, margin: float, seed: int) -> Collision:
     """Return the collision model without the pairs that touch in nearly every posture."""
-    geometry = found._geometry
-    fixed = np.array([pair.second >= found._links for pair in geometry.collisionPairs])
-    distances = found.distances(random_joints(found._chain, SAMPLES, seed))
-    gone, excluded = inseparable(found.pairs, distances, fixed, margin)
-    for index in np.flatnonzero(gone)[::-1]:
+    geometry = collision._geometry
+    fixed = np.array([pair.second >= collision._links for pair in geometry.collisionPairs])
+    distances = collision.distances(random_joints(collision._chain, SAMPLES, seed))
+    touching, excluded = inseparable(collision.pairs, distances, fixed, margin)
+    for index in np.flatnonzero(touching)[::-1]:
         geometry.removeCollisionPair(geometry.collisionPairs[int(index)])
-    return replace(found, pairs=_names(geometry), excluded=excluded)
+    return replace(collision, pairs=_pair_names(geometry), excluded=excluded)
 
 
-def _names(geometry: Any) -> tuple[tuple[str, str], ...]:
+def _pair_names(geometry: Any) -> tuple[tuple[str, str], ...]:
     shapes = geometry.geometryObjects
     return tuple((shapes[pair.first].name, shapes[pair.second].name) for pair in geometry.collisionPairs)
 
@@ -240,14 +282,18 @@ def _attach(model: Any, geometry: Any, link: str, name: str, placed: np.ndarray,
     geometry.addGeometryObject(pin.GeometryObject(name, frame.parentJoint, index, placement, shape))
 
 
-def _surround(geometry: Any, stand: Any, walls: Sequence[Wall], obstacles: Sequence[Obstacle]) -> None:
-    """Add walls and obstacles to `geometry`, fixed relative to the base, whose pose is `stand`."""
+def _surround(geometry: Any, base_pose: Any, walls: Sequence[Wall], obstacles: Sequence[Obstacle]) -> None:
+    """Add walls and obstacles to `geometry`, fixed relative to the base."""
     pin, coal = _libraries()
-    things: list[Any] = [(wall.name, coal.Halfspace(wall.normal, wall.offset), np.eye(4)) for wall in walls]
-    things += [(obstacle.name, _solid(obstacle.kind, obstacle.size), obstacle.placement) for obstacle in obstacles]
-    for name, shape, placed in things:
-        placement = stand * pin.SE3(placed[:3, :3], placed[:3, 3])
+
+    def add(name: str, shape: Any, T_base_shape: np.ndarray) -> None:
+        placement = base_pose * pin.SE3(T_base_shape[:3, :3], T_base_shape[:3, 3])
         geometry.addGeometryObject(pin.GeometryObject(name, 0, 0, placement, shape))
+
+    for wall in walls:
+        add(wall.name, coal.Halfspace(wall.normal, wall.offset), np.eye(4))
+    for obstacle in obstacles:
+        add(obstacle.name, _solid(obstacle.kind, obstacle.size), obstacle.placement)
 
 
 def _solid(kind: str, sizes: Sequence[float]) -> Any:
@@ -264,32 +310,34 @@ def set_still(model: Any, configurations: np.ndarray, posture: Mapping[str, floa
         configurations[:, joint.idx_q : joint.idx_q + joint.nq] = values
 
 
-def _stand(model: Any, base: str, posture: Mapping[str, float]) -> Any:
-    """Return the pose of the base in Pinocchio's world, at zero joints but those of a posture."""
+def _link_pose(model: Any, link: str, posture: Mapping[str, float]) -> Any:
+    """Return the pose of a link in Pinocchio's world, at zero joints but those of a posture."""
     pin, _ = _libraries()
     data = model.createData()
-    still = pin.neutral(model)[None]
-    set_still(model, still, posture)
-    pin.framesForwardKinematics(model, data, still[0])
-    return data.oMf[link_frame(model, base)].copy()
+    configuration = pin.neutral(model)[None]
+    set_still(model, configuration, posture)
+    pin.framesForwardKinematics(model, data, configuration[0])
+    return data.oMf[link_frame(model, link)].copy()
 
 
-def _shape(node: Node | None, folders: Sequence[Path], missing: list[str], place: str) -> Any | None:
+def _shape(node: Node | None, folders: Sequence[Path], missing: list[str], where: str) -> Any | None:
     """Return the coal shape of a <geometry>; None, with an entry in `missing`, for an unreadable mesh."""
     kind = node.children[0] if node is not None and node.children else None
     if kind is None:
-        refuse_robot(place, "<collision> without a shape")
+        refuse_robot(where, "<collision> without a shape")
     if kind.tag == "mesh":
-        return _hull(kind, folders, missing, place)
+        return _hull(kind, folders, missing, where)
     if kind.tag == "box":
-        return _solid(kind.tag, numbers(kind, "size", place).tolist())
+        return _solid(kind.tag, numbers(kind, "size", where).tolist())
     if kind.tag not in ("sphere", "cylinder", "capsule"):
-        refuse_robot(place, f"<{kind.tag}> is not one of box, sphere, cylinder, capsule, mesh")
-    keys = ("radius",) if kind.tag == "sphere" else ("radius", "length")
-    return _solid(kind.tag, [numbers(kind, key, place, count=1)[0] for key in keys])
+        refuse_robot(where, f"<{kind.tag}> is not one of box, sphere, cylinder, capsule, mesh")
+    sizes = [numbers(kind, "radius", where, count=1)[0]]
+    if kind.tag != "sphere":
+        sizes.append(numbers(kind, "length", where, count=1)[0])
+    return _solid(kind.tag, sizes)
 
 
-def _hull(node: Node, folders: Sequence[Path], missing: list[str], place: str) -> Any | None:
+def _hull(node: Node, folders: Sequence[Path], missing: list[str], where: str) -> Any | None:
     """Return the scaled convex hull of a mesh file; None, with an entry in `missing`, if unreadable."""
     _, coal = _libraries()
     name = node.attributes.get("filename", "")
@@ -297,7 +345,7 @@ def _hull(node: Node, folders: Sequence[Path], missing: list[str], place: str) -
     if path is None:
         missing.append(name)
         return None
-    scale = numbers(node, "scale", place, "1 1 1")
+    scale = numbers(node, "scale", where, "1 1 1")
     try:
         mesh = coal.MeshLoader().load(str(path), scale)
         mesh.buildConvexHull(True, "Qt")
@@ -315,14 +363,21 @@ def find_mesh(name: str, folders: Sequence[Path]) -> Path | None:
     if name.startswith("package://"):
         inner = name.removeprefix("package://")
         variants = [inner, inner.partition("/")[2]]
-    found = (folder / variant for folder in (*folders, *package_folders()) for variant in variants)
-    return next((path for path in found if path.is_file()), None)
+    for folder in (*folders, *package_folders()):
+        for variant in variants:
+            path = folder / variant
+            if path.is_file():
+                return path
+    return None
 
 
 def package_folders() -> list[Path]:
     """Return the folders that hold ROS packages: of ``ROS_PACKAGE_PATH``, and of the installed ROS."""
-    places = [Path(one) for one in os.environ.get(PACKAGE_PATH, "").split(os.pathsep) if one]
-    return places + [Path(one, "share") for one in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if one]
+    sources = os.environ.get(PACKAGE_PATH, "").split(os.pathsep)
+    prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+    folders = [Path(source) for source in sources if source]
+    folders += [Path(prefix, "share") for prefix in prefixes if prefix]
+    return folders
 
 
 def meshes_beside(path: Path) -> dict[str, Path | str]:
@@ -332,19 +387,26 @@ def meshes_beside(path: Path) -> dict[str, Path | str]:
     """
     if not is_urdf(path):
         return {}
-    folders, found = list(path.resolve().parents), dict[str, Path | str]()
+    folders = list(path.resolve().parents)
+    meshes: dict[str, Path | str] = {}
     for _, _, node in urdf_meshes(path, "collision"):
         name = node.attributes.get("filename", "")
-        inner, mesh = name.removeprefix("package://"), find_mesh(name, folders)
-        if mesh is not None and not inner.startswith(("/", "file:")) and ".." not in Path(inner).parts:
-            found[f"1-robot/{inner}"] = mesh
-    return found
+        mesh = find_mesh(name, folders)
+        inner = name.removeprefix("package://")
+        leaves_folder = inner.startswith(("/", "file:")) or ".." in Path(inner).parts
+        if mesh is not None and not leaves_folder:
+            meshes[f"1-robot/{inner}"] = mesh
+    return meshes
 
 
 def urdf_meshes(path: str | Path, tag: str) -> list[tuple[Node, Node, Node]]:
     """Return each mesh of a URDF's ``<visual>`` or ``<collision>`` elements, with its link and its element."""
-    shapes = [(link, node) for link in parse(text(path)[0], str(path)).all("link") for node in link.all(tag)]
-    return [(*own, mesh) for own in shapes for shape in own[1].all("geometry") for mesh in shape.all("mesh")]
+    meshes: list[tuple[Node, Node, Node]] = []
+    for link in parse(text(path)[0], str(path)).all("link"):
+        for node in link.all(tag):
+            for geometry in node.all("geometry"):
+                meshes += [(link, node, mesh) for mesh in geometry.all("mesh")]
+    return meshes
 
 
 def _libraries() -> tuple[Any, Any]:

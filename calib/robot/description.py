@@ -45,6 +45,20 @@ from calib.errors import RobotError, listing, refuse_robot, require
 from calib.robot import mdh, tables
 from calib.robot.chain import Chain, Element, Joint
 
+EXTRA = ("station", "tool", "camera", "board", "deflection", "truth", "provenance")
+_TOP = ("name", "base", "tip", "gravity", "floor", "source", "joint", "element", "tail")
+_JOINT = ("name", "kind", *tables.LIMITS, "link", "inertia")
+_ELEMENT = tuple(field.name for field in fields(Element))
+
+# Largest plausible limit [rad]: a continuous wrist may be given two turns (our choice).
+MAX_TURN = 4.0 * np.pi + 0.01
+# Largest mass of the arm by the cube of its stretched length [kg/m³]; known arms have 1 to 50 (our choice).
+MAX_DENSITY = 1000.0
+# Share of M L² below which a moment of inertia is rounding.
+ROUNDING = 1e-6
+# Share by which a moment may exceed the sum of the others: rounded sets do by up to 0.7 (our choice).
+MAX_EXCESS = 1.0
+
 
 def remarks(chain: Chain, bodies: bool = True) -> tuple[str, ...]:
     """Return remarks on suspicious values in a chain's description, by joint; () if there are none.
@@ -52,23 +66,30 @@ def remarks(chain: Chain, bodies: bool = True) -> tuple[str, ...]:
     Args:
         bodies: whether to include impossible bodies.
     """
-    found = list(chain.remarks)
+    result = list(chain.remarks)
     unstated: dict[str, list[str]] = {}
     for joint in chain.joints:
-        for what in joint.unstated:
-            unstated.setdefault(what, []).append(joint.name)
-    found += [
-        f"{', '.join(names)}: {what} in the robot's description is not a limit; ignored"
-        for what, names in unstated.items()
-    ]
-    wide = {joint.name: max(-joint.lower, joint.upper) for joint in chain.joints if joint.unit != "m"}
-    if wide := {name: angle for name, angle in wide.items() if MAX_TURN < angle < np.inf}:
-        furthest = max(wide.values())
-        found.append(f"{listing(wide, 4)}: limits up to {furthest:g} rad in the robot's description; are they degrees?")
-    masses = () if chain.inertias is None else chain.inertias
-    if bare := [joint.name for joint, body in zip(chain.joints, masses) if not body.any()]:
-        found.append(f"body after {listing(bare, 4)}: mass not stated, taken as zero")
-    return (*found, *(impossible_bodies(chain) if bodies else ()))
+        for limit in joint.unstated:
+            unstated.setdefault(limit, []).append(joint.name)
+    for limit, names in unstated.items():
+        result.append(f"{', '.join(names)}: {limit} in the robot's description is not a limit; ignored")
+
+    wide: dict[str, float] = {}
+    for joint in chain.joints:
+        angle = max(-joint.lower, joint.upper)
+        if joint.unit != "m" and MAX_TURN < angle < np.inf:
+            wide[joint.name] = angle
+    if wide:
+        largest = max(wide.values())
+        result.append(f"{listing(wide, 4)}: limits up to {largest:g} rad in the robot's description; are they degrees?")
+
+    if chain.inertias is not None:
+        massless = [joint.name for joint, body in zip(chain.joints, chain.inertias) if not body.any()]
+        if massless:
+            result.append(f"body after {listing(massless, 4)}: mass not stated, taken as zero")
+    if bodies:
+        result += impossible_bodies(chain)
+    return tuple(result)
 
 
 def impossible_bodies(chain: Chain) -> tuple[str, ...]:
@@ -76,59 +97,54 @@ def impossible_bodies(chain: Chain) -> tuple[str, ...]:
 
     A body has M > 0 and, about its centre of mass, positive principal moments of which none exceeds the sum of the
     others (triangle inequality; Wensing, Kim and Slotine, 2018, eq. 7). Its radius of gyration and its centre of mass
-    lie within the stretched arm's length L, and the whole arm weighs no more than `max_density` L³.
+    lie within the stretched arm's length L, and the whole arm weighs no more than `MAX_DENSITY` L³.
     """
     if chain.inertias is None:
         return ()
-    length, total = chain.stretched_length(), float(chain.inertias[:, 9].sum())
-    found = {
-        joint.name: words
-        for joint, body in zip(chain.joints, chain.inertias)
-        if body.any() and (words := _impossible(body, length))
-    }
-    same: dict[str, list[str]] = {}
-    for name, words in found.items():
-        same.setdefault(words.partition(" (")[0], []).append(name)
-    lines = [f"body after {listing(names, 4)}: {found[names[0]]}" for names in same.values()]
-    # [kg/m³] of the arm's mass by the cube of its stretched length; arms known have 1 to 50 (our choice)
-    max_density = 1000.0
-    if total > max_density * length**3:
+    length = chain.stretched_length()
+    reasons: dict[str, str] = {}
+    for joint, body in zip(chain.joints, chain.inertias):
+        reason = _impossible(body, length) if body.any() else ""
+        if reason:
+            reasons[joint.name] = reason
+    # One sentence for bodies with the same fault; the figures of the first stand in it.
+    joints_by_fault: dict[str, list[str]] = {}
+    for name, reason in reasons.items():
+        fault = reason.partition(" (")[0]
+        joints_by_fault.setdefault(fault, []).append(name)
+    lines = [f"body after {listing(names, 4)}: {reasons[names[0]]}" for names in joints_by_fault.values()]
+
+    total = float(chain.inertias[:, 9].sum())
+    if total > MAX_DENSITY * length**3:
         lines.append(
             f"its bodies weigh {total:.4g} kg, the stretched arm is {length:.3g} m long: are the masses in grams?"
         )
     return tuple(lines)
 
 
-def _impossible(body: np.ndarray, length: float, rounding: float = 1e-6, max_excess: float = 1.0) -> str:
-    """Return the reason why a body (10,) is physically impossible; "" if it is possible.
-
-    `rounding`: of M L²: moments below are rounding.
-
-    `max_excess`: share by which a moment may exceed the sum of the others: rounded sets do by up to 0.7 (our choice).
-    """
-    mass, first = float(body[9]), body[6:9]
+def _impossible(body: np.ndarray, length: float) -> str:
+    """Return the reason why a body (10,) is physically impossible; "" if it is possible."""
+    mass = float(body[9])
+    first_moment = body[6:9]
+    if mass == 0.0:
+        return f"no mass (M = {mass:g} kg)"
     if mass <= 0.0:
-        return f"no mass (M = {mass:g} kg)" if mass == 0.0 else f"a negative mass (M = {mass:g} kg)"
-    if np.linalg.norm(first) > mass * length:
-        return f"a centre of mass beyond the arm ({np.linalg.norm(first) / mass:.3g} m from its joint: in millimetres?)"
+        return f"a negative mass (M = {mass:g} kg)"
+    if np.linalg.norm(first_moment) > mass * length:
+        distance = np.linalg.norm(first_moment) / mass
+        return f"a centre of mass beyond the arm ({distance:.3g} m from its joint: in millimetres?)"
     xx, xy, xz, yy, yz, zz = body[:6]
-    about = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    moments = np.linalg.eigvalsh(about - (first @ first * np.eye(3) - np.outer(first, first)) / mass)
+    inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    shift = first_moment @ first_moment * np.eye(3) - np.outer(first_moment, first_moment)
+    moments = np.linalg.eigvalsh(inertia - shift / mass)
     if moments[2] > mass * length**2:
         reach = np.sqrt(moments[2] / mass)
         return f"an inertia too large for the arm (radius of gyration {reach:.3g} m: is it in kg mm²?)"
-    if moments[0] < -rounding * mass * length**2:
+    if moments[0] < -ROUNDING * mass * length**2:
         return f"a negative moment of inertia ({moments[0]:.3g} kg m² about its centre of mass)"
-    if moments[2] > (1.0 + max_excess) * (moments[0] + moments[1]) + rounding * mass * length**2:
+    if moments[2] > (1.0 + MAX_EXCESS) * (moments[0] + moments[1]) + ROUNDING * mass * length**2:
         return f"an impossible inertia (one moment exceeds the sum of the others: {moments[2]:.3g} kg m²)"
     return ""
-
-
-MAX_TURN = 4.0 * np.pi + 0.01  # [rad] a continuous wrist may be given two turns (our choice)
-EXTRA = ("station", "tool", "camera", "board", "deflection", "truth", "provenance")
-_TOP = ("name", "base", "tip", "gravity", "floor", "source", "joint", "element", "tail")
-_JOINT = ("name", "kind", *tables.LIMITS, "link", "inertia")
-_ELEMENT = tuple(field.name for field in fields(Element))
 
 
 def read(path: str | Path, propose_beta: bool = True) -> Chain:
@@ -152,9 +168,14 @@ def read_whole(path: str | Path, propose_beta: bool = True) -> tuple[Chain, dict
             f"{path} is a parallel robot (legs and a platform), only serial arms are supported here; use "
             "calib fit, excite, identify or plan"
         )
-    robot = {key: value for key, value in table.items() if key not in EXTRA}
-    where, extra = str(path), {key: value for key, value in table.items() if key in EXTRA}
-    return _from_elements(robot, where) if "element" in robot else mdh.from_table(robot, where, propose_beta), extra
+    robot: dict[str, Any] = {}
+    extra: dict[str, Any] = {}
+    for key, value in table.items():
+        target = extra if key in EXTRA else robot
+        target[key] = value
+    if "element" in robot:
+        return _from_elements(robot, str(path)), extra
+    return mdh.from_table(robot, str(path), propose_beta), extra
 
 
 def read_extra(path: str | Path) -> dict[str, Any]:
@@ -172,32 +193,44 @@ def write(path: str | Path, chain: Chain, extra: Mapping[str, Any] | None = None
         source: where the numbers come from.
     """
     tables.check_keys(extra or {}, EXTRA, f"robot '{chain.name}', extra tables")
-    table = mdh.to_table(chain) if mdh.is_table(chain) and not chain.links else _to_elements(chain)
-    head = {key: value for key, value in table.items() if not isinstance(value, (list, dict)) or key == "gravity"}
-    head |= {"source": source} if source else {}
+    if mdh.is_table(chain) and not chain.links:
+        table = mdh.to_table(chain)
+    else:
+        table = _to_elements(chain)
+    # TOML demands plain values before tables.
+    head = {key: value for key, value in table.items() if key == "gravity" or not isinstance(value, (list, dict))}
+    if source:
+        head["source"] = source
     return files.write(path, tables.dumps(head | table | dict(extra or {})))
 
 
 def _from_elements(table: Mapping[str, Any], where: str) -> Chain:
     tables.check_keys(table, _TOP, where)
     joints, inertias, links = [], [], []
-    for index, entry in enumerate(_tables(table, "joint", where)):
-        place = f"{where}, [[joint]] number {index + 1}"
-        tables.check_keys(entry, _JOINT, place)
-        limits: dict[str, Any] = {
-            key: tables.number(entry[key], f"{place}, {key}") for key in tables.LIMITS if key in entry
-        }
-        joints.append(Joint(tables.word(entry, "name", place), tables.word(entry, "kind", place, "revolute"), **limits))
-        inertias.append(tables.vector(entry["inertia"], 10, f"{place}, inertia") if "inertia" in entry else None)
-        links.append(tables.word(entry, "link", place) if "link" in entry else None)
-    if any(entry is None for entry in inertias) != all(entry is None for entry in inertias):
+    for number, entry in enumerate(_tables(table, "joint", where), 1):
+        joint_where = f"{where}, [[joint]] number {number}"
+        tables.check_keys(entry, _JOINT, joint_where)
+        limits: dict[str, Any] = {}
+        for key in tables.LIMITS:
+            if key in entry:
+                limits[key] = tables.number(entry[key], f"{joint_where}, {key}")
+        name = tables.word(entry, "name", joint_where)
+        kind = tables.word(entry, "kind", joint_where, "revolute")
+        joints.append(Joint(name, kind, **limits))
+        if "inertia" in entry:
+            inertias.append(tables.vector(entry["inertia"], 10, f"{joint_where}, inertia"))
+        if "link" in entry:
+            links.append(tables.word(entry, "link", joint_where))
+    if inertias and len(inertias) < len(joints):
         refuse_robot(where, "some joints have an inertia and others have none: state all of them, or none")
-    elements = enumerate(_tables(table, "element", where), 1)
+    elements = []
+    for number, entry in enumerate(_tables(table, "element", where), 1):
+        elements.append(_element(entry, len(joints), f"{where}, [[element]] number {number}"))
     return Chain(
         joints=tuple(joints),
-        elements=tuple(_element(one, len(joints), f"{where}, [[element]] number {i}") for i, one in elements),
-        inertias=None if inertias[0] is None else np.array(inertias),
-        links=tuple(links) if all(links) else (),
+        elements=tuple(elements),
+        inertias=np.array(inertias) if inertias else None,
+        links=tuple(links) if len(links) == len(joints) else (),
         **tables.chain_head(table, where),
     )
 
@@ -206,23 +239,20 @@ def _element(entry: Mapping[str, Any], n: int, where: str) -> Element:
     tables.check_keys(entry, _ELEMENT, where)
     name = tables.word(entry, "name", where)
     where = f"{where} ('{name}')"
-    for key, most in (("owner", n), ("joint", n - 1)):
+    for key, highest in (("owner", n), ("joint", n - 1)):
         value = entry.get(key, 0)
-        if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= most:
-            refuse_robot(where, f"{key} {value!r} is not an integer from 0 to {most}")
+        if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= highest:
+            refuse_robot(where, f"{key} {value!r} is not an integer from 0 to {highest}")
     axis = tables.word(entry, "axis", where)
     sign = tables.number(entry.get("sign", 1.0), f"{where}, sign")
     require(abs(sign) == 1.0, f"{where}: sign {sign:g} is neither 1 nor -1", RobotError)
-    return Element(
-        name=name,
-        axis=axis,
-        value=tables.number(entry.get("value", 0.0), f"{where}, value", "length" if axis[:1] == "t" else "angle"),
-        owner=entry.get("owner", 0),
-        joint=entry.get("joint"),
-        ratio=tables.number(entry.get("ratio", 1.0), f"{where}, ratio"),
-        sign=sign,
-        placement=tables.placement(entry["placement"], f"{where}, placement") if "placement" in entry else None,
-    )
+    quantity = "length" if axis[:1] == "t" else "angle"
+    value = tables.number(entry.get("value", 0.0), f"{where}, value", quantity)
+    ratio = tables.number(entry.get("ratio", 1.0), f"{where}, ratio")
+    placement = None
+    if "placement" in entry:
+        placement = tables.placement(entry["placement"], f"{where}, placement")
+    return Element(name, axis, value, entry.get("owner", 0), entry.get("joint"), ratio, sign, placement)
 
 
 def _to_elements(chain: Chain) -> dict[str, Any]:
@@ -236,7 +266,10 @@ def _to_elements(chain: Chain) -> dict[str, Any]:
         joints.append(entry)
     for element in chain.elements:
         entry = {key: getattr(element, key) for key in ("name", "axis", "value", "owner", "joint")}
-        entry |= {key: getattr(element, key) for key in ("ratio", "sign") if getattr(element, key) != 1.0}
+        if element.ratio != 1.0:
+            entry["ratio"] = element.ratio
+        if element.sign != 1.0:
+            entry["sign"] = element.sign
         if element.placement is not None:
             entry["placement"] = tables.placement_table(element.placement)
         elements.append(entry)
@@ -244,7 +277,7 @@ def _to_elements(chain: Chain) -> dict[str, Any]:
 
 
 def _tables(table: Mapping[str, Any], key: str, where: str) -> list[Mapping[str, Any]]:
-    found = table.get(key)
-    if not isinstance(found, list) or not found or not all(isinstance(entry, Mapping) for entry in found):
+    entries = table.get(key)
+    if not isinstance(entries, list) or not entries or not all(isinstance(entry, Mapping) for entry in entries):
         refuse_robot(where, f"no [[{key}]] tables found")
-    return found
+    return entries

@@ -154,16 +154,15 @@ def twist_product(
     """
     moving = chain.driven
     v, w = columns[:, :3], columns[:, 3:]
-    turned = _cross(v, G[:, :3]) + _cross(w, G[:, 3:])
-    moved = _cross(G[:, :3], w)
+    rotation_part = _cross(v, G[:, :3]) + _cross(w, G[:, 3:])
+    translation_part = _cross(G[:, :3], w)
     behind = (places > moving[:, None]).astype(float)
     shape = (len(moving), 3, G.shape[2])
-    about = (behind @ turned.reshape(len(G), -1)).reshape(shape)
-    along = ((1.0 - behind) @ moved.reshape(len(G), -1)).reshape(shape)
-    slopes = np.einsum("kim,kim->km", elements[moving, 3:], about) + np.einsum(
-        "kim,kim->km", elements[moving, :3], along
-    )
-    return chain.rates.T @ slopes
+    rotation_sum = (behind @ rotation_part.reshape(len(G), -1)).reshape(shape)
+    translation_sum = ((1.0 - behind) @ translation_part.reshape(len(G), -1)).reshape(shape)
+    by_rotation = np.einsum("kim,kim->km", elements[moving, 3:], rotation_sum)
+    by_translation = np.einsum("kim,kim->km", elements[moving, :3], translation_sum)
+    return chain.rates.T @ (by_rotation + by_translation)
 
 
 def joint_jacobian(chain: Chain, walked: Sweep, point: np.ndarray, before: int | None = None) -> np.ndarray:
@@ -177,10 +176,14 @@ def joint_jacobian(chain: Chain, walked: Sweep, point: np.ndarray, before: int |
     Returns:
         (m, 6, n): linear velocity of the point, then angular velocity, both in the reference frame.
     """
-    moving = chain.driven if before is None else chain.driven[chain.driven < before]
-    columns, rates = element_jacobian(chain, walked, point, moving), chain.rates[: len(moving)]
-    own = columns if np.array_equal(rates, np.eye(chain.n)) else np.tensordot(rates.T, columns, 1)
-    return own.transpose(2, 1, 0)
+    moving = chain.driven
+    if before is not None:
+        moving = moving[moving < before]
+    columns = element_jacobian(chain, walked, point, moving)
+    rates = chain.rates[: len(moving)]
+    if not np.array_equal(rates, np.eye(chain.n)):
+        columns = np.tensordot(rates.T, columns, 1)
+    return columns.transpose(2, 1, 0)
 
 
 def tip_jacobian(chain: Chain, q: np.ndarray) -> np.ndarray:
@@ -194,16 +197,21 @@ def moving_frames(chain: Chain, q: np.ndarray) -> np.ndarray:
     q = shaped(q, (None, chain.n), f"joint values of '{chain.name}'")
     frames = np.zeros((len(chain.driven), len(q), 4, 4))
     frames[..., 3, 3] = 1.0
-    moving = (each for each in _walk(chain, q, _start(None, len(q))) if each[0].joint is not None)
-    for frame, (_, _, rotation, position) in zip(frames, moving):
-        frame[:, :3, :3], frame[:, :3, 3] = rotation.transpose(2, 1, 0), position.T
+    number = 0
+    for element, _, rotation, position in _walk(chain, q, _start(None, len(q))):
+        if element.joint is not None:
+            frames[number, :, :3, :3] = rotation.transpose(2, 1, 0)
+            frames[number, :, :3, 3] = position.T
+            number += 1
     return frames
 
 
 def joint_frames(chain: Chain, q: np.ndarray) -> np.ndarray:
     """Return the frames (n, m, 4, 4) right after each joint's moving element, as used by `Chain.inertias`."""
     frames = moving_frames(chain, q)
-    return frames if np.array_equal(chain.driven, chain.moving) else frames[np.searchsorted(chain.driven, chain.moving)]
+    if np.array_equal(chain.driven, chain.moving):
+        return frames
+    return frames[np.searchsorted(chain.driven, chain.moving)]
 
 
 def gravity_torques(chain: Chain, q: np.ndarray) -> np.ndarray:
@@ -225,34 +233,39 @@ def gravity_torques(chain: Chain, q: np.ndarray) -> np.ndarray:
         refuse_robot(f"robot '{chain.name}'", "has no masses; add 'inertia' to its joints")
     joints = [chain.elements[k].joint for k in chain.driven]
     turning = np.array([chain.elements[k].axis[0] == "r" for k in chain.driven])
-    masses, moments = chain.inertias[joints, 9], chain.inertias[joints, 6:9]
-    frames, walked = moving_frames(chain, q), sweep(chain, q)
-    axes, origins = walked.directions[chain.driven], walked.origins[chain.driven]
-    # first moments (n, 3, m) of each body about the base, then those of all bodies from each joint on
+    masses = chain.inertias[joints, 9]
+    moments = chain.inertias[joints, 6:9]
+    frames = moving_frames(chain, q)
+    walk = sweep(chain, q)
+    axes = walk.directions[chain.driven]
+    origins = walk.origins[chain.driven]
+    # First moments (n, 3, m) of each body about the base, then those of all bodies from each joint on.
     moment = np.einsum("jmik,jk->jim", frames[..., :3, :3], moments)
     moment += masses[:, None, None] * frames[..., :3, 3].swapaxes(1, 2)
     carried_moment = np.cumsum(moment[::-1], axis=0)[::-1]
     carried_mass = np.cumsum(masses[::-1])[::-1][:, None, None]
-    swept = np.where(turning[:, None, None], _cross(axes, carried_moment - carried_mass * origins), carried_mass * axes)
-    return -np.einsum("i,jim->mj", chain.gravity, swept) @ chain.rates
+    by_rotation = _cross(axes, carried_moment - carried_mass * origins)
+    by_translation = carried_mass * axes
+    moment_rates = np.where(turning[:, None, None], by_rotation, by_translation)
+    return -np.einsum("i,jim->mj", chain.gravity, moment_rates) @ chain.rates
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return the cross products of (K, 3, m) arrays along their middle axis."""
-    return np.stack(
-        [
-            a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1],
-            a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2],
-            a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0],
-        ],
-        axis=1,
-    )
+    x = a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1]
+    y = a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]
+    z = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    return np.stack([x, y, z], axis=1)
 
 
 def _start(base: np.ndarray | None, m: int) -> tuple[np.ndarray, np.ndarray]:
     """Return rotation columns (3, 3, m) and position (3, m) of the base placement."""
-    placement = np.broadcast_to(np.eye(4) if base is None else base, (m, 4, 4))
-    return np.ascontiguousarray(placement[:, :3, :3].transpose(2, 1, 0)), np.ascontiguousarray(placement[:, :3, 3].T)
+    if base is None:
+        base = np.eye(4)
+    placement = np.broadcast_to(base, (m, 4, 4))
+    rotation = np.ascontiguousarray(placement[:, :3, :3].transpose(2, 1, 0))
+    position = np.ascontiguousarray(placement[:, :3, 3].T)
+    return rotation, position
 
 
 def _place(rotation: np.ndarray, position: np.ndarray, placement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -267,9 +280,9 @@ def _place(rotation: np.ndarray, position: np.ndarray, placement: np.ndarray) ->
 def _rotate(rotation: np.ndarray, axis: int, angle: np.ndarray | float) -> np.ndarray:
     """Return frames rotated about one of their axes by an angle."""
     cosine, sine = np.cos(angle), np.sin(angle)
-    one, two = (axis + 1) % 3, (axis + 2) % 3
+    next_axis, last_axis = (axis + 1) % 3, (axis + 2) % 3
     result = np.empty_like(rotation)
     result[axis] = rotation[axis]
-    result[one] = cosine * rotation[one] + sine * rotation[two]
-    result[two] = cosine * rotation[two] - sine * rotation[one]
+    result[next_axis] = cosine * rotation[next_axis] + sine * rotation[last_axis]
+    result[last_axis] = cosine * rotation[last_axis] - sine * rotation[next_axis]
     return result

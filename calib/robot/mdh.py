@@ -42,7 +42,7 @@ The file, in TOML (numbers as in `calib.robot.tables`; angles in rad, lengths in
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -55,6 +55,7 @@ from calib.robot.chain import Chain, Element, Joint
 AXES = {"alpha": "rx", "d": "tx", "beta": "ry", "r": "tz", "theta": "rz"}
 TOP = ("name", "base", "tip", "gravity", "floor", "source", "propose_beta", "joint", "tail")
 KINDS = ("revolute", "prismatic", "fixed")
+MAX_SINE = 0.05  # of the angle between two axes that are nearly parallel
 _ROW = ("name", "kind", "index", "alpha", "d", "beta", "theta", "r", *tables.LIMITS, "inertia")
 _ELEMENT = re.compile(r"(alpha|d|beta|r|theta)(\d+)")
 
@@ -84,23 +85,25 @@ class Row:
 def from_table(table: Mapping[str, Any], where: str, propose_beta: bool = True) -> Chain:
     """Return the chain of a parsed table; `where` names it in messages."""
     tables.check_keys(table, TOP, where)
-    if not isinstance(proposed := table.get("propose_beta", True), bool):
+    proposed = table.get("propose_beta", True)
+    if not isinstance(proposed, bool):
         refuse_robot(where, f"propose_beta must be true or false, found {proposed!r}")
     rows: list[Row] = []
     if not isinstance(table.get("joint"), list) or not table["joint"]:
         refuse_robot(where, "no [[joint]] rows found; an MDH table needs one per axis")
-    for position, entry in enumerate(table["joint"]):
-        rows.append(_row(entry, rows[-1].index + 1 if rows else 1, f"{where}, [[joint]] number {position + 1}"))
+    for number, entry in enumerate(table["joint"], 1):
+        next_index = rows[-1].index + 1 if rows else 1
+        rows.append(_row(entry, next_index, f"{where}, [[joint]] number {number}"))
     return chain(rows=rows, propose_beta=propose_beta and proposed, **tables.chain_head(table, where))
 
 
-def chain(name: str, rows: Sequence[Row], propose_beta: bool = True, **more: Any) -> Chain:
+def chain(name: str, rows: Sequence[Row], propose_beta: bool = True, **fields: Any) -> Chain:
     """Return the chain of MDH rows.
 
     Args:
         rows: base to tip.
         propose_beta: add ``beta`` to moving rows whose axis is nearly parallel to the moving one before.
-        more: other fields of `Chain`: base, tip, tail, gravity, floor.
+        fields: other fields of `Chain`: base, tip, tail, gravity, floor.
     """
     moving = [row for row in rows if row.kind != "fixed"]
     require(moving, f"robot '{name}': every row is fixed; at least one has to be revolute or prismatic", RobotError)
@@ -108,15 +111,19 @@ def chain(name: str, rows: Sequence[Row], propose_beta: bool = True, **more: Any
     elements: list[Element] = []
     owner = 0
     for row in rows:
-        beta = 0.0 if row.beta is None and row.index in parallel else row.beta
+        beta = row.beta
+        if beta is None and row.index in parallel:
+            beta = 0.0
         elements += _elements(row, beta, owner)
         owner += row.kind != "fixed"
-    known = [row.inertia is not None for row in moving]
-    if any(known) and not all(known):
-        refuse_robot(f"robot '{name}'", f"row '{moving[known.index(False)].name}' has no inertia while others have")
+    massless = [row.name for row in moving if row.inertia is None]
+    if massless and len(massless) < len(moving):
+        refuse_robot(f"robot '{name}'", f"row '{massless[0]}' has no inertia while others have")
+    inertias = None
+    if not massless:
+        inertias = np.array([row.inertia for row in moving], dtype=float)
     joints = tuple(Joint(row.name, row.kind, row.lower, row.upper, row.velocity, row.effort) for row in moving)
-    inertias = np.array([row.inertia for row in moving], dtype=float) if all(known) else None
-    return Chain(name, joints, tuple(elements), inertias=inertias, **more)
+    return Chain(name, joints, tuple(elements), inertias=inertias, **fields)
 
 
 def rows(chain: Chain) -> tuple[Row, ...]:
@@ -127,13 +134,14 @@ def rows(chain: Chain) -> tuple[Row, ...]:
     """
     groups: dict[int, list[Element]] = {}
     for element in chain.elements:
-        found = _ELEMENT.fullmatch(element.name)
+        match = _ELEMENT.fullmatch(element.name)
         plain = element.placement is None and element.sign == 1.0 and element.ratio == 1.0
-        if not found or not plain or AXES[found[1]] != element.axis:
+        if not match or not plain or AXES[match[1]] != element.axis:
             raise RobotError(f"robot '{chain.name}' is not an MDH table: element '{element.name}' does not fit")
-        groups.setdefault(int(found[2]), []).append(element)
+        groups.setdefault(int(match[2]), []).append(element)
     result = tuple(_regroup(chain, index, group) for index, group in groups.items())
-    owner, expected = 0, []
+    owner = 0
+    expected: list[Element] = []
     for row in result:
         expected += _elements(row, row.beta, owner)
         owner += row.kind != "fixed"
@@ -158,30 +166,34 @@ def to_table(chain: Chain) -> dict[str, Any]:
 
 def _elements(row: Row, beta: float | None, owner: int) -> list[Element]:
     """Return the elements of one row, in the order of the product."""
-    joint = None if row.kind == "fixed" else owner
-    order = ["alpha", "d", *([] if beta is None else ["beta"])]
-    order += ["theta", "r"] if row.kind == "prismatic" else ["r", "theta"]
-    values = {"alpha": row.alpha, "d": row.d, "beta": beta or 0.0, "r": row.r, "theta": row.theta}
-    return [
-        Element(f"{name}{row.index}", AXES[name], values[name], owner, joint if name == order[-1] else None)
-        for name in order
-    ]
+    values = {"alpha": row.alpha, "d": row.d}
+    if beta is not None:
+        values["beta"] = beta
+    if row.kind == "prismatic":
+        values |= {"theta": row.theta, "r": row.r}
+    else:
+        values |= {"r": row.r, "theta": row.theta}
+    elements = [Element(f"{name}{row.index}", AXES[name], value, owner) for name, value in values.items()]
+    if row.kind != "fixed":
+        elements[-1] = replace(elements[-1], joint=owner)
+    return elements
 
 
-def _parallel(rows: Iterable[Row], max_sine: float = 0.05) -> set[int]:
+def _parallel(rows: Iterable[Row]) -> set[int]:
     """Return the indices of moving rows with an axis nearly parallel to the previous moving axis, at zero joints."""
-    found: set[int] = set()
-    turned: Rotation | None = None
+    indices: set[int] = set()
+    # Rotation since the last moving row.
+    rotation: Rotation | None = None
     for row in rows:
-        if turned is not None:
-            turned = turned * Rotation.from_euler("XY", [row.alpha, row.beta or 0.0])
-            if row.kind != "fixed" and np.hypot(*turned.as_matrix()[:2, 2]) < max_sine:
-                found.add(row.index)
+        if rotation is not None:
+            rotation = rotation * Rotation.from_euler("XY", [row.alpha, row.beta or 0.0])
+            if row.kind != "fixed" and np.hypot(*rotation.as_matrix()[:2, 2]) < MAX_SINE:
+                indices.add(row.index)
         if row.kind != "fixed":
-            turned = Rotation.identity()
-        elif turned is not None:
-            turned = turned * Rotation.from_euler("Z", row.theta)
-    return found
+            rotation = Rotation.identity()
+        elif rotation is not None:
+            rotation = rotation * Rotation.from_euler("Z", row.theta)
+    return indices
 
 
 def _row(entry: Any, index: int, where: str) -> Row:
@@ -199,20 +211,24 @@ def _row(entry: Any, index: int, where: str) -> Row:
     quantity |= {"velocity": "angular speed", "effort": "torque"}
     if kind == "prismatic":
         quantity |= {"lower": "length", "upper": "length", "velocity": "speed", "effort": "force"}
-    if kind == "fixed" and (extra := [key for key in (*tables.LIMITS, "inertia") if key in entry]):
-        refuse_robot(where, f"a fixed row cannot have '{extra[0]}': remove the key")
+    if kind == "fixed":
+        for key in (*tables.LIMITS, "inertia"):
+            if key in entry:
+                refuse_robot(where, f"a fixed row cannot have '{key}': remove the key")
     numbers = {key: tables.number(entry[key], f"{where}, {key}", quantity[key]) for key in quantity if key in entry}
-    inertia = tuple(tables.vector(entry["inertia"], 10, f"{where}, inertia").tolist()) if "inertia" in entry else None
+    inertia = None
+    if "inertia" in entry:
+        inertia = tuple(tables.vector(entry["inertia"], 10, f"{where}, inertia").tolist())
     return Row(name=name, index=index, kind=kind, inertia=inertia, **numbers)
 
 
 def _regroup(chain: Chain, index: int, group: list[Element]) -> Row:
     """Return the MDH row of a group of elements with one number; the caller checks order and completeness."""
     values: dict[str, Any] = {element.name.removesuffix(str(index)): element.value for element in group}
-    moved = [element for element in group if element.joint is not None]
-    if not moved:
+    moving = [element for element in group if element.joint is not None]
+    if not moving:
         return Row(name=f"joint{index}", index=index, kind="fixed", **values)
-    position = moved[0].joint or 0
+    position = moving[0].joint or 0
     joint = chain.joints[position]
     inertia = None if chain.inertias is None else tuple(chain.inertias[position].tolist())
     limits = {key: getattr(joint, key) for key in tables.LIMITS}
@@ -221,10 +237,14 @@ def _regroup(chain: Chain, index: int, group: list[Element]) -> Row:
 
 def _entry(row: Row, expected: int) -> dict[str, Any]:
     """Return the [[joint]] table of a row, without default values (the four parameters are always written)."""
-    usual: dict[str, Any] = {"kind": "revolute", "index": expected}
-    entry = {"name": row.name} | {key: getattr(row, key) for key in usual if getattr(row, key) != usual[key]}
+    entry: dict[str, Any] = {"name": row.name}
+    if row.kind != "revolute":
+        entry["kind"] = row.kind
+    if row.index != expected:
+        entry["index"] = row.index
     for key in ("alpha", "d", "beta", "theta", "r"):
-        if (value := getattr(row, key)) is not None:
+        value = getattr(row, key)
+        if value is not None:
             entry[key] = tables.spelled(value) if AXES[key][0] == "r" else value
     entry |= tables.finite_limits(row)
     if row.inertia is not None:

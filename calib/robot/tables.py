@@ -71,7 +71,9 @@ def placement_table(transform: np.ndarray) -> dict[str, list]:
     xyz, rpy = to_xyz_rpy(transform)
     if np.array_equal(from_xyz_rpy(xyz, rpy), transform):
         table = {"xyz": xyz.tolist()}
-        return table if not rpy.any() else {**table, "rpy": [spelled(angle) for angle in rpy.tolist()]}
+        if rpy.any():
+            table["rpy"] = [spelled(angle) for angle in rpy.tolist()]
+        return table
     return {"matrix": transform[:3].tolist()}
 
 
@@ -83,24 +85,33 @@ def spelled(angle: float) -> float | str:
 def chain_head(table: Mapping[str, Any], where: str) -> dict[str, Any]:
     """Return the fields of a `Chain` in a robot's table except its joints: name, ends, tail, gravity, floor."""
     head: dict[str, Any] = {"name": word(table, "name", where)}
-    head |= {key: word(table, key, where) for key in ("base", "tip") if key in table}
+    for key in ("base", "tip"):
+        if key in table:
+            head[key] = word(table, key, where)
     if "tail" in table:
         head["tail"] = placement(table["tail"], f"{where}, [tail]")
     if "gravity" in table:
         head["gravity"] = vector(table["gravity"], 3, f"{where}, gravity")
-    return head | {"floor": number(table.get("floor", 0.0), f"{where}, floor", "length")}
+    head["floor"] = number(table.get("floor", 0.0), f"{where}, floor", "length")
+    return head
 
 
 def chain_table(chain: Chain, **rows: Any) -> dict[str, Any]:
     """Return the table of a chain that `chain_head` reads back exactly; `rows` stand before its tail."""
     table: dict[str, Any] = {"name": chain.name, "base": chain.base, "tip": chain.tip}
-    table |= {"gravity": chain.gravity.tolist(), **({"floor": chain.floor} if chain.floor else {}), **rows}
-    return table if np.array_equal(chain.tail, np.eye(4)) else {**table, "tail": placement_table(chain.tail)}
+    table["gravity"] = chain.gravity.tolist()
+    if chain.floor:
+        table["floor"] = chain.floor
+    table |= rows
+    if not np.array_equal(chain.tail, np.eye(4)):
+        table["tail"] = placement_table(chain.tail)
+    return table
 
 
 def finite_limits(joint: Any) -> dict[str, float]:
     """Return the known (finite) limits of a joint or MDH row, by name."""
-    return {key: value for key in LIMITS if np.isfinite(value := getattr(joint, key))}
+    limits = {key: getattr(joint, key) for key in LIMITS}
+    return {key: limit for key, limit in limits.items() if np.isfinite(limit)}
 
 
 def dumps(table: Mapping[str, Any]) -> str:

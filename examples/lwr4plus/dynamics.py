@@ -34,14 +34,14 @@ from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.torque_rows import BOTH, MODELS, MOTOR, TorqueRows
 from calib.estimation.essential import Elimination, Rule, eliminate
 from calib.estimation.linear import LinearFit, settled_std, wls
+from calib.identification.closed_loop.controllers import Reference
+from calib.identification.closed_loop.simulation import Plant, feed_forward, tracking_error
 from calib.identification.rows import observe
 from calib.procedure.excitation import coefficients
 from calib.procedure.report.style import AFTER, INK, PAGE_WIDTH, QUIET, save, sheet, styled
 from calib.robot.chain import Chain
 from calib.rooms.cells import lwr4plus
 from calib.rooms.cells.known_robots import random_fourier
-from calib.rooms.closed_loop.controllers import Reference
-from calib.rooms.closed_loop.simulation import Plant, feed_forward, tracking_error
 
 REACH = 0.8 * np.deg2rad([170.0, 120.0, 170.0, 120.0, 170.0, 90.0, 170.0])
 SPEED = 0.8 * np.deg2rad([110.0, 110.0, 128.0, 128.0, 204.0, 184.0, 184.0])

@@ -51,6 +51,7 @@ from calib.estimation.triangles import combine
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit
 from calib.geometry.weighing import calibrated_chain
+from calib.identification.closed_loop.controllers import Reference
 from calib.procedure.excitation import coefficients
 from calib.procedure.excitation.design import Designed, search_motion
 from calib.procedure.excitation.excited_model import excited_model
@@ -63,7 +64,6 @@ from calib.robot.tables import dumps
 from calib.rooms.cells import lwr4plus
 from calib.rooms.cells.cell import measure
 from calib.rooms.cells.virtual_cells import lwr4plus_cell
-from calib.rooms.closed_loop.controllers import Reference
 from calib.workers.threads import one_blas_thread
 from trajectories.design.objectives import condition_numbers
 

@@ -21,12 +21,12 @@ from calib.dynamics.bodies import bodies_of, standard_parameters, with_payload
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.torque_rows import LINK, MOTOR, TorqueRows
 from calib.estimation.triangles import Triangles, absorb, empty
+from calib.identification.closed_loop.controllers import Reference, pd
+from calib.identification.closed_loop.simulation import Plant, Sensing, feed_forward, simulate
 from calib.identification.loop import Controller
 from calib.identification.rows import Case, make_case, observe
 from calib.robot.chain import Chain
 from calib.rooms.cells import known_robots, lwr4plus
-from calib.rooms.closed_loop.controllers import Reference, pd
-from calib.rooms.closed_loop.simulation import Plant, Sensing, feed_forward, simulate
 from calib.transforms import pose
 
 PAYLOAD = "8"

@@ -15,10 +15,10 @@ import numpy as np
 
 from calib.data.recordings.recording import Recording
 from calib.data.signals.motion import FilterOptions, make_motion
-from calib.identification.methods.registry import method_named
+from calib.identification.closed_loop.simulation import Sensing, simulate
+from calib.identification.registry import method_named
 from calib.identification.rows import Case, observe
 from calib.rooms.cells import known_robots
-from calib.rooms.closed_loop.simulation import Sensing, simulate
 from calib.rooms.studies.conditions import Condition, read_study
 from calib.rooms.studies.experiment import Experiment, make_experiment, set_up
 

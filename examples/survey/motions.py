@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.identification.methods.registry import method_named
+from calib.identification.registry import method_named
 from calib.rooms.studies.conditions import read_study
 from calib.rooms.studies.experiment import make_experiment
 

@@ -15,10 +15,10 @@ from dataclasses import replace
 import numpy as np
 
 from calib.identification.methods.method import Method
-from calib.identification.methods.registry import method_named
+from calib.identification.registry import method_named
+from calib.identification.survey.networks import ADALINE, HOPFIELD
 from calib.rooms.studies.conditions import Condition, read_study
 from calib.rooms.studies.experiment import make_experiment
-from calib.rooms.studies.methods.networks import ADALINE, HOPFIELD
 
 TRIED: dict[str, Method] = {
     "ols": method_named("ols"),

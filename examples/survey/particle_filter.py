@@ -2,7 +2,7 @@
 
     python examples/survey/particle_filter.py [--conditions MCS-RV2SQ-1-1,MCS-TX40-1-1] [--particles 1300] [--seeds 1]
 
-State and noise are those of the Kalman filters (`calib.rooms.studies.methods.filters`); every particle is a motion with
+State and noise are those of the Kalman filters (`calib.identification.survey.filters`); every particle is a motion with
 parameters of its own. Weights are the Gaussian density of the measured positions (Gordon, Salmond & Smith 1993), and
 the parameters move as
 
@@ -26,11 +26,11 @@ import numpy as np
 from calib.errors import CalibError
 from calib.identification.methods.least_squares import WLS
 from calib.identification.methods.method import IdentificationProblem
-from calib.identification.methods.registry import method_named
+from calib.identification.registry import method_named
+from calib.identification.survey.filters import _steps, _thin
+from calib.identification.survey.simulated_robot import Stepper, believed_robot, stepper
 from calib.rooms.studies.conditions import read_study
 from calib.rooms.studies.experiment import Experiment, make_experiment
-from calib.rooms.studies.methods.filters import _steps, _thin
-from calib.rooms.studies.methods.simulated_robot import Stepper, believed_robot, stepper
 
 WAYS = {"jitter": 1.0, "shrinkage": 1.0, "tempered": 30.0}  # times the positions' noise
 SHRINK, JITTER, SPREAD, WIDTH = 0.99, 0.01, 0.05, 5.0  # of Liu & West, the survey (2), and the Kalman filters

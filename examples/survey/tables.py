@@ -16,7 +16,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from calib.identification.methods.registry import METHODS
+from calib.identification.registry import METHODS
 from calib.rooms.studies.conditions import Condition, read_study
 from calib.rooms.studies.store import read_rows
 from calib.rooms.studies.summary import ConditionSummary, MethodSummary, summarise

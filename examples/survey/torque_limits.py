@@ -12,8 +12,8 @@ import sys
 
 import numpy as np
 
+from calib.identification.closed_loop.simulation import Sensing, simulate
 from calib.rooms.cells import known_robots
-from calib.rooms.closed_loop.simulation import Sensing, simulate
 from calib.rooms.studies.conditions import read_study
 from calib.rooms.studies.experiment import set_up
 

@@ -38,16 +38,16 @@ from calib.estimation.essential import Rule, eliminate
 from calib.estimation.linear import LinearFit, subsystem_std
 from calib.estimation.triangles import collect, combine
 from calib.estimation.whiteness import examine
-from calib.identification.constraint_settings import ConstraintSettings
+from calib.identification.closed_loop.controllers import Reference, identify_controller, pd
+from calib.identification.closed_loop.instrumental import Instrumental, Round, identify_instrumental
+from calib.identification.closed_loop.loop_recordings import Loop, simulated_case
+from calib.identification.closed_loop.simulation import Plant, Sensing, SimulatedRun, simulate
 from calib.identification.loop import Controller
+from calib.identification.methods.constraint_settings import ConstraintSettings
+from calib.identification.methods.parameter_constraints import hold, make_constraints
 from calib.identification.rows import Case, make_case, observe
-from calib.rooms.alternatives.parameter_constraints import hold, make_constraints
 from calib.rooms.cells import known_robots
 from calib.rooms.cells.known_robots import random_fourier, trapezoidal
-from calib.rooms.closed_loop.controllers import Reference, identify_controller, pd
-from calib.rooms.closed_loop.instrumental import Instrumental, Round, identify_instrumental
-from calib.rooms.closed_loop.loop_recordings import Loop, simulated_case
-from calib.rooms.closed_loop.simulation import Plant, Sensing, SimulatedRun, simulate
 
 RATE, EVERY = 5000.0, 5
 FILTERS = FilterOptions(cutoff=50.0, band=20.0, clock="stamps")
@@ -197,7 +197,7 @@ def consistent(study: Study, result: Instrumental) -> LinearFit:
     bounds = dict.fromkeys(signs(result.names), (0.0, np.inf))
     settings = ConstraintSettings(signs=False, inertia=0, bounds=bounds)
     asked = make_constraints(settings, study.model, study.base, result.names, [None] * study.base.b)
-    return hold(result.ordinary, combine(data, std), data, std, asked, stated=True)[0]
+    return hold(result.ordinary, combine(data, std), data, std, asked, stated_noise=True)[0]
 
 
 def finite(result: Instrumental) -> list[Round]:

@@ -12,14 +12,14 @@ import pytest
 from calib.data.recordings.recording import Recording
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics import base as bases
-from calib.identification.constraint_settings import ConstraintSettings
+from calib.identification.closed_loop.instrumental import identify_instrumental
+from calib.identification.closed_loop.loop_recordings import Loop
+from calib.identification.closed_loop.simulation import Sensing, simulate
+from calib.identification.methods.constraint_settings import ConstraintSettings
+from calib.identification.methods.parameter_constraints import make_constraints
 from calib.identification.rows import make_case
-from calib.rooms.alternatives.parameter_constraints import make_constraints
 from calib.rooms.cells import known_robots
 from calib.rooms.cells.known_robots import random_fourier
-from calib.rooms.closed_loop.instrumental import identify_instrumental
-from calib.rooms.closed_loop.loop_recordings import Loop
-from calib.rooms.closed_loop.simulation import Sensing, simulate
 
 PLANT = known_robots.plant("tx40", coupled=True)
 MODEL = known_robots.model(PLANT)

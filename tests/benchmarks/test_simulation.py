@@ -15,14 +15,14 @@ from calib.data.recordings.recording import Recording
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics import base as bases
 from calib.dynamics.bodies import standard_parameters
+from calib.identification.closed_loop.controllers import Reference
+from calib.identification.closed_loop.instrumental import identify_instrumental
+from calib.identification.closed_loop.loop_recordings import Loop
+from calib.identification.closed_loop.simulation import Plant, Sensing, forward_dynamics, simulate
 from calib.identification.rows import Case, make_case
 from calib.robot import description, library
 from calib.rooms.cells import known_robots
 from calib.rooms.cells.known_robots import random_fourier
-from calib.rooms.closed_loop.controllers import Reference
-from calib.rooms.closed_loop.instrumental import identify_instrumental
-from calib.rooms.closed_loop.loop_recordings import Loop
-from calib.rooms.closed_loop.simulation import Plant, Sensing, forward_dynamics, simulate
 
 STATES = 20_000
 REACH = np.array([2.8, 1.8, 2.0, 3.5, 1.9, 4.0])

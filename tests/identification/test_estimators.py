@@ -13,10 +13,10 @@ from without_figures import run
 from calib.estimation.triangles import collect
 from calib.folders import read_estimate
 from calib.identification.identify import identify as fit
-from calib.identification.methods.registry import METHODS
+from calib.identification.methods.estimators import scaled_tls
+from calib.identification.registry import METHODS
 from calib.procedure.dynamic_stage.inputs import gather
 from calib.procedure.dynamic_stage.verdict import model_findings
-from calib.rooms.alternatives.estimators import scaled_tls
 
 
 def identify(robot: Path, log: Path, method: str, out: Path, code: int = 0) -> dict[str, tuple[float, float]]:

@@ -94,11 +94,13 @@ def test_regimes_hold_each_joints_extremes_and_with_the_rest_are_everything():
     rate = design_decimator(case.motion.rate, case.motion.decimator.factor)
     own = regimes(found.rows, [case], rate)
     assert own.squares.shape[0] == 6
-    share = own.counts / own.total
+    share = own.counts / own.total_counts
     np.testing.assert_allclose(share[:2], 0.1, atol=0.01)
     np.testing.assert_allclose(share[2:4], 0.15, atol=0.01)
     np.testing.assert_allclose(share[4] + share[5], 1.0, atol=0.01)
-    np.testing.assert_allclose(own.squares[4] + own.squares[5], own.whole, rtol=0.02, atol=1e-3 * own.whole.max())
+    np.testing.assert_allclose(
+        own.squares[4] + own.squares[5], own.total_squares, rtol=0.02, atol=1e-3 * own.total_squares.max()
+    )
 
 
 def test_friction_drives_a_joint_only_where_it_moves():

@@ -23,7 +23,7 @@ def test_rich_motion_does_not_feel_the_prior():
     case = planted.case("a", 0, noise=0.02)
     drawn, bare = (identify(planted.arm(), [case], replace(PLAIN, prior=one)) for one in ("auto", "none"))
     sigma = bare.fitted.estimate.sigma
-    told = drawn.prior is not None and sigma < 0.3 * drawn.prior.own
+    told = drawn.prior is not None and sigma < 0.3 * drawn.prior.deviation
     assert np.sum(told) > 10
     away = (drawn.fitted.estimate.values - bare.fitted.estimate.values) / sigma
     assert np.abs(away[told]).max() < 1.0

@@ -25,7 +25,7 @@ from calib.identification.standstill import (
     with_standstills,
     with_weights,
 )
-from calib.identification.torque_errors import intervals, learn_torque_errors
+from calib.identification.uncertainty.torque_errors import intervals, learn_torque_errors
 
 PLAIN = IdentificationSettings(friction="standard", essential="none")
 WIDTH = np.full(planted.N, 0.01)  # of Coulomb's sign [rad/s]
@@ -189,7 +189,7 @@ def test_intervals_have_two_widths_and_hold_in_both():
         assert errors is not None
         stated = intervals(errors, found.dynamics, other, predict(found.dynamics, other))
         assert (stated.median_at_rest > 1.5 * stated.median).all()
-        covered.append([stated.inside[~stated.standing].mean(), stated.inside[stated.standing].mean()])
+        covered.append([stated.contains[~stated.standing].mean(), stated.contains[stated.standing].mean()])
     moving, resting = np.mean(covered, axis=0)
     assert 0.92 < moving <= 1.0 and resting > 0.85
 
@@ -203,7 +203,7 @@ def test_left_out_motion_does_not_ask_for_standing_rows_where_friction_holds_the
     case = stop_and_go(3)
     rows = rows_of(case)
     first = first_fit(rows)
-    rows = with_weights(rows, first.rest)
+    rows = with_weights(rows, first.rest_weights)
     as_moving = [replace(part, standing=np.zeros_like(part.standing)) for part in rows]
     once = left_out_error(rows, rows, first.std, first.inflation, None, ())
     first_as_moving = first_fit(as_moving)

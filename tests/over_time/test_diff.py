@@ -90,7 +90,7 @@ def test_the_nominal_robot_is_one_of_the_two(fits):
 def test_what_cannot_be_compared_is_refused(fits, tmp_path):
     with pytest.raises(RobotError, match=r"different robots \(ur5, panda\): joints joint_1"):
         calib.diff(fits / "first", "panda")
-    with pytest.raises(UsageError, match="neither the folder of a fit"):
+    with pytest.raises(UsageError, match="give folders of fits, of identifications or of sessions"):
         calib.diff(fits / "first", tmp_path)
     with pytest.raises(UsageError, match="neither ur5 nor panda is"):
         calib.diff("ur5", "panda")

@@ -156,7 +156,7 @@ def test_capsules_measure_as_coal_does(arm):
     q = random_joints(chain, 20, 3)
     distances, lines = found.distances(q), found.lines_at(q)
     solids = [coal.Box(0.3, 0.4, 0.5), coal.Sphere(0.2), coal.Cylinder(0.1, 0.8)]
-    assert len(found.world) > 6 and (arm == "motley" or len(found.own) > 1)
+    assert len(found.world_pairs) > 6 and (arm == "motley" or len(found.arm_pairs) > 1)
 
     def capsule(i: int, k: int):
         start, end = lines.start[i, k], lines.end[i, k]
@@ -165,10 +165,10 @@ def test_capsules_measure_as_coal_does(arm):
         return solid, coal.Transform3s(turned, (start + end) / 2)
 
     for i in range(len(q)):
-        for (one, two), distance in zip(found.own, distances[i], strict=False):
+        for (one, two), distance in zip(found.arm_pairs, distances[i], strict=False):
             oracle = coal.distance(*capsule(i, one), *capsule(i, two), coal.DistanceRequest(), coal.DistanceResult())
             assert distance == pytest.approx(oracle, abs=1e-6)
-        for (one, thing), distance in zip(found.world, distances[i, len(found.own) :], strict=True):
+        for (one, thing), distance in zip(found.world_pairs, distances[i, len(found.arm_pairs) :], strict=True):
             if thing == 0:  # the floor
                 low = min(lines.start[i, one, 2], lines.end[i, one, 2])
                 assert distance == pytest.approx(low + 0.2 - found.radii[one])

@@ -10,7 +10,7 @@ from rich.console import Console
 from study_rows import ROW
 
 from calib.errors import UsageError
-from calib.identification.methods.registry import VERSIONS
+from calib.identification.registry import VERSIONS
 from calib.procedure.report.page import rendered
 from calib.rooms.studies.conditions import Condition, Study, read_study, shipped
 from calib.rooms.studies.experiment import ACCELERATION, REACH, SPEED, data_set, make_experiment, set_up

@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 from sessions import begin, edit, quiet
-from typer.main import get_command
 from without_figures import DRAWING
 
 from calib import cli
@@ -17,7 +16,7 @@ from calib.errors import CalibError
 from calib.procedure.session import steps
 from calib.procedure.session.folder import Session, locked, open_session
 
-COMMAND = get_command(cli.app)
+COMMAND = cli.command_tree()
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,13 @@ from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of, with_payload
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.torque_rows import LINK, TorqueRows
+from calib.identification.closed_loop import controllers
+from calib.identification.closed_loop.simulation import Plant, Sensing, simulate
 from calib.identification.loop import LoopSettings
 from calib.identification.methods.method import IdentificationProblem
 from calib.identification.rows import make_case, observe
 from calib.robot import mdh
 from calib.rooms.cells import known_robots
-from calib.rooms.closed_loop import controllers
-from calib.rooms.closed_loop.simulation import Plant, Sensing, simulate
 
 RATE = 700.0
 ROWS = [

@@ -25,8 +25,24 @@ from calib.geometry.weighing import GeometricFit
 from calib.robot.calibrated import Deflection, Term
 from calib.robot.chain import Chain
 
-JUDGED_POSES = 20_000  # poses that models are judged by (our choice)
+# poses that models are judged by (our choice)
+JUDGED_POSES = 20_000
+# labels of residual parts that count in metres
 METRES = ("position", "consistency", "distance", "plane", "pixel")
+HARMONIC = ("cos", "sin")
+# first guess of a coefficient's magnitude, of harmonics that of the first order (our choice)
+FIRST_SIZE = 1e-4
+# rounds of the search for the ridges of a fold, and of all rows
+FOLD_ROUNDS = 8
+TOTAL_ROUNDS = 15
+# prior of a parameter without one [m, rad] (our choice)
+UNKNOWN_SIGMA = 10.0
+# how far a frame may be from where it is [m, rad] (our choice)
+FRAME_SIGMA = 1.0
+# error by covariance alone over the nominal residuals: beyond, a fold says nothing (our choice)
+MAX_BLIND_ERROR = 3.0
+# poses observed at once
+CHUNK = 1000
 
 
 def term_groups(terms: tuple[Term, ...]) -> np.ndarray:
@@ -35,12 +51,13 @@ def term_groups(terms: tuple[Term, ...]) -> np.ndarray:
     With a ridge per order the evidence switches most orders off and makes the rest too large, which shows only on
     distant rows; see `term_sizes` for the decrease with the order.
     """
-    keys: dict[tuple, int] = {}
+    numbers: dict[tuple, int] = {}
     result = []
     for term in terms:
-        paired = term.basis in ("cos", "sin")
-        key = (term.element, "turn" if paired else term.basis, term.source, 0 if paired else term.order)
-        result.append(keys.setdefault(key, len(keys)))
+        key = (term.element, term.basis, term.source, term.order)
+        if term.basis in HARMONIC:
+            key = (term.element, "turn", term.source, 0)
+        result.append(numbers.setdefault(key, len(numbers)))
     return np.array(result, dtype=int)
 
 
@@ -49,7 +66,11 @@ def term_sizes(terms: tuple[Term, ...]) -> np.ndarray:
 
     Our choice among constant, 1 / √order and 1 / order: the last predicts held-out regions of a UR5 and a Motoman best.
     """
-    return np.array([1e-4 / term.order if term.basis in ("cos", "sin") else 1e-4 for term in terms])
+    sizes = []
+    for term in terms:
+        order = term.order if term.basis in HARMONIC else 1
+        sizes.append(FIRST_SIZE / order)
+    return np.array(sizes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,9 +90,9 @@ class UnseenErrors:
         """Root mean square of the error's norm over all rows [m]."""
         return float(np.sqrt(max(self.squares.sum(), 0.0) / max(self.rows.sum(), 1)))
 
-    def wins(self, other: UnseenErrors) -> bool:
-        """Return whether the error is smaller than `other` in at least half of the folds."""
-        return bool(np.sum(self.squares < other.squares) * 2 >= len(self.squares))
+    def wins(self, errors: UnseenErrors) -> bool:
+        """Return whether the error is smaller than `errors` in at least half of the folds."""
+        return bool(np.sum(self.squares < errors.squares) * 2 >= len(self.squares))
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,25 +123,28 @@ class FoldStatistics:
     held_out: list[Gram]
     rows: np.ndarray
     total: Gram
-    _chosen: dict[bytes, np.ndarray] = field(default_factory=dict, init=False)
+    _widths_of_terms: dict[bytes, np.ndarray] = field(default_factory=dict, init=False)
 
     def error(self, terms: np.ndarray) -> UnseenErrors:
         """Return the errors on held-out rows of a model with the geometry and `terms` (whole groups)."""
-        index, chosen = self._columns(terms), self._widths(terms)
-        begin = np.where(chosen > 0.0, chosen, self.coordinates.sizes[index])  # where the search begins
+        index = self._columns(terms)
+        widths = self._widths(terms)
+        start = np.where(widths > 0.0, widths, self.coordinates.sizes[index])
         squares = []
-        for training, held in zip(self.training, self.held_out):
-            x = self._search(training, index, begin, 8).values
-            square = held.square.take(index, 0).take(index, 1)
-            squares.append(held.total - 2.0 * x @ held.cross[index] + x @ square @ x)
+        for training, held_out in zip(self.training, self.held_out):
+            x = self._search(training, index, start, FOLD_ROUNDS).values
+            square = held_out.square.take(index, 0).take(index, 1)
+            squares.append(held_out.total - 2.0 * x @ held_out.cross[index] + x @ square @ x)
         return UnseenErrors(np.array(squares), self.rows)
 
     def ridges(self, terms: np.ndarray) -> np.ndarray:
         """Return the most probable prior standard deviation of each term from all rows; 0 if the data drop the term."""
-        width = np.ones(int(self.groups.max(initial=-1)) + 1)
-        own = self.coordinates.groups[self._columns(terms)[self.rigid :]]
-        width[own] = (self._widths(terms) / self.coordinates.sizes[self._columns(terms)])[self.rigid :]
-        return width[self.groups[terms]] * self.sizes[terms]
+        columns = self._columns(terms)
+        factors = self._widths(terms) / self.coordinates.sizes[columns]
+        factor_of_group = np.ones(int(self.groups.max(initial=-1)) + 1)
+        group_of_column = self.coordinates.groups[columns[self.rigid :]]
+        factor_of_group[group_of_column] = factors[self.rigid :]
+        return factor_of_group[self.groups[terms]] * self.sizes[terms]
 
     def _columns(self, terms: np.ndarray) -> np.ndarray:
         return np.flatnonzero(np.isin(self.coordinates.groups, [-1, *self.groups[terms]]))
@@ -128,78 +152,111 @@ class FoldStatistics:
     def _widths(self, terms: np.ndarray) -> np.ndarray:
         """Return the most probable prior standard deviation of each geometry and term coordinate, from all rows."""
         key = terms.tobytes()
-        if key not in self._chosen:
+        if key not in self._widths_of_terms:
             index = self._columns(terms)
-            self._chosen[key] = self._search(self.total, index, self.coordinates.sizes[index], 15).ridge
-        return self._chosen[key]
+            estimate = self._search(self.total, index, self.coordinates.sizes[index], TOTAL_ROUNDS)
+            self._widths_of_terms[key] = estimate.ridge
+        return self._widths_of_terms[key]
 
-    def _search(self, data: Gram, index: np.ndarray, begin: np.ndarray, iterations: int) -> Relevance:
-        square, rigid = data.square.take(index, 0).take(index, 1), np.arange(self.rigid)
+    def _search(self, data: Gram, index: np.ndarray, start: np.ndarray, iterations: int) -> Relevance:
+        """Return the estimate of some coordinates; `start`: their prior standard deviations to begin with."""
+        square = data.square.take(index, 0).take(index, 1)
+        rigid = np.arange(self.rigid)
         square[rigid, rigid] += 1.0 / self.plausible**2
         _, groups = np.unique(self.coordinates.groups[index], return_inverse=True)
-        return relevance(
-            Gram(square, data.cross[index], data.total, data.rows),
-            groups - int(self.rigid > 0),
-            begin,
-            iterations,
-            SETTLED,
-            self.coordinates.counts[index],
-        )
+        if self.rigid:
+            groups = groups - 1
+        statistics = Gram(square, data.cross[index], data.total, data.rows)
+        return relevance(statistics, groups, start, iterations, SETTLED, self.coordinates.counts[index])
 
 
 def fold_statistics(
-    found: GeometricFit, measured: Sequence[PoseMeasurements], terms: tuple[Term, ...], reference: Chain, folds: Folds
+    fit: GeometricFit, measured: Sequence[PoseMeasurements], terms: tuple[Term, ...], reference: Chain, folds: Folds
 ) -> FoldStatistics:
     """Return the statistics of every fold at a fitted model, for its free parameters and `terms`.
 
     Args:
-        found: the model, fitted to all rows.
+        fit: the model, fitted to all rows.
         measured: the blocks it was fitted to.
         terms: E deflection terms on offer.
         reference: chain on which the terms' bases are evaluated.
         folds: partition of the rows.
     """
-    cell = replace(found.cell, deflection=Deflection(terms, np.zeros(len(terms)), reference))
-    free = np.concatenate([found.free, layout(cell).index("deflection")])
-    chosen = sampled(measured, JUDGED_POSES)
-    measured = [take(block, rows) for block, rows in zip(measured, chosen)]
-    folds = replace(folds, members=tuple(members[rows] for members, rows in zip(folds.members, chosen)))
-    weights = [each[rows] for each, rows in zip(found.row_weights(), chosen)]
-    rows_of = _Rows(cell, measured, free, found.used_sigmas(), weights, found.used_noises())
-    rigid, groups, sizes = len(found.free), term_groups(terms), term_sizes(terms)
+    cell = replace(fit.cell, deflection=Deflection(terms, np.zeros(len(terms)), reference))
+    free = np.concatenate([fit.free, layout(cell).index("deflection")])
+    sample = sampled(measured, JUDGED_POSES)
+    measured = [take(block, rows) for block, rows in zip(measured, sample)]
+    folds_of_rows = [members[rows] for members, rows in zip(folds.members, sample)]
+    weights = [weight[rows] for weight, rows in zip(fit.row_weights(), sample)]
+    rows = _Rows(cell, measured, free, fit.used_sigmas(), weights, fit.used_noises())
+    # with instruments alone a fold's training rows are all rows but its own, so that statistics subtract
     pooled = all(block.has_instrument for block in measured)
-    outside, shares, rows = list[list[Share]](), list[list[Share]](), []
+    held_out_shares = list[list[Share]]()
+    training_shares = list[list[Share]]()
+    counts = []
     for fold in range(folds.count):
-        inside = [np.flatnonzero(members == fold) for members in folds.members]
-        seen = {block.station for block, chosen in zip(measured, inside) if len(chosen) < len(block)}
-        moved = [block.has_instrument and block.station not in seen for block in measured]
-        own, count = rows_of.statistics(inside, moved)
-        shares.append(own)
-        rows.append(count)
+        held_out = [np.flatnonzero(members == fold) for members in folds_of_rows]
+        shares, count = rows.statistics(held_out, _placed_anew(measured, held_out))
+        held_out_shares.append(shares)
+        counts.append(count)
         if not pooled:
-            outside.append(rows_of.statistics([np.flatnonzero(members != fold) for members in folds.members])[0])
-    whole = list(chain(*shares)) if pooled else rows_of.statistics([np.arange(len(b)) for b in measured])[0]
+            training = [np.flatnonzero(members != fold) for members in folds_of_rows]
+            training_shares.append(rows.statistics(training)[0])
+    if pooled:
+        all_shares = list(chain(*held_out_shares))
+    else:
+        all_shares = rows.statistics([np.arange(len(block)) for block in measured])[0]
+    rigid = len(fit.free)
+    groups = term_groups(terms)
+    sizes = term_sizes(terms)
     coordinates = condensed(
-        lambda columns: sum(factor * own.square[np.ix_(columns, columns)] for own, factor, _ in whole),
+        lambda columns: sum(share.gram.square[np.ix_(columns, columns)] * share.whitening for share in all_shares),
         np.concatenate([np.full(rigid, -1), groups]).astype(int),
         np.concatenate([np.ones(rigid), sizes]),
     )
-    shares = [[(coordinates.gram(data), white, metric) for data, white, metric in own] for own in shares]
-    held_out, each = ([_sum(own, in_metres) for own in shares] for in_metres in (True, False))
-    total = sum(each[1:], each[0]) if pooled else coordinates.gram(_sum(whole))
-    training = [total - own for own in each] if pooled else [coordinates.gram(_sum(own)) for own in outside]
-    wide = plausible_deviation(found.cell, found.free) if found.prior is None else found.prior
-    plausible = np.where(np.isfinite(wide), wide, 10.0)
+    metric_sums = []
+    whitened_sums = []
+    for shares in held_out_shares:
+        condensed_shares = [share.condensed(coordinates) for share in shares]
+        metric_sums.append(_sum(condensed_shares, in_metres=True))
+        whitened_sums.append(_sum(condensed_shares))
+    if pooled:
+        total = sum(whitened_sums[1:], whitened_sums[0])
+        training_sums = [total - held_out for held_out in whitened_sums]
+    else:
+        total = coordinates.gram(_sum(all_shares))
+        training_sums = [coordinates.gram(_sum(shares)) for shares in training_shares]
+    width = fit.prior
+    if width is None:
+        width = plausible_deviation(fit.cell, fit.free)
     return FoldStatistics(
-        rigid, found.identified, groups, sizes, coordinates, plausible, training, held_out, np.array(rows), total
+        rigid=rigid,
+        identified=fit.identified,
+        groups=groups,
+        sizes=sizes,
+        coordinates=coordinates,
+        plausible=np.where(np.isfinite(width), width, UNKNOWN_SIGMA),
+        training=training_sums,
+        held_out=metric_sums,
+        rows=np.array(counts),
+        total=total,
     )
+
+
+def _placed_anew(measured: Sequence[PoseMeasurements], held_out: Sequence[np.ndarray]) -> list[bool]:
+    """Return for each block whether all rows of its station are held out, so that its placement is fitted to them."""
+    fitted_stations = set()
+    for block, rows in zip(measured, held_out):
+        if len(rows) < len(block):
+            fitted_stations.add(block.station)
+    return [block.has_instrument and block.station not in fitted_stations for block in measured]
 
 
 def blind_folds(nominal: GeometricFit, measured: Sequence[PoseMeasurements], folds: Folds) -> np.ndarray:
     """Return which folds cannot be predicted (folds,): the other rows do not determine the tool position in them.
 
     There the error by the covariance of geometry and frames (nominal residuals as noise, `plausible_deviation` as
-    prior) exceeds `max_blind_error` times those residuals.
+    prior) exceeds `MAX_BLIND_ERROR` times those residuals.
 
     Args:
         nominal: the nominal arm with its frames fitted to all rows.
@@ -209,38 +266,53 @@ def blind_folds(nominal: GeometricFit, measured: Sequence[PoseMeasurements], fol
     free = layout(nominal.cell).rigid_index
     sigmas: list[dict[str, float]] = [{} for _ in measured]
     for piece in nominal.pieces:
-        sigmas[piece.block][piece.part.label] = max(float(np.sqrt(np.mean(piece.part.value**2))), 1e-9)
-    frame_sigma = 1.0  # how far a frame may be from where it is [m, rad] (our choice)
-    known = np.minimum(plausible_deviation(nominal.cell, free), frame_sigma)
-    none = [None] * len(measured)
-    rows = _Rows(nominal.cell, measured, free, sigmas, nominal.row_weights(), none)
-    each, squares = [], []
+        rms = float(np.sqrt(np.mean(piece.part.value**2)))
+        sigmas[piece.block][piece.part.label] = max(rms, 1e-9)
+    prior = np.minimum(plausible_deviation(nominal.cell, free), FRAME_SIGMA)
+    scales = np.outer(prior, prior)
+    rows = _Rows(nominal.cell, measured, free, sigmas, nominal.row_weights(), [None] * len(measured))
+    statistics = []
+    mean_squares = []
+    noise = 0.0
     for fold in range(folds.count):
-        inside = [np.flatnonzero(members == fold) for members in folds.members]
-        own, count = rows.statistics(inside, [True] * len(measured))
-        held = _sum(own, in_metres=True)
-        each.append(_sum(own))
-        squares.append((held.square / max(count, 1.0), held.total / max(count, 1.0)))
-    total = sum(each[1:], each[0])
+        held_out = [np.flatnonzero(members == fold) for members in folds.members]
+        shares, count = rows.statistics(held_out, [True] * len(measured))
+        in_metres = _sum(shares, in_metres=True)
+        statistics.append(_sum(shares))
+        mean_squares.append(in_metres.square / max(count, 1.0))
+        noise += in_metres.total / max(count, 1.0)
+    noise /= folds.count
+    total = sum(statistics[1:], statistics[0])
     result = np.zeros(folds.count, dtype=bool)
-    noise = sum(square for _, square in squares) / folds.count
-    # error by covariance alone over the nominal residuals: beyond, a fold says nothing (our choice)
-    max_blind_error = 3.0
-    for fold, own in enumerate(each):
-        spread = np.linalg.inv(((total - own).square + np.diag(known**-2)) * np.outer(known, known))
-        predicted = float(np.sum(squares[fold][0] * (spread * np.outer(known, known))))
-        result[fold] = predicted > max_blind_error**2 * noise
+    for fold, held_out_statistics in enumerate(statistics):
+        information = (total - held_out_statistics).square + np.diag(prior**-2)
+        covariance = np.linalg.inv(information * scales) * scales
+        predicted = float(np.sum(mean_squares[fold] * covariance))
+        result[fold] = predicted > MAX_BLIND_ERROR**2 * noise
     return result
 
 
-Share = tuple[Gram, float, float]  # statistics of some rows, and factors that whiten them and put them in metres
+@dataclass(frozen=True, eq=False)
+class Share:
+    """Statistics of some rows, and factors that whiten them and put them in metres; 0 where they do not count."""
+
+    gram: Gram
+    whitening: float
+    metric: float
+
+    def condensed(self, coordinates: Condensed) -> Share:
+        """Return the statistics in other coordinates."""
+        return replace(self, gram=coordinates.gram(self.gram))
 
 
 def _sum(shares: Sequence[Share], in_metres: bool = False) -> Gram:
     """Return the statistics of all shares, whitened or in metres."""
-    factors = [metric if in_metres else white for _, white, metric in shares]
-    first, *rest = (own.scaled(factor) for (own, *_), factor in zip(shares, factors) if factor)
-    return sum(rest, first)
+    scaled = []
+    for share in shares:
+        factor = share.metric if in_metres else share.whitening
+        if factor:
+            scaled.append(share.gram.scaled(factor))
+    return sum(scaled[1:], scaled[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,49 +322,78 @@ class _Rows:
     cell: Installation
     measured: Sequence[PoseMeasurements]
     free: np.ndarray
-    scales: Sequence[dict[str, float]]
+    sigmas: Sequence[dict[str, float]]
     weights: Sequence[np.ndarray]
     noises: Sequence[Any]
 
     def statistics(
-        self, chosen: Sequence[np.ndarray], moved: Sequence[bool] | None = None
+        self, block_rows: Sequence[np.ndarray], placed_anew: Sequence[bool] | None = None
     ) -> tuple[list[Share], float]:
-        """Return the statistics of chosen rows, and the number of rows in metres.
+        """Return the statistics of some rows, and the number of rows in metres.
 
-        Of the blocks that are `moved` the station's placement is projected out of the statistics in metres.
+        Of the blocks that are `placed_anew` the station's placement is projected out of the statistics in metres.
         """
-        found, count = list[Share](), 0.0
-        chunk = 1000  # poses observed at once
-        for number, (block, rows) in enumerate(zip(self.measured, chosen)):
+        shares = list[Share]()
+        count = 0.0
+        for number, (block, rows) in enumerate(zip(self.measured, block_rows)):
+            projected = placed_anew is not None and placed_anew[number]
+            pieces = [rows]
+            if block.has_instrument:
+                pieces = np.array_split(rows, max(1, len(rows) // CHUNK))
             frames: list[np.ndarray] = []
-            apart, scales = moved is not None and moved[number], self.scales[number]
-            pieces = np.array_split(rows, max(1, len(rows) // chunk)) if block.has_instrument else [rows]
-            for piece in filter(len, pieces):
-                ready, weights = prepare(self.cell, [take(block, piece)])[0], self.weights[number][piece]
-                if separable(block) and not apart:
-                    divisors = repeat(1.0 / np.sqrt(weights[None]))
-                    for part, own in row_statistics(self.cell, ready, self.free, divisors):
-                        found.append((own, scales[part.label] ** -2.0, float(part.label in METRES)))
-                    count += float(weights.sum())  # each has one position
+            for piece in pieces:
+                if not len(piece):
                     continue
-                noise = self.noises[number].unweighted(len(piece)) if self.noises[number] else None
-                for bare in observe(self.cell, ready, self.free):
-                    part, weight = replace(bare, noise=noise), weights[bare.index]
-                    root = 1.0 / np.sqrt(weight)
-                    own = gram(*part.whitened(root * scales[part.label]))
-                    found.append((replace(own, rows=part.value.size), 1.0, 0.0))
-                    if part.label in METRES:
-                        residual, matrix = bare.whitened(root * part.per_length)
-                        count += float(weight.sum())
-                        if apart:
-                            frames.append(np.vstack([matrix.T, residual]))
-                        else:
-                            found.append((gram(residual, matrix), 0.0, 1.0))
+                if separable(block) and not projected:
+                    shares += self._separable_shares(number, piece)
+                    # each row has one position
+                    count += float(self.weights[number][piece].sum())
+                    continue
+                piece_shares, metric_parts = self._observed_shares(number, piece)
+                shares += piece_shares
+                for residual, matrix, weight in metric_parts:
+                    count += float(weight.sum())
+                    if projected:
+                        frames.append(np.vstack([matrix.T, residual]))
+                    else:
+                        shares.append(Share(gram(residual, matrix), 0.0, 1.0))
             if frames:
                 station = np.flatnonzero(np.isin(self.free, layout(self.cell).index("station")))
                 columns = project_out(np.concatenate(frames, axis=1), station)
-                found.append((gram(columns[-1], columns[:-1].T), 0.0, 1.0))
-        return found, count
+                shares.append(Share(gram(columns[-1], columns[:-1].T), 0.0, 1.0))
+        return shares, count
+
+    def _separable_shares(self, number: int, rows: np.ndarray) -> list[Share]:
+        """Return the statistics of positions or poses, of which whitened rows and rows in metres differ by a factor."""
+        block = prepare(self.cell, [take(self.measured[number], rows)])[0]
+        divisors = repeat(1.0 / np.sqrt(self.weights[number][rows][None]))
+        shares = []
+        for part, statistics in row_statistics(self.cell, block, self.free, divisors):
+            whitening = self.sigmas[number][part.label] ** -2.0
+            shares.append(Share(statistics, whitening, float(part.label in METRES)))
+        return shares
+
+    def _observed_shares(
+        self, number: int, rows: np.ndarray
+    ) -> tuple[list[Share], list[tuple[np.ndarray, np.ndarray, np.ndarray]]]:
+        """Return the statistics of whitened rows; and residual, W and weights of rows in metres."""
+        block = prepare(self.cell, [take(self.measured[number], rows)])[0]
+        weights = self.weights[number][rows]
+        noise = self.noises[number]
+        if noise:
+            noise = noise.unweighted(len(rows))
+        shares = []
+        metric_parts = []
+        for part in observe(self.cell, block, self.free):
+            weight = weights[part.index]
+            root = 1.0 / np.sqrt(weight)
+            residual, matrix = replace(part, noise=noise).whitened(root * self.sigmas[number][part.label])
+            statistics = replace(gram(residual, matrix), rows=part.value.size)
+            shares.append(Share(statistics, 1.0, 0.0))
+            if part.label in METRES:
+                residual, matrix = part.whitened(root * part.per_length)
+                metric_parts.append((residual, matrix, weight))
+        return shares, metric_parts
 
 
 def project_out(columns: np.ndarray, frames: np.ndarray) -> np.ndarray:

@@ -12,8 +12,14 @@ import numpy as np
 from calib.data.poses.measurements import Distances, PoseMeasurements, Sockets, take
 from calib.errors import UsageError, require
 
+# regions of the joint space, and folds that they are divided among (our choice)
 REGIONS = 20
 FOLDS = 5
+# parts of a fold that the other rows do not determine
+SCATTERED_FOLDS = 3
+# poses of which each may be held out alone
+MAX_SINGLE_POSES = 150
+NAMES = ("transfer", "regions", "random", "poses")
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,21 +46,26 @@ def transfer_folds(measured: Sequence[PoseMeasurements], seed: int = 0) -> Folds
     without an instrument: leave one file out. Several fixtures (groups of linked sockets, planes): leave some out. Else
     `REGIONS` regions of the joint space by k-means, in `FOLDS` folds, both fewer where there are few rows.
     """
-    stations = list(dict.fromkeys(block.station for block in measured if block.has_instrument))
+    stations = {block.station for block in measured if block.has_instrument}
     if len(stations) >= 2 and all(block.has_instrument for block in measured):
         return _folds_of("stations", [block.station for block in measured], measured)
-    if not stations and len({block.file for block in measured}) >= 2:
-        return _folds_of("files", [block.file for block in measured], measured)
-    if len(measured) == 1 and isinstance(measured[0], Sockets) and (fixtures := _fixtures(measured[0])) is not None:
-        return fixtures
+    files = [block.file for block in measured]
+    if not stations and len(set(files)) >= 2:
+        return _folds_of("files", files, measured)
+    if len(measured) == 1 and isinstance(measured[0], Sockets):
+        fixtures = _fixtures(measured[0])
+        if fixtures is not None:
+            return fixtures
     return region_folds(measured, seed=seed)
 
 
 def _folds_of(kind: str, names: Sequence[str], measured: Sequence[PoseMeasurements]) -> Folds:
     """Return folds that each hold out all blocks of one name; if there are too many names, some share a fold."""
-    each = list(dict.fromkeys(names))
-    count = min(len(each), 2 * FOLDS)
-    members = [np.full(len(block), each.index(name) % count) for block, name in zip(measured, names)]
+    distinct = list(dict.fromkeys(names))
+    count = min(len(distinct), 2 * FOLDS)
+    members = []
+    for block, name in zip(measured, names):
+        members.append(np.full(len(block), distinct.index(name) % count))
     return Folds(kind, count, tuple(members))
 
 
@@ -70,28 +81,39 @@ def divide(
         scattered: hold out every third row of a region instead of the region, if the other rows do not determine its
             tool.
     """
-    members, count = [np.array(fold) for fold in folds.members], 0
+    members = [np.array(fold) for fold in folds.members]
+    count = 0
     for fold in range(folds.count):
-        inside = [np.flatnonzero(each == fold) for each in folds.members]
-        if not blind[fold]:
-            new = [np.full(len(rows), 0) for rows in inside]
-        else:
-            chosen = [(take(block, rows), k) for k, (block, rows) in enumerate(zip(measured, inside)) if len(rows)]
-            new = [np.zeros(0, dtype=int) for _ in measured]
-            parts = [block for block, _ in chosen]
-            divided = random_folds(parts, 3, seed) if scattered else region_folds(parts, seed=seed)
-            for (_, k), fresh in zip(chosen, divided.members):
-                new[k] = fresh
-        for each, rows, fresh in zip(members, inside, new):
-            each[rows] = count + fresh
-        count += 1 + max(int(fresh.max(initial=0)) for fresh in new)
-    names = [
-        block.station if block.has_instrument else block.file
-        for block, fold in zip(measured, folds.members)
-        if blind[fold].any()
-    ]
-    kind = folds.kind if scattered or not blind.all() else "regions"
-    return Folds(kind, count, tuple(members), tuple(dict.fromkeys((*folds.blind, *names))))
+        fold_rows = [np.flatnonzero(fold_of_row == fold) for fold_of_row in folds.members]
+        parts = [np.zeros(len(rows), dtype=int) for rows in fold_rows]
+        if blind[fold]:
+            parts = _divided(measured, fold_rows, seed, scattered)
+        highest = 0
+        for fold_of_row, rows, part in zip(members, fold_rows, parts):
+            fold_of_row[rows] = count + part
+            highest = max(highest, int(part.max(initial=0)))
+        count += 1 + highest
+    names = list(folds.blind)
+    for block, fold_of_row in zip(measured, folds.members):
+        if blind[fold_of_row].any():
+            names.append(block.station if block.has_instrument else block.file)
+    kind = folds.kind
+    if blind.all() and not scattered:
+        kind = "regions"
+    return Folds(kind, count, tuple(members), tuple(dict.fromkeys(names)))
+
+
+def _divided(
+    measured: Sequence[PoseMeasurements], fold_rows: Sequence[np.ndarray], seed: int, scattered: bool
+) -> list[np.ndarray]:
+    """Return, for each block, the part of each row of a fold that is divided by region or at random."""
+    parts = [np.zeros(0, dtype=int) for _ in measured]
+    numbers = [number for number, rows in enumerate(fold_rows) if len(rows)]
+    blocks = [take(measured[number], fold_rows[number]) for number in numbers]
+    divided = random_folds(blocks, SCATTERED_FOLDS, seed) if scattered else region_folds(blocks, seed=seed)
+    for number, part in zip(numbers, divided.members):
+        parts[number] = part
+    return parts
 
 
 def region_folds(
@@ -102,33 +124,35 @@ def region_folds(
 
     q = np.concatenate([block.q for block in measured])
     spread = q.std(axis=0)
-    scaled = q[:, spread > 1e-9] / spread[spread > 1e-9]
+    moving = spread > 1e-9
+    scaled = q[:, moving] / spread[moving]
     regions = int(np.clip(len(q) // 12, 2, regions))
     count = min(folds, regions)
-    _, label = kmeans2(scaled, regions, rng=seed, minit="++", missing="warn")
-    order = {int(old): new for new, old in enumerate(np.argsort(-np.bincount(label, minlength=regions)))}
-    fold = np.array([order[int(k)] for k in label]) % count
-    members = np.split(fold, np.cumsum([len(block) for block in measured])[:-1])
-    return Folds("regions", count, tuple(_whole(block, rows) for block, rows in zip(measured, members)))
+    _, region = kmeans2(scaled, regions, rng=seed, minit="++", missing="warn")
+    # the largest regions go to different folds
+    by_size = np.argsort(-np.bincount(region, minlength=regions))
+    rank = np.empty(regions, dtype=int)
+    rank[by_size] = np.arange(regions)
+    fold = rank[region] % count
+    edges = np.cumsum([len(block) for block in measured])[:-1]
+    members = [_together(block, rows) for block, rows in zip(measured, np.split(fold, edges))]
+    return Folds("regions", count, tuple(members))
 
 
 def folds_by_name(name: str, measured: Sequence[PoseMeasurements], seed: int = 0) -> Folds:
     """Return folds by name: `transfer_folds`, `region_folds`, ten `random_folds`, or one fold per pose (``poses``).
 
     Raises:
-        UsageError: for another name, or for leaving out each of more than `max_station_poses` poses.
+        UsageError: for another name, or for leaving out each of more than `MAX_SINGLE_POSES` poses.
     """
-    max_station_poses = 150
-    if name == "poses" and sum(len(block) for block in measured) > max_station_poses:
-        raise UsageError(f"folds 'poses' hold out each pose once: at most {max_station_poses} rows; choose 'random'")
-    ways = {
-        "transfer": lambda: transfer_folds(measured, seed),
-        "regions": lambda: region_folds(measured, seed=seed),
-        "random": lambda: random_folds(measured, 10, seed),
-        "poses": lambda: random_folds(measured, None, seed),
-    }
-    require(name in ways, f"folds {name}: expected one of {', '.join(ways)}", UsageError)
-    return ways[name]()
+    if name == "poses" and sum(len(block) for block in measured) > MAX_SINGLE_POSES:
+        raise UsageError(f"folds 'poses' hold out each pose once: at most {MAX_SINGLE_POSES} rows; choose 'random'")
+    require(name in NAMES, f"folds {name}: expected one of {', '.join(NAMES)}", UsageError)
+    if name == "transfer":
+        return transfer_folds(measured, seed)
+    if name == "regions":
+        return region_folds(measured, seed=seed)
+    return random_folds(measured, 10 if name == "random" else None, seed)
 
 
 def random_folds(measured: Sequence[PoseMeasurements], folds: int | None = 10, seed: int = 0) -> Folds:
@@ -139,34 +163,39 @@ def random_folds(measured: Sequence[PoseMeasurements], folds: int | None = 10, s
     together.
     """
     members = []
+    count = 0
     for number, block in enumerate(measured):
-        _, unit = np.unique(block.together, return_inverse=True)
-        count = int(unit.max(initial=-1)) + 1
-        most = count if folds is None else min(folds, count)
-        order = np.random.default_rng([seed, number]).permutation(count)
-        members.append((order % most)[unit])
-    highest = max(int(fold.max(initial=0)) for fold in members) + 1
-    return Folds("poses" if folds is None else "random", highest, tuple(members))
+        _, pose = np.unique(block.together, return_inverse=True)
+        poses = int(pose.max(initial=-1)) + 1
+        block_folds = poses if folds is None else min(folds, poses)
+        order = np.random.default_rng([seed, number]).permutation(poses)
+        fold = (order % block_folds)[pose]
+        members.append(fold)
+        count = max(count, int(fold.max(initial=0)) + 1)
+    return Folds("poses" if folds is None else "random", count, tuple(members))
 
 
-def _whole(block: PoseMeasurements, fold: np.ndarray) -> np.ndarray:
+def _together(block: PoseMeasurements, fold: np.ndarray) -> np.ndarray:
     """Return the fold of each row, with both rows of a distance in one fold."""
     if not isinstance(block, Distances):
         return fold
-    _, first, inverse = np.unique(block.group, return_index=True, return_inverse=True)
-    return fold[first][inverse]
+    _, first, pair = np.unique(block.group, return_index=True, return_inverse=True)
+    return fold[first][pair]
 
 
 def _fixtures(block: Sockets) -> Folds | None:
     """Return folds of whole fixtures (sockets with known distances form one fixture); None for fewer than three."""
-    root = {int(group): int(group) for group in np.unique(block.group)}
-    for a, b, _ in block.links:
-        if a in root and b in root:
-            old, new = root[b], root[a]
-            root = {group: new if parent == old else parent for group, parent in root.items()}
-    names = sorted(set(root.values()))
-    if len(names) < 3:
+    groups = np.unique(block.group).tolist()
+    fixture = dict(zip(groups, groups))
+    for first, second, _ in block.links:
+        if first in fixture and second in fixture:
+            merged = fixture[second]
+            for group in groups:
+                if fixture[group] == merged:
+                    fixture[group] = fixture[first]
+    fixtures = sorted(set(fixture.values()))
+    if len(fixtures) < 3:
         return None
-    count = min(len(names), FOLDS)
-    fold = {group: names.index(parent) % count for group, parent in root.items()}
-    return Folds("fixtures", count, (np.array([fold[int(group)] for group in block.group]),))
+    count = min(len(fixtures), FOLDS)
+    fold = [fixtures.index(fixture[group]) % count for group in block.group.tolist()]
+    return Folds("fixtures", count, (np.array(fold),))

@@ -20,73 +20,105 @@ from calib.data.poses.measurements import PoseMeasurements, Positions
 from calib.errors import UsageError, one_of
 from calib.geometry.fit import fit, fit_with_prior, polish_frames
 from calib.geometry.installation import Installation
-from calib.geometry.model_choice.cross_validation import FoldStatistics, UnseenErrors, blind_folds, fold_statistics
+from calib.geometry.model_choice.cross_validation import (
+    HARMONIC,
+    FoldStatistics,
+    UnseenErrors,
+    blind_folds,
+    fold_statistics,
+)
 from calib.geometry.model_choice.folds import Folds, divide, transfer_folds
 from calib.geometry.observation import layout, prepare
 from calib.geometry.weighing import GeometricFit, Settings
 from calib.robot.calibrated import Deflection, Term
 from calib.robot.chain import Chain
 
+# an effect has to lower the error on held-out rows by this share (our choice)
+MIN_GAIN = 0.03
+# robust sigmas beyond which a row is not of this robot (our choice)
+MAX_RESIDUAL = 8.0
+# highest orders of harmonics: of a joint's encoder and gear, and of its axis' wobble
+MAX_ORDER = 60
+MAX_WOBBLE_ORDER = 2
+# harmonics of order k are offered to sets of at least this many poses times k (our choice)
+POSES_PER_ORDER = 8
+RIGID_MODELS = ("frames", "offsets", "geometry")
+NONE = np.array([], dtype=int)
 
-def _stiffness(chain: Chain, known: bool) -> list[Term]:
+Progress = Callable[[int, int, str], None]
+
+
+def _stiffness(chain: Chain, torques_known: bool) -> list[Term]:
     """Return the terms of joint deflection about the axis under gravity: by known torques, else fitted moments."""
-    names = chain.names
-    if known:
-        return [Term(names[k], "torque", j) for j, k in enumerate(chain.moving) if chain.joints[j].kind == "revolute"]
-    return [term for k in chain.moving if chain.elements[k].axis[0] == "r" for term in _sag(chain, int(k))]
+    terms: list[Term] = []
+    for joint, element in enumerate(chain.moving):
+        if torques_known and chain.joints[joint].kind == "revolute":
+            terms.append(Term(chain.names[element], "torque", joint))
+        elif not torques_known and chain.elements[element].axis[0] == "r":
+            terms += _sag(chain, int(element))
+    return terms
 
 
-def _bending(chain: Chain, known: bool) -> list[Term]:
+def _bending(chain: Chain, torques_known: bool) -> list[Term]:
     """Return the terms for tilt of each joint's axis under gravity, due to compliant bearings and links."""
+    terms: list[Term] = []
+    for number in _fixed_elements(chain):
+        if chain.elements[number].axis[0] == "r":
+            terms += _sag(chain, number)
+    return terms
+
+
+def _fixed_elements(chain: Chain) -> list[int]:
+    """Return the elements that no joint moves, without those behind the last joint."""
     moving = set(chain.moving.tolist())
-    places = [k for k, e in enumerate(chain.elements) if e.axis[0] == "r" and k not in moving and e.owner < chain.n]
-    return [term for k in places for term in _sag(chain, k)]
+    return [k for k, element in enumerate(chain.elements) if k not in moving and element.owner < chain.n]
 
 
-def _sag(chain: Chain, place: int) -> list[Term]:
-    element = chain.elements[place]
-    return [Term(element.name, "lever", i, a) for i in range(element.owner, chain.n) for a in range(3)]
+def _sag(chain: Chain, number: int) -> list[Term]:
+    """Return the terms of an element that turns under the weight of the links it carries, by link and axis."""
+    element = chain.elements[number]
+    links = range(element.owner, chain.n)
+    return [Term(element.name, "lever", link, axis) for link in links for axis in range(3)]
 
 
-def _coupling(chain: Chain, known: bool) -> list[Term]:
+def _coupling(chain: Chain, torques_known: bool) -> list[Term]:
     """Return the terms that correct a joint by its reading and its neighbours': gear ratio, coupled gears."""
-    names = chain.names
-    near = [(j, i) for j in range(chain.n) for i in (j - 1, j, j + 1) if 0 <= i < chain.n]
-    return [Term(names[chain.moving[j]], "joint", i) for j, i in near]
+    terms: list[Term] = []
+    for joint in range(chain.n):
+        name = chain.names[chain.moving[joint]]
+        sources = range(max(joint - 1, 0), min(joint + 2, chain.n))
+        terms += [Term(name, "joint", source) for source in sources]
+    return terms
 
 
-def _harmonics(chain: Chain, known: bool, max_order: int = 60) -> list[Term]:
-    """Return the terms sin k q_j, cos k q_j of each revolute joint, k = 1 … `max_order`: encoder and gear errors."""
-    return _turning(chain, [(chain.names[k], j) for j, k in enumerate(chain.moving)], max_order)
+def _harmonics(chain: Chain, torques_known: bool) -> list[Term]:
+    """Return the terms sin k q_j, cos k q_j of each revolute joint, k = 1 … `MAX_ORDER`: encoder and gear errors."""
+    terms: list[Term] = []
+    for joint, element in enumerate(chain.moving):
+        terms += _turning(chain, chain.names[element], joint, MAX_ORDER)
+    return terms
 
 
-def _wobble(chain: Chain, known: bool, max_order: int = 2) -> list[Term]:
+def _wobble(chain: Chain, torques_known: bool) -> list[Term]:
     """Return low harmonics of q_j on every other element of joint j: wobble of its axis."""
-    moving = set(chain.moving.tolist())
-    places = [(e.name, e.owner) for k, e in enumerate(chain.elements) if k not in moving and e.owner < chain.n]
-    return _turning(chain, places, max_order)
+    terms: list[Term] = []
+    for number in _fixed_elements(chain):
+        element = chain.elements[number]
+        terms += _turning(chain, element.name, element.owner, MAX_WOBBLE_ORDER)
+    return terms
 
 
-def _turning(chain: Chain, places: list[tuple[str, int]], max_order: int) -> list[Term]:
-    """Return the harmonic terms of given elements, in the angle of their revolute joint; none for prismatic joints."""
-    revolute = [(name, j) for name, j in places if chain.joints[j].kind == "revolute"]
-    orders = range(1, max_order + 1)
-    return [Term(name, basis, j, order) for name, j in revolute for order in orders for basis in ("cos", "sin")]
+def _turning(chain: Chain, name: str, joint: int, max_order: int) -> list[Term]:
+    """Return the harmonic terms of an element in the angle of a revolute joint; none for a prismatic joint."""
+    if chain.joints[joint].kind != "revolute":
+        return []
+    return [Term(name, basis, joint, order) for order in range(1, max_order + 1) for basis in HARMONIC]
 
 
 MODELS = CHOICES[1:]
-RIGID_MODELS = ("frames", "offsets", "geometry")
-NONE = np.array([], dtype=int)
 FAMILIES = (_stiffness, _bending, _coupling, _harmonics, _wobble)
 # by name: from a chain, and whether gravity torques are known, to terms
 EFFECTS: dict[str, Callable[[Chain, bool], list[Term]]] = dict(zip(MODELS[3:], FAMILIES, strict=True))
-
-
-MIN_GAIN = 0.03  # an effect has to lower the error on unseen rows by this share (our choice)
-
-MAX_RESIDUAL = 8.0  # robust sigmas beyond which a row is not of this robot (our choice)
-
-Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True)
@@ -122,6 +154,7 @@ class ModelSelection:
     Attributes:
         fit: the chosen model, fitted to all rows.
         nominal: the nominal arm with its frames fitted to all rows.
+        nominal_step: the ladder's step of this nominal arm.
         rigid: the best fit without effects, to all rows. The geometry in ``fit`` is valid only together with its
             effects, with which it is correlated; use this one without effects (for a URDF).
         rungs: all models tried, in order.
@@ -134,6 +167,7 @@ class ModelSelection:
 
     fit: GeometricFit
     nominal: GeometricFit
+    nominal_step: ModelStep
     rigid: GeometricFit
     rungs: tuple[ModelStep, ...]
     chosen: str
@@ -145,7 +179,11 @@ class ModelSelection:
     @property
     def cross_validated(self) -> float:
         """The error of the chosen model on held-out rows [m]: that of the last step kept."""
-        return ([rung.cross_validated for rung in self.rungs if rung.kept] or [np.inf])[-1]
+        error = np.inf
+        for rung in self.rungs:
+            if rung.kept:
+                error = rung.cross_validated
+        return error
 
     def rigid_fit(self, measured: Sequence[PoseMeasurements], settings: Settings, bare: Chain | None) -> GeometricFit:
         """Return the best fit without any joint corrections (for a URDF), not even those of the robot as it came.
@@ -188,21 +226,21 @@ def select_model(
         prior: standard deviations of the parameter vector about its nominal; infinite without a prior.
         seed: of the regions.
         folds: how unseen rows are set aside; None for the most demanding way (`calib.geometry.model_choice.folds`).
-        progress: called with (done, total, what).
+        progress: called with (done, total, task).
 
     Raises:
         UsageError: for a model that does not exist.
     """
     one_of(model, ("auto", *MODELS), "model", UsageError)
     climber = _Climber(
-        cell,
-        measured,
-        settings or Settings(),
-        NONE if fixed is None else fixed,
-        prior,
-        folds or transfer_folds(measured, seed),
-        progress or (lambda done, total, what: None),
-        seed,
+        cell=cell,
+        measured=measured,
+        settings=settings or Settings(),
+        fixed=NONE if fixed is None else fixed,
+        prior=prior,
+        transfer=folds or transfer_folds(measured, seed),
+        progress=progress or _no_progress,
+        seed=seed,
     )
     climber.rigid(model)
     if climber.settings.loss == "auto" and climber.best.outliers(MAX_RESIDUAL):
@@ -213,59 +251,81 @@ def select_model(
     return climber.result()
 
 
+def _no_progress(done: int, total: int, task: str) -> None:
+    """Show nothing."""
+
+
 @dataclass
 class _Climber:
-    """State of one model selection: the best model so far and the steps tried; see `select_model` for its fields."""
+    """State of one model selection: the best model so far and the steps tried; see `select_model` for its fields.
+
+    Attributes:
+        transfer: the partition of the rows that was asked for.
+        folds: that partition, with folds divided that the other rows do not determine.
+        nominal: the nominal arm with its frames fitted.
+        best: the best model so far, and `chosen` its name.
+        stiff: the best model without effects.
+        full: the fit of all rigid parameters, to which effects may be added; None without one.
+        error: rms error of the best rigid model on held-out rows [m].
+        rungs: steps tried; `nominal_step` the first of them.
+        offered: terms of the effects that were taken up.
+        ticks: calls of `progress` so far.
+    """
 
     cell: Installation
     measured: Sequence[PoseMeasurements]
     settings: Settings
     fixed: np.ndarray
     prior: np.ndarray | None
-    asked: Folds
+    transfer: Folds
     progress: Progress
     seed: int
 
     def __post_init__(self) -> None:
-        self.steps, self.folds = -1, self.asked
+        self.ticks = 0
+        self.folds = self.transfer
         self._tick("frames")
-        self.nominal = self.best = self.stiff = polish_frames(self.cell, self.measured, self.settings)
+        self.nominal = polish_frames(self.cell, self.measured, self.settings)
+        self.best = self.stiff = self.nominal
+        self.full: GeometricFit | None = None
+        self.chosen = "frames"
+        self.offered: tuple[Term, ...] = ()
         self.rungs: list[ModelStep] = []
-        self.chosen, self.offered = "frames", tuple[Term, ...]()
-        positions = all(isinstance(block, Positions) for block in self.measured)
-        if self.folds.kind == "stations" and not self.folds.blind and positions:
-            for scattered in (False, True):
-                blind = blind_folds(self.nominal, self.measured, self.folds)
-                if not blind.any():
-                    break
-                self.folds = divide(self.folds, blind, self.measured, self.seed, scattered)
+        measures_positions = all(isinstance(block, Positions) for block in self.measured)
+        if self.folds.kind == "stations" and not self.folds.blind and measures_positions:
+            self._divide_blind_folds()
+
+    def _divide_blind_folds(self) -> None:
+        """Divide the stations that the others do not determine by regions, and regions still undetermined by rows."""
+        for scattered in (False, True):
+            blind = blind_folds(self.nominal, self.measured, self.folds)
+            if not blind.any():
+                return
+            self.folds = divide(self.folds, blind, self.measured, self.seed, scattered)
 
     def rigid(self, model: str) -> None:
         """Fit the rigid geometry, or the frames or joint offsets alone where the user asks for these."""
-        table = layout(self.nominal.cell)
-        chosen = model if model in RIGID_MODELS else "geometry"
-        nominal_error = self._statistics(self.nominal, ()).error(NONE).rms
-        self.rungs.append(ModelStep("frames", self.nominal.identified, 1e3 * nominal_error, chosen == "frames"))
-        self.best, self.chosen, self.error = self.nominal, "frames", nominal_error
+        rigid_model = model if model in RIGID_MODELS else "geometry"
+        self.error = self._statistics(self.nominal, ()).error(NONE).rms
+        self.nominal_step = ModelStep("frames", self.nominal.identified, 1e3 * self.error, rigid_model == "frames")
+        self.rungs.append(self.nominal_step)
+        self.best = self.stiff = self.nominal
+        self.chosen = rigid_model
         self.full = None
-        if chosen != "frames":
-            self._tick(chosen)
-            candidates = table.rigid_index
-            if chosen == "offsets":
-                candidates = np.concatenate([self.nominal.cell.chain.driven, table.frame_index])
-            result = fit(
-                self.nominal.cell,
-                self.measured,
-                np.setdiff1d(candidates, self.fixed),
-                settings=self.settings,
-                prior=self.prior,
-            )
-            self.best, self.chosen = result, chosen
-            self.error = self._statistics(result, ()).error(NONE).rms
-            self.rungs.append(ModelStep(chosen, result.identified, 1e3 * self.error, True))
-        if chosen == "geometry":
-            self.full = self.best
+        if rigid_model == "frames":
+            return
+        self._tick(rigid_model)
+        table = layout(self.nominal.cell)
+        candidates = table.rigid_index
+        if rigid_model == "offsets":
+            candidates = np.concatenate([self.nominal.cell.chain.driven, table.frame_index])
+        candidates = np.setdiff1d(candidates, self.fixed)
+        self.best = fit(self.nominal.cell, self.measured, candidates, settings=self.settings, prior=self.prior)
         self.stiff = self.best
+        self.error = self._statistics(self.best, ()).error(NONE).rms
+        self.rungs.append(ModelStep(rigid_model, self.best.identified, 1e3 * self.error, True))
+        if rigid_model == "geometry":
+            self.full = self.best
 
     def effects(self, model: str) -> None:
         """Add effects to the geometry one by one; for an effect's name, use it and all before it.
@@ -274,124 +334,151 @@ class _Climber:
         """
         if self.full is None:
             return
-        terms_of = {name: self._terms(name) for name in EFFECTS}
-        terms = tuple(term for family in terms_of.values() for term in family)
+        terms: list[Term] = []
+        columns: dict[str, np.ndarray] = {}
+        for name in EFFECTS:
+            family = self._terms(name)
+            columns[name] = np.arange(len(terms), len(terms) + len(family))
+            terms += family
         self._tick("observation matrix")
-        statistics = self._statistics(self.full, terms)
-        edges = np.cumsum([0, *map(len, terms_of.values())])
-        columns = {name: np.arange(*edges[k : k + 2]) for k, name in enumerate(terms_of)}
-        rigid_rungs, names = tuple(self.rungs), list(EFFECTS)
+        statistics = self._statistics(self.full, tuple(terms))
+        rigid_rungs = tuple(self.rungs)
         if model == "auto":
-            effects = self._greedy(statistics, {name: columns[name] for name in names if terms_of[name]})
+            on_offer = {name: index for name, index in columns.items() if len(index)}
+            effects = self._greedy(statistics, on_offer)
         else:
+            names = list(EFFECTS)
             effects = names[: names.index(model) + 1]
-            selected = np.concatenate([columns[name] for name in effects])
-            self._tick(model)
-            self.rungs.append(_rung(statistics, model, selected, statistics.error(selected).rms))
         if not effects:
             return
+        index = np.concatenate([columns[name] for name in effects])
+        if model != "auto":
+            self._tick(model)
+            self.rungs.append(_rung(statistics, model, index, statistics.error(index).rms))
         self._tick("final fit")
-        selected = np.concatenate([columns[name] for name in effects])
-        corrected = self._final(self.full, statistics, terms, selected)
+        corrected = self._final(self.full, statistics, terms, index)
         status = corrected.solution.status
         if model == "auto" and not status.good and self.best.solution.status.good:
             note = f"did not converge ({status.name.lower()}): not used"
-            tried = self.rungs[len(rigid_rungs) :]
-            self.rungs = [*rigid_rungs, *(replace(rung, kept=False, note=note) for rung in tried)]
+            declined = [replace(rung, kept=False, note=note) for rung in self.rungs[len(rigid_rungs) :]]
+            self.rungs = [*rigid_rungs, *declined]
             return
-        self.best, self.chosen = corrected, " + ".join(["geometry", *effects])
-        self.offered = tuple(terms[k] for k in selected)
+        self.best = corrected
+        self.chosen = " + ".join(["geometry", *effects])
+        self.offered = tuple(terms[k] for k in index)
         last = max(k for k, rung in enumerate(self.rungs) if rung.kept)
         corrections = len(corrected.cell.deflection.terms)
         self.rungs[last] = replace(self.rungs[last], parameters=corrected.identified, corrections=corrections)
 
-    def _greedy(self, statistics: FoldStatistics, place: dict[str, np.ndarray]) -> list[str]:
+    def _greedy(self, statistics: FoldStatistics, columns: dict[str, np.ndarray]) -> list[str]:
         """Return the effects that reduce the cross-validation error, best first (greedy selection).
 
         Args:
-            place: indices of each effect's terms among those of the statistics.
+            columns: indices of each effect's terms among those of the statistics.
         """
-        kept: list[str] = []
+        effects: list[str] = []
+        index = NONE
         error = statistics.error(NONE)
-        while waiting := [name for name in place if name not in kept]:
-            tried = {}
-            where = {name: np.concatenate([place[other] for other in [*kept, name]]) for name in waiting}
-            for name in waiting:
+        while len(effects) < len(columns):
+            candidates = [name for name in columns if name not in effects]
+            indices = {}
+            errors = {}
+            for name in candidates:
                 self._tick(name)
-                tried[name] = statistics.error(where[name])
-            best = min(waiting, key=lambda name: tried[name].rms)
-            pays = tried[best].rms < error.rms * (1.0 - MIN_GAIN) and tried[best].wins(error)
-            for name in [best] if pays else waiting:
-                note = "" if pays else _declined(tried[name], error)
-                self.rungs.append(_rung(statistics, name, where[name], tried[name].rms, note))
+                indices[name] = np.concatenate([index, columns[name]])
+                errors[name] = statistics.error(indices[name])
+            best = min(candidates, key=lambda name: errors[name].rms)
+            pays = errors[best].rms < error.rms * (1.0 - MIN_GAIN) and errors[best].wins(error)
             if not pays:
+                for name in candidates:
+                    note = _declined(errors[name], error)
+                    self.rungs.append(_rung(statistics, name, indices[name], errors[name].rms, note))
                 break
-            kept.append(best)
-            error = tried[best]
-        return kept
+            self.rungs.append(_rung(statistics, best, indices[best], errors[best].rms))
+            effects.append(best)
+            index = indices[best]
+            error = errors[best]
+        return effects
 
     def _final(
-        self, rigid: GeometricFit, statistics: FoldStatistics, terms: tuple[Term, ...], where: np.ndarray
+        self, rigid: GeometricFit, statistics: FoldStatistics, terms: Sequence[Term], index: np.ndarray
     ) -> GeometricFit:
         """Return the fit of geometry and effects to all rows, each term with its most probable ridge."""
-        ridge, reference = statistics.ridges(where), self.nominal.cell.chain
-        picked = tuple(terms[k] for k in where[ridge > 0.0])
-        cell = replace(rigid.cell, deflection=Deflection(picked, np.zeros(len(picked)), reference))
-        free = np.concatenate([rigid.free, layout(cell).index("deflection")])
-        own = np.full(len(rigid.free), np.inf) if rigid.prior is None else rigid.prior
-        found = fit_with_prior(
+        reference = self.nominal.cell.chain
+        ridges = statistics.ridges(index)
+        alive = ridges > 0.0
+        alive_terms = tuple(terms[k] for k in index[alive])
+        cell = replace(rigid.cell, deflection=Deflection(alive_terms, np.zeros(len(alive_terms)), reference))
+        geometry_prior = rigid.prior
+        if geometry_prior is None:
+            geometry_prior = np.full(len(rigid.free), np.inf)
+        result = fit_with_prior(
             cell,
             prepare(cell, self.measured),
-            free,
-            np.concatenate([own, ridge[ridge > 0.0]]),
+            np.concatenate([rigid.free, layout(cell).index("deflection")]),
+            np.concatenate([geometry_prior, ridges[alive]]),
             settings=self.settings,
             nominal=replace(cell, chain=reference),
         )
-        return replace(found, start=rigid.start, split=rigid.split, candidates=rigid.candidates)
+        return replace(result, start=rigid.start, split=rigid.split, candidates=rigid.candidates)
 
-    def _terms(self, effect: str, poses_per_order: int = 8) -> list[Term]:
-        """Return the terms of an effect; harmonics only up to the order that the number of poses can identify.
+    def _terms(self, effect: str) -> list[Term]:
+        """Return the terms of an effect; harmonics only up to the order that the number of poses can identify."""
+        torques_known = all(block.torque is not None for block in self.measured)
+        poses = sum(len(block) for block in self.measured)
+        terms = EFFECTS[effect](self.nominal.cell.chain, torques_known)
+        max_order = poses // POSES_PER_ORDER
+        return [term for term in terms if term.basis not in HARMONIC or term.order <= max_order]
 
-        `poses_per_order`: harmonics of order k are offered to sets of at least 8 k poses (our choice).
-        """
-        known = all(block.torque is not None for block in self.measured)
-        highest = sum(len(block) for block in self.measured) // poses_per_order
-        terms = EFFECTS[effect](self.nominal.cell.chain, known)
-        return [term for term in terms if term.basis not in ("cos", "sin") or term.order <= highest]
+    def _statistics(self, fit: GeometricFit, terms: tuple[Term, ...]) -> FoldStatistics:
+        return fold_statistics(fit, self.measured, terms, self.nominal.cell.chain, self.folds)
 
-    def _statistics(self, found: GeometricFit, terms: tuple[Term, ...]) -> FoldStatistics:
-        return fold_statistics(found, self.measured, terms, self.nominal.cell.chain, self.folds)
-
-    def _tick(self, what: str) -> None:
-        self.steps += 1
-        self.progress(self.steps, 2 * len(MODELS), what)
+    def _tick(self, task: str) -> None:
+        self.progress(self.ticks, 2 * len(MODELS), task)
+        self.ticks += 1
 
     def result(self) -> ModelSelection:
-        loss = "none" if self.settings.loss == "auto" else self.settings.loss
-        known = self.nominal.cell.known.terms
+        """Return the model selected."""
+        loss = self.settings.loss
+        if loss == "auto":
+            loss = "none"
+        rigid_error = self.error
+        if self.nominal.cell.known.terms:
+            # the error is of an arm with the corrections that it came with
+            rigid_error = None
         return ModelSelection(
-            self.best,
-            self.nominal,
-            self.stiff,
-            tuple(self.rungs),
-            self.chosen,
-            self.folds,
-            loss,
-            self.offered,
-            None if known else self.error,
+            fit=self.best,
+            nominal=self.nominal,
+            nominal_step=self.nominal_step,
+            rigid=self.stiff,
+            rungs=tuple(self.rungs),
+            chosen=self.chosen,
+            folds=self.folds,
+            loss=loss,
+            offered=self.offered,
+            rigid_cross_validated=rigid_error,
         )
 
 
-def _declined(tried: UnseenErrors, error: UnseenErrors) -> str:
+def _declined(effect: UnseenErrors, error: UnseenErrors) -> str:
     """Return why an effect is not used: by how much it changes the error on held-out rows, and in how many folds."""
-    gain = 1.0 - tried.rms / error.rms
+    gain = 1.0 - effect.rms / error.rms
     if gain <= 0.0:
         return "no better on held-out rows: not used"
-    folds, better = len(error.squares), int(np.sum(tried.squares < error.squares))
+    folds = len(error.squares)
+    better = int(np.sum(effect.squares < error.squares))
     return f"{100.0 * gain:.0f} % better on held-out rows, in {better} of {folds} folds: not used"
 
 
-def _rung(statistics: FoldStatistics, effect: str, where: np.ndarray, rms: float, note: str = "") -> ModelStep:
+def _rung(statistics: FoldStatistics, effect: str, index: np.ndarray, rms: float, note: str = "") -> ModelStep:
     """Return the ladder step of an effect from its cross-validation error `rms` [m]; kept if `note` is empty."""
-    shrunk = int(np.sum(statistics.ridges(where) > 0.0))  # terms that the data do not switch off
-    return ModelStep(f"+ {effect}", statistics.identified + shrunk, 1e3 * rms, not note, note, shrunk)
+    # terms that the data do not switch off
+    corrections = int(np.sum(statistics.ridges(index) > 0.0))
+    return ModelStep(
+        model=f"+ {effect}",
+        parameters=statistics.identified + corrections,
+        cross_validated_mm=1e3 * rms,
+        kept=not note,
+        note=note,
+        corrections=corrections,
+    )

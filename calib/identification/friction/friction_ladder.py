@@ -33,7 +33,16 @@ from calib.identification.rows import Case, ObservationRows, observe_terms, tria
 from calib.identification.time_folds import CrossValidation, regimes
 from calib.records import Number, stored
 
-MIN_GAIN = 0.02  # a step has to lower a joint's rms error on unseen time by this share (our choice)
+MIN_GAIN = 0.02
+"""Share by which a step has to lower a joint's rms error on unseen time (our choice)."""
+MIN_BLOCKS_WON = 0.6
+"""Share of time blocks on which the error has to fall (our choice)."""
+MIN_SIGMA = 1e-9
+"""σ of a term below which its ridge holds it at zero."""
+MIN_EXPLAINED = 0.05
+"""Share of two joints' squared residuals that a coupling has to explain to be offered (our choice)."""
+COUPLING_ROWS = 3000
+"""Rows in which couplings are sought, about."""
 
 
 NAMES = ("auto", "standard", "coupling", *STEPS, "ripple")
@@ -85,20 +94,28 @@ class FrictionSelection:
 
     def fitted(self, sigma: np.ndarray) -> FrictionSelection:
         """Return the selection without the terms that the final fit switched off, from the σ (k,) of its terms."""
-        min_sigma = 1e-9  # σ of a term below which its ridge holds it at zero
-        off = tuple(one.name for one, own in zip(self.terms, sigma, strict=True) if own < min_sigma)
-        joints = {one.name: _joints(one) for one in self.terms if one.name not in off}
+        off = []
+        joints = {}
+        for term, term_sigma in zip(self.terms, sigma, strict=True):
+            if term_sigma < MIN_SIGMA:
+                off.append(term.name)
+            else:
+                joints[term.name] = _joints(term)
         steps = []
         for step in self.steps:
-            left = tuple(1 + joint for joint in _flat([joints[name] for name in step.terms if name in joints]))
-            if step.terms and left != step.kept_at_joints:
-                step = replace(step, kept_at_joints=left, note="" if left else "switched off by the final fit")
+            active = [joints[name] for name in step.terms if name in joints]
+            at = tuple(1 + joint for joint in _flat(active))
+            if step.terms and at != step.kept_at_joints:
+                note = "" if at else "switched off by the final fit"
+                step = replace(step, kept_at_joints=at, note=note)
             steps.append(step)
-        return replace(self, steps=tuple(steps), off=off)
+        return replace(self, steps=tuple(steps), off=tuple(off))
 
     @property
     def chosen(self) -> str:
-        return " + ".join(["standard", *(step.model[2:] for step in self.steps if step.kept and step.model[0] == "+")])
+        """Steps that are part of the model, as text: ``standard + load + stribeck``."""
+        names = [step.model[2:] for step in self.steps if step.kept and step.model[0] == "+"]
+        return " + ".join(["standard", *names])
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,141 +155,181 @@ class FrictionCandidates:
 
 
 def select_friction(
-    candidates: FrictionCandidates, wanted: str = "auto", progress: Progress | None = None
+    candidates: FrictionCandidates, friction: str = "auto", progress: Progress | None = None
 ) -> FrictionSelection:
     """Return the friction terms that reduce the error on held-out time, or all terms of a named step.
 
     Args:
-        wanted: ``auto``; ``standard`` (or ``ripple``, found later by `calib.identification.friction.ripple`): none;
+        candidates: the rows, and what the terms depend on.
+        friction: ``auto``; ``standard`` (or ``ripple``, found later by `calib.identification.friction.ripple`): none;
             a step's name: that step at all joints, nothing else.
+        progress: called with a few words at each step.
     """
-    say = progress or (lambda words: None)
-    one_of(wanted, NAMES, "friction", UsageError)
+    say = progress or (lambda message: None)
+    one_of(friction, NAMES, "friction", UsageError)
     say("friction: columns")
-    sensed = candidates.torque_rows.sensed
-    steps_tried = [name for name in NAMES[2:-1] if wanted == name or (wanted == "auto" and (sensed or name != "cable"))]
-    offered = {name: terms for name, terms in _terms(candidates, steps_tried).items() if terms or name == wanted}
-    every = [one for terms in offered.values() for one in terms]
-    validation, place = _cross_validation(candidates, offered, every)
-    bench = _Bench(candidates, validation, every, wanted != "auto")
+    names = [friction] if friction in NAMES[2:-1] else []
+    if friction == "auto":
+        sensed = candidates.torque_rows.sensed
+        names = [name for name in NAMES[2:-1] if sensed or name != "cable"]
+    offered = {name: terms for name, terms in _terms(candidates, names).items() if terms or name == friction}
+    all_terms = [term for terms in offered.values() for term in terms]
+    validation, columns_of = _cross_validation(candidates, offered, all_terms)
+    bench = _Bench(candidates, validation, all_terms, friction != "auto")
+
     say("friction: standard")
     error = bench.errors([])
     steps = [bench.trial("standard", [], error, tuple(range(candidates.n)))]
-    taken: list[int] = []
+    selected: list[int] = []
     waiting = list(offered)
-    for second in (False, True):
+    for second_round in (False, True):
         refused = []
         for name in waiting:
             say(f"friction: {name}")
-            columns = [k for k in place[name] if k not in taken]
-            found, new, at = bench.tried(taken, columns, error)
-            note = "" if at else "no improvement on held-out time: not used"
-            note = note if columns else "no joint shows a need for such terms in its residual: none tried"
-            shown = new if found else bench.errors([*taken, *columns])
-            names = tuple(bench.term(k).name for k in found)
-            steps.append(bench.trial(f"+ {name}", [*taken, *(found or columns)], shown, at, note, names))
-            if found:
-                taken, error = [*taken, *found], new
+            columns = [column for column in columns_of[name] if column not in selected]
+            accepted, accepted_error, at = bench.test(selected, columns, error)
+            note = ""
+            if not columns:
+                note = "no joint shows a need for such terms in its residual: none tried"
+            elif not at:
+                note = "no improvement on held-out time: not used"
+            if accepted:
+                selected = [*selected, *accepted]
+                error = accepted_error
+                term_names = tuple(bench.term(column).name for column in accepted)
+                steps.append(bench.trial(f"+ {name}", selected, error, at, note, term_names))
             else:
+                tested = [*selected, *columns]
+                steps.append(bench.trial(f"+ {name}", tested, bench.errors(tested), at, note))
                 refused.append(name)
-        if second or not taken or not refused:
+        if second_round or not selected or not refused:
             break
-        waiting = [name for name in refused if any(at > place[name][0] for at in taken)]
-    groups = validation.group[taken]
-    return FrictionSelection(tuple(map(bench.term, taken)), tuple(int(g) for g in groups), tuple(steps))
+        # A step that was refused may pay beside a later one that was accepted.
+        waiting = [name for name in refused if max(selected) > columns_of[name][0]]
+    terms = tuple(bench.term(column) for column in selected)
+    groups = tuple(validation.group[selected].tolist())
+    return FrictionSelection(terms, groups, tuple(steps))
 
 
 @dataclass(frozen=True, eq=False)
 class _Bench:
-    """Test of friction terms by cross-validation; the columns of all candidate terms, `every`, follow the base columns.
+    """Test of friction terms by cross-validation; the columns of all candidate terms follow the base columns.
 
     Attributes:
+        candidates: the rows, and what the terms depend on.
+        validation: of the base columns and all terms.
+        terms: all candidate terms.
         forced: whether terms are kept without a test.
     """
 
     candidates: FrictionCandidates
     validation: CrossValidation
-    every: Sequence[DriveTerm]
+    terms: Sequence[DriveTerm]
     forced: bool
 
     def term(self, column: int) -> DriveTerm:
-        return self.every[column - self.validation.data.parameters]  # counted from behind
+        """Return the term of a column."""
+        first = self.validation.data.parameters - len(self.terms)
+        return self.terms[column - first]
 
-    def errors(self, taken: Sequence[int], folds: int | None = None) -> np.ndarray:
+    def errors(self, columns: Sequence[int], folds: int | None = None) -> np.ndarray:
         """Return the squared errors (blocks, rows) of a model with the base columns and these columns."""
-        return self.validation.errors(self._with_base(taken), folds)
+        return self.validation.errors(self._with_base(columns), folds)
 
-    def _with_base(self, taken: Sequence[int]) -> np.ndarray:
-        return np.array([*range(self.validation.data.parameters - len(self.every)), *taken])
+    def _with_base(self, columns: Sequence[int]) -> np.ndarray:
+        base_count = self.validation.data.parameters - len(self.terms)
+        return np.array([*range(base_count), *columns])
 
-    def tried(
-        self, taken: list[int], columns: list[int], error: np.ndarray
+    def test(
+        self, selected: list[int], columns: list[int], error: np.ndarray
     ) -> tuple[list[int], np.ndarray, tuple[int, ...]]:
-        """Return the columns that pass the test, the errors of the model with them, and their joints."""
-        if not columns:  # a step asked for by name that has no terms here
+        """Return the columns that pass the test, the errors of the model with them, and their joints.
+
+        Args:
+            selected: columns of the model so far.
+            columns: columns to test.
+            error: (blocks, rows) squared errors of the model so far.
+        """
+        if not columns:
+            # A step that the settings name has no terms for this robot.
             return [], error, ()
-        joints = {k: _joints(self.term(k)) for k in columns}
-        everyone, side = tuple(sorted(set(joints.values()))), self.term(columns[0]).side
+        joints = {column: _joints(self.term(column)) for column in columns}
+        at = tuple(sorted(set(joints.values())))
         if self.forced:
-            return columns, self.errors([*taken, *columns]), _flat(everyone)
+            return columns, self.errors([*selected, *columns]), _flat(at)
 
-        def felt(squares: np.ndarray, own: tuple[int, ...]) -> np.ndarray:
-            """Return the whitened squared errors (blocks,) of the torque rows affected by terms of these joints."""
-            rows = [row for j in own for row in self.candidates.torque_rows.of_side(side, j, self.candidates.n)]
-            return np.sum(squares[:, rows] / self.validation.std[rows] ** 2, axis=1)
-
-        half, far = self.errors(taken, 2), self.validation.extrapolated(self._with_base(taken))
-        at, some = everyone, columns
-        for _ in range(2):  # with the joints left that it pays at, once more
-            both = [*taken, *some]
-            new, other, beyond = (
-                self.errors(both),
-                self.errors(both, 2),
-                self.validation.extrapolated(self._with_base(both)),
-            )
-            at = tuple(
-                own
-                for own in at
-                if _pays(felt(error, own), felt(new, own))
-                and _carries(felt(half, own), felt(other, own))
-                and _extrapolates(felt(far, own), felt(beyond, own))
-            )
-            some, before = [k for k in some if joints[k] in at], some
-            if not some:
+        halves_error = self.errors(selected, 2)
+        ranges_error = self.validation.extrapolated(self._with_base(selected))
+        side = self.term(columns[0]).side
+        accepted = columns
+        # Twice: the second time with the terms of those joints only at which they pay.
+        for _ in range(2):
+            model = [*selected, *accepted]
+            new_error = self.errors(model)
+            new_halves_error = self.errors(model, 2)
+            new_ranges_error = self.validation.extrapolated(self._with_base(model))
+            improved = []
+            for joint_set in at:
+                rows = self._rows(joint_set, side)
+                pays = _pays(self._whitened(error, rows), self._whitened(new_error, rows))
+                carries = pays and _carries(self._whitened(halves_error, rows), self._whitened(new_halves_error, rows))
+                if carries and _extrapolates(
+                    self._whitened(ranges_error, rows), self._whitened(new_ranges_error, rows)
+                ):
+                    improved.append(joint_set)
+            at = tuple(improved)
+            tested = accepted
+            accepted = [column for column in tested if joints[column] in at]
+            if not accepted:
                 return [], error, ()
-            if some == before:
-                break
-        else:
-            new = self.errors([*taken, *some])
-        return some, new, _flat(at)
+            if accepted == tested:
+                return accepted, new_error, _flat(at)
+        return accepted, self.errors([*selected, *accepted]), _flat(at)
+
+    def _rows(self, joints: tuple[int, ...], side: str) -> list[int]:
+        """Return the torque rows that terms of these joints act on."""
+        torque_rows = self.candidates.torque_rows
+        rows: list[int] = []
+        for joint in joints:
+            rows += torque_rows.of_side(side, joint, self.candidates.n)
+        return rows
+
+    def _whitened(self, squares: np.ndarray, rows: list[int]) -> np.ndarray:
+        """Return the squared errors (k,) of some rows together, each in units of its residuals."""
+        return np.sum(squares[:, rows] / self.validation.std[rows] ** 2, axis=1)
 
     def trial(
         self,
         name: str,
-        taken: Sequence[int],
+        columns: Sequence[int],
         error: np.ndarray,
         at: tuple[int, ...],
         note: str = "",
         terms: tuple[str, ...] = (),
     ) -> FrictionTrial:
         """Return the result of a step from its columns, its squared errors, and the joints at which it is kept."""
-        squares = (self.validation.data.factors[:, :, -1] ** 2).sum(axis=1).reshape(-1, self.validation.rows)
-        size = squares[: self.validation.blocks].sum(axis=0)  # Σ τ² per row over the judged blocks
+        blocks, rows = self.validation.blocks, self.validation.rows
+        squares = (self.validation.data.factors[:, :, -1] ** 2).sum(axis=1).reshape(-1, rows)
+        # Σ τ² per row over the blocks that are held out.
+        size = squares[:blocks].sum(axis=0)
         with np.errstate(divide="ignore", invalid="ignore"):
-            joints = 100.0 * np.sqrt(error.sum(axis=0) / size)
-        alike = np.setdiff1d(np.arange(len(size)), self.candidates.apart)
-        total = float(100.0 * np.sqrt(error[:, alike].sum() / size[alike].sum()))
-        percent, count = tuple(float(x) for x in np.nan_to_num(joints)), len(self._with_base(taken))
-        return FrictionTrial(name, count, total, percent, tuple(1 + joint for joint in at), note, terms)
+            percent = 100.0 * np.sqrt(error.sum(axis=0) / size)
+        same_unit = np.setdiff1d(np.arange(len(size)), self.candidates.apart)
+        total = 100.0 * np.sqrt(error[:, same_unit].sum() / size[same_unit].sum())
+        joints_percent = tuple(np.nan_to_num(percent).tolist())
+        kept_at_joints = tuple(1 + joint for joint in at)
+        parameters = len(self._with_base(columns))
+        return FrictionTrial(name, parameters, float(total), joints_percent, kept_at_joints, note, terms)
 
 
-def _joints(one: DriveTerm) -> tuple[int, ...]:
+def _joints(term: DriveTerm) -> tuple[int, ...]:
     """Return the joints whose torques a term acts on."""
-    return tuple(sorted({row for row, _ in one.acts}))
+    return tuple(sorted({row for row, _ in term.acts}))
 
 
-def _flat(at: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
-    return tuple(sorted({joint for own in at for joint in own}))
+def _flat(joint_sets: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
+    """Return all joints of some sets."""
+    return tuple(sorted({joint for joint_set in joint_sets for joint in joint_set}))
 
 
 def _carries(before: np.ndarray, after: np.ndarray) -> bool:
@@ -282,108 +339,138 @@ def _carries(before: np.ndarray, after: np.ndarray) -> bool:
 
 def _extrapolates(before: np.ndarray, after: np.ndarray) -> bool:
     """Return whether the geometric mean of a joint's squared errors in held-out ranges (k,) did not increase."""
-    used = (before > 0.0) & (after > 0.0)
-    return bool(np.log(after[used] / before[used]).mean() <= 0.0) if used.any() else True
+    positive = (before > 0.0) & (after > 0.0)
+    if not positive.any():
+        return True
+    return bool(np.log(after[positive] / before[positive]).mean() <= 0.0)
 
 
-def _pays(before: np.ndarray, after: np.ndarray, min_blocks_won: float = 0.6) -> bool:
-    """Return whether the squared errors per time block decreased by enough in total, and on enough blocks.
-
-    `min_blocks_won`: smallest share of blocks with a smaller error.
-    """
-    used = before > 0.0
-    if not used.any():
+def _pays(before: np.ndarray, after: np.ndarray) -> bool:
+    """Return whether the squared errors per time block decreased by enough in total, and on enough blocks."""
+    positive = before > 0.0
+    if not positive.any():
         return False
-    lower = float(np.mean(after[used] < before[used]))
-    return bool(after.sum() < (1.0 - MIN_GAIN) ** 2 * before.sum() and lower >= min_blocks_won)
+    won = float(np.mean(after[positive] < before[positive]))
+    decreased = after.sum() < (1.0 - MIN_GAIN) ** 2 * before.sum()
+    return bool(decreased and won >= MIN_BLOCKS_WON)
 
 
 def _terms(candidates: FrictionCandidates, names: Sequence[str]) -> dict[str, list[DriveTerm]]:
     """Return the candidate terms of steps for all joints."""
-    found = {name: _couplings(candidates) if name == "coupling" else [] for name in names}
-    for j in range(candidates.n):
-        v = np.concatenate([np.abs(case.motion.v[:, j]) for case in candidates.cases])
-        travel = float(np.ptp(np.concatenate([case.motion.q[:, j] for case in candidates.cases])))
-        seen = JointRange(float(candidates.v0[j]), float(np.quantile(v, 0.98)), float(v.max()), travel)
-        for name in found.keys() & STEPS.keys() if seen.peak > 0.0 else ():
-            found[name] += drives.offered(name, j, seen, bool(candidates.linear[j]))
-    return found
+    terms: dict[str, list[DriveTerm]] = {name: [] for name in names}
+    if "coupling" in terms:
+        terms["coupling"] = _couplings(candidates)
+    for joint in range(candidates.n):
+        speed = np.concatenate([np.abs(case.motion.v[:, joint]) for case in candidates.cases])
+        position = np.concatenate([case.motion.q[:, joint] for case in candidates.cases])
+        v0 = float(candidates.v0[joint])
+        joint_range = JointRange(v0, float(np.quantile(speed, 0.98)), float(speed.max()), float(np.ptp(position)))
+        if joint_range.peak <= 0.0:
+            continue
+        for name in names:
+            if name in STEPS:
+                terms[name] += drives.offered(name, joint, joint_range, bool(candidates.linear[joint]))
+    return terms
 
 
-def _couplings(candidates: FrictionCandidates, min_explained: float = 0.05) -> list[DriveTerm]:
+def _couplings(candidates: FrictionCandidates) -> list[DriveTerm]:
     """Return the coupling terms of neighbouring joints that explain residual torques of the standard model.
 
     A joint is in one coupling at most, and its motor turns with the sum or the difference, whichever explains more.
-
-    `min_explained`: of two joints' squared residuals, by a coupling that is offered (our choice).
     """
     n = candidates.n
     if not candidates.torque_rows.motors_alone:
         return []
-    matrix, target, factors, motion = _sampled(candidates)
-    rows = (matrix / candidates.std[:, None]).reshape(-1, matrix.shape[2])
-    basis = np.asarray(scipy.linalg.qr(rows, mode="economic")[0])
-    y = (target / candidates.std).ravel()
-    left = y - basis @ (basis.T @ y)
-    size = np.sum(left.reshape(-1, n) ** 2, axis=0)
-    found = []
+    matrix, target, weight, motion = _sampled(candidates)
+    whitened = (matrix / candidates.std[:, None]).reshape(-1, matrix.shape[2])
+    basis = np.asarray(scipy.linalg.qr(whitened, mode="economic")[0])
+    torque = (target / candidates.std).ravel()
+    residual = torque - basis @ (basis.T @ torque)
+    residual_squares = np.sum(residual.reshape(-1, n) ** 2, axis=0)
+    explaining = []
     for i, j in pairwise(range(n)):
         if candidates.linear[i] != candidates.linear[j] or (i, j) in candidates.coupled:
             continue
-        for weight in (1.0, -1.0):
-            terms = drives.coupled(i, j, float(candidates.v0[j]), f"{i + 1}.{j + 1}", weight)
+        for ratio in (1.0, -1.0):
+            terms = drives.coupled(i, j, float(candidates.v0[j]), f"{i + 1}.{j + 1}", ratio)
             columns = np.zeros((len(terms), n, len(target)))
             drives.fill(terms, columns, [*motion, None], np.zeros((0, len(target))))
-            white = (factors / candidates.std)[:, :, None]
-            seen = (columns.transpose(2, 1, 0) * white).reshape(-1, len(terms))
-            seen -= basis @ (basis.T @ seen)
-            rest = left - seen @ np.linalg.lstsq(seen, left, rcond=None)[0]
-            explained = float((left @ left - rest @ rest) / max(size[[i, j]].sum(), 1e-300))
-            if explained > min_explained:
-                found.append((explained, terms))
-    taken: list[DriveTerm] = []
-    for _, terms in sorted(found, key=lambda one: -one[0]):
-        if not {row for one in taken for row in _joints(one)} & set(_joints(terms[0])):
-            taken += [replace(one, linear=bool(candidates.linear[_joints(one)[0]])) for one in terms]
-    return taken
+            row_weight = (weight / candidates.std)[:, :, None]
+            white = (columns.transpose(2, 1, 0) * row_weight).reshape(-1, len(terms))
+            white -= basis @ (basis.T @ white)
+            values = np.linalg.lstsq(white, residual, rcond=None)[0]
+            remainder = residual - white @ values
+            pair_squares = max(residual_squares[[i, j]].sum(), 1e-300)
+            explained = float((residual @ residual - remainder @ remainder) / pair_squares)
+            if explained > MIN_EXPLAINED:
+                explaining.append((explained, terms))
+
+    selected: list[DriveTerm] = []
+    coupled_joints: set[int] = set()
+    for _, terms in sorted(explaining, key=lambda entry: -entry[0]):
+        if coupled_joints.isdisjoint(_joints(terms[0])):
+            selected += [replace(term, linear=bool(candidates.linear[_joints(term)[0]])) for term in terms]
+            for term in terms:
+                coupled_joints.update(_joints(term))
+    return selected
 
 
 def _sampled(candidates: FrictionCandidates) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]]:
-    """Return about `coupling_rows` training rows, weighed, (M, n, b) and (M, n), their weights, and q, v, a (n, M)."""
-    parts = []
-    for part, case in zip(candidates.rows, candidates.cases):
-        own = kept(case.motion.segment, candidates.decimator)
-        used = part.present.all(axis=1)
-        weighed = part.matrix * part.weight[:, :, None], part.target * part.weight, part.weight
-        parts.append([x[used] for x in (*weighed, *(getattr(case.motion, key)[own] for key in "qva"))])
-    matrix, target, weight, *motion = (np.concatenate(series) for series in zip(*parts))
-    coupling_rows = 3000  # of the rows that couplings are sought in, about
-    every = slice(None, None, max(1, len(target) // coupling_rows))
-    return matrix[every], target[every], weight[every], [series[every].T for series in motion]
+    """Return about `COUPLING_ROWS` rows, weighed, (M, n, b) and (M, n), their weights, and q, v, a (n, M)."""
+    matrices, targets, weights, motions = [], [], [], []
+    for rows, case in zip(candidates.rows, candidates.cases):
+        motion = case.motion
+        index = kept(motion.segment, candidates.decimator)
+        used = rows.present.all(axis=1)
+        matrices.append((rows.matrix * rows.weight[:, :, None])[used])
+        targets.append((rows.target * rows.weight)[used])
+        weights.append(rows.weight[used])
+        states = np.stack([motion.q[index], motion.v[index], motion.a[index]])
+        motions.append(states[:, used])
+    matrix, target, weight = np.concatenate(matrices), np.concatenate(targets), np.concatenate(weights)
+    step = max(1, len(target) // COUPLING_ROWS)
+    q, v, a = np.concatenate(motions, axis=1)[:, ::step]
+    return matrix[::step], target[::step], weight[::step], [q.T, v.T, a.T]
 
 
 def _cross_validation(
-    candidates: FrictionCandidates, offered: dict[str, list[DriveTerm]], every: list[DriveTerm]
+    candidates: FrictionCandidates, offered: dict[str, list[DriveTerm]], all_terms: list[DriveTerm]
 ) -> tuple[CrossValidation, dict[str, list[int]]]:
     """Return the cross-validation of base and all candidate columns, and the column indices of each step."""
-    rows = [
-        part.extend(every, observe_terms(every, case, candidates.decimator, load, candidates.torque_rows))
-        for part, case, load in zip(candidates.rows, candidates.cases, candidates.loads)
-    ]
-    data, prior = triangulate(rows), candidates.prior
-    base = data.parameters - len(every)
-    kinds = [(name, _joints(one)) for name, terms in offered.items() for one in terms]
-    steps = np.cumsum([one != other for one, other in pairwise(kinds[:1] + kinds)])  # a ridge per step and joints
-    group = np.concatenate([np.full(base, -1), steps]).astype(int)
-    place = {own: [base + k for k, (name, _) in enumerate(kinds) if name == own] for own in offered}
+    decimator, torque_rows = candidates.decimator, candidates.torque_rows
+    rows = []
+    for part, case, load in zip(candidates.rows, candidates.cases, candidates.loads):
+        term_columns = observe_terms(all_terms, case, decimator, load, torque_rows)
+        rows.append(part.extend(all_terms, term_columns))
+    data = triangulate(rows)
+
+    # A ridge per step and joints: the group's number grows where one of them changes.
+    base_count = data.parameters - len(all_terms)
+    groups = [-1] * base_count
+    columns_of: dict[str, list[int]] = {}
+    group = -1
+    previous = None
+    for name, terms in offered.items():
+        columns_of[name] = []
+        for term in terms:
+            kind = (name, _joints(term))
+            if kind != previous:
+                group += 1
+                previous = kind
+            columns_of[name].append(len(groups))
+            groups.append(group)
+    prior_rows = None
+    if candidates.prior is not None:
+        prior_rows = np.sqrt(TEMPERING) * candidates.prior.widened(len(all_terms))
     blocks = 1 + max(int(part.block.max(initial=-1)) for part in rows)
-    return CrossValidation(
+    validation = CrossValidation(
         data,
-        rows[0].target.shape[1],
-        blocks,
-        candidates.std,
-        candidates.inflation,
-        group,
-        prior and np.sqrt(TEMPERING) * prior.widened(len(every)),
-        regimes(rows, candidates.cases, candidates.decimator),
-    ), place
+        rows=rows[0].target.shape[1],
+        blocks=blocks,
+        std=candidates.std,
+        inflation=candidates.inflation,
+        group=np.array(groups),
+        prior=prior_rows,
+        regimes=regimes(rows, candidates.cases, decimator),
+    )
+    return validation, columns_of

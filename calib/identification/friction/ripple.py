@@ -22,7 +22,6 @@ is told apart, and whether an order stays at all, time blocks that are left out 
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 
@@ -32,10 +31,41 @@ from calib.dynamics.shapes import Joined
 from calib.identification.rows import Case, segments
 from calib.records import frozen
 
-COARSE, FINE = (10.0, 40.0), (10.0, 20.0, 30.0, 45.0, 65.0)  # nodes of the gains [Hz]
-MIN_ORDER, MAX_ORDER = 16, 800  # orders per turn
-TURNS = range(16, 321)  # motor turns per turn that a family may have
-RIDGES = (0.03, 0.1, 0.3, 1.0)  # of the mean information of a column
+COARSE = (10.0, 40.0)
+"""Nodes of the gains in the search [Hz]."""
+FINE = (10.0, 20.0, 30.0, 45.0, 65.0)
+"""Nodes of the gains of the final fit, where held-out time confirms them [Hz]."""
+MIN_ORDER, MAX_ORDER = 16, 800
+"""Orders per turn."""
+TURNS = range(16, 321)
+"""Motor turns per turn that a family may have."""
+RIDGES = (0.03, 0.1, 0.3, 1.0)
+"""Ridges that are tried, in units of the mean information of a column."""
+MAX_SAMPLES = 4_000
+"""Samples that the search uses, about."""
+MIN_TRAVEL = 0.1
+"""Travel from which a joint takes part [rad]."""
+MIN_COHERENCE = 0.6
+"""Share of a gear's own best coherence from which another gear's number of turns is taken instead (our choice)."""
+MIN_GAIN = 0.015
+"""Share of the fast residual's power on held-out blocks that a step of the search in families explains (our choice)."""
+MIN_FREE_GAIN = 0.04
+"""The same of free orders, where no family pays: 2 % of the rms (our choice)."""
+MIN_TOTAL_GAIN = 0.03
+"""The same of all waves together: 1.5 % of the rms (our choice)."""
+MAX_SETS = 12
+"""Sets of waves, at most."""
+MAX_FREE_SETS = 3
+"""Sets of free orders, at most."""
+SPEED_BINS = 4
+"""Bins of the speed per direction in which the coherence is summed."""
+CELLS = 8192
+"""Cells of a turn for the search."""
+TIME_BLOCKS = 8
+"""Blocks of time in all, about."""
+SKIPPED_START = 0.5
+"""Time excluded at the beginning of a recording, where the robot starts [s]."""
+
 
 Wave = tuple[int, int]  # joint whose gear turns, order per turn of it
 
@@ -77,7 +107,8 @@ class Ripple:
     @property
     def found(self) -> RippleWaves:
         """Record of the waves and of the share of the residual that they explain."""
-        return RippleWaves(self.joint + 1, tuple(GearWave(j + 1, order) for j, order in self.waves), self.share)
+        waves = tuple(GearWave(gear + 1, order) for gear, order in self.waves)
+        return RippleWaves(self.joint + 1, waves, self.share)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,26 +127,35 @@ def find_all(cases: Sequence[Case], residuals: Sequence[np.ndarray]) -> list[Rip
     Args:
         residuals: per case (N, n), torque not explained at the full rate; what is slow in it is taken off here.
     """
-    max_samples = 4_000  # of the search
-    step = max(1, sum(len(case.motion) for case in cases) // max_samples)
-    used = np.concatenate([case.motion.weight[::step] > 0.5 for case in cases])
-    block = np.where(used, np.concatenate([own[::step] for own in _blocks(cases)]), -1)
-    kept = block >= 0
-    if len(np.unique(block[kept])) < 2:
+    step = max(1, sum(len(case.motion) for case in cases) // MAX_SAMPLES)
+    case_blocks, positions, speeds = [], [], []
+    for case, numbers in zip(cases, _blocks(cases)):
+        motion = case.motion
+        valid = motion.weight[::step] > 0.5
+        case_blocks.append(np.where(valid, numbers[::step], -1))
+        positions.append(motion.q[::step])
+        speeds.append(motion.v[::step])
+    block = np.concatenate(case_blocks)
+    used = block >= 0
+    if len(np.unique(block[used])) < 2:
         return []
-    q, v = (np.concatenate([getattr(case.motion, name)[::step] for case in cases])[kept] for name in ("q", "v"))
-    min_travel = 0.1  # [rad] that a joint must travel
-    moving = tuple(int(j) for j in np.flatnonzero(np.ptp(q, axis=0) >= min_travel))
+    q = np.concatenate(positions)[used]
+    v = np.concatenate(speeds)[used]
+    moving = tuple(np.flatnonzero(np.ptp(q, axis=0) >= MIN_TRAVEL).tolist())
     if not moving:
         return []
-    track = GearTravel(q, v, block[kept], moving)
+    track = GearTravel(q, v, block[used], moving)
     fast = np.zeros(q.shape)
-    for j in moving:
-        parts = [_fast(case, residual[:, j])[::step] for case, residual in zip(cases, residuals)]
-        fast[:, j] = np.concatenate(parts)[kept]
+    for joint in moving:
+        parts = [_fast(case, residual[:, joint])[::step] for case, residual in zip(cases, residuals)]
+        fast[:, joint] = np.concatenate(parts)[used]
     turns = find_turns(track, fast)
-    found = [find(j, track, fast[:, j], turns) for j in moving]
-    return [one for one in found if one is not None]
+    ripples = []
+    for joint in moving:
+        ripple = find(joint, track, fast[:, joint], turns)
+        if ripple is not None:
+            ripples.append(ripple)
+    return ripples
 
 
 def find_turns(track: GearTravel, residuals: np.ndarray) -> dict[int, int]:
@@ -124,51 +164,68 @@ def find_turns(track: GearTravel, residuals: np.ndarray) -> dict[int, int]:
     Args:
         residuals: (N, n) fast parts.
     """
-    scores = {j: _lobes(coherence(track, j, residuals[:, j])) for j in track.moving}
-    every = sum(score / max(float(score.max()), 1e-300) for score in scores.values())
-    found = {j: int(np.argmax(score)) for j, score in scores.items()}
-    offered = sorted({*found.values(), int(np.argmax(every))}, key=lambda k: -float(np.asarray(every)[k]))
-    min_coherence = 0.6  # of a gear's own best coherence: a number of turns of other gears takes its place (our choice)
-    return {
-        j: TURNS[next((k for k in offered if scores[j][k] >= min_coherence * scores[j][own]), own)]
-        for j, own in found.items()
-    }
+    scores: dict[int, np.ndarray] = {}
+    total = np.zeros(len(TURNS))
+    for joint in track.moving:
+        score = _lobes(coherence(track, joint, residuals[:, joint]))
+        scores[joint] = score
+        total = total + score / max(float(score.max()), 1e-300)
+
+    # A gear takes the number of turns that is most coherent in all gears together, unless its own says otherwise.
+    best = {joint: int(np.argmax(score)) for joint, score in scores.items()}
+    candidates = sorted({*best.values(), int(np.argmax(total))}, key=lambda index: -float(total[index]))
+    turns = {}
+    for joint, score in scores.items():
+        index = best[joint]
+        for candidate in candidates:
+            if score[candidate] >= MIN_COHERENCE * score[best[joint]]:
+                index = candidate
+                break
+        turns[joint] = TURNS[index]
+    return turns
 
 
 def find(joint: int, track: GearTravel, residual: np.ndarray, turns: Mapping[int, int]) -> Ripple | None:
     """Return the ripple in a joint's torque; None if held-out time blocks do not confirm it.
 
     Args:
+        joint: from 0.
+        track: positions of the gears.
         residual: (N,) torque not explained, without its slow part, at the samples of `track`.
         turns: as of `find_turns`.
     """
     if not residual.any():
         return None
-    bench = _WaveCrossValidation(track, residual)
-    others = {j: _lobes(coherence(track, j, residual))[turns[j] - TURNS[0]] for j in turns if j != joint}
-    sources = [joint, *sorted(others, key=lambda j: -others[j])[:1]]
-    offers = [tuple((j, order) for order in one) for j in sources for one in _family(turns[j])]
-    min_gain = 0.015  # of the fast residual's power on left-out blocks, per step of the search in families
-    taken, best, ridge = _climb(bench, lambda rest: offers, min_gain)
-    max_free_sets = 3  # of free orders, at most
-    min_free_gain = 0.04  # and where no family pays: 2 % of its rms (our choices)
-    if not taken:
-        taken, best, ridge = _climb(bench, lambda rest: _free(track, joint, rest), min_free_gain, max_free_sets)
-    if not taken:
+    validation = _WaveCrossValidation(track, residual)
+
+    # Families of the joint's own gear, and of the one other gear that is felt most.
+    power = {gear: _lobes(coherence(track, gear, residual))[turns[gear] - TURNS[0]] for gear in turns if gear != joint}
+    gears = [joint]
+    if power:
+        gears.append(max(power, key=power.__getitem__))
+    families = []
+    for gear in gears:
+        families += [tuple((gear, order) for order in orders) for orders in _family(turns[gear])]
+    waves, best, ridge = _climb(validation, lambda remainder: families, MIN_GAIN)
+    if not waves:
+        waves, best, ridge = _climb(
+            validation, lambda remainder: _free(track, joint, remainder), MIN_FREE_GAIN, MAX_FREE_SETS
+        )
+    if not waves:
         return None
     nodes = COARSE
-    share, level = bench.judge(taken, FINE)
-    if share > best:
-        nodes, best, ridge = FINE, share, level
-    values = bench.fit(taken, nodes, ridge)[1]
-    return Ripple(joint, taken, _terms(joint, taken, nodes, track), frozen(values), best)
+    fine_share, fine_ridge = validation.explained_share(waves, FINE)
+    if fine_share > best:
+        nodes, best, ridge = FINE, fine_share, fine_ridge
+    _, values = validation.fit(waves, nodes, ridge)
+    return Ripple(joint, waves, _terms(joint, waves, nodes, track), frozen(values), best)
 
 
-def _family(n: int) -> tuple[tuple[int, ...], ...]:
-    """Return the orders per turn of the ripple of a gear with n motor turns per turn, in sets tested together."""
-    return tuple(
-        one for one in ((2 * n, 2 * n + 2), (n,), (3 * n,), (4 * n, 4 * n + 2, 4 * n + 4)) if one[-1] <= MAX_ORDER
-    )
+def _family(turns: int) -> tuple[tuple[int, ...], ...]:
+    """Return the orders per turn of a gear with so many motor turns per turn, in sets tested together."""
+    twice, four_times = 2 * turns, 4 * turns
+    sets = ((twice, twice + 2), (turns,), (3 * turns,), (four_times, four_times + 2, four_times + 4))
+    return tuple(orders for orders in sets if orders[-1] <= MAX_ORDER)
 
 
 def _terms(
@@ -176,16 +233,23 @@ def _terms(
 ) -> tuple[DriveTerm, ...]:
     """Return the drive terms of a joint's ripple, wave by wave; without `track`, the terms apply at all positions."""
     edges = (0.0, *nodes, np.inf)
-    found = []
-    for source, order in waves:
-        reach = (-np.inf, np.inf) if track is None else (track.q[:, source].min(), track.q[:, source].max())
-        label = f"{joint + 1}" if source == joint else f"{joint + 1}q{source + 1}"
-        shapes = ("sine_band", "Rs"), ("cosine_band", "Rc")
-        for (m, node), (way, sign), (shape, name) in product(enumerate(nodes), ((1.0, "+"), (-1.0, "-")), shapes):
-            settings = (order, *edges[m : m + 3], way, *reach)
-            title = f"{name}{label}.{order}{sign}{node:g}Hz"
-            found.append(DriveTerm(title, shape, ((joint, ((source, 1.0),)),), tuple(float(x) for x in settings)))
-    return tuple(found)
+    terms = []
+    for gear, order in waves:
+        lower, upper = -np.inf, np.inf
+        if track is not None:
+            lower, upper = track.q[:, gear].min(), track.q[:, gear].max()
+        label = f"{joint + 1}"
+        if gear != joint:
+            label = f"{joint + 1}q{gear + 1}"
+        acts = ((joint, ((gear, 1.0),)),)
+        for m, node in enumerate(nodes):
+            for direction, sign in ((1.0, "+"), (-1.0, "-")):
+                settings = (order, *edges[m : m + 3], direction, lower, upper)
+                numbers = tuple(float(setting) for setting in settings)
+                suffix = f"{label}.{order}{sign}{node:g}Hz"
+                terms.append(DriveTerm(f"Rs{suffix}", "sine_band", acts, numbers))
+                terms.append(DriveTerm(f"Rc{suffix}", "cosine_band", acts, numbers))
+    return tuple(terms)
 
 
 class _WaveCrossValidation:
@@ -195,100 +259,126 @@ class _WaveCrossValidation:
     """
 
     def __init__(self, track: GearTravel, residual: np.ndarray) -> None:
-        self._track, self.residual = track, residual
-        self._parts = [slice(a, b) for a, b in segments(track.block)]
-        self._made: dict[tuple[Wave, tuple[float, ...]], np.ndarray] = {}
+        self._track = track
+        self.residual = residual
+        self._blocks = [slice(start, stop) for start, stop in segments(track.block)]
+        self._columns: dict[tuple[Wave, tuple[float, ...]], np.ndarray] = {}
 
     def columns(self, waves: Sequence[Wave], nodes: tuple[float, ...]) -> np.ndarray:
         """Return the regressor columns (N, k) of the waves, in the order of `_terms`."""
         for wave in waves:
-            if (wave, nodes) not in self._made:
-                self._made[wave, nodes] = _columns(self._track, wave, nodes)
-        return np.hstack([self._made[wave, nodes] for wave in waves])
+            if (wave, nodes) not in self._columns:
+                self._columns[wave, nodes] = _columns(self._track, wave, nodes)
+        return np.hstack([self._columns[wave, nodes] for wave in waves])
 
-    def judge(self, waves: Sequence[Wave], nodes: tuple[float, ...]) -> tuple[float, float]:
+    def explained_share(self, waves: Sequence[Wave], nodes: tuple[float, ...]) -> tuple[float, float]:
         """Return the explained share of the power on held-out blocks, and the best ridge."""
         matrix, residual = self.columns(waves, nodes), self.residual
-        squares = [matrix[own].T @ matrix[own] for own in self._parts]
-        crosses = [matrix[own].T @ residual[own] for own in self._parts]
-        whole, cross = np.sum(squares, axis=0), np.sum(crosses, axis=0)
-        unit, power = float(np.trace(whole)) / len(whole), float(residual @ residual)
+        squares = np.array([matrix[block].T @ matrix[block] for block in self._blocks])
+        crosses = np.array([matrix[block].T @ residual[block] for block in self._blocks])
+        square = np.sum(squares, axis=0)
+        cross = np.sum(crosses, axis=0)
+        unit = float(np.trace(square)) / len(square)
         if unit == 0.0:
             return 0.0, RIDGES[-1]
-        left = (whole - np.array(squares)) + (np.array(RIDGES) * unit)[:, None, None, None] * np.eye(len(whole))
-        x = np.linalg.solve(left, (cross - np.array(crosses))[..., None])[..., 0]
-        gained = 2.0 * np.einsum("rfk,fk->r", x, crosses) - np.einsum("rfk,fkl,rfl->r", x, squares, x, optimize=True)
-        result = gained / power
-        best = int(np.argmax(result))
-        return float(result[best]), RIDGES[best]
+        # Estimates (ridges, blocks, k) without each block; what they leave of its power in comparison to zero.
+        ridges = (np.array(RIDGES) * unit)[:, None, None, None] * np.eye(len(square))
+        values = np.linalg.solve((square - squares) + ridges, (cross - crosses)[..., None])[..., 0]
+        linear = 2.0 * np.einsum("rfk,fk->r", values, crosses)
+        quadratic = np.einsum("rfk,fkl,rfl->r", values, squares, values, optimize=True)
+        share = (linear - quadratic) / float(residual @ residual)
+        best = int(np.argmax(share))
+        return float(share[best]), RIDGES[best]
 
     def fit(self, waves: Sequence[Wave], nodes: tuple[float, ...], ridge: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the residual after fitting the waves (N,), and their parameters (k,)."""
         matrix = self.columns(waves, nodes)
         square = matrix.T @ matrix
         unit = float(np.trace(square)) / len(square)
-        x = np.linalg.solve(square + ridge * unit * np.eye(len(square)), matrix.T @ self.residual)
-        return self.residual - matrix @ x, x
+        values = np.linalg.solve(square + ridge * unit * np.eye(len(square)), matrix.T @ self.residual)
+        return self.residual - matrix @ values, values
 
 
 def _columns(track: GearTravel, wave: Wave, nodes: Sequence[float]) -> np.ndarray:
     """Return the regressor columns (N, k) of a wave along a track, in the order of `_terms`."""
-    q, v = track.q[:, wave[0]], track.v[:, wave[0]]
-    seen = Joined(q, v, np.zeros_like(q))
-    return np.stack([one.values(seen) for one in _terms(wave[0], (wave,), nodes, None)], axis=1)
+    gear = wave[0]
+    q, v = track.q[:, gear], track.v[:, gear]
+    motion = Joined(q, v, np.zeros_like(q))
+    return np.stack([term.values(motion) for term in _terms(gear, (wave,), nodes, None)], axis=1)
 
 
-def coherence(track: GearTravel, source: int, residual: np.ndarray) -> np.ndarray:
+def coherence(track: GearTravel, gear: int, residual: np.ndarray) -> np.ndarray:
     """Return the coherence S(k) of a gear's integer orders k = 0, 1, ..., (cells / 2 + 1,); see the module."""
-    q, v = track.q[:, source], track.v[:, source]
+    q, v = track.q[:, gear], track.v[:, gear]
     speed = np.abs(v)
-    speed_bins = 4  # of the speed, per direction
-    edges = np.quantile(speed, np.linspace(0.1, 1.0, speed_bins + 1))[:-1]
-    bins = np.searchsorted(edges, speed, side="right") * np.where(v > 0.0, 1, -1)
-    cells = 8192  # of a turn, for the search
-    cell = np.floor(q / (2.0 * np.pi) * cells).astype(int) % cells
-    numbers, place = np.unique(track.block, return_inverse=True)
-    result = np.zeros(cells // 2 + 1)
-    for b in np.unique(bins[bins != 0]):
-        own = bins == b
-        index = place[own] * cells + cell[own]
-        waves = np.bincount(index, residual[own], len(numbers) * cells).reshape(len(numbers), cells)
-        spectrum = np.fft.rfft(waves, axis=1)
-        result += (np.abs(spectrum.sum(axis=0)) ** 2 - (np.abs(spectrum) ** 2).sum(axis=0)) / own.sum()
+    edges = np.quantile(speed, np.linspace(0.1, 1.0, SPEED_BINS + 1))[:-1]
+    direction = np.where(v > 0.0, 1, -1)
+    speed_bin = np.searchsorted(edges, speed, side="right") * direction
+    cell = np.floor(q / (2.0 * np.pi) * CELLS).astype(int) % CELLS
+    numbers, block = np.unique(track.block, return_inverse=True)
+    result = np.zeros(CELLS // 2 + 1)
+    # Bin 0 holds the slowest tenth, which is left out.
+    for number in np.unique(speed_bin[speed_bin != 0]):
+        selected = speed_bin == number
+        index = block[selected] * CELLS + cell[selected]
+        sums = np.bincount(index, residual[selected], len(numbers) * CELLS)
+        spectrum = np.fft.rfft(sums.reshape(len(numbers), CELLS), axis=1)
+        together = np.abs(spectrum.sum(axis=0)) ** 2
+        separately = (np.abs(spectrum) ** 2).sum(axis=0)
+        result += (together - separately) / selected.sum()
     return result
 
 
 def _lobes(power: np.ndarray) -> np.ndarray:
     """Return the sum of the coherence S at N, 2 N and 2 N + 2, for every N of `TURNS`."""
     turns = np.array(TURNS)
-    seen = np.maximum(power, 0.0)
-    return seen[turns] + seen[2 * turns] + seen[2 * turns + 2]
+    positive = np.maximum(power, 0.0)
+    return positive[turns] + positive[2 * turns] + positive[2 * turns + 2]
 
 
 def _climb(
-    bench: _WaveCrossValidation, offer: Callable[[np.ndarray], Sequence[tuple[Wave, ...]]], pays: float, most: int = 12
+    validation: _WaveCrossValidation,
+    candidates: Callable[[np.ndarray], Sequence[tuple[Wave, ...]]],
+    min_gain: float,
+    max_sets: int = MAX_SETS,
 ) -> tuple[tuple[Wave, ...], float, float]:
-    """Return the waves of a forward selection by held-out blocks, their explained share, and the ridge."""
-    taken: tuple[Wave, ...] = ()
-    best, ridge = 0.0, RIDGES[-1]
-    rest = bench.residual
-    for _ in range(most):
-        wanted = [tuple(dict.fromkeys((*taken, *more))) for more in offer(rest) if not set(more) <= set(taken)]
-        judged = [(*bench.judge(waves, COARSE), waves) for waves in wanted]
-        share, level, waves = max(judged, default=(0.0, ridge, taken), key=lambda one: one[0])
-        if share < best + pays:
+    """Return the waves of a forward selection by held-out blocks, their explained share, and the ridge.
+
+    Args:
+        validation: of the joint's residual.
+        candidates: function of the remaining residual (N,) to sets of waves.
+        min_gain: explained share of the residual's power that each set adds, at least.
+        max_sets: number of sets, at most.
+    """
+    selection: tuple[Wave, ...] = ()
+    selection_share, ridge = 0.0, RIDGES[-1]
+    remainder = validation.residual
+    for _ in range(max_sets):
+        best_share, best_ridge, best_waves = 0.0, ridge, selection
+        tested = False
+        for wave_set in candidates(remainder):
+            if set(wave_set) <= set(selection):
+                continue
+            waves = tuple(dict.fromkeys((*selection, *wave_set)))
+            share, level = validation.explained_share(waves, COARSE)
+            if not tested or share > best_share:
+                best_share, best_ridge, best_waves = share, level, waves
+            tested = True
+        if best_share < selection_share + min_gain:
             break
-        taken, best, ridge = waves, share, level
-        rest = bench.fit(taken, COARSE, ridge)[0]
-    min_total_gain = 0.03  # in all: 1.5 % of its rms
-    return (taken, best, ridge) if best >= min_total_gain else ((), 0.0, ridge)
+        selection, selection_share, ridge = best_waves, best_share, best_ridge
+        remainder, _ = validation.fit(selection, COARSE, ridge)
+    if selection_share < MIN_TOTAL_GAIN:
+        return (), 0.0, ridge
+    return selection, selection_share, ridge
 
 
-def _free(track: GearTravel, joint: int, rest: np.ndarray) -> list[tuple[Wave, ...]]:
+def _free(track: GearTravel, joint: int, residual: np.ndarray) -> list[tuple[Wave, ...]]:
     """Return the most coherent order of the joint's gear, and the most coherent pair of orders with difference two."""
-    power = coherence(track, joint, rest)
+    power = coherence(track, joint, residual)
     order = MIN_ORDER + int(np.argmax(power[MIN_ORDER : MAX_ORDER + 1]))
-    lower = MIN_ORDER + int(np.argmax(power[MIN_ORDER : MAX_ORDER - 1] + power[MIN_ORDER + 2 : MAX_ORDER + 1]))
+    pairs = power[MIN_ORDER : MAX_ORDER - 1] + power[MIN_ORDER + 2 : MAX_ORDER + 1]
+    lower = MIN_ORDER + int(np.argmax(pairs))
     return [((joint, order),), ((joint, lower), (joint, lower + 2))]
 
 
@@ -296,20 +386,20 @@ def _fast(case: Case, residual: np.ndarray) -> np.ndarray:
     """Return the high-pass part of a residual (N,), above twice the bandwidth of the motion, by segments."""
     motion = case.motion
     cutoff = min(2.0 * motion.cutoffs.dynamics, 0.4 * motion.rate)
-    slow = [low_pass(residual[a:b], motion.rate, cutoff) for a, b in segments(motion.segment)]
+    slow = [low_pass(residual[start:stop], motion.rate, cutoff) for start, stop in segments(motion.segment)]
     return residual - np.concatenate(slow)
 
 
-def _blocks(cases: Sequence[Case], blocks: int = 8, skipped_start: float = 0.5) -> list[np.ndarray]:
-    """Return the block number of each sample, contiguous, about `blocks` in all; -1 at the start of a recording.
-
-    `skipped_start`: excluded at the beginning, where the robot starts [s].
-    """
-    sizes = [len(case.motion) for case in cases]
-    own = [max(1 if len(cases) > 1 else 2, round(blocks * size / sum(sizes))) for size in sizes]
-    numbers, first = [], 0
-    for case, size, count in zip(cases, sizes, own):
+def _blocks(cases: Sequence[Case]) -> list[np.ndarray]:
+    """Return the block number of each sample: contiguous, about `TIME_BLOCKS`; -1 at the start of a recording."""
+    total = sum(len(case.motion) for case in cases)
+    min_count = 1 if len(cases) > 1 else 2
+    numbers = []
+    first = 0
+    for case in cases:
+        size = len(case.motion)
+        count = max(min_count, round(TIME_BLOCKS * size / total))
         number = first + np.arange(size) * count // size
-        numbers.append(np.where(case.motion.t < skipped_start, -1, number))
+        numbers.append(np.where(case.motion.t < SKIPPED_START, -1, number))
         first += count
     return numbers

@@ -6,6 +6,7 @@ from typing import Protocol
 import numpy as np
 import scipy.linalg
 
+from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.estimation.cone_program import bounded
 from calib.estimation.linear import LinearFit, ols, ridge, settled_std, wls
@@ -16,9 +17,14 @@ from calib.identification.prediction import Dynamics
 from calib.identification.prior import Prior, residual_inflation, weighing
 from calib.identification.time_folds import estimate
 
+SETTLING_ROUNDS = 2
+"""Rounds of weighing rows by the residuals that richer friction leaves."""
+MAX_COST = 1.2
+"""Factor on a joint's squared residuals above which braking friction is not what was recorded (our choice)."""
+
 
 class _Solve(Protocol):
-    def __call__(self, problem: IdentificationProblem, std: np.ndarray, tau: np.ndarray, /) -> LinearFit: ...
+    def __call__(self, problem: IdentificationProblem, std: np.ndarray, inflation: np.ndarray, /) -> LinearFit: ...
 
 
 @dataclass(frozen=True)
@@ -42,25 +48,31 @@ class LeastSquares(Method):
 
     def _estimate(self, problem: IdentificationProblem) -> MethodEstimate:
         prior = problem.prior if self.takes_prior else None
+        prior_rows = None
         if prior is None:
-            std, tau = weighed(problem)
-            fit = self.solve(problem, std, tau)
-            ridges = self.takes_prior and bool((problem.groups >= 0).any())
-            fit, _, known = _regularised(problem, None, std, tau) if ridges else (fit, None, None)
+            std, inflation = weighed(problem)
+            fit = self.solve(problem, std, inflation)
+            if self.takes_prior and bool((problem.groups >= 0).any()):
+                fit, _, prior_rows = _regularised(problem, None, std, inflation)
         else:
-            fit, known, std, tau = _settled(problem, prior)
-        return MethodEstimate(self.name, EstimateStatus.FOUND, fit, problem.pooled, std, tau, self.weighted, known)
+            fit, prior_rows, std, inflation = _settled(problem, prior)
+        return MethodEstimate(
+            self.name, EstimateStatus.FOUND, fit, problem.pooled, std, inflation, self.weighted, prior_rows
+        )
 
 
 def weighed(problem: IdentificationProblem) -> tuple[np.ndarray, np.ndarray]:
     """Return the standard deviation and variance inflation (rows,) of a problem's residuals by WLS without a prior."""
     pooled, noise = problem.pooled, problem.noise
-    std = settled_std(pooled) if noise is None else noise * wls(pooled, noise).estimate.residual_std
+    if noise is None:
+        std = settled_std(pooled)
+    else:
+        std = noise * wls(pooled, noise).estimate.residual_std
     return std, residual_inflation(problem.rows, wls(pooled, std).estimate.values)
 
 
 def _regularised(
-    problem: IdentificationProblem, prior: Prior | None, std: np.ndarray, tau: np.ndarray, tempering: float = 1.0
+    problem: IdentificationProblem, prior: Prior | None, std: np.ndarray, inflation: np.ndarray, tempering: float = 1.0
 ) -> tuple[LinearFit, np.ndarray, np.ndarray]:
     """Return the WLS fit with a prior of the base columns and with ridges of richer friction chosen by evidence.
 
@@ -68,20 +80,21 @@ def _regularised(
     The prior counts `tempering` times.
     """
     pooled, group = problem.pooled, problem.groups
-    own = problem.base.b
-    known = None
+    base_count = problem.base.b
+    prior_rows = None
     if prior is not None:
-        known = np.sqrt(tempering) * prior.widened(pooled.parameters - own)
-    ridges = estimate(pooled, std, tau, group, known)[1]
-    covariance = np.diag(np.where(group < 0, np.inf, np.maximum(ridges, 1e-12) ** 2))
+        prior_rows = np.sqrt(tempering) * prior.widened(pooled.parameters - base_count)
+    _, ridges = estimate(pooled, std, inflation, group, prior_rows)
+    variances = np.where(group < 0, np.inf, np.maximum(ridges, 1e-12) ** 2)
+    covariance = np.diag(variances)
     if prior is not None:
-        covariance[:own, :own] = prior.covariance / tempering
-    fit = ridge(pooled, np.zeros(len(ridges)), covariance, std * np.sqrt(tau))
+        covariance[:base_count, :base_count] = prior.covariance / tempering
+    fit = ridge(pooled, np.zeros(len(ridges)), covariance, std * np.sqrt(inflation))
     finite = np.isfinite(np.diag(covariance))
-    rows = np.zeros((int(finite.sum()), len(ridges)))
     root = np.linalg.cholesky(covariance[np.ix_(finite, finite)])
-    rows[:, np.flatnonzero(finite)] = scipy.linalg.solve_triangular(root, np.eye(len(root)), lower=True)
-    return fit, covariance, rows
+    whitened = np.zeros((len(root), len(ridges)))
+    whitened[:, np.flatnonzero(finite)] = scipy.linalg.solve_triangular(root, np.eye(len(root)), lower=True)
+    return fit, covariance, whitened
 
 
 def _settled(problem: IdentificationProblem, prior: Prior) -> tuple[LinearFit, np.ndarray, np.ndarray, np.ndarray]:
@@ -91,53 +104,61 @@ def _settled(problem: IdentificationProblem, prior: Prior) -> tuple[LinearFit, n
     and friction brakes, which the covariance does not know. Not so the friction of a joint that the data say it drives:
     that says that something is wrong, and is to be seen.
     """
-    pooled, noise = problem.pooled, problem.noise
-    std, tau, tempering = prior.first.std, prior.first.inflation, prior.tempering
-    fit, covariance, known = _regularised(problem, prior, std, tau, tempering)
-    rounds = 2  # of weighing rows by the residuals that richer friction leaves
-    for _ in range(rounds):
-        own = fit.estimate
-        std, tau = weighing(problem.rows, pooled, own.values, own.covariance, std, tau, noise)
-        fit, covariance, known = _regularised(problem, prior, std, tau, tempering)
-    values = _braking(problem, fit.estimate.values, std * np.sqrt(tau), known)
-    covariance[: problem.base.b, : problem.base.b] *= tempering
-    stated = ridge(pooled, np.zeros(len(values)), covariance, std * np.sqrt(tau))
-    return replace(stated, estimate=replace(stated.estimate, values=values)), known, std, tau
-
-
-def _braking(problem: IdentificationProblem, free: np.ndarray, std: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Return the estimate (p,) with dissipative friction, except at joints where the data contradict it."""
-    fastest = np.max([np.abs(case.motion.v).max(axis=0) for case in problem.cases], axis=0)
-    terms, pooled = problem.terms, problem.pooled
-    factor = retriangulate(np.vstack([combine(pooled, std), np.pad(known, ((0, 0), (0, 1)))]))
-    values = bounded(factor, braking(terms, fastest))
-    wrong = _driving(problem, free)
-    max_cost = 1.2  # of a joint's squared residuals, above which braking friction is not what was recorded (our choice)
-    if wrong.any():
-        wrong &= (
-            pooled.residual_squares(values)[-len(wrong) :] > max_cost * pooled.residual_squares(free)[-len(wrong) :]
+    pooled = problem.pooled
+    base_count = problem.base.b
+    std, inflation, tempering = prior.first.std, prior.first.inflation, prior.tempering
+    fit, covariance, prior_rows = _regularised(problem, prior, std, inflation, tempering)
+    for _ in range(SETTLING_ROUNDS):
+        estimated = fit.estimate
+        std, inflation = weighing(
+            problem.rows, pooled, estimated.values, estimated.covariance, std, inflation, problem.noise
         )
-    if not wrong.any():
+        fit, covariance, prior_rows = _regularised(problem, prior, std, inflation, tempering)
+    values = _braking(problem, fit.estimate.values, std * np.sqrt(inflation), prior_rows)
+    covariance[:base_count, :base_count] *= tempering
+    untempered = ridge(pooled, np.zeros(len(values)), covariance, std * np.sqrt(inflation))
+    fit = replace(untempered, estimate=replace(untempered.estimate, values=values))
+    return fit, prior_rows, std, inflation
+
+
+def _braking(problem: IdentificationProblem, free: np.ndarray, std: np.ndarray, prior_rows: np.ndarray) -> np.ndarray:
+    """Return the estimate (p,) with dissipative friction, except at joints where the data contradict it."""
+    terms, pooled = problem.terms, problem.pooled
+    fastest = np.max([np.abs(case.motion.v).max(axis=0) for case in problem.cases], axis=0)
+    factor = retriangulate(np.vstack([combine(pooled, std), np.pad(prior_rows, ((0, 0), (0, 1)))]))
+    values = bounded(factor, braking(terms, fastest))
+    contradicted = _driving(problem, free)
+    if contradicted.any():
+        n = len(contradicted)
+        braking_squares = pooled.residual_squares(values)[-n:]
+        free_squares = pooled.residual_squares(free)[-n:]
+        contradicted &= braking_squares > MAX_COST * free_squares
+    if not contradicted.any():
         return values
-    reversed_ = [one is not None and one.form.dissipative and any(wrong[row] for row, _ in one.acts) for one in terms]
-    kept = [None if skipped else one for one, skipped in zip(terms, reversed_)]
-    return bounded(factor, braking(kept, fastest))
+    constrained: list[DriveTerm | None] = []
+    for term in terms:
+        if term is not None and term.form.dissipative and any(contradicted[row] for row, _ in term.acts):
+            constrained.append(None)
+        else:
+            constrained.append(term)
+    return bounded(factor, braking(constrained, fastest))
 
 
 def _driving(problem: IdentificationProblem, values: np.ndarray) -> np.ndarray:
     """Return the mask (n,) of joints where friction of an unconstrained estimate adds energy."""
-    model, own = problem.model, problem.base.b
+    model, base = problem.model, problem.base
     if not isinstance(model, IdentificationModel) or not model.torque_rows.motors_alone:
         return np.zeros(0, dtype=bool)
-    richer = model.with_terms(*(one for one in problem.terms[own:] if one is not None))
-    standard = np.concatenate([problem.base.to_standard(values[:own]), values[own:]])
-    return driving(Dynamics(richer, standard), problem.cases)
+    richer_terms = [term for term in problem.terms[base.b :] if term is not None]
+    richer_model = model.with_terms(*richer_terms)
+    standard = np.concatenate([base.to_standard(values[: base.b]), values[base.b :]])
+    return driving(Dynamics(richer_model, standard), problem.cases)
 
 
 OLS = LeastSquares(
     "ols",
     "the torques of all joints are equally noisy; q, v and a are exact",
-    lambda problem, std, tau: ols(problem.pooled, tau),
+    lambda problem, std, inflation: ols(problem.pooled, inflation),
     weighted=False,
     description="least squares, equal weights",
     source="Gauss; Atkeson, An & Hollerbach 1986",
@@ -145,7 +166,7 @@ OLS = LeastSquares(
 WLS = LeastSquares(
     "wls",
     "each joint's torque noise is that of its residuals; q, v and a are exact",
-    lambda problem, std, tau: wls(problem.pooled, std, tau),
+    lambda problem, std, inflation: wls(problem.pooled, std, inflation),
     takes_prior=True,
     description="least squares, each joint weighted by its residuals",
     source="Gautier & Poignet 2001",

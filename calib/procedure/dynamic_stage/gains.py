@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from calib.data.schema import Joints
 from calib.data.signals.motion import Motion, make_motion
 from calib.dynamics.bodies import STANDARD
 from calib.errors import UsageError
-from calib.extensions import needed
+from calib.extensions import Point
 from calib.identification.gains import DriveGains, identify_gains, identify_relative_gains
 from calib.identification.identify import chain_states, common_decimator, find_base
 from calib.identification.identify_options import FileSettings, GainPair, IdentifyOptions
@@ -21,6 +22,9 @@ from calib.identification.rows import Case, make_case, observe, pool, triangulat
 from calib.identification.settings import IdentificationSettings, make_model
 from calib.robot.chain import Chain
 from calib.units import TORQUE, without_gains
+
+Gains = Callable[[Any, Sequence[Case], IdentificationSettings, Mapping[str, float], int | None], DriveGains]
+DRIVE_GAINS: Point[Gains] = Point("drive_gains", "gains of a robot that is no serial arm")
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +149,7 @@ def _identify(
     reference: int | None,
 ) -> DriveGains:
     if not isinstance(chain, Chain):
-        return needed("drive_gains")(chain, cases, settings, known, reference)
+        return DRIVE_GAINS.one()(chain, cases, settings, known, reference)
     model = make_model(chain, settings)
     base = find_base(model, cases, chain_states(chain, model, settings.seed))
     missing = [name for name in known if name not in [model.names[k] for k in base.kept]]

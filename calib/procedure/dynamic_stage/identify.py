@@ -13,14 +13,13 @@ import numpy as np
 
 from calib.data.signals.persistency import ExcitationReport, repeats, report_excitation
 from calib.errors import Finding, finding
-from calib.extensions import offered
-from calib.identification import geometry_uncertainty, torque_errors
 from calib.identification.friction.passivity import driven
 from calib.identification.identify import Identification, identify
 from calib.identification.loop import Controller, LoopDisagreement, Replay
-from calib.identification.possible.solve import Contradiction, contradiction
+from calib.identification.physical_consistency.solve import Contradiction, contradiction
 from calib.identification.prediction import Dynamics, Score, predict, score
 from calib.identification.rows import Case
+from calib.identification.uncertainty import geometry_uncertainty, torque_errors
 from calib.procedure.dynamic_stage import plain, plausibility
 from calib.procedure.dynamic_stage import verdict as judging
 from calib.procedure.dynamic_stage.hypotheses import gravity_hypotheses
@@ -198,7 +197,9 @@ def assess(
     relative = inputs.unit != TORQUE
     amperes = [finding("torques-relative", unit=without_gains(inputs.unit))] if relative else []
     replays, failure = {}, ""
-    for track in offered("track") if inputs.replayed and not relative else ():
+    if inputs.replayed and not relative:
+        from calib.procedure.dynamic_stage.replay import track
+
         replays, failure = track(inputs, dynamics, found.predictions, findings.controller)
     if any(one.inertia_added.any() for one in replays.values()):
         use = lines_of([finding("prediction-not-simulation")])

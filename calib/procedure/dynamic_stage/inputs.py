@@ -17,12 +17,12 @@ from calib.data.signals.filtering import SHARE
 from calib.data.signals.motion import FilterOptions, Motion, make_motion, with_reference
 from calib.data.signals.resampling import Resampled, resample
 from calib.errors import MeasurementError, NoPosture, UsageError, refuse_data, refused_as, suggestion
-from calib.extensions import offered
 from calib.identification.checks.recorded_motion import DesignedMotion, locate
 from calib.identification.friction.friction_ladder import NAMES
 from calib.identification.gains import DriveGains
 from calib.identification.identify_options import FileSettings, IdentifyOptions
-from calib.identification.methods.registry import METHODS
+from calib.identification.link_motion import with_link_motion
+from calib.identification.registry import METHODS
 from calib.identification.rows import Case, case_names, make_case
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.gains import FoundGains, find_gains
@@ -209,8 +209,8 @@ def _read_case(path: str, name: str, motion: Motion, options: IdentifyOptions, f
         case = make_case(
             name, motion, options.settings.torque_rows, gains=found.for_motion(motion, own), carried=own.payload
         )
-    for moved in offered("link_motion") if getattr(robot, "corrections", None) is not None else ():
-        case = moved(robot, case, options.settings)
+    if getattr(robot, "corrections", None) is not None:
+        case = with_link_motion(robot, case, options.settings)
     return case
 
 

@@ -15,14 +15,14 @@ import numpy as np
 from calib.data.signals.motion import Motion
 from calib.errors import Finding
 from calib.estimation.essential import EliminationStep
-from calib.identification.constraint_settings import Binding
 from calib.identification.friction.friction_ladder import FrictionTrial
 from calib.identification.friction.ripple import RippleWaves
 from calib.identification.gains import GainRecord
 from calib.identification.identify import Identification
 from calib.identification.loop import LoopMetrics, Replay
-from calib.identification.methods.registry import METHODS
+from calib.identification.methods.constraint_settings import Binding
 from calib.identification.prediction import Score, relative_error_sigma
+from calib.identification.registry import METHODS
 from calib.identification.rows import Case
 from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.identify import Assessment, IdentificationOutcome, ModelFindings

@@ -46,6 +46,7 @@ from calib.data.schema import Joints
 from calib.data.signals.resampling import resample
 from calib.errors import MeasurementError, UsageError, refused_as, require
 from calib.folders import METRICS
+from calib.result_kinds import refusal
 from calib.units import headings, motion_units
 from trajectories.bspline import bspline_family
 from trajectories.errors import BadInput
@@ -144,7 +145,7 @@ def read(folder: Path) -> Periodic:
         UsageError: if the file is missing or damaged.
     """
     path = folder / NAME
-    require(path.is_file(), f"{folder} has no {NAME}: give the folder that calib excite wrote", UsageError)
+    require(path.is_file(), refusal(folder, "recall"), UsageError)
     table = parse(TrajectoryFile, read_toml(path), str(path))
     coefficients = []
     for number, joint in enumerate(table.joint, 1):

@@ -10,10 +10,10 @@ import numpy as np
 from calib.config import Tables
 from calib.dynamics.base import columns_at_rest, standard_name
 from calib.errors import UsageError, one_of, refused_as, require
-from calib.extensions import offered
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.excitation.excited_model import ExcitedModel, check_held, read_model
+from calib.procedure.excitation.geometry_spread import geometry_spread
 from calib.procedure.excitation.limits import MotionLimits, read_motion_limits
 from calib.procedure.excitation.prior_motions import GeometrySpread, PriorMotions, designed_orders, read_prior
 from calib.procedure.excitation.settings import ExcitationSettings
@@ -125,8 +125,7 @@ def read_inputs(
     check_held(dynamics, known)
     noise = None if known.noise is None or after is not None else known.noise[dynamics.exact.joint_of_row]
     locked = _read_locked(settings.lock, chain, known.positions)
-    spreads = [find(robot, source, chain, dynamics, after) for find in offered("geometry_spread")]
-    spread = next(iter(spreads), None)
+    spread = geometry_spread(robot, source, chain, dynamics, after)
     prior = read_prior(settings.existing, dynamics, chain, after, noise, spread)
     columns = selected_columns(identifiable(dynamics, chain, locked, prior, noise), dynamics, settings, model)
     return ExcitationInputs(chain, known, dynamics, locked, columns, prior, spread, found.source or str(source))

@@ -21,7 +21,8 @@ parameters.json       names, units, values and covariances of geometry and dynam
                       with drives.csv) and by the identified model, at the samples of the ``torques_N.csv`` named there.
 README.txt            what each file is for, and the verdict on it.
 
-Masses are those of physically consistent bodies (`calib.identification.possible.solve`). What the torques do not
+Masses are those of physically consistent bodies (`calib.identification.physical_consistency.solve`). What the torques
+do not
 identify is regularised towards the masses of the robot's description: by the entropic (log-det) prior, which keeps off
 the border of the physically consistent; with ``--prior euclidean`` by its second order, which does not, so that a body
 may come out thin. A link to which others are fixed (flange, covers, sensors) is identified with them as one body: the
@@ -42,12 +43,13 @@ import numpy as np
 
 from calib import files
 from calib.errors import UsageError
-from calib.extensions import offered
 from calib.folders import OFFSETS, PARAMETERS, check_target, write_staged
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.export import geometry, identified
 from calib.procedure.export.geometry import results
 from calib.procedure.export.identified import ExportedPrediction, IdentifiedRobot
+from calib.procedure.export.joint_origins import joint_origins
+from calib.procedure.export.ur_kinematics import kinematics
 from calib.procedure.findings import Verdict, Verdicts
 from calib.procedure.kinematic_stage.folder import (
     CORRECTED_URDF,
@@ -93,7 +95,7 @@ class Export:
         fit: folder of the fit; None: identified dynamics alone.
         identified: folder of the identification; None: geometry alone.
         prior: regularisation of masses that the torques do not identify, see
-            `calib.identification.possible.solve.PRIORS`.
+            `calib.identification.physical_consistency.solve.PRIORS`.
         remark: for the head of files that a robot or a simulation moves by.
     """
 
@@ -177,12 +179,9 @@ def _offsets(export: Export, path: Path) -> list[str]:
 
 
 def _ur_kinematics(export: Export, path: Path) -> list[str]:
-    notes = []
-    for kinematics in offered("ur_kinematics"):
-        content, flange = kinematics(export.robot, FitFolder(export.fit or Path()).urdf)
-        files.write(path, _remarked(content.encode(), export.remark))
-        notes.append(f"{path.name}: for kinematics_params_file of ur_description" + (f"; {flange}" if flange else ""))
-    return notes
+    content, flange = kinematics(export.robot, FitFolder(export.fit or Path()).urdf)
+    files.write(path, _remarked(content.encode(), export.remark))
+    return [f"{path.name}: for kinematics_params_file of ur_description" + (f"; {flange}" if flange else "")]
 
 
 def _mjcf(export: Export, path: Path) -> list[str]:
@@ -209,8 +208,8 @@ def _drives(export: Export, path: Path) -> list[str]:
 
 def _joint_origins(export: Export, path: Path) -> list[str]:
     if export.urdf is not None:
-        for origins in offered("joint_origins"):
-            files.write(path, origins(text(export.urdf)[0], export.with_masses[0], str(export.urdf)))
+        origins = joint_origins(text(export.urdf)[0], export.with_masses[0], str(export.urdf))
+        files.write(path, origins)
     return []
 
 

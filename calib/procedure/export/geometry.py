@@ -9,6 +9,7 @@ from calib.errors import RobotError, UsageError
 from calib.folders import files_of
 from calib.procedure.dynamic_stage import folder as identification
 from calib.procedure.kinematic_stage.folder import OURS, FitFolder
+from calib.result_kinds import refusal
 from calib.robot import calibrated
 from calib.robot.calibrated import CalibratedChain, nominal_of
 from calib.robot.chain import Chain, random_joints
@@ -27,14 +28,18 @@ class NoSuchArm(UsageError):
     """Error for an arm of a kind that a file format does not support."""
 
 
-def read(folder: Path) -> CalibratedChain:
+def read(folder: Path, verb: str = "export") -> CalibratedChain:
     """Read the calibrated robot from the folder of a fit.
+
+    Args:
+        folder: of a fit.
+        verb: what asks, for the message (`calib.result_kinds.TAKES`).
 
     Raises:
         UsageError: where it is none, or does not say what it was calibrated from.
     """
     if not FitFolder(folder).robot.is_file():
-        raise UsageError(f"{folder} contains no robot.toml; give the folder written by `calib fit --out`")
+        raise UsageError(refusal(folder, verb))
     robot = calibrated.read(folder)
     if robot.nominal is None:
         raise UsageError(f"{folder}/robot.toml does not say which nominal robot it was calibrated from; fit again")

@@ -1,15 +1,15 @@
 """The dynamics section of reports, for the console output of an identification and for its report."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from calib.errors import UsageError
 from calib.folders import read_estimate
+from calib.identification.friction.ripple import RippleWaves
 from calib.identification.loop import (
     CAD,
     DAMPING,
@@ -22,6 +22,7 @@ from calib.identification.loop import (
     Replay,
 )
 from calib.identification.prediction import Score
+from calib.identification.rows import Case
 from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
@@ -34,10 +35,14 @@ from calib.records import read_rows
 from calib.robot.chain import Chain
 from calib.units import small
 
-MAX_RSD = 50.0  # RSD [%] from which on a parameter is not told from zero: two sigmas
-WORDS = 46  # letters of what a parameter holds that are printed
-SHOWN = 8  # geometric errors listed
-WHITE = 0.10  # share of autocorrelations beyond the bound below which a residual may be called white (0.05 if it is)
+# RSD [%] from which on a parameter cannot be distinguished from zero: two sigmas
+MAX_RSD = 50.0
+# letters of a parameter's expression that are printed
+EXPRESSION_LETTERS = 46
+# geometric errors listed
+MAX_EFFECTS = 8
+# share of autocorrelations beyond the bound below which a residual may be called white (0.05 if it is)
+WHITE = 0.10
 ERROR_NOTE = (
     "Of limit: of the torque that the robot's description allows. "
     "Error: 100 ‖τ - τ̂‖ / ‖τ‖ of the torque as recorded; in band: both low-passed to the band of the motion; moving, "
@@ -45,21 +50,27 @@ ERROR_NOTE = (
     "by no model of q, v, a. ACF outside: share of the residual's autocorrelations beyond the 95 % bounds of "
     "white noise; 5 % if it is white."
 )
-EFFECTS = (
-    page.Column("geometric error", "{0.element}", number=False),
-    page.Column("sigma", lambda one: small(one.sigma, one.unit)),
-    page.Column("moves most", "{0.parameter}", number=False),
-    page.Column("shift [its σ of torque noise]", "{0.shift_sigma:.2f}"),
-    page.Column("parameters moved", "{0.parameters_moved}"),
-    page.Column("torque rms [N m]", lambda one: f"{one.torque_rms or 0.0:.2g}"),
+ERROR_HEADER = (
+    "torque",
+    "rms error",
+    "of limit",
+    "error",
+    "in band",
+    "moving",
+    "standing",
+    "torque above band",
+    "ACF outside",
 )
-PARAMETERS = (
-    page.Column("parameter", "{0.name}", number=False),
-    page.Column("unit", "{0.unit}", number=False),
-    page.Column("value", "{0.value:.4g}"),
-    page.Column("σ", lambda row: "" if row.sigma is None else f"{row.sigma:.2g}"),
-    page.Column("RSD", lambda row: page.relative_sigma(row.rsd)),
-    page.Column("what it holds", lambda row: page.shortened(row.expression, WORDS), number=False),
+REFERENCE_NOTE = (
+    "Plain least squares: weighted, base parameters with Coulomb and viscous friction and offsets, no prior, no "
+    "selection, truncated at the data's rank. In motion, where joints stand for more than 5 % of the recording."
+)
+INTERVAL_HEADER = (
+    "torque",
+    "errors within the 95 % interval",
+    "median interval in motion",
+    "at rest",
+    "of the time extrapolated",
 )
 FED_FORWARD = {
     FEEDBACK: "feedback alone",
@@ -97,24 +108,21 @@ class DynamicReport:
     unseen: UnseenReport
 
 
-_UNSEEN: WeakKeyDictionary[IdentificationOutcome, UnseenReport] = WeakKeyDictionary()  # for console and folder
-
-
 def read(folder: Path) -> DynamicReport:
     """Read the results of the steps identify and predict.
 
     Raises:
         UsageError: if it is missing or made by another version.
     """
-    effects = folder / geometry_tables.EFFECTS
+    identification = IdentificationFolder(folder)
+    effects_file = folder / geometry_tables.EFFECTS
     try:
-        place = IdentificationFolder(folder)
-        return DynamicReport(
-            place.metrics(),
-            read_estimate(folder, IdentifiedParameter),
-            read_rows(geometry_tables.GeometricEffect, effects) if effects.exists() else (),
-            place.judged,
-        )
+        metrics = identification.metrics()
+        estimate = read_estimate(folder, IdentifiedParameter)
+        effects: tuple[geometry_tables.GeometricEffect, ...] = ()
+        if effects_file.exists():
+            effects = read_rows(geometry_tables.GeometricEffect, effects_file)
+        return DynamicReport(metrics, estimate, effects, identification.judged)
     except (OSError, ValueError) as error:
         raise UsageError(f"{folder}: {error}; identify again: calib redo … identify") from error
 
@@ -124,16 +132,23 @@ def read_lines(inputs: IdentificationInputs) -> list[str]:
     chain = inputs.chain
     lines = [str(inputs.robot)]
     if isinstance(chain, Chain):
-        how = "calibrated" if inputs.robot.moved else "nominal geometry"
-        lines = [f"robot {chain.name}: {chain.n} joints, {chain.base} to {chain.tip}, {how}"]
-    for case in (*inputs.cases, *inputs.unseen):
-        motion = case.motion
-        role = "unseen" if any(case is other for other in inputs.unseen) else "to learn from"
-        load = f", carrying {', '.join(case.carried)}" if case.carried else ""
-        lines.append(
-            f"{case.name.rstrip(':')}: {case.duration:.1f} s at {motion.rate:.4g} Hz, {motion.kind}{load}, {role}"
-        )
-    return [*lines, *(f"  {note}".replace(":: ", ": ") for note in inputs.notes)]
+        geometry = "calibrated" if inputs.robot.moved else "nominal geometry"
+        lines = [f"robot {chain.name}: {chain.n} joints, {chain.base} to {chain.tip}, {geometry}"]
+    lines += [_recording_line(case, "to learn from") for case in inputs.cases]
+    lines += [_recording_line(case, "unseen") for case in inputs.unseen]
+    lines += [f"  {page.single_colons(note)}" for note in inputs.notes]
+    return lines
+
+
+def _recording_line(case: Case, role: str) -> str:
+    """Return the line on a recording: name, duration, rate, kind of motion, payload, and what it is used for."""
+    motion = case.motion
+    # a recording cut as log.npz@10: ends with a colon
+    name = case.name.rstrip(":")
+    load = ""
+    if case.carried:
+        load = f", carrying {', '.join(case.carried)}"
+    return f"{name}: {case.duration:.1f} s at {motion.rate:.4g} Hz, {motion.kind}{load}, {role}"
 
 
 def of_outcome(outcome: IdentificationOutcome, folder: Path | None = None) -> DynamicReport:
@@ -142,11 +157,14 @@ def of_outcome(outcome: IdentificationOutcome, folder: Path | None = None) -> Dy
     Args:
         folder: written for it, of which its parameters are read; None: without them.
     """
-    effects = () if outcome.carried is None else geometry_tables.effects(outcome.carried)
-    estimate = () if folder is None else read_estimate(folder, IdentifiedParameter)
-    if outcome not in _UNSEEN:
-        _UNSEEN[outcome] = UnseenReport.of(outcome.inputs, outcome)
-    return DynamicReport(record_of(outcome), estimate, tuple(effects), _UNSEEN[outcome])
+    effects: Sequence[geometry_tables.GeometricEffect] = ()
+    if outcome.carried is not None:
+        effects = geometry_tables.effects(outcome.carried)
+    estimate: tuple[IdentifiedParameter, ...] = ()
+    if folder is not None:
+        estimate = read_estimate(folder, IdentifiedParameter)
+    unseen = UnseenReport.of(outcome.inputs, outcome)
+    return DynamicReport(record_of(outcome), estimate, tuple(effects), unseen)
 
 
 def outcome_section(outcome: IdentificationOutcome) -> page.Section:
@@ -155,8 +173,8 @@ def outcome_section(outcome: IdentificationOutcome) -> page.Section:
 
 
 def report_section(
-    found: DynamicReport,
-    drawn: Mapping[str, page.Picture],
+    report: DynamicReport,
+    figures: Mapping[str, page.Picture],
     exported: Sequence[str] = (),
     tolerance: float = 0.0,
     delivered: float | None = None,
@@ -164,44 +182,67 @@ def report_section(
     """Return the section of a report: errors on unseen motion, torques, excitation, and parameters.
 
     Args:
-        drawn: figures by name (`dynamics_figures.captioned`); those that are not there are left out.
+        figures: by name (`dynamics_figures.captioned`); missing ones are left out.
         exported: what the export had to say.
         tolerance: largest error of the torque on unseen motion that is good enough [%]; 0: none.
         delivered: error of the exported robot there [%]; None where it is not known.
     """
-    metrics, unseen = found.metrics, found.unseen
+    metrics, unseen = report.metrics, report.unseen
     blocks: list[page.Block] = [_error_table(unseen), _reference_table(unseen), _interval_table(unseen)]
-    recorded = [name for name in drawn if name.startswith("torque_")]
-    blocks += [page.pictures("", drawn, ("errors", "residuals")), page.pictures("Torques", drawn, recorded)]
-    blocks.append(page.pictures("Excitation", drawn, ("excitation",)))
+
+    torque_figures = [name for name in figures if name.startswith("torque_")]
+    blocks.append(page.pictures("", figures, ("errors", "residuals")))
+    blocks.append(page.pictures("Torques", figures, torque_figures))
+    blocks.append(page.pictures("Excitation", figures, ("excitation",)))
+
     if len(metrics.ladder) > 1:
         blocks.append(_friction_table(metrics))
     blocks.append(page.Text("The model", _model_sentences(metrics)))
-    blocks.append(page.Text("What the motion identifies", _identifiability(found)))
-    blocks += [*_geometry_blocks(metrics, found.effects), page.pictures("", drawn, ("geometries", "geometry_effects"))]
-    note = "R marks parameters that include others by regrouping; complete table: 8-dynamics/estimate.csv."
-    blocks.append(page.pictures("Dynamic parameters", drawn, ("significance",)))
-    blocks.append(page.table("Identified parameters", PARAMETERS, found.estimate, note))
+    blocks.append(page.Text("What the motion identifies", _identifiability(report)))
+    blocks += _geometry_blocks(metrics, report.effects)
+    blocks.append(page.pictures("", figures, ("geometries", "geometry_effects")))
+    blocks.append(page.pictures("Dynamic parameters", figures, ("significance",)))
+    blocks.append(_parameter_table(report.estimate))
+
     if metrics.loop:
         blocks.append(page.Text("Closed loop", _loop_sentences(metrics.loop)))
     blocks += tracking_blocks(unseen.tracking, unseen.tracking_failure)
-    blocks += [page.Text("What was exported", exported), page.Text("Notes on the dynamics", warnings_of(found), "note")]
-    return page.Section("Dynamics", blocks, unseen.verdict, unseen.reason, _key_figures(unseen, tolerance, delivered))
+    blocks.append(page.Text("What was exported", exported))
+    blocks.append(page.Text("Notes on the dynamics", warnings_of(report), "note"))
+    key_figures = _key_figures(unseen, tolerance, delivered)
+    return page.Section("Dynamics", blocks, unseen.verdict, unseen.reason, key_figures)
 
 
-def warnings_of(found: DynamicReport) -> list[str]:
-    """Return what was noticed by identification and validation, each once, and nothing that validation refuted."""
-    early = [one for one in found.metrics.noticed if one.code == "no-unseen-motion" and found.unseen.proofs]
-    lines = dict.fromkeys((*found.metrics.warnings, *found.unseen.warnings))
-    return [line for line in lines if line not in lines_of(early)]
+def _parameter_table(estimate: Sequence[IdentifiedParameter]) -> page.Table:
+    """Return the table of identified parameters."""
+    header = ("parameter", "unit", "value", "σ", "RSD", "what it holds")
+    rows = []
+    for parameter in estimate:
+        sigma = "" if parameter.sigma is None else f"{parameter.sigma:.2g}"
+        rsd = page.relative_sigma(parameter.rsd)
+        expression = page.shortened(parameter.expression, EXPRESSION_LETTERS)
+        rows.append([parameter.name, parameter.unit, f"{parameter.value:.4g}", sigma, rsd, expression])
+    note = "R marks parameters that include others by regrouping; complete table: 8-dynamics/estimate.csv."
+    return page.Table("Identified parameters", header, rows, note, numbers=[2, 3, 4])
+
+
+def warnings_of(report: DynamicReport) -> list[str]:
+    """Return the warnings of identification and validation, each once, without those that validation refuted."""
+    refuted: list[str] = []
+    if report.unseen.proofs:
+        early = [finding for finding in report.metrics.noticed if finding.code == "no-unseen-motion"]
+        refuted = lines_of(early)
+    lines = dict.fromkeys((*report.metrics.warnings, *report.unseen.warnings))
+    return [line for line in lines if line not in refuted]
 
 
 def proof_of(unseen: UnseenReport) -> tuple[str, Score, str]:
     """Return name, errors and kind of motion of the deciding recording: the worst unseen one, else the fitted one."""
-    where = "unseen motion" if unseen.proofs else "the training motion"
-    sets = unseen.proofs or unseen.fit
-    name, found = max(sets.items(), key=lambda item: item[1].judged.total)
-    return name, found, where
+    scores, motion = unseen.fit, "the training motion"
+    if unseen.proofs:
+        scores, motion = unseen.proofs, "unseen motion"
+    name = max(scores, key=lambda recording: scores[recording].judged.total)
+    return name, scores[name], motion
 
 
 def _key_figures(unseen: UnseenReport, tolerance: float, delivered: float | None) -> list[page.KeyFigure]:
@@ -209,28 +250,37 @@ def _key_figures(unseen: UnseenReport, tolerance: float, delivered: float | None
     name, proof, _ = proof_of(unseen)
     count = len(unseen.proofs)
     basis = {0: "the training motion", 1: "1 unseen motion"}.get(count, f"worst of {count} unseen motions")
-    sigma = next((one.error_sigma for one in unseen.curves if one.name == name), np.nan)
-    spread = f"± {sigma:.2g} %" if np.isfinite(sigma) else ""
-    shares = ((x, row) for x, row in zip(proof.filtered.joints, unseen.rows) if np.isfinite(x))
-    worst, row = max(shares, default=(np.nan, "torque"))
-    left = proof.judged.total if delivered is None else delivered
-    asked = {"allowed": f"{tolerance:g} %" if tolerance else "none", "met": page.met(left, tolerance)}
+
+    spread = ""
+    for curves in unseen.curves:
+        if curves.name == name:
+            if np.isfinite(curves.error_sigma):
+                spread = f"± {curves.error_sigma:.2g} %"
+            break
+
     error, in_band = "torque unexplained", "torque unexplained in the motion's band"
     if proof.stands:
         error += " in motion"
-    figures = [page.KeyFigure(error, "", percent(proof.judged.total), spread, basis, **asked)]
-    if delivered is not None:
+    identified = percent(proof.judged.total)
+    allowed = f"{tolerance:g} %" if tolerance else "none"
+    if delivered is None:
+        met = page.met(proof.judged.total, tolerance)
+        figures = [page.KeyFigure(error, "", identified, spread, basis, allowed, met)]
+    else:
+        # the exported robot is what is judged
+        met = page.met(delivered, tolerance)
         figures = [
-            page.KeyFigure(f"{error} (exported robot)", "", percent(delivered), "", basis, **asked),
-            page.KeyFigure(f"{error} (identified model)", "", percent(proof.judged.total), spread, basis),
+            page.KeyFigure(f"{error} (exported robot)", "", percent(delivered), "", basis, allowed, met),
+            page.KeyFigure(f"{error} (identified model)", "", identified, spread, basis),
         ]
     if proof.stands:
         figures.append(page.KeyFigure("torque unexplained at rest", "", percent(proof.standing.total), "", basis))
-    return [
-        *figures,
-        page.KeyFigure(in_band, "", percent(proof.filtered.total), "", basis),
-        page.KeyFigure(f"{in_band}, worst joint: {row}", "", percent(worst), "", basis),
-    ]
+    figures.append(page.KeyFigure(in_band, "", percent(proof.filtered.total), "", basis))
+
+    finite = [(share, row) for share, row in zip(proof.filtered.joints, unseen.rows) if np.isfinite(share)]
+    worst, row = max(finite, default=(np.nan, "torque"))
+    figures.append(page.KeyFigure(f"{in_band}, worst joint: {row}", "", percent(worst), "", basis))
+    return figures
 
 
 def percent(value: float) -> str:
@@ -245,176 +295,213 @@ def _rsd(percent: float) -> str:
 
 def _error_table(unseen: UnseenReport) -> page.Table:
     """Return the table of torque errors, per row and recording."""
-    sets = {f"{name} (fitted)": one for name, one in unseen.fit.items()}
-    for name, one in unseen.validation.items():
-        sets[f"{name} ({'unseen' if one.evidence else 'repeat: no evidence'})"] = one
-    groups = {label: _error_rows(one, unseen) for label, one in sets.items()}
-    header = (
-        "torque",
-        "rms error",
-        "of limit",
-        "error",
-        "in band",
-        "moving",
-        "standing",
-        "torque above band",
-        "ACF outside",
-    )
-    return page.grouped("Torque errors", header, groups, ERROR_NOTE, _of_all)
+    groups = {}
+    for name, score in unseen.fit.items():
+        groups[f"{name} (fitted)"] = _error_rows(score, unseen)
+    for name, score in unseen.validation.items():
+        role = "unseen" if score.evidence else "repeat: no evidence"
+        groups[f"{name} ({role})"] = _error_rows(score, unseen)
+    return page.grouped("Torque errors", ERROR_HEADER, groups, ERROR_NOTE, _of_all)
 
 
-def _reference_table(unseen: UnseenReport) -> page.Table:
-    """Return the table of errors of plain references on held-out motion beside the model's; may be empty."""
-    columns = [
-        page.Column("recording", "{0[0]}", number=False),
-        page.Column("nominal masses, no friction", lambda row: percent(row[1].nominal)),
-        page.Column("plain least squares", lambda row: percent(row[1].plain)),
-        page.Column("this model", lambda row: percent(row[1].delivered)),
-    ]
-    note = (
-        "Plain least squares: weighted, base parameters with Coulomb and viscous friction and offsets, no prior, no "
-        "selection, truncated at the data's rank. In motion, where joints stand for more than 5 % of the recording."
-    )
-    title = "Beside plain references: torque unexplained on held-out motion"
-    return page.table(title, columns, list(unseen.references.items()), note)
+def _error_rows(score: Score, unseen: UnseenReport) -> Iterator[Sequence[str]]:
+    """Yield the cells of `ERROR_HEADER`: of all torques, then of each."""
+    parts = score.raw, score.filtered, score.moving, score.standing
+    totals = [percent(part.total) for part in parts]
+    yield "all", "", "", *totals, "", ""
+    for j, (row, whiteness) in enumerate(zip(unseen.rows, score.whiteness)):
+        rms, share = rms_words(score, unseen, j)
+        shares = [percent(part.joints[j]) for part in parts]
+        outside = "" if whiteness is None else f"{100 * whiteness.outside:.0f} %"
+        yield row, rms, share, *shares, percent(score.above_band_percent[j]), outside
 
 
-def _error_rows(one: Score, unseen: UnseenReport) -> Iterator[Sequence[str]]:
-    parts = one.raw, one.filtered, one.moving, one.standing
-    yield "all", "", "", *(percent(part.total) for part in parts), "", ""
-    for j, (row, white) in enumerate(zip(unseen.rows, one.whiteness)):
-        yield (
-            row,
-            *rms_words(one, unseen, j),
-            *(percent(part.joints[j]) for part in parts),
-            percent(one.above_band_percent[j]),
-            "" if white is None else f"{100 * white.outside:.0f} %",
-        )
-
-
-def rms_words(one: Score, unseen: UnseenReport, row: int) -> tuple[str, str]:
+def rms_words(score: Score, unseen: UnseenReport, row: int) -> tuple[str, str]:
     """Return the rms error of a torque row in its unit, and in per cent of its limit; "–" where that is not known."""
-    rms, limit = one.raw.rms[row], np.inf if unseen.limits is None else unseen.limits[row]
-    share = percent(100.0 * rms / limit) if np.isfinite(limit) else "–"
-    return (f"{rms:.3g} {unseen.units[row]}", share) if np.isfinite(rms) else ("–", "–")
+    rms = score.raw.rms[row]
+    if not np.isfinite(rms):
+        return "–", "–"
+    share = "–"
+    if unseen.limits is not None and np.isfinite(unseen.limits[row]):
+        share = percent(100.0 * rms / unseen.limits[row])
+    return f"{rms:.3g} {unseen.units[row]}", share
 
 
 def _of_all(row: Sequence[str]) -> bool:
     return row[0] == "all"
 
 
+def _reference_table(unseen: UnseenReport) -> page.Table:
+    """Return the table of errors of plain references on held-out motion beside the model's; may be empty."""
+    header = ("recording", "nominal masses, no friction", "plain least squares", "this model")
+    rows = []
+    for recording, references in unseen.references.items():
+        errors = references.nominal, references.plain, references.delivered
+        rows.append([recording, *map(percent, errors)])
+    title = "Beside plain references: torque unexplained on held-out motion"
+    return page.Table(title, header, rows, REFERENCE_NOTE, numbers=[1, 2, 3])
+
+
 def _interval_table(unseen: UnseenReport) -> page.Table:
     """Return the table of the coverage of predicted 95 % intervals, per row of unseen recordings; may be empty."""
     groups = {}
-    for name, one in unseen.validation.items():
-        if (found := one.interval95) is not None:
-            at_rest = np.resize(found.median_at_rest, len(unseen.rows)) if len(found.median_at_rest) else None
-            groups[name] = [("all", f"{found.coverage_percent:.1f} %", "", "", f"{found.extrapolated_percent:.0f} %")]
-            for k, (row, unit) in enumerate(zip(unseen.rows, unseen.units)):
-                resting = "–" if at_rest is None or not np.isfinite(at_rest[k]) else f"± {at_rest[k]:.3g} {unit}"
-                inside, half = f"{found.joints_percent[k]:.0f} %", f"± {found.median[k]:.3g} {unit}"
-                groups[name].append((row, inside, half, resting, ""))
-    header = (
-        "torque",
-        "errors within the 95 % interval",
-        "median interval in motion",
-        "at rest",
-        "of the time extrapolated",
-    )
-    return page.grouped("Intervals stated", header, groups, strong=_of_all)
+    for name, score in unseen.validation.items():
+        coverage = score.interval95
+        if coverage is None:
+            continue
+        # of earlier versions without any at rest; a single value holds for all rows
+        at_rest = np.full(len(unseen.rows), np.nan)
+        if len(coverage.median_at_rest):
+            at_rest = np.resize(coverage.median_at_rest, len(unseen.rows))
+        extrapolated = f"{coverage.extrapolated_percent:.0f} %"
+        rows = [("all", f"{coverage.coverage_percent:.1f} %", "", "", extrapolated)]
+        for k, (row, unit) in enumerate(zip(unseen.rows, unseen.units)):
+            inside = f"{coverage.joints_percent[k]:.0f} %"
+            moving = f"± {coverage.median[k]:.3g} {unit}"
+            resting = f"± {at_rest[k]:.3g} {unit}" if np.isfinite(at_rest[k]) else "–"
+            rows.append((row, inside, moving, resting, ""))
+        groups[name] = rows
+    return page.grouped("Intervals stated", INTERVAL_HEADER, groups, strong=_of_all)
 
 
 def _friction_table(metrics: ModelMetrics) -> page.Table:
     """Return the table of friction models with their errors on held-out time, for all rows and for each row."""
-
-    def shown(shares: Iterable[float], digits: int) -> str:
-        return "".join(f"{x:.{digits}f}" if np.isfinite(x) else "–" for x in shares)
-
     count = max(len(step.joints_percent) for step in metrics.ladder)
-    columns = [
-        page.Column("friction", "{0.model}", number=False),
-        page.Column("p", "{0.parameters}"),
-        page.Column("total", lambda step: shown([step.cross_validated_percent], 2)),
-        *(page.Column(str(j + 1), lambda step, j=j: shown(step.joints_percent[j : j + 1], 1)) for j in range(count)),
-        page.Column("kept at joints", lambda step: ", ".join(map(str, step.kept_at_joints)) or step.note, number=False),
-    ]
+    joints = [str(j + 1) for j in range(count)]
+    header = ["friction", "p", "total", *joints, "kept at joints"]
+    rows = []
+    strong = set()
+    for k, step in enumerate(metrics.ladder):
+        shares = [_rounded(share, 1) for share in step.joints_percent]
+        shares += [""] * (count - len(shares))
+        remark = ", ".join(map(str, step.kept_at_joints)) or step.note
+        total = _rounded(step.cross_validated_percent, 2)
+        rows.append([step.model, str(step.parameters), total, *shares, remark])
+        if step.kept:
+            strong.add(k)
     title = "Ladder of friction models: relative error on held-out time [%]"
-    return page.table(title, columns, metrics.ladder, f"Chosen: {metrics.friction}.", lambda step: step.kept)
+    numbers = range(1, len(header) - 1)
+    return page.Table(title, header, rows, f"Chosen: {metrics.friction}.", frozenset(strong), list(numbers))
+
+
+def _rounded(share: float, digits: int) -> str:
+    return f"{share:.{digits}f}" if np.isfinite(share) else "–"
 
 
 def _model_sentences(metrics: ModelMetrics) -> list[str]:
     """Return sentences on the model: number of parameters, method, and eliminated parameters."""
-    lines = []
-    for one in metrics.ripple:
-        others = ("" if wave.gear == one.joint else f" of joint {wave.gear}" for wave in one.waves)
-        waves = (f"{wave.order_per_turn:g}{other}" for wave, other in zip(one.waves, others))
-        lines.append(
-            f"ripple at joint {one.joint}, orders {', '.join(waves)} per turn: explains "
-            f"{100 * one.explained_share_on_unseen_blocks:.0f} % of the fast residual's power on held-out time blocks; "
-            "not included in the covariance"
-        )
+    lines = [_ripple_sentence(ripple) for ripple in metrics.ripple]
     lines += _coupling_sentences(metrics)
     lines.append(f"method {metrics.method}: assumes that {metrics.method_assumes}")
+
     count, columns = metrics.parameters, metrics.counts
     base = count.standard - columns.without_effect - columns.regrouped
-    raw, normalised = metrics.condition_number.raw, metrics.condition_number.normalised
-    condition = ", with unit columns ".join(f"{x:.0f}" if np.isfinite(x) else "infinite" for x in (raw, normalised))
+    raw = _condition(metrics.condition_number.raw)
+    normalised = _condition(metrics.condition_number.normalised)
     lines.append(
         f"{count.standard} standard parameters: {columns.without_effect} without effect, {columns.regrouped} "
-        f"regrouped, {base} base; {count.base - base} additional friction parameters; condition {condition}"
+        f"regrouped, {base} base; {count.base - base} additional friction parameters; "
+        f"condition {raw}, with unit columns {normalised}"
     )
     if metrics.elimination or count.essential < count.base:
-        gone = ", ".join(
-            f"{one.name} ({_rsd(one.rsd)})" if np.isfinite(one.rsd) else one.name for one in metrics.elimination
-        )
-        lines.append(f"{count.essential} essential parameters; removed, with their RSD: {gone or 'none'}")
+        removed = []
+        for step in metrics.elimination:
+            rsd = f" ({_rsd(step.rsd)})" if np.isfinite(step.rsd) else ""
+            removed.append(f"{step.name}{rsd}")
+        names = ", ".join(removed) or "none"
+        lines.append(f"{count.essential} essential parameters; removed, with their RSD: {names}")
     return lines
+
+
+def _ripple_sentence(ripple: RippleWaves) -> str:
+    """Return the sentence on a joint's torque ripple: its orders, and how much of the residual it explains."""
+    orders = []
+    for wave in ripple.waves:
+        gear = "" if wave.gear == ripple.joint else f" of joint {wave.gear}"
+        orders.append(f"{wave.order_per_turn:g}{gear}")
+    return (
+        f"ripple at joint {ripple.joint}, orders {', '.join(orders)} per turn: explains "
+        f"{100 * ripple.explained_share_on_unseen_blocks:.0f} % of the fast residual's power on held-out time blocks; "
+        "not included in the covariance"
+    )
+
+
+def _condition(number: float) -> str:
+    return f"{number:.0f}" if np.isfinite(number) else "infinite"
 
 
 def _coupling_sentences(metrics: ModelMetrics) -> list[str]:
     """Return what coupling terms do to the errors of their joints: what they are in the drives nobody measured."""
-    lines = []
-    before = metrics.ladder[0] if metrics.ladder else None
+    lines: list[str] = []
+    if not metrics.ladder:
+        return lines
+    before = metrics.ladder[0]
     for step in metrics.ladder:
-        if step.model == "+ coupling" and before is not None:
-            at = step.kept_at_joints
-            for i, j in zip(at[::2], at[1::2]):
-                old = " and ".join(f"{before.joints_percent[joint - 1]:.3g}" for joint in (i, j))
-                new = " and ".join(f"{step.joints_percent[joint - 1]:.3g}" for joint in (i, j))
+        if step.model == "+ coupling":
+            # the coupled joints are listed pair by pair
+            joints = step.kept_at_joints
+            for pair in zip(joints[::2], joints[1::2]):
+                errors_before = " and ".join(f"{before.joints_percent[joint - 1]:.3g}" for joint in pair)
+                errors_after = " and ".join(f"{step.joints_percent[joint - 1]:.3g}" for joint in pair)
                 lines.append(
-                    f"a coupling term between joints {i} and {j} lowers their errors on held-out rows from {old} % to "
-                    f"{new} %"
+                    f"a coupling term between joints {pair[0]} and {pair[1]} lowers their errors on held-out rows "
+                    f"from {errors_before} % to {errors_after} %"
                 )
-        before = step if step.kept else before
+        if step.kept:
+            before = step
     return lines
 
 
 def _geometry_blocks(metrics: ModelMetrics, effects: Sequence[geometry_tables.GeometricEffect]) -> list[page.Block]:
     """Return the blocks on the effect of geometric errors on the dynamics: summary, and the largest effects."""
-    found = metrics.geometry
-    if found is None:
+    geometry = metrics.geometry
+    if geometry is None:
         return []
-    lines, tilt = [found.summary], found.moved_by_1_mrad_of_tilt
-    if found.propagated and tilt.sigmas > geometry_tables.MIN_SHIFT:
+    lines = [geometry.summary]
+    tilt = geometry.moved_by_1_mrad_of_tilt
+    if geometry.propagated and tilt.sigmas > geometry_tables.MIN_SHIFT:
         lines.append(
             f"a tilt of the base is not included: 1 mrad against gravity would change {tilt.parameter} by "
             f"{tilt.sigmas:.2g} of its sigma of torque noise"
         )
-    known = [one for one in effects if one.matters == "yes"]
     blocks: list[page.Block] = [page.Text("Geometry and dynamics", lines)]
-    if found.changed and known:
-        blocks.append(page.table("Which geometric errors matter for the dynamics", EFFECTS, known[:SHOWN]))
+    relevant = [effect for effect in effects if effect.matters == "yes"]
+    if geometry.changed and relevant:
+        blocks.append(_effect_table(relevant[:MAX_EFFECTS]))
     return blocks
+
+
+def _effect_table(effects: Sequence[geometry_tables.GeometricEffect]) -> page.Table:
+    """Return the table of geometric errors with the parameter that each shifts most, and its effect on the torque."""
+    header = (
+        "geometric error",
+        "sigma",
+        "moves most",
+        "shift [its σ of torque noise]",
+        "parameters moved",
+        "torque rms [N m]",
+    )
+    rows = []
+    for effect in effects:
+        sigma = small(effect.sigma or 0.0, effect.unit)
+        shift, count = f"{effect.shift_sigma:.2f}", str(effect.parameters_moved)
+        torque = f"{effect.torque_rms or 0.0:.2g}"
+        rows.append([effect.element, sigma, effect.parameter, shift, count, torque])
+    return page.Table("Which geometric errors matter for the dynamics", header, rows, numbers=[1, 3, 4, 5])
 
 
 def _loop_sentences(loop: LoopMetrics) -> list[str]:
     """Return sentences on the closed-loop simulation, and on the bias of least squares."""
-    lines, test = list(loop.notes), loop.durbin_wu_hausman
+    lines = list(loop.notes)
+    test = loop.durbin_wu_hausman
     if test is None:
         return lines
-    whose = f"results of the test of least squares by {loop.instruments}, not of this estimate: " if loop.beside else ""
+
+    subject = ""
+    if loop.beside:
+        subject = f"results of the test of least squares by {loop.instruments}, not of this estimate: "
     lines.append(
-        f"{whose}closed loop simulated, {loop.rounds} rounds; difference of simulated and recorded motion "
+        f"{subject}closed loop simulated, {loop.rounds} rounds; difference of simulated and recorded motion "
         f"{_joints(loop.distance_percent)} %, torque {_joints(loop.simulated_torque_error_percent)} %"
     )
     strength = "weak" if loop.instruments_weak else "strong"
@@ -422,18 +509,21 @@ def _loop_sentences(loop: LoopMetrics) -> list[str]:
         f"instruments: full rank, Cragg-Donald {_number(loop.cragg_donald)} ({strength}), smallest explained share "
         f"of a column {100 * loop.least_partial_r2:.3g} %"
     )
-    said = "no bias of least squares is detected"
-    if test.least_squares_biased:
-        little = loop.largest_shift_sigma < MAX_SHIFT_SIGMAS
-        said = "least squares is biased, significantly but slightly" if little else "least squares is biased"
+
     if not loop.explains:
-        said = "no result, since the simulated loop explains less of the torque than the model"
+        result = "no result, since the simulated loop explains less of the torque than the model"
+    elif not test.least_squares_biased:
+        result = "no bias of least squares is detected"
+    elif loop.largest_shift_sigma < MAX_SHIFT_SIGMAS:
+        result = "least squares is biased, significantly but slightly"
+    else:
+        result = "least squares is biased"
     if not loop.valid:
-        said += ", but the instruments are unreliable"
+        result += ", but the instruments are unreliable"
     p = f"p = {test.p:.2g}" if test.p > 0.0 else "p < 1e-300"
-    degrees = ", ".join(f"{one:g}" for one in test.degrees)
+    degrees = ", ".join(f"{degree:g}" for degree in test.degrees)
     lines.append(
-        f"Durbin-Wu-Hausman: F({degrees}) = {_number(test.statistic)}, {p}: {said}; largest shift "
+        f"Durbin-Wu-Hausman: F({degrees}) = {_number(test.statistic)}, {p}: {result}; largest shift "
         f"{loop.largest_shift_sigma:.3g} sigma"
     )
     return lines
@@ -450,46 +540,57 @@ def _number(value: float, unit: str = "") -> str:
 def tracking_blocks(replays: Mapping[str, Replay], failure: str = "") -> list[page.Block]:
     """Return the blocks on the simulated tracking errors with the model as feedforward."""
     if failure:
-        why = f"tracking with the model as feedforward was not simulated:  {failure}"
-        return [page.Text("Tracking, simulated", [why])]
+        line = f"tracking with the model as feedforward was not simulated:  {failure}"
+        return [page.Text("Tracking, simulated", [line])]
     if not replays:
         return []
+
+    groups = {}
+    for name, replay in replays.items():
+        rows = []
+        for key, rms in replay.rms.items():
+            errors = map(_number, 1e3 * rms)
+            rows.append((FED_FORWARD[key], *errors))
+        groups[name] = rows
+
     first = next(iter(replays.values()))
-    groups = {
-        name: [(FED_FORWARD[key], *map(_number, 1e3 * rms)) for key, rms in one.rms.items()]
-        for name, one in replays.items()
-    }
-    joints = [str(j + 1) for j in range(len(first.inertia_added))]
     lines = []
     gain = f": feedforward of the model reduces the tracking error by a factor of {first.feedback_over_model:.3g}"
     if first.inertia_added.any():
-        shown = " ".join(f"{x:.2g}" for x in first.inertia_added)
+        inertia = " ".join(f"{added:.2g}" for added in first.inertia_added)
         lines.append(
-            f"the identified model is physically inconsistent: simulation adds motor inertia, {shown} kg m² (kg); "
+            f"the identified model is physically inconsistent: simulation adds motor inertia, {inertia} kg m² (kg); "
             "compare only the rows with each other"
         )
         gain = ""
-    default = f"a PD of {FREQUENCY:g} Hz, damping {DAMPING:g} (our default)"
-    control = "the controller of [loop]" if first.stated else default
+    control = f"a PD of {FREQUENCY:g} Hz, damping {DAMPING:g} (our default)"
+    if first.stated:
+        control = "the controller of [loop]"
     motion = "unseen motion" if first.unseen else "the training motion, which gives too small errors"
     lines.append(f"the simulated robot is the identified model plus the unexplained torque; {control}; {motion}{gain}")
+
     title = "Tracking, simulated: rms of q - reference [mrad or mm]"
+    joints = [str(j + 1) for j in range(len(first.inertia_added))]
     return [page.grouped(title, ("fed forward", *joints), groups), page.Text("", lines)]
 
 
-def _identifiability(found: DynamicReport) -> list[str]:
+def _identifiability(report: DynamicReport) -> list[str]:
     """Return sentences on the parameters that the motion identifies, and on the residuals."""
     lines = []
-    weak = [row.name for row in found.estimate if row.rsd is not None and row.rsd > MAX_RSD]
+    weak = [row.name for row in report.estimate if row.rsd is not None and row.rsd > MAX_RSD]
     if weak:
         lines.append(f"Not distinguishable from zero (σ above half the value): {', '.join(weak)}.")
-    _, proof, where = proof_of(found.unseen)
-    coloured = [row for row, white in zip(found.unseen.rows, proof.whiteness) if white and white.outside > WHITE]
+
+    _, proof, motion = proof_of(report.unseen)
+    coloured = []
+    for row, whiteness in zip(report.unseen.rows, proof.whiteness):
+        if whiteness and whiteness.outside > WHITE:
+            coloured.append(row)
     if coloured:
         lines.append(
-            f"The residual on {where} is not white in {', '.join(coloured)}: it contains unmodelled effects, "
+            f"The residual on {motion} is not white in {', '.join(coloured)}: it contains unmodelled effects, "
             "so that σ is too small there."
         )
     elif any(proof.whiteness):
-        lines.append(f"The residual on {where} cannot be distinguished from white noise.")
+        lines.append(f"The residual on {motion} cannot be distinguished from white noise.")
     return lines

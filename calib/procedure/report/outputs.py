@@ -1,4 +1,4 @@
-"""What the folder of a result holds besides its numbers: the data of its report, figures, and pages made by rooms."""
+"""What the folder of a result holds besides its numbers: the data of its report, figures, and its certificate."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from calib.extensions import offered
 from calib.files import write_json
 
 if TYPE_CHECKING:
@@ -28,8 +27,10 @@ def write_fit(outcome: Outcome, folder: Path, plots: bool = True, pages: bool = 
         from calib.procedure.report.geometry_figures import captioned
 
         drawn = saved(captioned(report), folder)
-    for write in offered("fit_pages") if pages else ():
-        write(report, drawn, folder)
+    if pages:
+        from calib.procedure.report.certificate import results
+
+        results.write_fit(report, drawn, folder)
 
 
 def write_model(outcome: IdentificationOutcome, folder: Path, plots: bool = True, pages: bool = True) -> None:
@@ -51,5 +52,6 @@ def write_model(outcome: IdentificationOutcome, folder: Path, plots: bool = True
     write_json(UnseenFolder(folder).report, report.unseen)
     if plots:
         drawn = charts.saved(dynamics_figures.captioned(report, folder), folder)
-    for write in offered("model_pages"):
-        write(report, drawn, folder)
+    from calib.procedure.report.certificate import results
+
+    results.write_model(report, drawn, folder)

@@ -5,7 +5,7 @@ Report and certificate show the same values as HTML and PDF; this module does no
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from rich import box
 from rich.console import RenderableType
@@ -14,7 +14,10 @@ from rich.text import Text as RichText
 
 from calib.procedure.findings import LEVELS, Warned
 
-FileRow = tuple[str, str, str, str]  # name, what it is, bytes, SHA-256
+# name, what it is, bytes, SHA-256
+FileRow = tuple[str, str, str, str]
+# RSD [%] above which no value is printed: the parameter is unknown
+MAX_PRINTED_RSD = 999.0
 COLOURS: dict[str, str] = dict(zip(LEVELS, ("green", "green", "yellow", "yellow", "red")))
 
 
@@ -51,7 +54,13 @@ class Column(NamedTuple):
 
     def of(self, record: Any) -> str:
         """Return the text of a record's cell."""
-        return self.cell.format(record) if isinstance(self.cell, str) else self.cell(record)
+        if isinstance(self.cell, str):
+            return self.cell.format(record)
+        return self.cell(record)
+
+
+def _never(record: Any) -> bool:
+    return False
 
 
 def table(
@@ -59,16 +68,22 @@ def table(
     columns: Sequence[Column],
     records: Sequence[Any],
     note: str = "",
-    strong: Callable[[Any], bool] = lambda record: False,
+    strong: Callable[[Any], bool] = _never,
     most: int | None = None,
 ) -> Table:
     """Return a table of records, one row per record up to `most`, with the `strong` ones in bold."""
     if most is not None and len(records) > most:
-        note, records = f"{note} {len(records) - most} more in metrics.json.", records[:most]
-    rows = [[column.of(record) for column in columns] for record in records]
-    bold = frozenset(k for k, record in enumerate(records) if strong(record))
+        note = f"{note} {len(records) - most} more in metrics.json."
+        records = records[:most]
+    header = [column.name for column in columns]
     numbers = [k for k, column in enumerate(columns) if column.number]
-    return Table(title, [column.name for column in columns], rows, note, bold, numbers)
+    rows = []
+    bold = set()
+    for k, record in enumerate(records):
+        rows.append([column.of(record) for column in columns])
+        if strong(record):
+            bold.add(k)
+    return Table(title, header, rows, note, frozenset(bold), numbers)
 
 
 def grouped(
@@ -76,18 +91,24 @@ def grouped(
     header: Sequence[str],
     groups: Mapping[str, Iterable[Sequence[str]]],
     note: str = "",
-    strong: Callable[[Sequence[str]], bool] = lambda row: False,
+    strong: Callable[[Sequence[str]], bool] = _never,
     texts: int = 1,
 ) -> Table:
     """Return a table of rows under headings, with the `strong` rows in bold; the first `texts` columns are text."""
-    rows = [row for heading, own in groups.items() for row in ((heading,), *own)]
+    rows: list[Sequence[str]] = []
+    for heading, group in groups.items():
+        rows.append((heading,))
+        rows += group
     bold = frozenset(k for k, row in enumerate(rows) if strong(row))
     return Table(title, header, rows, note, bold, range(texts, len(header)))
 
 
-def shortened(text: str, most: int) -> str:
-    """Return a text, cut at a word with an ellipsis if it is longer than `most` letters."""
-    return text if len(text) <= most else f"{text[: most - 1].rsplit(' ', 1)[0]} …"
+def shortened(text: str, max_letters: int) -> str:
+    """Return a text, cut at a word with an ellipsis if it is longer than `max_letters`."""
+    if len(text) <= max_letters:
+        return text
+    words, *_ = text[: max_letters - 1].rsplit(" ", 1)
+    return f"{words} …"
 
 
 @dataclass(frozen=True)
@@ -125,9 +146,9 @@ class Pictures:
         return len(self.pictures)
 
 
-def pictures(title: str, drawn: Mapping[str, Picture], names: Iterable[str]) -> Pictures:
-    """Return those of the figures drawn that have these names, side by side."""
-    return Pictures(title, [drawn[name] for name in names if name in drawn])
+def pictures(title: str, figures: Mapping[str, Picture], names: Iterable[str]) -> Pictures:
+    """Return those of the figures that have these names, side by side."""
+    return Pictures(title, [figures[name] for name in names if name in figures])
 
 
 Block = Table | Text | Pictures
@@ -157,7 +178,9 @@ class KeyFigure:
 
 def met(value: float, tolerance: float) -> str:
     """Return whether a value is within a tolerance, in a word; empty without a tolerance (0)."""
-    return "" if not tolerance else "yes" if value <= tolerance else "NO"
+    if not tolerance:
+        return ""
+    return "yes" if value <= tolerance else "NO"
 
 
 @dataclass(frozen=True)
@@ -173,44 +196,59 @@ class Section:
 
 def relative_sigma(percent: float | None) -> str:
     """Return an RSD [%] with two digits as text; empty if None or too large."""
-    return "" if percent is None or percent > 999 else f"{percent:.0f} %" if percent >= 10 else f"{percent:.2g} %"
+    if percent is None or percent > MAX_PRINTED_RSD:
+        return ""
+    if percent >= 10:
+        return f"{percent:.0f} %"
+    return f"{percent:.2g} %"
 
 
 def rendered(blocks: Iterable[Block]) -> Iterator[RenderableType]:
     """Yield each block as a rich renderable, without pictures and empty blocks."""
-    for block in filter(len, blocks):
+    for block in blocks:
+        if not len(block):
+            continue
         if isinstance(block, Table):
             yield _rich_table(block)
         elif isinstance(block, Text):
             for line in block.lines:
                 label = "warning" if isinstance(line, Warned) else block.label
-                yield RichText.assemble(*([(label, "yellow"), ": "] if label else []), line.replace(":: ", ": "))
+                printed = RichText()
+                if label:
+                    printed.append(label, "yellow")
+                    printed.append(": ")
+                yield printed.append(single_colons(line))
+
+
+def single_colons(line: str) -> str:
+    """Return a line without doubled colons: a recording cut as ``log.npz@10:`` ends with a colon of its own."""
+    return line.replace(":: ", ": ")
 
 
 def _rich_table(table: Table) -> RichTable:
     """Return a table as a rich renderable."""
     title = table.title[:1].lower() + table.title[1:]
+    caption = RichText(table.note) if table.note else None
     result = RichTable(
-        title=RichText(title),
-        title_justify="left",
-        caption=RichText(table.note) if table.note else None,
-        caption_justify="left",
-        box=box.HEAVY_HEAD,
+        title=RichText(title), title_justify="left", caption=caption, caption_justify="left", box=box.HEAVY_HEAD
     )
     numbers = set(table.numbers)
     for k, name in enumerate(table.header):
-        result.add_column(RichText(name), justify="right" if k in numbers else "left", overflow="fold")
+        justify: Literal["left", "right"] = "right" if k in numbers else "left"
+        result.add_column(RichText(name), justify=justify, overflow="fold")
     for number, row in enumerate(table.rows):
         if len(row) == 1 and len(table.header) > 1:
             result.add_section()
             result.add_row(RichText(row[0], style="bold"))
         else:
-            result.add_row(*map(RichText, row), style="bold" if number in table.strong else "")
+            style = "bold" if number in table.strong else ""
+            result.add_row(*map(RichText, row), style=style)
     return result
 
 
-def section(shown: Section) -> Iterator[RenderableType]:
+def section(section: Section) -> Iterator[RenderableType]:
     """Yield the verdict of a section with its reason, then its blocks, as rich renderables."""
-    if shown.verdict:
-        yield RichText.assemble("verdict: ", (shown.verdict, f"bold {COLOURS[shown.verdict]}"), f": {shown.reason}")
-    yield from rendered(shown.blocks)
+    if section.verdict:
+        style = f"bold {COLOURS[section.verdict]}"
+        yield RichText.assemble("verdict: ", (section.verdict, style), f": {section.reason}")
+    yield from rendered(section.blocks)

@@ -14,10 +14,10 @@ from rich.text import Text
 
 from calib.arguments import checked
 from calib.config import parse
+from calib.controllers.table import check_controller
 from calib.data.csv_table import read_table
 from calib.data.poses import IMAGES
 from calib.errors import UsageError, command_line, require
-from calib.extensions import needed, offered
 from calib.folders import CERTIFICATE, PAGES, SESSION
 from calib.geometry.observability import targets_of
 from calib.procedure.excitation.coefficients import RUN, SAMPLES
@@ -31,6 +31,7 @@ from calib.procedure.session import steps
 from calib.procedure.session.folder import POSES, UNSEEN, WAYS, Say, Session, create, locked, open_session, read_state
 from calib.procedure.session.geometry_steps import chain_of
 from calib.procedure.session.questions import instrument_named
+from calib.procedure.session.second_round import promised
 from calib.procedure.session.settings import NOTHING, SessionSettings
 from calib.procedure.session.steps import DONE, KEPT, WAITING, State
 from calib.robot.chain import Chain
@@ -208,7 +209,7 @@ def new_session(
     require(dynamics or device.measures != NOTHING, words, UsageError)
     chain = load(robot, base or None, tip or None)
     if program:
-        needed("check_controller")(program, chain.n)
+        check_controller(program, chain.n)
     copied, named = _limits(limits, chain, source, dynamics)
     table = {
         "name": chain.name,
@@ -270,7 +271,7 @@ def _ending(session: Session) -> tuple[str, ...]:
     """Return the closing lines of a complete session: the verdict, where certificate and robot are."""
     first, *others = PAGES
     page = f"{session.path(first)} ({', '.join(others)})"
-    found, further = session.verdicts(), [line for ending in offered("endings") for line in ending(session)]
+    found, further = session.verdicts(), promised(session)
     robot = session.path(f"{session.export}/{URDF}")
     corrected = session.path(f"{session.export}/{CORRECTED_URDF}")
     use = ""

@@ -29,8 +29,6 @@ session.lock     there while a command works on the session
 from __future__ import annotations
 
 import json
-import os
-import socket
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -43,13 +41,14 @@ from calib.config import parse
 from calib.config_types import Text
 from calib.data.poses import CORNERS, is_image_folder
 from calib.errors import Busy, SessionError, command_line, refused_as
-from calib.folders import CERTIFICATE, METRICS, PARAMETERS, STATE, write_staged
+from calib.folders import PARAMETERS, STATE, write_staged
 from calib.folders import SESSION as SETTINGS
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.findings import Verdict, Verdicts
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.session.settings import NOTHING, SCHEMA, SessionSettings, check_schema, read_settings, written
 from calib.records import plain
+from calib.result_kinds import refusal
 from calib.robot import tables
 from calib.robot.calibrated import ROBOT
 from calib.robot.formats.urdf_tree import converter, is_urdf, text
@@ -251,19 +250,6 @@ def create(folder: Path, robot_file: Path, settings: SessionSettings, copied: Ma
         write_staged(folder, (), fill)
 
 
-def _no_session(folder: Path) -> str:
-    """Return the message for a folder that is not a session: what the folder contains, and the command to use."""
-    identified = IdentificationFolder(folder).model.exists()
-    if not identified and not FitFolder(folder).report.exists():
-        return f"{folder} is not a session (no session.toml); make one with: {command_line('new', folder)}"
-    what, where = ("an identification", METRICS) if identified else ("a fit", CERTIFICATE)
-    return (
-        f"{folder} is the result of {what}, not a session: verdict and figures are in its {where}; "
-        f"{command_line('view', folder)} shows it, {command_line('export', folder, '--into', 'DIR')} writes the robot "
-        "for other programs"
-    )
-
-
 def open_session(folder: Path, plots: bool = True) -> Session:
     """Read the session in `folder`.
 
@@ -272,7 +258,7 @@ def open_session(folder: Path, plots: bool = True) -> Session:
     """
     path = folder / SETTINGS
     if not path.exists():
-        raise SessionError(_no_session(folder))
+        raise SessionError(refusal(folder, "session"))
     return Session(folder, read_settings(path), plots=plots)
 
 
@@ -297,34 +283,11 @@ def read_state(session: Session) -> StateFile:
 def locked(session: Session, say: Say = print) -> Iterator[None]:
     """Lock the session for one command; the lock of a killed command is replaced.
 
-    The lock is the kernel's (flock), so that it ends with the process; the file says whose it is.
-
     Raises:
         Busy: while another command works on it.
     """
-    import fcntl
-
-    path = session.path("session.lock")
-    with refused_as(SessionError, OSError, f"cannot write in {session.folder}: {{}}"):
-        file = path.open("a+", errors="replace")
-    with file:
-        file.seek(0)
-        holder = file.read(200).strip()
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            words = f"{holder or 'another command'} works on it; wait for it to end"
-            raise Busy(f"{session.folder} is busy: {words}") from None
-        if not path.exists() or not os.path.samestat(path.stat(), os.fstat(file.fileno())):
-            raise Busy(f"{session.folder} was busy a moment ago; try again")
+    busy = f"{session.folder} is busy: {{}} works on it; wait for it to end"
+    with files.locked(session.path("session.lock"), busy, Busy) as holder:
         if holder:
             say(f"the last command ({holder}) was interrupted; continuing from there")
-        file.truncate(0)
-        file.write(f"process {os.getpid()} on {socket.gethostname()}")
-        file.flush()
-        try:
-            yield
-        except Exception:
-            path.unlink(missing_ok=True)
-            raise
-        path.unlink(missing_ok=True)
+        yield

@@ -4,7 +4,7 @@ A session asks for two sets of poses: optimised ones for the fit, and random one
 """
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from calib import files
+from calib.data.images.coverage import image_words
 from calib.data.poses import IMAGES
 from calib.data.poses.fit_options import FileOptions, FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
@@ -28,10 +29,9 @@ from calib.data.poses.pose_lists import (
 )
 from calib.data.schema import Joints
 from calib.errors import CalibError, Finding, UsageError, finding
-from calib.extensions import needed, offered
+from calib.extensions import Point
 from calib.folders import write_staged
 from calib.geometry.observability import SIGMA_ORIENTATION, observation, targets_of
-from calib.geometry.weighing import Settings
 from calib.identification.model_file import MODEL
 from calib.procedure.findings import UNJUDGED, Warned, lines_of
 from calib.procedure.kinematic_stage import fit as fitting
@@ -48,7 +48,7 @@ from calib.procedure.measuring.run import same_turn, write_run
 from calib.procedure.report import fit_report
 from calib.procedure.report.geometry_section import error_words, outlier_sentences, parameter_words
 from calib.procedure.report.outputs import write_fit
-from calib.procedure.session import folder
+from calib.procedure.session import drift, folder
 from calib.procedure.session.folder import Say, Session
 from calib.robot import calibrated
 from calib.robot.chain import Chain, joint_kinds
@@ -57,6 +57,10 @@ from calib.robot.library import load_calibrated
 from calib.units import JOINT
 from poses.candidates import draw_candidates
 from poses.space import is_feasible
+
+WRITE_PROGRAM: Point[Callable[[Path, Path, str], Any]] = Point(
+    "write_program", "files of a program of the poses in a CSV"
+)
 
 HOW = "add [camera] to the limits file, see `calib formats constraints`"
 
@@ -98,7 +102,7 @@ def _choose(session: Session, chain: Chain, say: Say) -> list[str]:
     for name, joints in sets.items():
         path = write_poses(session.path(f"2-poses/{name}"), joints, chain.joint_names, joint_kinds(chain))
         if settings.robot.controller:
-            needed("write_program")(path, path.with_suffix(""), settings.robot.controller)
+            WRITE_PROGRAM.one()(path, path.with_suffix(""), settings.robot.controller)
     write_run(session.path(f"2-poses/{folder.WAYS}"), chosen.run, chain)
     if chosen.prediction is not None:
         write_prediction(chosen.prediction, session.path(f"2-poses/{folder.POSES}"))
@@ -202,8 +206,7 @@ def arrive(session: Session, say: Say) -> list[str]:
     chain = chain_of(session)
     blocks, again = (read_measured(session, chain, session.brought(kind)) for kind in ("measured", "drift"))
     notes = notes_on(session, chain, blocks, folder.POSES)
-    for drift in offered("drift"):
-        notes += lines_of(drift(session, chain, *([block for _, block in own] for own in (blocks, again))))
+    notes += lines_of(drift.of_session(session, chain, *([block for _, block in own] for own in (blocks, again))))
     files.write(session.path(folder.POSES_CHECKED), "\n".join(notes) + "\n")
     return notes
 
@@ -232,7 +235,7 @@ def notes_on(session: Session, chain: Chain, blocks: Sequence[tuple[str, PoseMea
         if measures == Poses.kind and isinstance(block, Positions) and not isinstance(block, Poses):
             found.append("only positions, although the instrument measures poses")
         if block.kind == IMAGES:
-            found.append(needed("image_words")(block))
+            found.append(image_words(block))
         elif measures == IMAGES:
             found.append("contains no images, although the instrument is a camera; the file is fitted nevertheless")
         found += block.notes
@@ -310,7 +313,7 @@ def validate(session: Session, say: Say) -> list[str]:
     notes = notes_on(session, chain, read_measured(session, chain, unseen, like), folder.UNSEEN)
     say("comparing on unseen poses")
     given, options, wanted = _gathered(session, unseen), _options_of(session), _fit_settings(session)
-    settings = Settings(wanted.loss or options.loss, options.loss_scale)
+    settings = fitting.weighing_settings(options, wanted)
     asked = replace(wanted, model=wanted.model or options.model)
     found = assess(fit.arms(given, settings), given, fit.findings(), settings, asked)
     rows = [fit_report.rows_of(name, each, each.proves) for name, each in found.validation.items()]

@@ -29,11 +29,13 @@ SENSOR_WORDS = frozenset(
 )
 FINGER_WORDS = ("finger", "jaw", "claw", "knuckle", "thumb")
 GRIPPER_WORDS = (*FINGER_WORDS, "grip")
+NUMBERED = re.compile(r"(\D*)(\d+)")
 AXIS_WORDS = frozenset(
     ("wrist", "elbow", "shoulder", "roll", "pitch", "yaw", "rotate", "rotation", "pan", "tilt", "flex")
 )
-ARM_AXES, ARM_SHARE = 4, 0.75
-"""A second chain is another arm from this many axes of its own, and this share of the longest one's (our choice)."""
+# A second chain is another arm from this many axes of its own, and this share of the longest one's (our choice).
+ARM_AXES = 4
+ARM_SHARE = 0.75
 
 
 @dataclass(frozen=True)
@@ -42,19 +44,19 @@ class ArmEnds:
 
     Attributes:
         base, tip: links.
-        why: the tip was taken, as words that follow its name.
+        reason: why the tip was taken, as words that follow its name.
         unused: remarks on joints that are not in the arm, columns that are not used, frames that are not taken.
     """
 
     base: str
     tip: str
-    why: str = ""
+    reason: str = ""
     unused: tuple[str, ...] = ()
 
     @property
     def words(self) -> str:
         """The tip and why it was taken; what is not part of the arm."""
-        return "; ".join([f"{self.tip}, {self.why}", *self.unused])
+        return "; ".join([f"{self.tip}, {self.reason}", *self.unused])
 
 
 def choose(tree: UrdfTree, base: str, joint_names: Sequence[str] | None = None) -> ArmEnds:
@@ -72,12 +74,12 @@ def choose(tree: UrdfTree, base: str, joint_names: Sequence[str] | None = None) 
     ends = axes.chains if joint_names is None else axes.named(joint_names)
     if len(ends) > 1:
         tips = [_frame(tree, body)[0] for body in ends]
-        both = "" if joint_names is None else "; the table has columns of several"
+        table = "" if joint_names is None else "; the table has columns of several"
         count = "two arms" if len(ends) == 2 else f"{len(ends)} chains of joints"
-        refuse_robot(tree.where, f"{count}: choose one by its last link, --tip {' or '.join(tips)}{both}")
+        refuse_robot(tree.where, f"{count}: choose one by its last link, --tip {' or '.join(tips)}{table}")
     body = ends[0]
-    tip, why = _frame(tree, body)
-    return ArmEnds(base, tip, why, axes.remarks(body, joint_names))
+    tip, reason = _frame(tree, body)
+    return ArmEnds(base, tip, reason, axes.remarks(body, joint_names))
 
 
 class _Axes:
@@ -96,10 +98,10 @@ class _Axes:
         if not self._last_bodies():
             refuse_robot(tree.where, f"no actuated joint follows '{base}'; choose another base (--base)")
         for rule in (self._mimicking, self._named_jaws, self._behind_flange, self._beside_axis, self._forked):
-            marked = rule()
             before = self.aside
-            self.aside = {**marked, **before}
-            if not self._last_bodies():  # a gripper alone is an arm
+            self.aside = {**rule(), **before}
+            # A gripper alone is an arm.
+            if not self._last_bodies():
                 self.aside = before
         self.chains = self._rivals(self._last_bodies())
 
@@ -116,8 +118,10 @@ class _Axes:
 
     def departing(self, body: str) -> list[JointTag]:
         """Return the moving joints whose parent link is fixed to a body's link."""
-        links = [link for link, _ in self.tree.rigid(body)]
-        return [joint for link in links for joint in self.tree.below[link] if joint.moves]
+        joints: list[JointTag] = []
+        for link, _ in self.tree.rigid(body):
+            joints += [joint for joint in self.tree.below[link] if joint.moves]
+        return joints
 
     def named(self, joint_names: Sequence[str]) -> list[str]:
         """Return the last bodies of the chains that hold the named joints, jaws left out where any joint remains.
@@ -128,35 +132,38 @@ class _Axes:
         joints = self.tree.joints
         for name in joint_names:
             if name not in joints:
-                known = ", ".join(joint.name for joint in joints.values() if joint.actuated)
-                refuse_robot(self.tree.where, f"no joint '{name}'{suggestion(name, joints)} (joints: {known})")
+                actuated = ", ".join(joint.name for joint in joints.values() if joint.actuated)
+                refuse_robot(self.tree.where, f"no joint '{name}'{suggestion(name, joints)} (joints: {actuated})")
         counted = [name for name in joint_names if name not in self.aside] or list(joint_names)
-        bodies = [joints[name].child for name in counted if _hangs(self.tree, joints[name].child, self.base)]
+        children = [joints[name].child for name in counted]
+        bodies = [body for body in children if _hangs(self.tree, body, self.base)]
         if not bodies:
             refuse_robot(self.tree.where, f"joint '{counted[0]}' does not follow '{self.base}'; choose another base")
-        last = [body for body in bodies if not any(_hangs(self.tree, other, body) for other in bodies if other != body)]
-        return self._rivals(last)
+        return self._rivals(_leaves(self.tree, bodies))
 
     def remarks(self, body: str, joint_names: Sequence[str] | None) -> tuple[str, ...]:
         """Return remarks on jaws, columns of which are not used, and on a tool0 that is not at the end of the arm."""
         path = {joint.name for joint in self.tree.path(self.base, body)}
         joints = self.tree.joints
-        jaws = {name: reason for name, reason in self.aside.items() if name not in path and joints[name].actuated}
-        reasons = dict.fromkeys(jaws.values())
-        found: list[str] = []
-        for reason in reasons:
-            names = [name for name, its in jaws.items() if its == reason]
-            found.append(f"not an axis of the arm: {listing(names, 3)} ({reason})")
+        joints_by_reason: dict[str, list[str]] = {}
+        for name, reason in self.aside.items():
+            if name not in path and joints[name].actuated:
+                joints_by_reason.setdefault(reason, []).append(name)
+        result: list[str] = []
+        for reason, names in joints_by_reason.items():
+            result.append(f"not an axis of the arm: {listing(names, 3)} ({reason})")
         unused = [name for name in joint_names or () if name not in path]
         if unused:
-            found.append(f"columns not used: {listing(unused, 4)}")
+            result.append(f"columns not used: {listing(unused, 4)}")
         links = {link for link, _ in self.tree.rigid(body)}
-        earlier = [joint.child for joint in self.tree.path(self.base, body) if joint.child not in links]
-        for link in earlier:
-            tools = [name for name, _ in self.tree.rigid(link) if TOOL0.search(name) and name not in links]
-            behind = self.depth(body) - self.depth(link)
-            found += [f"{name} is not taken: {behind} axes follow it" for name in tools]
-        return tuple(dict.fromkeys(found))
+        for joint in self.tree.path(self.base, body):
+            if joint.child in links:
+                continue
+            axes_behind = self.depth(body) - self.depth(joint.child)
+            for name, _ in self.tree.rigid(joint.child):
+                if TOOL0.search(name) and name not in links:
+                    result.append(f"{name} is not taken: {axes_behind} axes follow it")
+        return tuple(dict.fromkeys(result))
 
     def _reached(self) -> list[str]:
         """Return the links below the base, the base first, without those behind joints that are no axes."""
@@ -170,10 +177,11 @@ class _Axes:
 
     def _last_bodies(self) -> list[str]:
         """Return the bodies behind axes that no other axis departs from."""
-        links = self._reached()
-        bodies = [link for link in links if link != self.base and self.tree.above[link].moves]
-        followed = [body for body in bodies if any(self.height(joint) for joint in self.departing(body))]
-        last = [body for body in bodies if body not in followed and self.depth(body) and self._is_driven(body)]
+        last: list[str] = []
+        for body in self._bodies():
+            followed = any(self.height(joint) for joint in self.departing(body))
+            if not followed and self.depth(body) and self._is_driven(body):
+                last.append(body)
         return _leaves(self.tree, last)
 
     def _is_driven(self, body: str) -> bool:
@@ -184,44 +192,53 @@ class _Axes:
 
     def _rivals(self, bodies: list[str]) -> list[str]:
         """Return of several last bodies those of the longest chain and of other arms."""
-        most = max(self.depth(body) for body in bodies)
-        longest = [body for body in bodies if self.depth(body) == most]
-        result = list(longest)
-        for body in bodies:
-            apart = [self._apart(body, other) for other in longest]
-            arms = [own >= ARM_AXES and own >= ARM_SHARE * its for own, its in apart]
-            if body not in longest and all(arms):
-                result.append(body)
-        return result
+        depth = max(self.depth(body) for body in bodies)
+        longest = [body for body in bodies if self.depth(body) == depth]
+        shorter = [body for body in bodies if body not in longest]
+        arms = [body for body in shorter if all(self._is_another_arm(body, main) for main in longest)]
+        return [*longest, *arms]
 
-    def _apart(self, body: str, other: str) -> tuple[int, int]:
-        """Return the numbers of axes of two chains behind the link at which they part."""
-        first, second = (self.tree.path(self.base, link) for link in (body, other))
-        shared = sum(a.actuated for a, b in zip(first, second) if a.name == b.name)
-        return self.depth(body) - shared, self.depth(other) - shared
+    def _is_another_arm(self, body: str, main: str) -> bool:
+        """Return whether a chain has nearly as many axes as the longest one behind the link at which they part."""
+        path = self.tree.path(self.base, body)
+        main_path = self.tree.path(self.base, main)
+        shared = sum(joint.actuated for joint, main_joint in zip(path, main_path) if joint.name == main_joint.name)
+        axes = self.depth(body) - shared
+        main_axes = self.depth(main) - shared
+        return axes >= ARM_AXES and axes >= ARM_SHARE * main_axes
 
     def _mimicking(self) -> dict[str, str]:
         """Return mimic joints whose leader is in another branch, and leaders that no actuated joint follows."""
-        tree, found = self.tree, dict[str, str]()
+        tree = self.tree
+        result: dict[str, str] = {}
         for joint in tree.joints.values():
             leader = tree.joints.get(joint.mimic.leader) if joint.mimic else None
             if leader is None or _hangs(tree, joint.child, leader.child) or _hangs(tree, leader.child, joint.child):
                 continue
-            found[joint.name] = "moves with another joint"
-            if not any(other.actuated and _hangs(tree, other.child, leader.child) for other in tree.joints.values()):
-                found[leader.name] = "drives a gripper"
-        return found
+            result[joint.name] = "moves with another joint"
+            followers = [follower for follower in tree.joints.values() if _hangs(tree, follower.child, leader.child)]
+            if not any(follower.actuated for follower in followers):
+                result[leader.name] = "drives a gripper"
+        return result
 
     def _named_jaws(self) -> dict[str, str]:
         """Return joints at the ends of chains that are jaws or fingers by name, with those before them."""
-        found: dict[str, str] = {}
+        result: dict[str, str] = {}
         jaws = [joint for joint in self.tree.joints.values() if joint.actuated and self._is_jaw(joint)]
-        jaws.sort(key=lambda joint: -len(self.tree.ancestry(joint.child)))
-        for joint in jaws:
-            behind = [other for other in self.tree.joints.values() if _hangs(self.tree, other.child, joint.child)]
-            if all(other.name in found or not other.actuated or other.name in self.aside for other in behind):
-                found[joint.name] = "a gripper by its name"
-        return found
+        jaws.sort(key=self._depth_in_tree, reverse=True)
+        for jaw in jaws:
+            axes_behind = []
+            for joint in self.tree.joints.values():
+                is_axis = joint.actuated and joint.name not in result and joint.name not in self.aside
+                if is_axis and _hangs(self.tree, joint.child, jaw.child):
+                    axes_behind.append(joint)
+            if not axes_behind:
+                result[jaw.name] = "a gripper by its name"
+        return result
+
+    def _depth_in_tree(self, joint: JointTag) -> int:
+        """Return how many joints stand between the root and a joint's child."""
+        return len(self.tree.ancestry(joint.child))
 
     def _is_jaw(self, joint: JointTag) -> bool:
         """Return whether a joint's name, or its link's, is that of a jaw; a word that the whole arm has is a prefix."""
@@ -235,14 +252,14 @@ class _Axes:
 
     def _behind_flange(self) -> dict[str, str]:
         """Return the joints behind bodies with a tool0 or a flange, where what is behind them is no arm."""
-        found: dict[str, str] = {}
+        result: dict[str, str] = {}
         for body in self._bodies():
             frames = [link for link, _ in self.tree.rigid(body) if TOOL0.search(link) or FLANGE.search(link)]
             branches = [joint for joint in self.departing(body) if self.height(joint)]
             if frames and branches and self._is_tool(body, branches):
                 for joint in branches:
-                    found |= dict.fromkeys(self._behind(joint), f"behind {frames[-1]}")
-        return found
+                    result |= dict.fromkeys(self._behind(joint), f"behind {frames[-1]}")
+        return result
 
     def _is_tool(self, body: str, branches: list[JointTag]) -> bool:
         """Return whether the joints departing from a body with a flange belong to a tool: one joint each, or a hand."""
@@ -254,30 +271,34 @@ class _Axes:
 
     def _beside_axis(self) -> dict[str, str]:
         """Return short branches beside the only one that continues the arm: by its name, or up to a flange."""
-        found: dict[str, str] = {}
+        result: dict[str, str] = {}
         for body in self._bodies():
             branches = [joint for joint in self.departing(body) if self.height(joint)]
             axes = [joint for joint in branches if self._in_series(joint) or self._is_flanged(joint)]
+            if len(axes) != 1:
+                continue
             for joint in branches:
-                if len(axes) == 1 and joint is not axes[0] and self.height(joint) < ARM_AXES:
-                    found |= dict.fromkeys(self._behind(joint), f"beside {axes[0].name}")
-        return found
+                if joint is not axes[0] and self.height(joint) < ARM_AXES:
+                    result |= dict.fromkeys(self._behind(joint), f"beside {axes[0].name}")
+        return result
 
     def _is_flanged(self, joint: JointTag) -> bool:
         """Return whether a tool0 or a flange hangs on a joint or on what follows it."""
-        bodies = [self.tree.joints[name].child for name in self._behind(joint)]
-        links = [link for body in bodies for link, _ in self.tree.rigid(body)]
-        return any(TOOL0.search(link) or FLANGE.search(link) for link in links)
+        for name in self._behind(joint):
+            body = self.tree.joints[name].child
+            if any(TOOL0.search(link) or FLANGE.search(link) for link, _ in self.tree.rigid(body)):
+                return True
+        return False
 
     def _forked(self) -> dict[str, str]:
         """Return the joints of hands: equally short branches at the end of a chain, nearest to the base first."""
-        found: dict[str, str] = {}
+        fingers: dict[str, str] = {}
         for body in self._bodies():
-            branches = [joint for joint in self.departing(body) if self.height(joint) and joint.name not in found]
+            branches = [joint for joint in self.departing(body) if self.height(joint) and joint.name not in fingers]
             if self._is_hand(body, branches):
                 for joint in branches:
-                    found |= dict.fromkeys(self._behind(joint), "finger of a hand")
-        return found
+                    fingers |= dict.fromkeys(self._behind(joint), "finger of a hand")
+        return fingers
 
     def _is_hand(self, body: str, branches: list[JointTag]) -> bool:
         """Return whether several branches are fingers: shorter than what is before, of one length, not named as axes.
@@ -291,9 +312,10 @@ class _Axes:
         even = difference == 0 or (len(heights) > 2 and difference == 1)
         if not even or heights[-1] >= self.depth(body):
             return False
-        axes = [joint for joint in branches if self._in_series(joint) or self._is_named_axis(joint)]
-        flanged = [joint for joint in branches if self._is_flanged(joint)]
-        return not flanged and not axes
+        for joint in branches:
+            if self._is_flanged(joint) or self._in_series(joint) or self._is_named_axis(joint):
+                return False
+        return True
 
     def _bodies(self) -> list[str]:
         """Return the links behind moving joints that are reached, nearest to the base first."""
@@ -301,8 +323,8 @@ class _Axes:
 
     def _behind(self, joint: JointTag) -> list[str]:
         """Return the names of a joint and of all moving joints behind it."""
-        joints = self.tree.joints.values()
-        behind = [one.name for one in joints if one.moves and _hangs(self.tree, one.child, joint.child)]
+        moving = [follower for follower in self.tree.joints.values() if follower.moves]
+        behind = [follower.name for follower in moving if _hangs(self.tree, follower.child, joint.child)]
         return [joint.name, *behind]
 
     def _first(self, link: str) -> str:
@@ -314,13 +336,14 @@ class _Axes:
 
     def _in_series(self, joint: JointTag) -> bool:
         """Return whether a joint's name is that of the actuated joint before it with the next number or letter."""
-        before = [one for one in self.tree.ancestry(joint.child)[:-1] if one.actuated]
+        before = [earlier for earlier in self.tree.ancestry(joint.child)[:-1] if earlier.actuated]
         return bool(before) and _follows(before[-1].name, joint.name)
 
 
 def _follows(before: str, name: str) -> bool:
     """Return whether two names begin alike up to a number that grows by one: ``joint_1_s``, ``joint_2_l``."""
-    first, second = (re.match(r"(\D*)(\d+)", text.lower()) for text in (before, name))
+    first = NUMBERED.match(before.lower())
+    second = NUMBERED.match(name.lower())
     if first is None or second is None:
         return False
     return first[1] == second[1] and int(second[2]) == int(first[2]) + 1
@@ -333,18 +356,20 @@ def _hangs(tree: UrdfTree, link: str, on: str) -> bool:
 def _frame(tree: UrdfTree, body: str) -> tuple[str, str]:
     """Return the link of a last body at which the arm ends, and why."""
     links = [link for link, _ in tree.rigid(body)]
-    for pattern, words in ((TOOL0, "its tool frame (REP 199)"), (FLANGE, "its flange (REP 199)")):
-        found = [link for link in links if pattern.search(link)]
-        if found:
-            return found[0], words
+    for pattern, reason in ((TOOL0, "its tool frame (REP 199)"), (FLANGE, "its flange (REP 199)")):
+        frames = [link for link in links if pattern.search(link)]
+        if frames:
+            return frames[0], reason
     counted = _without_tools(tree, body)
-    ends = [link for link in counted if link != body and END_WORDS & _words(link)]
-    if len(_leaves(tree, ends)) == 1:
-        return _leaves(tree, ends)[0], "its end-effector frame"
+    effectors = [link for link in counted if link != body and END_WORDS & _words(link)]
+    last_effectors = _leaves(tree, effectors)
+    if len(last_effectors) == 1:
+        return last_effectors[0], "its end-effector frame"
     leaves = _leaves(tree, counted)
+    if len(leaves) == 1 and len(counted) == len(links):
+        return leaves[0], "the last link"
     if len(leaves) == 1:
-        alone = len(counted) == len(links)
-        return leaves[0], "the last link" if alone else "the last link that is no gripper or sensor"
+        return leaves[0], "the last link that is no gripper or sensor"
     return body, f"the last moving link ({listing(leaves, 4)} hang on it; --tip takes one of them)"
 
 
@@ -358,9 +383,11 @@ def _without_tools(tree: UrdfTree, body: str) -> list[str]:
         result.append(link)
         for joint in tree.below[link]:
             name = joint.child.lower()
-            gripper = any(word in name and word not in prefix for word in GRIPPER_WORDS)
-            holds = any(other.moves for other in tree.below[joint.child]) and not END_WORDS & _words(joint.child)
-            if joint.kind == "fixed" and not (gripper or holds or SENSOR_WORDS & _words(joint.child)):
+            words_of_name = _words(joint.child)
+            is_gripper = any(word in name and word not in prefix for word in GRIPPER_WORDS)
+            carries_joint = any(follower.moves for follower in tree.below[joint.child])
+            is_tool = is_gripper or (carries_joint and not END_WORDS & words_of_name)
+            if joint.kind == "fixed" and not is_tool and not SENSOR_WORDS & words_of_name:
                 todo.append(joint.child)
     return result
 
@@ -368,7 +395,10 @@ def _without_tools(tree: UrdfTree, body: str) -> list[str]:
 def _leaves(tree: UrdfTree, links: Iterable[str]) -> list[str]:
     """Return those of some links that no other of them hangs on."""
     links = list(links)
-    return [link for link in links if not any(_hangs(tree, other, link) for other in links if other != link)]
+    before: set[str] = set()
+    for link in links:
+        before.update(joint.parent for joint in tree.ancestry(link))
+    return [link for link in links if link not in before]
 
 
 def _words(link: str) -> set[str]:

@@ -30,26 +30,29 @@ def mjcf_text(chain: Chain, bodies: np.ndarray, armature: np.ndarray, damping: n
         bodies: (B, 10) standard parameters of the body after each moving element.
         armature, damping, friction: (n,) of each joint [kg m², N m s/rad, N m, or kg, N s/m, N].
     """
-    root, first = ET.Element("mujoco", model=chain.name), set(chain.moving.tolist())
+    root = ET.Element("mujoco", model=chain.name)
+    main_elements = set(chain.moving.tolist())
     ET.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
     ET.SubElement(root, "option", gravity=numbers_text(chain.gravity))
-    parent, ties = ET.SubElement(root, "worldbody"), ET.Element("equality")
+    parent = ET.SubElement(root, "worldbody")
+    ties = ET.Element("equality")
     frames = moving_frames(chain, np.zeros((1, chain.n)))[:, 0]
-    placed = [frames[0], *(invert(frames[:-1]) @ frames[1:])]  # each in the frame of the body before
-    ends = [one[:3, 3] for one in (*placed[1:], chain.tail)]
+    # Each body's frame in the frame of the body before.
+    body_poses = [frames[0], *(invert(frames[:-1]) @ frames[1:])]
+    ends = [transform[:3, 3] for transform in (*body_poses[1:], chain.tail)]
     for number, k in enumerate(chain.driven.tolist()):
         element, name = chain.elements[k], joint_name(chain, k)
-        parent = ET.SubElement(parent, "body", {"name": f"{name}_body", **pose_attributes(placed[number])})
+        parent = ET.SubElement(parent, "body", {"name": f"{name}_body", **pose_attributes(body_poses[number])})
         if bodies[number].any():
             mass, centre, (xx, xy, xz, yy, yz, zz) = centred(bodies[number])
             full = numbers_text(np.array([xx, yy, zz, xy, xz, yz]))
             ET.SubElement(parent, "inertial", pos=numbers_text(centre), mass=repr(mass), fullinertia=full)
         axis = numbers_text(element.sign * np.eye(3)[AXES.index(element.axis) % 3])
-        joint = ET.SubElement(
-            parent, "joint", name=name, type="slide" if element.axis[0] == "t" else "hinge", axis=axis
-        )
-        mover, leader = element.joint or 0, chain.joints[element.joint or 0]
-        if k in first:
+        kind = "slide" if element.axis[0] == "t" else "hinge"
+        joint = ET.SubElement(parent, "joint", name=name, type=kind, axis=axis)
+        mover = element.joint or 0
+        leader = chain.joints[mover]
+        if k in main_elements:
             for key, values in (("armature", armature), ("damping", damping), ("frictionloss", friction)):
                 joint.set(key, repr(float(values[mover])))
             if np.isfinite([leader.lower, leader.upper]).all():
@@ -61,7 +64,8 @@ def mjcf_text(chain: Chain, bodies: np.ndarray, armature: np.ndarray, damping: n
             shape = {"type": "capsule", "fromto": f"0 0 0 {numbers_text(ends[number])}", "size": "0.03"}
             ET.SubElement(parent, "geom", shape, contype="0", conaffinity="0", rgba="0.6 0.6 0.6 1")
     ET.SubElement(parent, "site", {"name": f"{chain.tip}_tip", **pose_attributes(chain.tail)})
-    root.extend([ties] if len(ties) else [])
+    if len(ties):
+        root.append(ties)
     return xml_text(root)
 
 
@@ -126,7 +130,8 @@ def configurations(model: Any, chain: Chain, q: np.ndarray, from_zero: bool = Fa
     result = np.tile(pin.neutral(model), (len(q), 1))
     for k, joint in zip(chain.driven, driven_joints(model, chain)):
         element = chain.elements[k]
-        value = element.ratio * q[:, element.joint] + (0.0 if from_zero else element.value)
+        constant = 0.0 if from_zero else element.value
+        value = element.ratio * q[:, element.joint] + constant
         values = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
         result[:, joint.idx_q : joint.idx_q + joint.nq] = np.stack(values, axis=1)
     return result
@@ -164,8 +169,8 @@ def motion_torques(
         pin.forwardKinematics(model, data, configuration)
         torques[row] = pin.rnea(model, data, configuration, velocity @ v[row], velocity @ a[row]) @ velocity
         frames[:, row] = [data.oMi[joint.id].homogeneous for joint in joints]
-    main = [joints[place].idx_v for place in np.searchsorted(chain.driven, chain.moving)]
-    return torques, frames, model.damping[main], model.friction[main]
+    rows = [joints[number].idx_v for number in np.searchsorted(chain.driven, chain.moving)]
+    return torques, frames, model.damping[rows], model.friction[rows]
 
 
 def pinocchio_model(source: str, mjcf: bool = False) -> Any:
@@ -176,9 +181,10 @@ def pinocchio_model(source: str, mjcf: bool = False) -> Any:
     """
     import pinocchio
 
-    pin: Any = pinocchio  # its names come from C++, where no type checker sees them
-    words = f"Pinocchio cannot read the {'MJCF' if mjcf else 'URDF'}: {{}}"
-    with refused_as(RobotError, (ValueError, RuntimeError), words):
+    # Its names come from C++, where no type checker sees them.
+    pin: Any = pinocchio
+    file_format = "MJCF" if mjcf else "URDF"
+    with refused_as(RobotError, (ValueError, RuntimeError), f"Pinocchio cannot read the {file_format}: {{}}"):
         if not mjcf:
             return pin.buildModelFromXML(source)
         with tempfile.TemporaryDirectory() as folder:

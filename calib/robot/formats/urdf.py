@@ -14,6 +14,7 @@ actuated joints (a gripper's fingers) are not included.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -88,7 +89,9 @@ def build(tree: UrdfTree, between: ArmEnds) -> Chain:
     actuated = [joint for joint in path if joint.actuated]
     index = {joint.name: j for j, joint in enumerate(actuated)}
     elements: list[Element] = []
-    pending, passed = _IDENTITY, 0
+    # Transform since the last moving element, and number of actuated joints passed.
+    pending = _IDENTITY
+    passed = 0
     for joint in path:
         pending = pending @ joint.origin
         if not joint.moves:
@@ -114,9 +117,13 @@ def build(tree: UrdfTree, between: ArmEnds) -> Chain:
 
 def _unused_faults(tree: UrdfTree, path: list[JointTag]) -> list[str]:
     """Return remarks on joints outside the chain whose limits are wrong."""
-    used = {joint.name for joint in path}
-    faults = [joint.fault for joint in tree.joints.values() if joint.fault and joint.name not in used]
-    return [f"{fault} (this joint is not in the arm)" for fault in faults]
+    path_joints = {joint.name for joint in path}
+    result = []
+    for joint in tree.joints.values():
+        if joint.fault and joint.name not in path_joints:
+            remark = f"{joint.fault} (this joint is not in the arm)"
+            result.append(remark)
+    return result
 
 
 def align(axis: np.ndarray) -> np.ndarray:
@@ -135,31 +142,36 @@ def _elements(
     joint: JointTag, placement: np.ndarray, owner: int, mover: int, ratio: float, offset: float
 ) -> list[Element]:
     """Return the six elements of a joint: translations, rotations, the moving one last."""
-    main = int(np.argmax(np.abs(joint.axis))) if np.count_nonzero(joint.axis) == 1 else 2
-    sign = -1.0 if np.count_nonzero(joint.axis) == 1 and joint.axis[main] < 0 else 1.0
-    moving = ("t" if joint.kind == "prismatic" else "r") + "xyz"[main]
-    order = [axis for axis in AXES if axis != moving]
-    first = None if np.array_equal(placement, _IDENTITY) else placement
-    elements = [
-        Element(f"{joint.name}.{_SUFFIX[axis]}", axis, 0.0, owner, placement=first if k == 0 else None)
-        for k, axis in enumerate(order)
-    ]
-    return [*elements, Element(f"{joint.name}.offset", moving, offset, owner, mover, ratio, sign)]
+    # An oblique axis is z of the frame that `align` turned.
+    direction, sign = 2, 1.0
+    if np.count_nonzero(joint.axis) == 1:
+        direction = int(np.argmax(np.abs(joint.axis)))
+        sign = -1.0 if joint.axis[direction] < 0 else 1.0
+    motion = "t" if joint.kind == "prismatic" else "r"
+    moving_axis = motion + "xyz"[direction]
+    constant_axes = [axis for axis in AXES if axis != moving_axis]
+    elements = [Element(f"{joint.name}.{_SUFFIX[axis]}", axis, 0.0, owner) for axis in constant_axes]
+    if not np.array_equal(placement, _IDENTITY):
+        elements[0] = replace(elements[0], placement=placement)
+    elements.append(Element(f"{joint.name}.offset", moving_axis, offset, owner, mover, ratio, sign))
+    return elements
 
 
 def drive(tree: UrdfTree, joint: JointTag) -> tuple[str, float, float]:
     """Return the actuated joint that moves `joint`, the ratio and the offset, through chains of mimic joints."""
     ratio, offset, name = 1.0, 0.0, joint.name
-    seen = {name}
+    where = f"{tree.where}, line {joint.node.line}, joint '{joint.name}'"
+    passed = {name}
     mimic: Mimic | None = joint.mimic
     while mimic is not None:
         offset += ratio * mimic.offset
         ratio *= mimic.multiplier
         name = mimic.leader
-        if name in seen or name not in tree.joints:
-            what = "a circle" if name in seen else f"'{name}', which is not a joint{suggestion(name, tree.joints)}"
-            refuse_robot(f"{tree.where}, line {joint.node.line}, joint '{joint.name}'", f"it mimics {what}")
-        seen.add(name)
+        if name in passed:
+            refuse_robot(where, "it mimics a circle")
+        if name not in tree.joints:
+            refuse_robot(where, f"it mimics '{name}', which is not a joint{suggestion(name, tree.joints)}")
+        passed.add(name)
         mimic = tree.joints[name].mimic
     return name, ratio, offset
 
@@ -171,23 +183,26 @@ def _check_path(tree: UrdfTree, path: list[JointTag], base: str, tip: str, joint
         refuse_robot(tree.where, f"no actuated joint between '{base}' and '{tip}'; choose another base or tip")
     passed: set[str] = set()
     for joint in path:
-        place = f"{tree.where}, line {joint.node.line}, joint '{joint.name}'"
+        where = f"{tree.where}, line {joint.node.line}, joint '{joint.name}'"
         if joint.kind in ("floating", "planar"):
-            refuse_robot(place, f"type '{joint.kind}' cannot be part of an arm; choose a base after it (--base)")
+            refuse_robot(where, f"type '{joint.kind}' cannot be part of an arm; choose a base after it (--base)")
         passed.add(joint.name)
         if not joint.moves or joint.actuated:
             continue
         leader, ratio, _ = drive(tree, joint)
         if leader not in passed:
             side = "comes after it" if leader in actuated else f"is not between '{base}' and '{tip}'"
-            refuse_robot(place, f"the joint it mimics, '{leader}', {side}; choose another base or tip")
+            refuse_robot(where, f"the joint it mimics, '{leader}', {side}; choose another base or tip")
         if ratio == 0.0 or tree.joints[leader].kind == "fixed":
-            refuse_robot(place, f"it mimics '{leader}' but cannot move; change its type to fixed")
-    if joint_names and (extra := [name for name in actuated if name not in joint_names]):
+            refuse_robot(where, f"it mimics '{leader}' but cannot move; change its type to fixed")
+    if not joint_names:
+        return
+    unmeasured = [name for name in actuated if name not in joint_names]
+    if unmeasured:
         refuse_robot(
             tree.where,
             f"between '{base}' and '{tip}' some joints are not in the measurements: "
-            f"{', '.join(extra)}; choose base and tip (--base, --tip), or make them fixed at their value",
+            f"{', '.join(unmeasured)}; choose base and tip (--base, --tip), or make them fixed at their value",
         )
 
 
@@ -196,16 +211,19 @@ def _inertias(tree: UrdfTree, path: list[JointTag]) -> np.ndarray | None:
 
     Also None where the body behind a mimic follower has mass: it would need a row of its own.
     """
-    rows, known = [], False
+    rows = []
     for joint in path:
         if not joint.moves:
             continue
-        back = invert(align(joint.axis))
-        bodies = [(tree.bodies[link], placed) for link, placed in tree.rigid(joint.child)]
-        total = sum((transform_body(body, back @ placed) for body, placed in bodies if body is not None), np.zeros(10))
+        T_element_joint = invert(align(joint.axis))
+        total = np.zeros(10)
+        for link, T_joint_link in tree.rigid(joint.child):
+            body = tree.bodies[link]
+            if body is not None:
+                total = total + transform_body(body, T_element_joint @ T_joint_link)
         if joint.actuated:
             rows.append(total)
-            known = known or bool(total.any())
         elif total.any():
             return None
-    return np.array(rows) if known else None
+    inertias = np.array(rows)
+    return inertias if inertias.any() else None

@@ -15,15 +15,30 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Protocol
 from xml.parsers import expat
 
 import numpy as np
 
 from calib.errors import RobotError, listing, refuse_robot, refused_as, require, suggestion
-from calib.extensions import offered
+from calib.extensions import Point
 from calib.robot.chain import MIN_LIMIT, Joint
 from calib.transforms import from_xyz_rpy
+
+
+class DescriptionReader(Protocol):
+    """Reader of robots that another program describes, as URDF."""
+
+    def takes(self, path: str) -> bool:
+        """Return whether `urdf` converts this file."""
+        ...
+
+    def urdf(self, path: str) -> str:
+        """Return the URDF text of a file."""
+        ...
+
+
+DESCRIPTIONS: Point[DescriptionReader] = Point("descriptions", "readers of robots' descriptions that are no URDF")
 
 XACRO = "this is a xacro file; name it so (robot.urdf.xacro)"
 _DECLARED = re.compile(rb"""^\s*<\?xml[^>]*?encoding\s*=\s*["']([A-Za-z0-9._-]+)["']""")
@@ -51,9 +66,12 @@ class Node:
         return next(self.all(tag), None)
 
 
-def converter(path: str | Path) -> Any:
-    """Return the module of a room that converts this file to a URDF (``descriptions``); None where there is none."""
-    return next((room for room in offered("descriptions") if room.takes(str(path))), None)
+def converter(path: str | Path) -> DescriptionReader | None:
+    """Return the reader that converts this file to a URDF; None where there is none."""
+    for reader in DESCRIPTIONS.all():
+        if reader.takes(str(path)):
+            return reader
+    return None
 
 
 def is_urdf(path: Path) -> bool:
@@ -67,17 +85,24 @@ def text(path: str | Path) -> tuple[str, str]:
     Raises:
         RobotError: where it cannot be read, decoded or converted.
     """
-    if (room := converter(path)) is not None:
+    room = converter(path)
+    if room is not None:
         return room.urdf(str(path)), "utf-8"
     with refused_as(RobotError, OSError, f"cannot read {path}: {{}}"):
         data = Path(path).read_bytes()
-    declared = _DECLARED.match(data)
-    encoding = declared[1].decode() if declared else "utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8"
+    declaration = _DECLARED.match(data)
+    if declaration:
+        encoding = declaration[1].decode()
+    elif data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        encoding = "utf-16"
+    else:
+        encoding = "utf-8"
     with refused_as(RobotError, (LookupError, UnicodeError), f"{path}: not readable as {encoding}: {{}}"):
-        found = data.decode(encoding)
-        for way in ("utf-8", encoding):  # Python knows encodings that are no way back
-            found.encode(way)
-        return found, encoding
+        content = data.decode(encoding)
+        # Python knows encodings that it cannot write.
+        content.encode("utf-8")
+        content.encode(encoding)
+        return content, encoding
 
 
 def parse(source: str, where: str) -> Node:
@@ -92,11 +117,15 @@ def parse(source: str, where: str) -> Node:
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         node = Node(tag, attributes, parser.CurrentLineNumber, parser.CurrentByteIndex)
-        (stack[-1].children if stack else root).append(node)
+        siblings = stack[-1].children if stack else root
+        siblings.append(node)
         stack.append(node)
 
+    def end(tag: str) -> None:
+        stack.pop()
+
     parser.StartElementHandler = start
-    parser.EndElementHandler = lambda tag: stack.pop()
+    parser.EndElementHandler = end
     try:
         parser.Parse(source, True)
     except expat.ExpatError as error:
@@ -116,40 +145,52 @@ def edited(source: str, changes: Iterable[tuple[int, int, str]]) -> str:
 def set_attributes(source: str, node: Node, values: dict[str, str]) -> list[tuple[int, int, str]]:
     """Return the changes (for `edited`) that set a node's attributes, in place or after the last one."""
     data = source.encode("utf-8")
-    found = {match[1].decode(): match for match in _attributes(data, node)}
-    end = max([match.end() for match in found.values()], default=node.start + 1 + len(node.tag.encode()))
-    changes = [(found[key].start(2) + 1, found[key].end(2) - 1, value) for key, value in values.items() if key in found]
-    fresh = "".join(f' {key}="{value}"' for key, value in values.items() if key not in found)
-    return [*changes, (end, end, fresh)] if fresh else changes
+    end = node.start + 1 + len(node.tag.encode())
+    matches: dict[str, re.Match[bytes]] = {}
+    for match in _attributes(data, node):
+        matches[match[1].decode()] = match
+        end = max(end, match.end())
+    changes: list[tuple[int, int, str]] = []
+    added = ""
+    for key, value in values.items():
+        match = matches.get(key)
+        if match is None:
+            added += f' {key}="{value}"'
+        else:
+            changes.append((match.start(2) + 1, match.end(2) - 1, value))
+    if added:
+        changes.append((end, end, added))
+    return changes
 
 
 def insert_child(source: str, node: Node, child: str) -> list[tuple[int, int, str]]:
     """Return the change that inserts a first child into a node, with the indentation of the next child."""
     data = source.encode("utf-8")
-    last = max([match.end() for match in _attributes(data, node)], default=node.start)
-    place = data.index(b">", last) + 1
-    if data[place - 2 : place] == b"/>":
-        return [(place - 2, place, f">{child}</{node.tag}>")]
-    indent = _BLANK.match(data, place)
-    return [(place, place, (indent[0].decode() if indent else "") + child)]
+    attributes_end = max([match.end() for match in _attributes(data, node)], default=node.start)
+    tag_end = data.index(b">", attributes_end) + 1
+    if data[tag_end - 2 : tag_end] == b"/>":
+        return [(tag_end - 2, tag_end, f">{child}</{node.tag}>")]
+    blank = _BLANK.match(data, tag_end)
+    indent = blank[0].decode() if blank else ""
+    return [(tag_end, tag_end, indent + child)]
 
 
 def _attributes(data: bytes, node: Node) -> Iterator[re.Match[bytes]]:
     """Yield the matches (name, quoted value) of a node's attributes."""
-    place = node.start + 1 + len(node.tag.encode())
-    while match := _ATTRIBUTE.match(data, place):
+    position = node.start + 1 + len(node.tag.encode())
+    while match := _ATTRIBUTE.match(data, position):
         yield match
-        place = match.end()
+        position = match.end()
 
 
-def with_comment(content: bytes, words: str) -> bytes:
+def with_comment(content: bytes, remark: str) -> bytes:
     """Return an XML file with an ASCII comment inserted after its declaration.
 
     A file in UTF-16 is returned as it is.
     """
     if b"\0" in content[:4]:
         return content
-    comment = f"<!-- {re.sub('-(?=-)', '- ', words)} -->".encode("ascii", "xmlcharrefreplace")
+    comment = f"<!-- {re.sub('-(?=-)', '- ', remark)} -->".encode("ascii", "xmlcharrefreplace")
     bom = len(codecs.BOM_UTF8) if content.startswith(codecs.BOM_UTF8) else 0
     if not content[bom:].startswith(b"<?xml"):
         return content[:bom] + comment + b"\n" + content[bom:]
@@ -284,8 +325,9 @@ def read(source: str, where: str) -> UrdfTree:
     root = parse(source, where)
     if root.tag != "robot":
         refuse_robot(f"{where}, line {root.line}", f"the root element is <{root.tag}>, a URDF has <robot>")
-    if macro := next((node for node in root.children if _is_macro(node)), None):
-        refuse_robot(f"{where}, line {macro.line}", f"found <{macro.tag}>: {XACRO}")
+    for node in root.children:
+        if _is_macro(node):
+            refuse_robot(f"{where}, line {node.line}", f"found <{node.tag}>: {XACRO}")
     bodies: dict[str, np.ndarray | None] = {}
     for node in root.all("link"):
         name = _fresh(node, bodies, where)
@@ -298,9 +340,11 @@ def read(source: str, where: str) -> UrdfTree:
     below: dict[str, list[JointTag]] = {link: [] for link in bodies}
     for joint in joints.values():
         if joint.child in above:
-            both = f"'{above[joint.child].name}' and '{joint.name}'"
-            place = f"{where}, line {joint.node.line}"
-            refuse_robot(place, f"link '{joint.child}' has two parents, joints {both}; a URDF must be a tree")
+            parents = f"'{above[joint.child].name}' and '{joint.name}'"
+            refuse_robot(
+                f"{where}, line {joint.node.line}",
+                f"link '{joint.child}' has two parents, joints {parents}; a URDF must be a tree",
+            )
         above[joint.child] = joint
         below[joint.parent].append(joint)
     name, remarks = root.attributes.get("name", "robot"), _large_angles(joints, where)
@@ -315,17 +359,19 @@ def _large_angles(joints: dict[str, JointTag], where: str) -> tuple[str, ...]:
     Raises:
         RobotError: for several joints.
     """
-    found = []
+    origins = []
     for joint in joints.values():
         node = joint.node.first("origin")
         if node is not None and (np.abs(numbers(node, "rpy", where, "0 0 0")) > TURN).any():
-            found.append(f"joint '{joint.name}' (line {node.line}): rpy=\"{node.attributes['rpy']}\"")
-    if len(found) > 1:
+            origins.append(f"joint '{joint.name}' (line {node.line}): rpy=\"{node.attributes['rpy']}\"")
+    if not origins:
+        return ()
+    if len(origins) > 1:
         refuse_robot(
             where,
-            f"{listing(found, 3)}: beyond a full turn: are these degrees? A URDF's angles are radians; convert them",
+            f"{listing(origins, 3)}: beyond a full turn: are these degrees? A URDF's angles are radians; convert them",
         )
-    return tuple(f"{one} is beyond a full turn: are these degrees? A URDF's angles are radians" for one in found)
+    return (f"{origins[0]} is beyond a full turn: are these degrees? A URDF's angles are radians",)
 
 
 def transform_body(body: np.ndarray, pose: np.ndarray) -> np.ndarray:
@@ -338,9 +384,10 @@ def transform_body(body: np.ndarray, pose: np.ndarray) -> np.ndarray:
     rotation, lever, mass = pose[:3, :3], pose[:3, 3], body[9]
     moment = rotation @ body[6:9]
     inertia = rotation @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ rotation.T
-    cross, first = _skew(lever), _skew(moment)
-    inertia = inertia + cross.T @ first + first.T @ cross + mass * cross.T @ cross
-    return np.array([*inertia[0], *inertia[1, 1:], inertia[2, 2], *(moment + mass * lever), mass])
+    lever_cross, moment_cross = _skew(lever), _skew(moment)
+    inertia = inertia + lever_cross.T @ moment_cross + moment_cross.T @ lever_cross + mass * lever_cross.T @ lever_cross
+    moment = moment + mass * lever
+    return np.array([*inertia[0], *inertia[1, 1:], inertia[2, 2], *moment, mass])
 
 
 def _skew(v: np.ndarray) -> np.ndarray:
@@ -352,120 +399,143 @@ def _is_macro(node: Node) -> bool:
     return node.tag.startswith("xacro:") and node.tag not in ("xacro:property", "xacro:arg")
 
 
-def _fresh(node: Node, known: Iterable[str], where: str) -> str:
+def _fresh(node: Node, names: Iterable[str], where: str) -> str:
     """Return the name of a link or joint; refuse a missing or duplicate name."""
     name = node.attributes.get("name", "")
     require(name, f"{where}, line {node.line}: a <{node.tag}> without a name", RobotError)
-    require(name not in known, f"{where}, line {node.line}: a second {node.tag} named '{name}'", RobotError)
+    require(name not in names, f"{where}, line {node.line}: a second {node.tag} named '{name}'", RobotError)
     return name
 
 
 def _joint(node: Node, links: Iterable[str], where: str) -> JointTag:
     name, kind = node.attributes["name"], node.attributes.get("type", "")
-    place = f"{where}, line {node.line}, joint '{name}'"
+    where = f"{where}, line {node.line}, joint '{name}'"
     if kind not in KINDS:
-        refuse_robot(place, f"type '{kind}' is not one of {', '.join(KINDS)}{suggestion(kind, KINDS)}")
-    parent, child = (_end(node, role, links, place) for role in ("parent", "child"))
-    axis, mimic, fault = _axis(node, kind, place), _mimic(node, place), ""
+        refuse_robot(where, f"type '{kind}' is not one of {', '.join(KINDS)}{suggestion(kind, KINDS)}")
+    parent = _end(node, "parent", links, where)
+    child = _end(node, "child", links, where)
+    axis = _axis(node, kind, where)
+    mimic = _mimic(node, where)
+    fault = ""
     try:
-        limits = _limits(node, kind, place)
+        limits = _limits(node, kind, where)
     except RobotError as error:
         limits, fault = (-np.inf, np.inf, np.inf, np.inf, ()), str(error)
-    return JointTag(name, kind, parent, child, origin(node, place), axis, mimic, limits, node, fault)
+    return JointTag(name, kind, parent, child, origin(node, where), axis, mimic, limits, node, fault)
 
 
-def _end(node: Node, role: str, links: Iterable[str], place: str) -> str:
+def _end(node: Node, role: str, links: Iterable[str], where: str) -> str:
     """Return the name of a joint's parent or child link."""
     child = node.first(role)
-    if child is None or not (link := child.attributes.get("link")):
-        refuse_robot(place, f"no <{role} link=.../>")
+    link = "" if child is None else child.attributes.get("link")
+    if not link:
+        refuse_robot(where, f"no <{role} link=.../>")
     if link not in links:
-        refuse_robot(place, f"its {role} '{link}' is not a link of this file{suggestion(link, list(links))}")
+        refuse_robot(where, f"its {role} '{link}' is not a link of this file{suggestion(link, list(links))}")
     return link
 
 
-def origin(node: Node, place: str) -> np.ndarray:
+def origin(node: Node, where: str) -> np.ndarray:
     """Return the transform (4, 4) of a node's first <origin>; the identity if absent."""
-    found = node.first("origin")
-    if found is None:
+    tag = node.first("origin")
+    if tag is None:
         return np.eye(4)
-    return from_xyz_rpy(numbers(found, "xyz", place, "0 0 0"), numbers(found, "rpy", place, "0 0 0"))
+    return from_xyz_rpy(numbers(tag, "xyz", where, "0 0 0"), numbers(tag, "rpy", where, "0 0 0"))
 
 
-def _axis(node: Node, kind: str, place: str) -> np.ndarray:
-    found = node.first("axis")
-    if kind not in MOVING:
+def _axis(node: Node, kind: str, where: str) -> np.ndarray:
+    tag = node.first("axis")
+    if kind not in MOVING or tag is None:
         return np.array([1.0, 0.0, 0.0])
-    axis = np.array([1.0, 0.0, 0.0]) if found is None else numbers(found, "xyz", place, "1 0 0")
+    axis = numbers(tag, "xyz", where, "1 0 0")
     length = np.linalg.norm(axis)
-    require(length > 1e-9, f'{place}: its axis is zero; give a direction such as xyz="0 0 1"', RobotError)
+    require(length > 1e-9, f'{where}: its axis is zero; give a direction such as xyz="0 0 1"', RobotError)
     return axis / length
 
 
-def _mimic(node: Node, place: str) -> Mimic | None:
-    found = node.first("mimic")
-    if found is None:
+def _mimic(node: Node, where: str) -> Mimic | None:
+    tag = node.first("mimic")
+    if tag is None:
         return None
-    if not (leader := found.attributes.get("joint")):
-        refuse_robot(place, "<mimic> has no attribute joint: name the joint to follow")
-    return Mimic(leader, _number(found, "multiplier", 1.0, place), _number(found, "offset", 0.0, place))
+    leader = tag.attributes.get("joint")
+    if not leader:
+        refuse_robot(where, "<mimic> has no attribute joint: name the joint to follow")
+    multiplier = _number(tag, "multiplier", 1.0, where)
+    offset = _number(tag, "offset", 0.0, where)
+    return Mimic(leader, multiplier, offset)
 
 
-def _limits(node: Node, kind: str, place: str) -> tuple[float, float, float, float, tuple[str, ...]]:
+def _limits(node: Node, kind: str, where: str) -> tuple[float, float, float, float, tuple[str, ...]]:
     """Return a joint's limits (lower, upper, velocity, effort), and as text those below `MIN_LIMIT`.
 
     Infinite where not given or beyond 1e9, the last two also below `MIN_LIMIT`: URDF demands velocity and effort, so 0
     is what people write who do not know them, and 1e9 is what we write.
     """
-    found = node.first("limit")
     lower, upper, velocity, effort = -np.inf, np.inf, np.inf, np.inf
+    tag = node.first("limit")
+    if tag is None:
+        return lower, upper, velocity, effort, ()
+
+    if kind in ("revolute", "prismatic") and ("lower" in tag.attributes or "upper" in tag.attributes):
+        lower = _number(tag, "lower", 0.0, where)
+        upper = _number(tag, "upper", 0.0, where)
+        if not lower < upper:
+            fault = f"lower limit {lower:g} is not below the upper {upper:g}"
+            refuse_robot(where, f"{fault}; correct them, or make the joint fixed or continuous")
+    if not lower > -UNLIMITED:
+        lower = -np.inf
+    if not upper < UNLIMITED:
+        upper = np.inf
+
+    velocity = _number(tag, "velocity", np.inf, where)
+    effort = _number(tag, "effort", np.inf, where)
     unstated: list[str] = []
-    if found is not None:
-        if kind in ("revolute", "prismatic") and ("lower" in found.attributes or "upper" in found.attributes):
-            lower, upper = _number(found, "lower", 0.0, place), _number(found, "upper", 0.0, place)
-            if not lower < upper:
-                found_limits = f"lower limit {lower:g} is not below the upper {upper:g}"
-                refuse_robot(place, f"{found_limits}; correct them, or make the joint fixed or continuous")
-        velocity, effort = _number(found, "velocity", np.inf, place), _number(found, "effort", np.inf, place)
-        sizes = {"velocity": velocity, "effort": effort}
-        unstated = [f"{what} {size:g}" for what, size in sizes.items() if size < MIN_LIMIT]
-    lower, upper = lower if lower > -UNLIMITED else -np.inf, upper if upper < UNLIMITED else np.inf
-    velocity, effort = (size if MIN_LIMIT <= size < UNLIMITED else np.inf for size in (velocity, effort))
+    if velocity < MIN_LIMIT:
+        unstated.append(f"velocity {velocity:g}")
+    if effort < MIN_LIMIT:
+        unstated.append(f"effort {effort:g}")
+    if not MIN_LIMIT <= velocity < UNLIMITED:
+        velocity = np.inf
+    if not MIN_LIMIT <= effort < UNLIMITED:
+        effort = np.inf
     return lower, upper, velocity, effort, tuple(unstated)
 
 
 def _body(node: Node, where: str) -> np.ndarray | None:
     """Return the standard parameters (10,) of a link about its frame; None without mass."""
-    place = f"{where}, line {node.line}, link '{node.attributes.get('name')}'"
+    link_where = f"{where}, line {node.line}, link '{node.attributes.get('name')}'"
     inertial = node.first("inertial")
     if inertial is None:
         return None
     mass_node, inertia_node = inertial.first("mass"), inertial.first("inertia")
-    mass = 0.0 if mass_node is None else _number(mass_node, "value", 0.0, place)
+    mass = 0.0
+    if mass_node is not None:
+        mass = _number(mass_node, "value", 0.0, link_where)
     moments = [0.0] * 6
     if inertia_node is not None:
-        moments = [_number(inertia_node, key, 0.0, place) for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")]
+        moments = [_number(inertia_node, key, 0.0, link_where) for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")]
     if mass == 0.0 and not any(moments):
         return None
-    return transform_body(np.array([*moments, 0.0, 0.0, 0.0, mass]), origin(inertial, place))
+    return transform_body(np.array([*moments, 0.0, 0.0, 0.0, mass]), origin(inertial, link_where))
 
 
-def numbers(node: Node, key: str, place: str, default: str = "", count: int = 3, infinite: bool = False) -> np.ndarray:
+def numbers(node: Node, key: str, where: str, default: str = "", count: int = 3, infinite: bool = False) -> np.ndarray:
     """Return the numbers (count,) of an attribute, `default` if absent; only finite ones unless `infinite`."""
-    found = node.attributes.get(key)
+    attribute = node.attributes.get(key)
+    numerals = default if attribute is None else attribute
     try:
-        values = np.array([float(word) for word in (default if found is None else found).split()])
+        values = np.array([float(numeral) for numeral in numerals.split()])
     except ValueError:
         values = np.empty(0)
     if len(values) != count or np.isnan(values).any() or not (infinite or np.isfinite(values).all()):
         expected = "a number" if count == 1 else f"{count} finite numbers"
-        hint = f"; {XACRO}" if found and "${" in found else ""
-        refuse_robot(place, f'{key}="{found}" of <{node.tag}> in line {node.line} is not {expected}{hint}')
+        hint = f"; {XACRO}" if attribute and "${" in attribute else ""
+        refuse_robot(where, f'{key}="{attribute}" of <{node.tag}> in line {node.line} is not {expected}{hint}')
     return values
 
 
-def _number(node: Node, key: str, default: float, place: str) -> float:
-    return float(numbers(node, key, place, str(default), 1, infinite=True)[0])
+def _number(node: Node, key: str, default: float, where: str) -> float:
+    return float(numbers(node, key, where, str(default), 1, infinite=True)[0])
 
 
 def _check_loops(tree: UrdfTree) -> None:
@@ -476,6 +546,7 @@ def _check_loops(tree: UrdfTree) -> None:
         link = todo.pop()
         reached.add(link)
         todo += [joint.child for joint in tree.below[link]]
-    if lost := [link for link in tree.bodies if link not in reached]:
-        refuse_robot(tree.where, f"links {', '.join(lost)} form a loop; a URDF must be a tree")
+    looped = [link for link in tree.bodies if link not in reached]
+    if looped:
+        refuse_robot(tree.where, f"links {', '.join(looped)} form a loop; a URDF must be a tree")
     require(tree.bodies, f"{tree.where}: no <link> found", RobotError)

@@ -43,6 +43,14 @@ from calib.robot.tables import LIMITS
 from calib.transforms import invert, pose, to_xyz_rpy
 
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+# Change of an origin's element [m or 1] below which it stays as written.
+UNCHANGED = 1e-12
+# Largest element by which the edited URDF's link frames may differ from the calibrated robot's [m or 1].
+MAX_DIFFERENCE = 1e-9
+# Largest element by which a link may move against the nominal chain's frame [m or 1].
+MAX_OFFSET = 1e-6
+# Number below which 0 is written.
+MIN_NUMBER = 1e-15
 
 
 def put(
@@ -56,12 +64,16 @@ def put(
         bodies: link name to standard parameters (10,) about the link's frame; all zero for none.
         friction: joint name to damping [N m s/rad or N s/m] and friction [N m or N].
     """
-    root, changes = parse(source, where), []
+    root = parse(source, where)
+    friction = friction or {}
+    changes: list[tuple[int, int, str]] = []
     for link in root.all("link"):
-        if (body := bodies.get(link.attributes.get("name", ""))) is not None:
+        body = bodies.get(link.attributes.get("name", ""))
+        if body is not None:
             changes += _inertial(source, link, body)
     for joint in root.all("joint"):
-        if (pair := (friction or {}).get(joint.attributes.get("name", ""))) is not None:
+        pair = friction.get(joint.attributes.get("name", ""))
+        if pair is not None:
             values = {"damping": repr(float(pair[0])), "friction": repr(float(pair[1]))}
             changes += _child(source, joint, "dynamics", values)
     return edited(source, changes)
@@ -97,32 +109,34 @@ def centred(body: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
 def _inertial_parts(body: np.ndarray) -> dict[str, dict[str, str]]:
     """Return the attributes of <origin>, <mass> and <inertia> of standard parameters (10,), by tag."""
     mass, centre, moments = centred(body)
-    inertia = {name: repr(float(x)) for name, x in zip(MOMENTS, moments)}
-    place = {"xyz": " ".join(repr(float(x)) for x in centre), "rpy": "0 0 0"}
-    return {"origin": place, "mass": {"value": repr(mass)}, "inertia": inertia}
+    inertia = {name: repr(float(moment)) for name, moment in zip(MOMENTS, moments)}
+    xyz = " ".join(repr(float(coordinate)) for coordinate in centre)
+    return {"origin": {"xyz": xyz, "rpy": "0 0 0"}, "mass": {"value": repr(mass)}, "inertia": inertia}
 
 
 def _inertial(source: str, link: Node, body: np.ndarray) -> list[tuple[int, int, str]]:
-    parts, node = _inertial_parts(body), link.first("inertial")
+    parts = _inertial_parts(body)
+    node = link.first("inertial")
     if node is None:
-        inner = "".join(_tag(tag, values) for tag, values in parts.items())
-        return insert_child(source, link, f"<inertial>{inner}</inertial>")
-    return [change for tag, values in parts.items() for change in _child(source, node, tag, values)]
+        content = "".join(_tag(tag, values) for tag, values in parts.items())
+        return insert_child(source, link, f"<inertial>{content}</inertial>")
+    changes: list[tuple[int, int, str]] = []
+    for tag, values in parts.items():
+        changes += _child(source, node, tag, values)
+    return changes
 
 
 def _tag(tag: str, values: Mapping[str, str]) -> str:
-    return f"<{tag} " + " ".join(f'{key}="{value}"' for key, value in values.items()) + "/>"
+    attributes = " ".join(f'{key}="{value}"' for key, value in values.items())
+    return f"<{tag} {attributes}/>"
 
 
 def _child(source: str, node: Node, tag: str, values: dict[str, str]) -> list[tuple[int, int, str]]:
     """Return the changes that set attributes of a node's first child with this tag; a missing child is inserted."""
-    found = node.first(tag)
-    if found is not None:
-        return set_attributes(source, found, values)
+    child = node.first(tag)
+    if child is not None:
+        return set_attributes(source, child, values)
     return insert_child(source, node, _tag(tag, values))
-
-
-UNCHANGED = 1e-12
 
 
 def edit_file(source: str | Path, target: str | Path, nominal: Chain, calibrated: Chain) -> Path:
@@ -155,12 +169,16 @@ def edit(source: str, nominal: Chain, calibrated: Chain, where: str = "URDF") ->
     goal = invert(base) @ calibrated_frames @ offsets[:, None]
     origins = _origins(tree, path, goal[:, 0])
     origins |= _tip_origin(tree, path, nominal, calibrated, base @ links[-1, 0], base @ goal[-1, 0])
-    changes = [one for name, origin in origins.items() for one in _change(source, tree.joints[name], origin)]
+    changes: list[tuple[int, int, str]] = []
+    for name, origin in origins.items():
+        changes += _change(source, tree.joints[name], origin)
     result = edited(source, changes)
-    written = read_tree(result, where)
-    error = np.abs(_link_frames(written, [written.joints[joint.name] for joint in path], nominal, q) - goal).max()
-    max_difference = 1e-9
-    if error > max_difference:
+
+    # The edited text, read again, has to put every link where the calibrated chain has it.
+    edited_tree = read_tree(result, where)
+    edited_path = [edited_tree.joints[joint.name] for joint in path]
+    error = np.abs(_link_frames(edited_tree, edited_path, nominal, q) - goal).max()
+    if error > MAX_DIFFERENCE:
         refuse_robot(where, f"the edited URDF differs from the calibrated robot by {error:.2g}; report this as a bug")
     return result
 
@@ -173,14 +191,16 @@ def write_new(chain: Chain) -> str:
     """
     root = ET.Element("robot", name=chain.name)
     ET.SubElement(root, "link", name=chain.base)
-    parent, first, before = chain.base, set(chain.moving.tolist()), np.eye(4)
+    main_elements = set(chain.moving.tolist())
+    parent = chain.base
+    # Transform since the last moving element.
+    T_parent_joint = np.eye(4)
     for k, element in enumerate(chain.elements):
-        before = (
-            before @ (np.eye(4) if element.placement is None else element.placement) @ _motion(element, element.value)
-        )
+        placement = np.eye(4) if element.placement is None else element.placement
+        T_parent_joint = T_parent_joint @ placement @ _motion(element, element.value)
         if element.joint is None:
             continue
-        main = k in first
+        main = k in main_elements
         if main and element.ratio != 1.0:
             refuse_robot(f"element '{element.name}'", f"a URDF joint moves by q, not by {element.ratio:g} q")
         child = _link_name(chain, k, element.joint, main)
@@ -189,11 +209,12 @@ def write_new(chain: Chain) -> str:
             inertial = ET.SubElement(link, "inertial")
             for tag, values in _inertial_parts(chain.inertias[element.joint]).items():
                 ET.SubElement(inertial, tag, values)
-        _add_moving_joint(root, chain, element, main, parent, child, before)
-        parent, before = child, np.eye(4)
+        _add_moving_joint(root, chain, element, main, parent, child, T_parent_joint)
+        parent = child
+        T_parent_joint = np.eye(4)
     if parent != chain.tip:
         ET.SubElement(root, "link", name=chain.tip)
-        add_joint(root, f"{chain.tip}_fixed", "fixed", parent, chain.tip, before @ chain.tail)
+        add_joint(root, f"{chain.tip}_fixed", "fixed", parent, chain.tip, T_parent_joint @ chain.tail)
     return '<?xml version="1.0"?>\n' + xml_text(root)
 
 
@@ -211,8 +232,12 @@ def _link_frames(tree: UrdfTree, path: Sequence[JointTag], chain: Chain, q: np.n
         chain: whose joints, in the order of the actuated ones of the path, q belongs to.
         q: (m, n) [rad or m].
     """
-    index = {joint.name: j for j, joint in enumerate(joint for joint in path if joint.actuated)}
-    frame, frames = np.broadcast_to(np.eye(4), (len(q), 4, 4)), []
+    index: dict[str, int] = {}
+    for joint in path:
+        if joint.actuated:
+            index[joint.name] = len(index)
+    frame = np.broadcast_to(np.eye(4), (len(q), 4, 4))
+    frames = []
     for joint in path:
         frame = frame @ joint.origin
         if joint.moves:
@@ -224,8 +249,10 @@ def _link_frames(tree: UrdfTree, path: Sequence[JointTag], chain: Chain, q: np.n
 
 
 def _screw(axis: np.ndarray, amount: np.ndarray, slides: bool) -> np.ndarray:
-    steps = np.multiply.outer(amount, axis)
-    return pose(position=steps) if slides else pose(Rotation.from_rotvec(steps).as_matrix())
+    displacement = np.multiply.outer(amount, axis)
+    if slides:
+        return pose(position=displacement)
+    return pose(Rotation.from_rotvec(displacement).as_matrix())
 
 
 def _motion(element: Element, amount: float | np.ndarray) -> np.ndarray:
@@ -236,11 +263,12 @@ def _motion(element: Element, amount: float | np.ndarray) -> np.ndarray:
 
 def _check_pair(nominal: Chain, calibrated: Chain) -> None:
     """Refuse a calibrated chain that differs from the nominal one in more than its elements' values."""
-    one, two = (
-        [(element.axis, element.joint, element.ratio) for element in chain.elements if element.joint is not None]
-        for chain in (nominal, calibrated)
-    )
-    if nominal.joint_names != calibrated.joint_names or one != two:
+
+    def motions(chain: Chain) -> list[tuple[str, int | None, float]]:
+        moving = [chain.elements[k] for k in chain.driven]
+        return [(element.axis, element.joint, element.ratio) for element in moving]
+
+    if nominal.joint_names != calibrated.joint_names or motions(nominal) != motions(calibrated):
         raise RobotError(
             f"the calibrated chain '{calibrated.name}' (joints {', '.join(calibrated.joint_names)}) does not move as "
             f"the nominal '{nominal.name}' (joints {', '.join(nominal.joint_names)}); give its nominal robot"
@@ -255,18 +283,20 @@ def _matching_path(tree: UrdfTree, nominal: Chain) -> list[JointTag]:
     names = nominal.joint_names
     named = any(name in tree.joints for name in names)
     tip = nominal.tip if nominal.tip in tree.bodies else None
-    if tip is None:
-        tip = ends(tree, tree.roots[0], None, names).tip if named else ends(tree).tip
+    if tip is None and named:
+        tip = ends(tree, tree.roots[0], None, names).tip
+    elif tip is None:
+        tip = ends(tree).tip
     path = tree.ancestry(tip)
-    if named and names[0] in tree.joints:
-        behind = [joint.name for joint in path]
-        path = path[behind.index(names[0]) :] if names[0] in behind else path
-    found = tuple(joint.name for joint in path if joint.actuated)
+    path_names = [joint.name for joint in path]
+    if names[0] in path_names:
+        path = path[path_names.index(names[0]) :]
+    actuated = tuple(joint.name for joint in path if joint.actuated)
     moving = [joint for joint in path if joint.moves]
-    if len(found) != nominal.n or (named and found != names) or len(moving) != len(nominal.driven):
+    if len(actuated) != nominal.n or (named and actuated != names) or len(moving) != len(nominal.driven):
         refuse_robot(
             tree.where,
-            f"its joints to '{tip}' are {', '.join(found)}; the nominal robot '{nominal.name}' has "
+            f"its joints to '{tip}' are {', '.join(actuated)}; the nominal robot '{nominal.name}' has "
             f"{', '.join(names)}: not the same arm",
         )
     return path[path.index(moving[0]) :]
@@ -285,24 +315,27 @@ def _base_offset(
         top = tree.above[top].parent
     body = dict(tree.rigid(top))
     names = [nominal.base] if nominal.base in body else list(body)
-    worst, best = np.full(len(path), np.inf), np.eye(4)
+    least_spread = np.full(len(path), np.inf)
+    T_base_foot = np.eye(4)
     for name in names:
         offset = invert(body[name]) @ body[foot]
-        seen = invert(frames) @ offset @ links
-        spread = np.abs(seen - seen[:, :1]).max(axis=(1, 2, 3))
-        if spread.max() < worst.max():
-            worst, best = spread, offset
-    max_offset = 1e-6
-    if worst.max() > max_offset:
-        k = int(np.argmax(worst > max_offset))
-        joint = [joint for joint in path if joint.moves][k]
+        relative = invert(frames) @ offset @ links
+        spread = np.abs(relative - relative[:, :1]).max(axis=(1, 2, 3))
+        if spread.max() < least_spread.max():
+            least_spread = spread
+            T_base_foot = offset
+    if least_spread.max() > MAX_OFFSET:
+        k = int(np.argmax(least_spread > MAX_OFFSET))
+        moving = [joint for joint in path if joint.moves]
+        joint = moving[k]
         refuse_robot(
             f"{tree.where}, line {joint.node.line}",
             f"this URDF does not describe the nominal robot '{nominal.name}': at "
-            f"joint '{joint.name}' the link moves against the chain's frame by up to {worst[k]:.3g} (m or rad) over "
-            f"random postures; give the URDF of the same nominal robot, with the same base, joint signs and lengths",
+            f"joint '{joint.name}' the link moves against the chain's frame by up to {least_spread[k]:.3g} "
+            "(m or rad) over random postures; give the URDF of the same nominal robot, with the same base, joint "
+            "signs and lengths",
         )
-    return best
+    return T_base_foot
 
 
 def _origins(tree: UrdfTree, path: list[JointTag], goal: np.ndarray) -> dict[str, np.ndarray]:
@@ -328,22 +361,25 @@ def _tip_origin(
         last, goal: (4, 4), the last moving link at q = 0 in the chain's base, before and after.
     """
     zero = np.zeros((1, nominal.n))
-    ends = [invert(moving_frames(chain, zero)[-1, 0]) @ forward(chain, zero)[0] for chain in (nominal, calibrated)]
-    if np.abs(ends[0] - ends[1]).max() < UNCHANGED:
+    nominal_end = invert(moving_frames(nominal, zero)[-1, 0]) @ forward(nominal, zero)[0]
+    calibrated_end = invert(moving_frames(calibrated, zero)[-1, 0]) @ forward(calibrated, zero)[0]
+    if np.abs(nominal_end - calibrated_end).max() < UNCHANGED:
         return {}
-    place = max(k for k, joint in enumerate(path) if joint.moves) + 1
-    if place == len(path):
+    position = max(k for k, joint in enumerate(path) if joint.moves) + 1
+    if position == len(path):
         refuse_robot(
             tree.where,
             "the calibrated chain differs after the last joint, but the URDF has no fixed joint to "
             f"'{nominal.tip}' for the difference; add one, or calibrate without elements of the tool",
         )
-    rest = np.eye(4)
-    for joint in path[place + 1 :]:
-        rest = rest @ joint.origin
-    tip = last @ path[place].origin @ rest
+    # What follows the changed joint stays.
+    T_joint_tip = np.eye(4)
+    for joint in path[position + 1 :]:
+        T_joint_tip = T_joint_tip @ joint.origin
+    tip = last @ path[position].origin @ T_joint_tip
     offset = invert(forward(nominal, zero)[0]) @ tip
-    return {path[place].name: invert(goal) @ forward(calibrated, zero)[0] @ offset @ invert(rest)}
+    origin = invert(goal) @ forward(calibrated, zero)[0] @ offset @ invert(T_joint_tip)
+    return {path[position].name: origin}
 
 
 def _change(source: str, joint: JointTag, origin: np.ndarray) -> list[tuple[int, int, str]]:
@@ -359,7 +395,11 @@ def _change(source: str, joint: JointTag, origin: np.ndarray) -> list[tuple[int,
 
 def numbers_text(values: np.ndarray) -> str:
     """Return numbers as text in full precision (repr), values below 1e-15 as 0."""
-    return " ".join("0" if abs(value) < 1e-15 else repr(value) for value in values.tolist())
+    numerals = []
+    for value in values.tolist():
+        numeral = "0" if abs(value) < MIN_NUMBER else repr(value)
+        numerals.append(numeral)
+    return " ".join(numerals)
 
 
 def _link_name(chain: Chain, k: int, joint: int, main: bool) -> str:
@@ -367,15 +407,22 @@ def _link_name(chain: Chain, k: int, joint: int, main: bool) -> str:
 
     The tip's name may go to the last link where nothing follows it.
     """
-    fallback = f"{chain.joint_names[joint]}_link" if main else f"{chain.elements[k].name}_link"
-    name = chain.links[joint] if main and chain.links else fallback
-    last = k == len(chain.elements) - 1 and np.array_equal(chain.tail, np.eye(4))
-    return fallback if name == chain.base or (name == chain.tip and not last) else name
+    if not main:
+        return f"{chain.elements[k].name}_link"
+    fallback = f"{chain.joint_names[joint]}_link"
+    if not chain.links:
+        return fallback
+    name = chain.links[joint]
+    ends_arm = k == len(chain.elements) - 1 and np.array_equal(chain.tail, np.eye(4))
+    if name == chain.base or (name == chain.tip and not ends_arm):
+        return fallback
+    return name
 
 
 def add_joint(root: ET.Element, name: str, kind: str, parent: str, child: str, origin: np.ndarray) -> ET.Element:
     """Add a <joint> with its links and its origin (4, 4) to a URDF, and return it."""
-    joint, (xyz, rpy) = ET.SubElement(root, "joint", name=name, type=kind), to_xyz_rpy(origin)
+    xyz, rpy = to_xyz_rpy(origin)
+    joint = ET.SubElement(root, "joint", name=name, type=kind)
     ET.SubElement(joint, "parent", link=parent)
     ET.SubElement(joint, "child", link=child)
     ET.SubElement(joint, "origin", xyz=numbers_text(xyz), rpy=numbers_text(rpy))
@@ -387,12 +434,22 @@ def _add_moving_joint(
 ) -> None:
     """Add a moving <joint> to a URDF; a second element of a joint becomes a mimic joint."""
     joint = chain.joints[element.joint or 0]
-    free = not np.isfinite([joint.lower, joint.upper]).any()
-    kind = "prismatic" if element.axis[0] == "t" else "continuous" if free else "revolute"
-    node = add_joint(root, joint.name if main else element.name, kind, parent, child, origin)
-    ET.SubElement(node, "axis", xyz=numbers_text(element.sign * np.eye(3)[AXES.index(element.axis) % 3]))
-    limits = {key: getattr(joint, key) for key in LIMITS if kind != "continuous" or key not in ("lower", "upper")}
-    written = {key: repr(float(np.clip(value, -UNLIMITED, UNLIMITED))) for key, value in limits.items()}
-    ET.SubElement(node, "limit", written)
+    if element.axis[0] == "t":
+        kind = "prismatic"
+    elif np.isfinite([joint.lower, joint.upper]).any():
+        kind = "revolute"
+    else:
+        kind = "continuous"
+    name = joint.name if main else element.name
+    node = add_joint(root, name, kind, parent, child, origin)
+    axis = element.sign * np.eye(3)[AXES.index(element.axis) % 3]
+    ET.SubElement(node, "axis", xyz=numbers_text(axis))
+    limits: dict[str, str] = {}
+    for key in LIMITS:
+        if kind == "continuous" and key in ("lower", "upper"):
+            continue
+        limit = np.clip(getattr(joint, key), -UNLIMITED, UNLIMITED)
+        limits[key] = repr(float(limit))
+    ET.SubElement(node, "limit", limits)
     if not main:
         ET.SubElement(node, "mimic", joint=joint.name, multiplier=repr(element.ratio), offset="0")

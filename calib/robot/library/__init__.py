@@ -6,6 +6,7 @@ from importlib import resources
 from pathlib import Path
 
 from calib.errors import RobotError, refuse_robot, require, suggestion
+from calib.result_kinds import refusal
 from calib.robot import calibrated, description
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
@@ -17,10 +18,9 @@ LOG = logging.getLogger(__name__)
 
 def names() -> tuple[str, ...]:
     """Return the names of the robots in the library."""
-    files = (entry.name for entry in resources.files(__name__).iterdir())
-    return tuple(
-        sorted(name.removesuffix(".toml") for name in files if name.endswith(".toml") and "_truth" not in name)
-    )
+    files = [entry.name for entry in resources.files(__name__).iterdir()]
+    robots = [name.removesuffix(".toml") for name in files if name.endswith(".toml") and "_truth" not in name]
+    return tuple(sorted(robots))
 
 
 def path(name: str) -> Path:
@@ -51,9 +51,11 @@ def load(
 
 
 def _check_ends(path: Path, chain: Chain, base: str | None, tip: str | None) -> Chain:
-    for option, given, found in (("base", base, chain.base), ("tip", tip, chain.tip)):
-        if given is not None and given != found:
-            refuse_robot(path, f"its {option} is '{found}', not '{given}'; only a URDF allows to choose base and tip")
+    for option, link, chain_link in (("base", base, chain.base), ("tip", tip, chain.tip)):
+        if link is not None and link != chain_link:
+            refuse_robot(
+                path, f"its {option} is '{chain_link}', not '{link}'; only a URDF allows to choose base and tip"
+            )
     return chain
 
 
@@ -62,28 +64,32 @@ def load_calibrated(robot: str | Path, base: str | None = None, tip: str | None 
     path = resolve(robot)
     if is_urdf(path):
         return CalibratedChain(load(path, base, tip), source=str(robot))
-    found = calibrated.read(path)
-    _check_ends(path, found.complete, base, tip)
-    return found
+    calibrated_robot = calibrated.read(path)
+    _check_ends(path, calibrated_robot.complete, base, tip)
+    return calibrated_robot
 
 
 def resolve(robot: str | Path) -> Path:
     """Return the file of a robot given by name or path; the working folder takes precedence over the library."""
-    place, listed = Path(robot), names()
-    require(str(robot).strip(), f"the robot's name is empty; the library has {', '.join(listed)}", RobotError)
-    known = (
+    location = Path(robot)
+    library = names()
+    require(str(robot).strip(), f"the robot's name is empty; the library has {', '.join(library)}", RobotError)
+    choices = (
         "a path of a .urdf, .urdf.xacro, MJCF (.xml) or .toml file, a folder with robot.toml, or one of the library: "
-        f"{', '.join(listed)}"
+        f"{', '.join(library)}"
     )
-    if place.is_dir():
-        if (place / calibrated.ROBOT).is_file():
-            return place / calibrated.ROBOT
-        require(str(robot) in listed, f"folder {place} has no robot.toml; give {known}", RobotError)
-    elif place.is_file() or converter(place):
-        require(place.suffix == ".toml" or is_urdf(place), f"{place} is no robot file; give {known}", RobotError)
-        return place
-    if str(robot) in listed:
+    if location.is_dir():
+        if (location / calibrated.ROBOT).is_file():
+            return location / calibrated.ROBOT
+        require(
+            str(robot) in library, f"{refusal(location, 'robot')}; the library has {', '.join(library)}", RobotError
+        )
+    elif location.is_file() or converter(location):
+        is_robot = location.suffix == ".toml" or is_urdf(location)
+        require(is_robot, f"{location} is no robot file; give {choices}", RobotError)
+        return location
+    if str(robot) in library:
         return path(str(robot))
-    a_path = place.suffix in (".urdf", ".toml", ".xacro", ".xml") or len(place.parts) > 1
-    what = f"no file {place}" if a_path else f"no robot '{robot}'{suggestion(str(robot), listed)}"
-    raise RobotError(f"{what}; give {known}")
+    if location.suffix in (".urdf", ".toml", ".xacro", ".xml") or len(location.parts) > 1:
+        raise RobotError(f"no file {location}; give {choices}")
+    raise RobotError(f"no robot '{robot}'{suggestion(str(robot), library)}; give {choices}")

@@ -13,11 +13,11 @@ import numpy as np
 from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
+from calib.identification.closed_loop.controllers import Reference, pd
+from calib.identification.closed_loop.simulation import Plant
 from calib.identification.loop import Controller
 from calib.records import shaped
 from calib.robot import description, library
-from calib.rooms.closed_loop.controllers import Reference, pd
-from calib.rooms.closed_loop.simulation import Plant
 
 
 def _fourier(

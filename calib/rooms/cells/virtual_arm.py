@@ -18,14 +18,14 @@ from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.pseudo_inertia import from_standard, to_standard
 from calib.dynamics.torque_rows import LINK
 from calib.errors import CalibError
+from calib.identification.closed_loop.controllers import Reference, pd
+from calib.identification.closed_loop.simulation import Plant, Sensing, feed_forward, simulate
 from calib.identification.loop import Controller
 from calib.robot import library
 from calib.robot.chain import Chain, random_joints
 from calib.rooms.cells import known_robots
 from calib.rooms.cells.cell import Cell
 from calib.rooms.cells.unmodelled import TorqueErrors, gear_torques
-from calib.rooms.closed_loop.controllers import Reference, pd
-from calib.rooms.closed_loop.simulation import Plant, Sensing, feed_forward, simulate
 
 STRETCH, SHIFT, MASS = 0.05, 6e-3, 0.04  # how wrong the maker's masses are, 1 sigma: shape, centre [m], mass
 BANDWIDTH, DAMPING, CUTOFF = 8.0, 0.8, 60.0  # of the joint controller, and of its measured speed's filter [Hz]

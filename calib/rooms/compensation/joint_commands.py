@@ -32,9 +32,11 @@ from calib.geometry.error_model import Discrepancy, ErrorModel, outside
 from calib.geometry.installation import Installation, see
 from calib.geometry.inverse import Goal
 from calib.geometry.observation import layout, pose_sigmas
+from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.findings import lines_of, sentence
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.kinematic_stage.tables import read_covariance
+from calib.result_kinds import refusal
 from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain
 from calib.transforms import from_xyz_rpy, invert, pose, rotation_vector
@@ -124,8 +126,9 @@ def read(folder: str | Path) -> Fitted:
     session, fit = Path(folder), FitFolder(Path(folder))
     inside, proof = FitFolder(session / IN_SESSION), ValidationFolder(session / VALIDATED)
     fit = inside if inside.robot.is_file() and not fit.robot.is_file() else fit
-    if not fit.robot.is_file():
-        raise UsageError(f"{fit.path} contains no robot.toml; give the folder written by `calib fit --out`")
+    identified = IdentificationFolder(fit.path).model.is_file()
+    if identified or not fit.robot.is_file():
+        raise UsageError(refusal(session, "compensate"))
     cell, nominal = installation.read_arms(fit.path)
     free, covariance = read_covariance(fit.path, cell)
     own = fit.metrics()

@@ -25,7 +25,7 @@ from calib.errors import Busy, CalibError, UsageError, refused_as, require
 from calib.folders import SESSION, STATE
 
 CLAIM = "calib.claim"
-LAST = (STATE, "rows.csv")  # of a session, of a study
+LAST = (STATE, "rows.sqlite")  # of a session, of a study
 PASSING = (".part", ".lock")  # suffixes of files that stay where they are
 LEASE = 20.0  # [s] that a claim may go unchanged (our choice)
 

@@ -36,7 +36,7 @@ def visits(calibrations: str | Path | Sequence[str | Path]) -> Visits:
     Raises:
         UsageError: for a folder that holds no fit, or one given twice; where one or none is left.
     """
-    places, unfinished = [place_of(folder) for folder in folders_of(calibrations)], list[str]()
+    places, unfinished = [place_of(folder, "fleet") for folder in folders_of(calibrations)], list[str]()
     own: dict[str, list[Visit]] = {}
     for place in places:
         waits = place.session and place.session.geometric and not place.fit

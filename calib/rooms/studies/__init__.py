@@ -5,6 +5,6 @@ condition, a method and a seed (`trial`); rows are keyed and kept (`rows`), run 
 up so that methods can be ranked (`summary`).
 """
 
-OFFERS = {"commands": "commands:app", "topics": ":TOPICS", "schemas": ":SCHEMAS", "methods": "methods:METHODS"}
+OFFERS = {"commands": "commands:app", "topics": ":TOPICS", "schemas": ":SCHEMAS"}
 TOPICS = {"study": ("the TOML file of calib study", "calib.rooms.studies.conditions")}
 SCHEMAS = {"study": ("calib.rooms.studies.conditions", "StudyFile")}

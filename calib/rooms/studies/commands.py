@@ -2,13 +2,21 @@
 
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from calib.cli.completion import Robot
 from calib.cli.shared import Seed, command, exit_failed, reporting, say
 from calib.errors import UsageError, one_of, require
+
+if TYPE_CHECKING:
+    from calib.procedure.report.page import Block
+
+# Between two lines on progress where the output is no terminal [s].
+LOG_INTERVAL = 30.0
+# Most conditions whose tables are printed in full.
+MAX_DETAILED = 3
 
 app = typer.Typer()
 
@@ -41,23 +49,29 @@ def study(
         list_methods: list all methods with their requirements
         list_studies: list the studies shipped with the toolkit
     """
-    from calib.identification.methods.registry import METHODS
+    from calib.identification.registry import METHODS
     from calib.procedure.report import page
     from calib.rooms.fleet import stores
     from calib.rooms.studies import report
 
+    if list_methods:
+        say(*METHODS.values())
+    if list_studies:
+        say(*report.study_lines())
     if list_methods or list_studies:
-        say(*(map(str, METHODS.values()) if list_methods else ()), *(report.study_lines() if list_studies else ()))
         return
     if not studies:
         raise UsageError("no study given: name a file, or a study of calib study --list")
-    if out is None and (len(studies) > 1 or any(mark in studies[0] for mark in "*?[")):
+    is_pattern = any(mark in studies[0] for mark in "*?[")
+    if out is None and (len(studies) > 1 or is_pattern):
         raise UsageError("several studies need one folder: give --out DIR")
-    place = out or f"{Path(studies[0]).stem}-study"
-    log_interval = 30.0  # [s] between two lines on progress where the output is no terminal
-    kept = stores.held(place) if stores.is_address(place) else nullcontext(Path(place))
-    with kept as folder, reporting(log_interval) as (_, progress):
-        found = report.run_study(
+    location = out or f"{Path(studies[0]).stem}-study"
+    if stores.is_address(location):
+        local_folder = stores.held(location)
+    else:
+        local_folder = nullcontext(Path(location))
+    with local_folder as folder, reporting(LOG_INTERVAL) as (_, progress):
+        outcome = report.run_study(
             studies,
             folder,
             methods=_names(methods),
@@ -67,14 +81,15 @@ def study(
             plots=plots,
             say=progress,
         )
-    seen = [one for one in found.conditions if one.methods]
-    max_shown = 3  # conditions whose tables are printed in full
-    if len(seen) > max_shown:
-        blocks = [report.overview(found.conditions), report.torque_table(found.conditions)]
+    conditions = [condition for condition in outcome.conditions if condition.methods]
+    blocks: list[Block] = []
+    if len(conditions) > MAX_DETAILED:
+        blocks += [report.overview(outcome.conditions), report.torque_table(outcome.conditions)]
     else:
-        blocks = [block for one in seen for block in (report.condition_table(one), *report.failures(one))]
+        for condition in conditions:
+            blocks += [report.condition_table(condition), *report.failures(condition)]
     say(*page.rendered(blocks), result=True)
-    say(*found.described(), f"written to {place}: {report.REPORT} shows it")
+    say(*outcome.described(), f"written to {location}: {report.REPORT} shows it")
 
 
 @command(app, "Files and studies")
@@ -112,11 +127,14 @@ def compare(
     from calib.rooms.studies import method_comparison
     from calib.rooms.studies.method_comparison import caveats, compare_methods, write_table
 
-    table = [] if out is None else [(out, (".csv",))]
+    if out is None:
+        table = []
+    else:
+        table = [(out, (".csv",))]
     files.check_results(table, [robot, *recordings, *(validate or []), options], overwrite)
-    chosen = _names(methods)
-    with reporting() as (say_now, progress):
-        given = inputs.gather(
+    names = _names(methods)
+    with reporting() as (say_line, progress):
+        gathered = inputs.gather(
             robot,
             recordings,
             validate or (),
@@ -127,24 +145,28 @@ def compare(
             friction=friction,
             progress=progress,
         )
-        found = compare_methods(given, chosen, friction, progress, lambda one: say_now(method_comparison.line(one)))
-    say(*page.section(method_comparison.section(found, caveats(given, found))), result=True)
+        compared = compare_methods(
+            gathered, names, friction, progress, lambda method: say_line(method_comparison.line(method))
+        )
+    section = method_comparison.section(compared, caveats(gathered, compared))
+    say(*page.section(section), result=True)
     if out is not None:
         with files.results(table, overwrite=overwrite):
-            say(f"written to {write_table(found, out)}")
-    if all(one.failure for one in found):
+            say(f"written to {write_table(compared, out)}")
+    if all(method.failure for method in compared):
         raise typer.Exit(3)
-    exit_failed(next(one.verdict.level for one in found if one.verdict is not None))
+    verdicts = [method.verdict for method in compared if method.verdict is not None]
+    exit_failed(verdicts[0].level)
 
 
 def _names(text: str | None) -> list[str] | None:
     """Return the methods of a comma-separated list after a check of their names; None for all."""
-    from calib.identification.methods.registry import METHODS
+    from calib.identification.registry import METHODS
 
     if text is None:
         return None
-    found = [name.strip() for name in text.split(",") if name.strip()]
-    for name in found:
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    for name in names:
         one_of(name, METHODS, "--methods:", UsageError)
-    require(found, "--methods is empty; see calib study --list-methods", UsageError)
-    return found
+    require(names, "--methods is empty; see calib study --list-methods", UsageError)
+    return names

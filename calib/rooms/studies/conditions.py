@@ -52,18 +52,18 @@ from annotated_types import MinLen
 from calib.config import parse, read_toml, strict
 from calib.config_types import Name, OneOf, Real, Spread, Text, Whole
 from calib.errors import UsageError, require, suggestion
-from calib.identification.methods.registry import METHODS, method_named
+from calib.identification.registry import METHODS, method_named
 
 ROBOTS = ("tx40", "rv2sq")
 MOTIONS = ("random", "designed")
 MISMATCHES = ("none", "geometry", "calibrated", "controller", "friction", "payload", "clock")
 LIBRARY = Path(str(resources.files("calib.rooms.studies").joinpath("library")))
+# Raised whenever the trials of all methods change: rows with a lower number do not count. Where one method changes,
+# its `calib.identification.methods.method.Method.version` is raised.
 TRIAL = 1
-"""Number raised whenever the trials of all methods change: rows with a lower number do not count.
 
-Where one method changes, its `calib.identification.methods.method.Method.version` is raised."""
-
-_LATER = {"motion": "random", "rate": 0.0, "guesses": 1}  # no part of a digest: rows from before these fields count
+# Values of fields that came later: they are no part of a digest, so that rows from before these fields count.
+_LATER = {"motion": "random", "rate": 0.0, "guesses": 1}
 _Few = Spread(words="a value, or a list of them")
 Robots = Annotated[
     tuple[Annotated[str, OneOf(ROBOTS, "simulated robots only; for recordings: calib compare")], ...], _Few
@@ -149,9 +149,13 @@ class Condition:
     @property
     def digest(self) -> str:
         """Key of the condition's rows in the store; conditions that differ only in name have the same key."""
-        content = {key: value for key, value in asdict(self).items() if key not in ("name", "resimulated")}
-        content = {key: value for key, value in content.items() if value != _LATER.get(key)}
-        return hashlib.sha256(json.dumps([TRIAL, content], sort_keys=True).encode()).hexdigest()[:16]
+        content = asdict(self)
+        del content["name"], content["resimulated"]
+        for key, value in _LATER.items():
+            if content[key] == value:
+                del content[key]
+        text = json.dumps([TRIAL, content], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 @dataclass(frozen=True)
@@ -174,8 +178,8 @@ class Study:
     @property
     def methods(self) -> tuple[str, ...]:
         """All methods of the study, in the registry's order."""
-        asked = {name for own in self.runs for name in own}
-        return tuple(name for name in METHODS if name in asked)
+        names = set().union(*self.runs)
+        return tuple(name for name in METHODS if name in names)
 
 
 def shipped() -> dict[str, Path]:
@@ -195,20 +199,28 @@ def read_study(files: Sequence[str | Path], methods: Sequence[str] | None = None
     """
     for name in methods or ():
         method_named(name)
-    read = [_parse(path) for path in _paths(files)]
-    found = [(one, condition) for one in read for condition in _expanded(one)]
-    conditions = [condition for _, condition in found]
+    study_files = [_parse(path) for path in _paths(files)]
+    conditions: list[Condition] = []
+    counts: list[Mapping[str, int]] = []
+    seeds: list[int] = []
+    for study in study_files:
+        for condition in _expanded(study):
+            conditions.append(condition)
+            counts.append(_counts(study, methods, runs))
+            seeds.append(study.seed)
     names = [condition.name for condition in conditions]
-    if twice := next((name for name in names if names.count(name) > 1), ""):
-        raise UsageError(
-            f"two conditions are named '{twice}': state each value once, and give noises (and studies of "
-            "several files) different names"
-        )
+    for name in names:
+        if names.count(name) > 1:
+            raise UsageError(
+                f"two conditions are named '{name}': state each value once, and give noises (and studies of "
+                "several files) different names"
+            )
     _check_cutoffs(conditions)
-    counts = tuple(_counts(one, methods, runs) for one, _ in found)
-    name = read[0].name if len(read) == 1 else f"{len(read)} studies"
-    about = read[0].about if len(read) == 1 else ", ".join(one.name for one in read)
-    return Study(name, about, tuple(conditions), counts, tuple(one.seed for one, _ in found))
+    name, about = study_files[0].name, study_files[0].about
+    if len(study_files) > 1:
+        name = f"{len(study_files)} studies"
+        about = ", ".join(study.name for study in study_files)
+    return Study(name, about, tuple(conditions), tuple(counts), tuple(seeds))
 
 
 def _check_cutoffs(conditions: Sequence[Condition]) -> None:
@@ -219,27 +231,30 @@ def _check_cutoffs(conditions: Sequence[Condition]) -> None:
     """
     from calib.rooms.cells import known_robots  # slow to load
 
-    for one in conditions:
-        most = 0.5 * (one.rate or float(known_robots.truth(one.robot)["control"]["sampling"]))
-        if one.cutoff >= most:
+    for condition in conditions:
+        rate = condition.rate or float(known_robots.truth(condition.robot)["control"]["sampling"])
+        limit = 0.5 * rate
+        if condition.cutoff >= limit:
             raise UsageError(
-                f"{one.name}: cutoff: expected less than {most:g} Hz, half the rate of the {one.robot}'s log, found "
-                f"{one.cutoff:g}; 0 is unfiltered"
+                f"{condition.name}: cutoff: expected less than {limit:g} Hz, half the rate of the {condition.robot}'s "
+                f"log, found {condition.cutoff:g}; 0 is unfiltered"
             )
 
 
 def _paths(files: Sequence[str | Path]) -> list[Path]:
-    own, result = shipped(), []
-    for one in map(str, files):
-        found = [path for name, path in own.items() if fnmatchcase(name.lower(), one.lower())]
-        if not Path(one).exists() and not one.endswith(".toml"):
-            words = f"no study '{one}'{suggestion(one, own)}: give a file, or a name of calib study --list"
-            require(found, words, UsageError)
-            result += found
-        else:
-            result.append(Path(one))
-    require(result, "no study given: name a file, or a study of calib study --list", UsageError)
-    return list(dict.fromkeys(result))
+    """Return the paths of study files, from paths, names of shipped studies, and patterns of these; each once."""
+    library = shipped()
+    paths: list[Path] = []
+    for text in map(str, files):
+        if Path(text).exists() or text.endswith(".toml"):
+            paths.append(Path(text))
+            continue
+        matches = [path for name, path in library.items() if fnmatchcase(name.lower(), text.lower())]
+        message = f"no study '{text}'{suggestion(text, library)}: give a file, or a name of calib study --list"
+        require(matches, message, UsageError)
+        paths += matches
+    require(paths, "no study given: name a file, or a study of calib study --list", UsageError)
+    return list(dict.fromkeys(paths))
 
 
 def _parse(path: Path) -> StudyFile:
@@ -248,12 +263,18 @@ def _parse(path: Path) -> StudyFile:
     Raises:
         UsageError: see `calib.config.parse`; methods that there are none of.
     """
-    found = parse(StudyFile, read_toml(path), str(path))
-    for key, names in (("methods", found.methods), ("runs_of", found.runs_of)):
-        for name in names:
-            words = f"{path}: {key}: there is no method '{name}'{suggestion(name, METHODS)}; calib study --list-methods"
-            require(name in METHODS or (key, name) == ("methods", "all"), words, UsageError)
-    return found
+    study = parse(StudyFile, read_toml(path), str(path))
+    for name in study.methods:
+        if name != "all":
+            _check_method(path, "methods", name)
+    for name in study.runs_of:
+        _check_method(path, "runs_of", name)
+    return study
+
+
+def _check_method(path: Path, key: str, name: str) -> None:
+    advice = f"{suggestion(name, METHODS)}; calib study --list-methods"
+    require(name in METHODS, f"{path}: {key}: there is no method '{name}'{advice}", UsageError)
 
 
 def _expanded(study: StudyFile) -> list[Condition]:
@@ -267,40 +288,58 @@ def _expanded(study: StudyFile) -> list[Condition]:
         "cutoff": study.cutoff,
         "mismatch": study.mismatch,
     }
-    result = []
-    for values in product(*axes.values()):
-        chosen = dict(zip(axes, values))
-        parts = [_word(axis, chosen[axis]) for axis, several in axes.items() if len(several) > 1]
-        noise = chosen.pop("noise")
-        result.append(
-            Condition(
-                "-".join([study.name, *parts]),
-                sigma_q=noise.sigma_q,
-                sigma_tau=noise.sigma_tau,
-                duration=study.duration,
-                guess=study.guess,
-                guesses=study.guesses,
-                resimulated=study.resimulated,
-                **chosen,
-            )
+    varied = [axis for axis, values in axes.items() if len(values) > 1]
+    conditions = []
+    for combination in product(*axes.values()):
+        values = dict(zip(axes, combination))
+        parts = [_name_part(axis, values[axis]) for axis in varied]
+        noise = values.pop("noise")
+        condition = Condition(
+            "-".join([study.name, *parts]),
+            sigma_q=noise.sigma_q,
+            sigma_tau=noise.sigma_tau,
+            duration=study.duration,
+            guess=study.guess,
+            guesses=study.guesses,
+            resimulated=study.resimulated,
+            **values,
         )
-    return result
+        conditions.append(condition)
+    return conditions
 
 
-def _word(axis: str, value: Any) -> str:
-    if axis in ("cutoff", "rate"):
-        return f"{value:g}Hz" if value else "unfiltered" if axis == "cutoff" else "own"
-    return value.name if isinstance(value, Noise) else f"r{value}" if axis == "decimation" else str(value)
+def _name_part(axis: str, value: Any) -> str:
+    """Return how a value appears in the name of its condition."""
+    if axis == "cutoff":
+        return f"{value:g}Hz" if value else "unfiltered"
+    if axis == "rate":
+        return f"{value:g}Hz" if value else "own"
+    if axis == "decimation":
+        return f"r{value}"
+    if isinstance(value, Noise):
+        return value.name
+    return str(value)
 
 
 def _counts(study: StudyFile, methods: Sequence[str] | None, runs: int | None) -> dict[str, int]:
-    names = list(METHODS) if "all" in study.methods else list(study.methods)
-    chosen = names if methods is None else list(methods)
-    return {name: _stated(study, name) if runs is None else runs for name in dict.fromkeys(chosen)}
+    """Return the number of runs of each method; `methods` and `runs` in place of the file's."""
+    if "all" in study.methods:
+        names = list(METHODS)
+    else:
+        names = list(study.methods)
+    if methods is not None:
+        names = list(methods)
+    if runs is not None:
+        return dict.fromkeys(names, runs)
+    return {name: _runs_of(study, name) for name in names}
 
 
-def _stated(study: StudyFile, name: str) -> int:
+def _runs_of(study: StudyFile, name: str) -> int:
     """Return the number of runs that a file states for a method, or for its kind."""
     method = METHODS[name]
-    kind = study.runs_loop if method.needs_controller else study.runs_filter if method.needs_simulation else None
-    return study.runs_of.get(name, study.runs if kind is None else kind)
+    kind_runs = None
+    if method.needs_controller:
+        kind_runs = study.runs_loop
+    elif method.needs_simulation:
+        kind_runs = study.runs_filter
+    return study.runs_of.get(name, study.runs if kind_runs is None else kind_runs)

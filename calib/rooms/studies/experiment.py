@@ -27,8 +27,10 @@ from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.pseudo_inertia import ball, margin
 from calib.geometry import fit as geometry
 from calib.geometry.first_guess import install
-from calib.identification.constraint_settings import ConstraintSettings
+from calib.identification.closed_loop.controllers import Reference
+from calib.identification.closed_loop.simulation import Plant, Sensing, SimulatedRun, feed_forward, simulate
 from calib.identification.loop import Controller, LoopSettings
+from calib.identification.methods.constraint_settings import ConstraintSettings
 from calib.identification.methods.method import IdentificationProblem
 from calib.identification.rows import Case, make_case, observe
 from calib.procedure.excitation import coefficients
@@ -38,18 +40,31 @@ from calib.rooms.cells import known_robots
 from calib.rooms.cells.cell import SimulatedInstrument, measure
 from calib.rooms.cells.known_robots import random_fourier
 from calib.rooms.cells.virtual_cells import perturbed_cell, rigid
-from calib.rooms.closed_loop.controllers import Reference
-from calib.rooms.closed_loop.simulation import Plant, Sensing, SimulatedRun, feed_forward, simulate
 from calib.rooms.studies.conditions import LIBRARY, Condition
 
-# our choices
-MOTION_TRIES, HARMONICS = 20, 12  # motions to take the best of; harmonics of each
-VALIDATION = 10_000  # number of the random motion that validates
-REACH, SPEED, ACCELERATION = 0.9, 0.8, 40.0  # shares of the limits; largest in any joint [rad/s²]
-THIN = 50  # of the control rate: instants at which a motion's condition and the validation torques are taken
-BELIEVED = 1.3, 0.7  # factors of kp, kd
-STRIBECK, SLIP = 0.5, 0.1  # peak of friction at rest beyond Fc, as its share; the speed it falls with [rad/s]
-PAYLOAD, AWAY = 1.0, 0.05  # [kg] a ball, [m] in front of the flange
+# The numbers below are our choices.
+# Random motions to take the best of; harmonics of each.
+MOTION_TRIES, HARMONICS = 20, 12
+# Number of the random motion that validates.
+VALIDATION = 10_000
+# Shares of the joints' limits of position and speed; largest acceleration of any joint [rad/s²].
+REACH, SPEED, ACCELERATION = 0.9, 0.8, 40.0
+# Factor of the control period: instants at which a motion's condition and the validation torques are taken.
+THIN = 50
+# Factors of kp and kd in the believed controller (mismatch "controller").
+BELIEVED = 1.3, 0.7
+# Peak of friction at rest beyond Fc, as its share; the speed that it falls with [rad/s] (mismatch "friction").
+STRIBECK, SLIP = 0.5, 0.1
+# Mass of a ball [kg]; its radius, and its distance from the flange [m] (mismatch "payload").
+PAYLOAD, AWAY = 1.0, 0.05
+# Delay of the logged torques [s] (mismatch "clock").
+TORQUE_LAG = 2e-3
+# Times 0.3 mm, 0.5 mrad and 3 mrad of joint offset (1 sigma): a drawing's robot, not calibrated (mismatch "geometry").
+DRAWING_ERROR = 3.0
+# Poses measured for the geometric fit, by a tracker of frames (60 µm, 0.2 mrad) (mismatch "calibrated").
+POSE_COUNT = 40
+# Draws of start values of a body with one spread; then it is halved. Draws in all.
+DRAWS, MAX_DRAWS = 100, 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,31 +106,47 @@ class Experiment:
 
 def set_up(condition: Condition) -> Setup:
     """Return the data shared by all data sets of a condition."""
-    shared = _set_up(condition.robot, condition.duration, condition.motion)
-    return replace(shared, every=1.0 / (shared.reference.period * condition.rate)) if condition.rate else shared
+    setup = _set_up(condition.robot, condition.duration, condition.motion)
+    if not condition.rate:
+        return setup
+    return replace(setup, every=1.0 / (setup.reference.period * condition.rate))
 
 
 @lru_cache(maxsize=4)
 def _set_up(robot: str, duration: float, motion: str) -> Setup:
+    """Return the shared data of a robot and a motion, logged at the robot's own rate."""
     chain = load(robot)
     plant = known_robots.plant(robot)
-    known = known_robots.truth(robot)["control"]
-    rate, every = float(known["rate"]), float(known["rate"]) / float(known["sampling"])
-    if motion != "random":
-        found = coefficients.read(LIBRARY / robot if motion == "designed" else Path(motion))
+    control = known_robots.truth(robot)["control"]
+    rate = float(control["rate"])
+    every = rate / float(control["sampling"])
+    validation = _drawn(chain, duration, rate, VALIDATION)
+    if motion == "random":
+        training = _best_random_motion(robot, chain, duration, rate)
+    else:
+        if motion == "designed":
+            folder = LIBRARY / robot
+        else:
+            folder = Path(motion)
+        series = coefficients.read(folder)
         t = np.arange(round(duration * rate) + 1) / rate
-        return Setup(chain, plant, Reference(t, *found.orders(t)), _drawn(chain, duration, rate, VALIDATION), every)
-    model = known_robots.model(plant)
-    kept = _nominal_base(robot).kept
+        training = Reference(t, *series.orders(t))
+    return Setup(chain, plant, training, validation, every)
 
-    def condition(reference: Reference) -> float:
-        part = slice(None, None, 2 * THIN)
-        matrix = model.regressor(reference.q[part], reference.v[part], reference.a[part])[:, :, kept]
-        matrix = matrix.reshape(-1, len(kept))
+
+def _best_random_motion(robot: str, chain: Chain, duration: float, rate: float) -> Reference:
+    """Return the best of `MOTION_TRIES` random motions by the condition number of the base regressor."""
+    model = known_robots.model(known_robots.plant(robot))
+    base_columns = _nominal_base(robot).kept
+    part = slice(None, None, 2 * THIN)
+
+    def condition_number(motion: Reference) -> float:
+        regressor = model.regressor(motion.q[part], motion.v[part], motion.a[part])
+        matrix = regressor[:, :, base_columns].reshape(-1, len(base_columns))
         return float(np.linalg.cond(matrix / np.linalg.norm(matrix, axis=0)))
 
-    training = min((_drawn(chain, duration, rate, number) for number in range(MOTION_TRIES)), key=condition)
-    return Setup(chain, plant, training, _drawn(chain, duration, rate, VALIDATION), every)
+    motions = (_drawn(chain, duration, rate, number) for number in range(MOTION_TRIES))
+    return min(motions, key=condition_number)
 
 
 def _drawn(chain: Chain, duration: float, rate: float, number: int) -> Reference:
@@ -149,10 +180,12 @@ def make_experiment(condition: Condition, seed: int) -> Experiment:
     """
     number, guess = divmod(seed, condition.guesses)
     data = data_set(condition, number)
-    values = _guess(set_up(condition).plant, condition.guess, guess if condition.guesses > 1 else seed)
+    guess_seed = guess if condition.guesses > 1 else seed
+    values = _guess(set_up(condition).plant, condition.guess, guess_seed)
     problem = replace(data.problem, start=data.problem.base.transform @ values)
     if guess:
-        vars(problem)["pooled"] = data.problem.pooled  # the same rows: reduced once for all guesses
+        # The rows are the same: `pooled`, a cached property, is reduced once for all guesses.
+        problem.__dict__["pooled"] = data.problem.pooled
     return replace(data, problem=problem)
 
 
@@ -161,57 +194,79 @@ def data_set(condition: Condition, seed: int) -> Experiment:
     """Return the simulated data set of a condition and a seed, without start values; always the same."""
     setup = set_up(condition)
     controller = known_robots.controller(condition.robot)
-    true, model, base, truth = _robots(condition, setup, seed)
-    case = _recorded(condition, setup, true, controller, seed)
+    robots = _robots(condition, setup, seed)
+    model, base = robots.model, robots.base
+    case = _recorded(condition, setup, robots.true, controller, seed)
     decimator = case.motion.decimator
     rows = observe(model, base.kept, case, decimator)
-    terms = tuple(None if k < model.inertial else model.columns[k - model.inertial] for k in base.kept)
+    terms = [None if column < model.inertial else model.columns[column - model.inertial] for column in base.kept]
     problem = IdentificationProblem(
         model,
         base,
         (case,),
         decimator,
         (rows,),
-        terms,
+        tuple(terms),
         np.full(base.b, -1),
         loop=_loop(condition, controller),
         constraints=ConstraintSettings(bodies=True),
     )
     part = slice(None, None, THIN)
-    thin = Reference(*(series[part] for series in (setup.other.t, setup.other.q, setup.other.v, setup.other.a)))
-    matrix = model.regressor(thin.q, thin.v, thin.a)[:, :, base.kept]
-    torque = feed_forward(truth if condition.mismatch == "payload" else true, thin)
-    return Experiment(problem, model, base.transform @ truth.parameters, matrix, torque)
+    other = setup.other
+    validation = Reference(other.t[part], other.q[part], other.v[part], other.a[part])
+    matrix = model.regressor(validation.q, validation.v, validation.a)[:, :, base.kept]
+    # A payload that nobody knows of is no part of the robot that the model shall predict.
+    if condition.mismatch == "payload":
+        predicted = robots.truth
+    else:
+        predicted = robots.true
+    torque = feed_forward(predicted, validation)
+    return Experiment(problem, model, base.transform @ robots.truth.parameters, matrix, torque)
 
 
-def _robots(condition: Condition, setup: Setup, seed: int) -> tuple[Plant, IdentificationModel, Base, Plant]:
+@dataclass(frozen=True, eq=False)
+class _Robots:
+    """The robots of a data set.
+
+    Attributes:
+        true: that is recorded.
+        model, base: assumed model with its base parameters.
+        truth: robot with the true values of the model's parameters.
+    """
+
+    true: Plant
+    model: IdentificationModel
+    base: Base
+    truth: Plant
+
+
+def _robots(condition: Condition, setup: Setup, seed: int) -> _Robots:
     """Return the true robot, the assumed model with its base, and the robot with the model's parameters."""
     plant, chain = setup.plant, setup.chain
-    model, base = known_robots.model(plant), _nominal_base(condition.robot)
-    size_factor = 3.0  # times 0.3 mm, 0.5 mrad and 3 mrad of joint offset (1 sigma): a drawing's robot, not calibrated
-    pose_count = 40  # measured for the geometric fit, by a tracker of frames (60 µm, 0.2 mrad)
+    robots = _Robots(plant, known_robots.model(plant), _nominal_base(condition.robot), plant)
     if condition.mismatch in ("geometry", "calibrated"):
-        cell = rigid(perturbed_cell(chain, seed, SimulatedInstrument(), size=size_factor))
-        true = replace(plant, bodies=bodies_of(replace(cell.truth.chain, inertias=chain.inertias)))
+        cell = rigid(perturbed_cell(chain, seed, SimulatedInstrument(), size=DRAWING_ERROR))
+        true_chain = replace(cell.truth.chain, inertias=chain.inertias)
+        robots = replace(robots, true=replace(plant, bodies=bodies_of(true_chain)))
         if condition.mismatch == "geometry":
-            return true, model, base, plant
-        measured = [measure(cell, random_joints(chain, pose_count, seed), seed=seed)]
-        found = geometry.fit(install(chain, measured), measured).cell.chain
-        fitted = replace(model, bodies=bodies_of(found))
-        return true, fitted, bases.regroup(base, fitted), plant
+            return robots
+        measured = [measure(cell, random_joints(chain, POSE_COUNT, seed), seed=seed)]
+        fitted_chain = geometry.fit(install(chain, measured), measured).cell.chain
+        fitted_model = replace(robots.model, bodies=bodies_of(fitted_chain))
+        return replace(robots, model=fitted_model, base=bases.regroup(robots.base, fitted_model))
     if condition.mismatch == "friction":
-        v0 = float(known_robots.truth(condition.robot)["drives"]["v0"])
-        peaks = tuple(drives.term(f"Fs{joint + 1}", "stribeck", joint, SLIP, 1.0, v0) for joint in range(chain.n))
-        coulomb = np.array(known_robots.truth(condition.robot)["drives"]["Fc"])
-        values = np.concatenate([plant.parameters, STRIBECK * coulomb])
-        return Plant(plant.bodies, (*plant.terms, *peaks), values), model, base, plant
+        friction = known_robots.truth(condition.robot)["drives"]
+        v0 = float(friction["v0"])
+        peaks = [drives.term(f"Fs{joint + 1}", "stribeck", joint, SLIP, 1.0, v0) for joint in range(chain.n)]
+        values = np.concatenate([plant.parameters, STRIBECK * np.array(friction["Fc"])])
+        return replace(robots, true=Plant(plant.bodies, (*plant.terms, *peaks), values))
     if condition.mismatch == "payload":
         size = plant.inertial
-        body = ball(PAYLOAD, AWAY, np.array([0.0, 0.0, AWAY]))
+        payload = ball(PAYLOAD, AWAY, np.array([0.0, 0.0, AWAY]))
         bodies = with_payload(plant.bodies, np.asarray(chain.tail), on=chain.n - 1)
-        values = np.concatenate([plant.parameters[:size], body, plant.parameters[size:]])
-        return Plant(bodies, plant.terms, values), model, base, plant
-    return plant, model, base, plant
+        values = np.concatenate([plant.parameters[:size], payload, plant.parameters[size:]])
+        return replace(robots, true=Plant(bodies, plant.terms, values))
+    return robots
 
 
 def _recorded(condition: Condition, setup: Setup, true: Plant, controller: Controller, seed: int) -> Case:
@@ -219,18 +274,19 @@ def _recorded(condition: Condition, setup: Setup, true: Plant, controller: Contr
     sensing = Sensing(condition.sigma_q, 0.0, condition.sigma_tau, every=setup.every)
 
     def run(every: float) -> SimulatedRun:
-        own = replace(sensing, every=every)
-        return simulate(true, controller, setup.reference, own, np.random.default_rng([seed, 20_211]))
+        rng = np.random.default_rng([seed, 20_211])
+        return simulate(true, controller, setup.reference, replace(sensing, every=every), rng)
 
-    log, period = run(setup.every), setup.reference.period
-    rate, torque = 1.0 / (period * setup.every), log.tau
-    torque_lag = 2e-3  # [s]
+    log = run(setup.every)
+    period = setup.reference.period
+    rate = 1.0 / (period * setup.every)
+    torque = log.tau
     if condition.mismatch == "clock":
-        torque = run(1).tau[np.maximum(np.rint((log.t - log.t[0] - torque_lag) / period).astype(int), 0)]
-    asked = CubicSpline(setup.reference.t, setup.reference.q)(log.t)
-    recording = Recording(
-        log.t, log.measured, torque, "torque", setup.chain.joint_names, q_ref=asked, file=condition.name
-    )
+        late_ticks = np.rint((log.t - log.t[0] - TORQUE_LAG) / period).astype(int)
+        torque = run(1).tau[np.maximum(late_ticks, 0)]
+    q_ref = CubicSpline(setup.reference.t, setup.reference.q)(log.t)
+    names = setup.chain.joint_names
+    recording = Recording(log.t, log.measured, torque, "torque", names, q_ref=q_ref, file=condition.name)
     cutoff = condition.cutoff or USABLE * rate / 2
     decimator = design_decimator(rate, condition.decimation, "chebyshev")
     motion = make_motion(recording, FilterOptions(cutoff=cutoff, band=0.999 * decimator.band, clock="stamps"))
@@ -240,14 +296,14 @@ def _recorded(condition: Condition, setup: Setup, true: Plant, controller: Contr
 def _loop(condition: Condition, controller: Controller) -> LoopSettings:
     """Return the loop settings for the methods, with the errors of the condition."""
     kp, kd = BELIEVED if condition.mismatch == "controller" else (1.0, 1.0)
-    known = known_robots.truth(condition.robot)
+    truth = known_robots.truth(condition.robot)
     return LoopSettings(
         "pd",
         kp=tuple(kp * controller.kp),
         kd=tuple(kd * controller.kd),
         limit=tuple(controller.limit),
-        rate=float(known["control"]["rate"]),
-        inertia=tuple(known["drives"]["Ia"]),
+        rate=float(truth["control"]["rate"]),
+        inertia=tuple(truth["drives"]["Ia"]),
     )
 
 
@@ -257,15 +313,19 @@ def _guess(plant: Plant, spread: float, seed: int) -> np.ndarray:
     A body is drawn until it can be (the survey's way, but body by body); where that takes long, from a smaller spread.
     """
     rng = np.random.default_rng([seed, 15])
+    size = plant.inertial
     values = np.array(plant.parameters)
-    for first in range(0, plant.inertial, 10):
-        body, own = plant.parameters[first : first + 10], spread
-        for attempt in range(1000):
-            values[first : first + 10] = body * (1.0 + own * rng.standard_normal(10))
-            if margin(values[first : first + 10]) > 0.0:
+    for first in range(0, size, 10):
+        body = plant.parameters[first : first + 10]
+        body_spread = spread
+        for draw in range(1, MAX_DRAWS + 1):
+            drawn = body * (1.0 + body_spread * rng.standard_normal(10))
+            values[first : first + 10] = drawn
+            if margin(drawn) > 0.0:
                 break
-            own *= 0.5 if attempt % 100 == 99 else 1.0
-    drives_ = plant.parameters[plant.inertial :]
-    off = 1.0 + spread * rng.standard_normal(len(drives_))
-    values[plant.inertial :] = drives_ * np.maximum(off, 0.01)
+            if draw % DRAWS == 0:
+                body_spread *= 0.5
+    drive_parameters = plant.parameters[size:]
+    factors = 1.0 + spread * rng.standard_normal(len(drive_parameters))
+    values[size:] = drive_parameters * np.maximum(factors, 0.01)
     return values

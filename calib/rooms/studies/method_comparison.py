@@ -22,8 +22,8 @@ from calib import files
 from calib.errors import CalibError, UsageError, require
 from calib.identification.identify import Identification, identify
 from calib.identification.methods.method import Method
-from calib.identification.methods.registry import METHODS, method_named
 from calib.identification.prediction import predict
+from calib.identification.registry import METHODS, method_named
 from calib.identification.rows import Case
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.identify import judged, overlaps, repeated_motion
@@ -32,9 +32,13 @@ from calib.procedure.dynamic_stage.verdict import motion_findings
 from calib.procedure.findings import Verdict, lines_of
 from calib.procedure.report.page import Block, Column, Section, Text, table
 
-MAX_SIGMAS, MAX_SHARE, MAX_TIMES, FAST_SECONDS = 2.0, 0.05, 2.0, 1.0  # our choices
+# Of the rule above (our choices).
+MAX_SIGMAS, MAX_SHARE, MAX_TIMES, FAST_SECONDS = 2.0, 0.05, 2.0, 1.0
+# Blocks of time in each recording, for the jackknife (our choice).
+TIME_BLOCKS = 10
 LOOP = "needs the closed loop: add [loop] to the options file (calib formats identify-options)"
-NO_MODEL = 100.0  # error [%] of predicting no torque at all
+# Error of predicting no torque at all [%].
+NO_MODEL = 100.0
 
 
 @dataclass(frozen=True)
@@ -91,8 +95,8 @@ def compare_methods(
     inputs: IdentificationInputs,
     methods: Sequence[str] | None = None,
     friction: str = "standard",
-    say: Callable[[str], None] = lambda words: None,
-    each: Callable[[ComparedMethod], None] = lambda one: None,
+    say: Callable[[str], None] = lambda message: None,
+    done: Callable[[ComparedMethod], None] = lambda method: None,
 ) -> list[ComparedMethod]:
     """Return the results of all methods on the recordings, best first; failed methods come last.
 
@@ -100,71 +104,86 @@ def compare_methods(
         inputs: training recordings, and unseen ones.
         methods: their names; None: all.
         friction: as of `IdentificationSettings`; methods that simulate know ``standard`` alone.
-        say: called with words on progress.
-        each: called with every method when it is done, not yet ranked.
+        say: called with messages on progress.
+        done: called with every method when it is done, not yet ranked.
 
     Raises:
         UsageError: where no recording is unseen, or one overlaps the training recordings; where a name is none of
             a method.
     """
     require(inputs.unseen, "methods are ranked on unseen motion: give a recording with --validate", UsageError)
-    if shared := overlaps(inputs.cases, inputs.unseen):
+    shared = overlaps(inputs.cases, inputs.unseen)
+    if shared:
         raise UsageError(f"{lines_of(shared)[0]}: cut them apart, log.npz@0:20 and log.npz@20:30")
+    # Recordings that repeat the training motion do not rank methods, unless there are no others.
     repeated = repeated_motion(inputs.cases, inputs.unseen)
-    proofs = tuple(case for case in inputs.unseen if case.name not in repeated)
-    inputs = replace(inputs, unseen=proofs or inputs.unseen)
-    chosen = {name: method_named(name) for name in methods or METHODS}
-    if inputs.options.settings.loop is None and all(method.needs_controller for method in chosen.values()):
-        raise UsageError(f"{', '.join(chosen)}: {LOOP}")
-    done: list[tuple[ComparedMethod, _Sums]] = []
+    validation = tuple(case for case in inputs.unseen if case.name not in repeated)
+    if validation:
+        inputs = replace(inputs, unseen=validation)
+    candidates = {name: method_named(name) for name in methods or METHODS}
+    without_loop = inputs.options.settings.loop is None
+    if without_loop and all(method.needs_controller for method in candidates.values()):
+        raise UsageError(f"{', '.join(candidates)}: {LOOP}")
+    results: list[tuple[ComparedMethod, _Sums]] = []
     models: dict[str, Identification] = {}
     failed: list[ComparedMethod] = []
-    same_unit = ~np.isin(np.arange(inputs.cases[0].target.shape[1]), inputs.currents.own)
-    for name, method in chosen.items():
-        if method.needs_controller and inputs.options.settings.loop is None:
+    joints = np.arange(inputs.cases[0].target.shape[1])
+    same_unit = ~np.isin(joints, inputs.currents.own)
+    for name, method in candidates.items():
+        if method.needs_controller and without_loop:
             failed.append(ComparedMethod(name, LOOP))
             continue
         say(name)
+        settings = _settings(inputs, method, friction)
         try:
-            found = identify(inputs.robot, inputs.cases, _settings(inputs, method, friction), partial(_said, say, name))
-            done.append(_errors(found, inputs, same_unit))
-            models[name] = found
-            each(done[-1][0])
+            model = identify(inputs.robot, inputs.cases, settings, partial(_say_of, say, name))
+            compared, sums = _errors(model, inputs, same_unit)
         except CalibError as error:
-            failed.append(ComparedMethod(name, " ".join(str(error).split())))
-            each(failed[-1])
+            failed.append(ComparedMethod(name, _one_line(error)))
+            done(failed[-1])
         except Exception as error:  # of one method: the others' results are not lost by it
             failed.append(ComparedMethod(name, f"internal error: {type(error).__name__}: {error}"))
-            each(failed[-1])
-    ranked = _ranked(done, same_unit)
-    return [
-        *(_held(one, inputs, models[one.name], bool(proofs), say) if one.chosen else one for one in ranked),
-        *failed,
-    ]
+            done(failed[-1])
+        else:
+            results.append((compared, sums))
+            models[name] = model
+            done(compared)
+    ranked = _ranked(results, same_unit)
+    for rank, method in enumerate(ranked):
+        if method.chosen:
+            ranked[rank] = _judged(method, inputs, models[method.name], bool(validation), say)
+    return ranked + failed
 
 
-def caveats(inputs: IdentificationInputs, found: Sequence[ComparedMethod]) -> list[str]:
+def caveats(inputs: IdentificationInputs, compared: Sequence[ComparedMethod]) -> list[str]:
     """Return notes on a ranking, and the reason if no method is recommended."""
     repeated = repeated_motion(inputs.cases, inputs.unseen)
     notes = [*inputs.currents.notes, *lines_of(motion_findings({}, repeated))]
-    notes += [line for one in found for line in one.warnings]
+    for method in compared:
+        notes += method.warnings
     if len(repeated) == len(inputs.unseen):
         notes.append("no method recommended: all unseen files repeat the training motion; give others with --validate")
     elif repeated:
         notes.append(f"excluded from the ranking: {', '.join(repeated)}")
-    judged_one = next((one for one in found if one.verdict is not None and one.verdict.level == "fail"), None)
-    if found and found[0].unseen >= NO_MODEL:
+    if compared and compared[0].unseen >= NO_MODEL:
         notes.append(
-            f"no method recommended: best unseen error {found[0].unseen:.3g} %, without a model {NO_MODEL:g} %: "
+            f"no method recommended: best unseen error {compared[0].unseen:.3g} %, without a model {NO_MODEL:g} %: "
             "add training motion"
         )
-    elif judged_one is not None:
-        notes.append(f"no method recommended: the model of {judged_one.name} fails in calib identify, reason below")
+    else:
+        for method in compared:
+            if method.verdict is not None and method.verdict.level == "fail":
+                notes.append(f"no method recommended: the model of {method.name} fails in calib identify, reason below")
+                break
     return list(dict.fromkeys(notes))
 
 
-def _said(say: Callable[[str], None], name: str, words: str) -> None:
-    say(f"{name}: {words}")
+def _say_of(say: Callable[[str], None], name: str, message: str) -> None:
+    say(f"{name}: {message}")
+
+
+def _one_line(error: CalibError) -> str:
+    return " ".join(str(error).split())
 
 
 def _settings(inputs: IdentificationInputs, method: Method, friction: str) -> IdentificationSettings:
@@ -174,11 +193,17 @@ def _settings(inputs: IdentificationInputs, method: Method, friction: str) -> Id
         settings = replace(settings, constraints=None)
     if not method.takes_prior:
         settings = replace(settings, weights="residuals")
-    return settings if method.needs_controller else replace(settings, loop=None)
+    if method.needs_controller:
+        return settings
+    return replace(settings, loop=None)
 
 
-def _held(
-    one: ComparedMethod, inputs: IdentificationInputs, found: Identification, proven: bool, say: Callable[[str], None]
+def _judged(
+    method: ComparedMethod,
+    inputs: IdentificationInputs,
+    model: Identification,
+    proven: bool,
+    say: Callable[[str], None],
 ) -> ComparedMethod:
     """Return the selected method with the verdict on its model; with verdict fail it is not recommended.
 
@@ -187,49 +212,54 @@ def _held(
     """
     warnings: tuple[str, ...] = ()
     try:
-        outcome = judged(inputs, found, partial(_said, say, one.name))
+        outcome = judged(inputs, model, partial(_say_of, say, method.name))
         verdict, warnings = outcome.verdict, outcome.warnings
     except CalibError as error:
-        verdict = Verdict("fail", " ".join(str(error).split()))
-    taken = proven and one.unseen < NO_MODEL and verdict.level != "fail"
-    return replace(one, chosen=taken, verdict=verdict, warnings=warnings)
+        verdict = Verdict("fail", _one_line(error))
+    recommended = proven and method.unseen < NO_MODEL and verdict.level != "fail"
+    return replace(method, chosen=recommended, verdict=verdict, warnings=warnings)
 
 
-def _errors(found: Identification, inputs: IdentificationInputs, same_unit: np.ndarray) -> tuple[ComparedMethod, _Sums]:
+def _errors(model: Identification, inputs: IdentificationInputs, same_unit: np.ndarray) -> tuple[ComparedMethod, _Sums]:
     """Return the errors of a method's model, and their sums by block of time."""
-    unseen, training = (_sums(found, cases) for cases in (inputs.unseen, inputs.cases))
-    joints = 100.0 * np.sqrt(unseen.error.sum(axis=0) / np.maximum(unseen.size.sum(axis=0), 1e-300))
-    worst = int(np.argmax(np.where(same_unit, joints, -1.0)))
-    fitted = found.fitted
-    return ComparedMethod(
+    unseen = _sums(model, inputs.unseen)
+    training = _sums(model, inputs.cases)
+    joint_errors = 100.0 * np.sqrt(unseen.error.sum(axis=0) / np.maximum(unseen.size.sum(axis=0), 1e-300))
+    worst = int(np.argmax(np.where(same_unit, joint_errors, -1.0)))
+    fitted = model.fitted
+    compared = ComparedMethod(
         fitted.method,
         unseen=_percent(unseen.error[:, same_unit], unseen.size[:, same_unit]),
         sigma=float(_jackknife(_leaving_out(unseen, same_unit))),
         raw=_percent(unseen.raw_error[:, same_unit], unseen.raw_size[:, same_unit]),
         training=_percent(training.error[:, same_unit], training.size[:, same_unit]),
-        worst=(worst + 1, float(joints[worst])),
+        worst=(worst + 1, float(joint_errors[worst])),
         parameters=len(fitted.estimate.values),
         seconds=fitted.seconds,
         iterations=fitted.iterations,
         simulations=fitted.simulations,
-    ), unseen
+    )
+    return compared, unseen
 
 
-def _sums(found: Identification, cases: Sequence[Case], blocks: int = 10) -> _Sums:
-    # blocks: of time in each recording
-    parts = []
+def _sums(model: Identification, cases: Sequence[Case]) -> _Sums:
+    """Return the sums of a model's errors over each block of time of the recordings."""
+    errors, sizes, raw_errors, raw_sizes = [], [], [], []
     for case in cases:
-        motion, known = case.motion, case.motion.weight > 0.5
-        predicted = predict(found.dynamics, case)
-        low, target = motion.in_band(predicted), motion.in_band(np.asarray(case.target))
-        starts = np.linspace(0, len(known), blocks, endpoint=False).astype(int)
-        parts.append(
-            [
-                np.add.reduceat(np.where(known[:, None], x, 0.0) ** 2, starts, axis=0)
-                for x in (target - low, target, case.target - predicted, case.target)
-            ]
-        )
-    return _Sums(*(np.concatenate(own) for own in zip(*parts)))
+        motion = case.motion
+        usable = motion.weight > 0.5
+        starts = np.linspace(0, len(usable), TIME_BLOCKS, endpoint=False).astype(int)
+
+        def block_sums(values: np.ndarray, usable: np.ndarray = usable, starts: np.ndarray = starts) -> np.ndarray:
+            return np.add.reduceat(np.where(usable[:, None], values, 0.0) ** 2, starts, axis=0)
+
+        predicted = predict(model.dynamics, case)
+        target = motion.in_band(np.asarray(case.target))
+        errors.append(block_sums(target - motion.in_band(predicted)))
+        sizes.append(block_sums(target))
+        raw_errors.append(block_sums(case.target - predicted))
+        raw_sizes.append(block_sums(case.target))
+    return _Sums(np.concatenate(errors), np.concatenate(sizes), np.concatenate(raw_errors), np.concatenate(raw_sizes))
 
 
 def _percent(error: np.ndarray, size: np.ndarray) -> float:
@@ -238,29 +268,36 @@ def _percent(error: np.ndarray, size: np.ndarray) -> float:
 
 def _leaving_out(sums: _Sums, same_unit: np.ndarray) -> np.ndarray:
     """Return the error (k,) [%] with each of k blocks of time left out."""
-    error, size = sums.error[:, same_unit].sum(axis=1), sums.size[:, same_unit].sum(axis=1)
+    error = sums.error[:, same_unit].sum(axis=1)
+    size = sums.size[:, same_unit].sum(axis=1)
     return 100.0 * np.sqrt((error.sum() - error) / np.maximum(size.sum() - size, 1e-300))
 
 
-def _jackknife(each: np.ndarray) -> float:
-    return float(np.sqrt((len(each) - 1) / len(each) * np.sum((each - each.mean()) ** 2)))
+def _jackknife(values: np.ndarray) -> float:
+    """Return the jackknife's standard error of a figure from its values (k,) with each of k blocks left out."""
+    count = len(values)
+    return float(np.sqrt((count - 1) / count * np.sum((values - values.mean()) ** 2)))
 
 
-def _ranked(done: Sequence[tuple[ComparedMethod, _Sums]], same_unit: np.ndarray) -> list[ComparedMethod]:
+def _ranked(results: Sequence[tuple[ComparedMethod, _Sums]], same_unit: np.ndarray) -> list[ComparedMethod]:
     """Return the methods by rank; the first fast one of the good methods is marked as chosen."""
-    if not done:
+    if not results:
         return []
-    order = sorted(done, key=lambda pair: pair[0].unseen)
-    best, own = order[0]
-    result = []
-    for rank, (one, sums) in enumerate(order, 1):
-        behind = one.unseen - best.unseen
-        sigma = _jackknife(_leaving_out(sums, same_unit) - _leaving_out(own, same_unit))
+    order = sorted(results, key=lambda result: result[0].unseen)
+    best, best_sums = order[0]
+    ranked = []
+    for rank, (method, sums) in enumerate(order, 1):
+        behind = method.unseen - best.unseen
+        sigma = _jackknife(_leaving_out(sums, same_unit) - _leaving_out(best_sums, same_unit))
         good = behind <= max(MAX_SIGMAS * sigma, MAX_SHARE * best.unseen)
-        result.append(replace(one, rank=rank, behind=behind, behind_sigma=sigma, good=bool(good)))
-    least = min(one.seconds for one in result if one.good)
-    taken = next(one for one in result if one.good and one.seconds <= max(FAST_SECONDS, MAX_TIMES * least))
-    return [replace(one, chosen=one is taken) for one in result]
+        ranked.append(replace(method, rank=rank, behind=behind, behind_sigma=sigma, good=bool(good)))
+    fastest = min(method.seconds for method in ranked if method.good)
+    fast = max(FAST_SECONDS, MAX_TIMES * fastest)
+    for index, method in enumerate(ranked):
+        if method.good and method.seconds <= fast:
+            ranked[index] = replace(method, chosen=True)
+            break
+    return ranked
 
 
 HEADER = [
@@ -284,38 +321,49 @@ HEADER = [
 ]
 
 
-def write_table(found: Sequence[ComparedMethod], path: Path) -> Path:
+def write_table(compared: Sequence[ComparedMethod], path: Path) -> Path:
     """Write the comparison as CSV."""
-    lines = [
-        (
-            one.rank or "",
-            one.name,
-            one.unseen,
-            one.sigma,
-            one.raw,
-            one.training,
-            one.worst[0] or "",
-            one.worst[1],
-            one.behind,
-            one.behind_sigma,
-            "yes" if one.good else "no",
-            "yes" if one.chosen else "no",
-            one.parameters,
-            one.seconds,
-            one.iterations,
-            one.simulations,
-            one.failure,
+    lines = []
+    for method in compared:
+        worst_joint, worst_error = method.worst
+        cells = (
+            method.rank or "",
+            method.name,
+            method.unseen,
+            method.sigma,
+            method.raw,
+            method.training,
+            worst_joint or "",
+            worst_error,
+            method.behind,
+            method.behind_sigma,
+            "yes" if method.good else "no",
+            "yes" if method.chosen else "no",
+            method.parameters,
+            method.seconds,
+            method.iterations,
+            method.simulations,
+            method.failure,
         )
-        for one in found
-    ]
+        lines.append(cells)
     return files.write_table(path, HEADER, lines)
+
+
+def _behind(method: ComparedMethod) -> str:
+    return "" if method.rank == 1 else f"{method.behind:.2g} ± {method.behind_sigma:.2g}"
+
+
+def _choice(method: ComparedMethod) -> str:
+    if method.chosen:
+        return "take"
+    return "as good" if method.good else ""
 
 
 COLUMNS = (
     Column("rank", "{0.rank}"),
     Column("method", "{0.name}", number=False),
     Column("unseen [%]", "{0.unseen:.3g} ± {0.sigma:.2g}"),
-    Column("behind the best", lambda one: "" if one.rank == 1 else f"{one.behind:.2g} ± {one.behind_sigma:.2g}"),
+    Column("behind the best", _behind),
     Column("raw [%]", "{0.raw:.3g}"),
     Column("training [%]", "{0.training:.3g}"),
     Column("worst joint", "{0.worst[0]}: {0.worst[1]:.3g} %"),
@@ -323,34 +371,35 @@ COLUMNS = (
     Column("rounds", "{0.iterations}"),
     Column("simulations", "{0.simulations}"),
     Column("seconds", "{0.seconds:.2g}"),
-    Column("choice", lambda one: "take" if one.chosen else "as good" if one.good else "", number=False),
+    Column("choice", _choice, number=False),
 )
 
 
-def line(one: ComparedMethod) -> str:
+def line(method: ComparedMethod) -> str:
     """Return one line on a method's result: its error, or the reason of its failure."""
-    words = one.failure or f"{one.unseen:.3g} % on unseen motion, {one.seconds:.2g} s"
-    return f"{one.name}: {words}"
+    if method.failure:
+        return f"{method.name}: {method.failure}"
+    return f"{method.name}: {method.unseen:.3g} % on unseen motion, {method.seconds:.2g} s"
 
 
-def section(found: Sequence[ComparedMethod], notes: Sequence[str]) -> Section:
+def section(compared: Sequence[ComparedMethod], notes: Sequence[str]) -> Section:
     """Return a report section: table of methods, notes, and the verdict on the selected method's model."""
-    own = next((one for one in found if one.verdict is not None), None)
-    shown = (*_blocks(found), Text("", notes, "note"))
-    if own is None or own.verdict is None:
-        return Section("Methods", shown)
-    return Section("Methods", shown, own.verdict.level, f"{own.name}: {own.verdict.reason}")
+    blocks = [*_blocks(compared), Text("", notes, "note")]
+    for method in compared:
+        if method.verdict is not None:
+            return Section("Methods", blocks, method.verdict.level, f"{method.name}: {method.verdict.reason}")
+    return Section("Methods", blocks)
 
 
-def _blocks(found: Sequence[ComparedMethod]) -> Iterator[Block]:
+def _blocks(compared: Sequence[ComparedMethod]) -> Iterator[Block]:
     """Yield the ranked table, and the reasons for excluded methods."""
-    good = [one for one in found if not one.failure]
+    ranked = [method for method in compared if not method.failure]
     note = (
         "100 ‖τ - τ̂‖ / ‖τ‖ on unseen motion, in the identification band, ± its standard error over blocks of time; "
         f"methods are as good within {MAX_SIGMAS:g} standard errors of the difference, or {MAX_SHARE:.0%}, of the best"
     )
-    if good:
-        yield table("Methods", COLUMNS, good, note, lambda one: one.chosen)
-    lines = [line(one) for one in found if one.failure]
+    if ranked:
+        yield table("Methods", COLUMNS, ranked, note, lambda method: method.chosen)
+    lines = [line(method) for method in compared if method.failure]
     if lines:
         yield Text("Without an estimate", lines, "no estimate")

@@ -2,8 +2,7 @@
 
 ``calib study``: what is missing is run, what is there is summed up, and a report says what to take.
 
-rows.parquet, rows.csv   every trial (`store`): more may be added by anyone, at any time. While a command
-                         runs its rows go to rows.csv, which is emptied into rows.parquet at the end
+rows.sqlite              every trial (`store`): more may be added by anyone, at any time
 summary.csv              one line per condition and method: of every figure its median and, as lower and upper, its
                          quartiles, the nearest of the runs' own values
 report.html              tables, box plots, the decision rule; one file
@@ -19,13 +18,12 @@ import numpy as np
 
 from calib import files
 from calib.errors import UsageError, require
-from calib.procedure.report.charts import Chart, Panel, box, line, picture, text
-from calib.procedure.report.page import Column, Picture, Pictures, Section, Table, Text, table
+from calib.procedure.report.charts import Chart, Layer, Panel, box, line, picture, text
+from calib.procedure.report.page import Block, Column, Picture, Pictures, Section, Table, Text, table
 from calib.procedure.report.style import AFTER, BEFORE, MARK
-from calib.rooms.studies import summary
 from calib.rooms.studies.conditions import Condition, Study, read_study, shipped
 from calib.rooms.studies.run import Progress, run, span
-from calib.rooms.studies.store import JOURNAL, LOCK, WHOLE, opened, read_rows
+from calib.rooms.studies.store import LOCK, ROWS, check_format, opened, read_rows
 from calib.rooms.studies.summary import (
     ALIKE,
     FIGURES,
@@ -35,38 +33,13 @@ from calib.rooms.studies.summary import (
     SLACK,
     ConditionSummary,
     MethodSummary,
+    summarise,
 )
 from calib.rooms.studies.trial import TrialRow
 from calib.workers import workers
 
-LINE = 0.21  # height of one method [in]
-
-
-def boxes(one: ConditionSummary, rows: Sequence[TrialRow]) -> Picture:
-    """Return the box plot of a condition."""
-    layers: list = []
-    every: list[float] = []
-    for place, method in enumerate(one.methods):
-        own = [row.torque_error for row in rows if row.method == method.method and np.isfinite(row.torque_error)]
-        every += own
-        colour = AFTER if method.as_good else BEFORE
-        if len(own) < MIN_DATA_SETS:
-            layers.append(line(own, [place] * len(own), "o", colour, size=4.0))
-        else:
-            layers.append(box(own, place, colour))
-    low, high = 0.8 * max(min(every, default=0.1), 1e-6), 1.25 * max(max(every, default=1.0), 1.1e-6)
-    for place, method in enumerate(one.methods):
-        if failed := sum(method.failures.values()):
-            layers.append(text(f"{failed} failed", high, place, (3, 0), MARK, along="center"))
-    names = [method.method for method in one.methods]
-    panel = Panel(layers, x="torque error [%]", xlim=(low, high), log="x", ynames=names, grid="x")
-    words = (
-        "Torque error on unseen motion, noise-free: boxes from quartile to quartile with the median, lines to the 5th "
-        f"and 95th percentile, points beyond; fewer than {MIN_DATA_SETS} as points. Dark: as good as the best. Trials "
-        "without an estimate are counted at the right."
-    )
-    return picture(Chart([panel], 0.75 + LINE * len(names)), words)
-
+# Height of one method in a box plot [in].
+METHOD_HEIGHT = 0.21
 
 RULE = (
     f"A method counts as good if it gives an estimate in at least {RELIABLE:.0%} of the trials, and if its noise-free "
@@ -85,6 +58,39 @@ MEANING = (
     "All are medians over trials; CPU: processor time of the method alone; p: sign test against the best method.",
 )
 
+# Results of a study beside its rows, and all files that it owns.
+SUMMARY, REPORT = "summary.csv", "report.html"
+OURS = (ROWS, LOCK, SUMMARY, REPORT)
+
+
+def boxes(condition: ConditionSummary, rows: Sequence[TrialRow]) -> Picture:
+    """Return the box plot of a condition."""
+    layers: list[Layer] = []
+    all_errors: list[float] = []
+    for height, method in enumerate(condition.methods):
+        method_rows = [row for row in rows if row.method == method.method]
+        errors = [row.torque_error for row in method_rows if np.isfinite(row.torque_error)]
+        all_errors += errors
+        colour = AFTER if method.as_good else BEFORE
+        if len(errors) < MIN_DATA_SETS:
+            layers.append(line(errors, [height] * len(errors), "o", colour, size=4.0))
+        else:
+            layers.append(box(errors, height, colour))
+    low = 0.8 * max(min(all_errors, default=0.1), 1e-6)
+    high = 1.25 * max(max(all_errors, default=1.0), 1.1e-6)
+    for height, method in enumerate(condition.methods):
+        failed = sum(method.failures.values())
+        if failed:
+            layers.append(text(f"{failed} failed", high, height, (3, 0), MARK, along="center"))
+    names = [method.method for method in condition.methods]
+    panel = Panel(layers, x="torque error [%]", xlim=(low, high), log="x", ynames=names, grid="x")
+    caption = (
+        "Torque error on unseen motion, noise-free: boxes from quartile to quartile with the median, lines to the 5th "
+        f"and 95th percentile, points beyond; fewer than {MIN_DATA_SETS} as points. Dark: as good as the best. Trials "
+        "without an estimate are counted at the right."
+    )
+    return picture(Chart([panel], 0.75 + METHOD_HEIGHT * len(names)), caption)
+
 
 def _short(value: float) -> str:
     if math.isnan(value):
@@ -95,19 +101,37 @@ def _short(value: float) -> str:
 
 
 def _median(header: str, figure: str) -> Column:
-    return Column(header, lambda one: _short(one.figures[figure].median))
+    return Column(header, lambda method: _short(method.figures[figure].median))
 
 
-def _mark(one: MethodSummary) -> str:
-    return "take" if one.chosen else "as good" if one.as_good else "" if one.enough else "few runs"
+def _failures(method: MethodSummary) -> str:
+    counts = [f"{count} {status}" for status, count in method.failures.items()]
+    return ", ".join(counts) or "0"
+
+
+def _quartiles(method: MethodSummary) -> str:
+    _, lower, upper = method.figures["torque_error"]
+    return f"{_short(lower)}–{_short(upper)}"
+
+
+def _p_value(method: MethodSummary) -> str:
+    return _short(method.p)
+
+
+def _mark(method: MethodSummary) -> str:
+    if method.chosen:
+        return "take"
+    if method.as_good:
+        return "as good"
+    return "" if method.enough else "few runs"
 
 
 COLUMNS = (
     Column("method", "{0.method}", number=False),
     Column("trials", "{0.trials}"),
-    Column("failed", lambda one: ", ".join(f"{count} {status}" for status, count in one.failures.items()) or "0"),
+    Column("failed", _failures),
     _median("torque [%]", "torque_error"),
-    Column("quartiles", lambda one: "–".join(map(_short, one.figures["torque_error"][1:]))),
+    Column("quartiles", _quartiles),
     _median("worst joint [%]", "torque_worst"),
     _median("β [%]", "beta_error"),
     _median("in σ", "beta_sigma"),
@@ -117,7 +141,7 @@ COLUMNS = (
     _median("rounds", "iterations"),
     _median("simulations", "simulations"),
     _median("CPU [s]", "cpu"),
-    Column("p", lambda one: _short(one.p)),
+    Column("p", _p_value),
     Column("", _mark, number=False),
 )
 ON_CONSOLE = ("method", "trials", "failed", "torque [%]", "quartiles", "covered [%]", "CPU [s]", "")
@@ -126,99 +150,126 @@ ON_CONSOLE = ("method", "trials", "failed", "torque [%]", "quartiles", "covered 
 def overview(conditions: Sequence[ConditionSummary]) -> Table:
     """Return a table of the recommended method of each condition."""
     lines = []
-    for one in conditions:
-        if not one.methods:
-            lines.append((one.condition.name, _described(one.condition), "no rows yet", "", "", "", ""))
+    for summary in conditions:
+        name, description = summary.condition.name, _described(summary.condition)
+        if not summary.methods:
+            lines.append((name, description, "no rows yet", "", "", "", ""))
             continue
-        best, chosen = one.best, one.chosen
-        failed = ", ".join(f"{m.method} {sum(m.failures.values())}/{m.trials}" for m in one.methods if m.failures)
-        lines.append(
-            (
-                one.condition.name,
-                _described(one.condition),
-                chosen.method if chosen else "none",
-                _short(chosen.figures["torque_error"].median) if chosen else "",
-                f"{best.method} {_short(best.figures['torque_error'].median)}" if best else "",
-                ", ".join(m.method for m in one.methods if m.as_good and m is not chosen),
-                failed,
-            )
-        )
+        chosen, chosen_error = "none", ""
+        if summary.chosen is not None:
+            chosen = summary.chosen.method
+            chosen_error = _short(summary.chosen.figures["torque_error"].median)
+        best = ""
+        if summary.best is not None:
+            best = f"{summary.best.method} {_short(summary.best.figures['torque_error'].median)}"
+        as_good = []
+        failed = []
+        for method in summary.methods:
+            if method.as_good and method is not summary.chosen:
+                as_good.append(method.method)
+            if method.failures:
+                failed.append(f"{method.method} {sum(method.failures.values())}/{method.trials}")
+        lines.append((name, description, chosen, chosen_error, best, ", ".join(as_good), ", ".join(failed)))
     header = ("condition", "", "take", "torque [%]", "best [%]", "as good", "without an estimate")
     return Table("What to take", header, lines, numbers=(3,))
 
 
 def torque_table(conditions: Sequence[ConditionSummary]) -> Table:
     """Return a table of the median torque error of every method on every condition."""
-    names = list(dict.fromkeys(method.method for one in conditions for method in one.methods))
+    # A dictionary keeps the order of names, and each once.
+    names: dict[str, None] = {}
+    for summary in conditions:
+        names.update((method.method, None) for method in summary.methods)
     lines = []
-    for one in conditions:
-        own = {method.method: method for method in one.methods}
-        lines.append((one.condition.name, *(_median_cell(own.get(name)) for name in names)))
+    for summary in conditions:
+        by_name = {method.method: method for method in summary.methods}
+        cells = [_median_cell(by_name.get(name)) for name in names]
+        lines.append((summary.condition.name, *cells))
     note = (
         f"Median over trials [%]; a trial without an estimate counts as ∞. *: recommended; (n): n runs, fewer than "
         f"{MIN_DATA_SETS} runs."
     )
-    return Table("Torque error on unseen motion", ("condition", *names), lines, note, numbers=range(1, len(names) + 1))
+    numbers = range(1, len(names) + 1)
+    return Table("Torque error on unseen motion", ("condition", *names), lines, note, numbers=numbers)
 
 
-def _median_cell(one: MethodSummary | None) -> str:
-    if one is None:
+def _median_cell(method: MethodSummary | None) -> str:
+    if method is None:
         return ""
-    return _short(one.figures["torque_error"].median) + (
-        "*" if one.chosen else "" if one.enough else f" ({one.trials})"
-    )
+    median = _short(method.figures["torque_error"].median)
+    if method.chosen:
+        return f"{median}*"
+    return median if method.enough else f"{median} ({method.trials})"
 
 
 def reasons(conditions: Sequence[ConditionSummary]) -> list[str]:
     """Return sentences that say why conditions have no recommended method."""
-    found: dict[str, list[str]] = {}
-    for one in conditions:
-        if why := one.why_none:
-            found.setdefault(why, []).append(one.condition.name)
-    return [
-        f"no method recommended for {'all' if 1 < len(names) == len(conditions) else ', '.join(names)}: {why}"
-        for why, names in found.items()
-    ]
+    by_reason: dict[str, list[str]] = {}
+    for summary in conditions:
+        if summary.why_none:
+            by_reason.setdefault(summary.why_none, []).append(summary.condition.name)
+    sentences = []
+    for reason, names in by_reason.items():
+        if 1 < len(names) == len(conditions):
+            concerned = "all"
+        else:
+            concerned = ", ".join(names)
+        sentences.append(f"no method recommended for {concerned}: {reason}")
+    return sentences
 
 
-def _described(one: Condition) -> str:
+def _described(condition: Condition) -> str:
     """Return a condition as one line: robot, motion, rate, noise, decimation, cutoff, mismatch, guesses."""
-    filtered = f"{one.cutoff:g} Hz" if one.cutoff else "unfiltered"
-    wrong = "" if one.mismatch == "none" else f", {one.mismatch}"
-    wrong += f", {one.guesses} guesses" if one.guesses > 1 else ""
-    what = one.robot + (f" {one.motion}" if one.motion != "random" else "") + (f" {one.rate:g} Hz" if one.rate else "")
-    degrees = math.degrees(one.sigma_q)
-    return f"{what}, {degrees:.3g}°, {one.sigma_tau:g} N·m, r = {one.decimation}, {filtered}{wrong}"
+    parts = [condition.robot]
+    if condition.motion != "random":
+        parts.append(condition.motion)
+    if condition.rate:
+        parts.append(f"{condition.rate:g} Hz")
+    cutoff = f"{condition.cutoff:g} Hz" if condition.cutoff else "unfiltered"
+    degrees = math.degrees(condition.sigma_q)
+    noise = f"{degrees:.3g}°, {condition.sigma_tau:g} N·m"
+    description = f"{' '.join(parts)}, {noise}, r = {condition.decimation}, {cutoff}"
+    if condition.mismatch != "none":
+        description += f", {condition.mismatch}"
+    if condition.guesses > 1:
+        description += f", {condition.guesses} guesses"
+    return description
 
 
-def condition_table(one: ConditionSummary, names: Sequence[str] = ON_CONSOLE) -> Table:
+def condition_table(summary: ConditionSummary, names: Sequence[str] = ON_CONSOLE) -> Table:
     """Return a table of all methods on a condition, best first; by default with the columns for a terminal."""
     columns = [column for column in COLUMNS if column.name in names]
-    title = f"Methods on {one.condition.name}"
-    return table(title, columns, one.methods, _described(one.condition), lambda method: method.chosen)
+    title = f"Methods on {summary.condition.name}"
+    return table(title, columns, summary.methods, _described(summary.condition), lambda method: method.chosen)
 
 
-def failures(one: ConditionSummary) -> list[Text]:
+def failures(summary: ConditionSummary) -> list[Text]:
     """Return the failures of each method on a condition: kind, number, and first message; empty without any."""
-    said = [
-        f"{method.method}: {count} {status}, e.g. {method.examples[status]}"
-        for method in sorted(one.methods, key=lambda method: method.method)
-        for status, count in method.failures.items()
-    ]
-    return [Text("Without an estimate", said)] if said else []
+    lines = []
+    for method in sorted(summary.methods, key=lambda method: method.method):
+        for status, count in method.failures.items():
+            lines.append(f"{method.method}: {count} {status}, e.g. {method.examples[status]}")
+    if lines:
+        return [Text("Without an estimate", lines)]
+    return []
 
 
 def summary_table(conditions: Sequence[ConditionSummary]) -> tuple[list[str], list[list[object]]]:
     """Return header and rows of ``summary.csv``."""
     header = ["condition", "method", "trials", "failed", "rank", "as_good", "take", "p"]
-    header += [f"{name}_{part}" for name in FIGURES for part in ("median", "lower", "upper")]
+    for figure in FIGURES:
+        header += [f"{figure}_median", f"{figure}_lower", f"{figure}_upper"]
     lines: list[list[object]] = []
-    for one in conditions:
-        for method in one.methods:
-            flags = ["yes" if flag else "no" for flag in (method.as_good, method.chosen)]
-            head = [one.condition.name, method.method, method.trials, sum(method.failures.values()), method.rank]
-            spreads = [value for name in FIGURES for value in method.figures[name]]
-            lines.append([*head, *flags, method.p, *spreads])
+    for summary in conditions:
+        for method in summary.methods:
+            failed = sum(method.failures.values())
+            as_good = "yes" if method.as_good else "no"
+            chosen = "yes" if method.chosen else "no"
+            cells = [summary.condition.name, method.method, method.trials, failed, method.rank, as_good, chosen]
+            cells.append(method.p)
+            for figure in FIGURES:
+                cells.extend(method.figures[figure])
+            lines.append(cells)
     return header, lines
 
 
@@ -237,16 +288,21 @@ def make_page(
     """
     from calib.procedure.report.templates import filled, issued
 
-    head = [overview(conditions), *([torque_table(conditions)] if len(conditions) > 1 else [])]
-    sections = [Section("", [*head, Text("How that was decided", RULE), Text("Figures", MEANING)])]
-    for one in conditions:
-        if not one.methods:
+    blocks: list[Block] = [overview(conditions)]
+    if len(conditions) > 1:
+        blocks.append(torque_table(conditions))
+    blocks += [Text("How that was decided", RULE), Text("Figures", MEANING)]
+    sections = [Section("", blocks)]
+    all_columns = [column.name for column in COLUMNS]
+    for summary in conditions:
+        if not summary.methods:
             continue
-        own = [row for row in rows if row.digest == one.condition.digest]
-        blocks = [condition_table(one, [column.name for column in COLUMNS])]
-        drawn = [Pictures("", [boxes(one, own)])] if plots else []
-        blocks = [*blocks, *drawn, *failures(one)]
-        sections.append(Section(one.condition.name, blocks))
+        blocks = [condition_table(summary, all_columns)]
+        if plots:
+            condition_rows = [row for row in rows if row.digest == summary.condition.digest]
+            blocks.append(Pictures("", [boxes(summary, condition_rows)]))
+        blocks += failures(summary)
+        sections.append(Section(summary.condition.name, blocks))
     return filled(
         "calib.rooms.studies",
         "study.html",
@@ -258,19 +314,15 @@ def make_page(
     )
 
 
-SUMMARY, REPORT = "summary.csv", "report.html"
-OURS = (JOURNAL, WHOLE, LOCK, SUMMARY, REPORT)
-
-
 @dataclass(frozen=True)
 class StudyOutcome:
     """Result of a study.
 
     Attributes:
-        conditions: what the rows say, condition by condition.
+        conditions: summary of each condition.
         progress: of this command.
         notes: what a user should know.
-        folder: where all of it is.
+        folder: of rows, summary and report.
         rows: which file holds how many rows, in words; "" where nothing was run.
     """
 
@@ -282,15 +334,17 @@ class StudyOutcome:
 
     def described(self) -> list[str]:
         """Return the closing message of a command."""
-        done = self.progress
         lines = [f"note: {note}" for note in self.notes]
-        if done.wanted:
-            lines += [f"{done} in {span(done.seconds)}", *done.pace.lines()]
-        return [*lines, self.rows] if self.rows else lines
+        if self.progress.total:
+            lines.append(f"{self.progress} in {span(self.progress.seconds)}")
+            lines += self.progress.pace.lines()
+        if self.rows:
+            lines.append(self.rows)
+        return lines
 
 
 def run_study(
-    named: Sequence[str | Path],
+    studies: Sequence[str | Path],
     out: Path,
     *,
     methods: Sequence[str] | None = None,
@@ -298,78 +352,78 @@ def run_study(
     where: str | int | None = None,
     report_only: bool = False,
     plots: bool = True,
-    say: Callable[[str], None] = lambda words: None,
+    say: Callable[[str], None] = lambda message: None,
 ) -> StudyOutcome:
     """Run the missing trials of a study, and write its report.
 
     Args:
-        named: study files, names of shipped ones, patterns of these.
+        studies: study files, names of shipped ones, patterns of these.
         out: the folder of its rows; those that are there count.
         methods, runs: in place of the files'.
         where: the tasks run, see `calib.workers.workers`.
         report_only: run nothing, and leave the rows as they are, also while another command adds to them.
         plots: whether the report has figures.
-        say: called with words on progress.
+        say: called with messages on progress.
 
     Raises:
         UsageError: for a file that is no study, a folder that another command works in, rows of another version.
         CalibError: where rows cannot be kept, or the workers are gone; what is kept is kept.
     """
-    study = read_study(named, methods, runs)
-    _check_folder(out, named)
-    notes: list[str] = []
-    progress, settled = Progress(0), ""
+    study = read_study(studies, methods, runs)
+    _check_folder(out, studies)
+    progress, stored = Progress(0), ""
     if report_only:
-        kept = read_rows(out)  # takes no lock: a study that runs there may be looked at
+        # Takes no lock: a study that runs there may be looked at.
+        rows = read_rows(out)
     else:
         with opened(out) as store:
-            if store.dropped:
-                notes.append(f"{store.dropped} incomplete line was removed; its trial is run again")
             say(f"{len(store.rows)} rows are there")
             with workers(where) as crew:
-                progress = run(study, store, crew, lambda found: say(str(found)))
+                progress = run(study, store, crew, lambda progress: say(str(progress)))
             say("writing")
-            place = store.settle()
-            kept = list(store.rows.values())
-            settled = f"{place.name} holds {len(kept)} rows"
-    own, more = _counted(study, kept)
-    notes += more
-    if not progress.lost and not own:
-        there = "; ".join([f"{len(kept)} rows" if kept else "no rows", *more])
-        try_next = (
-            "run the study first, or name its folder (--out)" if report_only else "ask for 1 run or more (--runs)"
-        )
-        raise UsageError(f"nothing to report: {out} holds {there}; {try_next}")
-    if len(versions := sorted({row.toolkit for row in own})) > 1:
+            rows = list(store.rows.values())
+            stored = f"{ROWS} holds {len(rows)} rows"
+    counted, notes = _counted(study, rows)
+    if not progress.lost and not counted:
+        contents = "; ".join([f"{len(rows)} rows" if rows else "no rows", *notes])
+        advice = "ask for 1 run or more (--runs)"
+        if report_only:
+            advice = "run the study first, or name its folder (--out)"
+        raise UsageError(f"nothing to report: {out} holds {contents}; {advice}")
+    versions = sorted({row.toolkit for row in counted})
+    if len(versions) > 1:
         notes.append(f"rows were made by several versions: {', '.join(versions)}")
     if progress.lost:
         notes.append(f"{progress.lost} trials were lost with their workers; run the same command again")
-    conditions = tuple(summary.summarise(study, own))
+    conditions = tuple(summarise(study, counted))
     notes += reasons(conditions)
     files.write_table(out / SUMMARY, *summary_table(conditions))
-    files.write(out / REPORT, make_page(study, conditions, own, notes, plots))
-    return StudyOutcome(conditions, progress, tuple(notes), out, settled)
+    files.write(out / REPORT, make_page(study, conditions, counted, notes, plots))
+    return StudyOutcome(conditions, progress, tuple(notes), out, stored)
 
 
-def _counted(study: Study, kept: Sequence[TrialRow]) -> tuple[list[TrialRow], list[str]]:
+def _counted(study: Study, rows: Sequence[TrialRow]) -> tuple[list[TrialRow], list[str]]:
     """Return the rows that count for a study, and notes on those that do not."""
     digests = {condition.digest for condition in study.conditions}
-    own = [row for row in kept if row.digest in digests]
-    notes, changed = [], Counter(row.method for row in own if not row.current)
-    if others := len(kept) - len(own):
-        notes.append(f"{others} rows belong to conditions outside this study: kept, but not counted")
-    if changed:
-        named = ", ".join(f"{count} of {name}" for name, count in changed.items())
-        notes.append(f"rows of methods changed since their run do not count until they are run again: {named}")
-    return [row for row in own if row.current], notes
+    study_rows = [row for row in rows if row.digest in digests]
+    notes = []
+    foreign = len(rows) - len(study_rows)
+    if foreign:
+        notes.append(f"{foreign} rows belong to conditions outside this study: kept, but not counted")
+    outdated = Counter(row.method for row in study_rows if not row.current)
+    if outdated:
+        counts = ", ".join(f"{count} of {name}" for name, count in outdated.items())
+        notes.append(f"rows of methods changed since their run do not count until they are run again: {counts}")
+    return [row for row in study_rows if row.current], notes
 
 
-def _check_folder(out: Path, named: Sequence[str | Path]) -> None:
+def _check_folder(out: Path, studies: Sequence[str | Path]) -> None:
     """Raise if the output folder is a file, or contains files of these names that no study has written."""
     require(not out.is_file(), f"{out} is a file; give a folder for the study's rows (--out)", UsageError)
-    files.check_not_input([out, *(out / name for name in OURS)], named)
+    files.check_not_input([out, *(out / name for name in OURS)], studies)
+    check_format(out)
     foreign = [name for name in (SUMMARY, REPORT) if (out / name).exists()]
-    if foreign and not any((out / name).exists() for name in (JOURNAL, WHOLE)):
+    if foreign and not (out / ROWS).exists():
         raise UsageError(f"{out} contains {', '.join(foreign)}, not written by a study; choose another folder (--out)")
 
 

@@ -1,17 +1,21 @@
 """Running the missing trials of a study: tasks go to workers, rows to the store as they arrive."""
 
+import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 from calib.errors import TaskLost
-from calib.identification.methods.registry import method_named
+from calib.identification.registry import method_named
 from calib.rooms.fleet.throughput import Throughput
 from calib.rooms.studies.conditions import Study
 from calib.rooms.studies.store import RowStore
 from calib.rooms.studies.trial import Trials, grouped, run_trials
 from calib.workers import Workers
+
+# Shortest time between two messages on progress [s].
+MESSAGE_INTERVAL = 1.0
 
 
 @dataclass
@@ -19,19 +23,21 @@ class Progress:
     """Progress of a study's command.
 
     Attributes:
-        wanted: trials that this command has to run.
+        total: trials that this command has to run.
         done, failed: that have ended; of these without an estimate.
         lost: that no worker brought back.
+        spent: seconds of each trial that has ended, by method.
+        remaining_trials: number of trials that have not ended, by method.
         seconds: since it began.
         pace: of each worker.
     """
 
-    wanted: int
+    total: int
     done: int = 0
     failed: int = 0
     lost: int = 0
     spent: dict[str, list[float]] = field(default_factory=dict)
-    left: Counter = field(default_factory=Counter)
+    remaining_trials: Counter = field(default_factory=Counter)
     pace: Throughput = field(default_factory=Throughput)
     began: float = field(default_factory=time.monotonic)
 
@@ -42,20 +48,27 @@ class Progress:
     @property
     def remaining(self) -> float:
         """Estimated remaining time [s], from each method's mean time so far and the number of trials in parallel."""
-        paces = {name: sum(own) / len(own) for name, own in self.spent.items()}
-        if not paces or self.seconds <= 0:
+        if not self.spent or self.seconds <= 0:
             return float("nan")
-        worked = sum(sum(own) for own in self.spent.values())
+        mean_seconds = {name: sum(seconds) / len(seconds) for name, seconds in self.spent.items()}
+        worked = sum(sum(seconds) for seconds in self.spent.values())
         mean = worked / max(self.done, 1)
-        ahead = sum(count * paces.get(name, mean) for name, count in self.left.items())
-        return ahead * self.seconds / max(worked, 1e-9)
+        to_work = 0.0
+        for name, count in self.remaining_trials.items():
+            to_work += count * mean_seconds.get(name, mean)
+        return to_work * self.seconds / max(worked, 1e-9)
 
     def __str__(self) -> str:
-        words = f"{self.done} of {self.wanted} trials, {60 * self.done / max(self.seconds, 1e-9):.0f} a minute"
-        words += f", {self.failed} without an estimate" if self.failed else ""
-        words += f", {self.lost} lost" if self.lost else ""
-        left = self.remaining
-        return words if left != left or not self.wanted - self.done else f"{words}; {span(left)} to go"
+        rate = 60 * self.done / max(self.seconds, 1e-9)
+        message = f"{self.done} of {self.total} trials, {rate:.0f} a minute"
+        if self.failed:
+            message += f", {self.failed} without an estimate"
+        if self.lost:
+            message += f", {self.lost} lost"
+        remaining = self.remaining
+        if not math.isnan(remaining) and self.total != self.done:
+            message += f"; {span(remaining)} to go"
+        return message
 
 
 def span(seconds: float) -> str:
@@ -70,14 +83,19 @@ def _missing(study: Study, store: RowStore) -> Iterator[Trials]:
 
     Methods that take no start values run once per data set, the others from each guess.
     """
-    most = max((max(runs.values(), default=0) for runs in study.runs), default=0)
-    for number in range(most):
+    data_sets = max((max(runs.values(), default=0) for runs in study.runs), default=0)
+    for number in range(data_sets):
         for condition, runs, first in zip(study.conditions, study.runs, study.seeds):
-            digest, asked = condition.digest, [method_named(name) for name, count in runs.items() if number < count]
+            digest = condition.digest
+            methods = [method_named(name) for name, count in runs.items() if number < count]
             for guess in range(condition.guesses):
                 seed = (first + number) * condition.guesses + guess
-                own = [one.name for one in asked if one.takes_start or not guess]
-                yield from grouped(condition, [name for name in own if not store.holds((digest, name, seed))], seed)
+                missing = []
+                for method in methods:
+                    runs_here = method.takes_start or guess == 0
+                    if runs_here and not store.holds((digest, method.name, seed)):
+                        missing.append(method.name)
+                yield from grouped(condition, missing, seed)
 
 
 def run(study: Study, store: RowStore, workers: Workers, say: Callable[[Progress], None]) -> Progress:
@@ -91,22 +109,26 @@ def run(study: Study, store: RowStore, workers: Workers, say: Callable[[Progress
     """
     tasks = list(_missing(study, store))
     progress = Progress(sum(len(task.methods) for task in tasks))
-    progress.left.update(name for task in tasks for name in task.methods)
-    said = 0.0
-    word_interval = 1.0  # [s] between two words on progress
+    for task in tasks:
+        progress.remaining_trials.update(task.methods)
+    last_message = 0.0
     for number, rows in progress.pace.completed(workers, run_trials, tasks):
         methods = tasks[number].methods
-        progress.left.subtract(methods)
+        progress.remaining_trials.subtract(methods)
         if isinstance(rows, TaskLost):
             progress.lost += len(methods)
         else:
             store.append(rows)
             progress.done += len(rows)
-            progress.failed += sum(not row.found for row in rows)
             for row in rows:
-                progress.spent.setdefault(row.method, []).append(row.seconds if row.seconds == row.seconds else 0.0)
-        if time.monotonic() - said > word_interval:
-            said = time.monotonic()
+                progress.failed += not row.found
+                if math.isnan(row.seconds):
+                    seconds = 0.0
+                else:
+                    seconds = row.seconds
+                progress.spent.setdefault(row.method, []).append(seconds)
+        if time.monotonic() - last_message > MESSAGE_INTERVAL:
+            last_message = time.monotonic()
             say(progress)
     say(progress)
     return progress

@@ -10,6 +10,7 @@ are as good as the best; a method of fewer than `MIN_DATA_SETS` runs is listed a
 taken that is cheap: no more than `ALIKE` times the processor time of the cheapest, and of such the first in rank.
 """
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,8 +22,12 @@ from scipy.stats import binomtest
 from calib.rooms.studies.conditions import Condition, Study
 from calib.rooms.studies.trial import TrialRow
 
-RELIABLE, LEVEL, SLACK, ALIKE = 0.95, 0.05, 0.05, 2.0  # our choices
-MIN_DATA_SETS = 6  # common data sets below which the sign test cannot tell at 5 %
+# The rule's shares and factor (our choices), see above.
+RELIABLE, LEVEL, SLACK, ALIKE = 0.95, 0.05, 0.05, 2.0
+# Common data sets below which the sign test cannot tell at 5 %.
+MIN_DATA_SETS = 6
+# Error of a trial without an estimate.
+FAILED_ERROR = float("inf")
 FIGURES = (
     "torque_error",
     "torque_worst",
@@ -37,6 +42,8 @@ FIGURES = (
     "cpu",
     "seconds",
 )
+# Of these a trial without an estimate has an infinite one.
+ERROR_FIGURES = ("torque_error", "torque_worst", "beta_error", "beta_distance")
 
 
 class Quartiles(NamedTuple):
@@ -96,19 +103,19 @@ class ConditionSummary:
     @property
     def chosen(self) -> MethodSummary | None:
         """The recommended method; None if none is reliable."""
-        return next((one for one in self.methods if one.chosen), None)
+        return next((method for method in self.methods if method.chosen), None)
 
     @property
     def best(self) -> MethodSummary | None:
         """The best method with enough runs and an estimate; None without any."""
-        return next((one for one in self.methods if one.enough and one.estimates), None)
+        return next((method for method in self.methods if method.enough and method.estimates), None)
 
     @property
     def why_none(self) -> str:
         """Reason why no method is recommended; "" if one is, or without rows."""
         if self.chosen or not self.methods:
             return ""
-        if not any(one.enough for one in self.methods):
+        if not any(method.enough for method in self.methods):
             return f"fewer than {MIN_DATA_SETS} runs of each method are too few: --runs {MIN_DATA_SETS} or more"
         return f"no method of {MIN_DATA_SETS} runs or more gives an estimate in {RELIABLE:.0%} of its trials"
 
@@ -120,80 +127,112 @@ def summarise(study: Study, rows: Iterable[TrialRow]) -> list[ConditionSummary]:
 
     Methods that the study no longer asks for stay in the summary while their rows are stored.
     """
-    kept: dict[str, dict[str, list[TrialRow]]] = {}
-    for row in (one for one in rows if one.current):
-        kept.setdefault(row.digest, {}).setdefault(row.method, []).append(row)
-    result = []
+    by_digest: dict[str, dict[str, list[TrialRow]]] = {}
+    for row in rows:
+        if row.current:
+            by_digest.setdefault(row.digest, {}).setdefault(row.method, []).append(row)
+    summaries = []
     for condition, runs in zip(study.conditions, study.runs):
-        own = kept.get(condition.digest, {})
-        result.append(_ranked(condition, {name: own[name] for name in dict.fromkeys((*runs, *own)) if name in own}))
-    return result
+        by_method = by_digest.get(condition.digest, {})
+        # Methods of the study first, in its order; each once.
+        names = dict.fromkeys((*runs, *by_method))
+        summaries.append(_ranked(condition, {name: by_method[name] for name in names if name in by_method}))
+    return summaries
 
 
 def _ranked(condition: Condition, rows: Mapping[str, Sequence[TrialRow]]) -> ConditionSummary:
-    lost = float("inf")  # error of a trial without an estimate
-    first = {name: [row for row in own if not row.seed % condition.guesses] for name, own in rows.items()}
-    errors = {name: {row.seed: row.torque_error if row.found else lost for row in own} for name, own in first.items()}
-    plain = [_summary(name, own) for name, own in rows.items()]
-    plain.sort(key=lambda one: (not one.reliable, one.figures["torque_error"].median))
-    if not plain:
+    """Return the summary of a condition from the rows of each method."""
+    if not rows:
         return ConditionSummary(condition, ())
-    best = next((one for one in plain if one.enough), None)
-    judged = []
-    for rank, one in enumerate(plain, 1):
-        if best is None or one is best or not one.enough:
-            good = one is best and one.reliable and one.estimates
-            judged.append(replace(one, rank=rank, as_good=good))
+    summaries = []
+    errors: dict[str, dict[int, float]] = {}
+    for name, method_rows in rows.items():
+        summaries.append(_summary(name, method_rows))
+        errors[name] = {}
+        for row in method_rows:
+            # Of several guesses the first is compared.
+            if row.seed % condition.guesses == 0:
+                if row.found:
+                    errors[name][row.seed] = row.torque_error
+                else:
+                    errors[name][row.seed] = FAILED_ERROR
+    summaries.sort(key=lambda method: (not method.reliable, method.figures["torque_error"].median))
+    best = next((method for method in summaries if method.enough), None)
+    ranked = []
+    for rank, method in enumerate(summaries, 1):
+        if best is None or method is best or not method.enough:
+            as_good = method is best and method.reliable and method.estimates
+            ranked.append(replace(method, rank=rank, as_good=as_good))
             continue
-        p = sign_test(errors[one.method], errors[best.method])
-        near = _ratio(errors[one.method], errors[best.method]) <= 1.0 + SLACK
-        judged.append(replace(one, rank=rank, as_good=one.reliable and best.reliable and (near or p > LEVEL), p=p))
-    good = [one for one in judged if one.as_good]
-    least = min((one.figures["cpu"].median for one in good), default=0.0)
-    chosen = next((one for one in good if not one.figures["cpu"].median > ALIKE * least), None)
-    return ConditionSummary(condition, tuple(replace(one, chosen=one is chosen) for one in judged))
+        p = sign_test(errors[method.method], errors[best.method])
+        within_slack = _median_ratio(errors[method.method], errors[best.method]) <= 1.0 + SLACK
+        as_good = method.reliable and best.reliable and (within_slack or p > LEVEL)
+        ranked.append(replace(method, rank=rank, as_good=as_good, p=p))
+    cheapest = min((method.figures["cpu"].median for method in ranked if method.as_good), default=0.0)
+    chosen = None
+    for method in ranked:
+        # Also true for a time that is NaN.
+        cheap = not method.figures["cpu"].median > ALIKE * cheapest
+        if method.as_good and cheap:
+            chosen = method
+            break
+    return ConditionSummary(condition, tuple(replace(method, chosen=method is chosen) for method in ranked))
 
 
-def _ratio(one: Mapping[int, float], other: Mapping[int, float]) -> float:
+def _pairs(errors: Mapping[int, float], reference: Mapping[int, float]) -> list[tuple[float, float]]:
+    """Return the errors of two methods on the data sets of both."""
+    return [(errors[seed], reference[seed]) for seed in errors.keys() & reference.keys()]
+
+
+def _median_ratio(errors: Mapping[int, float], reference: Mapping[int, float]) -> float:
     """Return the median ratio of two methods' errors on the same data sets; infinite without common data sets."""
-    both = [(one[seed], other[seed]) for seed in one.keys() & other.keys() if np.isfinite(other[seed])]
-    return float(np.median([a / max(b, 1e-300) for a, b in both])) if both else float("inf")
+    ratios = []
+    for error, reference_error in _pairs(errors, reference):
+        if np.isfinite(reference_error):
+            ratios.append(error / max(reference_error, 1e-300))
+    if ratios:
+        return float(np.median(ratios))
+    return float("inf")
 
 
 def _summary(name: str, rows: Sequence[TrialRow]) -> MethodSummary:
     failures = Counter(row.status for row in rows if not row.found)
-    first = {row.status: row for row in sorted(rows, key=lambda row: -row.seed)}
-    examples = {status: f"data set {first[status].seed}: {first[status].message}" for status in failures}
+    examples = {}
+    for status in failures:
+        first = min((row for row in rows if row.status == status), key=lambda row: row.seed)
+        examples[status] = f"data set {first.seed}: {first.message}"
     figures = {}
     for figure in FIGURES:
-        bad = figure in ("torque_error", "torque_worst", "beta_error", "beta_distance")
         values = [float(getattr(row, figure)) for row in rows if row.found]
-        values += [float("inf")] * (len(rows) - len(values)) if bad else []
+        if figure in ERROR_FIGURES:
+            values += [FAILED_ERROR] * (len(rows) - len(values))
         figures[figure] = spread(values)
     return MethodSummary(name, len(rows), failures, examples, figures)
 
 
 def spread(values: Sequence[float]) -> Quartiles:
     """Return median and quartiles of the values without NaN; NaN if none remain."""
-    found = np.sort([value for value in values if value == value])
-    if not len(found):
+    numbers = np.sort([value for value in values if not math.isnan(value)])
+    if len(numbers) == 0:
         return Quartiles(float("nan"), float("nan"), float("nan"))
     with np.errstate(invalid="ignore"):
-        lower, upper = (float(x) for x in np.quantile(found, [0.25, 0.75], method="nearest"))
-    return Quartiles(float(np.median(found)), lower, upper)
+        lower, upper = np.quantile(numbers, [0.25, 0.75], method="nearest")
+    return Quartiles(float(np.median(numbers)), float(lower), float(upper))
 
 
-def sign_test(one: Mapping[int, float], other: Mapping[int, float]) -> float:
+def sign_test(errors: Mapping[int, float], reference: Mapping[int, float]) -> float:
     """Return the two-sided p value of the sign test between the errors of two methods.
 
     Args:
-        one, other: seed → error; seeds in both count, ties do not.
+        errors, reference: seed → error; seeds in both count, ties do not.
 
     Returns:
         1 where fewer than `MIN_DATA_SETS` data sets distinguish them.
     """
-    both = [(one[seed], other[seed]) for seed in one.keys() & other.keys()]
-    larger, smaller = sum(a > b for a, b in both), sum(a < b for a, b in both)
+    larger = smaller = 0
+    for error, reference_error in _pairs(errors, reference):
+        larger += error > reference_error
+        smaller += error < reference_error
     if larger + smaller < MIN_DATA_SETS:
         return 1.0
     return float(binomtest(larger, larger + smaller).pvalue)

@@ -4,23 +4,30 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from importlib.metadata import PackageNotFoundError, version
+from typing import Any
 
 import numpy as np
 
 from calib.errors import CalibError
+from calib.identification.closed_loop.simulation import Plant, Sensing, simulate
 from calib.identification.methods.method import EstimateStatus, MethodEstimate
-from calib.identification.methods.registry import VERSIONS, method_named
 from calib.identification.prediction import Dynamics, predict
+from calib.identification.registry import VERSIONS, method_named
 from calib.rooms.cells import known_robots
-from calib.rooms.closed_loop.simulation import Plant, Sensing, simulate
 from calib.rooms.studies.conditions import Condition
 from calib.rooms.studies.experiment import Experiment, make_experiment, set_up
 
 FOUND = EstimateStatus.FOUND.value
-NOT_RECORDED, FAILED = "not recorded", "failed"  # beside `EstimateStatus`: the true robot, or the method, raised
-STATUSES = (*(one.value for one in EstimateStatus), NOT_RECORDED, FAILED)
+# Beside `EstimateStatus`: the true robot, or the method, raised an error.
+NOT_RECORDED, FAILED = "not recorded", "failed"
+STATUSES = (*(status.value for status in EstimateStatus), NOT_RECORDED, FAILED)
 NAN = float("nan")
+# Between the versions of toolkit and method.
 _CHANGED = " method "
+# Standard deviations of a normal distribution that hold 95 %.
+NORMAL_95 = 1.959963984540054
+# Longest message of a row.
+MAX_MESSAGE = 300
 
 
 @dataclass(frozen=True)
@@ -95,7 +102,7 @@ class TrialRow:
         return self.status == FOUND
 
 
-COLUMNS = tuple(one.name for one in fields(TrialRow))
+COLUMNS = tuple(field.name for field in fields(TrialRow))
 
 
 @dataclass(frozen=True)
@@ -114,47 +121,62 @@ def run_trials(trials: Trials) -> list[TrialRow]:
 
 def run_trial(condition: Condition, method: str, seed: int) -> TrialRow:
     """Return the row of a condition, a method and a seed; always the same, except for the times."""
-    known = {key: value for key, value in asdict(condition).items() if key in COLUMNS}
-    head = {"condition": condition.name, "digest": condition.digest, "method": method, "seed": seed, **known}
-    own = method_named(method)
+    head: dict[str, Any] = {
+        "condition": condition.name,
+        "digest": condition.digest,
+        "method": method,
+        "seed": seed,
+        "version": _version(method),
+    }
+    head |= {key: value for key, value in asdict(condition).items() if key in COLUMNS}
+    estimator = method_named(method)
     try:
         data = make_experiment(condition, seed)
     except Exception as error:  # an unstable loop, a geometry that cannot be fitted: a finding, not an end
-        return TrialRow(status=NOT_RECORDED, message=_said(error), version=_version(method), **head)
+        return TrialRow(status=NOT_RECORDED, message=_message(error), **head)
     wall, cpu = time.perf_counter(), time.process_time()
+    outcome: MethodEstimate | None = None
+    failure: BaseException | None = None
     try:
-        found, failure = own.estimate(data.problem), None
+        outcome = estimator.estimate(data.problem)
     except Exception as error:
-        found, failure = None, error
-    times = {"seconds": time.perf_counter() - wall, "cpu": time.process_time() - cpu, "version": _version(method)}
-    if found is None or not found.found:
-        status = FAILED if found is None else found.status.value
-        why = failure if found is None else found.failure
-        return TrialRow(status=status, message=_said(why), **head, **times)
-    values = found.estimate.values[: data.problem.base.b]
+        failure = error
+    head["seconds"] = time.perf_counter() - wall
+    head["cpu"] = time.process_time() - cpu
+    if outcome is None:
+        return TrialRow(status=FAILED, message=_message(failure), **head)
+    if not outcome.found:
+        return TrialRow(status=outcome.status.value, message=_message(outcome.failure), **head)
+    values = outcome.estimate.values[: data.problem.base.b]
     if not np.isfinite(values).all():
-        return TrialRow(status=EstimateStatus.DIVERGED.value, message="the estimate is not finite", **head, **times)
-    merit = _merit(data, found, values) | {"survey_q": _resimulated(condition, data, values, seed)}
-    return TrialRow(status=FOUND, message="", **head, **merit, **times)
+        return TrialRow(status=EstimateStatus.DIVERGED.value, message="the estimate is not finite", **head)
+    merit = _merit(data, outcome, values)
+    merit["survey_q"] = _resimulated(condition, data, values, seed)
+    return TrialRow(status=FOUND, message="", **head, **merit)
 
 
-def _merit(data: Experiment, found: MethodEstimate, values: np.ndarray) -> dict[str, float]:
-    truth, error = data.truth, values - data.truth
-    wrong = data.matrix @ values - data.torque
-    sigma = np.asarray(found.estimate.sigma)[: len(values)]
-    stated = bool(np.isfinite(sigma).all() and (sigma > 0.0).any())
-    away = np.abs(error[sigma > 0.0] / sigma[sigma > 0.0]) if stated else np.full(1, NAN)
-    normal_95 = 1.959963984540054  # standard deviations that hold 95 %
+def _merit(data: Experiment, outcome: MethodEstimate, values: np.ndarray) -> dict[str, Any]:
+    """Return the figures of merit of an estimate with base parameters (b,), all but ``survey_q``."""
+    error = values - data.truth
+    torque_error = data.matrix @ values - data.torque
+    joint_errors = [_percent(joint, torque) for joint, torque in zip(torque_error.T, data.torque.T)]
+    sizes = np.maximum(np.abs(values) + np.abs(data.truth), 1e-300)
+    beta_sigma = coverage = NAN
+    sigma = np.asarray(outcome.estimate.sigma)[: len(values)]
+    if np.isfinite(sigma).all() and (sigma > 0.0).any():
+        in_sigmas = np.abs(error[sigma > 0.0] / sigma[sigma > 0.0])
+        beta_sigma = float(np.sqrt(np.mean(in_sigmas**2)))
+        coverage = float(100.0 * np.mean(in_sigmas < NORMAL_95))
     return {
-        "beta_error": _percent(error, truth),
-        "beta_distance": float(200.0 * np.mean(np.abs(error) / np.maximum(np.abs(values) + np.abs(truth), 1e-300))),
-        "beta_sigma": float(np.sqrt(np.mean(away**2))),
-        "coverage": float(100.0 * np.mean(away < normal_95)) if stated else NAN,
-        "torque_error": _percent(wrong, data.torque),
-        "torque_worst": float(max(_percent(own, true) for own, true in zip(wrong.T, data.torque.T))),
+        "beta_error": _percent(error, data.truth),
+        "beta_distance": float(200.0 * np.mean(np.abs(error) / sizes)),
+        "beta_sigma": beta_sigma,
+        "coverage": coverage,
+        "torque_error": _percent(torque_error, data.torque),
+        "torque_worst": float(max(joint_errors)),
         "survey_tau": _survey_tau(data, values),
-        "iterations": found.iterations,
-        "simulations": found.simulations,
+        "iterations": outcome.iterations,
+        "simulations": outcome.simulations,
     }
 
 
@@ -163,10 +185,13 @@ def _percent(error: np.ndarray, size: np.ndarray) -> float:
 
 
 def _survey_tau(data: Experiment, values: np.ndarray) -> float:
-    case, problem = data.problem.cases[0], data.problem
+    """Return the survey's torque error d_τ [%] of base parameters (b,) on the first data set."""
+    problem = data.problem
+    case = problem.cases[0]
     predicted = predict(Dynamics(problem.model, problem.base.to_standard(values)), case)
-    rest = np.linalg.norm(case.target - predicted, axis=1)
-    return float(100.0 * np.mean(rest / np.maximum(np.linalg.norm(case.target, axis=1), 1e-12)))
+    residual = np.linalg.norm(case.target - predicted, axis=1)
+    size = np.maximum(np.linalg.norm(case.target, axis=1), 1e-12)
+    return float(100.0 * np.mean(residual / size))
 
 
 def _resimulated(condition: Condition, data: Experiment, values: np.ndarray, seed: int) -> float:
@@ -182,19 +207,24 @@ def _resimulated(condition: Condition, data: Experiment, values: np.ndarray, see
         return NAN
     motion = problem.cases[0].motion
     index = np.rint((motion.t - run.t[0]) * motion.rate).astype(int)
-    away = np.linalg.norm(motion.q - run.q[index], axis=1)
-    return float(100.0 * np.mean(away / np.maximum(np.linalg.norm(motion.q, axis=1), 1e-12)))
+    position_error = np.linalg.norm(motion.q - run.q[index], axis=1)
+    size = np.maximum(np.linalg.norm(motion.q, axis=1), 1e-12)
+    return float(100.0 * np.mean(position_error / size))
 
 
-def _said(error: BaseException | None) -> str:
+def _message(error: BaseException | None) -> str:
     """Return the message of an error as one line, with its class if it is an unexpected one."""
     if error is None:
         return ""
-    words = str(error) if isinstance(error, CalibError) else f"{type(error).__name__}: {error}"
-    return " ".join(words.split())[:300]
+    if isinstance(error, CalibError):
+        message = str(error)
+    else:
+        message = f"{type(error).__name__}: {error}"
+    return " ".join(message.split())[:MAX_MESSAGE]
 
 
 def _version(method: str) -> str:
+    """Return the version of the toolkit and, where it has changed, of a method."""
     try:
         toolkit = version("armature-calib")
     except PackageNotFoundError:
@@ -204,6 +234,8 @@ def _version(method: str) -> str:
 
 def grouped(condition: Condition, methods: Sequence[str], seed: int) -> list[Trials]:
     """Return the trials of one data set as tasks: one per simulating method, one for all other methods."""
-    plain = tuple(name for name in methods if not method_named(name).needs_simulation)
-    alone = [Trials(condition, (name,), seed) for name in methods if name not in plain]
-    return [*([Trials(condition, plain, seed)] if plain else []), *alone]
+    fast = [name for name in methods if not method_named(name).needs_simulation]
+    tasks = []
+    if fast:
+        tasks.append(Trials(condition, tuple(fast), seed))
+    return tasks + [Trials(condition, (name,), seed) for name in methods if name not in fast]

@@ -25,6 +25,7 @@ from calib.procedure.excitation import coefficients
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.robot_kinds import stage_of
 from calib.records import Frozen
+from calib.result_kinds import refusal
 from calib.robot import calibrated, library
 from calib.robot.chain import Chain, Joint, joint_kinds
 from calib.robot.collision import find_mesh, urdf_meshes
@@ -242,9 +243,8 @@ def read(folder: str | Path, robot: str | None = None) -> Scene:
         tuple(_torques(path, folder, chain) for path in torques),
         tuple(notes),
     )
-    words = f"{folder} has nothing to show: no residuals.csv, trajectory.csv, motion.csv or torques_1.csv"
     shown = scene.measured or scene.sizes or scene.chosen or scene.played or scene.torques
-    require(shown, words, UsageError)
+    require(shown, refusal(folder, "view"), UsageError)
     if chain is None:
         words = "no robot is shown: the folder does not name one; give --robot"
         return replace(scene, notes=(*scene.notes, words))

@@ -10,8 +10,8 @@ import small_arm
 from calib.dynamics.torque_rows import POWER
 from calib.errors import Diverged, UsageError
 from calib.identification.methods.method import EstimateStatus
-from calib.identification.methods.registry import METHODS
-from calib.rooms.studies.methods.kalman import Belief, Filter, believe, corrected, linearly_predicted, points, predicted
+from calib.identification.registry import METHODS
+from calib.identification.survey.kalman import Belief, Filter, believe, corrected, linearly_predicted, points, predicted
 
 KINDS = [Filter(rule, root) for rule, root in product(("ekf", "ukf", "cdkf"), (False, True))]
 NAMES = [("sr" if one.root else "") + one.rule for one in KINDS]

@@ -8,7 +8,7 @@ import pytest
 
 from calib.errors import CannotSimulate, Diverged, NotConverged, Unidentifiable, UsageError
 from calib.identification.methods.method import EstimateStatus, Method, attempted
-from calib.identification.methods.registry import METHODS, method_named
+from calib.identification.registry import METHODS, method_named
 
 
 @pytest.mark.parametrize("name", ["ols", "wls", "irls", "tls"])

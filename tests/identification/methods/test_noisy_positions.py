@@ -14,15 +14,15 @@ from calib.dynamics.torque_rows import POWER
 from calib.errors import NotConverged, UsageError
 from calib.estimation.triangles import collect, combine
 from calib.identification.identify import chain_states, common_decimator, find_base
+from calib.identification.methods.estimators import samples_of
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem
-from calib.identification.methods.registry import METHODS
+from calib.identification.methods.samples import stack
+from calib.identification.registry import METHODS
 from calib.identification.rows import make_case, observe
 from calib.identification.settings import IdentificationSettings, make_model
-from calib.rooms.alternatives.estimators import samples_of
-from calib.rooms.alternatives.samples import stack
-from calib.rooms.studies.methods.bounded_errors import intervals
-from calib.rooms.studies.methods.maximum_likelihood import noise_of_states
-from calib.rooms.studies.methods.networks import adaline, hopfield
+from calib.identification.survey.bounded_errors import intervals
+from calib.identification.survey.maximum_likelihood import noise_of_states
+from calib.identification.survey.networks import adaline, hopfield
 
 
 def noisy(seed: int, noise: float) -> IdentificationProblem:

@@ -8,7 +8,7 @@ from small_arm import LOOP, problem, truth
 
 from calib.errors import UsageError
 from calib.identification.methods.method import EstimateStatus
-from calib.identification.methods.registry import METHODS
+from calib.identification.registry import METHODS
 
 
 @pytest.mark.slow

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calib.identification.methods.registry import METHODS
+from calib.identification.registry import METHODS
 from calib.rooms.studies.conditions import Condition
 from calib.rooms.studies.experiment import make_experiment
 

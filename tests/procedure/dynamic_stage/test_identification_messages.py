@@ -22,9 +22,9 @@ from calib.identification.prediction import PredictionErrors, RelativeErrors
 from calib.procedure.dynamic_stage.gains import FoundGains
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.metrics import TorqueCurves
+from calib.procedure.dynamic_stage.replay import Replay
 from calib.procedure.report import charts, dynamics_figures, dynamics_section, page
 from calib.robot.calibrated import CalibratedChain
-from calib.rooms.closed_loop.replay import Replay
 from calib.units import motion_units
 
 

@@ -210,7 +210,7 @@ def test_a_motion_is_recalled_from_a_log_and_read_by_identify(earlier, tmp_path,
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (("no/where", "log.npz"), "has no trajectory.toml"),
+        (("no/where", "log.npz"), "does not exist; give the folder of calib excite"),
         (("{earlier}", "other.npz"), "is not in the recording"),
         (("{earlier}", "none.npz"), "cannot be read"),
         (("{earlier}", "other.npz", "--skip", "-1"), "--skip -1"),

@@ -15,10 +15,10 @@ from calib import cli
 from calib.errors import CalibError, MeasurementError, SessionError
 from calib.procedure.findings import UNJUDGED
 from calib.procedure.session import commands, steps
+from calib.procedure.session.certificate import listed
 from calib.procedure.session.folder import Session, locked, open_session, read_state
 from calib.robot.formats.urdf_tree import with_comment
 from calib.robot.library import load
-from calib.rooms.certificate.session import listed
 
 
 def words(session: Session, name: str) -> str:
@@ -268,10 +268,10 @@ def test_commands_and_their_exit_codes(finished: Session, tmp_path: Path, capsys
     assert cli.run(new) == 2 and "already" in capsys.readouterr().err
     assert cli.run(["status", folder]) == 0 and "describe" in capsys.readouterr().out
     assert cli.run(["next", "--no-plots", folder]) == 0 and f"then: calib next '{folder}'" in capsys.readouterr().out
-    assert cli.run(["next", str(tmp_path)]) == 2 and "no session" in capsys.readouterr().err
+    assert cli.run(["next", str(tmp_path)]) == 2 and "calib new makes one" in capsys.readouterr().err
     assert cli.run(["status", str(finished.folder / "4-fit")]) == 2
     said = capsys.readouterr().err
-    assert "is the result of a fit, not a session" in said and "calib export" in said and "calib view" in said
+    assert "is the result of a fit; not a session" in said and "calib export" in said and "calib view" in said
     assert cli.run(["redo", folder, "nothing"]) == 2
     assert cli.run(["new", str(tmp_path / "b"), "--robot", "ur55", "--instrument", "tracker"]) == 2
     assert cli.run(["new", str(tmp_path / "b"), "--robot", "ur5", "--instrument", "ruler"]) == 2

@@ -49,7 +49,7 @@ def ends(*more: str, names: list[str] | None = None, base: str | None = None) ->
 )
 def test_the_tip_is_the_flange(more, tip, why):
     found = ends(*more)
-    assert (found.base, found.tip) == ("link_0", tip) and why in found.why
+    assert (found.base, found.tip) == ("link_0", tip) and why in found.reason
 
 
 def test_tool0_on_the_second_link_is_named_and_not_taken():

@@ -13,6 +13,7 @@ from calib.identification.model_file import MODEL
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.kinematic_stage.folder import FitFolder
 from calib.procedure.session.folder import Session, open_session
+from calib.result_kinds import refusal
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Element
 
@@ -53,7 +54,7 @@ class Place:
         return f"{self.name} holds no result yet ({command_line('next', self.name)})"
 
 
-def place_of(given: str | Path) -> Place:
+def place_of(given: str | Path, verb: str = "diff") -> Place:
     """Return what a calibration is read from; what is no folder counts as a description.
 
     Raises:
@@ -70,8 +71,8 @@ def place_of(given: str | Path) -> Place:
         return Place(name, session, fit if fitted else None, model if known else None)
     if (path / MODEL).exists():
         return Place(name, None, None, IdentificationFolder(path))
-    words = f"{name} is neither the folder of a fit (robot.toml, {METRICS}), of an identification, nor of a session"
-    require((path / METRICS).exists() and FitFolder(path).robot.exists(), f"{words} ({SESSION})", UsageError)
+    fitted = (path / METRICS).exists() and FitFolder(path).robot.exists()
+    require(fitted, refusal(path, verb), UsageError)
     return Place(name, None, FitFolder(path))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from calib.dynamics.kernels import OPTIONS, add, cross, dot, increase, inertia_times, inverse_dynamics, scaled, three
-from calib.rooms.closed_loop.loop_kernels import (
+from calib.identification.closed_loop.loop_kernels import (
     DIVERGED,
     FINE,
     MAX_STEPS,

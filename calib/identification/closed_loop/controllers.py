@@ -1,0 +1,259 @@
+"""Reference motions sampled at the controller's rate, and joint controllers (PD, PID, cascade P-PI, computed torque).
+
+    tau = clip(kp e + kd (share v_r - v_m) + ki ∫ e + ahead),    e = q_r - q_m,
+
+v_m the backward difference of measured positions at the control rate (BIRDy's choice), through a first-order low-pass
+where one is given. A cascade P-PI is the same law with other names. Computed torque puts a model around it:
+tau = M(q_m) (a_r + kp e + …) + c(q_m, v_m) + g(q_m) + ahead, so its gains are 1/s² and 1/s.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.data.signals.filtering import border, low_pass
+from calib.errors import CalibError, MeasurementError
+from calib.identification.loop import Controller, LoopSettings
+from calib.records import frozen, shaped
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """A reference motion at N equally spaced times.
+
+    Attributes:
+        t: (N,) times [s].
+        q, v, a: (N, n) [rad or m, and per s, per s²].
+    """
+
+    t: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "t", frozen(self.t))
+        for name in ("q", "v", "a"):
+            object.__setattr__(self, name, frozen(shaped(getattr(self, name), np.shape(self.q), name)))
+        if len(self.t) != len(self.q) or len(self.t) < 2:
+            raise CalibError(
+                f"{len(self.t)} times, {len(self.q)} positions: a reference needs equal numbers, at least 2"
+            )
+
+    @property
+    def period(self) -> float:
+        """The control period [s]."""
+        return float(self.t[-1] - self.t[0]) / (len(self.t) - 1)
+
+    def sampled(self, ahead: np.ndarray | None) -> np.ndarray:
+        """Return position, velocity, feedforward torque `ahead` (N, n) and acceleration as one array (4, N, n)."""
+        if ahead is None:
+            torque = np.zeros_like(self.q)
+        else:
+            torque = shaped(ahead, self.q.shape, "torque ahead")
+        return np.array([self.q, self.v, torque, self.a])
+
+    def at(self, tick: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return q, v, a (M, n) at control periods `tick` (M,), interpolated by cubic splines between integers."""
+        index = tick.astype(int)
+        if np.all(tick == index):
+            return self.q[index], self.v[index], self.a[index]
+        from scipy.interpolate import CubicSpline
+
+        q = CubicSpline(np.arange(len(self.t)), self.q)(tick)
+        v = CubicSpline(np.arange(len(self.t)), self.v)(tick)
+        a = CubicSpline(np.arange(len(self.t)), self.a)(tick)
+        return q, v, a
+
+
+def pd(kp: np.ndarray, kd: np.ndarray, limit: np.ndarray | float = np.inf, ki: np.ndarray | float = 0.0) -> Controller:
+    """Return a PD (or PID) controller."""
+    return Controller(kp, kd, np.asarray(ki), np.asarray(1.0), np.asarray(limit), np.asarray(np.inf))
+
+
+def cascade(
+    position: np.ndarray,
+    velocity: np.ndarray,
+    reset: np.ndarray | float = np.inf,
+    limit: np.ndarray | float = np.inf,
+    share: float = 1.0,
+) -> Controller:
+    """Return a cascade P-PI: v_c = share v_r + P e, tau = K [(v_c - v) + ∫ (v_c - v) / Ti], as a single law.
+
+    (v_c - v) integrates to share q_r - q + P ∫ e (start aside): with share = 1 that is kp = K (P + 1/Ti), kd = K,
+    ki = K P / Ti. Another share with an integral part is not of this form.
+
+    Args:
+        position: P (n,) [1/s].
+        velocity: K (n,) [N m s/rad].
+        reset: Ti (n,) [s]; infinite for a plain P-P cascade.
+    """
+    if share != 1.0 and np.isfinite(reset).any():
+        raise CalibError("a cascade with integral action needs the full reference velocity: set share = 1")
+    position = np.asarray(position, dtype=float)
+    velocity = np.asarray(velocity, dtype=float)
+    ki = velocity * position / np.asarray(reset, dtype=float)
+    kp = velocity * (position + 1.0 / np.asarray(reset, dtype=float))
+    return Controller(kp, velocity, ki, np.asarray(share), np.asarray(limit), np.asarray(np.inf))
+
+
+def computed_torque(
+    model: np.ndarray, frequency: float, damping: float, n: int, limit: np.ndarray | float = np.inf
+) -> Controller:
+    """Return a computed-torque controller with error dynamics ë + 2 ζ ω ė + ω² e = 0 for an exact model.
+
+    Args:
+        model: (10 B,) standard parameters; the drives' inertias and friction are those of the plant.
+        frequency: ω [rad/s].
+    """
+    kp = np.full(n, frequency**2)
+    kd = np.full(n, 2 * damping * frequency)
+    return Controller(kp, kd, np.zeros(n), np.ones(n), np.asarray(limit), np.asarray(np.inf), model=frozen(model))
+
+
+def completed(controller: Controller, loop: LoopSettings, n: int) -> Controller:
+    """Return the controller with the saturation, delay and velocity filter given in the settings."""
+    return Controller(
+        controller.kp,
+        controller.kd,
+        controller.ki,
+        np.full(n, loop.share),
+        loop.per_joint("limit", n),
+        loop.per_joint("windup", n),
+        delay=loop.delay,
+        cutoff=loop.velocity_cutoff,
+    )
+
+
+def stated_controller(loop: LoopSettings, n: int) -> Controller:
+    """Return the controller of n joints that the table [loop] describes.
+
+    Raises:
+        UsageError: where the length of a list is not the number of joints.
+    """
+    if loop.controller == "cascade":
+        first = loop.per_joint("position", n)
+        second = loop.per_joint("velocity", n)
+        third = loop.per_joint("reset", n)
+        return completed(cascade(first, second, third, share=loop.share), loop, n)
+    return completed(pd(loop.per_joint("kp", n), loop.per_joint("kd", n), ki=loop.per_joint("ki", n)), loop, n)
+
+
+# [Hz] the usual bandwidth of an industrial position loop
+BAND = 20.0
+# of a PD; more for a controller with memory, at the price of noise
+ORDERS = (0, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class IdentifiedController:
+    """A controller identified from a log.
+
+    Attributes:
+        controller: PD or PID with the identified gains.
+        explained: (n,) share of the low-passed torque by the PID's feedback, 100 (1 - ‖tau - τ̂‖ / ‖tau - mean‖) [%].
+    """
+
+    controller: Controller
+    explained: np.ndarray
+
+
+def identify_controller(
+    reference: Reference,
+    measured: np.ndarray,
+    tau: np.ndarray,
+    rate: float,
+    band: float = BAND,
+    orders: tuple[int, int] = ORDERS,
+    integral: bool = False,
+) -> IdentifiedController:
+    """Return a PD or PID identified from logged positions and torques and their reference.
+
+    Args:
+        reference: at any multiple of the log's rate; its first instant is the log's.
+        measured, tau: (N, n) positions and torques as logged.
+        rate: of the log [Hz].
+        band: of the low-pass, and the highest frequency at which the gains are read [Hz].
+        orders: na, nb.
+        integral: whether to look for ki.
+
+    Raises:
+        MeasurementError: where reference and log do not fit together, or the error is zero.
+    """
+    error = _error(reference, measured, rate)
+    tau = shaped(tau, np.shape(measured), "torques")
+    error = low_pass(error, rate, band)
+    tau = low_pass(tau, rate, band)
+    edge = border(rate, band)
+    basis = np.linalg.qr(_instruments(reference, len(error), rate, band)[edge:-edge])[0]
+    fits = [_joint(error[edge:-edge, j], tau[edge:-edge, j], basis, orders) for j in range(error.shape[1])]
+    gains = np.array([_read(past, errors, rate, band, integral) for past, errors in fits])
+    controller = pd(gains[:, 0], gains[:, 1], ki=gains[:, 2])
+    explained = [_explained(error[:, j], tau[:, j], gains[j], rate, band) for j in range(len(gains))]
+    return IdentifiedController(controller, frozen(explained))
+
+
+def _error(reference: Reference, measured: np.ndarray, rate: float) -> np.ndarray:
+    tick = _ticks(reference, rate, len(measured))
+    if rate * reference.period > 1.0 + 1e-3 or tick[-1] > len(reference.t) - 1:
+        raise MeasurementError(
+            f"a log of {len(measured)} samples at {rate:g} Hz does not match a reference of {len(reference.t)} samples "
+            f"at {1 / reference.period:g} Hz"
+        )
+    return reference.at(tick)[0] - shaped(measured, (None, reference.q.shape[1]), "measured positions")
+
+
+def _ticks(reference: Reference, rate: float, count: int) -> np.ndarray:
+    """Return the times (count,) of a log's samples in control periods, rounded if they are whole within 0.1 %."""
+    every = 1.0 / (rate * reference.period)
+    return np.arange(count) * (round(every) if abs(every / max(round(every), 1) - 1.0) < 1e-3 else every)
+
+
+def _instruments(reference: Reference, count: int, rate: float, band: float) -> np.ndarray:
+    """Return the instruments (count, k), functions of the reference: friction, inertia and gravity, low-passed."""
+    q, v, a = reference.at(_ticks(reference, rate, count))
+    jerk = np.gradient(a, 1.0 / rate, axis=0)
+    slow = np.tanh(v / (0.01 * np.abs(v).max(axis=0, initial=1e-9)))
+    parts = [v, a, jerk, slow, np.gradient(slow, 1.0 / rate, axis=0), np.sin(q), np.cos(q)]
+    series = low_pass(np.hstack(parts), rate, band)
+    return np.column_stack([series / np.maximum(np.linalg.norm(series, axis=0), 1e-12), np.ones(count)])
+
+
+def _joint(
+    error: np.ndarray, tau: np.ndarray, basis: np.ndarray, orders: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ARX coefficients a, b of one joint by two-stage least squares with an orthonormal instrument basis."""
+    if not np.ptp(error) > 0.0:
+        raise MeasurementError("the position error is zero throughout: log measured positions, not the reference")
+    na, nb = orders
+    first = max(orders)
+    count = len(error)
+    rows = basis[first:]
+    columns = [tau[first - i : count - i] for i in range(1, na + 1)]
+    columns += [error[first - i : count - i] for i in range(nb + 1)]
+    matrix = np.column_stack([rows @ (rows.T @ np.column_stack(columns)), np.ones(count - first)])
+    size = np.linalg.norm(matrix, axis=0)
+    values = np.linalg.lstsq(matrix / size, rows @ (rows.T @ tau[first:]), rcond=None)[0] / size
+    return values[:na], values[na:-1]
+
+
+def _read(past: np.ndarray, errors: np.ndarray, rate: float, band: float, integral: bool) -> np.ndarray:
+    """Return the kp, kd, ki (3,) that fit the ARX model's frequency response best, from 1/40 to 1/2 of the band."""
+    omega = 2.0 * np.pi * np.geomspace(band / 40.0, band / 2.0, 60)
+    shift = np.exp(-1j * omega / rate)
+    response = np.polyval(errors[::-1], shift) / (1.0 - shift * np.polyval(past[::-1], shift))
+    columns = np.column_stack([np.ones_like(omega), 1j * omega] + ([1.0 / (1j * omega)] if integral else []))
+    matrix = columns / np.abs(response)[:, None]
+    target = response / np.abs(response)
+    stacked = np.vstack([matrix.real, matrix.imag])
+    gains = np.linalg.lstsq(stacked, np.concatenate([target.real, target.imag]), rcond=None)[0]
+    return np.append(gains, np.zeros(3 - len(gains)))
+
+
+def _explained(error: np.ndarray, tau: np.ndarray, gains: np.ndarray, rate: float, band: float) -> float:
+    """Return the share of the low-passed torque explained by the gains (n,) [%]."""
+    feedback = gains[0] * error + gains[1] * np.gradient(error, 1.0 / rate) + gains[2] * np.cumsum(error) / rate
+    edge = border(rate, band)
+    residual = (tau - feedback)[edge:-edge] - (tau - feedback)[edge:-edge].mean()
+    torque = tau[edge:-edge] - tau[edge:-edge].mean()
+    return float(100.0 * (1.0 - np.linalg.norm(residual) / np.linalg.norm(torque)))

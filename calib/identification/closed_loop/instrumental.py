@@ -1,0 +1,639 @@
+"""IDIM-IV: instruments from a closed-loop simulation with the last estimate, repeated until both converge.
+
+    simulate with x_k → Z = W(q_s, v_s, a_s), filtered and thinned like W → x_{k+1} = (Zᵀ Ω⁻¹ W)⁻¹ Zᵀ Ω⁻¹ y
+
+(Janot, Vandanjon & Gautier 2014). Same reference, same controller: the simulation feels what the robot was asked to do,
+and not its noise, so Z is uncorrelated with the noise that the feedback brings into W. It starts from a regular robot:
+inertia diag(J), no gravity, no friction. DIDIM (Gautier, Janot & Vandanjon 2013) estimates from the simulated W alone,
+x_{k+1} = W_s⁺ y. A Coulomb sign whose measured speed is noisier than the width of its smoothing is no true column plus
+noise: no instrument helps there, and the simulated sign, which rests on the reference, takes its place in W; or that of
+the measured speed in half the band where the simulation does not follow the motion, as with a wrong controller (our
+choice). Constraints on base parameters, min ½ ‖P_Z (y - W x)‖² in every round, make it PC-IDIM-IV
+(`calib.identification.methods.parameter_constraints`); they do not cure a bias.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from calib.data.signals.filtering import Decimator, low_pass, slope
+from calib.data.signals.motion import Motion
+from calib.dynamics.base import Base
+from calib.dynamics.drives import DriveTerm, standard
+from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.torque_rows import POWER
+from calib.errors import CalibError, CannotSimulate, Diverged, NotConverged, UsageError, one_of
+from calib.estimation.linear import LinearFit, settled_std, wls
+from calib.estimation.triangles import Triangles, combine
+from calib.estimation.whiteness import inflation
+from calib.identification.closed_loop import instrumental_variables
+from calib.identification.closed_loop.instrumental_variables import Instruments, InstrumentStrength
+from calib.identification.closed_loop.loop_recordings import Loop, low_passed, simulated_case, simulated_samples
+from calib.identification.closed_loop.simulation import Plant, Sensing, SimulatedRun, plant_of
+from calib.identification.loop import ExogeneityTest
+from calib.identification.methods.constraint_settings import ConstraintSettings, Held
+from calib.identification.methods.parameter_constraints import Constraints, hold, make_constraints
+from calib.identification.rows import Case, ObservationRows, observe, observe_terms, pool, triangulate
+from calib.records import frozen
+
+# iterations; 3 to 6 are usual
+MAX_ROUNDS = 10
+# halvings of a step to parameters that cannot be simulated (our choice)
+MAX_RETREATS = 6
+# times the speed's noise, by which the simulated motion may be off the measured one (our choice)
+MAX_FOLLOWING = 1.25
+# of distances from the reference, recorded and simulated: beyond, gains are others (our choice)
+MAX_GAIN_RATIO = 1.25
+
+
+@dataclass(frozen=True)
+class _RoundEstimator:
+    """Estimator of one iteration, from the R factors of [Z W y].
+
+    Attributes:
+        name: name in options and files.
+        fit: function of triangles, standard deviations of the groups (g,), and inflation to the estimate.
+        triangle: function of triangles and (g,) std to the minimised [R z; 0 ρ], to which constraints apply.
+        measured: whether the estimate uses the measured motion, W.
+    """
+
+    name: str
+    fit: Callable[[Instruments, np.ndarray, float], LinearFit]
+    triangle: Callable[[Instruments, np.ndarray], np.ndarray]
+    measured: bool
+
+
+Runs = list[tuple[tuple[Case, Loop], SimulatedRun]]
+
+
+@dataclass(frozen=True)
+class Round:
+    """Convergence of one iteration.
+
+    Attributes:
+        change: largest |Δx_j| / max(|x_j|, 8 σ_j), 8 = 0.2 / 2.5 %, see
+            `calib.identification.closed_loop.instrumental_variables.settled`.
+        residual: standard deviation of the weighted residuals.
+        retreats: number of step halvings until the parameters could be simulated.
+    """
+
+    change: float
+    residual: float
+    retreats: int
+
+
+@dataclass(frozen=True, eq=False)
+class Instrumental:
+    """Result of IDIM-IV.
+
+    Attributes:
+        fit: the estimate.
+        ordinary: weighted least squares of the same rows, to compare.
+        plant: the simulated robot with the estimate.
+        rounds: history of the iterations.
+        strength: strength of the instruments, their correlation with W.
+        verdict: whether least squares is biased (Durbin, Wu, Hausman).
+        std, inflation: standard deviation of each torque row (rows,), variance inflation of all rows together.
+        distance: (n,) 100 ‖q - q_s‖ / ‖q - mean q‖ [%] of filtered measured and simulated positions: large where the
+            controller is not the robot's.
+        stray: (n,) tracking error of the recorded robot over that of the simulated one: the error factor of the
+            stated gains. NaN where noise hides it.
+        constrained: the constrained estimate, if constraints are set; `fit` has its values and covariance.
+        problem: triangles of [Z W y], one group per torque row.
+        estimator: estimator used in each iteration.
+        rows: by recording, the case whose motion W is of, its rows, and Z.
+    """
+
+    fit: LinearFit
+    ordinary: LinearFit
+    plant: Plant
+    rounds: tuple[Round, ...]
+    strength: InstrumentStrength
+    verdict: ExogeneityTest
+    std: np.ndarray
+    inflation: float
+    distance: np.ndarray
+    stray: np.ndarray
+    constrained: Held | None
+    problem: Instruments
+    estimator: _RoundEstimator
+    rows: tuple[tuple[Case, ObservationRows, np.ndarray], ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the estimated parameters, as in `Base.names`."""
+        return self.fit.estimate.names
+
+    @property
+    def direct(self) -> np.ndarray:
+        """Relative error of the simulated motion's torque (n,): 100 ‖y - Z x‖ / ‖y‖ [%]."""
+        return self.simulated_error(self.fit.estimate.values)
+
+    def simulated_error(self, values: np.ndarray) -> np.ndarray:
+        """Return the relative torque errors (n,) on the simulated motion, of values (p,): 100 ‖y - Z x‖ / ‖y‖ [%]."""
+        return self.problem.data.relative_errors(np.concatenate([values, np.zeros(len(self.names))]))
+
+    @property
+    def own(self) -> np.ndarray:
+        """Relative error of the measured motion's torque (n,): 100 ‖y - W x‖ / ‖y‖ [%]."""
+        return self.problem.data.relative_errors(np.concatenate([np.zeros(len(self.names)), self.fit.estimate.values]))
+
+    @property
+    def off(self) -> np.ndarray:
+        """Joints (from 0) whose given gains are wrong: recorded and simulated tracking errors differ."""
+        estimate = self.fit.estimate
+        simulated = self.problem.data.factors[:, :, : len(self.names)]
+        sizes = np.maximum(np.sum((simulated @ estimate.values) ** 2, axis=1), 1e-300)
+        # the torques' share that is unsure makes e_s = q_ref - q_s unsure, too
+        unsure = np.sqrt(np.einsum("gij,jk,gik->g", simulated, estimate.covariance, simulated) / sizes)
+        # rows of the motors
+        if len(unsure) >= len(self.stray):
+            unsure = unsure[-len(self.stray) :]
+        else:
+            unsure = unsure.max()
+        away = np.abs(np.log(np.maximum(np.nan_to_num(self.stray, nan=1.0), 1e-3)))
+        return np.flatnonzero(away > np.log(MAX_GAIN_RATIO) + 5.0 * unsure)
+
+    @property
+    def unexplained(self) -> np.ndarray:
+        """Torque rows (from 0) that the simulated motion fits much worse than the measured motion does."""
+        # of the torque simulated, times the model's own error: beyond, the loop is another (our choice)
+        max_loop_error = 2.0
+        return np.flatnonzero(self.direct >= max_loop_error * self.own)
+
+    @property
+    def explains(self) -> bool:
+        """Whether torques of the simulated motion fit the recording as well as those of the measured motion."""
+        return not len(self.off) and not len(self.unexplained)
+
+    @property
+    def shift(self) -> np.ndarray:
+        """Difference of least squares from this estimate (p,), in standard deviations.
+
+        The test finds any bias that the data can detect; this says whether it matters.
+        """
+        estimate = self.fit.estimate
+        return np.abs(self.ordinary.estimate.values - estimate.values) / np.where(estimate.sigma > 0, estimate.sigma, 1)
+
+    @property
+    def apart(self) -> np.ndarray:
+        """Distance of the constrained IV estimate from that by free instruments alone (p,), in σ of the free estimate.
+
+        Zero where nothing binds, and for didim; see `instrumental_variables.by_free_instruments`.
+        """
+        constrained = self.constrained
+        values = self.fit.estimate.values
+        if constrained is None or not len(constrained.normals) or not self.estimator.measured:
+            return np.zeros(len(values))
+        free_estimate = instrumental_variables.by_free_instruments(self.problem, self.std, values, constrained.normals)
+        return np.abs(free_estimate - values) / np.maximum(constrained.free.estimate.sigma, 1e-300)
+
+    @property
+    def valid(self) -> bool:
+        """Whether the instruments are valid: full rank, not weak, and the simulated robot follows the recorded one."""
+        return not self.strength.weak and bool(np.all(self.distance < 10.0))
+
+
+def identify_instrumental(
+    model: IdentificationModel,
+    base: Base,
+    cases: Sequence[tuple[Case, Loop]],
+    decimator: Decimator,
+    *,
+    method: str = "iv",
+    inertia: np.ndarray | None = None,
+    positive: Sequence[str] = (),
+    constraints: Constraints | None = None,
+    terms: Sequence[DriveTerm] = (),
+    limit: int = MAX_ROUNDS,
+) -> Instrumental:
+    """Return the estimate of the base parameters with instruments from simulation.
+
+    Args:
+        model: of motor torques, joint torque sensors, or both. With sensors alone no torque tells the motor side: the
+            simulated robot keeps the inertia that it starts with there, and has no friction.
+        base: its base columns.
+        cases: recordings, each with the loop it came from.
+        decimator: the parallel filter of W, Z and y.
+        method: ``iv`` or ``didim``.
+        inertia: (n,) of the regular robot it starts from [kg m²]; None: kd² / (2 kp), for which the first controller
+            would be damped by 0.7.
+        positive: names of base parameters that must not be negative (PC-IDIM-IV).
+        constraints: on the base parameters that are estimated; None: those of `positive`.
+        terms: richer friction, estimated after the base parameters; loads that it feels are those by least squares.
+        limit: most iterations.
+
+    Raises:
+        Unidentifiable: where the instruments do not identify the parameters separately.
+        NotConverged: with the last `LinearFit`, after `limit` iterations; `Diverged` where they led away.
+        CannotSimulate: where the loop is unstable with the robot it starts from, or with an estimate and all near it.
+    """
+    one_of(method, ROUNDS, "method", UsageError)
+    rows = model.torque_rows
+    if not rows.has_bodies or rows == POWER or not cases:
+        raise UsageError(
+            "instruments from simulation need a recording with its reference, and rows motor, link or both (of a "
+            f"parallel robot motor or platform); found '{rows.name}'"
+        )
+    observed = [replace(observe(model, base.kept, case, decimator), names=base.names) for case, _ in cases]
+    data = pool(triangulate(observed), model.rows)
+    friction = _Friction((), model, decimator, None)
+    if terms:
+        loads = base.to_standard(wls(data, settled_std(data, 1e-3)).estimate.values)
+        friction = _Friction(tuple(terms), model, decimator, loads)
+        observed = [friction.added(part, case) for part, (case, _) in zip(observed, cases)]
+        data = pool(triangulate(observed), model.rows)
+    if constraints is None and positive:
+        settings = ConstraintSettings(signs=False, inertia=0, bounds=dict.fromkeys(positive, (0.0, np.inf)))
+        constraints = make_constraints(settings, model, base, base.names, [None] * base.b)
+    task = _Fixed(model, base, cases, decimator, observed, ROUNDS[method], constraints, friction)
+    ordinary = wls(data, settled_std(data, 1e-3))
+    plant = _regular(model, friction.terms, cases[0][1], inertia)
+    std = ordinary.group_std
+    before: LinearFit | None = None
+    rounds: list[Round] = []
+    try:
+        runs = _runs(plant, cases)
+        retreats = 0
+        tau = 1.0
+    except NotConverged as error:
+        raise CannotSimulate(str(error), error.last) from error
+    # of the last step, and how often it was halved afterwards
+    start, returns = plant, 0
+    for _ in range(limit):
+        estimate = _estimate_round(task, runs, std, tau)
+        task = task.after(estimate)
+        rounds.append(Round(_change(before, estimate.fit), estimate.fit.estimate.residual_std, retreats))
+        if before is not None and retreats == 0 and instrumental_variables.settled(before, estimate.fit):
+            return _result(task, estimate, ordinary, task.plant(plant, estimate), rounds, std, runs)
+        try:
+            task, estimate, end, runs, retreats = _simulate_new(task, estimate, plant, std, tau)
+            start, plant, returns = plant, end, 0
+        except CannotSimulate:
+            # the last step led to a loop that is hardly stable, whose motion tells nothing: take a smaller one
+            returns += 1
+            if returns > MAX_RETREATS or plant is start:
+                raise
+            plant, runs = _nearer(start, plant, cases)
+            retreats = returns
+        before = estimate.fit
+        std = estimate.fit.group_std
+        tau = estimate.tau
+    kind = NotConverged
+    if len(rounds) > 2 and rounds[-1].change > rounds[1].change:
+        kind = Diverged
+    raise kind(
+        f"instruments from simulation: parameters still change by {100 * rounds[-1].change:.3g} % after {limit} "
+        f"iterations; estimate fewer (essential ones), or check the controller's gains{_if_weak(task, estimate, std)}",
+        before,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Friction:
+    """Richer friction of a model: its terms, and the standard parameters (p,) from which joint loads are computed."""
+
+    terms: tuple[DriveTerm, ...]
+    model: IdentificationModel
+    decimator: Decimator
+    loads: np.ndarray | None
+
+    def added(self, rows: ObservationRows, case: Case) -> ObservationRows:
+        """Return the rows of a case with a column for each term."""
+        if self.loads is None:
+            return rows
+        motion = case.motion
+        load = self.model.transmitted(self.loads, motion.q, motion.v, motion.a, case.carried)
+        return rows.extend(self.terms, observe_terms(self.terms, case, self.decimator, load, self.model.torque_rows))
+
+
+@dataclass(frozen=True, eq=False)
+class _Fixed:
+    """Data and settings that are the same in all iterations."""
+
+    model: IdentificationModel
+    base: Base
+    cases: Sequence[tuple[Case, Loop]]
+    decimator: Decimator
+    observed: Sequence[ObservationRows]
+    estimator: _RoundEstimator
+    constraints: Constraints | None
+    friction: _Friction
+
+    def after(self, estimate: _Found) -> _Fixed:
+        """Return the settings of the next iteration, which starts from the postures whose constraints are binding."""
+        if self.constraints is None or estimate.bound is None:
+            return self
+        return replace(self, constraints=replace(self.constraints, likely=estimate.bound.tight))
+
+    def plant(self, old: Plant, estimate: _Found) -> Plant:
+        """Return the simulated robot with an estimate; without motor torques, its motor inertias J are unchanged."""
+        estimated = estimate.fit.estimate.values
+        b = self.base.b
+        values = np.concatenate([self.base.to_standard(estimated[:b]), estimated[b:]])
+        regular = old.parameters[len(values) :] * (not self.model.torque_rows.driven)
+        return old.with_parameters(np.concatenate([values, regular]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """Data of one iteration: rows, instruments, R factors, estimate, and variance inflation of the residuals."""
+
+    observed: Sequence[ObservationRows]
+    simulated: Sequence[np.ndarray]
+    problem: Instruments
+    fit: LinearFit
+    tau: float
+    bound: Held | None
+
+
+def _estimate_round(task: _Fixed, runs: Runs, std: np.ndarray, tau: float) -> _Found:
+    """Return the estimate with instruments from simulated runs; `tau` is the variance inflation of the last round."""
+    columns = task.base.kept
+    simulated_cases = [simulated_case(case, run, loop) for (case, loop), run in runs]
+    simulated = [
+        task.friction.added(observe(task.model, columns, case, task.decimator), case).matrix for case in simulated_cases
+    ]
+    observed = [
+        _with_signs(task, columns, *arguments)
+        for arguments in zip(task.observed, simulated, (c for c, _ in task.cases), simulated_cases)
+    ]
+    problem = _stack(observed, simulated, task.estimator.measured)
+    fit, bound = _held_fit(task, problem, std, tau)
+    return _Found(observed, simulated, problem, fit, _inflation(observed, fit), bound)
+
+
+def _with_signs(
+    task: _Fixed, columns: np.ndarray, rows: ObservationRows, simulated: np.ndarray, case: Case, simulated_case: Case
+) -> ObservationRows:
+    """Return the rows with columns of Coulomb signs replaced where velocity noise exceeds their smoothing.
+
+    Args:
+        simulated: (M, rows, p) of `moved`, the case as it was simulated.
+    """
+    signs = _drowned_signs(task.model, columns, case)
+    drowned = np.append(signs, np.zeros(len(task.friction.terms), dtype=bool))
+    if not drowned.any():
+        return rows
+    motion = case.motion
+    band = 0.5 * case.motion.band
+    measured = slope(low_pass(case.motion.q, motion.rate, band), motion.rate)
+    expected = slope(low_pass(simulated_case.motion.q, motion.rate, band), motion.rate)
+    away = np.sqrt(np.nanmean((measured - expected) ** 2, axis=0))
+    followed = away <= MAX_FOLLOWING * motion.velocity_noise(band)
+    if not followed.all():
+        speed = np.where(followed | np.isnan(measured), simulated_case.motion.v, measured)
+        sign_rows = observe(task.model, columns[signs], replace(case, motion=replace(motion, v=speed)), task.decimator)
+        simulated = simulated.copy()
+        simulated[:, :, drowned] = sign_rows.matrix
+    return replace(rows, matrix=np.where(drowned, simulated, rows.matrix))
+
+
+def sign_noise(model: Any, motion: Motion) -> np.ndarray:
+    """Return the velocity noise of all joints that drive terms of a model act on, passive ones included."""
+    noise = motion.velocity_noise()
+    if hasattr(model, "joint_noise"):
+        return model.joint_noise(noise)
+    return noise
+
+
+def _drowned_signs(model: IdentificationModel, columns: np.ndarray, case: Case) -> np.ndarray:
+    """Return the mask (p,) of Coulomb columns of joints whose velocity noise exceeds the sign's smoothing."""
+    noise = sign_noise(model, case.motion)
+    drowned = np.zeros(len(columns), dtype=bool)
+    for position, k in enumerate(columns - model.inertial):
+        if k < 0 or model.columns[k].shape != "sign":
+            continue
+        term = model.columns[k]
+        speeds = [float(np.hypot.reduce([weight * noise[j] for j, weight in motion])) for _, motion in term.acts]
+        drowned[position] = max(speeds) > term.settings[0]
+    return drowned
+
+
+def _result(
+    task: _Fixed,
+    estimate: _Found,
+    ordinary: LinearFit,
+    plant: Plant,
+    rounds: Sequence[Round],
+    std: np.ndarray,
+    runs: Runs,
+) -> Instrumental:
+    """Return the result of the last iteration: σ with the variance inflation of its residuals, and the tests."""
+    if task.estimator.measured:
+        problem = estimate.problem
+    else:
+        problem = _stack(estimate.observed, estimate.simulated)
+    fit, bound = _held_fit(task, problem, std, estimate.tau)
+    verdict = instrumental_variables.exogeneity(problem, std, estimate.tau)
+    strength = instrumental_variables.strength(problem, std)
+    rows = zip((case for (case, _), _ in runs), estimate.observed, estimate.simulated)
+    if not task.estimator.measured:
+        simulated_cases = (simulated_case(case, run, loop) for (case, loop), run in runs)
+        rows = (
+            (case, replace(rows_, matrix=z), z)
+            for case, rows_, z in zip(simulated_cases, estimate.observed, estimate.simulated)
+        )
+    return Instrumental(
+        fit,
+        ordinary,
+        plant,
+        tuple(rounds),
+        strength,
+        verdict,
+        frozen(std),
+        estimate.tau,
+        _distance(runs),
+        _stray(runs),
+        bound,
+        problem,
+        task.estimator,
+        tuple(rows),
+    )
+
+
+def _regular(model: IdentificationModel, terms: Sequence[DriveTerm], loop: Loop, inertia: np.ndarray | None) -> Plant:
+    """Return the robot of the first simulation: joint inertias J (its last n parameters), no bodies, no gravity."""
+    if inertia is None:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inertia = loop.controller.kd**2 / (2.0 * loop.controller.kp)
+        if not np.all(np.isfinite(inertia)) or not np.all(inertia > 0.0):
+            raise UsageError("kd² / (2 kp) of these gains is no inertia above 0; give the inertia (n,) [kg m²]")
+    extra = tuple(replace(motor, name=f"regular {motor.name}") for motor in standard(["Ia"] * model.n))
+    values = np.concatenate([np.zeros(model.p + len(terms)), inertia])
+    return plant_of(model, values, (*terms, *extra))
+
+
+def _runs(plant: Plant, cases: Sequence[tuple[Case, Loop]]) -> Runs:
+    """Return the noise-free simulation of every recording's loop."""
+    result: Runs = []
+    for case, loop in cases:
+        robot = plant.carrying(case.carried)
+        controller = loop.controller
+        if loop.design is not None:
+            controller = controller.scaled(robot.inertia_diagonal(loop.reference.q[::200]) / loop.design)
+        result.append(((case, loop), robot.run(controller, loop.reference, Sensing(every=loop.every))))
+    return result
+
+
+def _simulate_new(
+    task: _Fixed, estimate: _Found, old: Plant, std: np.ndarray, tau: float
+) -> tuple[_Fixed, _Found, Plant, Runs, int]:
+    """Return the simulations with the new parameters or, if these fail, with smaller steps from the old ones.
+
+    Then those on the way to them (our choice). A controller holds no robot of next to no inertia.
+    """
+    retreats = 0
+    while retreats < MAX_RETREATS:
+        candidate = _between(old, task.plant(old, estimate), 0.5**retreats)
+        try:
+            return task, estimate, candidate, _runs(candidate, task.cases), retreats
+        except CalibError as error:
+            problem = error
+        if task.constraints and estimate.bound and estimate.bound.postures:
+            bound = task.constraints.raised()
+        else:
+            bound = None
+        if bound is not None:
+            further = replace(task, constraints=bound)
+            with suppress(NotConverged):
+                fit, binding = _held_fit(further, estimate.problem, std, tau)
+                task = further
+                estimate = replace(estimate, fit=fit, bound=binding)
+                continue
+        retreats += 1
+    message = f"neither the estimate nor smaller steps can be simulated: {problem}{_if_weak(task, estimate, std)}"
+    raise CannotSimulate(message, task.plant(old, estimate))
+
+
+def _between(start: Plant, end: Plant, share: float) -> Plant:
+    """Return the plant whose parameters are a share of the way from one plant to another."""
+    return end.with_parameters(share * end.parameters + (1.0 - share) * start.parameters)
+
+
+def _nearer(start: Plant, end: Plant, cases: Sequence[tuple[Case, Loop]]) -> tuple[Plant, Runs]:
+    """Return the plant halfway from `start` to `end`, or nearer where that cannot be simulated, and its runs.
+
+    Raises:
+        CannotSimulate: where none near `start` can.
+    """
+    problem: CalibError | None = None
+    for halvings in range(1, MAX_RETREATS + 1):
+        candidate = _between(start, end, 0.5**halvings)
+        try:
+            return candidate, _runs(candidate, cases)
+        except CalibError as error:
+            problem = error
+    raise CannotSimulate(f"no robot on the way to the estimate can be simulated: {problem}", start)
+
+
+def _if_weak(task: _Fixed, estimate: _Found, std: np.ndarray) -> str:
+    """Return what weak instruments add to the message of a failure; "" for strong ones."""
+    if not task.estimator.measured:
+        return ""
+    strength = instrumental_variables.strength(estimate.problem, std)
+    note = f". The instruments are weak (Cragg-Donald {strength.cragg_donald:.2g}, sound above 10)"
+    if strength.weak:
+        return f"{note}: record faster motion, or positions with less noise"
+    return ""
+
+
+def _stack(observed: Sequence[ObservationRows], simulated: Sequence[np.ndarray], measured: bool = True) -> Instruments:
+    """Return the R factors of [Z W y], one group per torque row; without `measured`, those of [Z 0 y] (cheaper)."""
+    first = observed[0]
+    count = observed[0].target.shape[1]
+    problem = instrumental_variables.unseen(first.names, first.units, count)
+    for rows, z in zip(observed, simulated, strict=True):
+        for row in range(count):
+            # no copy of all
+            if rows.present[:, row].all():
+                in_use = slice(None)
+            else:
+                in_use = rows.present[:, row]
+            instruments = z[in_use, row]
+            if measured:
+                w = rows.matrix[in_use, row]
+            else:
+                w = np.zeros_like(instruments)
+            problem = instrumental_variables.instrument(instruments, w, rows.target[in_use, row], row, before=problem)
+    return problem
+
+
+def _simulated(problem: Instruments) -> Triangles:
+    """Return the R factors of [Z y], selected from those of [Z W y]."""
+    return replace(problem.data.select(np.arange(len(problem.names))), names=problem.names)
+
+
+def _inflation(observed: Sequence[ObservationRows], fit: LinearFit) -> float:
+    """Return the variance inflation of the rows: mean over torque rows of the residuals' integrated autocorrelation."""
+    series = [rows.target - rows.matrix @ fit.estimate.values for rows in observed]
+    longest = max(series, key=len)
+    return max(1.0, float(np.mean([inflation(longest[:, row]) for row in range(longest.shape[1])])))
+
+
+def _held_fit(task: _Fixed, problem: Instruments, std: np.ndarray, tau: float) -> tuple[LinearFit, Held | None]:
+    """Return the estimate of an iteration, with the constraints if any are set."""
+    fit = task.estimator.fit(problem, std, tau)
+    estimator = task.estimator
+    if task.constraints is None:
+        return fit, None
+    if estimator.measured:
+        data = problem.least_squares()
+    else:
+        data = _simulated(problem)
+    return hold(fit, estimator.triangle(problem, std), data, std, task.constraints, stated_noise=not estimator.measured)
+
+
+def _change(before: LinearFit | None, after: LinearFit) -> float:
+    if before is None:
+        return float("inf")
+    size = np.maximum(np.abs(before.estimate.values), 8.0 * after.estimate.sigma)
+    return float(np.max(np.abs(after.estimate.values - before.estimate.values) / np.maximum(size, 1e-300)))
+
+
+def _distance(runs: Runs) -> np.ndarray:
+    """Return the position difference of simulated and recorded robot (n,), relative to the travel [%]."""
+    away, size = np.zeros((2, runs[0][0][0].motion.n))
+    for (case, loop), run in runs:
+        motion = case.motion
+        away += np.sum((motion.q - low_passed(run.q, motion)[simulated_samples(case, run.t, loop)]) ** 2, axis=0)
+        size += np.sum((motion.q - motion.q.mean(axis=0)) ** 2, axis=0)
+    return frozen(100.0 * np.sqrt(away / size))
+
+
+def _stray(runs: Runs) -> np.ndarray:
+    """Return the ratios (n,) of recorded to simulated tracking errors, by regression; NaN where noise hides them."""
+    pairs = []
+    for (case, loop), run in runs:
+        motion = case.motion
+        samples = simulated_samples(case, run.t, loop)
+        reference = loop.reference.at(np.arange(len(run.t)) * loop.every)[0]
+        reference = low_passed(reference, motion)[samples]
+        position = low_passed(run.q, motion)[samples]
+        pairs.append((reference - motion.q, reference - position))
+    measured, expected = (np.concatenate(x) for x in zip(*pairs))
+    size = np.maximum(np.sum(expected**2, axis=0), 1e-300)
+    slope = np.sum(measured * expected, axis=0) / size
+    residual = measured - slope * expected
+    rows = [inflation(residual[:, j]) for j in range(residual.shape[1])]
+    sigma = np.sqrt(np.array(rows) * np.mean(residual**2, axis=0) / size)
+    return frozen(np.where(5.0 * sigma < np.abs(slope) * np.log(MAX_GAIN_RATIO), slope, np.nan))
+
+
+ROUNDS = {
+    one.name: one
+    for one in (
+        _RoundEstimator("iv", instrumental_variables.iv, instrumental_variables.projected, True),
+        _RoundEstimator(
+            "didim",
+            lambda problem, std, tau: wls(_simulated(problem), std, np.full(problem.data.groups, tau)),
+            lambda problem, std: combine(_simulated(problem), std),
+            False,
+        ),
+    )
+}

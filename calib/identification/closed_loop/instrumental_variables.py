@@ -1,0 +1,303 @@
+"""Instrumental variables: consistent estimates although the noise of y reaches W through the robot's feedback.
+
+The instruments Z (r, p), one per column, are the observation matrix of a noise-free simulation. All that IV needs is in
+the R factor of [Z W y], so that the triangles of `triangles` serve here too:
+
+    [Z W y] = Q [Rz A b; 0 B c; 0 0 ρ],    Zᵀ W = Rzᵀ A,    P_Z W = Q1 A,
+
+the IV estimate solves A x = b, the residual of W on Z is Q2 B, and nothing is squared.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import fdtrc
+
+from calib.errors import Unidentifiable, require
+from calib.estimation.base_columns import split_columns
+from calib.estimation.estimate import Estimate
+from calib.estimation.linear import LinearFit
+from calib.estimation.triangles import (
+    Triangles,
+    absorb,
+    combine,
+    condition_numbers,
+    empty,
+    require_rank,
+    retriangulate,
+    solve_triangle,
+)
+from calib.identification.loop import ExogeneityTest
+from calib.identification.methods.constrained import null_space
+from calib.records import shaped
+
+
+@dataclass(frozen=True, eq=False)
+class InstrumentStrength:
+    """Strength of instruments: how well they explain the columns of W.
+
+    Attributes:
+        names: p columns of W.
+        correlations: (p,) canonical correlations between Z and W, falling; 1 where Z spans W, 0 where the rank fails.
+        partial_r2: (p,) share of each column, cleaned of the others, that Z explains (Shea 1997).
+        cragg_donald: F of the weakest combination, (r - p) λ² / (1 - λ²) / p with λ the least correlation; above 10 the
+            usual approximations hold (Staiger & Stock 1997).
+        condition: condition number of Zᵀ W, columns of Z and W of unit norm.
+    """
+
+    names: tuple[str, ...]
+    correlations: np.ndarray
+    partial_r2: np.ndarray
+    cragg_donald: float
+    condition: float
+
+    @property
+    def weak(self) -> bool:
+        return self.cragg_donald < 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class Instruments:
+    """R factors of [Z W y]; the first p columns are the instruments."""
+
+    data: Triangles
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.data.names[len(self.data.names) // 2 :]
+
+    def least_squares(self) -> Triangles:
+        """Return the R factors of [W y] alone, for `linear.ols` and `linear.wls`."""
+        p = len(self.names)
+        return self.data.select(np.arange(p, 2 * p))
+
+    def testable(self, fit: LinearFit, std: np.ndarray | None = None) -> Triangles:
+        """Return one group's R factor [A b; 0 ‖ρ‖] with the IV estimate and its covariance as least-squares solution.
+
+        ρ = y - W x_IV, whitened. With it tests of nested models are those of two-stage least squares (Wooldridge 2010,
+        section 5.2.3): differences of ‖P_Z (y - W x)‖² against the variance of ρ.
+
+        Args:
+            std: as in `iv`.
+            fit: the result of `iv`.
+        """
+        p = len(self.names)
+        sigma = std
+        if std is None:
+            sigma = np.ones(self.data.groups)
+        squares = self.data.residual_squares(np.concatenate([np.zeros(p), fit.estimate.values]))
+        factor = np.zeros((1, p + 1, p + 1))
+        factor[0, :p] = projected(self, sigma)[:p]
+        factor[0, p, p] = np.sqrt(np.sum(squares / sigma**2))
+        return replace(empty(self.names, self.data.units[p:], 1), factors=factor, rows=self.data.rows.sum()[None])
+
+
+def instrument(
+    instruments: np.ndarray,
+    matrix: np.ndarray,
+    target: np.ndarray,
+    group: np.ndarray | int = 0,
+    names: Sequence[str] | None = None,
+    units: Sequence[str] | None = None,
+    before: Instruments | None = None,
+) -> Instruments:
+    """Return the R factors of [Z W y], added to those of earlier rows if `before` is given.
+
+    Args:
+        instruments: Z (r, p), one column for each of W.
+        matrix: W (r, p).
+        target: y (r,).
+        group: as in `triangles.absorb`.
+        names, units: of W's columns.
+        before: earlier rows of the same problem.
+    """
+    matrix = shaped(matrix, (None, None), "observation matrix W")
+    instruments = shaped(instruments, matrix.shape, "instruments Z")
+    if before is None:
+        if names is not None:
+            column_names = tuple(names)
+        else:
+            column_names = tuple(f"x{k + 1}" for k in range(matrix.shape[1]))
+        before = unseen(
+            column_names, units if units is not None else ("",) * len(column_names), int(np.max(group, initial=0)) + 1
+        )
+    return replace(before, data=absorb(before.data, np.hstack([instruments, matrix]), target, group))
+
+
+def unseen(names: Sequence[str], units: Sequence[str], groups: int) -> Instruments:
+    """Return empty R factors of [Z W y], for columns of W with these names and units."""
+    return Instruments(empty([*(f"Z {name}" for name in names), *names], [*units, *units], groups))
+
+
+def iv(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1.0) -> LinearFit:
+    """Estimate x = (Zᵀ Ω⁻¹ W)⁻¹ Zᵀ Ω⁻¹ y, covariance σ² (ZᵀΩ⁻¹W)⁻¹ (ZᵀΩ⁻¹Z) (WᵀΩ⁻¹Z)⁻¹, Ω = diag(σ_g² I).
+
+    Janot, Vandanjon & Gautier (2014) write the covariance (ZᵀΩ⁻¹Z)⁻¹, which is the same where Z is W without its noise
+    and too small where the simulation misses. σ² is estimated, so `std` matters up to a factor. As many instruments as
+    columns: two-stage least squares is the same estimate.
+
+    Args:
+        problem: triangles of [Z W y].
+        std: (g,) of the groups; None: equal. Those of the weighted least squares of W are the usual choice.
+        inflation: >= 1, see `linear`; one number for all groups.
+
+    Raises:
+        Unidentifiable: where Zᵀ W is singular, naming the columns concerned.
+    """
+    p = len(problem.names)
+    if std is None:
+        sigma = np.ones(problem.data.groups)
+    else:
+        sigma = shaped(std, (problem.data.groups,), "std per group")
+    factor = combine(problem.data, sigma)
+    values, inverse, _ = solve_triangle(_projected(factor, problem.names), problem.names)
+    squares = problem.data.residual_squares(np.concatenate([np.zeros(p), values]))
+    degrees = problem.data.rows - inflation * p * problem.data.rows / problem.data.rows.sum()
+    dof = int(problem.data.rows.sum() / inflation) - p
+    require(dof > 0, "fewer independent rows than parameters; record longer motion", Unidentifiable, problem.names)
+    residual_std = float(np.sqrt(np.sum(squares / sigma**2) / degrees.sum()))
+    covariance = inflation * residual_std**2 * inverse @ inverse.T
+    units = problem.data.units[p:]
+    estimate = Estimate(problem.names, units, values, covariance, residual_std, dof)
+    return LinearFit(estimate, np.sqrt(squares / degrees), *condition_numbers(factor[:, p : 2 * p]))
+
+
+def settled(before: LinearFit, after: LinearFit, change: float = 0.025, residual: float = 0.025) -> bool:
+    """Return whether the outer loop (simulate, estimate) has converged in parameters and residual.
+
+    |Δx_j| < change · |x_j| for every parameter and |Δ‖ρ‖| < residual · ‖ρ‖ (Janot, Vandanjon & Gautier 2014; both
+    usually 1 … 5 %). A parameter that moves by less than a fifth of its standard deviation rests as well (our choice:
+    one near zero never meets a relative rule).
+    """
+    change_ = np.abs(after.estimate.values - before.estimate.values)
+    allowed = np.maximum(change * np.abs(before.estimate.values), 0.2 * after.estimate.sigma)
+    sizes = before.estimate.residual_std, after.estimate.residual_std
+    return bool(np.all(change_ <= allowed) and abs(sizes[1] - sizes[0]) <= residual * sizes[0])
+
+
+def strength(problem: Instruments, std: np.ndarray | None = None) -> InstrumentStrength:
+    """Return the strength of the instruments: how well they explain the columns of W.
+
+    Args:
+        problem: triangles of [Z W y].
+        std: as in `iv`.
+    """
+    p = len(problem.names)
+    rows = int(problem.data.rows.sum())
+    factor = combine(problem.data, std)
+    explained = factor[:p, p : 2 * p]
+    norms = np.linalg.norm(factor[:, p : 2 * p], axis=0)
+    basis = np.linalg.qr(factor[: 2 * p, p : 2 * p] / norms)[0]
+    correlations = np.clip(np.linalg.svd(basis[:p], compute_uv=False), 0.0, 1.0)
+    cross = (factor[:p, :p] / np.linalg.norm(factor[:p, :p], axis=0)).T @ (explained / norms)
+    minimum = correlations[-1] ** 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        donald = float((rows - p) / p * np.divide(minimum, 1.0 - minimum))
+    return InstrumentStrength(
+        problem.names,
+        correlations,
+        _shea(explained / norms, factor[:, p : 2 * p] / norms),
+        donald,
+        np.linalg.cond(cross),
+    )
+
+
+def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1.0) -> ExogeneityTest:
+    """Return the test that W is uncorrelated with the noise (Durbin, Wu, Hausman), by augmented regression and QR.
+
+    With V = W - P_Z W the part of the columns that the instruments do not explain, y = W x + V δ + e; the claim is
+    δ = 0, F = [(RSS0 - RSS1) / k] / [RSS1 / (r - p - k)] (Janot, Vandanjon & Gautier 2016, after Hausman 1978). Only
+    the k independent columns of V count. It takes valid instruments for granted: look at `strength` first.
+
+    Args:
+        problem: triangles of [Z W y].
+        std: as in `iv`; unlike groups tested with equal weights give false alarms.
+        inflation: >= 1; autocorrelated residuals without it give false alarms.
+    """
+    p = len(problem.names)
+    rows = problem.data.rows.sum() / inflation
+    factor = combine(problem.data, std)
+    instrument_rows = factor[:, p : 2 * p]
+    norms = np.linalg.norm(instrument_rows, axis=0)
+    require_rank(instrument_rows / np.where(norms > 0.0, norms, 1.0), problem.names)
+    part = np.vstack([np.zeros((p, p)), factor[p:, p : 2 * p]])
+    size = np.linalg.norm(part, axis=0) > 1e-8 * norms
+    columns = np.hstack([instrument_rows, part[:, size]])
+    split = split_columns(columns, [np.arange(p)], 1e-8)
+    k = split.rank - p
+    dof = int(rows) - p - k
+    require(k > 0 and dof > 0, "nothing to test: the instruments equal the columns, or there are too few rows")
+    target = factor[:, -1]
+    first = _rss(instrument_rows, target)
+    second = _rss(columns[:, split.kept], target)
+    if second > 0.0:
+        f = (first - second) / k / (second / (rows - p - k)) / inflation
+    else:
+        f = np.inf
+    return ExogeneityTest(float(f), (k, dof), float(fdtrc(k, dof, f)))
+
+
+def projected(problem: Instruments, std: np.ndarray | None = None) -> np.ndarray:
+    """Return the R factor (p + 1, p + 1) of min ‖P_Z (y - W x)‖, two-stage least squares; its solution is `iv`.
+
+    Constraints enter IV through it: `constrained.minimise` with Q = Wᵀ P_Z W, which is positive definite, and not with
+    Zᵀ W, which need not be.
+    """
+    return _projected(combine(problem.data, std), problem.names)
+
+
+def by_free_instruments(
+    problem: Instruments, std: np.ndarray, constrained: np.ndarray, normals: np.ndarray
+) -> np.ndarray:
+    """Return x (p,) with A x = A `held` from the instruments of what A leaves free alone, Z_Uᵀ Ω⁻¹ (y - W x) = 0.
+
+    Janot's slides on the TX40 state the criterion ½ ‖P_Z (y - W x)‖² (`projected`), in which all instruments count, but
+    print for bounds x_C = d the relation x_U = x_U^IV + (Z_UᵀW_U)⁻¹ Z_UᵀW_C (x_C^IV - d), which is this one. Both are
+    consistent where the constraint is true. On a simulated TX40 they are at most 0.011 σ apart (`examples/tx40`), in
+    planted problems with weak instruments 0.24 σ, and 2.4 σ where the bound is wrong by 6 σ: there this one errs less
+    (`tests/identification/closed_loop/test_instruments.py`).
+
+    Args:
+        std: as in `iv`.
+        held: (p,) a point that satisfies the constraints.
+        normals: A (k, p).
+    """
+    p = len(problem.names)
+    factor = combine(problem.data, std)
+    norms = np.linalg.norm(factor[:, p : 2 * p], axis=0)
+    free = null_space(normals / norms) / norms[:, None]
+    z = factor[:p, :p] @ free
+    w = factor[:p, p : 2 * p] @ free
+    residual = factor[:p, -1] - factor[:p, p : 2 * p] @ constrained
+    return np.asarray(constrained + free @ np.linalg.solve(z.T @ w, z.T @ residual))
+
+
+def _projected(factor: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """Return the R factor of P_Z [W y]; refuse Z and Zᵀ W without full rank."""
+    p = len(names)
+    size = np.linalg.norm(factor[:p, :p], axis=0)
+    require_rank(
+        factor[:p, :p] / np.where(size > 0.0, size, 1.0),
+        [f"instrument of {name}" for name in names],
+        "the simulated motion does not excite them: simulate the reference of this recording",
+    )
+    norms = np.linalg.norm(factor[:, p : 2 * p], axis=0)
+    require_rank(
+        factor[:p, p : 2 * p] / np.where(norms > 0.0, norms, 1.0),
+        names,
+        "the instruments do not distinguish them: W has dependent columns, or the simulated motion differs",
+    )
+    return retriangulate(factor[:p, p:])
+
+
+def _shea(explained: np.ndarray, total: np.ndarray) -> np.ndarray:
+    """Return diag((WᵀW)⁻¹) / diag((WᵀP_Z W)⁻¹) (Shea 1997 in the form of Godfrey 1999)."""
+    variances = [np.sum(np.linalg.pinv(part) ** 2, axis=1) for part in (total, explained)]
+    return variances[0] / variances[1]
+
+
+def _rss(matrix: np.ndarray, target: np.ndarray) -> float:
+    """Return the residual sum of squares of the regression of target on the columns."""
+    size = matrix.shape[1]
+    return float(np.sum(retriangulate(np.column_stack([matrix, target]))[size:, size] ** 2))

@@ -1,0 +1,397 @@
+"""Closed loops of recordings: reference and controller of every part without gaps, ready for simulation.
+
+A stretch is a part of a recording without gaps. The simulation runs along the whole of it and is compared some way
+inside: the filters' ends (2 / f_q), and `settling_time` for the simulated robot to forget that it started on the
+reference. Its motion then takes the place of the recorded one: the same instants, the same low-pass.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from calib.data.signals.bandwidth import USABLE
+from calib.data.signals.filtering import Decimator, border, curvature, low_pass, slope
+from calib.data.signals.motion import Motion
+from calib.errors import CalibError, NotConverged, UsageError, refuse_data
+from calib.identification.closed_loop.controllers import (
+    IdentifiedController,
+    Reference,
+    completed,
+    identify_controller,
+    stated_controller,
+)
+from calib.identification.closed_loop.simulation import SimulatedRun, plant_of
+from calib.identification.closed_loop.timing import check_no_copy, motor_torques, reference_shift
+from calib.identification.loop import Controller, LoopSettings
+from calib.identification.rows import Case, segments
+
+DEGREES = 180.0 / np.pi
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """The closed loop in which a recording was made.
+
+    Attributes:
+        controller: stated, identified from the log (`calib.identification.closed_loop.controllers`) or guessed: a
+            third of the true bandwidth suffices.
+        reference: at the controller's rate, in the recording's time, over its whole duration.
+        every: control periods per recorded sample, not necessarily an integer.
+        design: (n,) inertia for which the gains are stated [kg m²]; the simulated robot then gets gains times
+            J(x_k) / design, so that its bandwidth is constant (Gautier & Janot). None: gains as stated.
+    """
+
+    controller: Controller
+    reference: Reference
+    every: float = 1
+    design: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedLoops:
+    """Gap-free parts of recordings, each paired with its closed control loop (reference and controller).
+
+    Attributes:
+        pairs: each part and its loop.
+        controller: of all parts.
+        identified: result of identifying the controller from the logs; None where it was stated.
+        notes: remarks for the user.
+    """
+
+    pairs: tuple[tuple[Case, Loop], ...]
+    controller: Controller
+    identified: IdentifiedController | None
+    notes: tuple[str, ...]
+
+
+def close_loops(
+    model: Any, cases: Sequence[Case], decimator: Decimator, loop: LoopSettings, cad: np.ndarray | None = None
+) -> ClosedLoops:
+    """Return the closed control loops of recordings whose motions contain `q_ref`.
+
+    Args:
+        model: of the robot, simulable (`plant_of`).
+        decimator: of the rows; stretches that it eats up are left out.
+        cad: standard parameters by the robot's description, for a feed-forward of kind ``cad``; None: not known.
+
+    Raises:
+        MeasurementError: where a recording has no reference, or one that cannot be its own.
+        UsageError: for a rate that does not go with the recording's, or gains of another number of joints.
+    """
+    for case in cases:
+        _check_reference(case.motion)
+    stretches = [
+        part
+        for case in cases
+        for part in (take(case, slice(a, b)) for a, b in segments(case.motion.segment))
+        if _inside(part.motion).stop - _inside(part.motion).start > 2 * len(decimator.taps)
+    ]
+    if not stretches:
+        refuse_data(cases[0].motion.file, "no part without gaps is long enough to be simulated")
+    ordered = sorted(stretches, key=lambda part: -len(part.motion))
+    controller, identified, notes = _controller(loop, ordered[0])
+    shifts: dict[str, float] = {}
+    # the longest part of each recording tells
+    for part in ordered:
+        if part.name not in shifts and loop.timing != "stated":
+            shifts[part.name], note = _shift(part, loop, partial(_fed_forward, controller, loop, cad, model))
+            notes += note
+    design = None
+    if loop.design:
+        design = loop.per_joint("design", model.n)
+    pairs = []
+    for part in stretches:
+        reference, every = _make_reference(part.motion, loop.rate, shifts.get(part.name, 0.0))
+        feed_forward = _fed_forward(controller, loop, cad, model, part.motion, reference, every)
+        if loop.reference_velocity == "difference":
+            # by half a period
+            rates = np.diff(reference.q, axis=0) / reference.period
+            reference = replace(reference, v=np.vstack([reference.v[:1], rates]))
+        pairs.append((take(part, _inside(part.motion)), Loop(feed_forward, reference, every, design)))
+    return ClosedLoops(tuple(pairs), controller, identified, notes)
+
+
+def take(case: Case, part: slice) -> Case:
+    """Return the part of a case in the slice `part`."""
+    return replace(case, motion=case.motion.part(part), target=case.target[part], present=case.present[part])
+
+
+def _check_reference(motion: Motion) -> None:
+    """Raise an error for a motion whose reference is missing, of another motion, or in degrees."""
+    if motion.q_ref is None:
+        refuse_data(
+            motion.file,
+            "has no reference positions (columns q_ref1 …, q_des, q_cmd, or [recording] names = { q_ref = '…' }); the "
+            "simulation of the closed loop needs them. Log them, or give a file: [loop] reference = '…', or the folder "
+            "of the designed motion: --excitation FOLDER; without a reference use wls or irls",
+        )
+    finite = np.isfinite(motion.q_ref).all(axis=0)
+    if not finite.all():
+        joint = int(np.argmin(finite))
+        refuse_data(
+            motion.file, f"the reference of {motion.joint_names[joint]} (joint {joint + 1}) is not finite everywhere"
+        )
+    for j in np.flatnonzero(np.ptp(motion.q, axis=0) > 1e-3):
+        _compare(motion, motion.q_ref[:, j], int(j))
+    if motion.located is None:
+        check_no_copy(motion, low_passed(np.asarray(motion.q_ref), motion))
+
+
+def _compare(motion: Motion, reference: np.ndarray, joint: int, max_difference: float = 0.3) -> None:
+    """Raise an error for a joint that does not follow its reference `asked` (N,), naming a likely unit error.
+
+    `max_difference`: largest deviation, over a joint's motion, from its own reference (our choice).
+    """
+    q = motion.q[:, joint]
+    spread = np.std(q)
+    size = np.std(reference)
+    away = float(np.sqrt(np.mean((q - reference) ** 2)) / spread)
+    if away < max_difference:
+        return
+    name = f"{motion.joint_names[joint]} (joint {joint + 1})"
+    alike = False
+    if size > 0.0:
+        alike = abs(float(np.corrcoef(q, reference)[0, 1])) > 0.95
+    if alike and abs(size / spread / DEGREES - 1.0) < 0.1:
+        refuse_data(
+            motion.file,
+            f"the reference of {name} is {size / spread:.3g} times its position: it looks like deg; if so, state it (a "
+            f"header 'q_ref{joint + 1} [deg]', or [recording] units = {{ q_ref = 'deg' }})",
+        )
+    refuse_data(
+        motion.file,
+        f"{name} deviates from its reference by {away:.2g} times its travel (rms); the reference "
+        + (
+            f"is {size / spread:.3g} times as large, {np.mean(reference - q):.2g} rad (or m) above it on average"
+            if alike
+            else "is not correlated with it"
+        )
+        + "; check that the reference belongs to this recording, has the same joints and starts at the same time",
+    )
+
+
+def _shift(part: Case, loop: LoopSettings, fed_forward: Callable[..., Controller]) -> tuple[float, tuple[str, ...]]:
+    """Return by how much later than stated the reference of a recording was played [s], and notes.
+
+    A stated time is kept, and refused where the torques contradict it.
+
+    Raises:
+        MeasurementError: for a reference that is late or early by the motors' torques.
+        UsageError: for a designed motion without motor torques to time it by.
+    """
+    motion = part.motion
+    estimated = part.motion.located is not None or loop.timing == "estimated"
+    if motor_torques(part) is None:
+        if estimated:
+            raise UsageError(
+                f"{part.name}: no motor torques (rows = '{part.torque_rows.name}') tell when its reference was played; "
+                "use rows = 'both', or log the reference (q_ref); for iv alone [loop] timing = 'stated' will do, which "
+                "leaves it at the measured positions"
+            )
+        return 0.0, ()
+    reference, every = _make_reference(motion, loop.rate)
+    band = min(loop.band, 0.5 * float(motion.cutoff.min()), 0.2 * motion.rate)
+    shift = reference_shift(part, reference, every, fed_forward(motion, reference, every), band)
+    text = f"{1e3 * abs(shift.seconds):.3g} ± {1e3 * shift.sigma:.2g} ms"
+    if estimated:
+        begin = (motion.located or 0.0) + shift.seconds
+        where = "" if motion.located is None else f"the designed motion begins at {begin:.5f} s, "
+        direction = "later" if shift.seconds > 0.0 else "earlier"
+        return shift.seconds, (
+            f"{part.name}: {where}the reference was moved {text} {direction}; the controller explains "
+            f"{100 * (1 - shift.left):.3g} % of the torques, one σ of time changes them by {100 * shift.effect:.2g} %",
+        )
+    # [s], and shares of the torques (our choice)
+    min_shift, min_gain, max_left = 1.5e-3, 2.0, 0.5
+    significant = abs(shift.seconds) > max(5.0 * shift.sigma, min_shift)
+    if significant and shift.left < max_left and shift.before > min_gain * shift.left:
+        refuse_data(
+            motion.file,
+            f"its reference (q_ref) is {'late' if shift.seconds < 0.0 else 'early'} by {text}: so "
+            f"moved, the controller of [loop] explains {100 * (1 - shift.left):.3g} % of the torques, as logged "
+            f"{100 * (1 - min(shift.before, 1.0)):.2g} %. Set [loop] timing = 'estimated' to move it; or correct kd "
+            "and share, which may look like this; timing = 'stated' takes it as it is",
+        )
+    return 0.0, ()
+
+
+def _make_reference(
+    motion: Motion, rate: float | None = None, shift: float = 0.0, cutoff_factor: float = 4.0
+) -> tuple[Reference, float]:
+    """Return the reference of a motion without gaps, resampled at the control rate, and the control periods per sample.
+
+    It is moved to later by `shift` [s].
+
+    The logged positions are low-passed at `cutoff_factor` f_q and joined by a cubic spline, whose slopes are v and a.
+
+    Raises:
+        UsageError: where the control rate is below the motion's.
+
+    `cutoff_factor`: times f_q: low-pass of the logged reference, against the rounding of its digits (our choice).
+    """
+    every = periods_per_sample(motion, rate)
+    cutoff = min(cutoff_factor * float(motion.cutoff.max()), USABLE * motion.rate / 2)
+    smooth = low_pass(np.asarray(motion.q_ref), motion.rate, cutoff)
+    spline = CubicSpline(np.arange(len(smooth)), smooth)
+    indices = np.arange(int((len(smooth) - 1) * every + 1e-9) + 1) / every
+    times = np.clip(indices - shift * motion.rate, 0.0, len(smooth) - 1.0)
+    q, v, a = (spline(times, order) * motion.rate**order for order in range(3))
+    return Reference(motion.t[0] + indices / motion.rate, q, v, a), every
+
+
+def periods_per_sample(motion: Motion, rate: float | None = None) -> float:
+    """Return the control periods per sample, not always an integer; without `rate`, the controller's is >= `min_rate`.
+
+    Raises:
+        UsageError: where the control rate is below the motion's.
+    """
+    # of a controller whose rate is not stated [Hz] (our choice)
+    min_rate = 1000.0
+    if rate is None:
+        return max(1, int(np.ceil(min_rate / motion.rate - 1e-6)))
+    every = round(rate / motion.rate)
+    # of a control rate that is near a multiple of the log's, by which it is that: clocks are not exact
+    max_rounding = 0.001
+    if rate < (1.0 - max_rounding) * motion.rate:
+        raise UsageError(
+            f"[loop] rate: {rate:g} Hz is below {motion.rate:.6g} Hz, the rate of {motion.file}: no controller is "
+            "slower than its log; check the unit (Hz)"
+        )
+    if abs(rate / motion.rate - every) <= max_rounding * every:
+        return every
+    return rate / motion.rate
+
+
+def _inside(motion: Motion, settling_time: float = 0.2) -> slice:
+    """Return the slice of samples that are compared: without settling time and filter borders.
+
+    `settling_time`: [s] our choice.
+    """
+    edge = max(border(motion.rate, float(motion.cutoff.min())), 4)
+    return slice(max(edge, int(np.ceil(settling_time * motion.rate))), len(motion) - edge)
+
+
+def _controller(loop: LoopSettings, case: Case) -> tuple[Controller, IdentifiedController | None, tuple[str, ...]]:
+    """Return the controller (stated, or identified from the longest part), its identification result, and notes."""
+    n = case.motion.n
+    if loop.controller != "identify":
+        return stated_controller(loop, n), None, ()
+    motion = case.motion
+    tau = motor_torques(case)
+    if tau is None:
+        raise UsageError(f"[loop] controller = 'identify' needs motor torques, not rows = '{case.torque_rows.name}'")
+    band = min(loop.band, float(motion.cutoff.min()), 0.4 * motion.rate)
+
+    def identified(shift: float) -> IdentifiedController:
+        reference, _ = _make_reference(motion, loop.rate, shift)
+        if loop.integral:
+            orders = (1, 2)
+        else:
+            orders = (0, 1)
+        return identify_controller(reference, motion.q, tau, motion.rate, band, orders, loop.integral)
+
+    identified_controller = identified(
+        _best_shift(identified) if motion.located is not None or loop.timing == "estimated" else 0.0
+    )
+    kp = identified_controller.controller.kp
+    kd = identified_controller.controller.kd
+    bad = np.flatnonzero((kp <= 0.0) | (kd <= 0.0))
+    gains = ", ".join(
+        f"{x:.4g}/{y:.3g} ({share:.0f} %)" for x, y, share in zip(kp, kd, identified_controller.explained)
+    )
+    if len(bad):
+        raise NotConverged(
+            f"{case.name}: the log does not identify the controller of joint {bad[0] + 1} (kp/kd by joint: {gains}); "
+            "state the gains, or lower [loop] band",
+            identified_controller,
+        )
+    note = f"controller identified from {case.name} up to {band:.3g} Hz, kp/kd (explained torque): {gains}"
+    return completed(identified_controller.controller, loop, n), identified_controller, (note,)
+
+
+def _best_shift(identified: Callable[[float], IdentifiedController]) -> float:
+    """Return the shift of the reference [s] with which an identified controller explains the torques best."""
+    # within 0.03 s of where positions match best (our choice)
+    middle, step = 0.0, 0.01
+    while step > 1e-6:
+        candidates = middle + step * np.arange(-3, 4)
+        middle = max(candidates, key=lambda shift: float(np.mean(identified(shift).explained)))
+        step = step / 3.0
+    return float(middle)
+
+
+def _fed_forward(
+    controller: Controller,
+    loop: LoopSettings,
+    cad: np.ndarray | None,
+    model: Any,
+    motion: Motion,
+    reference: Reference,
+    every: float,
+) -> Controller:
+    """Return the controller with its feedforward torques along the reference."""
+    if loop.feedforward == "none":
+        return controller
+    if loop.feedforward == "recording":
+        if motion.tau_ff is None:
+            refuse_data(motion.file, "[loop] feedforward: the recording has no column tau_ff")
+        grid = np.arange(len(motion))
+        return controller.with_feedforward(CubicSpline(grid, motion.tau_ff)(np.arange(len(reference.t)) / every))
+    if cad is None:
+        raise UsageError("[loop] feedforward = 'cad': the robot's description states no masses")
+    believed = plant_of(model, np.append(cad, np.zeros(model.p - len(cad))))
+    return controller.with_feedforward(believed.feed_forward(reference))
+
+
+def simulated_case(case: Case, run: SimulatedRun, loop: Loop) -> Case:
+    """Return the case with the simulated motion at the recorded times, filtered like the recorded motion.
+
+    The same low-pass and differences: what they do to a motion (they round off reversals) is in W and in Z alike, and
+    what tells W from Z is noise.
+    """
+    q, v, a = followed(run.q, case.motion, simulated_samples(case, run.t, loop))
+    return replace(case, motion=replace(case.motion, q=q, v=v, a=a))
+
+
+def followed(q: np.ndarray, motion: Motion, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return q, v, a (M, n, ...) of simulated positions, or of their derivatives, filtered like the recorded motion.
+
+    Args:
+        q: (N, n, ...) of the whole simulation.
+        index: (M,) samples to return.
+    """
+    positions = low_passed(q, motion, motion.cutoff)
+    less = low_passed(q, motion, motion.velocity_cutoff)
+    return positions[index], slope(less, motion.rate)[index], curvature(positions, motion.rate)[index]
+
+
+def simulated_samples(case: Case, t: np.ndarray, loop: Loop) -> np.ndarray:
+    """Return the indices of the simulated samples, at times `t` [s], at the times of a case."""
+    step = loop.reference.period * loop.every
+    since = case.motion.t - loop.reference.t[0]
+    index = np.rint(since / step).astype(int)
+    if index[0] < 0 or index[-1] >= len(t) or np.abs(index * step - since).max() > 0.01 * step:
+        raise CalibError(
+            f"the recording runs from {case.motion.t[0]:.6g} s to {case.motion.t[-1]:.6g} s in steps of "
+            f"{1 / case.motion.rate:.6g} s, the simulation from {t[0]:.6g} s to {t[-1]:.6g} s in steps of "
+            f"{step:.6g} s; give the whole reference and `every`"
+        )
+    return index
+
+
+def low_passed(q: np.ndarray, motion: Motion, cutoff: np.ndarray | None = None) -> np.ndarray:
+    """Return simulated positions (N, n), or their derivatives (N, n, ...), low-passed like the recorded positions.
+
+    Args:
+        cutoff: (n,) of another of its filters [Hz].
+    """
+    result = np.empty_like(q)
+    cutoffs = motion.cutoff if cutoff is None else cutoff
+    for f in np.unique(cutoffs):
+        joints = cutoffs == f
+        result[:, joints] = low_pass(q[:, joints], motion.rate, float(f))
+    return result

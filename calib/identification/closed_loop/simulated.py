@@ -1,0 +1,390 @@
+"""Methods that simulate the closed loop of a recording: instrumental variables, and DIDIM."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from calib.dynamics.drives import DriveTerm
+from calib.errors import CalibError, Finding, UsageError, finding
+from calib.estimation.triangles import Triangles
+from calib.identification.closed_loop.instrumental import Instrumental, identify_instrumental, sign_noise
+from calib.identification.closed_loop.loop_recordings import ClosedLoops, close_loops
+from calib.identification.closed_loop.simulation import simulable
+from calib.identification.loop import LoopDisagreement, LoopMetrics, LoopResults
+from calib.identification.methods.estimators import CONSISTENT, CONSTRAINED
+from calib.identification.methods.least_squares import WLS
+from calib.identification.methods.method import IdentificationProblem, Method, MethodEstimate, attempted
+from calib.identification.methods.parameter_constraints import constraints_of
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LoopEstimate(MethodEstimate):
+    """Result of a method that simulates the closed loop.
+
+    Attributes:
+        loops: the simulated closed loops.
+        instrumental: further results of instrumental variables; None for other methods, and after a failure.
+    """
+
+    loops: ClosedLoops
+    instrumental: Instrumental | None = None
+
+    def testable(self) -> tuple[Triangles, np.ndarray, np.ndarray]:
+        """Return R factors on which least squares gives this estimate, with std and inflation (g,), for tests."""
+        identification = self.instrumental
+        if identification is None:
+            return super().testable()
+        return (
+            identification.problem.testable(identification.fit, identification.std),
+            np.ones(1),
+            np.array([identification.inflation]),
+        )
+
+
+def attempted_in_loop(
+    method: str, problem: IdentificationProblem, loops: ClosedLoops, run: Callable[[], MethodEstimate]
+) -> LoopEstimate:
+    """Return the result of `run` on a problem with its loops and computing time; a failure is returned as a status."""
+    estimate = attempted(method, problem, run)
+    if isinstance(estimate, LoopEstimate):
+        return estimate
+    return LoopEstimate(**vars(estimate), loops=loops)
+
+
+@dataclass(frozen=True)
+class _Simulated(Method):
+    """A method that simulates the closed loop.
+
+    Attributes:
+        instruments: its use of the simulated motion, see `calib.identification.closed_loop.instrumental.ROUNDS`;
+            "": by the loop's settings.
+    """
+
+    needs_controller: bool = field(default=True, kw_only=True)
+    needs_simulation: bool = field(default=True, kw_only=True)
+    tunes: tuple[str, ...] = field(default=("tolerance 2.5 %", "10 rounds"), kw_only=True)
+    instruments: str = ""
+
+    def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
+        """Return the estimate of the base columns, with row weights and variance inflation from WLS.
+
+        Raises:
+            UsageError, MeasurementError: for a loop or recordings that no simulation can start from.
+        """
+        if problem.loop is None or not simulable(problem.model):
+            raise UsageError(f"method '{self.name}' needs a [loop], and a robot that can be simulated")
+        plain = WLS.estimate(problem)
+        if not plain.found:
+            return replace(plain, method=self.name)
+        richer = [term for term in problem.terms[problem.base.b :] if term is not None]
+        estimate = self.beside(problem, plain, richer)
+        return replace(estimate, seconds=plain.seconds + estimate.seconds)
+
+    def beside(
+        self, problem: IdentificationProblem, plain: MethodEstimate, terms: Sequence[DriveTerm] = ()
+    ) -> LoopEstimate:
+        """Return the estimate, starting from the least-squares estimate `plain`, with the richer friction `terms`."""
+        model: Any = problem.model
+        loop = problem.loop
+        if loop is None or not simulable(model):
+            raise UsageError("instruments from simulation need a [loop], and a robot that can be simulated")
+        loops = close_loops(model, problem.cases, problem.decimator, loop, problem.cad)
+        inertia = None
+        if loop.inertia:
+            inertia = loop.per_joint("inertia", model.n)
+
+        def estimate() -> LoopEstimate:
+            identification = identify_instrumental(
+                model,
+                problem.base,
+                loops.pairs,
+                problem.decimator,
+                method=self.instruments or loop.instruments,
+                inertia=inertia,
+                positive=loop.positive,
+                terms=terms,
+                constraints=constraints_of(problem) if self.takes_constraints else None,
+            )
+            result = replace(
+                plain,
+                method=self.name,
+                solution=identification.fit,
+                std=identification.std,
+                iterations=len(identification.rounds),
+                simulations=len(loops.pairs) * sum(1 + round_.retreats for round_ in identification.rounds),
+                beforehand=None,
+                held=identification.constrained,
+                instruments=identification.rows,
+            )
+            return LoopEstimate(**{**vars(result), "loops": loops, "instrumental": identification})
+
+        return attempted_in_loop(self.name, problem, loops, estimate)
+
+
+CHOSEN = "friction model (with friction = 'auto': steps chosen by least squares) are those of the robot"
+IV = _Simulated(
+    "iv",
+    f"the stated controller, reference and {CHOSEN}",
+    description="instrumental variables from the simulated closed loop",
+    source="Janot, Vandanjon & Gautier 2014",
+)
+DIDIM = _Simulated(
+    "didim",
+    f"the simulated robot moves like the real one: stated controller, reference and {CHOSEN}; measured positions are "
+    "not used",
+    "didim",
+    description="least squares on the simulated motion alone (the slides' CLIE)",
+    source="Gautier, Janot & Vandanjon 2013",
+)
+PC_IV = replace(
+    IV,
+    name=f"pc-{IV.name}",
+    assumes=IV.assumes + CONSISTENT,
+    instruments=IV.name,
+    takes_constraints=True,
+    description=IV.name + CONSTRAINED,
+    source="Janot & Wensing 2021",
+)
+PC_DIDIM = replace(
+    DIDIM,
+    name=f"pc-{DIDIM.name}",
+    assumes=DIDIM.assumes + CONSISTENT,
+    instruments=DIDIM.name,
+    takes_constraints=True,
+    description=DIDIM.name + CONSTRAINED,
+    source="Leboutet et al. 2021",
+)
+METHODS = (IV, DIDIM, PC_IV, PC_DIDIM)
+
+
+@dataclass(frozen=True, eq=False)
+class LoopTest:
+    """Result of instrumental variables from simulation.
+
+    Attributes:
+        found: their estimate of the standard model, with the test of least squares; None if they failed.
+        loops: the simulated closed loops.
+        failure: reason for a missing estimate.
+    """
+
+    found: Instrumental | None = None
+    loops: ClosedLoops | None = None
+    failure: str = ""
+
+    def findings(self, is_estimate: bool) -> list[Finding]:
+        """Return the findings for a user of this estimate, or (`taken` False) of a least-squares one."""
+        if self.found is None or self.loops is None:
+            return [finding("loop-test-failed", why=self.failure)]
+        noticed = [*_weakness(self.found), *(_distance(self.found) or _gains(self.found) or _torques(self.found))]
+        return noticed + (_blurred(self.found, self.loops) if is_estimate else _biased(self.found))
+
+
+def compare_with_loop(problem: IdentificationProblem, estimate: MethodEstimate) -> LoopTest:
+    """Return the result of instrumental variables for an estimate whose closed loop is described in the options.
+
+    An estimate that came from them is the comparison itself; beside another method's, their failure is reported.
+    """
+    loop_estimate = None
+    if isinstance(estimate, LoopEstimate) and estimate.instrumental is not None:
+        loop_estimate = estimate
+    if loop_estimate is None:
+        try:
+            loop_estimate = IV.beside(problem, estimate)
+        except CalibError as error:
+            return LoopTest(failure=str(error))
+    return LoopTest(
+        loop_estimate.instrumental, loop_estimate.loops, "" if loop_estimate.found else str(loop_estimate.failure)
+    )
+
+
+def _weakness(identification: Instrumental) -> list[Finding]:
+    strength = identification.strength
+    if not strength.weak:
+        return []
+    weakest = np.argsort(strength.partial_r2)[:5]
+    names = [f"{strength.names[k]} ({100 * strength.partial_r2[k]:.2g} %)" for k in weakest]
+    return [finding("weak-instruments", donald=strength.cragg_donald, names=names)]
+
+
+def _distance(identification: Instrumental) -> list[Finding]:
+    # [%] of a joint's motion by which the simulated robot may miss the recorded one (our choice)
+    max_miss = 10.0
+    joints = [f"{x:.3g} % at joint {j + 1}" for j, x in enumerate(identification.distance) if not x < max_miss]
+    if joints:
+        return [finding("loop-not-followed", joints=joints)]
+    return []
+
+
+def _gains(identification: Instrumental) -> list[Finding]:
+    """Return the finding on joints whose given gains differ from the gains in the recording."""
+    joints = [f"{identification.stray[j]:.2g} times at joint {j + 1}" for j in identification.off]
+    if joints:
+        return [finding("loop-gains-off", joints=joints)]
+    return []
+
+
+def _torques(identification: Instrumental) -> list[Finding]:
+    """Return the finding on torque rows that the simulated motion does not explain, though the measured one does."""
+    case = identification.rows[0][0]
+    direct = identification.direct
+    iv_torques = identification.own
+    labels = case.torque_rows.numbered(case.motion.n)
+    rows = [f"{direct[k]:.3g} % for {iv_torques[k]:.3g} % at joint {labels[k]}" for k in identification.unexplained]
+    if rows:
+        return [finding("loop-unexplained", rows=rows)]
+    return []
+
+
+def _biased(identification: Instrumental) -> list[Finding]:
+    """Return the finding on a bias of least squares; none if the bias is small or the simulated loop fits poorly."""
+    # standard deviations of a shift that is worth a word (our choice)
+    shift = identification.shift
+    min_shift = 1.0
+    if (
+        not identification.verdict.biased()
+        or not identification.valid
+        or not identification.explains
+        or shift.max() < min_shift
+    ):
+        return []
+    names = [f"{identification.names[k]} by {shift[k]:.2g} σ" for k in np.argsort(-shift)[:5]]
+    return [finding("least-squares-biased", p=identification.verdict.p, names=names)]
+
+
+def _blurred(identification: Instrumental, loops: ClosedLoops) -> list[Finding]:
+    """Return the finding on joints whose Coulomb sign is mainly velocity noise, which instruments cannot correct."""
+    if not identification.estimator.measured:
+        return []
+    # widths of the sign (our choice)
+    noise = sign_noise(identification.plant, loops.pairs[0][0].motion)
+    max_blur = 3.0
+    signs = [term for term in identification.plant.terms if term.shape == "sign"]
+    blurred = {sign.name: noise[sign.acts[0][0]] / sign.settings[-1] for sign in signs}
+    joints = [f"{size:.2g} at {name}" for name, size in blurred.items() if size > max_blur]
+    if joints:
+        return [finding("noisy-signs", joints=joints)]
+    return []
+
+
+# of both together, by which a parameter differs surely (our choice)
+SIGMAS = 5.0
+
+
+def disagreement(problem: IdentificationProblem, estimate: MethodEstimate, test: LoopTest) -> LoopDisagreement | None:
+    """Return the disagreement of an output-error estimate with the recorded torques; None if both agree.
+
+    Args:
+        problem: of both.
+        found: the estimate.
+        test: result of instruments; least squares replaces it if absent.
+    """
+    if not (estimate.found and estimate.alone and isinstance(estimate, LoopEstimate)):
+        return None
+    own_estimate = estimate.estimate
+    instruments = test.found
+    # times the torque that instruments leave unexplained (our choice)
+    max_beside_instruments = 1.2
+    # the same beside least squares, of which it is the least that there is (our choice)
+    max_beside_wls = 2.0
+    if instruments is not None and instruments.valid and len(instruments.names) == len(own_estimate.values):
+        name = instruments.estimator.name
+        iv_estimate = instruments.fit.estimate
+        limit = max_beside_instruments
+        own_errors = instruments.simulated_error(own_estimate.values)
+        beside = instruments.simulated_error(iv_estimate.values)
+    else:
+        plain = WLS.estimate(problem)
+        if not plain.found:
+            return None
+        name = "wls"
+        iv_estimate = plain.estimate
+        limit = max_beside_wls
+        own_errors = problem.pooled.relative_errors(own_estimate.values)
+        beside = problem.pooled.relative_errors(iv_estimate.values)
+    away = np.abs(own_estimate.values - iv_estimate.values) / np.maximum(
+        np.hypot(own_estimate.sigma, iv_estimate.sigma), 1e-300
+    )
+    worst = int(np.argmax(away))
+    if away[worst] < SIGMAS or not np.any(own_errors > limit * beside):
+        return None
+    return LoopDisagreement(
+        estimate.method,
+        name,
+        iv_estimate.names[worst],
+        float(away[worst]),
+        tuple(own_errors.tolist()),
+        tuple(beside.tolist()),
+        _factors(problem, own_estimate.values, iv_estimate.values),
+    )
+
+
+def _factors(problem: IdentificationProblem, estimate: np.ndarray, reference: np.ndarray) -> tuple[float, ...]:
+    """Return for each torque row the ratio (regression slope) of the torques of two estimates."""
+    factors = problem.pooled.factors[:, :, :-1]
+    own_values = factors @ estimate
+    reference_values = factors @ reference
+    return tuple(
+        map(
+            float,
+            np.sum(own_values * reference_values, axis=1) / np.maximum(np.sum(reference_values**2, axis=1), 1e-300),
+        )
+    )
+
+
+def loop_results(problem: IdentificationProblem, estimate: MethodEstimate) -> LoopResults:
+    """Return the results of an estimate's loop test, in the form that is stored and printed."""
+    test = compare_with_loop(problem, estimate)
+    is_estimate = isinstance(estimate, LoopEstimate) and estimate.instrumental is not None
+    return LoopResults(
+        _metrics(test, not is_estimate),
+        tuple(test.findings(is_estimate)),
+        () if test.found is None else _table(test.found),
+        test.loops and test.loops.controller,
+        disagreement(problem, estimate, test),
+    )
+
+
+def _metrics(test: LoopTest, beside: bool) -> LoopMetrics:
+    """Return the metrics of a test by simulation."""
+    identification = test.found
+    loops = test.loops
+    notes = () if loops is None else loops.notes
+    if identification is None or loops is None:
+        return LoopMetrics(test.failure, notes, valid=False, explains=False)
+    identified = loops.identified
+    strength = identification.strength
+    distance = identification.apart
+    if distance.any():
+        notes += (
+            f"with the instruments of unbound parameters alone (Janot's slides) the estimate is at most "
+            f"{distance.max():.2g} σ away, at {identification.names[int(np.argmax(distance))]}",
+        )
+    return LoopMetrics(
+        "",
+        notes,
+        identification.estimator.name,
+        beside,
+        len(identification.rounds),
+        identification.verdict,
+        float(identification.shift.max()),
+        strength.cragg_donald,
+        strength.weak,
+        float(strength.partial_r2.min()),
+        identification.distance,
+        identification.direct,
+        identification.stray,
+        identification.valid,
+        identification.explains,
+        loops.controller,
+        identified and identified.explained,
+    )
+
+
+def _table(identification: Instrumental) -> tuple[tuple[Any, ...], ...]:
+    """Return the rows of both estimates of the standard model, one for each parameter."""
+    estimate = identification.fit.estimate
+    columns = (estimate.values, estimate.sigma, identification.ordinary.estimate.values, identification.shift)
+    explained = 100.0 * identification.strength.partial_r2
+    return tuple(zip(estimate.names, estimate.units, *(column.tolist() for column in (*columns, explained))))

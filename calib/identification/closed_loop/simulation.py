@@ -1,0 +1,412 @@
+"""Simulation of a robot with known parameters in closed loop: drives, friction, controller, encoders, noise.
+
+    (M(q) + Ia) a + c(q, v) + g(q) + Fv v + Fc tanh(v / v0) + off = tau + push,    tau held for one control period,
+
+integrated by the classical Runge-Kutta form at the controller's rate, in more steps where the smoothed sign of Coulomb
+friction is stiff (`kernels`): no chatter at rest, and no other model than the one that is identified. At every instant
+that is recorded the equation holds to rounding for the true q, v, a and the torque.
+
+`tracking_error` says what a model is good for: how far a robot strays from its reference when the model's torques are
+fed forward.
+
+A second judgement beside the computed-torque test, which by itself is "not a direct answer" about tracking (Kolyubin,
+Shiriaev & Jubien 2019, section 7): an error of torque that the feedback swallows costs nothing here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.linalg import solve_banded
+
+from calib.dynamics.bodies import Bodies, upright_turn
+from calib.dynamics.drives import DriveTerm
+from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.rigid_body import mass_matrix
+from calib.errors import CalibError, CannotSimulate, Diverged, NotConverged, require
+from calib.identification.closed_loop.controllers import Reference
+from calib.identification.loop import Controller
+from calib.records import frozen, shaped
+
+Packed = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+# shapes that the kernels hold as matrices; the others are acts
+LINEAR = ("acceleration", "velocity", "one")
+LOWER = "these gains cannot stabilise this robot at this rate; lower kp and kd (check their unit), or the delay"
+
+
+def added_inertia(terms: Iterable[DriveTerm], values: np.ndarray, n: int) -> np.ndarray:
+    """Return the constant inertia (n, n) that acceleration terms add to that of the bodies: diag(Ia) and couplings."""
+    result = np.zeros((n, n))
+    for term, value in zip(terms, values, strict=True):
+        if term.shape == "acceleration":
+            for row, motion in term.acts:
+                for joint, weight in motion:
+                    result[row, joint] += weight * value
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class Plant:
+    """A robot model to simulate.
+
+    Attributes:
+        bodies: rigid bodies of the robot.
+        terms: drive terms of the robot; signs have a smoothing above zero.
+        parameters: (10 B + k,) standard parameters of the bodies, then one value per term. Any values that give a
+            positive definite inertia are valid, also base parameters with zeros for the others.
+    """
+
+    bodies: Bodies
+    terms: tuple[DriveTerm, ...]
+    parameters: np.ndarray
+
+    def __post_init__(self) -> None:
+        size = self.inertial + len(self.terms)
+        object.__setattr__(self, "parameters", frozen(shaped(self.parameters, (size,), "parameters of the plant")))
+        for term in self.terms:
+            if any(x <= 0.0 for name, x in zip(term.form.settings, term.settings) if name in ("v0", "rest")):
+                raise CalibError(
+                    f"term '{term.name}': sign(v) without smoothing cannot be simulated; give v0, about 0.01 rad/s"
+                )
+
+    @property
+    def inertial(self) -> int:
+        """Number of the bodies' parameters, which come first."""
+        return 10 * self.bodies.count
+
+    def with_parameters(self, parameters: np.ndarray) -> Plant:
+        """Return the robot model with other parameters."""
+        return replace(self, parameters=parameters)
+
+    def carrying(self, carried: Collection[str]) -> Plant:
+        """Return the robot model with these payloads alone."""
+        carried_columns = IdentificationModel(self.bodies).carried_columns(carried)
+        return self.with_parameters(self.parameters * np.append(carried_columns, np.ones(len(self.terms))))
+
+    def run(self, controller: Controller, reference: Reference, sensing: Sensing | None = None) -> SimulatedRun:
+        """Return the simulated motion of the robot that follows a reference; see `simulate`."""
+        return simulate(self, controller, reference, sensing)
+
+    def feed_forward(self, reference: Reference) -> np.ndarray:
+        """Return the torques (N, n) along a reference; see `feed_forward`."""
+        return feed_forward(self, reference)
+
+    def inertia(self, q: np.ndarray) -> np.ndarray:
+        """Return the inertia matrices (N, n, n), motor inertia included, at configurations q (N, n)."""
+        rigid, drives = np.split(self.parameters, [self.inertial])
+        matrices = mass_matrix(self.bodies, rigid, np.ascontiguousarray(q, dtype=float))
+        return matrices + added_inertia(self.terms, drives, self.bodies.n)
+
+    def inertia_diagonal(self, q: np.ndarray) -> np.ndarray:
+        """Return the mean diagonal (n,) of the inertia matrix, motor inertia included, over configurations (N, n)."""
+        return np.einsum("kii->i", self.inertia(q)) / len(q)
+
+
+@dataclass(frozen=True, eq=False)
+class Sensing:
+    """Measurement noise, resolution and sampling of controller and log.
+
+    Attributes:
+        sigma_q: (n,) white noise of every measured position [rad or m]; the controller acts on it.
+        q_band: cut-off of the first-order low-pass that colours it, σ kept [Hz]; None: white.
+        quantum: (n,) resolution of the encoders [rad or m]; 0 for none.
+        sigma_tau: (n,) white noise of the recorded torque [N m or N]; it does not act.
+        push: (n,) torque that acts but is not recorded: ripple, cables, all unmodelled effects [N m or N].
+        push_band: cut-off of the first-order low-pass that colours it, σ kept [Hz]; None: white.
+        every: control periods per recorded sample, not necessarily an integer (5 kHz and 140 Hz: 35.7).
+    """
+
+    sigma_q: np.ndarray | float = 0.0
+    quantum: np.ndarray | float = 0.0
+    sigma_tau: np.ndarray | float = 0.0
+    push: np.ndarray | float = 0.0
+    push_band: float | None = None
+    every: float = 1
+    q_band: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedRun:
+    """Result of a simulation at M samples.
+
+    Attributes:
+        t: (M,) sample times [s].
+        q, v, a: (M, n) true motion.
+        measured: (M, n) positions measured by the encoders.
+        tau: (M, n) torques as recorded, with `Sensing.sigma_tau`.
+        torque: (M, n) torques that acted on the joints.
+    """
+
+    t: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    measured: np.ndarray
+    tau: np.ndarray
+    torque: np.ndarray
+
+
+def simulate(
+    plant: Plant,
+    controller: Controller,
+    reference: Reference,
+    sensing: Sensing | None = None,
+    seed: int | np.random.Generator = 0,
+    start: tuple[np.ndarray, np.ndarray] | None = None,
+    push: np.ndarray | None = None,
+) -> SimulatedRun:
+    """Return the simulated motion of a robot that follows a reference.
+
+    Args:
+        reference: sampled at the controller's rate, which is taken from it.
+        seed: of all noise; the same seed gives the same run to the last bit.
+        start: q, v (n,) at the first instant; None: on the reference.
+        push: (N, n) torque that acts besides, at the reference's instants [N m or N]; None for none.
+
+    Raises:
+        CalibError: where the inertia is not positive definite, or friction too stiff for the rate.
+        NotConverged: where the loop is unstable.
+    """
+    from calib.identification.closed_loop import loop_kernels
+
+    sensing = Sensing() if sensing is None else sensing
+    n = plant.bodies.n
+    count = len(reference.t)
+    rng = np.random.default_rng(seed)
+    noise = {name: np.broadcast_to(getattr(sensing, name), (n,)) for name in ("sigma_q", "push", "sigma_tau")}
+    drawn = {name: _draw(rng, size, count) for name, size in noise.items()}
+    if sensing.q_band is not None:
+        drawn["sigma_q"] = _coloured(drawn["sigma_q"], 2.0 * np.pi * sensing.q_band * reference.period)
+    if sensing.push_band is not None:
+        drawn["push"] = _coloured(drawn["push"], 2.0 * np.pi * sensing.push_band * reference.period)
+    if push is not None:
+        push_ = shaped(push, reference.q.shape, "push")
+        drawn["push"] = np.ascontiguousarray(push_ + drawn["push"] if len(drawn["push"]) else push_)
+    q, v = (np.array(x, dtype=float) for x in (start if start is not None else (reference.q[0], reference.v[0])))
+    tick = sample_ticks(count, sensing.every)
+    out = np.empty((5, len(tick), n))
+    if controller.model is None:
+        model = np.empty((0, 0))
+    else:
+        model = body_rows(plant.bodies, controller.model)
+    status, reached = loop_kernels.closed_loop(
+        *packed(plant),
+        model,
+        controller.rows,
+        reference.sampled(controller.ahead),
+        drawn["sigma_q"],
+        np.ascontiguousarray(np.broadcast_to(sensing.quantum, (n,)), dtype=float),
+        drawn["push"],
+        reference.period,
+        controller.smoothing(reference.period),
+        controller.delay,
+        float(sensing.every),
+        q,
+        v,
+        out,
+    )
+    if status != loop_kernels.FINE:
+        raise failure(status, reached * reference.period)
+    heard = 0.0
+    if len(drawn["sigma_tau"]):
+        heard = drawn["sigma_tau"][tick.astype(int)]
+    on_ticks = np.all(tick == tick.astype(int))
+    if on_ticks:
+        t = reference.t[tick.astype(int)]
+    else:
+        t = reference.t[0] + tick * reference.period
+    motion = [frozen(x) for x in out]
+    return SimulatedRun(t, motion[0], motion[1], motion[2], motion[3], frozen(out[4] + heard), motion[4])
+
+
+def sample_ticks(count: int, every: float) -> np.ndarray:
+    """Return the control periods at which samples are recorded during `count` periods, not necessarily integers."""
+    return np.arange(int((count - 1) / every + 1e-9) + 1) * every
+
+
+def forward_dynamics(
+    plant: Plant, q: np.ndarray, v: np.ndarray, tau: np.ndarray, parameters: np.ndarray | None = None
+) -> np.ndarray:
+    """Return the accelerations (N, n) under drive torques (N, n), with friction and motor inertia.
+
+    Friction that depends on the past is taken at rest.
+
+    Args:
+        parameters: (N, p) of each sample; None: the plant's.
+
+    Raises:
+        CalibError: where the inertia is not positive definite.
+    """
+    from calib.identification.closed_loop import loop_kernels
+
+    q, v, tau = (np.ascontiguousarray(shaped(x, (len(q), plant.bodies.n), "states")) for x in (q, v, tau))
+    out = np.empty_like(q)
+    count = len(plant.parameters)
+    if parameters is None:
+        values = np.empty((0, count))
+    else:
+        values = shaped(parameters, (len(q), count), "parameters")
+    layout = layout_of(plant)
+    failed = loop_kernels.forward_dynamics(*packed(plant), *layout, np.ascontiguousarray(values), q, v, tau, out)
+    require(failed < 0, f"sample {failed}: the inertia matrix is not positive definite", CannotSimulate)
+    return out
+
+
+def _draw(rng: np.random.Generator, sigma: np.ndarray, count: int) -> np.ndarray:
+    """Return white noise (count, n), or an empty array if the noise is zero."""
+    if not np.any(sigma):
+        return np.empty((0, len(sigma)))
+    return rng.standard_normal((count, len(sigma))) * sigma
+
+
+def _coloured(white: np.ndarray, step: float) -> np.ndarray:
+    """Return noise x_k = p x_{k-1} + √(1 - p²) w_k, p = exp(-step), with the variance of the white noise w (N, n)."""
+    if not len(white):
+        return white
+    pole = float(np.exp(-step))
+    bands = np.array([[1.0], [-pole]]) * np.ones(len(white))
+    return np.ascontiguousarray(solve_banded((1, 0), bands, np.sqrt(1.0 - pole**2) * white))
+
+
+def layout_of(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the index arrays by which `loop_kernels.set_parameters` writes parameters into the output of `packed`."""
+    n = plant.bodies.n
+    first = plant.inertial
+    order = np.ascontiguousarray(np.broadcast_to(plant.bodies.order, (plant.bodies.count, 10)), dtype=np.int64)
+    entries: list[tuple[int, int, int]] = []
+    shares: list[float] = []
+    owners: list[int] = []
+    for k, term in enumerate(plant.terms):
+        for row, motion in term.acts:
+            if term.shape not in LINEAR:
+                owners.append(first + k)
+                continue
+            motion_entries = motion
+            if term.shape == "one":
+                motion_entries = ((2 * n, 1.0),)
+            start = n if term.shape == "velocity" else 0
+            entries += [(row, start + offset, first + k) for offset, _ in motion_entries]
+            shares += [weight for _, weight in motion_entries]
+    return order, np.array(entries, dtype=np.int64).reshape(-1, 3), np.array(shares), np.array(owners, dtype=np.int64)
+
+
+def packed(plant: Plant) -> Packed:
+    """Return the robot model as arrays in the layout of the kernels: tree, body, linear, kinds and acts."""
+    bodies = plant.bodies.count
+    n = plant.bodies.n
+    parents = np.where(plant.bodies.parents < 0, bodies, plant.bodies.parents)
+    links = np.column_stack([parents, plant.bodies.kinds, plant.bodies.coordinates]).astype(np.int64)
+    linear, acts = _drives(plant.terms, plant.parameters[10 * bodies :], n)
+    kinds = np.array([[row, code] for row, code, *_ in acts], dtype=np.int64).reshape(-1, 2)
+    values = np.array([[amount, *settings, *weights] for _, _, amount, settings, weights in acts])
+    body = body_rows(plant.bodies, plant.parameters[: 10 * bodies])
+    return np.ascontiguousarray(links), body, linear, kinds, values.reshape(-1, 8 + n)
+
+
+def body_rows(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:
+    """Return placements and parameters of bodies, in frames rotated so that each joint moves about or along z."""
+    result = np.zeros((bodies.count + 1, 23))
+    result[-1, :3] = -bodies.gravity
+    turns = [upright_turn(axis)[:3, :3] for axis in bodies.axes]
+    for i, parent in enumerate(bodies.parents):
+        if parent < 0:
+            before = np.eye(3)
+        else:
+            before = turns[parent].T
+        result[i, :9] = (before @ bodies.placements[i, :3, :3] @ turns[i]).ravel()
+        result[i, 9:12] = before @ bodies.placements[i, :3, 3]
+        result[i, 12:22] = parameters[10 * i : 10 * i + 10][bodies.order[i]]
+    result[:-1, 22] = bodies.scales
+    return result
+
+
+def _drives(terms: Sequence[DriveTerm], values: np.ndarray, n: int, ramp: float = 0.1) -> tuple[np.ndarray, list]:
+    """Return the linear terms (n, 2 n + 1), and the friction terms: row, code, amount, seven settings, weights (n,).
+
+    `ramp`: of its dead zone: over so much speed a dead-zone sign is smoothed, since no jump can be integrated.
+    """
+    from calib.dynamics import shape_kernels
+
+    linear = np.zeros((n, 2 * n + 1))
+    acts = []
+    for term, value in zip(terms, values, strict=True):
+        for row, motion in term.acts:
+            if term.shape == "one":
+                linear[row, 2 * n] += value
+                continue
+            weights = np.zeros(n)
+            for joint, weight in motion:
+                weights[joint] += weight
+            if term.shape not in LINEAR:
+                if term.shape == "dead":
+                    settings = [*term.settings, ramp * term.settings[0]]
+                else:
+                    settings = [*term.settings]
+                code = getattr(shape_kernels, term.shape.upper())
+                acts.append((row, code, value, [*settings, *[0.0] * (7 - len(settings))], weights))
+            else:
+                first = 0 if term.shape == "acceleration" else n
+                linear[row, first : first + n] += value * weights
+    return linear, acts
+
+
+def failure(status: int, time: float, where: str | None = None) -> NotConverged:
+    """Return the error for a failure status at `time` [s], or at `where`."""
+    from calib.identification.closed_loop import loop_kernels
+
+    location = f"at {time:.4g} s " if where is None else where
+    if status == loop_kernels.SINGULAR:
+        return CannotSimulate(
+            f"{location}the inertia matrix is not positive definite: these parameters are not physically "
+            "consistent; use a physically consistent estimate, or start from regular inertia"
+        )
+    if status == loop_kernels.STIFF:
+        return CannotSimulate(
+            f"{location}friction at rest is too stiff: integrating a control period takes more than "
+            f"{loop_kernels.MAX_STEPS} steps; "
+            "smooth the sign over a larger velocity, or give the joint its motor inertia"
+        )
+    return Diverged(f"the loop diverged at {time:.4g} s: {LOWER}", None)
+
+
+def feed_forward(believed: Plant, reference: Reference) -> np.ndarray:
+    """Return the torques (N, n) of the controller's robot model along the reference, drives included [N m or N]."""
+    model = IdentificationModel(believed.bodies, believed.terms)
+    # instants at a time
+    block = 4096
+    parts = [slice(k, k + block) for k in range(0, len(reference.t), block)]
+    states = ((reference.q[part], reference.v[part], reference.a[part]) for part in parts)
+    return np.concatenate([model.torque(believed.parameters, *state) for state in states])
+
+
+def tracking_error(
+    robot: Plant,
+    controller: Controller,
+    reference: Reference,
+    ahead: np.ndarray | None = None,
+    push: np.ndarray | None = None,
+) -> np.ndarray:
+    """Return the rms of q - q_r (n,) [rad or m] of a robot without noise, at the controller's instants.
+
+    Args:
+        robot: what moves; on a real arm the best model there is stands for it.
+        ahead: (N, n) feedforward torques, of `feed_forward`; None: those of the controller.
+        push: (N, n) torques that act besides; None for none.
+    """
+    run = simulate(robot, controller if ahead is None else controller.with_feedforward(ahead), reference, push=push)
+    return np.sqrt(np.mean((run.q - reference.q) ** 2, axis=0))
+
+
+def plant_of(model: Any, values: np.ndarray, terms: Sequence[DriveTerm] = ()) -> Any:
+    """Return the robot of a model with its values and those of further terms: of an arm, or the model's own `plant`."""
+    if isinstance(model, IdentificationModel):
+        return Plant(model.bodies, (*model.columns, *terms), values)
+    return model.plant(values, terms)
+
+
+def simulable(model: Any) -> bool:
+    """Return whether a model's motion can be simulated."""
+    return isinstance(model, IdentificationModel) or hasattr(model, "plant")

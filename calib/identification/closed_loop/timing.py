@@ -1,0 +1,234 @@
+"""Time of a reference in its recording, from the stated controller: the shift δ that explains the logged torques best.
+
+    y_j(t) = C_j(q_ref(t - δ) - q(t)) + c_j,    min over δ of Σ_j ‖y_j - C_j - c_j‖² / σ_j²    (our choice)
+
+C is the control law with its gains, delays and feedforward. Gauss and Newton's steps begin where positions match best,
+which is later than the reference by the tracking lag. No model of the robot takes part: friction or masses that are
+not known move nothing, wrong gains do. A reference that follows the measured positions to their last digit is a copy.
+"""
+
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from calib.data.signals.filtering import border, low_pass
+from calib.data.signals.motion import Motion
+from calib.errors import NotConverged, refuse_data
+from calib.estimation.whiteness import inflation
+from calib.identification.closed_loop.controllers import Reference
+from calib.identification.loop import Controller
+from calib.identification.rows import Case
+
+# [s] by which a reference may be off (this and all below: our choice)
+MAX_SHIFT = 0.5
+
+
+@dataclass(frozen=True)
+class ReferenceShift:
+    """Shift of a reference in time.
+
+    Attributes:
+        seconds: by which the reference comes later than stated; sigma: standard deviation [s].
+        left, before: share of the torque that the controller does not explain, with this shift and without; of torques
+            along the reference's own motion.
+        effect: change of the reference's torque by one sigma, as a share of the torque.
+    """
+
+    seconds: float
+    sigma: float
+    left: float
+    before: float
+    effect: float
+
+
+def reference_shift(
+    case: Case, reference: Reference, every: float, controller: Controller, band: float
+) -> ReferenceShift:
+    """Return by how much later than stated the reference of a recording's part without gaps was played.
+
+    Args:
+        case: with motor torques.
+        reference: at the controller's rate, from the part's first sample on; `every`: control periods per sample.
+        controller: that followed it.
+        band: low-pass of torques and positions [Hz].
+
+    Raises:
+        NotConverged: where no shift within `MAX_SHIFT` explains the torques best.
+    """
+    law = _Law(case, reference, every, controller, band)
+    shift = _by_positions(law.asked, law.measured, law.t[law.rows])
+    for _ in range(30):
+        residual, slopes = law.linearised(shift)
+        weighted = slopes / np.maximum(residual.var(axis=0), 1e-300)
+        information = float(np.sum(weighted * slopes))
+        step = float(np.sum(weighted * residual)) / max(information, 1e-300)
+        shift += step
+        if abs(step) < 1e-8:
+            break
+        if abs(shift) > MAX_SHIFT:
+            raise NotConverged(f"{case.name}: no shift of the reference in time explains the torques: check [loop]")
+    tau = np.mean([inflation(column) for column in residual.T])
+    sigma = float(np.sqrt(tau / max(information, 1e-300)))
+    torque = law.torque(law.t, 0)[law.rows]
+    rise = law.torque(law.t, 1)[law.rows]
+    effect = float(sigma * np.sqrt(np.mean(rise.var(axis=0) / np.maximum(torque.var(axis=0), 1e-300))))
+    return ReferenceShift(shift, sigma, *law.left(shift), effect)
+
+
+class _Law:
+    """Control law of a recording as splines in time: reference, measured positions and torques, low-passed."""
+
+    def __init__(self, case: Case, reference: Reference, every: float, controller: Controller, band: float) -> None:
+        rate = case.motion.rate
+        n = case.motion.n
+        self.controller = controller
+        self.t = np.arange(len(case.motion)) / rate
+        ticks = np.arange(len(self.t)) * every
+        parts = (reference.at(ticks)[0], case.motion.q, cast(np.ndarray, motor_torques(case)))
+        self.asked, self.measured, self.torque = (CubicSpline(self.t, low_pass(x, rate, band)) for x in parts)
+        self.ahead = np.zeros((len(self.t), n))
+        if controller.ahead is not None:
+            ahead = CubicSpline(np.arange(len(controller.ahead)), controller.ahead)(ticks)
+            self.ahead = low_pass(ahead, rate, band)
+        edge = border(rate, band)
+        # saturated ones follow no law
+        free = (np.abs(parts[2]) < 0.98 * controller.limit).all(axis=1)
+        is_inside = (np.arange(len(self.t)) >= edge) & (np.arange(len(self.t)) < len(self.t) - edge)
+        self.rows = np.flatnonzero(is_inside & free)
+        self.late = controller.delay * reference.period
+        if controller.cutoff is None:
+            lag = 0.0
+        else:
+            lag = 1.0 / (2 * np.pi * controller.cutoff)
+        # the measured speed is a backward difference
+        self.speed_late = self.late + 0.5 * reference.period + lag
+
+    def linearised(self, shift: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return residual torques (M, n), without their means, and the law's derivative with respect to the shift."""
+        controller = self.controller
+        instants = self.t - self.late
+        reference = [self.asked(np.clip(instants - shift, self.t[0], self.t[-1]), order) for order in range(3)]
+        error = reference[0] - self.measured(instants)
+        speed = controller.share * reference[1] - self.measured(self.t - self.speed_late, 1)
+        sums = np.cumsum(error, axis=0) * (self.t[1] - self.t[0])
+        law = controller.kp * error + controller.kd * speed + controller.ki * sums + self.ahead
+        slopes = -(
+            controller.kp * reference[1]
+            + controller.kd * controller.share * reference[2]
+            + controller.ki * reference[0]
+        )
+        residual = (self.torque(self.t) - law)[self.rows]
+        slopes = slopes[self.rows]
+        return residual - residual.mean(axis=0), slopes - slopes.mean(axis=0)
+
+    def left(self, shift: float) -> tuple[float, float]:
+        """Return the shares of the torques that the law does not explain, with the shift and without.
+
+        Of torques and residuals counts what goes with the reference, shifted or not, and its derivatives, joint by
+        joint: noise of positions, which goes through the law, hides no delay (our choice).
+        """
+        times = [np.clip(self.t[self.rows] - instants_, self.t[0], self.t[-1]) for instants_ in (shift, 0.0)]
+        reference = np.array([self.asked(time, order) for time in times for order in range(3)])
+        reference = (reference - reference.mean(axis=1, keepdims=True)) / np.maximum(
+            reference.std(axis=1, keepdims=True), 1e-300
+        )
+        along = np.linalg.qr(reference.transpose(2, 1, 0))[0].transpose(0, 2, 1)
+        torque, *residuals = (
+            np.sum((along @ x.T[:, :, None]) ** 2, axis=(1, 2))
+            for x in (self.torque(self.t[self.rows]), self.linearised(shift)[0], self.linearised(0.0)[0])
+        )
+        late_share, stated_share = (
+            float(np.sqrt(np.mean(residual / np.maximum(torque, 1e-300)))) for residual in residuals
+        )
+        return late_share, stated_share
+
+
+def _by_positions(reference: CubicSpline, measured: CubicSpline, t: np.ndarray) -> float:
+    """Return the shift [s] of the reference at which it is nearest to the measured positions, at times t (M,)."""
+    shift = 0.0
+    low = float(reference.x[0])
+    high = float(reference.x[-1])
+    for _ in range(30):
+        residual = measured(t) - reference(np.clip(t - shift, low, high))
+        slopes = -reference(np.clip(t - shift, low, high), 1)
+        size = np.maximum(measured(t).var(axis=0), 1e-300)
+        step = float(np.sum(residual * slopes / size) / max(np.sum(slopes**2 / size), 1e-300))
+        shift = float(np.clip(shift + step, -MAX_SHIFT, MAX_SHIFT))
+        if abs(step) < 1e-9:
+            break
+    return shift
+
+
+def motor_torques(case: Case) -> np.ndarray | None:
+    """Return the motors' torques (N, n) of a case [N m or N]; None where its rows or recording do not hold them."""
+    if case.torque_rows.with_motors:
+        return case.target[:, -case.motion.n :]
+    projected = case.torque_rows.projection is not None and case.motion.kind == "torque"
+    if projected:
+        return np.asarray(case.motion.effort)
+    return None
+
+
+def check_no_copy(motion: Motion, reference_: np.ndarray) -> None:
+    """Refuse a reference that is the measured motion itself, perhaps shifted in time, rounded or low-passed.
+
+    Where the motion has died away the positions hold noise alone: a reference that holds it, too, comes from them.
+
+    Args:
+        asked: the reference (N, n), filtered like the measured positions.
+
+    Raises:
+        MeasurementError: naming the shift.
+    """
+    moves = np.ptp(motion.q, axis=0) > 1e-3
+    t = np.arange(len(motion)) / motion.rate
+    # the filters' ends differ
+    edge = 4 * border(motion.rate, float(motion.cutoff.min()))
+    rows = t[edge:-edge]
+    if len(rows) < 10 or not moves.any():
+        return
+    measured = CubicSpline(t, motion.q[:, moves])
+    reference = CubicSpline(t, reference_[:, moves])
+    shift = _by_positions(reference, measured, rows)
+    residual = measured(rows) - reference(np.clip(rows - shift, t[0], t[-1]))
+    # of the positions' noise in the band; no commanded motion has that of the encoders
+    share = 0.01
+    noise = (motion.cutoffs.noise * np.sqrt(2.0 * motion.cutoff / motion.rate))[moves]
+    exact = np.sqrt(np.mean(residual**2, axis=0)) < np.maximum(share * noise, 1e-7 * measured(rows).std(axis=0))
+    shares = _noise_shares(motion, measured(rows), residual, np.flatnonzero(moves))
+    # of the noise's power in the distance from a copy; from a commanded motion it is all (our choice)
+    max_share = 0.1
+    if exact.all() or (len(shares) and np.median(shares) < max_share):
+        note = f", {1e3 * -shift:.4g} ms later" if abs(shift) > 1e-5 else ""
+        refuse_data(
+            motion.file,
+            f"its reference (q_ref) is the measured positions{note}: instruments from it hold the noise that they are "
+            "to avoid. Log what was commanded (UR: target_q, Franka: q_d), or give the folder of the designed motion "
+            "(--excitation)",
+        )
+
+
+def _noise_shares(motion: Motion, measured: np.ndarray, residual: np.ndarray, joints: np.ndarray) -> np.ndarray:
+    """Return the noise's power in `rest` over that in the `measured` positions (N, k), of joints with noise alone.
+
+    In the lowest octave in which the positions' spectrum is at the floor of their noise, below f_q.
+    """
+    # slow to load
+    from scipy.signal import welch
+
+    # windows of 4 s
+    size = min(len(measured), max(64, int(4.0 * motion.rate)))
+    f, power = welch(measured, motion.rate, "hann", size, detrend="linear", axis=0)
+    spectrum = welch(residual, motion.rate, "hann", size, detrend="linear", axis=0)[1]
+    floor = 2.0 * motion.cutoffs.noise[joints] ** 2 / motion.rate
+    # times the floor that are still noise; frequencies that make a spectrum (our choice)
+    above, min_bins = 4.0, 8
+    result = []
+    for column, joint in enumerate(joints):
+        quiet = (power[:, column] < above * floor[column]) & (f > 0.0) & (f < 0.8 * motion.cutoff[joint])
+        octave = quiet & (f <= 2.0 * f[np.argmax(quiet)])
+        if octave.sum() >= min_bins:
+            result.append(spectrum[octave, column].sum() / power[octave, column].sum())
+    return np.array(result)

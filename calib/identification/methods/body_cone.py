@@ -1,0 +1,107 @@
+"""Base parameters of physically consistent bodies: those of standard parameters with pseudo-inertias P_i >= 0.
+
+    { β : β = T χ,  P_i(χ) ⪰ 0,  drives' terms >= 0 }       what the motion does not identify of χ is free
+
+(Sousa & Cortesão 2014, with the pseudo-inertia of Wensing, Kim & Slotine 2018). Where the data want to leave that
+convex cone, the optimum on it is found as a semidefinite program (Clarabel), and the cone is replaced by the
+plane that touches it there, νᵀ β >= νᵀ β*: the same optimum, with one multiplier, and a covariance that takes the plane
+as an equality (our choice; the cone is bent beyond it).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from calib.dynamics import pseudo_inertia
+from calib.dynamics.base import Base
+from calib.dynamics.regressor_model import RegressorModel
+from calib.estimation.cone_program import minimise
+from calib.records import Frozen
+
+
+@dataclass(frozen=True, eq=False)
+class _Plane:
+    """Tangent plane of the cone at an optimum β*: normal ν (p,), bound νᵀ β*, labels of the bodies on the border."""
+
+    normal: np.ndarray
+    bound: float
+    bodies: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class BodyCone(Frozen):
+    """Convex cone of all base parameters that belong to physically consistent bodies and drives.
+
+    Attributes:
+        transform: T (b, P) of the standard parameters, ten by body, then the drives' terms.
+        labels: names of the bodies.
+        positive: (P - 10 B,) which drive terms must not be negative.
+    """
+
+    transform: np.ndarray
+    labels: tuple[str, ...]
+    positive: np.ndarray
+
+    def touching(self, factor: np.ndarray, matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> _Plane | None:
+        """Return the cone's tangent plane at argmin ½ ‖R β - z‖², lower <= A β <= upper; None if the cone is inactive.
+
+        Args:
+            factor: (p + 1, p + 1) triangle [R z; 0 ρ]; base columns first.
+
+        Raises:
+            NotConverged: where no bodies satisfy the bounds.
+        """
+        p = len(factor) - 1
+        count = len(self.labels)
+        base = len(self.transform)
+        unit = np.linalg.norm(factor[:p, :p], axis=0)
+        size = max(1.0, float(np.linalg.norm(factor[:p, p])))
+        # β = size · b / unit
+        R = factor[:p, :p] / unit
+        z = factor[:p, p] / size
+        # [m] of a body of one kilogram, in whose units the program is written
+        unit_length = 0.1
+        root = np.diag([unit_length, unit_length, unit_length, 1.0])
+        # of the unknowns' pseudo-inertia
+        block = pseudo_inertia.to_standard(root @ pseudo_inertia.UNITS @ root).T
+        columns = unit[:base, None] / size * self.transform @ block_diag(*[block] * count, np.eye(len(self.positive)))
+        columns = np.asarray(
+            block_diag(columns, np.eye(p - base))
+        )  # b of bodies and terms, and of columns that are none of theirs
+        bodies = pseudo_inertia.unknown_bodies(count, columns.shape[1] - 10 * count)
+        # of a body in those units: keeps finite what the data do not tell
+        max_trace = 1e4
+        rows = [-np.einsum("irrj->ij", bodies) / max_trace]
+        rows.append(np.eye(columns.shape[1])[10 * count : 10 * count + len(self.positive)][self.positive])
+        low = np.isfinite(lower)
+        high = np.isfinite(upper)
+        sides = np.vstack([matrix[low], -matrix[high]]) / unit * size
+        lengths = np.linalg.norm(sides, axis=1, keepdims=True)
+        edges = np.concatenate([lower[low], -upper[high]]) / lengths[:, 0]
+        sides = sides / lengths
+        offset = np.concatenate([np.repeat([1.0, 0.0], [count, int(self.positive.sum())]), -edges])
+        solution = minimise(R @ columns, z, np.vstack([*rows, sides @ columns]), offset, bodies)
+        b = columns @ solution.values
+        # the gradient's part that the cone balances
+        gradient = (R.T @ (R @ b - z) - sides.T @ solution.rows[len(offset) - len(edges) :])[:base]
+        # of the gradient, from which on the cone holds the optimum
+        min_multiplier = 1e-6
+        if np.abs(gradient).max() < min_multiplier * max(float(np.abs(R.T @ z).max()), 1e-300):
+            return None
+        normal = np.zeros(p)
+        normal[:base] = gradient
+        eigenvalues = np.linalg.eigvalsh(bodies @ solution.values)
+        # of a body's largest moment in those units, below which it counts as on the border
+        max_on_border = 1e-4
+        border = eigenvalues[:, 0] < max_on_border * np.maximum(eigenvalues[:, -1], max_on_border)
+        labels = tuple(label for label, touches in zip(self.labels, border) if touches)
+        return _Plane(normal * unit / size, float(normal @ b), labels)
+
+
+def cone_of(model: RegressorModel, base: Base) -> BodyCone:
+    """Return the cone of consistent base parameters of a model."""
+    labels = tuple(name.removeprefix("XX") for name in model.names[: model.inertial : 10])
+    return BodyCone(
+        np.asarray(base.transform), labels, np.array([column.nonnegative for column in model.columns], dtype=bool)
+    )

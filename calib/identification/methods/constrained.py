@@ -1,0 +1,319 @@
+"""Least squares under bounds, equalities and positive definite matrices, from an R factor of [W y].
+
+min ½ ‖R b - z‖² under A b >= e, E b = d and M_k(b) = Σ_j A_kj b_j ⪰ λ I. With R from `triangles.combine` it is
+constrained least squares, with `instruments.projected` the inner problem of PC-IDIM-IV (Janot's slides on the TX40,
+where the sign of the multipliers' term must be read as minus). Clarabel finds which constraints bind (Goulart & Chen
+2024); on them the optimum is that of Gouriéroux & Monfort, to the last bit. Matrices come in only where the optimum
+without them leaves one indefinite.
+
+Constraints add knowledge, not consistency: where they bind at wrong values the estimate is biased, and they do not cure
+the bias of least squares in a loop.
+"""
+
+from dataclasses import dataclass
+from itertools import count
+
+import numpy as np
+import scipy.linalg
+
+from calib.errors import CalibError, require
+from calib.estimation.cone_program import from_free, minimise
+from calib.estimation.triangles import require_rank
+from calib.records import frozen, shaped
+
+
+@dataclass(frozen=True, eq=False)
+class Definite:
+    """Constraint on matrices M_k(b) = Σ_j A_kj b_j: no eigenvalue below `least`.
+
+    Attributes:
+        matrices: A (K, n, n, p), symmetric.
+        least: above zero.
+        likely: indices of those that bound the optimum of a problem much like this one, to begin with.
+    """
+
+    matrices: np.ndarray
+    least: float
+    likely: np.ndarray | None = None
+
+    def least_eigenvalues(self, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the smallest eigenvalues minus `least` (K,), and their derivatives (K, p) with respect to b (p,)."""
+        size, n, _, p = self.matrices.shape
+        flat = self.matrices.reshape(size, n * n, p)
+        values, vectors = np.linalg.eigh((flat @ b).reshape(size, n, n))
+        pairs = vectors[:, :, None, 0] * vectors[:, None, :, 0]
+        return values[:, 0] - self.least, np.asarray((pairs.reshape(size, 1, n * n) @ flat)[:, 0])
+
+    def satisfied(self, sizes: np.ndarray) -> bool:
+        """Return whether the smallest eigenvalues minus `least` (K,) satisfy the constraint."""
+        # of the least eigenvalue, by which a matrix that did not enter may miss it (our choice)
+        max_violation = 1e-3
+        return bool((sizes >= -max_violation * self.least).all())
+
+
+def contradicting(matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[int, ...]:
+    """Return the indices of rows lower <= A b <= upper that contradict each other; empty if all can be satisfied.
+
+    A linear program over the excess of each row; the rows are those with a multiplier, Farkas' certificate.
+    """
+    from scipy.optimize import linprog
+
+    unit = np.linalg.norm(matrix, axis=0)
+    scaled = matrix / np.where(unit > 0.0, unit, 1.0)
+    low = np.isfinite(lower)
+    high = np.isfinite(upper)
+    rows = np.vstack([-scaled[low], scaled[high]])
+    limit = np.concatenate([-lower[low], upper[high]])
+    size = np.maximum(np.linalg.norm(rows, axis=1), 1e-300)
+    count, p = rows.shape
+    program = linprog(
+        np.concatenate([np.zeros(p), np.ones(count)]),
+        np.hstack([rows / size[:, None], -np.eye(count)]),
+        limit / size,
+        bounds=[(None, None)] * p + [(0.0, None)] * count,
+    )
+    if program.fun <= 1e-9 * max(1.0, float(np.abs(limit / size).max(initial=0.0))):
+        return ()
+    places = np.concatenate([np.flatnonzero(low), np.flatnonzero(high)])
+    return tuple(sorted({int(places[k]) for k in np.flatnonzero(program.ineqlin.marginals < -1e-9)}))
+
+
+def restricted(covariance: np.ndarray, factor: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Return the covariance of an estimate under A b = d, P C Pᵀ with P = I - Q⁻¹Aᵀ (A Q⁻¹ Aᵀ)⁻¹ A, Q = RᵀR.
+
+    C may be any covariance of the free estimate, that of correlated residuals too.
+
+    Args:
+        covariance: C (p, p).
+        factor: (p + 1, p + 1) triangle [R z; 0 ρ] that the estimate minimises.
+        normals: A (k, p), of any rank.
+    """
+    if not len(normals):
+        return covariance
+    p = len(covariance)
+    norms = np.linalg.norm(factor[:p, :p], axis=0)
+    free = null_space(normals / norms)
+    if not free.shape[1]:
+        return np.zeros((p, p))
+    upper = factor[:p, :p] / norms
+    # P
+    shrink = free @ np.linalg.lstsq(upper @ free, upper)[0] * norms / norms[:, None]
+    return np.asarray(shrink @ covariance @ shrink.T)
+
+
+def null_space(rows: np.ndarray) -> np.ndarray:
+    """Return an orthonormal basis (p, p - rank) of the null space of rows; exact zeros for fixed parameters."""
+    size = np.linalg.norm(rows, axis=1)
+    rows = rows[size > 0.0] / size[size > 0.0, None]
+    _, values, right = np.linalg.svd(rows)
+    basis = right[int(np.sum(values > 1e-9)) :].T
+    return np.where(np.abs(basis) < 1e-14, 0.0, basis)
+
+
+@dataclass(frozen=True, eq=False)
+class Constrained:
+    """Optimum under constraints, with multipliers and slack to check it.
+
+    Attributes:
+        values: (p,) b.
+        multipliers: (c,) μ of the constraints, >= 0 but for equalities.
+        slack: (c,) distances to the bounds, and smallest eigenvalues minus their limit.
+        binding: (c,) bool; active constraints, a symptom of a constraint too tight or of a biased estimate.
+        normals: (c, p) slopes of the slack at the optimum; of a matrix that binds <A, Z> / trace Z, Z its multiplier.
+    """
+
+    values: np.ndarray
+    multipliers: np.ndarray
+    slack: np.ndarray
+    binding: np.ndarray
+    normals: np.ndarray
+
+
+def within(
+    factor: np.ndarray, matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray, matrices: Definite | None = None
+) -> Constrained:
+    """Minimise ½ ‖R b - z‖² under lower <= A b <= upper, with equality if both are the same, and definite matrices.
+
+    Infinite bounds are left out. Multipliers, slack, binding and normals come in the order of the finite lower bounds,
+    the finite upper ones, the matrices, the equalities, whose multipliers have either sign.
+
+    Args:
+        factor: (p + 1, p + 1) triangle [R z; 0 ρ], R of full rank.
+        matrix: A (c, p); the identity for bounds on single parameters.
+        lower, upper: (c,), -inf and inf allowed.
+        matrices: that must be positive definite; None: none.
+
+    Raises:
+        CalibError: for crossed bounds, and for equalities that contradict each other or fix all parameters.
+        NotConverged: where inequalities contradict each other, or no point makes the matrices definite.
+    """
+    p = len(factor) - 1
+    matrix = shaped(matrix, (None, p), "constraint matrix A")
+    lower = np.asarray(lower, dtype=float)
+    upper = np.asarray(upper, dtype=float)
+    sound = lower.shape == (len(matrix),) == upper.shape and not np.isnan([lower, upper]).any()
+    require(sound, f"bounds: expected {len(matrix)} lower and upper ones, none of them NaN")
+    if (lower > upper).any():
+        worst = int(np.argmax(lower - upper))
+        raise CalibError(f"bounds: lower {lower[worst]:g} is above upper {upper[worst]:g} in row {worst}")
+    equal = lower == upper
+    low = np.isfinite(lower) & ~equal
+    high = np.isfinite(upper) & ~equal
+    rows = np.vstack([matrix[low], -matrix[high]])
+    edges = np.concatenate([lower[low], -upper[high]])
+    planes = _Planes(factor, rows, edges, matrix[equal], lower[equal])
+    matrices = matrices or Definite(np.zeros((0, 1, 1, p)), 1.0)
+    solution = planes.optimum(np.zeros(len(rows), dtype=bool))
+    if (solution.slack[: len(rows)] < 0.0).any():
+        solution = planes.bounded()
+    sizes, normals = matrices.least_eigenvalues(solution.values)
+    if not matrices.satisfied(sizes):
+        return planes.definite(matrices)
+    return _widened(solution, len(rows), normals, sizes)
+
+
+class _Planes:
+    """Problem with the linear constraints A b >= e and E b = d only, in scaled units.
+
+    Columns of R and rows of A and E of unit norm, ‖z‖ = 1: `upper`, `target`, `scaled` and `edges` in b / `unit`.
+    """
+
+    def __init__(self, factor: np.ndarray, rows: np.ndarray, sides: np.ndarray, equal: np.ndarray, fixed: np.ndarray):
+        p = len(factor) - 1
+        norms = np.linalg.norm(factor[:p, :p], axis=0)
+        self.upper = factor[:p, :p] / np.where(norms > 0.0, norms, 1.0)
+        require_rank(self.upper, [f"x{k + 1}" for k in range(p)])
+        self.length = float(np.linalg.norm(factor[:p, p])) or 1.0
+        self.unit = self.length / norms
+        self.target = factor[:p, p] / self.length
+        self.normals = np.vstack([rows, equal])
+        self.sides = np.concatenate([sides, fixed])
+        self.count = len(rows)
+        sizes = np.linalg.norm(self.normals * self.unit, axis=1)
+        self.sizes = np.where(sizes > 0.0, sizes, 1.0)
+        self.scaled = self.normals * self.unit / self.sizes[:, None]
+        self.edges = self.sides / self.sizes
+        self.factor = factor
+        self.free = scipy.linalg.solve_triangular(factor[:p, :p], factor[:p, p])
+        self._require_solvable()
+
+    def _require_solvable(self, max_contradiction: float = 1e-8) -> None:
+        """Refuse equalities that contradict each other or fix all parameters.
+
+        `max_contradiction`: of an equality, by which the best point may miss it.
+        """
+        scaled = self.scaled[self.count :]
+        edges = self.edges[self.count :]
+        if not len(scaled):
+            return
+        acts = scaled.any(axis=1)
+        require(acts.all(), f"equality {int(np.argmin(acts)) + 1} has only zero coefficients")
+        origin, _, rank, _ = np.linalg.lstsq(scaled, edges, rcond=1e-10)
+        away = np.abs(scaled @ origin - edges) / np.maximum(np.abs(edges), max(float(np.abs(origin).max()), 1e-300))
+        require(away.max() <= max_contradiction, "equalities contradict each other: no point satisfies all of them")
+        require(rank < len(self.free), f"equalities fix all {rank} parameters: nothing remains to be estimated")
+
+    def optimum(self, active: np.ndarray) -> Constrained:
+        """Return the optimum under equalities and active inequalities (c,), the other inequalities ignored."""
+        binding = np.append(active, np.ones(len(self.sides) - self.count, dtype=bool))
+        normals = self.normals[binding]
+        sides = self.sides[binding]
+        values = np.array(self.free)
+        multipliers = np.zeros(len(binding))
+        if len(normals):
+            values = from_free(self.factor, self.free, normals, sides)
+            # bounds on single parameters
+            for row in np.flatnonzero(np.count_nonzero(normals, axis=1) == 1):
+                column = int(np.flatnonzero(normals[row])[0])
+                values[column] = sides[row] / normals[row, column]
+            slope = self.upper.T @ (self.upper @ (values / self.unit) - self.target)
+            multipliers[binding] = np.linalg.lstsq(self.scaled[binding].T, slope)[0]
+        slack = np.where(binding, 0.0, self.normals @ values - self.sides)
+        return _frozen(values, multipliers * self.length**2 / self.sizes, slack, binding, self.normals)
+
+    def bounded(self) -> Constrained:
+        """Return the optimum under the inequalities, exact on the binding ones.
+
+        As the solver has it where that is degenerate: a multiplier would change its sign, or another be violated.
+        """
+        c = self.count
+        p = len(self.free)
+        solution = self.definite(Definite(np.zeros((0, 1, 1, p)), 1.0))
+        exact = self.optimum(solution.binding[:c])
+        away = np.linalg.norm(self.upper @ ((exact.values - solution.values) / self.unit))
+        # of ‖z‖, by which the optimum on the constraints that bind may be off the solver's
+        max_move = 1e-3
+        good = (exact.slack >= 0.0).all() and (exact.multipliers[:c] >= 0.0).all() and away <= max_move
+        return exact if good else solution
+
+    def definite(self, matrices: Definite) -> Constrained:
+        """Return the optimum under inequalities and matrices by cone programs.
+
+        Of many matrices few bind: those most indefinite enter, until all others are definite; what does not bind may
+        go, since the least misfit rises from one set to the next and none comes back (our choice).
+        """
+        c = self.count
+        rows = self.scaled
+        edges = self.edges
+        small = Definite(matrices.matrices * self.unit, matrices.least)
+        if matrices.likely is None:
+            active = np.zeros(0, dtype=int)
+        else:
+            active = matrices.likely
+        # of the scaled problem, multipliers of matrices above which bind
+        min_multiplier = 1e-6
+        # matrices that enter at once, the most indefinite (our choice)
+        max_entering = 8
+        # rounds in which what does not bind may go: rounding could let it come back
+        max_drops = 30
+        for rounds in count():
+            if not len(active):
+                active = np.argsort(small.least_eigenvalues(self.free / self.unit)[0])[:max_entering]
+            goal = self.upper, self.target, rows[:c], -edges[:c]
+            solved = minimise(*goal, small.matrices[active], small.least, rows[c:], edges[c:])
+            b = solved.values
+            mu = solved.rows
+            pushes = solved.matrices
+            rates = solved.equalities
+            sizes, normals = small.least_eigenvalues(b)
+            traces = np.einsum("kii->k", pushes)
+            bind = traces > min_multiplier
+            margins = sizes.copy()
+            margins[active] = 0.0
+            if small.satisfied(margins):
+                break
+            worst = np.argsort(margins)[:max_entering]
+            active = np.union1d(active[bind] if rounds < max_drops else active, worst[margins[worst] < 0.0])
+        held_by = np.einsum("kij,kijp->kp", pushes[bind], small.matrices[active[bind]])
+        normals[active[bind]] = held_by / traces[bind, None]
+        force = np.zeros(len(small.matrices))
+        force[active[bind]] = traces[bind]
+        slack = np.maximum(rows[:c] @ b - edges[:c], 0.0)
+        all_rows = np.vstack([rows[:c], normals, rows[c:]])
+        binding = np.concatenate([mu > slack, force > 0.0, np.ones(len(rates), dtype=bool)])
+        scales = np.concatenate([self.sizes[:c], np.ones(len(force)), self.sizes[c:]])
+        gaps = np.concatenate([slack, np.where(force > 0.0, np.maximum(sizes, 0.0), sizes), np.zeros(len(rates))])
+        return _frozen(
+            b * self.unit,
+            np.concatenate([mu, force, rates]) * self.length**2 / scales,
+            gaps * scales,
+            binding,
+            all_rows * scales[:, None] / self.unit,
+        )
+
+
+def _frozen(*parts: np.ndarray) -> Constrained:
+    values, multipliers, slack, binding, normals = parts
+    return Constrained(frozen(values), frozen(multipliers), frozen(slack), frozen(binding, bool), frozen(normals))
+
+
+def _widened(solution: Constrained, position: int, normals: np.ndarray, slack: np.ndarray) -> Constrained:
+    """Return the optimum with further, inactive inequalities inserted at `place`."""
+    zero = np.zeros(len(slack))
+    return _frozen(
+        solution.values,
+        np.insert(solution.multipliers, position, zero),
+        np.insert(solution.slack, position, slack),
+        np.insert(solution.binding, position, zero > 0.0),
+        np.insert(solution.normals, position, normals, axis=0),
+    )

@@ -1,0 +1,293 @@
+"""Constraints h(β) >= 0 that bend: a function of a user's own, twice differentiable, of parameters by name.
+
+    min ½ ‖R β - z‖²    under    h_i(β) >= 0    and all other constraints
+
+by sequential quadratic programs (Wilson 1963; with slack at a price, so that each has a solution: Fletcher 1985). Each
+takes h by its tangent planes at the last β, Jacobian A, and adds the positive part of -Σ μ_i ∇²h_i to RᵀR, as Janot's
+slides on the TX40 ask for (there AᵀA stands for it). At the optimum the planes replace h: the same optimum, with one
+multiplier each, and a covariance that takes those that bind as equalities (our choice; h bends beyond them). Where h is
+not concave the set is not convex: the optimum is the nearest of its kind, not always the least.
+"""
+
+import ast
+import operator
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from inspect import signature
+from typing import Any
+
+import numpy as np
+
+from calib.config_types import evaluated
+from calib.errors import NotConverged, refuse_option, require
+from calib.estimation.triangles import retriangulate
+from calib.identification.methods.constrained import Constrained
+from calib.identification.methods.constraint_settings import CurvedConstraint
+
+_OPERATIONS = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.Pow: operator.pow,
+}
+_KNOWN = {name: getattr(np, name) for name in ("pi", "sqrt", "exp", "log", "sin", "cos", "tanh")}
+# characters
+MAX_FORMULA = 1000
+
+
+@dataclass(frozen=True, eq=False)
+class Curved:
+    """A constraint h(u) >= 0 on k parameters u = rows β.
+
+    Attributes:
+        name: for users.
+        arguments: names of the parameters.
+        rows: (k, p).
+        h, slope: function of u (k,), and its derivatives (k,).
+        stated: whether the slope is the user's: it is compared with differences of h wherever it is used.
+    """
+
+    name: str
+    arguments: tuple[str, ...]
+    rows: np.ndarray
+    h: Callable[[np.ndarray], float]
+    slope: Callable[[np.ndarray], np.ndarray]
+    stated: bool
+
+    def value(self, b: np.ndarray) -> float:
+        """Return h at b (p,), or NaN where it has no value."""
+        with np.errstate(all="ignore"):
+            try:
+                return float(self.h(self.rows @ b))
+            except ArithmeticError:
+                return float("nan")
+
+    def normal(self, b: np.ndarray) -> np.ndarray:
+        """Return ∂h/∂b (p,).
+
+        Raises:
+            UsageError: where h has no value, or the stated derivative is not that of h.
+        """
+        u = self.rows @ b
+        try:
+            with np.errstate(all="ignore"):
+                slope = self.slope(u)
+        except ArithmeticError:
+            slope = np.full(len(u), np.nan)
+        if not np.isfinite([self.value(b), *slope]).all():
+            self._refuse(f"no finite value or derivative at {self._at(u)}; state it so that it has one there")
+        if self.stated:
+            self._compare(u, slope)
+        return np.asarray(slope @ self.rows)
+
+    def curvature(self, b: np.ndarray) -> np.ndarray:
+        """Return ∂²h/∂b² (p, p), by differences of the slope; zero where it has none."""
+        u = self.rows @ b
+        with np.errstate(all="ignore"):
+            bend = _differences(self.slope, u)
+        return self.rows.T @ (0.5 * np.nan_to_num(bend + bend.T)) @ self.rows
+
+    def _compare(self, u: np.ndarray, slope: np.ndarray) -> None:
+        differences = np.ravel(_differences(lambda x: np.array([self.h(x)]), u))
+        size = _sizes(u)
+        analytic = slope * size
+        numeric = differences * size
+        # of the derivative; of the largest one, what differences lose
+        max_error, max_rounding = 1e-4, 1e-6
+        allowed = max_error * np.maximum(np.abs(analytic), np.abs(numeric)) + max_rounding * np.abs(numeric).max()
+        worst = int(np.argmax(np.abs(analytic - numeric) - allowed))
+        if abs(analytic[worst] - numeric[worst]) > allowed[worst]:
+            self._refuse(
+                f"its derivative by {self.arguments[worst]} is stated as {slope[worst]:.6g}, but differences of h give "
+                f"{differences[worst]:.6g}, at {self._at(u)}; correct 'slope', in the order of h's arguments"
+            )
+
+    def _at(self, u: np.ndarray) -> str:
+        return ", ".join(f"{name} = {x:.4g}" for name, x in zip(self.arguments, u))
+
+    def _refuse(self, message: str) -> None:
+        refuse_option(f"[constraints] curved '{self.name}'", message)
+
+
+def _sizes(u: np.ndarray) -> np.ndarray:
+    """Return the size (k,) of each argument, of at least a thousandth of the largest."""
+    return np.maximum(np.abs(u), max(1e-3 * float(np.abs(u).max()), 1e-9))
+
+
+def _differences(function: Callable[[np.ndarray], np.ndarray], u: np.ndarray) -> np.ndarray:
+    """Return central differences (m, k) of a function of u (k,)."""
+    steps = np.diag(1e-5 * _sizes(u))
+    return np.transpose([(function(u + step) - function(u - step)) / (2.0 * step.sum()) for step in steps])
+
+
+def make_curved(constraint: CurvedConstraint, row: Callable[[Mapping[str, float]], np.ndarray]) -> Curved:
+    """Return a constraint from its formula, or from a Python function and its derivatives.
+
+    Args:
+        row: weights of parameters by name → row (p,) of the columns.
+
+    Raises:
+        UsageError: for a formula of anything but names, numbers, + - * / ** and a few functions.
+    """
+    h = constraint.h
+    if callable(h):
+        names = tuple(signature(h).parameters)
+    else:
+        names = ()
+    name = constraint.name or (f"h({', '.join(names)}) >= 0" if callable(h) else h)
+    location = f"[constraints] curved '{name}'"
+    if callable(h) == (constraint.slope is None):
+        refuse_option(location, "'slope' states the derivatives of a function; a formula has its own")
+    if callable(h) and constraint.slope is not None:
+        function = _called(h, location, 1)
+        slope = _called(constraint.slope, location, len(names))
+        return Curved(name, names, _rows(names, row), lambda u: float(function(u)[0]), slope, True)
+    tree, names = _parsed(str(h), location)
+
+    def value(u: np.ndarray) -> Any:
+        return evaluated(tree, _KNOWN | dict(zip(names, u)), _OPERATIONS)
+
+    # by complex steps, without rounding (Squire & Trapp 1998)
+    def derivatives(u: np.ndarray) -> np.ndarray:
+        step = 1e-30
+        return np.array([np.imag(value(u + 1j * step * direction)) / step for direction in np.eye(len(u))])
+
+    return Curved(name, names, _rows(names, row), value, derivatives, False)
+
+
+def _called(function: Callable[..., Any], location: str, count: int) -> Callable[[np.ndarray], np.ndarray]:
+    def call(u: np.ndarray) -> np.ndarray:
+        values = np.ravel(np.asarray(function(*map(float, u)), dtype=float))
+        if len(values) != count:
+            message = f"returns {len(values)} numbers, expected {count}"
+            refuse_option(location, f"'{getattr(function, '__name__', 'function')}' {message}")
+        return values
+
+    return call
+
+
+def _rows(names: Sequence[str], row: Callable[[Mapping[str, float]], np.ndarray]) -> np.ndarray:
+    return np.array([row({name: 1.0}) for name in names])
+
+
+def _parsed(text: str, location: str) -> tuple[ast.expr, tuple[str, ...]]:
+    """Return the tree of h from a formula ``h``, ``left >= right`` or ``left <= right``, and its names."""
+    try:
+        require(len(text) <= MAX_FORMULA, "too long", ValueError)
+        tree = ast.parse(text.strip(), mode="eval").body
+        identifiers = [node.id for node in ast.walk(tree) if isinstance(node, ast.Name)]
+        names = tuple(dict.fromkeys(name for name in identifiers if name not in _KNOWN))
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        refuse_option(location, f"is not a formula of at most {MAX_FORMULA} characters: 'XX2 * ZZ2 >= XZ2**2'")
+    if isinstance(tree, ast.Compare) and len(tree.ops) == 1 and isinstance(tree.ops[0], (ast.GtE, ast.LtE)):
+        ends = (tree.left, tree.comparators[0])
+        larger, less = ends if isinstance(tree.ops[0], ast.GtE) else ends[::-1]
+        tree = ast.BinOp(larger, ast.Sub(), less)
+    try:
+        with np.errstate(all="ignore"):
+            evaluated(tree, _KNOWN | dict.fromkeys(names, 1.0), _OPERATIONS)
+    except ArithmeticError:
+        pass
+    except ValueError as wrong:
+        allowed = f"parameters' names, numbers, + - * / **, {' '.join(_KNOWN)}, and one >= or <="
+        refuse_option(location, f"expected {allowed}; found '{wrong}'")
+    if not names:
+        refuse_option(location, "names no parameter")
+    return tree, names
+
+
+# quadratic programs; price of a violation in the scaled problem (our choices)
+MAX_ROUNDS, MAX_PRICE = 100, 1e4
+# of ‖z‖: movement, and violation of h, in the scaled problem
+SETTLED = 1e-9
+
+
+def tangents(
+    curved: Sequence[Curved],
+    factor: np.ndarray,
+    start: np.ndarray,
+    solve: Callable[[np.ndarray, np.ndarray, np.ndarray], Constrained],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the tangent planes normals (m, p), bounds (m,) of m curved constraints at the optimum under all.
+
+    Args:
+        factor: (p + 1, p + 1) triangle [R z; 0 ρ].
+        start: (p,) β that satisfies the other constraints.
+        solve: the optimum of a triangle (p + m + 1)², under rows (2 m, p + m) b >= lower (2 m,) and the others.
+
+    Raises:
+        UsageError: for a derivative that is not that of h.
+        NotConverged: where no estimate satisfies them.
+    """
+    p = len(start)
+    m = len(curved)
+    price = 1.0
+    length = float(np.linalg.norm(factor[:p, p])) or 1.0
+    unit = length / np.linalg.norm(factor[:p, :p], axis=0)
+    b = np.asarray(start)
+    multipliers = np.zeros(m)
+    normals = np.array([constraint.normal(b) for constraint in curved])
+    size = np.linalg.norm(normals * unit, axis=1)
+    size = np.where(size > 0.0, size, 1.0)
+    # of the violation's price, below which it is at its least
+    min_gain = 1e-6
+
+    def merit(x: np.ndarray) -> float:
+        residual = (factor[:p, :p] @ x - factor[:p, p]) / length
+        violated = np.maximum(-np.array([constraint.value(x) for constraint in curved]) / size, 0.0)
+        return float(0.5 * residual @ residual + price * violated.sum() + 0.5 * violated @ violated)
+
+    for _ in range(MAX_ROUNDS):
+        normals = np.array([constraint.normal(b) for constraint in curved])
+        heights = np.array([constraint.value(b) for constraint in curved])
+        bend = -np.sum(
+            [mu / length_ * constraint.curvature(b) for mu, length_, constraint in zip(multipliers, size, curved)],
+            axis=0,
+        )
+        planes = np.hstack([normals / size[:, None], np.eye(m)])
+        rows = np.vstack([planes, np.eye(p + m)[p:]])
+        solution = solve(
+            _elastic(factor, b, bend, unit, price * np.full(m, length)),
+            rows,
+            np.append((normals @ b - heights) / size, np.zeros(m)),
+        )
+        multipliers = solution.multipliers[:m]
+        step = solution.values[:p] - b
+        slack = solution.values[p:]
+        satisfied = bool((slack < SETTLED).all())
+        if satisfied and np.linalg.norm(factor[:p, :p] @ step) < SETTLED * length:
+            return normals, normals @ b - heights
+        share = _share(merit, b, step)
+        merit_now = merit(b)
+        b = b + share * step
+        if not satisfied and price >= MAX_PRICE and merit_now - merit(b) < min_gain * merit_now:
+            break
+        if not satisfied:
+            price = min(10.0 * price, MAX_PRICE)
+    heights_text = "; ".join(f"h of '{constraint.name}' = {constraint.value(b):.3g}" for constraint in curved)
+    raise NotConverged(f"the nearest found has {heights_text}", b)
+
+
+def _share(merit: Callable[[np.ndarray], float], b: np.ndarray, step: np.ndarray) -> float:
+    """Return the share of a step, halved until the merit does not rise."""
+    share = 1.0
+    merit_now = merit(b)
+    max_halvings = 30
+    while not merit(b + share * step) <= merit_now + 1e-12 * abs(merit_now) and share > 0.5**max_halvings:
+        share *= 0.5
+    return share
+
+
+def _elastic(factor: np.ndarray, b: np.ndarray, bend: np.ndarray, unit: np.ndarray, price: np.ndarray) -> np.ndarray:
+    """Return the triangle of ½ ‖R x - z‖² + ½ (x - b)ᵀ K₊ (x - b) + Σ price t + ½ ‖length t‖², unknowns x and t."""
+    p = len(b)
+    m = len(price)
+    length = float(np.linalg.norm(factor[:-1, -1])) or 1.0
+    values, vectors = np.linalg.eigh(bend * np.outer(unit, unit))
+    root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T / unit
+    stacked = np.zeros((2 * p + 1 + m, p + m + 1))
+    stacked[: p + 1, :p], stacked[: p + 1, -1] = factor[:, :p], factor[:, p]
+    stacked[p + 1 : 2 * p + 1, :p], stacked[p + 1 : 2 * p + 1, -1] = root, root @ b
+    stacked[2 * p + 1 :, p : p + m], stacked[2 * p + 1 :, -1] = length * np.eye(m), -price
+    return retriangulate(stacked)

@@ -1,0 +1,255 @@
+"""Methods other than ordinary and weighted least squares: robust, total, and under constraints on parameters.
+
+Total least squares: noise in the columns of W as well as in y, some columns exact, each noise with its own size.
+
+Used where measured signals stand on both sides, as the motor currents in the identification of drive gains with a known
+payload (Gautier & Briot 2014): [V -W] [g; χ] = y, y the torque of the payload.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import scipy.linalg
+
+from calib.errors import CalibError, Unidentifiable
+from calib.estimation.estimate import Estimate
+from calib.estimation.linear import LinearFit
+from calib.estimation.triangles import Triangles, combine, condition_numbers, retriangulate
+from calib.identification.methods.least_squares import OLS, WLS, LeastSquares, weighed
+from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
+from calib.identification.methods.parameter_constraints import Constraints, constraints_of, hold
+from calib.identification.methods.samples import SampleFit, Samples, irls, stack
+from calib.records import shaped
+
+
+def tls(
+    data: Triangles, noise: np.ndarray, std: np.ndarray | None = None, inflation: np.ndarray | None = None
+) -> LinearFit:
+    """Estimate x of (W - ΔW) x = y - Δy with the smallest Σ (ΔW_kc / noise_c)² + (Δy_k / noise_y)².
+
+    With exact columns first, [W y] = Q [R11 R12; 0 R22]; the right singular vector of R22 / noise to the smallest
+    singular value gives the noisy components of [x; -1], back substitution the exact ones (Golub, Hoffman & Stewart
+    1987; Van Huffel & Vandewalle 1991, section 3.6). The noise level is σ² = s_min² / (r - p). Covariance (Fuller 1987,
+    theorem 2.3.2, normal noise): V = M⁻¹ σ_vv + r M⁻¹ (Σ_uu σ_vv - Σ_uv Σ_uvᵀ) M⁻¹ with M = WᵀW - r Σ_uu,
+    Σ_uv = -Σ_uu x and σ_vv = σ² (noise_y² + Σ noise_c² x_c²). With correlated rows, the share of V
+    that M's rows W_g bear is taken by what each of them is worth: V + σ_vv M⁻¹ (Σ_g (τ_g - 1) W_gᵀ W_g) M⁻¹.
+
+    Args:
+        data: triangles of W and y.
+        noise: (p + 1,) standard deviation of the noise in each column and in y, in their units, up to one common
+            factor; zero for exact ones.
+        std: (g,) factor by which the noise of each group of rows exceeds `noise`; None: one.
+        inflation: (g,) >= 1, τ, see `linear`; None: every row counts.
+
+    Raises:
+        Unidentifiable: if the noise, not the data, determines the solution.
+    """
+    p = data.parameters
+    count = int(data.rows.sum())
+    noise = shaped(noise, (p + 1,), "noise of the columns and of y")
+    if (noise < 0.0).any() or not noise.any():
+        raise CalibError("noise of the columns and of y: no entry may be negative and at least one must be positive")
+    factor = combine(data, std)
+    direction, singular = _null_direction(factor, noise, count, data.names)
+    if abs(direction[p]) <= 1e-10 * np.abs(direction).max():
+        raise Unidentifiable("no combination of the columns explains y: the columns depend on each other", data.names)
+    values = -direction[:p] / direction[p]
+    if count > p:
+        variance = singular**2 / (count - p)
+    else:
+        variance = np.nan
+    if not np.isfinite(variance):
+        raise Unidentifiable(f"{count} rows for {p} parameters: no residual is left to check them", data.names)
+    prior_rows = np.zeros((0, p))
+    independent = count
+    if inflation is not None:
+        scale = np.sqrt(inflation - 1.0) / (1.0 if std is None else std)
+        prior_rows = (data.factors[:, :, :p] * np.broadcast_to(scale, (data.groups,))[:, None, None]).reshape(-1, p)
+        independent = int(np.sum(data.rows / inflation))
+    covariance = _covariance(factor[:p, :p], noise, values, variance, count, data.names, prior_rows)
+    estimate = Estimate(data.names, data.units, values, covariance, float(np.sqrt(variance)), max(independent - p, 1))
+    group_std = np.sqrt(data.residual_squares(values) / np.maximum(data.rows * (1.0 - p / count), 1e-300))
+    return LinearFit(estimate, group_std, *condition_numbers(factor[:p, :p]))
+
+
+def _null_direction(
+    factor: np.ndarray, noise: np.ndarray, rows: int, names: tuple[str, ...]
+) -> tuple[np.ndarray, float]:
+    """Return v (p + 1,) that minimises ‖[W y] v‖ relative to the noise, and the smallest singular value.
+
+    Singular values of pure noise spread between 1 ± sqrt(columns / rows) (Marchenko & Pastur 1967): when the second
+    smallest is within that band of the smallest, the noise picks the solution.
+    """
+    exact = np.flatnonzero(noise == 0.0)
+    noisy = np.flatnonzero(noise > 0.0)
+    upper = retriangulate(factor[:, np.concatenate([exact, noisy])])
+    k = len(exact)
+    _, values, vt = np.linalg.svd(upper[k:, k:] / noise[noisy])
+    edge = min(np.sqrt(len(noisy) / rows), 0.5)
+    if len(values) > 1 and values[-2] * (1.0 - edge) < values[-1] * (1.0 + edge):
+        raise Unidentifiable(
+            f"the two smallest singular values are {values[-2]:.4g} and {values[-1]:.4g}: some columns contain only "
+            "their stated noise; state less noise, or excite more",
+            [names[c] for c in noisy[noisy < len(names)]],
+            values,
+        )
+    direction = np.zeros(len(noise))
+    direction[noisy] = vt[-1] / noise[noisy]
+    if k:
+        if np.abs(np.diag(upper)[:k]).min() <= 1e-12 * np.abs(upper).max():
+            raise Unidentifiable("the exact columns are dependent", [names[c] for c in exact if c < len(names)])
+        direction[exact] = -scipy.linalg.solve_triangular(upper[:k, :k], upper[:k, k:] @ direction[noisy])
+    return direction, float(values[-1])
+
+
+def _covariance(
+    upper: np.ndarray,
+    noise: np.ndarray,
+    values: np.ndarray,
+    variance: float,
+    rows: int,
+    names: tuple[str, ...],
+    prior_rows: np.ndarray,
+) -> np.ndarray:
+    """Return V (p, p) of `tls`, computed on columns of unit norm; `more` (k, p): rows √(τ - 1) W."""
+    norms = np.linalg.norm(upper, axis=0)
+    scaled = upper / norms
+    column_noise = variance * (noise[:-1] / norms) ** 2
+    x = values * norms
+    gram = scaled.T @ scaled - rows * np.diag(column_noise)
+    eigenvalues = np.linalg.eigvalsh(gram)
+    if eigenvalues[0] <= 0.0:
+        raise Unidentifiable("some columns contain only noise; filter, or excite more", names, eigenvalues)
+    inverse = np.linalg.inv(gram)
+    total = variance * noise[-1] ** 2 + column_noise @ x**2
+    middle = np.diag(column_noise) * total - np.outer(column_noise * x, column_noise * x)
+    extra = (prior_rows / norms) @ inverse
+    return (inverse * total + rows * inverse @ middle @ inverse + total * extra.T @ extra) / np.outer(norms, norms)
+
+
+CONSISTENT, CONSTRAINED = "; parameters satisfy [constraints]", " under constraints on its parameters"
+# of a column's rms: what filtered derivatives miss (our choice)
+COLUMN_NOISE = 0.01
+
+
+def scaled_tls(pooled: Triangles, std: np.ndarray, exact: np.ndarray, inflation: np.ndarray | None = None) -> LinearFit:
+    """Return the scaled TLS fit: noise of moving columns: `COLUMN_NOISE` times their rms; of y: its residuals.
+
+    The common level is the smallest singular value's; the ratio of the noises, which no single recording identifies, is
+    our choice.
+
+    Args:
+        pooled: triangles, one group per torque row.
+        std: (rows,) of the residuals.
+        exact: (p,) bool, columns without noise: ones (offsets) and signs.
+        inflation: (rows,) of the residuals; None: every row counts.
+    """
+    p = pooled.parameters
+    stacked = np.sum((pooled.factors / std[:, None, None]) ** 2, axis=(0, 1))
+    size = np.sqrt(stacked / max(float(pooled.rows.sum()), 1.0))
+    noise = np.append(np.where(exact, 0.0, COLUMN_NOISE * size[:p]), 1.0)
+    return tls(pooled, noise, std, inflation)
+
+
+@dataclass(frozen=True)
+class _ConstrainedLeastSquares(Method):
+    """A method that solves the rows directly, under constraints: physically consistent least squares.
+
+    Weights are those that come from the residuals of the free estimate; only IRLS weighs by those of the constrained
+    one, as there a sample's weight hangs on it.
+
+    Attributes:
+        free: the method without constraints.
+    """
+
+    takes_constraints: bool = field(default=True, kw_only=True)
+    free: LeastSquares
+
+    def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
+        """Return the estimate under the problem's constraints; its covariance treats active constraints as equalities.
+
+        Raises:
+            UsageError: for constraints that contradict each other.
+        """
+        constraints = constraints_of(problem)
+        return attempted(self.name, problem, lambda: self._estimate(problem, constraints))
+
+    def _estimate(self, problem: IdentificationProblem, constraints: Constraints) -> MethodEstimate:
+        std, tau = weighed(problem)
+        pooled = problem.pooled
+        free = self.free.solve(problem, std, tau)
+        if self.free.weighted:
+            weights = std
+        else:
+            weights = np.ones(len(std))
+        factor = combine(pooled, weights)
+        if self.free is IRLS:
+            factor = _reweighted(problem, tau, lambda triangle: constraints.solve(triangle).values).factor
+        fit, binding = hold(free, factor, pooled, weights, constraints, stated_noise=self.free.weighted)
+        return MethodEstimate(self.name, EstimateStatus.FOUND, fit, pooled, std, tau, self.free.weighted, held=binding)
+
+
+def _reweighted(
+    problem: IdentificationProblem, tau: np.ndarray, solve: Callable[[np.ndarray], np.ndarray] | None = None
+) -> SampleFit:
+    """Return the IRLS fit over whole samples, with the variance inflation of the most correlated row."""
+    return irls(samples_of(problem), inflation=float(np.max(tau)), solve=solve)
+
+
+def samples_of(problem: IdentificationProblem) -> Samples:
+    """Return the rows of all recordings, grouped by sample."""
+    rows = problem.rows
+    matrix = np.concatenate([part.matrix * part.weight[:, :, None] for part in rows])
+    target = np.concatenate([part.target * part.weight for part in rows])
+    present = np.concatenate([part.present for part in rows])
+    return stack(matrix, target, present, rows[0].names, rows[0].units)
+
+
+IRLS = LeastSquares(
+    "irls",
+    "torque noise is correlated across joints, outlier samples are rejected; q, v, a are exact",
+    lambda problem, std, tau: _reweighted(problem, tau).fit,
+    description="least squares, weighted across joints, outliers rejected",
+    source="Han, Wu, Liu & Xiong 2020",
+    tunes=("gate of 3 sigma",),
+    version=2,
+)
+TLS = LeastSquares(
+    "tls",
+    f"W has noise of {COLUMN_NOISE:.0%} of each column's rms, each joint's torque that of its "
+    "residuals, both up to a common estimated factor, independently in each row; offsets and signs are exact",
+    lambda problem, std, tau: scaled_tls(problem.pooled, std, problem.exact, tau),
+    description="total least squares with scaled columns",
+    version=2,
+    source="Golub & Van Loan 1980; Van Huffel & Vandewalle 1991",
+    tunes=("ratio of the columns' noise to the torques'",),
+)
+PC_OLS = _ConstrainedLeastSquares(
+    f"pc-{OLS.name}",
+    OLS.assumes + CONSISTENT,
+    OLS,
+    tunes=OLS.tunes,
+    version=OLS.version,
+    description=OLS.name + CONSTRAINED,
+    source="Sousa & Cortesão 2014; Wensing et al. 2018",
+)
+PC_WLS = _ConstrainedLeastSquares(
+    f"pc-{WLS.name}",
+    WLS.assumes + CONSISTENT,
+    WLS,
+    tunes=WLS.tunes,
+    version=WLS.version,
+    description=WLS.name + CONSTRAINED,
+    source="Sousa & Cortesão 2014; Wensing et al. 2018",
+)
+PC_IRLS = _ConstrainedLeastSquares(
+    f"pc-{IRLS.name}",
+    IRLS.assumes + CONSISTENT,
+    IRLS,
+    tunes=IRLS.tunes,
+    version=IRLS.version,
+    description=IRLS.name + CONSTRAINED,
+    source="Sousa & Cortesão 2014; Wensing et al. 2018",
+)
+METHODS = (IRLS, TLS, PC_OLS, PC_WLS, PC_IRLS)

@@ -1,0 +1,376 @@
+"""Constraints on parameters by name, and constrained estimates: the common part of the PC methods.
+
+A row is lower <= aᵀ β <= upper over the columns that are estimated. A standard parameter, or a weighted sum of several,
+is such a row where the torques depend on it alone: cᵀ χ = aᵀ β with c = Tᵀ a, T the regrouping of the base; any other
+has no effect, and a bound on it would say nothing of the estimate (Janot's slides on the TX40). Inertia matrices M(q)
+over random postures are matrix inequalities: λ_min(S M(q; β) S) >= `MIN_EIGENVALUE`, S making the mean diagonal one.
+Bodies that can exist are a cone (`calib.identification.methods.body_cone`), which M(q) > 0 follows from. A user's own
+functions h(β) >= 0 may bend (`calib.identification.methods.curved`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.dynamics import base as bases
+from calib.dynamics.base import Base
+from calib.dynamics.drives import DriveTerm
+from calib.dynamics.regressor_model import RegressorModel
+from calib.errors import Finding, NotConverged, UsageError, finding, refuse_option, require, suggestion
+from calib.estimation.linear import LinearFit
+from calib.estimation.triangles import Triangles
+from calib.identification.methods.body_cone import BodyCone, cone_of
+from calib.identification.methods.constrained import Constrained, Definite, contradicting, restricted, within
+from calib.identification.methods.constraint_settings import Binding, ConstraintSettings, Held
+from calib.identification.methods.curved import Curved, make_curved, tangents
+from calib.identification.methods.method import IdentificationProblem
+from calib.records import Frozen, frozen
+
+# of the smallest eigenvalue of S M(q) S (our choice): what falls below moves at no torque at all
+MIN_EIGENVALUE = 1e-3
+# factor and limit of it where an estimate cannot be simulated (our choice)
+RAISED_BY, MAX_EIGENVALUE = 10**0.5, 0.4
+
+
+@dataclass(frozen=True, eq=False)
+class Constraints(Frozen):
+    """Constraints on p columns.
+
+    Attributes:
+        names: c names of the constraints, for users.
+        matrix, lower, upper: (c, p), (c,), (c,), linear constraints lower <= matrix β <= upper.
+        inertia: (K, n, n, p), M(q_k; β) = inertia[k] β.
+        cone: of physically consistent bodies; None if not requested.
+        plane: name of the row that replaces the cone (`touched`); empty without one.
+        least: lower bound of the smallest eigenvalue of S M(q) S, see `raised`.
+        likely: indices of the postures whose constraint was binding in a similar problem.
+        curved: constraints h(β) >= 0; tangents: names of the rows that replace them (`touched`).
+    """
+
+    names: tuple[str, ...]
+    matrix: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    inertia: np.ndarray
+    cone: BodyCone | None = None
+    plane: str = ""
+    least: float = MIN_EIGENVALUE
+    likely: np.ndarray | None = None
+    curved: tuple[Curved, ...] = ()
+    tangents: tuple[str, ...] = ()
+
+    def solve(self, factor: np.ndarray, free: np.ndarray | None = None) -> Constrained:
+        """Return argmin ½ ‖R β - z‖² under these constraints, see `calib.identification.methods.constrained.within`.
+
+        Args:
+            free: (p,) β without constraints, from which the scale of M(q) is taken; None: that of the factor.
+
+        Raises:
+            NotConverged: with the last β, if no positive definite inertia satisfies the other constraints.
+        """
+        if self.cone is not None or self.curved:
+            return self.touched(factor).solve(factor, free)
+        p = len(factor) - 1
+        if free is None:
+            free = np.linalg.solve(factor[:p, :p], factor[:p, p])
+        postures = f"M(q) positive definite in {len(self.inertia)} postures"
+        with _unsatisfied(f"no estimate satisfies {self} with {postures}: remove bounds, or record other motion"):
+            definite = _definite(self.inertia, free, self.least, self.likely)
+            return within(factor, self.matrix, self.lower, self.upper, definite)
+
+    def __str__(self) -> str:
+        return "; ".join(self.names) or "them"
+
+    def raised(self) -> Constraints | None:
+        """Return these constraints with a three times larger least eigenvalue of M(q); None beyond `MAX_EIGENVALUE`.
+
+        A robot may have a definite inertia, and yet so little in a direction that a sampled controller cannot hold it.
+        """
+        least = self.least * RAISED_BY
+        if len(self.inertia) and least <= MAX_EIGENVALUE:
+            return replace(self, least=least)
+        return None
+
+    def touched(self, factor: np.ndarray) -> Constraints:
+        """Return the constraints with curved ones and the cone of consistent bodies replaced by planes at the optimum.
+
+        Raises:
+            NotConverged: where no estimate, or no physically consistent bodies, satisfy the other constraints.
+        """
+        if self.curved:
+            return self._flattened(factor).touched(factor)
+        if self.cone is None:
+            return self
+        with _unsatisfied(f"no bodies that can exist satisfy {self}: remove bounds"):
+            plane = self.cone.touching(factor, self.matrix, self.lower, self.upper)
+        if plane is None:
+            return replace(self, cone=None)
+        label = f"bodies that can exist ({', '.join(plane.bodies) or 'all'} on the border)"
+        return replace(
+            self,
+            cone=None,
+            plane=label,
+            names=(*self.names, label),
+            matrix=np.vstack([self.matrix, plane.normal]),
+            lower=np.append(self.lower, plane.bound),
+            upper=np.append(self.upper, np.inf),
+        )
+
+    def _flattened(self, factor: np.ndarray) -> Constraints:
+        """Return the constraints with the curved ones replaced by their tangent planes at the optimum."""
+        linear = replace(self, curved=())
+        m = len(self.curved)
+        start = linear.solve(factor).values
+        free = np.append(np.linalg.solve(factor[:-1, :-1], factor[:-1, -1]), np.zeros(m))
+
+        def solve(triangle: np.ndarray, rows: np.ndarray, lower: np.ndarray) -> Constrained:
+            wider = np.pad(self.matrix, ((0, 0), (0, m)))
+            return replace(
+                linear,
+                names=("",) * len(rows) + self.names,
+                matrix=np.vstack([rows, wider]),
+                lower=np.append(lower, self.lower),
+                upper=np.append(np.full(len(lower), np.inf), self.upper),
+                inertia=np.pad(self.inertia, ((0, 0), (0, 0), (0, 0), (0, m))),
+            ).solve(triangle, free)
+
+        names = tuple(constraint.name for constraint in self.curved)
+        with _unsatisfied(f"no estimate satisfies {'; '.join(names)} beside {linear}: remove one of them"):
+            normals, bounds = tangents(self.curved, factor, start, solve)
+        return replace(
+            linear,
+            tangents=names,
+            names=(*self.names, *names),
+            matrix=np.vstack([self.matrix, normals]),
+            lower=np.append(self.lower, bounds),
+            upper=np.append(self.upper, np.full(m, np.inf)),
+        )
+
+
+@contextmanager
+def _unsatisfied(message: str) -> Iterator[None]:
+    """Put `words` in front of the message of a `NotConverged` that is raised inside."""
+    try:
+        yield
+    except NotConverged as error:
+        raise NotConverged(f"[constraints]: {message} ({error})", error.last) from error
+
+
+def make_constraints(
+    settings: ConstraintSettings,
+    model: RegressorModel,
+    base: Base,
+    names: Sequence[str],
+    terms: Sequence[DriveTerm | None],
+) -> Constraints:
+    """Return the constraints on an estimate's columns that the settings request.
+
+    Args:
+        names: (p,) names of the columns: base columns, then richer friction.
+        terms: (p,) drive term of each column; None for parameters of bodies.
+
+    Raises:
+        UsageError: for an unknown name, a bound without effect on the torques, or contradicting bounds.
+    """
+    requests: list[tuple[str, Mapping[str, float], float, float]]
+    requests = [(name, {name: 1.0}, *bounds) for name, bounds in settings.bounds.items()]
+    for number, sum_ in enumerate(settings.sum, 1):
+        location, (low, high) = f"[[constraints.sum]] number {number}", sum_.limits
+        label = sum_.name or " + ".join(f"{weight:g} {name}" for name, weight in sum_.weights.items())
+        twice = sum_.equal is not None and (sum_.least, sum_.most) != (None, None)
+        require(not twice, f"{location}: 'equal' excludes 'least' and 'most'", UsageError)
+        if low > high or not (np.isfinite(low) or np.isfinite(high)):
+            refuse_option(f"{location} ({label})", "expected equal, or least <= most")
+        requests.append((label, sum_.weights, low, high))
+    if settings.signs:
+        signed = [name for name, term in zip(names, terms) if term is not None and term.nonnegative]
+        requests += [(name, {name: 1.0}, 0.0, np.inf) for name in signed if name not in settings.bounds]
+    descriptions = [_words(label, low, high) for label, _, low, high in requests]
+    matrix = np.reshape([_row(weights, base, names) for _, weights, _, _ in requests], (-1, len(names)))
+    low = np.array([sum_[2] for sum_ in requests], dtype=float)
+    high = np.array([sum_[3] for sum_ in requests], dtype=float)
+    if len(matrix):
+        against = contradicting(matrix, low, high)
+    else:
+        against = ()
+    if against:
+        label = "; ".join(descriptions[k] for k in against)
+        refuse_option(
+            "[constraints] contradict each other", f"{label}: no estimate satisfies them together; remove one of them"
+        )
+    cone = None
+    if settings.bodies and model.inertial:
+        cone = cone_of(model, base)
+    inertia = _inertia(settings if cone is None else replace(settings, inertia=0), model, base, len(names))
+    curved = tuple(make_curved(sum_, lambda weights: _row(weights, base, names)) for sum_ in settings.curved)
+    return Constraints(tuple(descriptions), matrix, low, high, inertia, cone, curved=curved)
+
+
+def constraints_of(problem: IdentificationProblem) -> Constraints:
+    """Return the constraints on a problem's columns.
+
+    Raises:
+        UsageError: see `make_constraints`.
+    """
+    names = (*problem.base.names, *problem.rows[0].names[problem.base.b :])
+    settings = problem.constraints or ConstraintSettings()
+    return make_constraints(settings, problem.model, problem.base, names, problem.terms)
+
+
+def hold(
+    fit: LinearFit, factor: np.ndarray, data: Triangles, std: np.ndarray, constraints: Constraints, stated_noise: bool
+) -> tuple[LinearFit, Held]:
+    """Return a constrained fit, whose covariance treats active constraints as equalities, and these constraints.
+
+    Args:
+        fit: the free estimate.
+        factor: (p + 1, p + 1) triangle [R z; 0 ρ] that it minimises.
+        data: triangles of the rows whose residuals give the noise, one group per torque row.
+        std: (g,) of the groups.
+        stated_noise: whether the covariance takes `std` as the noise; otherwise σ² of the residuals, of the constrained
+            estimate.
+    """
+    free = fit.estimate
+    constraints = constraints.touched(factor)
+    solution = constraints.solve(factor)
+    normals = solution.normals[solution.binding]
+    before = data.residual_squares(free.values)
+    after = data.residual_squares(solution.values)
+    if len(normals):
+        dof = free.dof + int(np.linalg.matrix_rank(normals))
+    else:
+        dof = free.dof
+    ratio = float(np.sum(after / std**2) / dof / max(np.sum(before / std**2) / free.dof, 1e-300))
+    covariance = restricted(np.asarray(free.covariance), factor, normals) * (1.0 if stated_noise else ratio)
+    estimate = replace(
+        free, values=solution.values, covariance=covariance, residual_std=free.residual_std * np.sqrt(ratio), dof=dof
+    )
+    group = fit.group_std * np.sqrt(after / np.where(before > 0.0, before, np.inf))
+    held_fit = replace(fit, estimate=estimate, group_std=np.where(before > 0.0, group, fit.group_std))
+    return held_fit, _binding(constraints, solution, fit)
+
+
+def _binding(constraints: Constraints, solution: Constrained, free: LinearFit) -> Held:
+    """Return the binding constraints of a solution, by its multipliers in the order of `within`."""
+    equal = constraints.lower == constraints.upper
+    low = np.flatnonzero(np.isfinite(constraints.lower) & ~equal)
+    high = np.flatnonzero(np.isfinite(constraints.upper) & ~equal)
+    postures = len(constraints.inertia)
+    places = np.concatenate([low, high, np.full(postures, -1), np.flatnonzero(equal)]).astype(int)
+    upper = np.zeros(len(places), bool)
+    upper[len(low) : len(low) + len(high)] = True
+    binding = []
+    for k in np.flatnonzero(solution.binding & (places >= 0)):
+        row = constraints.matrix[places[k]]
+        bound = (constraints.upper if upper[k] else constraints.lower)[places[k]]
+        name = constraints.names[places[k]]
+        origin = 0.0
+        # told as h, by its plane, above zero
+        if name in constraints.tangents:
+            origin = bound
+        binding.append(
+            Binding(
+                name,
+                float(solution.multipliers[k]),
+                float(row @ free.estimate.values - origin),
+                float(np.sqrt(max(row @ free.estimate.covariance @ row, 0.0))),
+                float(bound - origin),
+                bool(equal[places[k]]),
+            )
+        )
+    tight = frozen(np.flatnonzero(solution.binding[places < 0]), int)
+    findings = tuple(_findings(constraints, binding, len(tight)))
+    return Held(constraints.names, tuple(binding), tight, free, solution.normals[solution.binding], findings)
+
+
+def _findings(constraints: Constraints, binding: Sequence[Binding], postures: int) -> Iterator[Finding]:
+    """Yield the findings on binding constraints, and on the `postures` in which M(q) is on its bound."""
+    # standard deviations by which the data speak against an equality that is named (our choice)
+    max_sigmas = 3.0
+    for one in binding:
+        sigmas = abs(one.free - one.bound) / max(one.sigma, 1e-300)
+        if one.name == constraints.plane:
+            yield finding("held-to-bodies", name=one.name, sigmas=sigmas)
+        elif not one.equality or sigmas > max_sigmas:
+            code = "against-equality" if one.equality else "on-its-bound"
+            yield finding(code, name=one.name, free=one.free, sigma=one.sigma)
+    if postures:
+        yield finding("held-definite", postures=postures)
+        if constraints.least > MIN_EIGENVALUE:
+            yield finding("held-from-singular", times=constraints.least / MIN_EIGENVALUE)
+
+
+def _words(name: str, low: float, high: float) -> str:
+    if low == high:
+        return f"{name} = {low:g}"
+    if np.isinf(low):
+        return f"{name} <= {high:g}"
+    if np.isinf(high):
+        return f"{name} >= {low:g}"
+    return f"{low:g} <= {name} <= {high:g}"
+
+
+def _row(weights: Mapping[str, float], base: Base, names: Sequence[str]) -> np.ndarray:
+    """Return the row a (p,) of a weighted sum of columns and standard parameters.
+
+    Raises:
+        UsageError: where the torques do not identify the sum.
+    """
+    row = np.zeros(len(names))
+    standard = np.zeros(len(base.standard))
+    for name, weight in weights.items():
+        if name in names:
+            row[list(names).index(name)] += weight
+        elif name in base.standard:
+            standard[base.standard.index(name)] += weight
+        else:
+            similar = suggestion(name, (*names, *base.standard))
+            message = f"'{name}' is not a parameter of this model{similar}; its parameters: {', '.join(names)}"
+            refuse_option("[constraints]", message)
+    # T of the kept columns is the identity
+    row_ = standard[base.kept]
+    if np.abs(base.transform.T @ row_ - standard).max() > 1e-6 * max(np.abs(standard).max(), 1e-300):
+        refuse_option("[constraints]", _without_effect(weights, base))
+    row[: base.b] += row_
+    require(row.any(), f"[constraints]: the weights of {', '.join(weights)} sum to zero", UsageError)
+    return row
+
+
+def _without_effect(weights: Mapping[str, float], base: Base) -> str:
+    """Return the reason why a sum of standard parameters cannot be constrained."""
+    silent = [name for name in weights if name in base.without_effect]
+    if silent:
+        return f"{', '.join(silent)} has no effect on the torques of this robot: remove the bound"
+    lines = bases.expressions(base)
+    parts = [line for line in lines if any(name in line.replace("=", " ").split() for name in weights)]
+    sums = "; ".join(parts[:4])
+    return f"{', '.join(weights)}: identifiable only in sums with others: {sums}. State the bound for such a sum"
+
+
+def _inertia(settings: ConstraintSettings, model: RegressorModel, base: Base, p: int) -> np.ndarray:
+    """Return the tensor (K, n, n, p) of M(q_k) over random postures, linear in the parameters: M(q_k) = tensor[k] β."""
+    if not settings.inertia or not model.inertial or model.rows != model.n:
+        return np.zeros((0, model.n, model.n, p))
+    q = bases.random_samples(model, settings.inertia).q
+    count, n = q.shape
+    still = np.zeros_like(q)
+    regressor = model.regressor(q, still, still)[:, :, base.kept]
+    tensor = np.zeros((count, n, n, p))
+    for j in range(n):
+        moving = still.copy()
+        moving[:, j] = 1.0
+        tensor[:, :, j, : base.b] = model.regressor(q, still, moving)[:, :, base.kept] - regressor
+    return 0.5 * (tensor + tensor.transpose(0, 2, 1, 3))
+
+
+def _definite(inertia: np.ndarray, free: np.ndarray, least: float, likely: np.ndarray | None) -> Definite | None:
+    """Return the scaled inertia matrices S M(q) S of the postures, S from the diagonals at the free estimate."""
+    if not len(inertia):
+        return None
+    size = np.abs(np.einsum("kiip,p->ki", inertia, free)).mean(axis=0)
+    scale = 1.0 / np.sqrt(np.maximum(size, 1e-6 * size.max()))
+    return Definite(inertia * scale[:, None, None] * scale[None, :, None], least, likely)

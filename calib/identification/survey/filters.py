@@ -1,0 +1,298 @@
+"""The survey's nonlinear Kalman filters on the direct dynamic model, with parameters as states.
+
+    state x = [q, v, χ],   q, v ← one step under the measured torques with parameters χ,   χ ← χ,   seen: q
+
+(Gautier & Poignet 2001; Leboutet et al. 2021, section 6.1). One pass over all recordings; the robot alone is simulated,
+so no controller is asked for. What the survey tunes by hand, the data determine, or it follows from the model (our
+choices):
+
+* noise of q: the level of each log's spectrum, the filtered log thinned to `rate_factor` times its cut-off;
+* process noise: that of the torques, by the residuals of weighted least squares, through ½ T² M⁻¹ and T M⁻¹;
+* parameters have none: they are constants, and a filter that knows its other noise needs none to converge;
+* they start where `simulated_robot.start_of` says, as uncertain as `start_sigmas` standard deviations of least
+  squares, or as far from it as they are: that is next to nothing compared with what a pass adds.
+
+Where innovations are larger than the filter says, the covariance is widened by their mean square.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from calib.errors import CalibError, CannotSimulate, Diverged, require
+from calib.estimation.linear import LinearFit
+from calib.identification.closed_loop.loop_recordings import low_passed
+from calib.identification.closed_loop.simulation import forward_dynamics
+from calib.identification.methods.least_squares import WLS
+from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
+from calib.identification.rows import Case, segments
+from calib.identification.survey.kalman import Belief, Filter, believe, corrected, linearly_predicted, points, predicted
+from calib.identification.survey.simulated_robot import BelievedRobot, Stepper, believed_robot, start_of, stepper
+
+# of a rule's points, where the wider ones are no robots
+NARROWER = (1.0, 0.5, 0.25, 0.1, 0.03)
+
+
+@dataclass(frozen=True)
+class _KalmanFilter(Method):
+    """Identification by a Kalman filter whose states include the parameters.
+
+    Attributes:
+        kind: rule and form.
+    """
+
+    needs_simulation: bool = field(default=True, kw_only=True)
+    takes_start: bool = field(default=True, kw_only=True)
+    auto_friction: str = field(default="standard", kw_only=True)
+    takes_models: bool = field(default=False, kw_only=True)
+    kind: Filter
+
+    def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
+        """Return the parameters after the last sample.
+
+        Raises:
+            UsageError: for a model that is no serial arm with motor torques.
+        """
+        plain = WLS.estimate(problem)
+        if not plain.found:
+            return replace(plain, method=self.name)
+        return attempted(self.name, problem, lambda: self._estimate(problem, plain, believed_robot(problem, self)))
+
+    def _estimate(self, problem: IdentificationProblem, plain: MethodEstimate, robot: BelievedRobot) -> MethodEstimate:
+        values = plain.estimate.values
+        sigma = plain.estimate.sigma
+        start = start_of(problem, values, _inertia(problem), lambda x: _moves(robot, problem, x))
+        # standard deviations of least squares that the parameters are uncertain by at first
+        start_sigmas = 5.0
+        wide = np.maximum(start_sigmas * sigma, np.abs(start - values))
+        # of one sample of the torques
+        noise = plain.std / np.sqrt(np.sum(np.square(problem.decimator.taps)))
+        state = _State(robot, self.kind, start, np.diag(wide**2), [], 0)
+        for case in problem.cases:
+            for first, last in segments(case.motion.segment):
+                state = _pass(state, case, slice(first, last), noise)
+        if state.sizes:
+            innovation = float(np.mean(state.sizes))
+        else:
+            innovation = np.inf
+        # times the stated mean square: innovations of a filter that has lost the robot
+        max_innovation = 30.0
+        if not np.isfinite(innovation) or innovation > max_innovation:
+            raise Diverged(
+                f"{self.name} diverged: its innovations are {np.sqrt(innovation):.3g} times the predicted ones",
+                state.mean,
+            )
+        estimate = replace(
+            plain.estimate, values=state.mean, covariance=max(1.0, innovation) * state.covariance, residual_std=1.0
+        )
+        fit = LinearFit(estimate, plain.std, plain.fit.condition, plain.fit.condition_normalised)
+        return replace(
+            plain,
+            method=self.name,
+            status=EstimateStatus.FOUND,
+            solution=fit,
+            iterations=1,
+            simulations=state.count,
+            beforehand=None,
+            alone=True,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """Parameters and their covariance between recordings, with the sizes of past innovations."""
+
+    robot: BelievedRobot
+    kind: Filter
+    mean: np.ndarray
+    covariance: np.ndarray
+    sizes: list[float]
+    count: int
+
+
+def _inertia(problem: IdentificationProblem) -> np.ndarray:
+    """Return the mean inertia (n,) of each joint, from the regression of torques on accelerations."""
+    n = problem.cases[0].motion.n
+    cross = np.zeros(n)
+    size = np.full(n, 1e-12)
+    for case in problem.cases:
+        a = case.motion.a - case.motion.a.mean(axis=0)
+        tau = case.target - case.target.mean(axis=0)
+        cross += np.sum(a * tau, axis=0)
+        size += np.sum(a**2, axis=0)
+    return np.maximum(cross / size, 0.1 * np.max(np.abs(cross) / size))
+
+
+def _moves(robot: BelievedRobot, problem: IdentificationProblem, values: np.ndarray) -> None:
+    """Compute accelerations along the recordings; raise if the robot cannot be simulated."""
+    for case in problem.cases:
+        part = slice(None, None, max(1, len(case.motion) // 200))
+        q = case.motion.q[part]
+        v = case.motion.v[part]
+        forward_dynamics(robot.at(values, case), q, v, np.zeros_like(q))
+
+
+def _steps(case: Case, part: slice, max_step: float = 2.5e-3) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield each sample q (n,) of a segment, and the mean torques (s, n) of s equal steps since the last sample.
+
+    `max_step`: [s] of a step of the dynamics.
+    """
+    motion = case.motion
+    thin = _thin(case)
+    # as the positions were: the same band on both sides
+    q = motion.q[part]
+    tau = low_passed(case.target[part], motion)
+    cumulated = np.concatenate([np.zeros((1, motion.n)), np.cumsum(0.5 * (tau[1:] + tau[:-1]), axis=0)])
+    steps = max(1, int(np.ceil(thin / (motion.rate * max_step) - 1e-6)))
+    indices = np.arange(len(q), dtype=float)
+    for k in range(thin, len(q), thin):
+        ends = np.linspace(k - thin, k, steps + 1)
+        window = slice(k - thin, k + 1)
+        sums = np.column_stack([np.interp(ends, indices[window], joint_sum) for joint_sum in cumulated[window].T])
+        yield q[k], np.diff(sums, axis=0) * (steps / thin)
+
+
+def _thin(case: Case, rate_factor: float = 4.0) -> int:
+    # rate_factor: times the positions' cut-off: rate of the filter, at least
+    return max(1, int(case.motion.rate / (rate_factor * float(case.motion.cutoff.max()))))
+
+
+def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
+    """Return the state after a segment of a recording."""
+    motion = case.motion
+    thin = _thin(case)
+    n = case.motion.n
+    if part.stop - part.start <= 2 * thin:
+        return before
+    columns = before.robot.columns
+    p = len(before.mean)
+    robot_stepper = stepper(before.robot.at(before.mean, case), columns)
+    carried = before.robot.carried(case)
+    position_noise = np.maximum(motion.cutoffs.noise / np.sqrt(thin), 1e-9 * np.ptp(motion.q, axis=0).max())
+    period = thin / motion.rate
+    torque = noise * np.sqrt(1.0 / thin)
+    moving = np.maximum(motion.velocity_noise(), 1e-3 * np.abs(motion.v).max(axis=0))
+    first = np.concatenate([motion.q[part.start], motion.v[part.start], before.mean])
+    belief = believe(first, np.concatenate([position_noise, moving, np.ones(p)]), before.kind)
+    belief = replace(belief, spread=_joined(belief, before.covariance, 2 * n))
+    full = _Stepping(robot_stepper, before.kind, n, len(before.robot.plant.parameters), columns, carried)
+    sizes = []
+    for q, tau in _steps(case, part):
+        belief = full.step(belief, np.ascontiguousarray(tau), period / len(tau), torque)
+        belief, size = corrected(belief, q, n, position_noise)
+        require(np.isfinite(size), "the filter's estimate is no longer finite", Diverged, belief.mean)
+        sizes.append(size / n)
+    settled = sizes[len(sizes) // 4 :]
+    return replace(
+        before,
+        mean=belief.mean[2 * n :],
+        covariance=belief.covariance[2 * n :, 2 * n :],
+        sizes=[*before.sizes, *settled],
+        count=before.count + 1,
+    )
+
+
+def _joined(belief: Belief, parameters: np.ndarray, first: int) -> np.ndarray:
+    """Return a belief's spread (covariance or root) with its parameter block replaced by that of a covariance."""
+    spread = np.array(belief.spread)
+    if belief.root:
+        spread[first:, first:] = np.linalg.cholesky(parameters)
+    else:
+        spread[first:, first:] = parameters
+    return spread
+
+
+@dataclass(frozen=True, eq=False)
+class _Stepping:
+    """One step of the robot for a filter, with n joints and the plant's parameters, of which `columns` are states."""
+
+    made: Stepper
+    kind: Filter
+    n: int
+    size: int
+    columns: np.ndarray
+    there: np.ndarray
+
+    def step(self, before: Belief, tau: np.ndarray, period: float, torque: np.ndarray) -> Belief:
+        """Return the predicted belief after torques tau (s, n), each held for one period.
+
+        Raises:
+            CannotSimulate: where not even points near the mean are robots.
+        """
+        n = self.n
+        if self.kind.rule == "ekf":
+            mean = np.array(before.mean)
+            values = self._values(before.mean[None])[0]
+            slopes = np.eye(len(mean))
+            gain = np.eye(n)
+            for torques in tau:
+                outcome = self.made.linearised(values, mean[:n], mean[n : 2 * n], torques, period, len(self.columns))
+                mean[:n], mean[n : 2 * n], gain, part = outcome
+                part[:, 2 * n :] *= self.there
+                slopes[: 2 * n] = part[:, : 2 * n] @ slopes[: 2 * n]
+                slopes[: 2 * n, 2 * n :] += part[:, 2 * n :]
+            noise = self._noise(gain, len(tau) * period, torque, len(mean))
+            return linearly_predicted(before, mean, slopes, noise, self.kind)
+        failure: CalibError | None = None
+        for narrower in NARROWER:
+            spread = points(before, self.kind, narrower)
+            values = self._values(spread)
+            q = spread[:, :n]
+            v = spread[:, n : 2 * n]
+            gain = np.eye(n)
+            try:
+                for torques in tau:
+                    q, v, gain = self.made.points(values, q, v, torques, period)
+            except CalibError as error:
+                failure = error
+                continue
+            spread[:, :n], spread[:, n : 2 * n] = q, v
+            noise = self._noise(gain, len(tau) * period, torque, spread.shape[1])
+            return predicted(spread, noise, self.kind, narrower)
+        raise CannotSimulate(f"a robot with the filter's parameters cannot be simulated: {failure}", before.mean)
+
+    def _values(self, states: np.ndarray) -> np.ndarray:
+        """Return the plant's parameters (K, p) of states (K, L)."""
+        result = np.zeros((len(states), self.size))
+        result[:, self.columns] = states[:, 2 * self.n :] * self.there
+        return result
+
+    def _noise(self, gain: np.ndarray, period: float, torque: np.ndarray, size: int) -> np.ndarray:
+        """Return the effect N (L, n) of torque noise on the state in one step."""
+        result = np.zeros((size, self.n))
+        result[: self.n] = 0.5 * period**2 * gain * torque
+        result[self.n : 2 * self.n] = period * gain * torque
+        return result
+
+
+_ASSUMES = (
+    "torque noise as in the residuals of least squares, position noise as in the spectrum, both white; "
+    "the robot has the model's friction"
+)
+EKF, SREKF, UKF, SRUKF, CDKF, SRCDKF = (
+    _KalmanFilter(
+        ("sr" if root else "") + rule,
+        _ASSUMES,
+        Filter(rule, bool(root)),
+        source=source,
+        description="the same, square-root form" if root else description,
+        tunes=("initial covariance of the parameters", "rate of the filter", *(["α = 0.1"] if rule == "ukf" else [])),
+    )
+    for rule, description, *sources in (
+        (
+            "ekf",
+            "extended Kalman filter, parameters as states",
+            "Gautier & Poignet 2001",
+            "Kaminski, Bryson & Schmidt 1971",
+        ),
+        ("ukf", "unscented Kalman filter, parameters as states", "Julier & Uhlmann 2004", "van der Merwe & Wan 2001"),
+        (
+            "cdkf",
+            "central-difference Kalman filter, parameters as states",
+            "Nørgaard, Poulsen & Ravn 2000",
+            "van der Merwe & Wan 2001",
+        ),
+    )
+    for root, source in enumerate(sources)
+)

@@ -1,0 +1,154 @@
+"""Nonlinear Kalman filters with a linear measurement: three rules, each with the covariance or its square root.
+
+A rule says what a nonlinear step makes of a mean m and deviations S, S Sᵀ = P:
+
+    ekf     m⁺ = f(m),                D = F S,  F = ∂f/∂x  (Schmidt 1966)
+    ukf     m⁺ = Σ w_i f(m ± γ S_i),  D = √w_i (f_i - m⁺), and w_0^c for the middle one  (Julier & Uhlmann 2004)
+    cdkf    m⁺ = the same, γ = h = √3, D = [(f_i⁺ - f_i⁻) / 2h, √(h² - 1) (f_i⁺ + f_i⁻ - 2 f_0) / 2h²]
+                                      (Nørgaard, Poulsen & Ravn 2000)
+
+and then P⁺ = D Dᵀ + N Nᵀ, which a covariance filter adds up, while a square-root filter has the triangle of [D N] by QR
+(van der Merwe & Wan 2001). The measurement y = H x + e is linear, so its update is exact in all: Joseph's form, or one
+QR of the array [R^½ HS; 0 S] (Kaminski, Bryson & Schmidt 1971).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from calib.errors import Diverged
+
+# spread of the unscented points, and what is known of the distribution (Gaussian)
+ALPHA, BETA = 0.1, 2.0
+# h of central differences, for Gaussian kurtosis
+STEP = np.sqrt(3.0)
+
+
+@dataclass(frozen=True)
+class Filter:
+    """Type of a filter: rule and form of the covariance.
+
+    Attributes:
+        rule: ``ekf``, ``ukf`` or ``cdkf``.
+        root: whether the covariance's root is kept, and not the covariance.
+    """
+
+    rule: str
+    root: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """Mean and covariance of a state.
+
+    Attributes:
+        mean: (L,).
+        spread: (L, L) covariance, or its lower triangular root S.
+        root: which of them.
+    """
+
+    mean: np.ndarray
+    spread: np.ndarray
+    root: bool
+
+    @property
+    def covariance(self) -> np.ndarray:
+        if self.root:
+            return self.spread @ self.spread.T
+        return self.spread
+
+    @property
+    def deviations(self) -> np.ndarray:
+        """Lower triangular root S (L, L) of the covariance.
+
+        Raises:
+            Diverged: where the covariance is no longer positive definite.
+        """
+        if self.root:
+            return self.spread
+        try:
+            return np.linalg.cholesky(self.spread)
+        except np.linalg.LinAlgError as error:
+            raise Diverged("the filter's covariance is no longer positive definite", self.mean) from error
+
+
+def believe(mean: np.ndarray, sigma: np.ndarray, kind: Filter) -> Belief:
+    """Return the belief with a mean (L,) and independent components of standard deviation sigma (L,)."""
+    return Belief(np.array(mean, dtype=float), np.diag(sigma if kind.root else sigma**2), kind.root)
+
+
+def points(before: Belief, kind: Filter, narrower: float = 1.0) -> np.ndarray:
+    """Return the sigma points (2 L + 1, L) of a belief, the mean first; `narrower` scales their distance."""
+    deviations = before.deviations
+    gamma = narrower * _gamma(kind, len(before.mean))
+    return np.concatenate([before.mean[None], before.mean + gamma * deviations.T, before.mean - gamma * deviations.T])
+
+
+def predicted(images: np.ndarray, noise: np.ndarray, kind: Filter, narrower: float = 1.0) -> Belief:
+    """Return the predicted belief from the propagated `points` (2 L + 1, L) and noise N (L, k)."""
+    size = images.shape[1]
+    gamma = narrower * _gamma(kind, size)
+    middle = images[0]
+    ahead = images[1 : size + 1] - images[0]
+    behind = images[size + 1 :] - images[0]
+    share = 0.5 / gamma**2
+    shift = share * (ahead + behind).sum(axis=0)
+    if kind.rule == "cdkf":
+        second = np.sqrt(max(gamma**2 - 1.0, 0.0)) * share * (ahead + behind)
+        return _packed(middle + shift, np.vstack([0.5 / gamma * (ahead - behind), second]).T, noise, kind, 0.0, shift)
+    outer = np.sqrt(share) * np.vstack([ahead, behind])
+    # Σ w (f - m⁺)(f - m⁺)ᵀ about f_0: with Σ w_i = 1 and w_0^c = w_0 + 1 - α² + β, β - α² is left of the middle ones
+    return _packed(middle + shift, outer.T, noise, kind, BETA - (narrower * ALPHA) ** 2, shift)
+
+
+def linearly_predicted(before: Belief, mean: np.ndarray, slopes: np.ndarray, noise: np.ndarray, kind: Filter) -> Belief:
+    """Return the predicted belief at `mean` (L,), from the Jacobian F (L, L) of the step and noise N (L, k)."""
+    if kind.root:
+        return _packed(mean, slopes @ before.spread, noise, kind, 0.0, mean)
+    return Belief(mean, slopes @ before.spread @ slopes.T + noise @ noise.T, False)
+
+
+def corrected(before: Belief, measured: np.ndarray, rows: int, std: np.ndarray) -> tuple[Belief, float]:
+    """Return the belief corrected by a measurement of its first `rows` components, and the innovation's size.
+
+    The size is eᵀ (H P Hᵀ + R)⁻¹ e, on average `rows` where the filter knows its noise.
+    """
+    innovation = measured - before.mean[:rows]
+    size = len(before.mean)
+    if before.root:
+        array = np.zeros((rows + size, rows + size))
+        array[:rows, :rows] = np.diag(std)
+        array[:rows, rows:] = before.spread[:rows]
+        array[rows:, rows:] = before.spread
+        lower = _triangle(array)
+        white = scipy.linalg.solve_triangular(lower[:rows, :rows], innovation, lower=True)
+        after = Belief(before.mean + lower[rows:, :rows] @ white, lower[rows:, rows:], True)
+        return after, float(white @ white)
+    cross = before.spread[:, :rows]
+    innovation_covariance = cross[:rows] + np.diag(std**2)
+    gain = np.linalg.solve(innovation_covariance, cross.T).T
+    remainder = np.eye(size)
+    remainder[:, :rows] -= gain
+    spread = remainder @ before.spread @ remainder.T + (gain * std**2) @ gain.T
+    after = Belief(before.mean + gain @ innovation, 0.5 * (spread + spread.T), False)
+    return after, float(innovation @ np.linalg.solve(innovation_covariance, innovation))
+
+
+def _gamma(kind: Filter, size: int) -> float:
+    return float(STEP if kind.rule == "cdkf" else ALPHA * np.sqrt(size))
+
+
+def _packed(
+    mean: np.ndarray, deviations: np.ndarray, noise: np.ndarray, kind: Filter, weight: float, extra: np.ndarray
+) -> Belief:
+    """Return the belief with P = D Dᵀ + N Nᵀ + weight · extra extraᵀ."""
+    wide = np.hstack([deviations, noise, np.sqrt(weight) * extra[:, None]])
+    if kind.root:
+        return Belief(mean, _triangle(wide), True)
+    return Belief(mean, wide @ wide.T, False)
+
+
+def _triangle(wide: np.ndarray) -> np.ndarray:
+    """Return the lower triangular matrix L with L Lᵀ = A Aᵀ, from A (L, k) by QR."""
+    return np.asarray(scipy.linalg.qr(wide.T, mode="r", check_finite=False, overwrite_a=True)[0])[: len(wide)].T

@@ -1,0 +1,294 @@
+"""Maximum likelihood with noisy positions: errors in variables, each sample weighted by its propagated noise.
+
+What a sample leaves, r_k = y_k - W(x_k) β with x = (q, v, a) as measured, has to first order the covariance
+
+    S_k(β) = Σ_τ + B_k G B_kᵀ,    B_k = ∂(W β)/∂x at sample k,
+
+G the covariance of the filtered q, v, a of a joint, from the level σ_q of its white noise and the impulse responses of
+low-pass, differences and decimation. The true states are nuisance parameters; with them concentrated out, minus twice
+the logarithm of the likelihood is Σ_k r_kᵀ S_k(β)⁻¹ r_k, whose slope by β vanishes where
+
+    Σ_k W(x̂_k)ᵀ S_k⁻¹ (y_k - W(x_k) β) = 0,    x̂_k = x_k + G B_kᵀ S_k⁻¹ r_k    (Fuller 1987, section 3.2)
+
+with x̂ the states as the fit corrects them: weighted least squares puts W(x_k) there and shrinks what is noisy.
+(Leboutet et al. 2021, section 4.2, after Olsen, Swevers & Verdonck 2002, who are given the noise; here σ_q is read from
+each log's spectrum and Σ_τ is what makes Σ S_k⁻¹ r_k r_kᵀ S_k⁻¹ = Σ S_k⁻¹ on its diagonal, which is its own likelihood
+equation.)
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.data.signals.filtering import Decimator, curvature, kept, low_pass, slope
+from calib.data.signals.motion import Motion
+from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.torque_rows import TorqueRows
+from calib.errors import Diverged, NotConverged
+from calib.estimation.linear import LinearFit, wls
+from calib.estimation.triangles import condition_numbers
+from calib.identification.methods.estimators import samples_of
+from calib.identification.methods.least_squares import weighed
+from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
+from calib.identification.prior import residual_inflation
+from calib.identification.survey.score_covariance import scatter
+from calib.identification.survey.simulated_robot import serial_arm, with_friction
+
+# samples at a time
+BLOCK = 1000
+
+
+@dataclass(frozen=True)
+class _MaximumLikelihood(Method):
+    """Identification by maximum likelihood with errors in variables."""
+
+    def takes(self, rows: TorqueRows) -> bool:
+        """Return whether it estimates from these torque rows: from those of the motors alone."""
+        return rows.motors_alone
+
+    def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
+        """Return the estimate of the problem's columns, with the torque noise as weights.
+
+        Raises:
+            UsageError: for a model whose rows have no slopes by q, v and a.
+        """
+        model = serial_arm(problem, self)
+        return attempted(self.name, problem, lambda: self._estimate(problem, model))
+
+    def _estimate(self, problem: IdentificationProblem, model: IdentificationModel) -> MethodEstimate:
+        std, _ = weighed(problem)
+        task = noisy_states(problem, model)
+        values = wls(problem.pooled, std).estimate.values
+        noise = std**2
+        steps: list[float] = []
+        # of the residuals' standard deviation: torques are not free of noise
+        min_noise = 1e-4
+        max_steps = 40
+        # standard deviations of the estimate
+        tolerance = 0.01
+        for count in range(1, max_steps + 1):
+            noise = _torque_noise(task, values, noise, (min_noise * std) ** 2)
+            round_ = _step(task, values, noise)
+            steps.append(float(np.max(np.abs(round_.values - values) / round_.sigma)))
+            values = round_.values
+            if not np.all(np.isfinite(values)) or (count > 5 and steps[-1] > 10.0 * steps[0]):
+                raise Diverged("maximum likelihood diverged: too much position noise for a linear model", values)
+            if steps[-1] < tolerance:
+                break
+        else:
+            raise NotConverged(
+                f"maximum likelihood still changes by {steps[-1]:.2g} standard deviations after {max_steps} rounds",
+                values,
+            )
+        return MethodEstimate(
+            self.name,
+            EstimateStatus.FOUND,
+            _packed(problem, round_, noise),
+            problem.pooled,
+            np.sqrt(noise),
+            residual_inflation(problem.rows, values),
+            iterations=count,
+            alone=True,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Recording:
+    """States of one recording at the kept samples, with their noise.
+
+    Attributes:
+        own: its samples among all.
+        q, v, a: (M, n) states at the kept samples, not filtered by the decimation.
+        noise: (n, 3, 3) G of each joint.
+        present: (p,) one for columns of bodies on board.
+    """
+
+    own: slice
+    q: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    noise: np.ndarray
+    carried: tuple[str, ...]
+    present: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class NoisyStates:
+    """All samples: matrix (M, n, p), target and rows in use (M, n), recordings, and differentiable columns."""
+
+    model: IdentificationModel
+    columns: np.ndarray
+    smooth: np.ndarray
+    matrix: np.ndarray
+    target: np.ndarray
+    present: np.ndarray
+    parts: tuple[_Recording, ...]
+
+
+def noisy_states(problem: IdentificationProblem, model: IdentificationModel) -> NoisyStates:
+    """Return all samples of a problem, with the covariance of the noise in q, v and a."""
+    samples, (model, columns) = samples_of(problem), with_friction(problem, model)
+    smooth = np.array([term is None or term.form.slopes for term in problem.terms], dtype=bool)
+    parts = []
+    first = 0
+    for case in problem.cases:
+        motion = case.motion
+        index = kept(motion.segment, problem.decimator)
+        carried = np.append(model.carried_columns(case.carried), np.ones(model.p - model.inertial))
+        noise = noise_of_states(motion, problem.decimator)
+        part = slice(first, first + len(index))
+        q = motion.q[index]
+        v = motion.v[index]
+        a = motion.a[index]
+        parts.append(_Recording(part, q, v, a, noise, case.carried, carried[columns]))
+        first += len(index)
+    return NoisyStates(model, columns, smooth, samples.matrix, samples.target, samples.present, tuple(parts))
+
+
+def noise_of_states(motion: Motion, decimator: Decimator) -> np.ndarray:
+    """Return the covariance (n, 3, 3) of q, v, a of each joint, propagated from white position noise.
+
+    From the impulse response of low-pass, differences and decimation; the noise's level is that of the log's spectrum.
+    """
+    result = np.empty((motion.n, 3, 3))
+    cutoffs = np.stack([motion.cutoff, motion.velocity_cutoff], axis=1)
+    for cutoff, faster in np.unique(cutoffs, axis=0):
+        reach = int(np.ceil(6.0 * motion.rate / cutoff)) + decimator.reach + 16
+        impulse = np.zeros(2 * reach + 1)
+        impulse[reach] = 1.0
+        q = low_pass(impulse, motion.rate, float(cutoff))
+        less = low_pass(impulse, motion.rate, float(faster))
+        states = np.stack([q, slope(less, motion.rate), curvature(q, motion.rate)])
+        response = np.array([np.convolve(state, decimator.taps) for state in np.nan_to_num(states)])
+        result[np.all(cutoffs == (cutoff, faster), axis=1)] = response @ response.T
+    return result * (motion.cutoffs.noise**2)[:, None, None]
+
+
+def _slopes(task: NoisyStates, part: _Recording, values: np.ndarray) -> np.ndarray:
+    """Return B (M, n, 3, n), the Jacobian of W β with respect to q, v and a of each joint."""
+    differentiable = task.smooth & (part.present > 0.0)
+    order = np.argsort(task.columns[differentiable])
+    columns = task.columns[differentiable][order]
+    column_values = values[differentiable][order]
+    n = task.model.n
+    out = np.empty((len(part.q), n, 3, n))
+    for start in range(0, len(part.q), BLOCK):
+        block = slice(start, start + BLOCK)
+        q = np.ascontiguousarray(part.q[block])
+        v = np.ascontiguousarray(part.v[block])
+        a = np.ascontiguousarray(part.a[block])
+        for row in range(n):
+            weights = np.zeros((len(q), n, len(columns)))
+            weights[:, row] = column_values
+            gradient = task.model.regressor_gradient(q, v, a, weights, columns)
+            out[block, row] = np.stack(gradient, axis=1)
+    return out
+
+
+def _residuals(task: NoisyStates, part: _Recording, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the residuals r (M, n), and G Bᵀ (M, 3, n, n) and B G Bᵀ (M, n, n), of a recording."""
+    by_state = _slopes(task, part, values)
+    spread = np.einsum("kxj,mrxj->mkjr", part.noise.transpose(1, 2, 0), by_state)
+    residual = np.where(task.present[part.own], task.target[part.own] - task.matrix[part.own] @ values, 0.0)
+    return residual, spread, np.einsum("mrkj,mkjs->mrs", by_state, spread)
+
+
+def _inverse(position_part: np.ndarray, noise: np.ndarray, in_use: np.ndarray) -> np.ndarray:
+    """Return the inverse (M, n, n) of S = Σ_τ + other for the rows in use (M, n); zero for other rows."""
+    pairs = in_use[:, :, None] & in_use[:, None, :]
+    return np.where(pairs, np.linalg.inv(np.where(pairs, position_part + np.diag(noise), np.eye(len(noise)))), 0.0)
+
+
+def _torque_noise(task: NoisyStates, values: np.ndarray, noise: np.ndarray, minimum: np.ndarray) -> np.ndarray:
+    """Return the maximum likelihood torque noise Σ_τ (n,) for fixed parameters and position noise."""
+    parts = [_residuals(task, part, values) for part in task.parts]
+    residual, position_part = (np.concatenate(x) for x in zip(*((r, position_share) for r, _, position_share in parts)))
+    # of the residuals, after the fit
+    share = max(1.0 - len(values) / task.present.sum(), 0.1)
+    observed = task.present.any(axis=0)
+    for _ in range(50):
+        inverse = _inverse(position_part, noise, task.present)
+        score = np.sum(np.einsum("mij,mj->mi", inverse, residual) ** 2, axis=0) / share
+        ratio = np.clip(score / np.maximum(np.einsum("mii->i", inverse), 1e-300), 0.1, 10.0)
+        before = noise
+        noise = np.where(observed, np.maximum(noise * ratio, minimum), noise)
+        if np.max(np.abs(noise / before - 1.0)) < 1e-3:
+            break
+    return noise
+
+
+@dataclass(frozen=True, eq=False)
+class _Round:
+    """One round: parameters (p,), (Σ W(x̂)ᵀ S⁻¹ W)⁻¹, and S^(-½) times W(x̂) (M, n, p) and r (M, n) of each recording."""
+
+    values: np.ndarray
+    bread: np.ndarray
+    white: tuple[np.ndarray, ...]
+    residual: tuple[np.ndarray, ...]
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """Standard deviations (p,) for white residuals."""
+        return np.sqrt(sum(np.sum((white @ self.bread.T) ** 2, axis=(0, 1)) for white in self.white))
+
+
+def _step(task: NoisyStates, values: np.ndarray, noise: np.ndarray) -> _Round:
+    """Return the next round of the iteration, from parameters (p,) and torque noise (n,)."""
+    p = len(values)
+    cross = np.zeros((p, p))
+    score = np.zeros(p)
+    white = []
+    white_residuals = []
+    for part in task.parts:
+        residual, spread, position_part = _residuals(task, part, values)
+        in_use = task.present[part.own]
+        inverse = _inverse(position_part, noise, in_use)
+        error = np.einsum("mkjr,mrs,ms->mkj", spread, inverse, residual)
+        rows = np.where(in_use[:, :, None], task.matrix[part.own] + changed(task, part, error), 0.0)
+        root = np.linalg.cholesky(np.where(in_use[:, :, None], inverse, np.eye(len(noise)))).transpose(0, 2, 1)
+        white.append(root @ rows)
+        white_residuals.append((root @ residual[:, :, None])[:, :, 0])
+        cross += np.einsum("mip,miq->pq", inverse @ rows, task.matrix[part.own], optimize=True)
+        score += np.einsum("mip,mi->p", white[-1], white_residuals[-1])
+    size = np.sqrt(np.abs(np.diag(cross)))
+    bread = np.linalg.inv(cross / np.outer(size, size)) / np.outer(size, size)
+    return _Round(values + bread @ score, bread, tuple(white), tuple(white_residuals))
+
+
+def changed(task: NoisyStates, part: _Recording, error: np.ndarray) -> np.ndarray:
+    """Return W(x + error) - W(x) (M, n, p) at the kept samples, error (M, 3, n); zero where there is no derivative."""
+    out = np.zeros_like(task.matrix[part.own])
+    smooth = np.flatnonzero(task.smooth)
+    for start in range(0, len(part.q), BLOCK):
+        block = slice(start, start + BLOCK)
+        state = np.stack([part.q[block], part.v[block], part.a[block]])
+        shifted = state + error[block].transpose(1, 0, 2)
+        if task.smooth.all():
+            load = None
+        else:
+            load = np.zeros_like(state[0])
+        before = task.model.regressor(state[0], state[1], state[2], load, part.carried)
+        after = task.model.regressor(shifted[0], shifted[1], shifted[2], load, part.carried)
+        out[block][:, :, smooth] = (after - before)[:, :, task.columns[smooth]]
+    return out
+
+
+def _packed(problem: IdentificationProblem, round_: _Round, noise: np.ndarray) -> LinearFit:
+    """Return the fit of the last round; its covariance allows for residuals correlated in time."""
+    plain = wls(problem.pooled, np.sqrt(noise))
+    p = len(round_.values)
+    rows = int(problem.pooled.rows.sum())
+    meat = sum(scatter(white, residual) for white, residual in zip(round_.white, round_.residual))
+    covariance = rows / (rows - p) * round_.bread @ meat @ round_.bread.T
+    estimate = replace(plain.estimate, values=round_.values, covariance=covariance, residual_std=1.0)
+    return LinearFit(estimate, np.sqrt(noise), *condition_numbers(np.concatenate(round_.white).reshape(-1, p)))
+
+
+ML = _MaximumLikelihood(
+    "ml",
+    "positions have white noise (level from each log's spectrum), so have torques (level from the residuals); both are "
+    "small enough to linearise the torque",
+    description="maximum likelihood with noisy positions, noise levels estimated",
+    source="Olsen, Swevers & Verdonck 2002; Leboutet et al. 2021",
+    tunes=("tolerance 0.01 sigma", "40 rounds"),
+)

@@ -1,0 +1,175 @@
+"""Least squares by two neural networks, as the survey has them: an adaptive linear neuron, and a Hopfield-Tank network.
+
+Both go towards the minimum of ‖y - W x‖², ordinary least squares, by gradients that are not scaled, for a set number of
+steps, and do not arrive where W is badly conditioned: slow directions stay near the start. Both start from the
+problem's start values, or from zero without any. What remains between them and ordinary least squares, d = x - x_ols,
+is their error of training: the covariance is that of x_ols plus d dᵀ (an efficient estimate is uncorrelated with what
+another one differs by: Hausman 1978).
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from calib.errors import NotConverged, require
+from calib.estimation.linear import LinearFit, ols
+from calib.estimation.triangles import combine
+from calib.identification.methods.estimators import samples_of
+from calib.identification.methods.least_squares import weighed
+from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
+from calib.identification.methods.samples import Samples
+
+# of either network, as the survey's
+STEPS = 10_000
+
+
+def adaline(data: Samples, start: np.ndarray, rate: float = 1.0, steps: int = STEPS, seed: int = 0) -> np.ndarray:
+    """Return the weights x (p,) of an adaptive linear neuron after `steps` samples in random order.
+
+        x ← x + η (rᵀ r) / ‖W_k r‖² r,    r = W_kᵀ (y_k - W_k x)
+
+    stochastic gradients with a line search for each sample (Widrow & Hoff 1960; Leboutet et al. 2021): the
+    last samples decide, and the weights keep moving with the noise.
+
+    Args:
+        data: N samples.
+        start: (p,).
+        rate: η; 1 minimises a sample's residual along its gradient.
+        steps: samples seen; each once before any comes back.
+    """
+    matrix = np.where(data.present[:, :, None], data.matrix, 0.0)
+    target = np.where(data.present, data.target, 0.0)
+    rng = np.random.default_rng(seed)
+    x = np.array(start, dtype=float)
+    rounds = -(-steps // len(target))
+    # of a rate that diverges
+    with np.errstate(over="ignore", invalid="ignore"):
+        for k in np.concatenate([rng.permutation(len(target)) for _ in range(rounds)])[:steps]:
+            slope = (target[k] - matrix[k] @ x) @ matrix[k]
+            change = matrix[k] @ slope
+            size = change @ change
+            if size:
+                x += rate * (slope @ slope) / size * slope
+    return x
+
+
+def hopfield(
+    factor: np.ndarray, start: np.ndarray, bound: float, rate: float = 1.0, steps: int = STEPS
+) -> tuple[np.ndarray, int]:
+    """Return the outputs x (p,) of a Hopfield-Tank network, and the number of steps until it rests, at most `steps`.
+
+        u̇ = -Wᵀ W x + Wᵀ y,    x = α tanh(u / 5)
+
+    by Euler steps (Tank & Hopfield 1986; Atencia, Joya & Sandoval 2004; Leboutet et al. 2021). At rest x is ordinary
+    least squares, if no neuron saturates. The survey tunes the step by robot, 3e-8 to 1e-6; here it is half of what is
+    stable, times `rate` (our choice).
+
+    Args:
+        factor: (p + 1, p + 1) triangle [R z; 0 ρ] of [W y], not weighted.
+        start: (p,) of x.
+        bound: α, above all |x|.
+
+    Raises:
+        NotConverged: where a neuron saturates: x is then a bound and no estimate.
+    """
+    p = len(start)
+    weights = factor[:p, :p].T @ factor[:p, :p]
+    bias = factor[:p, :p].T @ factor[:p, p]
+    # of the sigmoid, as the survey's
+    width = 5.0
+    step = rate * width / bound / np.linalg.norm(factor[:p, :p], 2) ** 2
+    u = width * np.arctanh(np.asarray(start) / bound)
+    x = np.asarray(start, dtype=float)
+    count = 0
+    # of the first slope
+    max_rest = 1e-9
+    slope = first = bias - weights @ x
+    while np.linalg.norm(slope) > max_rest * np.linalg.norm(first) and count < steps:
+        u += step * slope
+        x = bound * np.tanh(u / width)
+        slope = bias - weights @ x
+        count = count + 1
+    # of α
+    saturation = 0.95
+    full = np.flatnonzero(np.abs(x) > saturation * bound)
+    numbers = ", ".join(str(k + 1) for k in full[:5])
+    require(not len(full), f"neurons saturate at {bound:.3g}: parameters {numbers}", NotConverged)
+    return x, count
+
+
+@dataclass(frozen=True)
+class _Network(Method):
+    """Identification by a network trained towards ordinary least squares.
+
+    Attributes:
+        rate: step, times the survey's (adaline) or half the stable one (hopfield).
+        steps: at most.
+    """
+
+    tunes: tuple[str, ...] = field(default=("learning rate", f"{STEPS:,} steps"), kw_only=True)
+    version: int = field(default=2, kw_only=True)
+    takes_start: bool = field(default=True, kw_only=True)
+    rate: float = 1.0
+    steps: int = STEPS
+
+    def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
+        """Return the estimate of the trained network; its covariance includes the error of training."""
+        return attempted(self.name, problem, lambda: self._estimate(problem))
+
+    def _estimate(self, problem: IdentificationProblem) -> MethodEstimate:
+        pooled = problem.pooled
+        std, tau = weighed(problem)
+        fit = ols(pooled, tau)
+        if problem.start is None:
+            start = np.zeros(pooled.parameters)
+        else:
+            start = problem.start
+        values, count = self.trained(problem, start)
+        require(
+            np.isfinite(values).all(), f"the network diverges: take a smaller rate than {self.rate:g}", NotConverged
+        )
+        trained_fit = _off(fit, values, np.sqrt(pooled.residual_squares(values) / pooled.rows))
+        return MethodEstimate(
+            self.name, EstimateStatus.FOUND, trained_fit, pooled, std, tau, False, iterations=count, alone=True
+        )
+
+    def trained(self, problem: IdentificationProblem, start: np.ndarray) -> tuple[np.ndarray, int]:
+        """Return the network's weights (p,) from a start, and its steps."""
+        raise NotImplementedError
+
+
+class _Adaline(_Network):
+    def trained(self, problem: IdentificationProblem, start: np.ndarray) -> tuple[np.ndarray, int]:
+        return adaline(samples_of(problem), start, self.rate, self.steps), self.steps
+
+
+class _Hopfield(_Network):
+    def trained(self, problem: IdentificationProblem, start: np.ndarray) -> tuple[np.ndarray, int]:
+        factor = combine(problem.pooled)
+        largest = float(np.abs(start).max())
+        # without start values: what the weakest column needs to explain all torques
+        if not largest:
+            largest = float((np.linalg.norm(factor[:-1, -1]) / np.linalg.norm(factor[:-1, :-1], axis=0)).max())
+        return hopfield(factor, start, 1.5 * largest, self.rate, self.steps)
+
+
+def _off(fit: LinearFit, values: np.ndarray, group_std: np.ndarray) -> LinearFit:
+    """Return a fit moved to other values, by the distance less certain."""
+    away = values - fit.estimate.values
+    covariance = fit.estimate.covariance + np.outer(away, away)
+    return replace(fit, estimate=replace(fit.estimate, values=values, covariance=covariance), group_std=group_std)
+
+
+_LIKE_OLS = "the torques of all joints are equally noisy; q, v and a exact; enough steps"
+ADALINE = _Adaline(
+    "adaline",
+    f"{_LIKE_OLS}; samples in random order",
+    description="adaptive linear neuron: stochastic gradients",
+    source="Widrow & Hoff 1960; Leboutet et al. 2021",
+)
+HOPFIELD = _Hopfield(
+    "hopfield",
+    f"{_LIKE_OLS}; no parameter is above 1.5 times the largest start value",
+    description="Hopfield-Tank network, Euler steps",
+    source="Tank & Hopfield 1986; Atencia, Joya & Sandoval 2004",
+)

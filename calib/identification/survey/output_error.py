@@ -1,0 +1,323 @@
+"""Output and input error of the simulated closed loop: the survey's CLOE and CLIE, with exact sensitivities.
+
+    CLOE    min Σ_k ‖q_k - q_s,k(χ)‖²        the robot that moves as the real one does
+    CLIE    min Σ_k ‖tau_k - tau_s,k(χ)‖²    the robot whose controller asks for the same torques
+
+With joint torque sensors (rows link, both) both compare their torques too, which are an output of the loop: simulated
+ones are those of the bodies and the link side along the simulated motion, filtered like the recorded one (our choice).
+
+q_s and tau_s of the loop simulated without noise (Leboutet et al. 2021, sections 5.1 and 5.2, after Landau 1979;
+Gautier, Janot & Vandanjon 2013), each joint weighed by what is left of it. Gauss and Newton's steps, damped, need
+∂q_s/∂χ and ∂tau_s/∂χ: here the tangents of the simulation itself in one pass (`tangent_kernels`) where differences take
+one simulation per parameter, as they do for parallel robots. Torques of redundant actuators are compared on the
+platform's coordinates, as least squares takes them. What is left is what noise did in the loop, correlated over time;
+the covariance H⁻¹ S H⁻¹ knows of it, S the scatter of the scores (`score_covariance`).
+
+What slides call CLIE, (ZᵀZ)⁻¹Zᵀy with Z the simulated observation matrix, is the survey's DIDIM; so it is here.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import scipy.linalg
+
+from calib.data.signals.filtering import decimate
+from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.torque_rows import BODIES, LINK, TorqueRows
+from calib.errors import CalibError, NotConverged, UsageError
+from calib.estimation import nonlinear
+from calib.estimation.linear import LinearFit
+from calib.estimation.triangles import condition_numbers, require_rank
+from calib.identification.closed_loop.loop_recordings import (
+    ClosedLoops,
+    close_loops,
+    followed,
+    low_passed,
+    simulated_samples,
+)
+from calib.identification.closed_loop.simulated import attempted_in_loop
+from calib.identification.closed_loop.simulation import Plant, Sensing
+from calib.identification.methods.least_squares import WLS
+from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate
+from calib.identification.rows import Case, thinned
+from calib.identification.survey.score_covariance import scatter
+from calib.identification.survey.simulated_robot import BelievedRobot, Sensitivities, believed_robot, start_of
+
+
+@dataclass(frozen=True)
+class _OutputError(Method):
+    """Identification that fits the simulated closed loop to the recordings.
+
+    Attributes:
+        torques: whether torques are compared, and not positions.
+    """
+
+    needs_controller: bool = field(default=True, kw_only=True)
+    needs_simulation: bool = field(default=True, kw_only=True)
+    takes_start: bool = field(default=True, kw_only=True)
+    auto_friction: str = field(default="standard", kw_only=True)
+    tunes: tuple[str, ...] = field(default=("damping", "tolerance 0.05 sigma"), kw_only=True)
+    torques: bool
+
+    def takes(self, rows: TorqueRows) -> bool:
+        """Return whether it estimates from these torque rows.
+
+        Torques of sensors alone do not tell how the motors move; positions do.
+        """
+        return super().takes(rows) and (not rows.sensed or rows.with_motors or not self.torques)
+
+    def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
+        """Return the estimate of the problem's parameters; one simulation gives motion and Jacobian.
+
+        Raises:
+            UsageError, MeasurementError: for a loop or recordings that no simulation can start from.
+        """
+        if problem.loop is None:
+            raise UsageError(f"method '{self.name}' needs a [loop], and a robot that can be simulated")
+        plain = WLS.estimate(problem)
+        if not plain.found:
+            return replace(plain, method=self.name)
+        # of the differences of a robot without tangents, in standard deviations (our choice)
+        step = 0.01
+        robot = believed_robot(problem, self, step * np.asarray(plain.estimate.sigma))
+        loops = close_loops(robot.model, problem.cases, problem.decimator, problem.loop, problem.cad)
+        task = _Comparison(problem, robot, loops, self.torques)
+        return attempted_in_loop(self.name, problem, loops, lambda: self._estimate(problem, plain, task))
+
+    def _estimate(self, problem: IdentificationProblem, plain: MethodEstimate, task: "_Comparison") -> MethodEstimate:
+        loops = task.loops
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inertia = loops.controller.kd**2 / (2.0 * loops.controller.kp)
+        inertia = np.where(np.isfinite(inertia) & (inertia > 0.0), inertia, 1.0)
+        values = start_of(problem, plain.estimate.values, inertia, lambda x: task.simulated(task.whole(x, inertia)))
+        values = task.whole(values, inertia)
+        first, _ = task.linearised(values)
+        std = task.spread(first, 0)
+        count = 1
+        # of weighing joints by what the last estimate leaves
+        rounds = 3
+        for _ in range(rounds):
+            solution = task.solved(values, std)
+            values = solution.state
+            count = count + solution.iterations
+            residual, slopes = task.linearised(values)
+            before = std
+            std = task.spread(residual, len(values))
+            if np.all(np.abs(std / before - 1.0) < 0.1):
+                break
+        fit = _packed(task, plain, values, residual, slopes, std)
+        step = np.linalg.norm(_gradient(residual / std, slopes / std[:, None]))
+        if not solution.status.good and step > 0.5:
+            raise NotConverged(f"{self.name}: {solution.status.value} ({step:.2g} standard deviations from rest)", fit)
+        return replace(
+            plain,
+            method=self.name,
+            status=EstimateStatus.FOUND,
+            solution=fit,
+            std=std if self.torques else plain.std,
+            iterations=count,
+            simulations=task.count[0],
+            beforehand=None,
+            alone=True,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Comparison:
+    """Signals to compare, positions or torques of the recordings' control loops; `count` counts the simulations.
+
+    Rows (M, r) are those of the torque sensors, if the problem has any, then r = n of the positions or motor torques.
+    """
+
+    problem: IdentificationProblem
+    robot: BelievedRobot
+    loops: ClosedLoops
+    torques: bool
+    count: list[int] = field(default_factory=lambda: [0])
+
+    @property
+    def rows(self) -> TorqueRows:
+        """Kind of the problem's torque rows."""
+        return self.problem.model.torque_rows
+
+    def whole(self, values: np.ndarray, inertia: np.ndarray) -> np.ndarray:
+        """Return the parameters (p + k,) of the simulated robot: the problem's and, without motor torques, its motors'.
+
+        Args:
+            values: (p,) of the problem.
+            inertia: (n,) that the motors start with [kg m² or kg]; they start without friction.
+        """
+        motors = np.zeros(len(self.robot.columns) - len(values))
+        motors[:: max(1, len(motors) // len(inertia))] = inertia[: len(motors)]
+        return np.append(values, motors)
+
+    def simulated(self, values: np.ndarray) -> None:
+        """Simulate all loops with the parameters (p,); raise if that fails."""
+        for case, loop in self.loops.pairs:
+            plant = self.robot.at(values, case)
+            controller = loop.controller
+            if loop.design is not None:
+                controller = controller.scaled(plant.inertia_diagonal(loop.reference.q[::200]) / loop.design)
+            self.count[0] += 1
+            plant.run(controller, loop.reference, Sensing(every=loop.every))
+
+    def linearised(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return residuals (M, r), zero at samples not compared, and the Jacobian (M, r, p) of simulated signals."""
+        residuals = []
+        slopes = []
+        for case, loop in self.loops.pairs:
+            plant = self.robot.at(values, case)
+            controller = loop.controller
+            relative = None
+            if loop.design is not None:
+                diagonal = plant.inertia_diagonal(loop.reference.q[::200])
+                controller = controller.scaled(diagonal / loop.design)
+                relative = self._inertia_slopes(loop.reference.q[::200]) / diagonal[:, None]
+            self.count[0] += 1
+            run = self.robot.sensitivities(values, case, controller, loop.reference, loop.every, relative)
+            index = simulated_samples(case, run.t, loop)
+            motion = case.motion
+            if self.rows.sensed:
+                parts = [self._sensed(plant, case, run, index)]
+            else:
+                parts = []
+            if not self.torques:
+                position = low_passed(run.q, motion)[index]
+                slope = low_passed(run.by_q, motion)[index]
+                parts.append((motion.q - position, slope))
+            elif self.rows.projection is not None:
+                torques = np.dstack([run.torque, run.by_torque])[index]
+                observed = self.rows.observe(torques, [BODIES] * torques.shape[2], motion.q, motion.v)
+                parts.append((case.target - observed[:, :, 0], observed[:, :, 1:]))
+            elif self.rows.with_motors:
+                parts.append((case.target[:, -motion.n :] - run.torque[index], run.by_torque[index]))
+            residual, slope = (np.concatenate(blocks, axis=1) for blocks in zip(*parts))
+            present = case.present[:, np.arange(residual.shape[1]) % min(motion.n, case.present.shape[1])]
+            in_use = thinned(present, motion.segment, self.problem.decimator)
+            residual = decimate(residual, self.problem.decimator, motion.segment)
+            slope = decimate(slope, self.problem.decimator, motion.segment)
+            residuals.append(np.where(in_use, residual, 0.0))
+            slopes.append(np.where(in_use[:, :, None], slope, 0.0))
+        return np.concatenate(residuals), np.concatenate(slopes)
+
+    def _sensed(self, plant: Plant, case: Case, run: Sensitivities, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return residuals (N, n) of the sensors' torques [N m or N], and the Jacobian (N, n, p) of simulated ones."""
+        link = IdentificationModel(plant.bodies, plant.terms, LINK)
+        link_columns = [
+            *range(plant.inertial),
+            *(plant.inertial + k for k, x in enumerate(plant.terms) if x in link.columns),
+        ]
+        position = np.full(len(plant.parameters), -1)
+        position[link_columns] = np.arange(len(link_columns))
+        columns = position[self.robot.columns]
+        values = plant.parameters[link_columns]
+        states = followed(run.q, case.motion, index)
+        slopes = followed(run.by_q, case.motion, index)
+        regressor = link.regressor(*states, None, case.carried)
+        jacobian = np.where(columns >= 0, regressor[:, :, columns], 0.0)
+        for row in np.eye(case.motion.n, dtype=bool):
+            for by, slope in zip(link.torque_gradient(*states, values, np.tile(row, (len(index), 1)) * 1.0), slopes):
+                jacobian[:, row] += np.einsum("kj,kjc->kc", by, slope)[:, None]
+        return case.target[:, : case.motion.n] - regressor @ values, jacobian
+
+    def _inertia_slopes(self, q: np.ndarray) -> np.ndarray:
+        """Return the Jacobian (n, p) of the mean diagonal of the inertia matrix with respect to the parameters."""
+        p = len(self.robot.columns)
+        return np.array([self.robot.at(np.eye(p)[k]).inertia_diagonal(q) for k in range(p)]).T
+
+    def whitened(self, values: np.ndarray, std: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return residuals (M r,) and Jacobian (M r, p) divided by std (r,); huge residuals if the simulation fails."""
+        p = len(values)
+        # residual of parameters that cannot be simulated: any step that can is better
+        impossible = 1e60
+        try:
+            residual, slopes = self.linearised(values)
+        except CalibError:
+            return np.full(p + 1, impossible), np.zeros((p + 1, p))
+        return (residual / std).ravel(), np.asfortranarray((slopes / std[:, None]).reshape(-1, p))
+
+    def solved(self, values: np.ndarray, std: np.ndarray) -> nonlinear.Solution[np.ndarray]:
+        """Return the parameters that minimise the residuals divided by std (r,)."""
+        # at first
+        first_damping = 1e-3
+        # simulations with tangents per round
+        max_simulations = 25
+        # standard deviations of the estimate
+        step_tolerance = 0.05
+        return nonlinear.solve(
+            lambda x: nonlinear.triangle(*self.whitened(x, std)),
+            lambda x, step: x + step,
+            values,
+            damping=first_damping,
+            tolerance=step_tolerance,
+            limit=max_simulations,
+        )
+
+    def spread(self, residual: np.ndarray, p: int) -> np.ndarray:
+        """Return the standard deviation (r,) of each row's residuals."""
+        count = np.maximum(np.sum(residual != 0.0, axis=0), 1)
+        share = max(1.0 - p / count.sum(), 0.1)
+        std = np.sqrt(np.sum(residual**2, axis=0) / count / share)
+        n = self.problem.cases[0].motion.n
+        # of torques and of positions: other units
+        kinds = [std[k : k + n] for k in range(0, len(std), n)]
+        return np.concatenate([np.maximum(kind, 1e-6 * max(float(kind.max()), 1e-300)) for kind in kinds])
+
+
+def _gradient(residual: np.ndarray, slopes: np.ndarray) -> np.ndarray:
+    """Return the next Gauss–Newton step Qᵀ r (p,), in standard deviations of white residuals."""
+    p = slopes.shape[2]
+    return np.linalg.qr(slopes.reshape(-1, p))[0].T @ residual.ravel()
+
+
+def _packed(
+    task: _Comparison,
+    plain: MethodEstimate,
+    values: np.ndarray,
+    residual: np.ndarray,
+    slopes: np.ndarray,
+    std: np.ndarray,
+) -> LinearFit:
+    """Return the fit for parameters, residuals and Jacobian, with the covariance H⁻¹ S H⁻¹.
+
+    Raises:
+        Unidentifiable: where the simulated motion does not distinguish parameters.
+    """
+    white = slopes / std[:, None]
+    white_residual = residual / std
+    p = len(values)
+    rows = int(np.sum(residual != 0.0))
+    count_ = len(plain.pooled.names)
+    plant = task.robot.plant
+    names = (*plain.pooled.names, *(plant.terms[k - plant.inertial].name for k in task.robot.columns[count_:]))
+    flat = white.reshape(-1, p)
+    size = np.linalg.norm(flat, axis=0)
+    factor = np.asarray(np.linalg.qr(flat / np.where(size > 0.0, size, 1.0), mode="r"))
+    require_rank(factor, names, "the simulated motion does not distinguish them")
+    inverse = scipy.linalg.solve_triangular(factor, np.eye(p)) / size[:, None]
+    bread = inverse @ inverse.T
+    covariance = rows / max(rows - p, 1) * bread @ scatter(white, white_residual) @ bread
+    rounds = 5
+    for _ in range(rounds):
+        covariance = bread @ scatter(white, white_residual, covariance) @ bread
+    estimate = replace(
+        plain.estimate, values=values[:count_], covariance=covariance[:count_, :count_], residual_std=1.0
+    )
+    return LinearFit(estimate, std, *condition_numbers(flat))
+
+
+_LOOP = "controller and reference are those of [loop], the robot has the model's friction; "
+CLOE = _OutputError(
+    "cloe",
+    _LOOP + "measured motor torques are not used",
+    False,
+    source="Landau 1979; Leboutet et al. 2021",
+    description="closed-loop output error: simulated positions are fitted to measured ones",
+)
+CLIE = _OutputError(
+    "clie",
+    _LOOP + "measured positions are not used",
+    True,
+    source="Leboutet et al. 2021",
+    description="closed-loop input error: simulated torques are fitted to measured ones",
+)

@@ -1,0 +1,49 @@
+"""Covariance of the scores of autocorrelated residuals, for methods whose estimate minimises correlated errors."""
+
+import numpy as np
+
+from calib.estimation.whiteness import autocorrelation, inflation
+from calib.records import shaped
+
+
+def scatter(white: np.ndarray, residual: np.ndarray, covariance: np.ndarray | None = None) -> np.ndarray:
+    """Return Σ_j σ_j² Σ_kl ρ_j(k - l) w_jk w_jlᵀ (p, p): the covariance of Σ_k W_kᵀ r_k.
+
+    σ_j², ρ_j are variance and autocorrelation of row j's residuals over one uninterrupted record, tapered linearly
+    (Bartlett 1946) so that the result is positive; its width is three times that of `whiteness.inflation`'s window.
+    Where noise was differentiated (accelerations) neighbours cancel and this is less than Σ σ_j² w wᵀ; where they are
+    alike, as in the error of a simulated motion, it is far more.
+
+    Args:
+        white: W (N, rows, p).
+        residual: r (N, rows); zero where a row is not in use.
+        covariance: C (p, p) of the estimate behind the residuals: σ_j² and ρ_j are then those of r and of what the fit
+            took out, E[e_k e_l] = r_k r_l + w_k C w_lᵀ; on a short record least of all is left where W is large.
+    """
+    white = shaped(white, (None, None, None), "rows")
+    residual = shaped(residual, white.shape[:2], "residuals")
+    count = len(white)
+    p = white.shape[2]
+    size = 1 << (2 * count - 1).bit_length()
+    result = np.zeros((p, p))
+    # at least, of the residuals' autocorrelation
+    min_lags = 12
+    if covariance is None:
+        root = np.zeros((p, 0))
+    else:
+        root = np.linalg.cholesky(covariance)
+    for row in range(white.shape[1]):
+        values = white[:, row]
+        row_residuals = np.column_stack([residual[:, row], values @ root])
+        variance = float(np.sum(row_residuals**2) / count)
+        if variance == 0.0 or count < 4 * min_lags:
+            result += variance * values.T @ values
+            continue
+        lags = int(min(count // 4, max(min_lags, 15 * inflation(row_residuals))))
+        rho = autocorrelation(row_residuals, lags) * (1.0 - np.arange(1, lags + 1) / (lags + 1.0))
+        kernel = np.zeros(size)
+        kernel[0], kernel[1 : lags + 1], kernel[size - lags :] = 1.0, rho, rho[::-1]
+        gain = np.fft.rfft(kernel).real
+        smooth = np.fft.irfft(np.fft.rfft(values, size, axis=0) * gain[:, None], size, axis=0)[:count]
+        result += variance * values.T @ smooth
+    return 0.5 * (result + result.T)

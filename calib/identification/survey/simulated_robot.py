@@ -1,0 +1,357 @@
+"""The simulated robot of an identification problem, and initial parameters of simulating methods.
+
+Closed loops with their slopes by parameters: a whole run at once, or states advanced one at a time.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from calib.dynamics.drives import standard
+from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.shapes import V0
+from calib.errors import CalibError, CannotSimulate, Diverged, UsageError, refused_as, require
+from calib.identification.closed_loop.controllers import Reference
+from calib.identification.closed_loop.simulation import (
+    LOWER,
+    Packed,
+    Plant,
+    Sensing,
+    body_rows,
+    failure,
+    layout_of,
+    packed,
+    plant_of,
+    sample_ticks,
+)
+from calib.identification.loop import Controller
+from calib.identification.methods.method import IdentificationProblem, Method
+from calib.identification.rows import Case
+from calib.records import frozen, shaped
+
+
+@dataclass(frozen=True, eq=False)
+class Sensitivities:
+    """Simulated noise-free motion of M samples, and its derivatives with respect to c parameters.
+
+    Attributes:
+        t: (M,) [s].
+        q, v, torque: (M, n) [rad or m, per s, N m or N].
+        by_q, by_v, by_torque: (M, n, c) their slopes, per unit of each parameter.
+    """
+
+    t: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    torque: np.ndarray
+    by_q: np.ndarray
+    by_v: np.ndarray
+    by_torque: np.ndarray
+
+
+def simulate_tangents(
+    plant: Plant,
+    controller: Controller,
+    reference: Reference,
+    columns: np.ndarray,
+    every: float = 1,
+    relative: np.ndarray | None = None,
+) -> Sensitivities:
+    """Return a noise-free simulated motion along a reference, and its exact derivatives with respect to the parameters.
+
+    Args:
+        plant: whose friction hangs on position and velocity alone.
+        columns: (c,) indices of the parameters.
+        every: control periods per sample.
+        relative: (n, c) slopes of the logarithm of all gains of a joint by the parameters, where the gains follow them
+            (`calib.identification.closed_loop.loop_recordings.Loop.design`); None: they stay.
+
+    Raises:
+        CalibError: where the inertia is not positive definite, friction too stiff, or of a kind without slopes.
+        NotConverged: where the loop is unstable.
+    """
+    from calib.identification.closed_loop import loop_kernels
+    from calib.identification.survey import tangent_kernels
+
+    for term in plant.terms:
+        message = (
+            f"term '{term.name}' ({term.shape}): no derivatives of friction that hangs on past motion or on torques"
+        )
+        require(term.form.slopes, f"{message}; iv and didim take it")
+    n = plant.bodies.n
+    count = len(reference.t)
+    c = len(columns)
+    find = np.full(len(plant.parameters), -1)
+    find[np.asarray(columns, dtype=int)] = np.arange(c)
+    tick = sample_ticks(count, every)
+    out = np.empty((3, len(tick), n))
+    slopes = np.empty((3, len(tick), n, c))
+    if controller.model is None:
+        model = np.empty((0, 0))
+    else:
+        model = body_rows(plant.bodies, controller.model)
+    if relative is None:
+        scale = np.zeros((n, c))
+    else:
+        scale = np.ascontiguousarray(shaped(relative, (n, c), "relative"))
+    status, reached = tangent_kernels.closed_loop_tangent(
+        packed(plant),
+        (*layout_of(plant), find),
+        model,
+        controller.rows,
+        scale,
+        reference.sampled(controller.ahead),
+        reference.period,
+        controller.smoothing(reference.period),
+        controller.delay,
+        float(every),
+        np.array(reference.q[0]),
+        np.array(reference.v[0]),
+        count,
+        out,
+        slopes,
+    )
+    if status != loop_kernels.FINE:
+        raise failure(status, reached * reference.period)
+    # slope of the last sample by a parameter, in SI units, from which on the loop is unstable (our choice)
+    max_slope = 1e20
+    # saturated torques keep only the motion finite
+    if not np.abs(slopes[:, -1]).max(initial=0.0) < max_slope:
+        raise Diverged(f"the loop is unstable, its derivatives diverge: {LOWER}", None)
+    t = reference.t[0] + tick * reference.period
+    return Sensitivities(t, *(frozen(x) for x in out), *(frozen(x) for x in slopes))
+
+
+def simulate_differences(
+    plant: Any, controller: Controller, reference: Reference, columns: np.ndarray, steps: np.ndarray, every: float = 1
+) -> Sensitivities:
+    """Return what `simulate_tangents` does of a robot without tangents, by one more simulation per parameter.
+
+    Args:
+        plant: of a model's `plant`, with the payloads on board.
+        steps: (c,) of the forward differences: so small that the motion is linear, see `BelievedRobot.steps`.
+    """
+
+    def moved(parameters: np.ndarray) -> np.ndarray:
+        run = plant.with_parameters(parameters).run(controller, reference, Sensing(every=every))
+        return np.array([run.q, run.v, run.torque])
+
+    values = np.array(plant.parameters)
+    nominal = moved(values)
+    shifts = np.eye(len(values))[columns] * steps[:, None]
+    slopes = np.stack([(moved(values + shift) - nominal) / step for shift, step in zip(shifts, steps)], axis=-1)
+    tick = sample_ticks(len(reference.t), every)
+    return Sensitivities(reference.t[0] + tick * reference.period, *map(frozen, (*nominal, *slopes)))
+
+
+@dataclass(frozen=True, eq=False)
+class Stepper:
+    """Simulated robot prepared for single time steps with varying parameters and states."""
+
+    parts: Packed
+    layout: Packed
+
+    def points(
+        self, parameters: np.ndarray, q: np.ndarray, v: np.ndarray, tau: np.ndarray, period: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return q and v (K, n) one period later under one torque (n,), and M⁻¹ (n, n) of the first state.
+
+        Args:
+            parameters: (K, p) of each state's robot.
+
+        Raises:
+            CannotSimulate, Diverged: naming the first point that cannot be followed.
+        """
+        from calib.identification.closed_loop import loop_kernels
+
+        q, v, gain = np.array(q), np.array(v), np.empty((q.shape[1], q.shape[1]))
+        order, entries, shares, owners, _ = self.layout
+        where = (order, entries, shares, owners, np.ascontiguousarray(parameters), q, v, tau, period, gain)
+        status, reached = loop_kernels.advance_points(*self.parts, *where)
+        if status != loop_kernels.FINE:
+            raise failure(status, 0.0, f"point {reached}: ")
+        return q, v, gain
+
+    def linearised(
+        self, parameters: np.ndarray, q: np.ndarray, v: np.ndarray, tau: np.ndarray, period: float, columns: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return q, v (n,) one period later, M⁻¹ (n, n), and their Jacobian with respect to q, v and parameters."""
+        from calib.identification.closed_loop import loop_kernels
+        from calib.identification.survey import tangent_kernels
+
+        n = len(q)
+        q = np.array(q)
+        v = np.array(v)
+        gain = np.empty((n, n))
+        slopes = np.empty((2, n, 2 * n + columns))
+        args = (self.parts, self.layout, np.ascontiguousarray(parameters), q, v, tau, period, gain)
+        status = tangent_kernels.advance_linearised(*args, slopes[0], slopes[1])
+        if status != loop_kernels.FINE:
+            raise failure(status, 0.0, "")
+        return q, v, gain, slopes.reshape(2 * n, -1)
+
+
+def stepper(plant: Plant, columns: np.ndarray) -> Stepper:
+    """Return the stepper of a robot, with derivatives with respect to the parameters `columns` (c,)."""
+    find = np.full(len(plant.parameters), -1)
+    find[np.asarray(columns, dtype=int)] = 2 * plant.bodies.n + np.arange(len(columns))
+    return Stepper(packed(plant), (*layout_of(plant), find))
+
+
+# shares of least squares, the rest being a regular robot, that are tried until one can be simulated
+SHARES = (1.0, 0.9, 0.75, 0.5, 0.25, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class BelievedRobot:
+    """Robot model to be simulated with the parameters of an identification problem.
+
+    Attributes:
+        model: with richer friction, where the problem has any.
+        columns: (p,) place of each of the problem's parameters among the plant's; without motor torques, those of the
+            motors follow.
+        plant: with all parameters zero; of another model than a serial arm's, what its `plant` returns.
+        steps: (p,) of differences for a robot without tangents, 0.01 σ of least squares; None for a serial arm.
+    """
+
+    model: Any
+    columns: np.ndarray
+    plant: Any
+    steps: np.ndarray | None = None
+
+    def at(self, values: np.ndarray, case: Case | None = None) -> Any:
+        """Return the robot with parameters (p,) and the payloads of a case."""
+        parameters = np.zeros(len(self.plant.parameters))
+        parameters[self.columns] = values
+        plant = self.plant.with_parameters(parameters)
+        if case is None:
+            return plant
+        return plant.carrying(case.carried)
+
+    def sensitivities(
+        self,
+        values: np.ndarray,
+        case: Case,
+        controller: Controller,
+        reference: Reference,
+        every: float,
+        relative: np.ndarray | None = None,
+    ) -> Sensitivities:
+        """Return the simulated motion with parameters (p,) and its slopes by them; none by payloads not attached."""
+        plant = self.at(values, case)
+        if self.steps is not None:
+            return simulate_differences(plant, controller, reference, self.columns, self.steps, every)
+        sensitivities = simulate_tangents(plant, controller, reference, self.columns, every, relative)
+        carried = self.carried(case)
+        return replace(
+            sensitivities, **{name: vars(sensitivities)[name] * carried for name in ("by_q", "by_v", "by_torque")}
+        )
+
+    def carried(self, case: Case) -> np.ndarray:
+        """Return a factor (p,) per parameter of a serial arm: 0 for payloads not attached in a case, otherwise 1."""
+        return np.append(self.model.carried_columns(case.carried), np.ones(len(self.plant.terms)))[self.columns]
+
+
+def serial_arm(problem: IdentificationProblem, method: Method) -> IdentificationModel:
+    """Return the model of a problem; raise unless it is a serial arm with torque rows that the method takes.
+
+    Raises:
+        UsageError: for another.
+    """
+    model = problem.model
+    if not isinstance(model, IdentificationModel) or not method.takes(model.torque_rows):
+        message = f"needs a serial arm with motor torques, not rows '{model.torque_rows.name}'"
+        raise UsageError(f"method '{method.name}' {message}; otherwise take wls or tls")
+    return model
+
+
+def believed_robot(problem: IdentificationProblem, method: Method, steps: np.ndarray | None = None) -> BelievedRobot:
+    """Return the robot model that simulates an identification problem.
+
+    Without motor torques (rows link) nothing in the problem tells how the motors move: inertia, friction and offset of
+    each are parameters more, the last ones (our choice).
+
+    Args:
+        steps: of a model that is no serial arm, of the differences; None: such a model is refused.
+
+    Raises:
+        UsageError: for a model that cannot be simulated, or torque rows that the method does not take.
+        CannotSimulate: for friction that the simulator does not know, or an exact sign.
+    """
+    if steps is not None and not isinstance(problem.model, IdentificationModel):
+        columns = np.array(problem.base.kept)
+        return BelievedRobot(problem.model, columns, plant_of(problem.model, np.zeros(problem.model.p)), steps)
+    model, columns = with_friction(problem, serial_arm(problem, method))
+    terms = model.columns
+    size = model.p
+    if not model.torque_rows.with_motors:
+        widths = {term.acts[0][0]: term.settings[-1] for term in terms if term.shape == "sign"}
+        width = [widths.get(joint, V0) for joint in range(model.n)]
+        motors = standard(["Ia Fvm Fcm offm"] * model.n, width, model.prismatic.tolist())
+        terms = (*terms, *(replace(motor, name=f"motor {motor.name}") for motor in motors))
+        columns = np.append(columns, np.arange(size, size + len(motors)))
+    with refused_as(CannotSimulate, CalibError, "{}"):
+        plant = Plant(model.bodies, terms, np.zeros(model.inertial + len(terms)))
+    return BelievedRobot(model, columns, plant)
+
+
+def with_friction(problem: IdentificationProblem, model: IdentificationModel) -> tuple[IdentificationModel, np.ndarray]:
+    """Return a problem's model with all friction terms, and the index (p,) of each parameter in it."""
+    extra = [term for term in problem.terms[problem.base.b :] if term is not None]
+    model = model.with_terms(*extra)
+    return model, np.array([*problem.base.kept, *range(model.p - len(extra), model.p)], dtype=int)
+
+
+def start_of(
+    problem: IdentificationProblem, plain: np.ndarray, inertia: np.ndarray, simulated: Callable[[np.ndarray], object]
+) -> np.ndarray:
+    """Return initial parameters (p,): the given ones, or those nearest to least squares that can be simulated.
+
+    Args:
+        plain: (p,) of weighted least squares.
+        inertia: (n,) of a regular robot, which nothing couples [kg m² or kg].
+        simulated: raises `CalibError` where values cannot be simulated.
+
+    Raises:
+        CannotSimulate: where none can be.
+    """
+    if problem.start is not None:
+        return np.array(problem.start, dtype=float)
+    model: Any = problem.model
+    base_count = problem.base.b
+    standard = np.zeros(model.p)
+    serial = isinstance(model, IdentificationModel)
+    motors = {
+        column.joint: k for k, column in enumerate(model.columns, model.inertial) if column.shape == "acceleration"
+    }
+    for joint, own_inertia in zip(range(model.n) if serial else model.mechanism.robot.actuated, inertia):
+        if joint in motors:
+            standard[motors[joint]] = own_inertia
+    regular = np.append(problem.base.transform @ standard, np.zeros(len(plain) - base_count))
+    if serial and not np.any(standard):
+        regular = np.append(problem.base.transform @ _hubs(model, inertia), np.zeros(len(plain) - base_count))
+    failure: CalibError | None = None
+    for share in SHARES:
+        values = share * plain + (1.0 - share) * regular
+        try:
+            simulated(values)
+        except CalibError as error:
+            failure = failure or error
+        else:
+            return values
+    raise CannotSimulate(f"no parameters between least squares and regular inertias can be simulated: {failure}", plain)
+
+
+def _hubs(model: IdentificationModel, inertia: np.ndarray) -> np.ndarray:
+    """Return parameters (p,) of bodies that have only the inertia (n,) about their joint axis, or the mass along it."""
+    result = np.zeros(model.p)
+    for i, (coordinate, axis) in enumerate(zip(model.bodies.coordinates, model.bodies.axes)):
+        if coordinate >= 0:
+            if model.prismatic[coordinate]:
+                entry = 9
+            else:
+                entry = (0, 3, 5)[int(axis)]
+            result[10 * i + entry] = inertia[coordinate]
+    return result

@@ -1,0 +1,191 @@
+"""Benefit of the model as feedforward in a controller: simulated tracking errors on recorded motion.
+
+Nobody has the real robot here, so the simulated one is made to need the torque that was measured: it is the identified
+model, and what that model left unexplained along the recording is replayed on it as a disturbance,
+
+    M(q) a + … = tau + (tau_model(q_r, v_r, a_r) - tau_measured),    tau = feedback + ahead,
+
+with the recorded motion (filtered) as the reference. A robot that stays on it needs tau = tau_measured. Fed forward
+are: nothing; the robot's own inertias (CAD), without friction; the identified model in full; and, as the floor that the
+control period leaves, the measured torque itself. So the model is not excused by being its own robot: on motion that it
+was not fitted to, all of its error disturbs it. What this cannot show: disturbances that would change with the path
+(they are replayed by the clock), elastic joints, and what the real controller has besides. The noise of the torque
+sensors is replayed too, as if it pushed; feedback swallows most of it.
+
+Real estimates are often no possible robots (a small wrist inertia comes out below zero). Then as much motor inertia is
+added to the simulated robot as it needs, and told; along the reference the disturbance takes it off again, so only how
+fast the feedback reacts depends on it. Signs too steep for so little inertia are smoothed over more speed, likewise.
+
+Without a stated controller: PD of `FREQUENCY`, damping `DAMPING`, on the model's mean inertia, as slow as robots come,
+so that the model's part shows. All of this is our choice; the judgement itself is that of Kolyubin, Shiriaev & Jubien
+(2019, section 7), who miss it.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from calib.dynamics.bodies import standard_parameters
+from calib.dynamics.drives import DriveTerm, standard
+from calib.errors import CalibError, require
+from calib.identification.closed_loop.controllers import Reference, pd, stated_controller
+from calib.identification.closed_loop.loop_recordings import periods_per_sample, take
+from calib.identification.closed_loop.simulation import Plant, feed_forward, tracking_error
+from calib.identification.loop import CAD, DAMPING, FEEDBACK, FLOOR, FREQUENCY, IDENTIFIED, Controller, Replay
+from calib.identification.prediction import Dynamics
+from calib.identification.rows import Case, segments
+from calib.procedure.dynamic_stage.inputs import IdentificationInputs
+from calib.robot.chain import Chain
+
+
+def replay(
+    chain: Chain,
+    dynamics: Dynamics,
+    case: Case,
+    predicted: np.ndarray,
+    controller: Controller | None = None,
+    rate: float | None = None,
+) -> Replay:
+    """Return the tracking errors on a recorded motion with three feedforwards: none, the CAD model, and the model.
+
+    Args:
+        chain: whose inertias are the CAD's, where it has any.
+        dynamics: the identified model, of motor torques (or of both).
+        predicted: (N, rows) its torques along the case.
+        controller: the feedback; None: the default. Torques it adds by itself are not taken.
+        rate: of the controller [Hz]; None: see `calib.identification.closed_loop.loop_recordings.periods_per_sample`.
+
+    Raises:
+        CalibError: where the rows are not the motors', or the loop is unstable.
+    """
+    model = dynamics.model
+    n = chain.n
+    require(model.torque_rows.with_motors, f"rows '{model.torque_rows.name}' do not contain the whole motor torque")
+    part = _stretch(case)
+    motion = case.motion
+    robot, left_out = _robot(dynamics, case)
+    reference, every = _reference(take(case, part), rate)
+    robot, added = _possible(robot, reference)
+    if controller is None:
+        control = _default(robot, reference)
+    else:
+        control = replace(controller, ahead=None)
+    sampled = np.arange(part.stop - part.start)
+
+    def controlled(torque: np.ndarray) -> np.ndarray:
+        spline = CubicSpline(sampled, torque[part, -n:])
+        return spline(np.arange(len(reference.t)) / every)
+
+    measured = controlled(np.asarray(case.target))
+    ahead: dict[str, np.ndarray | None] = {FEEDBACK: None}
+    if chain.inertias is not None:
+        values = np.zeros(model.inertial)
+        parameters = standard_parameters(chain)
+        values[: len(parameters)] = parameters
+        ahead[CAD] = feed_forward(Plant(model.bodies, (), values), reference)
+    ahead |= {IDENTIFIED: controlled(predicted), FLOOR: measured}
+    push = feed_forward(robot, reference) - measured
+    rms = {name: tracking_error(robot, control, reference, push_, push) for name, push_ in ahead.items()}
+    seconds = float(motion.t[part.stop - 1] - motion.t[part.start])
+    return Replay(case.name, seconds, control, controller is not None, left_out, added, rms)
+
+
+def _stretch(case: Case, max_seconds: float = 20.0) -> slice:
+    """Return the slice of the longest part without gaps, cut to `max_seconds`.
+
+    `max_seconds`: [s] of a recording that are replayed.
+    """
+    first, last = max(segments(case.motion.segment), key=lambda ends: ends[1] - ends[0])
+    return slice(first, min(last, first + int(max_seconds * case.motion.rate)))
+
+
+def _robot(dynamics: Dynamics, case: Case) -> tuple[Plant, tuple[str, ...]]:
+    """Return the model as a robot with the case's payloads, and the names of terms that cannot be simulated."""
+    model = dynamics.model
+    bodies = model.inertial
+    simulated = [column.form.of_velocity or column.shape == "acceleration" for column in model.columns]
+    columns = np.flatnonzero(simulated)
+    terms = tuple(replace(model.columns[k], side="motor") for k in columns)
+    values = dynamics.values[:bodies] * model.carried_columns(case.carried)
+    left_out = tuple(column.name for column, is_simulated in zip(model.columns, simulated) if not is_simulated)
+    return Plant(model.bodies, terms, np.concatenate([values, dynamics.values[bodies:][columns]])), left_out
+
+
+def _reference(part: Case, rate: float | None) -> tuple[Reference, float]:
+    """Return the recorded motion as a reference at the control rate, and the control periods per sample."""
+    motion = part.motion
+    every = periods_per_sample(motion, rate)
+    samples = np.arange(len(motion))
+    indices = np.arange(int((len(motion) - 1) * every + 1e-9) + 1) / every
+    series = [CubicSpline(samples, x)(indices) for x in (motion.q, motion.v, motion.a)]
+    return Reference(indices / motion.rate, *series), every
+
+
+def _possible(robot: Plant, reference: Reference, min_eigenvalue: float = 0.05) -> tuple[Plant, np.ndarray]:
+    """Return the robot with motor inertia added until M(q) is positive definite, and the added inertia (n,).
+
+    The least eigenvalue of its inertia matrix along the reference, scaled by its diagonal, becomes `min_eigenvalue`.
+
+    `min_eigenvalue`: least eigenvalue of a possible robot's inertia, scaled by its diagonal.
+    """
+    bodies = robot.bodies
+    first = robot.inertial
+    inertia = robot.inertia(reference.q[::50])
+    # [kg m² or kg] least inertia of a joint
+    min_inertia = 1e-3
+    size = np.maximum(np.abs(np.einsum("kii->i", inertia)) / len(inertia), min_inertia)
+    minimum = float(np.linalg.eigvalsh(inertia / np.sqrt(np.outer(size, size)))[:, 0].min())
+    added = max(0.0, min_eigenvalue - minimum) * size
+    softer = tuple(_softer(term, value, size, reference) for term, value in zip(robot.terms, robot.parameters[first:]))
+    robot = replace(robot, terms=softer)
+    if not added.any():
+        return robot, added
+    extra = tuple(replace(column, name=f"added {column.name}") for column in standard(["Ia"] * bodies.n))
+    return Plant(bodies, (*robot.terms, *extra), np.concatenate([robot.parameters, added])), added
+
+
+def _softer(term: DriveTerm, value: float, size: np.ndarray, reference: Reference) -> DriveTerm:
+    """Return a drive term whose sign function is smooth enough to integrate at this control period."""
+    if "v0" not in term.form.settings:
+        return term
+    # of a sign, in Fc h / inertia: Runge and Kutta's bound in 64 steps at `min_eigenvalue` is 0.11
+    min_smoothing = 0.25
+    minimum = min_smoothing * abs(value) * reference.period / size[term.acts[0][0]]
+    return replace(term, settings=(*term.settings[:-1], max(term.settings[-1], minimum)))
+
+
+def _default(robot: Plant, reference: Reference) -> Controller:
+    omega = 2.0 * np.pi * FREQUENCY
+    inertia = robot.inertia_diagonal(reference.q[::200])
+    return pd(omega**2 * inertia, 2.0 * DAMPING * omega * inertia)
+
+
+def track(
+    inputs: IdentificationInputs,
+    dynamics: Dynamics,
+    predictions: Mapping[str, np.ndarray],
+    controller: Controller | None = None,
+) -> tuple[dict[str, Replay], str]:
+    """Return the replays by name, of unseen recordings or else of a training recording, or the reason for none.
+
+    Args:
+        predictions: case name → torques by the model.
+        controller: that was identified, where the loop's is not stated.
+    """
+    chain = inputs.chain
+    loop = inputs.options.settings.loop
+    max_replays = 3
+    chosen = inputs.unseen[:max_replays] or inputs.cases[:1]
+    try:
+        if loop is None or loop.controller != "identify":
+            controller = loop and stated_controller(loop, chain.n)
+        if controller is None or loop is None:
+            rate = None
+        else:
+            rate = loop.rate
+        replays = (replay(chain, dynamics, case, predictions[case.name], controller, rate) for case in chosen)
+        return {replay.name: replace(replay, unseen=bool(inputs.unseen)) for replay in replays}, ""
+    except CalibError as error:
+        return {}, str(error)

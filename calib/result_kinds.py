@@ -1,0 +1,110 @@
+"""Kinds of results on disk: how a folder is recognised, what made it, and what a verb says that does not take it.
+
+Every verb that takes a result (`calib view`, `certificate`, `export`, `diff` …) refuses others by `refusal`, so that
+the message says what the folder is, and which folder or command to use instead.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from calib.folders import METRICS, OFFSETS, PARAMETERS, SESSION
+
+
+@dataclass(frozen=True)
+class ResultKind:
+    """One kind of result.
+
+    Attributes:
+        name: what `kind_of` is compared with.
+        noun: what a folder of this kind is, with its article.
+        marks: sets of files, each of which identifies the kind.
+        advice: verb → what to do instead, a clause with ``{folder}``.
+    """
+
+    name: str
+    noun: str
+    marks: tuple[tuple[str, ...], ...]
+    advice: Mapping[str, str] = field(default_factory=dict)
+
+
+_SHOWN = "calib view {folder} shows it, calib export {folder} --into DIR writes the robot for other programs"
+_NOT_A_SESSION = {"session": "not a session; " + _SHOWN}
+
+# In the order of recognition: a session also holds fits, an identification also a robot.
+KINDS = (
+    ResultKind(
+        "session",
+        "a session",
+        ((SESSION,),),
+        {
+            "certificate": "its details stand in {folder}/session.toml, under [certificate]; then: "
+            "calib redo {folder} certificate",
+            "robot": "give the robot it exported, {folder}/9-export/robot.urdf, or its fit, {folder}/4-fit",
+            "export": "its last step exports the robot; for other files give {folder}/4-fit or {folder}/8-dynamics",
+            "deliver": "give its fit, {folder}/4-fit",
+            "compensate": "it has no fit yet: calib next {folder}",
+            "recall": "give its motion, {folder}/6-excitation",
+            "program": "give a list of poses or a motion in it, {folder}/2-poses/poses.csv or {folder}/6-excitation",
+            "view": "it holds nothing to show yet: calib next {folder}",
+        },
+    ),
+    ResultKind("export", "an exported robot", ((OFFSETS, "README.txt"), (PARAMETERS, "README.txt"))),
+    ResultKind(
+        "identification",
+        "the result of an identification",
+        (("dynamics.json",),),
+        _NOT_A_SESSION | {"compensate": "give the fit that it stands on"},
+    ),
+    ResultKind("excitation", "a motion of calib excite", (("trajectory.toml",),)),
+    ResultKind("plan", "a motion of calib plan", (("motion.csv",),)),
+    ResultKind("fit", "the result of a fit", (("robot.toml", METRICS),), _NOT_A_SESSION),
+    ResultKind("comparison", "a comparison of calib diff", ((METRICS, "changes.csv"), (METRICS, "torque_changes.csv"))),
+    ResultKind("drift", "a report of calib drift", (("trends.csv",),)),
+    ResultKind("log", "a report of calib log", (("log.csv", METRICS),)),
+    ResultKind("robot", "a robot", (("robot.toml",),)),
+    ResultKind("fleet", "a report of calib fleet", ((METRICS, "report.html"),)),
+)
+
+# What each verb takes, in words. `robot` stands for every command that takes a robot.
+TAKES = {
+    "certificate": "the folder of a fit or of an identification",
+    "compensate": "the folder of a fit, or of a session that has one",
+    "deliver": "the folder of a fit",
+    "diff": "folders of fits, of identifications or of sessions",
+    "export": "the folder of a fit or of an identification",
+    "fleet": "folders of fits or of sessions",
+    "log": "folders of sessions",
+    "program": "a list of poses, a program, or the folder of a motion",
+    "recall": "the folder of calib excite",
+    "session": "the folder of a session; calib new makes one",
+    "robot": "a URDF, xacro, MJCF or TOML file, the folder of a fit, or a robot of the library",
+    "view": "a folder with measured poses, a motion or torques",
+}
+
+
+def kind_of(path: str | Path) -> ResultKind | None:
+    """Return the kind of result in a folder; None for a folder of something else, and for what is no folder."""
+    folder = Path(path)
+    if not folder.is_dir():
+        return None
+    for kind in KINDS:
+        for marks in kind.marks:
+            if all((folder / name).exists() for name in marks):
+                return kind
+    return None
+
+
+def refusal(path: str | Path, verb: str) -> str:
+    """Return the message of a verb that does not take a path: what it is, what the verb takes, what to do.
+
+    Args:
+        path: what the user named.
+        verb: a key of `TAKES`.
+    """
+    kind = kind_of(path)
+    if kind is None:
+        what = "holds no result" if Path(path).is_dir() else "is a file" if Path(path).is_file() else "does not exist"
+        return f"{path} {what}; give {TAKES[verb]}"
+    advice = kind.advice.get(verb, f"give {TAKES[verb]}")
+    return f"{path} is {kind.noun}; {advice.format(folder=path)}"

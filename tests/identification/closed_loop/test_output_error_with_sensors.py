@@ -1,0 +1,94 @@
+"""Output and input error with joint torque sensors and a payload stack: derivatives, recovery, and what is refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_arm import sensed
+
+from calib.dynamics.torque_rows import BOTH, DRIVE, LINK, MOTOR, POWER
+from calib.errors import UsageError
+from calib.identification.closed_loop.loop_recordings import close_loops
+from calib.identification.loop import LoopSettings
+from calib.identification.methods.method import IdentificationProblem
+from calib.identification.registry import METHODS
+from calib.identification.settings import IdentificationSettings, require_usable
+from calib.identification.survey.output_error import _Comparison
+from calib.identification.survey.simulated_robot import believed_robot
+
+
+def comparison(problem: IdentificationProblem, method: str) -> _Comparison:
+    loops = close_loops(problem.model, problem.cases, problem.decimator, problem.loop)
+    return _Comparison(problem, believed_robot(problem, METHODS[method]), loops, method == "clie")
+
+
+@pytest.mark.parametrize(("method", "rows"), [pytest.param("cloe", LINK, marks=pytest.mark.slow), ("clie", BOTH)])
+def test_the_jacobian_of_sensor_rows_is_that_of_differences(method, rows):
+    problem, truth = sensed(rows, 0, 0.0)
+    task = comparison(problem, method)
+    start = task.whole(truth, np.array([0.2, 0.1]))
+    residual, slopes = task.linearised(start)
+    assert residual.shape[1] == 4 and slopes.shape[2] == len(start)
+    assert (len(start) > len(truth)) == (rows is LINK)  # inertia, friction and offset of each motor
+    for k in range(0, len(start), 5):
+        step = 1e-5 * max(abs(start[k]), 0.1)
+        ahead, behind = (task.linearised(start + sign * step * np.eye(len(start))[k])[0] for sign in (1.0, -1.0))
+        away = np.abs((behind - ahead) / (2.0 * step) - slopes[:, :, k])
+        assert np.median(away) < 1e-6 * np.abs(slopes[:, :, k]).max()  # at the others the steps' number changes
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("method", "rows"), [("cloe", LINK), ("cloe", BOTH), ("clie", BOTH), ("iv", BOTH), ("didim", LINK)]
+)
+def test_a_payload_stack_with_sensors_is_recovered_within_sigma(method, rows):
+    away = []
+    for seed in range(3):
+        problem, truth = sensed(rows, seed, 1e-4)
+        found = METHODS[method].estimate(problem)
+        assert found.found
+        away.append((found.estimate.values - truth) / found.estimate.sigma)
+    assert np.mean(np.abs(away) < 2.0) > 0.85 and np.abs(away).max() < 6.0
+
+
+LOOP = LoopSettings(controller="pd", kp=(1.0,), kd=(1.0,))
+
+
+@pytest.mark.parametrize(
+    ("method", "rows", "works", "fails"),
+    [
+        ("clie", LINK, "wls iv didim pc-iv cloe", "clie ml ekf"),
+        ("cloe", POWER, "wls irls", "iv didim clie"),
+        ("ekf", BOTH, "wls iv cloe clie", "ml ukf"),
+        ("didim", DRIVE, "wls pc-wls tls", "iv pc-didim"),
+    ],
+)
+def test_torque_rows_that_a_method_does_not_take_are_refused_with_all_that_do(method, rows, works, fails):
+    settings = IdentificationSettings(method=method, torque_rows=rows, loop=LOOP)
+    with pytest.raises(UsageError, match=f"rows = '{rows.name}' is not supported; methods that do: ") as caught:
+        require_usable(settings, METHODS[method])
+    named = str(caught.value).split(": ")[-1].split(", ")
+    assert set(works.split()) <= set(named) and not set(fails.split()) & set(named)
+    assert all(METHODS[name].takes(rows) for name in named)
+
+
+def test_friction_is_what_the_method_takes():
+    auto = IdentificationSettings(torque_rows=MOTOR, loop=LOOP)
+    assert [require_usable(auto, METHODS[name]).friction for name in ("iv", "didim", "cloe", "ekf", "wls")] == [
+        "auto", "auto", "standard", "standard", "auto",
+    ]  # fmt: skip
+    assert require_usable(replace(auto, friction="stribeck"), METHODS["clie"]).friction == "stribeck"
+    with pytest.raises(UsageError, match=r"standard friction only.* methods that take it: .*iv"):
+        require_usable(replace(auto, friction="stribeck"), METHODS["ukf"])
+
+
+def test_friction_without_derivatives_is_refused_by_name():
+    from calib.dynamics import drives
+    from calib.dynamics.shapes import JointRange
+
+    problem, _ = sensed(BOTH, 0, 0.0)
+    terms = drives.offered("presliding", 0, JointRange(0.2, 2.0, 3.0, 3.0))
+    rows = tuple(one.extend(terms, np.ones((*one.target.shape, len(terms)))) for one in problem.rows)
+    found = replace(problem, rows=rows, terms=(*problem.terms, *terms))
+    with pytest.raises(Exception, match=r"no derivatives .* iv and didim take it"):
+        comparison(found, "cloe").linearised(np.zeros(len(found.terms)))

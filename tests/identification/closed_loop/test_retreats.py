@@ -1,0 +1,38 @@
+"""Steps to robots that cannot be simulated: halved, from either end."""
+
+import numpy as np
+import pytest
+
+from calib.errors import CannotSimulate, UsageError
+from calib.identification.closed_loop import instrumental
+from calib.identification.closed_loop.simulation import Plant
+from calib.rooms.cells import known_robots
+
+
+@pytest.mark.parametrize(("stable", "share"), [(0.6, 0.5), (0.3, 0.25), (0.02, 2.0**-6)])
+def test_the_step_is_halved_until_the_loop_is_stable(
+    monkeypatch: pytest.MonkeyPatch, stable: float, share: float
+) -> None:
+    start, end = step(monkeypatch, stable)
+    nearer, runs = instrumental._nearer(start, end, [])
+    assert runs == [] and nearer.parameters[0] == share
+
+
+def test_where_no_part_of_the_step_is_stable_that_is_the_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    start, end = step(monkeypatch, 0.0)
+    with pytest.raises(CannotSimulate, match="no robot on the way to the estimate can be simulated: unstable"):
+        instrumental._nearer(start, end, [])
+
+
+def step(monkeypatch: pytest.MonkeyPatch, stable: float) -> tuple[Plant, Plant]:
+    """Return two plants with parameters 0 and 1; up to `stable` between them the loop can be simulated."""
+
+    def runs(plant: Plant, cases: list) -> list:
+        if plant.parameters[0] > stable:
+            raise UsageError("unstable")
+        return []
+
+    monkeypatch.setattr(instrumental, "_runs", runs)
+    plant = known_robots.plant("tx40", coupled=True)
+    zero, one = np.zeros_like(plant.parameters), np.ones_like(plant.parameters)
+    return plant.with_parameters(zero), plant.with_parameters(one)
