@@ -8,6 +8,11 @@ import scipy.linalg
 
 from calib.records import frozen
 
+# norm of a column relative to the largest below which it has no effect
+NO_EFFECT = 1e-12
+# relative difference of norms within which columns enter in their own order
+TIE = 1e-3
+
 
 @dataclass(frozen=True, eq=False)
 class ColumnSplit:
@@ -58,50 +63,61 @@ def split_columns(
         tolerance: see `ColumnSplit`.
     """
     p = matrix.shape[1]
-    factor = np.linalg.qr(matrix, mode="r") if matrix.shape[0] > p else np.asarray(matrix, dtype=float)
+    factor = np.asarray(matrix, dtype=float)
+    if matrix.shape[0] > p:
+        factor = np.linalg.qr(matrix, mode="r")
     norms = np.linalg.norm(factor, axis=0)
-    silent = norms <= 1e-12 * norms.max(initial=0.0)
+    silent = norms <= NO_EFFECT * norms.max(initial=0.0)
     divisor = np.where(silent, 1.0, norms)
     scaled = factor / divisor
     scaled[:, silent] = 0.0
-    kept = _pick(scaled, _complete(groups, p), np.flatnonzero(silent), tolerance)
-    dropped = np.setdiff1d(np.arange(p), kept)
-    coefficients = np.linalg.lstsq(scaled[:, kept], scaled[:, dropped], rcond=None)[0]
-    coefficients = coefficients * divisor[dropped] / divisor[kept][:, None] if len(kept) else coefficients
+    base = _independent(scaled, _with_all_columns(groups, p), np.flatnonzero(silent), tolerance)
+    dropped = np.setdiff1d(np.arange(p), base)
+    coefficients = np.linalg.lstsq(scaled[:, base], scaled[:, dropped], rcond=None)[0]
+    if len(base):
+        coefficients = coefficients * divisor[dropped] / divisor[base][:, None]
     values = np.linalg.svd(scaled, compute_uv=False)
     values = np.concatenate([values, np.zeros(p - len(values))])
     return ColumnSplit(
-        frozen(kept, int),
-        frozen(dropped, int),
-        frozen(np.flatnonzero(silent), int),
-        frozen(coefficients),
-        frozen(values),
-        tolerance,
+        kept=frozen(base, int),
+        dropped=frozen(dropped, int),
+        without_effect=frozen(np.flatnonzero(silent), int),
+        coefficients=frozen(coefficients),
+        singular_values=frozen(values),
+        tolerance=tolerance,
     )
 
 
-def _complete(groups: Sequence[np.ndarray] | None, p: int) -> list[np.ndarray]:
+def _with_all_columns(groups: Sequence[np.ndarray] | None, p: int) -> list[np.ndarray]:
     """Return the groups with the columns in no group appended."""
-    listed = [np.asarray(group, dtype=int) for group in groups] if groups is not None else []
-    named = np.concatenate(listed) if listed else np.array([], dtype=int)
-    return [*listed, np.setdiff1d(np.arange(p), named)]
+    result: list[np.ndarray] = []
+    remaining = np.arange(p)
+    if groups is None:
+        groups = []
+    for group in groups:
+        columns = np.asarray(group, dtype=int)
+        result.append(columns)
+        remaining = np.setdiff1d(remaining, columns)
+    result.append(remaining)
+    return result
 
 
-def _pick(scaled: np.ndarray, groups: list[np.ndarray], silent: np.ndarray, tolerance: float) -> np.ndarray:
+def _independent(scaled: np.ndarray, groups: list[np.ndarray], silent: np.ndarray, tolerance: float) -> np.ndarray:
     """Return the sorted indices of independent columns, chosen group by group."""
     basis = np.zeros((scaled.shape[0], 0))
-    kept: list[int] = []
-    tie = 1e-3  # columns of nearly equal norm enter in their own order
+    independent: list[int] = []
     for group in groups:
         candidates = np.setdiff1d(group, silent)
         if len(candidates) == 0 or basis.shape[1] == scaled.shape[0]:
             continue
-        rest = scaled[:, candidates]
-        for _ in range(2):  # twice is enough (Kahan): orthogonal to rounding
-            rest = rest - basis @ (basis.T @ rest)
-        rest = rest * (1.0 - tie * np.arange(len(candidates)) / len(candidates))
-        q, r, order = (np.asarray(x) for x in scipy.linalg.qr(rest, mode="economic", pivoting=True))
+        remainder = scaled[:, candidates]
+        # twice is enough (Kahan): orthogonal to rounding
+        for _ in range(2):
+            remainder = remainder - basis @ (basis.T @ remainder)
+        # of columns of nearly equal norm the earlier enters first
+        remainder = remainder * (1.0 - TIE * np.arange(len(candidates)) / len(candidates))
+        q, r, order = scipy.linalg.qr(remainder, mode="economic", pivoting=True)
         count = int(np.sum(np.abs(np.diag(r)) > tolerance))
-        kept.extend(candidates[order[:count]])
+        independent.extend(candidates[order[:count]])
         basis = np.hstack([basis, q[:, :count]])
-    return np.array(sorted(kept), dtype=int)
+    return np.array(sorted(independent), dtype=int)

@@ -15,7 +15,13 @@ from calib.estimation.triangles import require_rank
 if TYPE_CHECKING:
     import clarabel
 
-ACCURACIES = 1e-10, 1e-8, 1e-6  # of the scaled problem; the others where rounding forbids the first
+# of the scaled problem; the others where rounding forbids the first
+ACCURACIES = (1e-10, 1e-8, 1e-6)
+# states of Clarabel that end the search for an accuracy, and those with an optimum
+OPTIMAL = ("Solved", "AlmostSolved")
+FINAL = (*OPTIMAL, "PrimalInfeasible")
+# of ‖z‖, by which the optimum on the binding rows may be off Clarabel's
+MAX_MOVE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +41,8 @@ def minimise(
     offset: np.ndarray,
     matrices: np.ndarray,
     least: np.ndarray | float = 0.0,
-    equal: np.ndarray | None = None,
-    held: np.ndarray | None = None,
+    equality_rows: np.ndarray | None = None,
+    equality_values: np.ndarray | None = None,
 ) -> ConeOptimum:
     """Minimise ½ ‖R b - z‖² under A b + c >= 0, E b = d and M_k(b) ⪰ λ 1; t = R b - z is an unknown: no squares.
 
@@ -45,7 +51,7 @@ def minimise(
         rows, offset: A (c, p), c (c,).
         matrices: (k, n, n, p), M_k = Σ_j A_kj b_j.
         least: λ, one or (k,).
-        equal, held: E (e, p), d (e,); None for none.
+        equality_rows, equality_values: E (e, p), d (e,); None for none.
 
     Raises:
         NotConverged: where no point satisfies all.
@@ -53,34 +59,49 @@ def minimise(
     import clarabel
     from scipy import sparse
 
-    (m, p), (size, n, _, _) = upper.shape, matrices.shape
-    equal, held = np.zeros((0, p)) if equal is None else equal, np.zeros(0) if held is None else held
-    i, j = np.tril_indices(n)[::-1]  # upper triangle, column by column
+    m, p = upper.shape
+    size, n, _, _ = matrices.shape
+    if equality_rows is None or equality_values is None:
+        equality_rows = np.zeros((0, p))
+        equality_values = np.zeros(0)
+    # upper triangle, column by column
+    j, i = np.tril_indices(n)
     weight = np.where(i == j, 1.0, np.sqrt(2.0))
     flat = (matrices[:, i, j] * weight[:, None]).reshape(-1, p)
-    system = np.vstack([upper, equal, -rows, -flat])
-    right = np.concatenate([target, held, offset, -np.outer(np.broadcast_to(least, size), i == j).ravel()])
-    ends = np.cumsum([m, len(equal), len(rows)])
-    cones = [clarabel.ZeroConeT(int(ends[1])), *[clarabel.NonnegativeConeT(len(rows))][: len(rows)]]
+    bounds = -np.outer(np.broadcast_to(least, size), i == j).ravel()
+    system = np.vstack([upper, equality_rows, -rows, -flat])
+    right = np.concatenate([target, equality_values, offset, bounds])
+    end_of_target, end_of_equalities, end_of_rows = np.cumsum([m, len(equality_rows), len(rows)]).tolist()
+    cones = [clarabel.ZeroConeT(end_of_equalities)]
+    if len(rows):
+        cones.append(clarabel.NonnegativeConeT(len(rows)))
     cones += [clarabel.PSDTriangleConeT(n)] * size
     settings = clarabel.DefaultSettings()
-    settings.verbose, settings.max_threads = False, 1
+    settings.verbose = False
+    settings.max_threads = 1
     cost = sparse.diags(np.repeat([0.0, 1.0], [p, m])).tocsc()
     system = sparse.csc_matrix(np.hstack([system, -np.eye(len(system), m)]))
+    solution = None
     for accuracy in ACCURACIES:
         settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = accuracy
-        found = _solved(clarabel.DefaultSolver(cost, np.zeros(p + m), system, right, cones, settings))
-        if found is not None and str(found.status) in ("Solved", "AlmostSolved", "PrimalInfeasible"):
+        solution = _solved(clarabel.DefaultSolver(cost, np.zeros(p + m), system, right, cones, settings))
+        if solution is not None and str(solution.status) in FINAL:
             break
-    if found is None:
+    if solution is None:
         raise NotConverged("the constraints are not solvable to any accuracy: Clarabel's eigenvalues do not converge")
-    b, dual = np.array(found.x)[:p], np.array(found.z)
-    if str(found.status) not in ("Solved", "AlmostSolved"):
-        raise NotConverged(f"the constraints may contradict each other: Clarabel reports {found.status}", b)
-    pushes = np.zeros((size, n, n))
-    pushes[:, i, j] = dual[ends[2] :].reshape(size, len(i)) / weight
-    pushes[:, j, i] = pushes[:, i, j]
-    return ConeOptimum(b, dual[ends[1] : ends[2]], pushes, -dual[ends[0] : ends[1]])
+    values = np.array(solution.x)[:p]
+    if str(solution.status) not in OPTIMAL:
+        raise NotConverged(f"the constraints may contradict each other: Clarabel reports {solution.status}", values)
+    dual = np.array(solution.z)
+    matrix_multipliers = np.zeros((size, n, n))
+    matrix_multipliers[:, i, j] = dual[end_of_rows:].reshape(size, len(i)) / weight
+    matrix_multipliers[:, j, i] = matrix_multipliers[:, i, j]
+    return ConeOptimum(
+        values=values,
+        rows=dual[end_of_equalities:end_of_rows],
+        matrices=matrix_multipliers,
+        equalities=-dual[end_of_target:end_of_equalities],
+    )
 
 
 def _solved(solver: "clarabel.DefaultSolver") -> "clarabel.DefaultSolution | None":
@@ -90,13 +111,14 @@ def _solved(solver: "clarabel.DefaultSolver") -> "clarabel.DefaultSolution | Non
     """
     try:
         return solver.solve()
-    except BaseException as error:  # a panic of Rust is no Exception
+    # a panic of Rust is no Exception
+    except BaseException as error:
         if type(error).__name__ != "PanicException":
             raise
         return None
 
 
-def from_free(factor: np.ndarray, free: np.ndarray, normals: np.ndarray, held: np.ndarray) -> np.ndarray:
+def from_free(factor: np.ndarray, free: np.ndarray, normals: np.ndarray, sides: np.ndarray) -> np.ndarray:
     """Return the estimate under A b = d from the unconstrained one, b_f - Q⁻¹Aᵀ (A Q⁻¹ Aᵀ)⁻¹ (A b_f - d), Q = RᵀR.
 
     Gouriéroux & Monfort (1995, section 10.3): under inequalities the same, A and d those that bind.
@@ -105,12 +127,15 @@ def from_free(factor: np.ndarray, free: np.ndarray, normals: np.ndarray, held: n
         factor: (p + 1, p + 1) triangle [R z; 0 ρ].
         free: (p,) b_f.
         normals: A (k, p), of full rank.
-        held: d (k,).
+        sides: d (k,).
     """
     p = len(free)
-    turned = scipy.linalg.solve_triangular(factor[:p, :p].T, normals.T, lower=True)  # R⁻ᵀ Aᵀ
-    push = np.linalg.lstsq(turned, np.linalg.lstsq(turned.T, normals @ free - held)[0])[0]
-    return np.asarray(free - scipy.linalg.solve_triangular(factor[:p, :p], turned @ push))
+    upper = factor[:p, :p]
+    # R⁻ᵀ Aᵀ
+    whitened = scipy.linalg.solve_triangular(upper.T, normals.T, lower=True)
+    violation = np.linalg.lstsq(whitened.T, normals @ free - sides)[0]
+    multipliers = np.linalg.lstsq(whitened, violation)[0]
+    return np.asarray(free - scipy.linalg.solve_triangular(upper, whitened @ multipliers))
 
 
 def bounded(factor: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -123,22 +148,29 @@ def bounded(factor: np.ndarray, rows: np.ndarray) -> np.ndarray:
         rows: A (c, p); one of a single entry is satisfied exactly.
     """
     p = len(factor) - 1
-    norms, length = np.linalg.norm(factor[:p, :p], axis=0), float(np.linalg.norm(factor[:p, p])) or 1.0
-    upper, target = factor[:p, :p] / np.where(norms > 0.0, norms, 1.0), factor[:p, p] / length
+    norms = np.linalg.norm(factor[:p, :p], axis=0)
+    upper = factor[:p, :p] / np.where(norms > 0.0, norms, 1.0)
     require_rank(upper, [f"x{k + 1}" for k in range(p)])
-    unit, values = length / norms, scipy.linalg.solve_triangular(factor[:p, :p], factor[:p, p])
-    alone = np.count_nonzero(rows, axis=1) == 1
+    length = float(np.linalg.norm(factor[:p, p])) or 1.0
+    target = factor[:p, p] / length
+    unit = length / norms
+    values = scipy.linalg.solve_triangular(factor[:p, :p], factor[:p, p])
+    single_entry = np.count_nonzero(rows, axis=1) == 1
     if (rows @ values < 0.0).any():
-        sizes = np.linalg.norm(rows * unit, axis=1)
-        scaled = rows * unit / np.where(sizes > 0.0, sizes, 1.0)[:, None]
-        solved = minimise(upper, target, scaled, np.zeros(len(rows)), np.zeros((0, 1, 1, p)))
-        binding = solved.rows > np.maximum(scaled @ solved.values, 0.0)
+        scaled = rows * unit
+        sizes = np.linalg.norm(scaled, axis=1)
+        scaled = scaled / np.where(sizes > 0.0, sizes, 1.0)[:, None]
+        optimum = minimise(upper, target, scaled, np.zeros(len(rows)), np.zeros((0, 1, 1, p)))
+        binding = optimum.rows > np.maximum(scaled @ optimum.values, 0.0)
         exact = from_free(factor, values, rows[binding], np.zeros(int(binding.sum())))
-        exact[(rows[binding & alone] != 0.0).any(axis=0)] = 0.0
-        slope = upper.T @ (upper @ (exact / unit) - target)
-        pushes = np.linalg.lstsq(scaled[binding].T, slope)[0]
-        away = np.linalg.norm(upper @ (exact / unit - solved.values))
-        max_move = 1e-3  # of ‖z‖, by which the optimum on the binding rows may be off Clarabel's
-        good = (rows[~binding] @ exact >= 0.0).all() and (pushes >= 0.0).all() and away <= max_move
-        values = exact if good else solved.values * unit
-    return np.where((rows[alone] != 0.0).any(axis=0), np.maximum(values, 0.0), values)
+        exact[(rows[binding & single_entry] != 0.0).any(axis=0)] = 0.0
+        gradient = upper.T @ (upper @ (exact / unit) - target)
+        multipliers = np.linalg.lstsq(scaled[binding].T, gradient)[0]
+        move = np.linalg.norm(upper @ (exact / unit - optimum.values))
+        satisfies_others = (rows[~binding] @ exact >= 0.0).all()
+        if satisfies_others and (multipliers >= 0.0).all() and move <= MAX_MOVE:
+            values = exact
+        else:
+            values = optimum.values * unit
+    bounded_alone = (rows[single_entry] != 0.0).any(axis=0)
+    return np.where(bounded_alone, np.maximum(values, 0.0), values)

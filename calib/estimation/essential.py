@@ -97,65 +97,88 @@ def eliminate(
         inflation: (g,) see `linear`; without it too many parameters are kept for autocorrelated residuals.
     """
     _check_lists(data.names, keep, drop)
-    sigma = settled_std(data) if std is None else np.asarray(std, dtype=float)
-    base = current = wls(data, sigma, inflation)
-    kept, gone, steps = list(range(data.parameters)), [], []
-    while True:
+    if std is None:
+        std = settled_std(data)
+    sigma = np.asarray(std, dtype=float)
+    base = wls(data, sigma, inflation)
+    current = base
+    columns = list(range(data.parameters))
+    dropped: list[int] = []
+    steps: list[EliminationStep] = []
+    refused = None
+    while len(columns) > 1:
         worst = _next(current, keep, drop)
-        if worst is None or len(kept) == 1:
-            return Elimination(base, current, np.array(kept), tuple(steps), None)
-        smaller = wls(data.select(np.delete(kept, worst)), sigma, inflation)
-        step = _step(base, current, smaller, worst, [*gone, kept[worst]], current.estimate.names[worst] in drop)
+        if worst is None:
+            break
+        name = current.estimate.names[worst]
+        smaller = wls(data.select(np.delete(columns, worst)), sigma, inflation)
+        step = _step(base, current, smaller, worst, [*dropped, columns[worst]], name in drop)
         if not step.listed and _refused(step, rule, ratio, level):
-            return Elimination(base, current, np.array(kept), tuple(steps), step)
-        gone.append(kept.pop(worst))
+            refused = step
+            break
+        dropped.append(columns.pop(worst))
         steps.append(step)
         current = smaller
+    return Elimination(base, current, np.array(columns), tuple(steps), refused)
 
 
-def nested_test(base: LinearFit, gone: Sequence[int]) -> tuple[float, float]:
+def nested_test(base: LinearFit, dropped: Sequence[int]) -> tuple[float, float]:
     """Return F and its p-value for the hypothesis that the parameters with these indices are all zero.
 
     Equal to the F-test of the two residual sums; F uses the residual variance of the base fit.
     """
-    x = base.estimate.values[list(gone)]
-    covariance = base.estimate.covariance[np.ix_(gone, gone)] * base.estimate.residual_std**2
+    values = base.estimate.values[list(dropped)]
+    covariance = base.estimate.covariance[np.ix_(dropped, dropped)] * base.estimate.residual_std**2
     scale = np.sqrt(np.diag(covariance))
-    y = x / scale
-    f = float(y @ np.linalg.solve(covariance / np.outer(scale, scale), y)) / len(x)
-    return f, float(fdtrc(len(x), base.estimate.dof, f))
+    scaled = values / scale
+    correlation = covariance / np.outer(scale, scale)
+    f = float(scaled @ np.linalg.solve(correlation, scaled)) / len(values)
+    return f, float(fdtrc(len(values), base.estimate.dof, f))
 
 
 def _step(
-    base: LinearFit, current: LinearFit, smaller: LinearFit, worst: int, gone: list[int], listed: bool
+    base: LinearFit, current: LinearFit, smaller: LinearFit, worst: int, dropped: list[int], listed: bool
 ) -> EliminationStep:
+    """Return the step from the current to a smaller model; `dropped`: all indices of the base model that went."""
     rsd = current.estimate.rsd
+    ratio = np.inf
+    if rsd.min() > 0.0:
+        ratio = float(rsd.max() / rsd.min())
     f, p = nested_test(current, [worst])
-    spread = float(rsd.max() / rsd.min()) if rsd.min() > 0.0 else np.inf
+    _, p_total = nested_test(base, dropped)
     return EliminationStep(
-        current.estimate.names[worst],
-        float(rsd[worst]),
-        spread,
-        f,
-        p,
-        nested_test(base, gone)[1],
-        smaller.estimate.residual_std,
-        listed,
+        name=current.estimate.names[worst],
+        rsd=float(rsd[worst]),
+        ratio=ratio,
+        f=f,
+        p=p,
+        p_total=p_total,
+        residual_std=smaller.estimate.residual_std,
+        listed=listed,
     )
 
 
 def _next(current: LinearFit, keep: Sequence[str], drop: Sequence[str]) -> int | None:
     """Return the index of the next parameter to drop: listed ones first, then the largest RSD."""
-    names, rsd = current.estimate.names, current.estimate.rsd
-    listed = [k for k, name in enumerate(names) if name in drop]
-    candidates = listed or [k for k, name in enumerate(names) if name not in keep]
-    return max(candidates, key=lambda k: rsd[k]) if candidates else None
+    names = current.estimate.names
+    rsd = current.estimate.rsd
+    candidates = [k for k, name in enumerate(names) if name in drop]
+    if not candidates:
+        candidates = [k for k, name in enumerate(names) if name not in keep]
+    if not candidates:
+        return None
+    return max(candidates, key=lambda k: rsd[k])
 
 
 def _refused(step: EliminationStep, rule: Rule, ratio: float, level: float) -> bool:
+    """Return whether the rule ends the elimination before this step."""
     even = step.ratio < ratio
-    needed = step.p < level or step.p_total < level
-    return {Rule.RSD: even, Rule.F: needed, Rule.BOTH: even or needed}[rule]
+    significant = step.p < level or step.p_total < level
+    if rule is Rule.RSD:
+        return even
+    if rule is Rule.F:
+        return significant
+    return even or significant
 
 
 def _check_lists(names: Sequence[str], keep: Sequence[str], drop: Sequence[str]) -> None:

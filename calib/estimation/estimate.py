@@ -43,9 +43,10 @@ class Estimate(Frozen):
         correlation = self.covariance / np.outer(sigma, sigma)
         rows, columns = np.triu_indices(len(sigma), 1)
         strong = np.abs(correlation[rows, columns]) > threshold
-        pairs = [
-            (self.names[i], self.names[j], float(correlation[i, j])) for i, j in zip(rows[strong], columns[strong])
-        ]
+        pairs = []
+        for i, j in zip(rows[strong], columns[strong]):
+            pair = (self.names[i], self.names[j], float(correlation[i, j]))
+            pairs.append(pair)
         return sorted(pairs, key=lambda pair: -abs(pair[2]))
 
 
@@ -53,6 +54,9 @@ def whitened(values: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Return [R z] (p, p + 1) of values and covariance (p, p), RᵀR = Σ⁻¹ and z = R x; zero variances count as one."""
     sigma = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
     sigma = np.where(sigma > 0.0, sigma, 1.0)
-    size, axes = np.linalg.eigh(covariance / np.outer(sigma, sigma))
-    root = (axes / np.sqrt(np.maximum(size, 1e-13 * size[-1]))).T / sigma
+    correlation = covariance / np.outer(sigma, sigma)
+    size, axes = np.linalg.eigh(correlation)
+    # rounding may leave an eigenvalue negative
+    size = np.maximum(size, 1e-13 * size[-1])
+    root = (axes / np.sqrt(size)).T / sigma
     return np.column_stack([root, root @ values])

@@ -18,6 +18,11 @@ from calib.estimation.estimate import Estimate
 from calib.estimation.triangles import Triangles, combine, retriangulate, solve_triangle
 from calib.records import Frozen, shaped
 
+# relative size below which a group's column depends on its others
+RANK_TOLERANCE = 1e-8
+# smallest standard deviation of a group, relative to the largest
+MIN_STD = 1e-9
+
 
 @dataclass(frozen=True, eq=False)
 class LinearFit(Frozen):
@@ -58,7 +63,9 @@ def wls(data: Triangles, std: np.ndarray | None = None, inflation: np.ndarray | 
         std: (g,) in units of y; `subsystem_std` is the study's choice. None: `settled_std`.
         inflation: (g,) >= 1, see the module.
     """
-    return _fit(data, settled_std(data) if std is None else np.asarray(std, dtype=float), inflation, stated=True)
+    if std is None:
+        std = settled_std(data)
+    return _fit(data, np.asarray(std, dtype=float), inflation, stated=True)
 
 
 def ridge(data: Triangles, mean: np.ndarray, covariance: np.ndarray, std: np.ndarray | None = None) -> LinearFit:
@@ -74,12 +81,15 @@ def ridge(data: Triangles, mean: np.ndarray, covariance: np.ndarray, std: np.nda
     """
     p = data.parameters
     mean = shaped(mean, (p,), "prior mean")
-    known = np.isfinite(np.diag(covariance))
-    root = np.linalg.cholesky(shaped(np.asarray(covariance)[np.ix_(known, known)], (None, None), "prior covariance"))
-    rows = np.zeros((int(known.sum()), p + 1))
-    rows[:, np.flatnonzero(known)] = scipy.linalg.solve_triangular(root, np.eye(len(root)), lower=True)
+    with_prior = np.flatnonzero(np.isfinite(np.diag(covariance)))
+    prior = np.asarray(covariance)[np.ix_(with_prior, with_prior)]
+    root = np.linalg.cholesky(shaped(prior, (None, None), "prior covariance"))
+    rows = np.zeros((len(with_prior), p + 1))
+    rows[:, with_prior] = scipy.linalg.solve_triangular(root, np.eye(len(root)), lower=True)
     rows[:, p] = rows[:, :p] @ mean
-    sigma = settled_std(data) if std is None else np.asarray(std, dtype=float)
+    if std is None:
+        std = settled_std(data)
+    sigma = np.asarray(std, dtype=float)
     factor = retriangulate(np.vstack([combine(data, sigma), rows]))
     values, inverse, conditions = solve_triangle(factor, data.names)
     return _pack(data, values, inverse @ inverse.T, sigma, np.ones(data.groups), inverse, conditions)
@@ -90,14 +100,14 @@ def subsystem_std(data: Triangles) -> np.ndarray:
     p = data.parameters
     result = np.empty(data.groups)
     for g, factor in enumerate(data.factors):
-        own = split_columns(factor[:, :p], tolerance=1e-8).kept
-        if data.rows[g] <= len(own):
+        columns = split_columns(factor[:, :p], tolerance=RANK_TOLERANCE).kept
+        if data.rows[g] <= len(columns):
             raise CalibError(
-                f"group {g} has {data.rows[g]} rows for its {len(own)} independent columns: no residual is left for "
-                "its noise; state the standard deviations"
+                f"group {g} has {data.rows[g]} rows for its {len(columns)} independent columns: no residual is left "
+                "for its noise; state the standard deviations"
             )
-        rest = retriangulate(factor[:, np.append(own, p)])[-1, -1]
-        result[g] = abs(rest) / np.sqrt(data.rows[g] - len(own))
+        residual = retriangulate(factor[:, np.append(columns, p)])[-1, -1]
+        result[g] = abs(residual) / np.sqrt(data.rows[g] - len(columns))
     return _floored(result)
 
 
@@ -108,11 +118,13 @@ def settled_std(data: Triangles, tolerance: float = 1e-6, limit: int = 200) -> n
     likelihood (Patterson & Thompson 1971). Starts from `subsystem_std`.
     """
     std = subsystem_std(data)
+    change = np.inf
     for _ in range(limit):
         values, inverse, _ = solve_triangle(combine(data, std), data.names)
-        left = data.rows - leverage(data, std, inverse)
-        new = _floored(np.sqrt(data.residual_squares(values) / np.maximum(left, 1e-9)))
-        change, std = float(np.max(np.abs(new / std - 1.0))), new
+        dof = data.rows - leverage(data, std, inverse)
+        updated = _floored(np.sqrt(data.residual_squares(values) / np.maximum(dof, 1e-9)))
+        change = float(np.max(np.abs(updated / std - 1.0)))
+        std = updated
         if change < tolerance:
             return std
     raise NotConverged(
@@ -124,16 +136,20 @@ def settled_std(data: Triangles, tolerance: float = 1e-6, limit: int = 200) -> n
 
 def _fit(data: Triangles, std: np.ndarray, inflation: np.ndarray | None, stated: bool) -> LinearFit:
     """Return the fit with rows divided by std; `stated`: std is the noise, otherwise the noise up to a factor."""
-    tau = np.ones(data.groups) if inflation is None else shaped(inflation, (data.groups,), "inflation per group")
     values, inverse, conditions = solve_triangle(combine(data, std), data.names)
     covariance = inverse @ inverse.T
+    tau = np.ones(data.groups)
     if inflation is not None:
-        spread = (data.factors[:, :, :-1] @ inverse * (np.sqrt(tau) / std)[:, None, None]).reshape(-1, len(inverse))
+        tau = shaped(inflation, (data.groups,), "inflation per group")
+        # the sum over rows counts those of group g τ_g times
+        scale = (np.sqrt(tau) / std)[:, None, None]
+        spread = (data.factors[:, :, :-1] @ inverse * scale).reshape(-1, len(inverse))
         covariance = inverse @ (spread.T @ spread) @ inverse.T
     fit = _pack(data, values, covariance, std, tau, inverse, conditions)
     if stated:
         return fit
-    return _pack(data, values, covariance * fit.estimate.residual_std**2, std, tau, inverse, conditions)
+    scaled = covariance * fit.estimate.residual_std**2
+    return _pack(data, values, scaled, std, tau, inverse, conditions)
 
 
 def _pack(
@@ -147,12 +163,13 @@ def _pack(
 ) -> LinearFit:
     """Return the fit with the residuals' standard deviations; degrees of freedom account for the inflation τ."""
     squares = data.residual_squares(values)
-    left = data.rows - tau * leverage(data, std, inverse)
-    dof = int(np.round(np.sum(left / tau), 6))
-    if dof <= 0 or left.sum() <= 0:
+    group_dof = data.rows - tau * leverage(data, std, inverse)
+    dof = int(np.round(np.sum(group_dof / tau), 6))
+    if dof <= 0 or group_dof.sum() <= 0:
         independent = float(np.sum(data.rows / tau))
         advice = "record longer or estimate fewer parameters"
-        if independent > data.parameters:  # the rows would do: what is left of them is no noise
+        # the rows would do: their residuals are no noise
+        if independent > data.parameters:
             advice = (
                 "the residuals of neighbouring rows are strongly correlated, as with another robot's model or "
                 "swapped columns; check both, then record longer"
@@ -162,18 +179,21 @@ def _pack(
             f"parameters: no residual is left to check them; {advice}",
             data.names,
         )
-    residual_std = float(np.sqrt(np.sum(squares / std**2) / left.sum()))
-    group_std = np.sqrt(squares / np.maximum(left, 1e-9))
+    residual_std = float(np.sqrt(np.sum(squares / std**2) / group_dof.sum()))
+    group_std = np.sqrt(squares / np.maximum(group_dof, 1e-9))
     estimate = Estimate(data.names, data.units, values, covariance, residual_std, dof)
     return LinearFit(estimate, group_std, *conditions)
 
 
 def leverage(data: Triangles, std: np.ndarray, inverse: np.ndarray) -> np.ndarray:
     """Return the leverage h_g = ‖W_g R⁻¹‖² / σ_g² (g,) of each group; their sum is p."""
-    return np.sum((data.factors[:, :, :-1] @ inverse) ** 2, axis=(1, 2)) / std**2
+    whitened = data.factors[:, :, :-1] @ inverse
+    return np.sum(whitened**2, axis=(1, 2)) / std**2
 
 
 def _floored(std: np.ndarray) -> np.ndarray:
-    """Return std with a floor of 1e-9 times the largest, which keeps the weights of exact data finite."""
+    """Return std with a floor relative to the largest, which keeps the weights of exact data finite."""
     largest = std.max(initial=0.0)
-    return np.maximum(std, 1e-9 * largest) if largest > 0.0 else np.ones_like(std)
+    if largest > 0.0:
+        return np.maximum(std, MIN_STD * largest)
+    return np.ones_like(std)

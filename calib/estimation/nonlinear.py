@@ -18,7 +18,20 @@ from scipy.linalg.lapack import dpotrf, dtpqrt, dtrcon, dtrtri  # type: ignore[a
 
 from calib.estimation.relevance import Gram, gram
 
+# numbers of W held at once (our choice)
+MOST_NUMBERS = 500_000
+# condition number up to which R has relative errors of 1e-6 at most: κ² times rounding
+MAX_CONDITION = 1e5
+# columns of LAPACK's panels
+PANEL = 32
+# λ from which on no step is better
+MAX_DAMPING = 1e10
+# rms residual [standard deviations of a measurement] at which computed measurements are met
+EXACT_RMS = 0.01
+
 State = TypeVar("State")
+# residual (m,) and W (m, p)
+Rows = tuple[np.ndarray, np.ndarray]
 
 
 class Status(Enum):
@@ -72,13 +85,15 @@ class Reduced:
 
     def extended(self, residual: np.ndarray, matrix: np.ndarray) -> Reduced:
         """Return the problem with further rows r (m,) and W (m, p)."""
-        found = triangle(np.concatenate([self.target, residual]), np.vstack([self.factor, matrix]))
-        return replace(found, cost=self.cost + float(residual @ residual), rows=self.rows + len(residual))
+        stacked = triangle(np.concatenate([self.target, residual]), np.vstack([self.factor, matrix]))
+        cost = self.cost + float(residual @ residual)
+        return replace(stacked, cost=cost, rows=self.rows + len(residual))
 
     def moved(self, change: np.ndarray) -> Reduced:
         """Return the problem with r + W dx in place of r."""
         target = self.target + self.factor @ change
-        return replace(self, target=target, cost=self.cost + float(target @ target - self.target @ self.target))
+        cost = self.cost + float(target @ target - self.target @ self.target)
+        return replace(self, target=target, cost=cost)
 
     def gram(self) -> Gram:
         """Return its sufficient statistics WᵀW, Wᵀr, rᵀr."""
@@ -98,9 +113,6 @@ def triangle(residual: np.ndarray, matrix: np.ndarray) -> Reduced:
     return Reduced(np.triu(factor[:p, :p]), factor[:p, p], float(residual @ residual), len(residual))
 
 
-Rows = tuple[np.ndarray, np.ndarray]  # residual (m,) and W (m, p)
-
-
 def reduced(pieces: Callable[[], Iterable[Rows]], total: Gram | None = None) -> Reduced:
     """Return the problem of many pieces of rows reduced in the memory of one piece.
 
@@ -111,14 +123,11 @@ def reduced(pieces: Callable[[], Iterable[Rows]], total: Gram | None = None) -> 
         pieces: yields the rows, the same at every call.
         total: their statistics, of many rows where they are known already.
     """
-    start = list[Rows]()
-    for piece in pieces() if total is None else ():
-        start.append(piece)
-        if total is not None or sum(matrix.size for _, matrix in start) > MOST_NUMBERS:
-            each = [gram(*one) for one in start]
-            total, start = sum(each[1:], each[0] if total is None else total + each[0]), []
     if total is None:
-        return triangle(np.concatenate([one for one, _ in start]), _stacked([matrix for _, matrix in start]))
+        rows, total = _gathered(pieces())
+        if total is None:
+            residual = np.concatenate([residual for residual, _ in rows])
+            return triangle(residual, _stacked([matrix for _, matrix in rows]))
     scale = np.sqrt(np.diag(total.square))
     scale[scale == 0.0] = 1.0
     factor, failed = dpotrf(total.square / np.outer(scale, scale), clean=True)
@@ -128,31 +137,52 @@ def reduced(pieces: Callable[[], Iterable[Rows]], total: Gram | None = None) -> 
     return Reduced(factor * scale, target, total.total, total.rows)
 
 
-MOST_NUMBERS = 500_000  # of W held at once (our choice)
-MAX_CONDITION = 1e5  # then R has relative errors of 1e-6 at most: κ² times rounding
+def _gathered(pieces: Iterable[Rows]) -> tuple[list[Rows], Gram | None]:
+    """Return the pieces; where W has more than `MOST_NUMBERS` their statistics instead."""
+    rows = list[Rows]()
+    total = None
+    for residual, matrix in pieces:
+        if total is not None:
+            total = total + gram(residual, matrix)
+            continue
+        rows.append((residual, matrix))
+        if sum(matrix.size for _, matrix in rows) > MOST_NUMBERS:
+            statistics = [gram(residual, matrix) for residual, matrix in rows]
+            total = sum(statistics[1:], statistics[0])
+            rows = []
+    return rows, total
 
 
 def _by_qr(pieces: Iterable[Rows]) -> Reduced:
-    found = None
+    problem = None
     for residual, matrix in pieces:
-        found = triangle(residual, matrix) if found is None else found.extended(residual, matrix)
-    assert found is not None
-    return found
+        if problem is None:
+            problem = triangle(residual, matrix)
+        else:
+            problem = problem.extended(residual, matrix)
+    assert problem is not None
+    return problem
 
 
 def _stacked(matrices: list[np.ndarray]) -> np.ndarray:
     """Return matrices one above the other, column-major; a single one as it is."""
-    return matrices[0] if len(matrices) == 1 else np.concatenate([each.T for each in matrices], axis=1).T
+    if len(matrices) == 1:
+        return matrices[0]
+    return np.concatenate([matrix.T for matrix in matrices], axis=1).T
 
 
 def damped_step(factor: np.ndarray, target: np.ndarray, damping: float) -> np.ndarray:
     """Solve [WᵀW + λ diag(WᵀW)] dx = Wᵀ r by QR of [R; sqrt(λ) D] (Kolyubin et al. 2019, eq. 12; λ = 0 is eq. 11)."""
-    p, block = len(target), 32
-    whole, tail = np.zeros((2, p + 1, p + 1))
-    whole[:p, :p], whole[:p, p] = factor, target
-    np.fill_diagonal(tail[:p, :p], np.sqrt(damping) * np.linalg.norm(factor, axis=0))
-    found = dtpqrt(p + 1, min(block, p + 1), whole, tail)[0] if damping else whole  # both are triangles
-    return scipy.linalg.solve_triangular(found[:p, :p], found[:p, p])
+    p = len(target)
+    stacked = np.zeros((p + 1, p + 1))
+    stacked[:p, :p] = factor
+    stacked[:p, p] = target
+    if damping:
+        diagonal = np.zeros((p + 1, p + 1))
+        np.fill_diagonal(diagonal[:p, :p], np.sqrt(damping) * np.linalg.norm(factor, axis=0))
+        # both are triangles
+        stacked = dtpqrt(p + 1, min(PANEL, p + 1), stacked, diagonal)[0]
+    return scipy.linalg.solve_triangular(stacked[:p, :p], stacked[:p, p])
 
 
 def solve(
@@ -171,7 +201,7 @@ def solve(
 
     Converged (our choice): the next Gauss–Newton step is shorter than ``tolerance`` standard deviations of the
     estimate, ‖Qᵀr‖ <= tolerance · ‖r‖ / sqrt(dof); or ‖r‖ has fallen to rounding, 1e-11 of where it started; or no step
-    is better any more, or the limit is reached, with residuals of `exact_cost` standard deviations rms, as of computed
+    is better any more, or the limit is reached, with residuals of `EXACT_RMS` standard deviations rms, as of computed
     measurements: what they do not determine then lies in valleys too narrow to follow.
 
     Args:
@@ -182,28 +212,34 @@ def solve(
         tolerance: length of the last step in standard deviations.
         limit: linearisations at most.
     """
-    now = linearise(start)
-    dof = max(now.rows - len(now.target), 1)
-    state, lam, count, history, floor = start, damping, 1, [float(np.sqrt(now.cost))], 1e-22 * now.cost
+    state = start
+    problem = linearise(state)
+    dof = max(problem.rows - len(problem.target), 1)
+    rounding = 1e-22 * problem.cost
+    history = [float(np.sqrt(problem.cost))]
+    lam = damping
+    count = 1
     status = None
-    exact_cost = 0.01
     while status is None:
-        if now.target @ now.target <= tolerance**2 * now.cost / dof or now.cost <= floor:
+        short = problem.target @ problem.target <= tolerance**2 * problem.cost / dof
+        if short or problem.cost <= rounding:
             status = Status.CONVERGED
-        elif count >= limit or lam > 1e10:
-            exact = now.cost <= exact_cost**2 * now.rows
+        elif count >= limit or lam > MAX_DAMPING:
+            exact = problem.cost <= EXACT_RMS**2 * problem.rows
             failure = Status.ITERATIONS if count >= limit else Status.STALLED
             status = Status.CONVERGED if exact else failure
         else:
-            trial = retract(state, damped_step(now.factor, now.target, lam))
-            found = linearise(trial)
+            trial = retract(state, damped_step(problem.factor, problem.target, lam))
+            trial_problem = linearise(trial)
             count += 1
-            if found.cost < now.cost or damping == 0.0:
-                state, now, lam = trial, found, lam / 10.0
-                history.append(float(np.sqrt(now.cost)))
+            if trial_problem.cost < problem.cost or damping == 0.0:
+                state = trial
+                problem = trial_problem
+                lam = lam / 10.0
+                history.append(float(np.sqrt(problem.cost)))
             else:
                 lam *= 10.0
-    return Solution(state, now.factor, now.cost, tuple(history), status, count)
+    return Solution(state, problem.factor, problem.cost, tuple(history), status, count)
 
 
 def covariance(factor: np.ndarray, variance: float = 1.0) -> np.ndarray:

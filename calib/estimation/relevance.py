@@ -12,7 +12,14 @@ from scipy.linalg.lapack import dpotrf, dtrtri  # type: ignore[attr-defined]
 
 from calib.errors import Unidentifiable
 
-SETTLED = 0.02  # share of the parameters' sigmas that a search among many may leave open (our choice)
+# share of the parameters' sigmas that a search among many may leave open (our choice)
+SETTLED = 0.02
+# of a group's largest information, below which a direction is rounding
+ROUNDING = 1e-12
+# ‖y - W x‖ relative to ‖y‖ below which a fit counts as perfect: WᵀW knows no better
+EXACT_RESIDUAL = 1e-7
+# a group is out once its prior is this many times as precise as the data on its columns (our choice)
+MAX_PRIOR_WEIGHT = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,15 +31,11 @@ class Gram:
     total: float
     rows: int
 
-    def __add__(self, other: Gram) -> Gram:
-        return Gram(
-            self.square + other.square, self.cross + other.cross, self.total + other.total, self.rows + other.rows
-        )
+    def __add__(self, term: Gram) -> Gram:
+        return Gram(self.square + term.square, self.cross + term.cross, self.total + term.total, self.rows + term.rows)
 
-    def __sub__(self, other: Gram) -> Gram:
-        return Gram(
-            self.square - other.square, self.cross - other.cross, self.total - other.total, self.rows - other.rows
-        )
+    def __sub__(self, term: Gram) -> Gram:
+        return Gram(self.square - term.square, self.cross - term.cross, self.total - term.total, self.rows - term.rows)
 
     def scaled(self, factor: float) -> Gram:
         """Return the statistics of rows multiplied by √factor."""
@@ -84,13 +87,23 @@ class Condensed:
     def columns(self, matrix: np.ndarray) -> np.ndarray:
         """Return Wᵀ (r, ...) in these coordinates from Wᵀ (p, ...) in the original ones."""
         flat = matrix.reshape(len(matrix), -1)
-        parts = [flat[own] if basis is None else basis.T @ flat[own] for own, basis in self.blocks]
+        parts = []
+        for columns, basis in self.blocks:
+            part = flat[columns]
+            if basis is not None:
+                part = basis.T @ part
+            parts.append(part)
         return np.concatenate(parts).reshape(-1, *matrix.shape[1:])
 
     def gram(self, data: Gram) -> Gram:
         """Return statistics in these coordinates."""
         half = self.columns(data.square)
-        parts = [half.take(own, 1) if basis is None else half.take(own, 1) @ basis for own, basis in self.blocks]
+        parts = []
+        for columns, basis in self.blocks:
+            part = half.take(columns, 1)
+            if basis is not None:
+                part = part @ basis
+            parts.append(part)
         return Gram(np.concatenate(parts, axis=1), self.columns(data.cross), data.total, data.rows)
 
 
@@ -102,24 +115,54 @@ def condensed(square: Callable[[np.ndarray], Any], groups: np.ndarray, start: np
         groups: (p,) group of each column; -1 for no ridge.
         start: (p,) first guess of each column's prior standard deviation; within a group their ratios stay.
     """
-    family, inverse, members = np.unique(groups, return_inverse=True, return_counts=True)
-    alone = np.flatnonzero((groups < 0) | (members[inverse] == 1))
-    blocks: list[tuple[np.ndarray, np.ndarray | None]] = [(alone, None)]
-    labels, sizes, counts = [groups[alone]], [start[alone]], [np.ones(len(alone))]
-    rounding = 1e-12  # of a group's largest information, below which a direction is rounding
-    for group in family[(family >= 0) & (members > 1)]:
-        own = np.flatnonzero(groups == group)
-        size = float(np.exp(np.log(start[own]).mean()))
-        profile = start[own] / size
-        seen, basis = np.linalg.eigh(square(own) * np.outer(profile, profile))
-        kept = seen > rounding * seen[-1]
-        kept[-1] = True
-        blocks.append((own, profile[:, None] * basis[:, kept]))
-        width = int(kept.sum())
+    numbers, number_of_column, members = np.unique(groups, return_inverse=True, return_counts=True)
+    single = np.flatnonzero((groups < 0) | (members[number_of_column] == 1))
+    blocks: list[tuple[np.ndarray, np.ndarray | None]] = [(single, None)]
+    labels = [groups[single]]
+    sizes = [start[single]]
+    counts = [np.ones(len(single))]
+    for group in numbers[(numbers >= 0) & (members > 1)]:
+        columns = np.flatnonzero(groups == group)
+        size = float(np.exp(np.log(start[columns]).mean()))
+        profile = start[columns] / size
+        information, axes = np.linalg.eigh(square(columns) * np.outer(profile, profile))
+        visible = information > ROUNDING * information[-1]
+        visible[-1] = True
+        blocks.append((columns, profile[:, None] * axes[:, visible]))
+        width = int(visible.sum())
         labels.append(np.full(width, group))
         sizes.append(np.full(width, size))
-        counts.append(np.full(width, len(own) / width))
+        counts.append(np.full(width, len(columns) / width))
     return Condensed(np.concatenate(labels), np.concatenate(sizes), np.concatenate(counts), tuple(blocks))
+
+
+@dataclass(frozen=True, eq=False)
+class _Elimination:
+    """Columns without a ridge, eliminated from the statistics: they follow from the values of the others.
+
+    Attributes:
+        columns: (f,) those eliminated.
+        root: (f, f) lower root of their WᵀW.
+        half: (f, p) root⁻¹ times their rows of WᵀW.
+        target: (f,) root⁻¹ times their Wᵀy.
+    """
+
+    columns: np.ndarray
+    root: np.ndarray
+    half: np.ndarray
+    target: np.ndarray
+
+    @classmethod
+    def of(cls, data: Gram, columns: np.ndarray) -> _Elimination:
+        """Eliminate columns (f,) of statistics."""
+        root = _root(data.square[np.ix_(columns, columns)])
+        half = solve_triangular(root, data.square[columns], lower=True)
+        target = solve_triangular(root, data.cross[columns], lower=True)
+        return cls(columns, root, half, target)
+
+    def values(self, other_values: np.ndarray) -> np.ndarray:
+        """Return the values (f,) of the columns from those of all others (p,), zero at these."""
+        return solve_triangular(self.root, self.target - self.half @ other_values, trans=1, lower=True)
 
 
 def relevance(
@@ -146,48 +189,64 @@ def relevance(
             (`SETTLED`); 0: never early.
         counts: (p,) how many columns each stands for (`Condensed`); None for one.
     """
-    counts = np.ones(len(groups)) if counts is None else counts
+    if counts is None:
+        counts = np.ones(len(groups))
     ridged = groups >= 0
+    without_ridge = int((~ridged).sum())
     count = int(groups.max(initial=-1)) + 1
-    family = np.where(ridged, groups, count)  # columns without a ridge form the last family, with precision 0
+    # columns without a ridge form the last family, with precision 0
+    family = np.where(ridged, groups, count)
     members = np.maximum(np.bincount(family, counts, count + 1), 1.0)
-    lam = np.bincount(family, counts * np.where(ridged, start, np.inf) ** -2.0, count + 1) / members
+    start_precision = np.where(ridged, start, np.inf) ** -2.0
+    lam = np.bincount(family, counts * start_precision, count + 1) / members
     information = np.bincount(family, np.diag(data.square), count + 1) / members
-    beta, alive = 1.0, np.ones(count + 1, dtype=bool)
+    alive = np.ones(count + 1, dtype=bool)
+    beta = 1.0
     # columns without a ridge are eliminated once, but where a search ends early, which looks at all columns
-    free = np.flatnonzero(~ridged & (settled == 0.0))
-    index = np.setdiff1d(np.arange(len(groups)), free)
-    root = _root(data.square[np.ix_(free, free)])
-    half, known = (solve_triangular(root, x[free], lower=True) for x in (data.square, data.cross))
-    square, cross = (data.square - half.T @ half)[np.ix_(index, index)], data.cross - half.T @ known
-    solution, effective, last = np.zeros(len(index)), 0.0, np.full(len(groups), np.inf)
-    exact_residual = 1e-7  # ‖y - W x‖ relative to ‖y‖ below which a fit counts as perfect: WᵀW knows no better
-    # a group is out once its prior is this many times as precise as the data on its columns (our choice)
-    max_prior_weight = 2.0
+    eliminated = np.array([], dtype=int)
+    if settled == 0.0:
+        eliminated = np.flatnonzero(~ridged)
+    elimination = _Elimination.of(data, eliminated)
+    index = np.setdiff1d(np.arange(len(groups)), eliminated)
+    square = (data.square - elimination.half.T @ elimination.half)[np.ix_(index, index)]
+    cross = data.cross - elimination.half.T @ elimination.target
+    total = data.total - elimination.target @ elimination.target
+    # what rounding leaves of a perfect fit
+    least_misfit = EXACT_RESIDUAL**2 * max(data.total, 1e-300)
+    solution = np.zeros(len(index))
+    last = np.full(len(groups), np.inf)
+    effective = 0.0
     for _ in range(iterations):
-        inside = np.flatnonzero(alive[family[index]])
-        if len(inside) < len(index):
-            index, square = index[inside], square.take(inside, 0).take(inside, 1)
-        own = family[index]
-        solution, variance = _posterior(square, cross[index], lam[own], beta)
-        determined = np.where(own < count, 1.0 - lam[own] * variance, 0.0)
-        gamma = np.bincount(own, determined, count + 1)
-        size = np.bincount(own, solution**2, count + 1)
-        lam[:count] = np.where(alive, np.maximum(gamma, 1e-12) / np.maximum(size, 1e-300), lam)[:count]
-        alive[:count] &= (lam < max_prior_weight * beta * np.maximum(information, 1e-300))[:count]
+        # groups that were switched off leave the system
+        remaining = np.flatnonzero(alive[family[index]])
+        if len(remaining) < len(index):
+            index = index[remaining]
+            square = square.take(remaining, 0).take(remaining, 1)
+        group = family[index]
+        solution, variance = _posterior(square, cross[index], lam[group], beta)
+        determined = np.where(group < count, 1.0 - lam[group] * variance, 0.0)
+        gamma = np.bincount(group, determined, count + 1)
+        size = np.bincount(group, solution**2, count + 1)
+        most_probable = np.maximum(gamma, 1e-12) / np.maximum(size, 1e-300)
+        lam[:count] = np.where(alive, most_probable, lam)[:count]
+        max_lam = MAX_PRIOR_WEIGHT * beta * np.maximum(information, 1e-300)
+        alive[:count] &= (lam < max_lam)[:count]
         effective = float(gamma.sum())
-        misfit = data.total - known @ known - 2.0 * solution @ cross[index]
+        misfit = total - 2.0 * solution @ cross[index]
         misfit += solution @ square @ solution
-        least = exact_residual**2 * max(data.total, 1e-300)  # what rounding leaves of a perfect fit
-        beta = max(data.rows - effective - int((~ridged).sum()), 1.0) / max(float(misfit), least)
-        if settled > 0.0 and np.sum((solution - last[index]) ** 2 / variance) < settled**2 * counts[index].sum():
-            break
+        dof = max(data.rows - effective - without_ridge, 1.0)
+        beta = dof / max(float(misfit), least_misfit)
+        if settled > 0.0:
+            change = np.sum((solution - last[index]) ** 2 / variance)
+            if change < settled**2 * counts[index].sum():
+                break
         last[index] = solution
-    values, ridge = np.zeros(len(groups)), np.where(ridged, 0.0, np.inf)
+    values = np.zeros(len(groups))
     values[index] = solution
-    values[free] = solve_triangular(root, known - half @ values, trans=1, lower=True)
-    kept = index[ridged[index]]
-    ridge[kept] = 1.0 / np.sqrt(lam[groups[kept]])
+    values[eliminated] = elimination.values(values)
+    ridge = np.where(ridged, 0.0, np.inf)
+    alive_index = index[ridged[index]]
+    ridge[alive_index] = 1.0 / np.sqrt(lam[groups[alive_index]])
     return Relevance(values, ridge, effective, float(1.0 / np.sqrt(beta)))
 
 
@@ -197,8 +256,10 @@ def _posterior(
     """Return mean and variances of x from WᵀW and Wᵀy."""
     if not len(cross):
         return cross, cross
-    inverse, _ = dtrtri(_root(square, penalty / beta), lower=1, overwrite_c=1)  # the variances need no more
-    return (inverse @ cross) @ inverse, np.einsum("ij,ij->j", inverse, inverse) / beta
+    # the variances need no more than the inverse of the root
+    inverse, _ = dtrtri(_root(square, penalty / beta), lower=1, overwrite_c=1)
+    mean = (inverse @ cross) @ inverse
+    return mean, np.einsum("ij,ij->j", inverse, inverse) / beta
 
 
 def _root(square: np.ndarray, penalty: np.ndarray | float = 0.0) -> np.ndarray:

@@ -5,7 +5,14 @@
 
 import numpy as np
 
-ROUNDS = 200  # of the fixed point
+# rounds of the fixed point of variances
+ROUNDS = 200
+# squared errors count as so many times their variance at most (our choice)
+MAX_RATIO = 9.0
+LOSSES = ("none", "huber", "cauchy")
+# scales [standard deviations] of 95 % efficiency on normal residuals
+HUBER_SCALE = 1.345
+CAUCHY_SCALE = 2.385
 
 
 def variance_weights(
@@ -22,17 +29,14 @@ def variance_weights(
         counts: (m,) how many errors each is worth.
         rounds: of the fixed point; fewer will do from weights of nearly the same errors.
     """
-    weights, columns = np.array(start, dtype=float), np.ascontiguousarray(shapes.T)
-    max_ratio = 9.0  # squared errors count as so many times their variance at most (our choice)
+    weights = np.array(start, dtype=float)
+    columns = np.ascontiguousarray(shapes.T)
     for _ in range(rounds):
         precision = 1.0 / np.maximum(weights @ columns, 1e-30)
         counted = counts * precision
-        push = columns @ (counted * np.minimum(squares * precision, max_ratio))
+        push = columns @ (counted * np.minimum(squares * precision, MAX_RATIO))
         weights *= push / np.maximum(columns @ counted, 1e-300)
     return weights
-
-
-LOSSES = ("none", "huber", "cauchy")
 
 
 def weights(size: np.ndarray, loss: str, scale: float | None = None) -> np.ndarray:
@@ -49,14 +53,16 @@ def weights(size: np.ndarray, loss: str, scale: float | None = None) -> np.ndarr
     if loss == "none":
         return np.ones_like(size)
     if loss == "huber":
-        k = 1.345 if scale is None else scale
+        k = HUBER_SCALE if scale is None else scale
         return np.where(size <= k, 1.0, k / np.maximum(size, k))
     if loss == "cauchy":
-        c = 2.385 if scale is None else scale
+        c = CAUCHY_SCALE if scale is None else scale
         return 1.0 / (1.0 + (size / c) ** 2)
     raise ValueError(f"unknown loss '{loss}'; expected one of {', '.join(LOSSES)}")
 
 
 def spread(residuals: np.ndarray) -> float:
-    """Return the robust standard deviation 1.4826 · median |r| of residuals centred at zero."""
-    return float(1.4826 * np.median(np.abs(residuals))) if residuals.size else 0.0
+    """Return the robust standard deviation 1.4826 · median |r| of residuals centred at zero; 0 without residuals."""
+    if not residuals.size:
+        return 0.0
+    return float(1.4826 * np.median(np.abs(residuals)))

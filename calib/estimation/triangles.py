@@ -20,6 +20,14 @@ from calib.errors import CalibError, Unidentifiable, listing, require
 from calib.records import frozen, shaped
 
 ADVICE = "choose base columns first (columns.split_columns), or add motion that distinguishes them"
+# rows per factorisation: bounds the working memory, 16 MB at 100 parameters
+CHUNK = 20_000
+# columns of LAPACK's panels; of 8 to 32 the fastest for 1000 rows and 10 to 70 columns
+PANEL = 8
+# singular values of unit-norm columns below this part of the largest are rounding
+RESOLUTION = 1e-10
+# part in a null direction from which on a column is named
+MIN_PART = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,23 +60,27 @@ class Triangles:
     def relative_errors(self, values: np.ndarray) -> np.ndarray:
         """Return 100 ‖y_g - W_g x‖ / ‖y_g‖ [%] of every group (g,); 0 where y_g is."""
         size = self.residual_squares(np.zeros(self.parameters))
-        return 100.0 * np.sqrt(self.residual_squares(values) / np.where(size > 0.0, size, np.inf))
+        ratio = self.residual_squares(values) / np.where(size > 0.0, size, np.inf)
+        return 100.0 * np.sqrt(ratio)
 
     def select(self, columns: np.ndarray) -> Triangles:
         """Return the R factors of the model with only these columns, in the given order."""
         columns = np.asarray(columns, dtype=int)
-        wanted = np.append(columns, self.parameters)
-        factors = [retriangulate(factor[:, wanted]) for factor in self.factors]
+        with_target = np.append(columns, self.parameters)
+        factors = np.stack([retriangulate(factor[:, with_target]) for factor in self.factors])
         names = tuple(self.names[k] for k in columns)
-        return Triangles(names, tuple(self.units[k] for k in columns), frozen(np.stack(factors)), self.rows)
+        units = tuple(self.units[k] for k in columns)
+        return Triangles(names, units, frozen(factors), self.rows)
 
 
 def empty(names: Sequence[str], units: Sequence[str] | None = None, groups: int = 1) -> Triangles:
     """Return empty R factors, of a problem without rows."""
     p = len(names)
-    given = tuple(units) if units is not None else ("",) * p
-    require(len(given) == p, f"{p} parameter names but {len(given)} units")
-    return Triangles(tuple(names), given, frozen(np.zeros((groups, p + 1, p + 1))), frozen(np.zeros(groups), int))
+    if units is None:
+        units = [""] * p
+    require(len(units) == p, f"{p} parameter names but {len(units)} units")
+    factors = frozen(np.zeros((groups, p + 1, p + 1)))
+    return Triangles(tuple(names), tuple(units), factors, frozen(np.zeros(groups), int))
 
 
 def absorb(data: Triangles, matrix: np.ndarray, target: np.ndarray, group: np.ndarray | int = 0) -> Triangles:
@@ -84,18 +96,23 @@ def absorb(data: Triangles, matrix: np.ndarray, target: np.ndarray, group: np.nd
     """
     matrix = shaped(matrix, (None, data.parameters), "observation matrix W")
     target = shaped(target, (len(matrix),), "target y")
+    if not len(matrix):
+        return data
     index = np.asarray(group, dtype=int)
-    found = np.unique(index)
-    if len(matrix) and not 0 <= found[0] <= found[-1] < data.groups:
-        raise CalibError(f"rows belong to groups {found[0]} to {found[-1]}, but there are {data.groups} groups")
-    factors, rows = np.array(data.factors), np.array(data.rows)
-    chunk = 20_000  # rows per factorisation: bounds the working memory, 16 MB at 100 parameters
-    for g in found if len(matrix) else ():
-        own = np.flatnonzero(index == g) if index.ndim else None  # no copies of rows that are all of one group
-        count = len(matrix) if own is None else len(own)
+    groups = np.unique(index)
+    if not 0 <= groups[0] <= groups[-1] < data.groups:
+        raise CalibError(f"rows belong to groups {groups[0]} to {groups[-1]}, but there are {data.groups} groups")
+    factors = np.array(data.factors)
+    rows = np.array(data.rows)
+    for g in groups:
+        # no copies of rows that are all of one group
+        group_rows = np.flatnonzero(index == g) if index.ndim else None
+        count = len(matrix) if group_rows is None else len(group_rows)
         rows[g] += count
-        for start in range(0, count, chunk):
-            part = slice(start, start + chunk) if own is None else own[start : start + chunk]
+        for start in range(0, count, CHUNK):
+            part = slice(start, start + CHUNK)
+            if group_rows is not None:
+                part = group_rows[part]
             factors[g] = _update(factors[g], matrix[part], target[part])
     return replace(data, factors=frozen(factors), rows=frozen(rows, int))
 
@@ -109,18 +126,24 @@ def collect(
 ) -> Triangles:
     """Return the R factors of a whole problem; without names the columns are called x1, x2, …"""
     matrix = shaped(matrix, (None, None), "observation matrix W")
-    count = 1 if group is None or len(group) == 0 else int(np.max(group)) + 1
-    names = names if names is not None else [f"x{k + 1}" for k in range(matrix.shape[1])]
-    return absorb(empty(names, units, count), matrix, target, 0 if group is None else group)
+    if names is None:
+        names = [f"x{k + 1}" for k in range(matrix.shape[1])]
+    if group is None:
+        return absorb(empty(names, units), matrix, target)
+    groups = 1 if len(group) == 0 else int(np.max(group)) + 1
+    return absorb(empty(names, units, groups), matrix, target, group)
 
 
 def combine(data: Triangles, std: np.ndarray | None = None) -> np.ndarray:
     """Return the R factor (p + 1, p + 1) of all rows, those of group g divided by std[g] (None: by one)."""
-    scale = np.ones(data.groups) if std is None else shaped(std, (data.groups,), "standard deviation per group")
+    scale = np.ones(data.groups)
+    if std is not None:
+        scale = shaped(std, (data.groups,), "standard deviation per group")
     if (scale <= 0.0).any():
         raise CalibError(f"standard deviations per group must be positive, smallest is {scale.min()}")
     size = data.parameters + 1
-    return retriangulate((data.factors / scale[:, None, None]).reshape(data.groups * size, size))
+    weighted = data.factors / scale[:, None, None]
+    return retriangulate(weighted.reshape(data.groups * size, size))
 
 
 def retriangulate(stacked: np.ndarray, overwrite: bool = False) -> np.ndarray:
@@ -129,7 +152,8 @@ def retriangulate(stacked: np.ndarray, overwrite: bool = False) -> np.ndarray:
     result = np.zeros((size, size))
     if stacked.size:
         packed = dgeqrf(stacked, lwork=32 * size, overwrite_a=overwrite)[0][:size]
-        np.copyto(result[: len(packed)], packed, where=_upper(size)[: len(packed)])
+        height = len(packed)
+        np.copyto(result[:height], packed, where=_upper(size)[:height])
     return result
 
 
@@ -138,8 +162,9 @@ def continued(upper: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
     Householder's way as in `retriangulate`, in half the time, since the panels are narrow.
     """
-    panel = min(8, len(upper))  # columns; of 8 to 32 the fastest for 1000 rows and 10 to 70 columns
-    return dtpqrt(0, panel, np.array(upper, order="F"), np.asfortranarray(rows), overwrite_a=True, overwrite_b=True)[0]
+    panel = min(PANEL, len(upper))
+    triangle = np.array(upper, order="F")
+    return dtpqrt(0, panel, triangle, np.asfortranarray(rows), overwrite_a=True, overwrite_b=True)[0]
 
 
 @lru_cache(maxsize=256)
@@ -153,11 +178,13 @@ def condition_numbers(factor: np.ndarray) -> tuple[float, float]:
     Such columns belong to parameters without rows, e.g. of a joint that stands; infinite where all columns are.
     """
     norms = np.linalg.norm(factor, axis=0)
-    excited = factor[:, norms > 0.0]
-    if not excited.size:
+    excited = norms > 0.0
+    columns = factor[:, excited]
+    if not columns.size:
         return float("inf"), float("inf")
-    normed = excited / norms[norms > 0.0]
-    return _ratio(np.linalg.svd(excited, compute_uv=False)), _ratio(np.linalg.svd(normed, compute_uv=False))
+    values = np.linalg.svd(columns, compute_uv=False)
+    normed_values = np.linalg.svd(columns / norms[excited], compute_uv=False)
+    return _ratio(values), _ratio(normed_values)
 
 
 def solve_triangle(factor: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
@@ -170,10 +197,11 @@ def solve_triangle(factor: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray
     upper = factor[:p, :p]
     norms = np.linalg.norm(upper, axis=0)
     scaled = upper / np.where(norms > 0.0, norms, 1.0)
-    values = require_rank(scaled, names)
+    scaled_values = require_rank(scaled, names)
     inverse = np.asarray(scipy.linalg.solve_triangular(scaled, np.eye(p))) / norms[:, None]
     solution = np.asarray(scipy.linalg.solve_triangular(scaled, factor[:p, p])) / norms
-    return solution, inverse, (_ratio(np.linalg.svd(upper, compute_uv=False)), _ratio(values))
+    values = np.linalg.svd(upper, compute_uv=False)
+    return solution, inverse, (_ratio(values), _ratio(scaled_values))
 
 
 def require_rank(scaled: np.ndarray, names: Sequence[str], advice: str = ADVICE) -> np.ndarray:
@@ -183,28 +211,35 @@ def require_rank(scaled: np.ndarray, names: Sequence[str], advice: str = ADVICE)
         Unidentifiable: naming every column with a part in a null direction.
     """
     values = np.linalg.svd(scaled, compute_uv=False)
-    resolution = 1e-10  # singular values of unit-norm columns below this part of the largest are rounding
-    weak = values <= resolution * values[0] if values[0] > 0.0 else np.ones(len(values), dtype=bool)
+    weak = np.ones(len(values), dtype=bool)
+    if values[0] > 0.0:
+        weak = values <= RESOLUTION * values[0]
     if not weak.any():
         return values
-    part = np.linalg.norm(np.linalg.svd(scaled)[2][weak], axis=0)
-    concerned = [name for name, size in zip(names, part) if size > 0.01]
+    null_directions = np.linalg.svd(scaled)[2][weak]
+    parts = np.linalg.norm(null_directions, axis=0)
+    concerned = [name for name, part in zip(names, parts) if part > MIN_PART]
     message = f"{int(weak.sum())} combination(s) of {len(names)} parameters have no effect on the data"
     raise Unidentifiable(f"{message}: {listing(concerned)}; {advice}", concerned, values)
 
 
 def _update(factor: np.ndarray, matrix: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Return the R of [factor; matrix target], factorising non-zero columns only."""
-    old = factor[factor.any(axis=1)]
-    live = np.flatnonzero(np.append(matrix.any(axis=0), True) | old.any(axis=0))
-    stacked = np.empty((len(old) + len(matrix), len(live)), order="F")
-    stacked[: len(old)] = old[:, live]
-    stacked[len(old) :, :-1] = matrix[:, live[:-1]]
-    stacked[len(old) :, -1] = target
+    top = factor[factor.any(axis=1)]
+    in_matrix = np.append(matrix.any(axis=0), True)
+    live = np.flatnonzero(in_matrix | top.any(axis=0))
+    stacked = np.empty((len(top) + len(matrix), len(live)), order="F")
+    stacked[: len(top)] = top[:, live]
+    stacked[len(top) :, :-1] = matrix[:, live[:-1]]
+    stacked[len(top) :, -1] = target
     result = np.zeros_like(factor)
-    result[: len(live), live] = retriangulate(stacked, overwrite=True)  # live[i] >= i: still upper triangular
+    # live[i] >= i: still upper triangular
+    result[: len(live), live] = retriangulate(stacked, overwrite=True)
     return result
 
 
 def _ratio(values: np.ndarray) -> float:
-    return float(values[0] / values[-1]) if values[-1] > 0.0 else float("inf")
+    """Return the condition number by singular values; infinite for a singular matrix."""
+    if values[-1] > 0.0:
+        return float(values[0] / values[-1])
+    return float("inf")

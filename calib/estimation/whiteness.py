@@ -39,30 +39,35 @@ def examine(residual: np.ndarray, lags: int = 30) -> Whiteness:
         lags: number of autocorrelations.
     """
     x = shaped(residual, (None,), "residuals")
-    if len(x) < max(lags + 1, 20):
-        raise CalibError(f"{len(x)} residuals are too few for {lags} lags; needed are at least {max(lags + 1, 20)}")
+    min_count = max(lags + 1, 20)
+    if len(x) < min_count:
+        raise CalibError(f"{len(x)} residuals are too few for {lags} lags; needed are at least {min_count}")
     rho = autocorrelation(x, lags)
     bound = 1.96 / np.sqrt(len(x))
+    _, ljung_box_p = ljung_box(rho, len(x))
     skewness, kurtosis = _shape(x)
     return Whiteness(
-        frozen(rho),
-        frozen(partial_autocorrelation(rho)),
-        bound,
-        float(np.mean(np.abs(rho) > bound)),
-        ljung_box(rho, len(x))[1],
-        kurtosis,
-        _normality(skewness, kurtosis, len(x)),
+        acf=frozen(rho),
+        pacf=frozen(partial_autocorrelation(rho)),
+        bound=bound,
+        outside=float(np.mean(np.abs(rho) > bound)),
+        ljung_box_p=ljung_box_p,
+        kurtosis=kurtosis,
+        normal_p=_normality(skewness, kurtosis, len(x)),
     )
 
 
 def _shape(x: np.ndarray) -> tuple[float, float]:
     """Return skewness and excess kurtosis of a series (N,), from its central moments; NaN for a constant series."""
-    centred = x - x.mean()
+    mean = x.mean()
+    centred = x - mean
     square = centred**2
-    m2 = square.mean()
-    if m2 <= (np.finfo(float).eps * x.mean()) ** 2:
+    variance = square.mean()
+    if variance <= (np.finfo(float).eps * mean) ** 2:
         return float("nan"), float("nan")
-    return float((square * centred).mean() / m2**1.5), float((square**2).mean() / m2**2 - 3.0)
+    skewness = (square * centred).mean() / variance**1.5
+    kurtosis = (square**2).mean() / variance**2 - 3.0
+    return float(skewness), float(kurtosis)
 
 
 def _normality(skewness: float, kurtosis: float, n: int) -> float:
@@ -71,35 +76,46 @@ def _normality(skewness: float, kurtosis: float, n: int) -> float:
     Both are turned into normal variables, whose squares add up (D'Agostino & Pearson 1973; D'Agostino 1970;
     Anscombe & Glynn 1983). As `scipy.stats.normaltest`, which takes half a second to load.
     """
+    # skewness (D'Agostino 1970)
     y = skewness * np.sqrt((n + 1) * (n + 3) / (6.0 * (n - 2)))
     beta = 3.0 * (n**2 + 27 * n - 70) * (n + 1) * (n + 3) / ((n - 2.0) * (n + 5) * (n + 7) * (n + 9))
     w = np.sqrt(2.0 * (beta - 1.0)) - 1.0
-    of_skewness = np.arcsinh(y * np.sqrt((w - 1.0) / 2.0)) / np.sqrt(0.5 * np.log(w))
+    delta = np.sqrt(0.5 * np.log(w))
+    normal_skewness = np.arcsinh(y * np.sqrt((w - 1.0) / 2.0)) / delta
+    # kurtosis (Anscombe & Glynn 1983)
     variance = 24.0 * n * (n - 2) * (n - 3) / ((n + 1) ** 2 * (n + 3.0) * (n + 5))
-    x = (kurtosis + 3.0 - 3.0 * (n - 1) / (n + 1)) / np.sqrt(variance)
-    third = 6.0 * (n * n - 5 * n + 2) / ((n + 7) * (n + 9)) * np.sqrt(6.0 * (n + 3) * (n + 5) / (n * (n - 2) * (n - 3)))
+    mean = 3.0 * (n - 1) / (n + 1)
+    x = (kurtosis + 3.0 - mean) / np.sqrt(variance)
+    root_beta = np.sqrt(6.0 * (n + 3) * (n + 5) / (n * (n - 2) * (n - 3)))
+    third = 6.0 * (n * n - 5 * n + 2) / ((n + 7) * (n + 9)) * root_beta
     a = 6.0 + 8.0 / third * (2.0 / third + np.sqrt(1.0 + 4.0 / third**2))
     root = np.cbrt((1.0 - 2.0 / a) / (1.0 + x * np.sqrt(2.0 / (a - 4.0))))
-    of_kurtosis = (1.0 - 2.0 / (9.0 * a) - root) / np.sqrt(2.0 / (9.0 * a))
-    return float(chdtrc(2, of_skewness**2 + of_kurtosis**2))
+    normal_kurtosis = (1.0 - 2.0 / (9.0 * a) - root) / np.sqrt(2.0 / (9.0 * a))
+    return float(chdtrc(2, normal_skewness**2 + normal_kurtosis**2))
 
 
 def autocorrelation(residual: np.ndarray, lags: int) -> np.ndarray:
     """Return ρ_k = Σ_t x_t x_{t+k} / Σ_t x_t² for k = 1 … lags, means removed (by FFT); sums run over columns, too."""
     columns = np.asarray(residual, dtype=float).reshape(len(residual), -1).T
     size = 1 << (2 * len(residual) - 1).bit_length()
-    spectrum = sum(np.abs(np.fft.rfft(x - x.mean(), size)) ** 2 for x in columns)
+    spectrum = np.zeros(size // 2 + 1)
+    for x in columns:
+        spectrum += np.abs(np.fft.rfft(x - x.mean(), size)) ** 2
     covariance = np.fft.irfft(spectrum, size)[: lags + 1]
-    return covariance[1:] / covariance[0] if covariance[0] > 0.0 else np.zeros(lags)
+    if not covariance[0] > 0.0:
+        return np.zeros(lags)
+    return covariance[1:] / covariance[0]
 
 
 def partial_autocorrelation(acf: np.ndarray) -> np.ndarray:
     """Return the partial autocorrelations of lags 1 … k from the autocorrelations (Durbin–Levinson)."""
-    result, phi = np.empty(len(acf)), np.zeros(0)
+    result = np.empty(len(acf))
+    phi = np.zeros(0)
     for k, rho in enumerate(acf):
-        before = acf[:k][::-1]
-        rest = 1.0 - phi @ acf[:k]
-        last = (rho - phi @ before) / rest if rest > 0.0 else 0.0
+        unexplained = 1.0 - phi @ acf[:k]
+        last = 0.0
+        if unexplained > 0.0:
+            last = (rho - phi @ acf[:k][::-1]) / unexplained
         phi = np.append(phi - last * phi[::-1], last)
         result[k] = last
     return result
@@ -110,7 +126,8 @@ def ljung_box(acf: np.ndarray, count: int) -> tuple[float, float]:
 
     Residuals of a regression on given columns lose no degree of freedom here; those of an ARMA model would.
     """
-    statistic = count * (count + 2.0) * np.sum(acf**2 / (count - np.arange(1, len(acf) + 1)))
+    lags = np.arange(1, len(acf) + 1)
+    statistic = count * (count + 2.0) * np.sum(acf**2 / (count - lags))
     return float(statistic), float(chdtrc(len(acf), statistic))
 
 
@@ -126,11 +143,14 @@ def inflation(residual: np.ndarray) -> float:
     if len(x) < 8:
         return 1.0
     tau = 1.0 + 2.0 * np.cumsum(autocorrelation(x, len(x) // 4))
-    enough = np.arange(1, len(tau) + 1) >= 5.0 * tau
-    return float(max(1.0, tau[np.argmax(enough)] if enough.any() else tau[-1]))
+    long_enough = np.arange(1, len(tau) + 1) >= 5.0 * tau
+    window = np.argmax(long_enough) if long_enough.any() else -1
+    return float(max(1.0, tau[window]))
 
 
 def r_squared(target: np.ndarray, residual: np.ndarray) -> float:
     """Return R² = 1 - Σ ρ² / Σ (y - mean y)²; negative if the mean predicts better."""
     total = float(np.sum((target - np.mean(target)) ** 2))
-    return 1.0 - float(np.sum(np.asarray(residual) ** 2)) / total if total > 0.0 else float("nan")
+    if not total > 0.0:
+        return float("nan")
+    return 1.0 - float(np.sum(np.asarray(residual) ** 2)) / total

@@ -21,6 +21,7 @@ from calib.geometry.installation import Installation
 from calib.geometry.observation import observe, positions, prepare
 from calib.units import ERRORS
 
+# kind of error (position, orientation, distance) of each residual part, by its label
 NATURE = {
     "position": "position",
     "consistency": "position",
@@ -29,7 +30,6 @@ NATURE = {
     "orientation": "orientation",
     "distance": "distance",
 }
-"""Kind of error (position, orientation, distance) of each residual part, by its label."""
 
 _NONE = np.array([], dtype=int)
 
@@ -75,18 +75,28 @@ class Errors:
     @property
     def main(self) -> np.ndarray:
         """Errors that decide the verdict: of positions, else of distances."""
-        chosen = self.position if self.position is not None else self.distance
-        return np.zeros(0) if chosen is None else chosen
+        if self.position is not None:
+            return self.position
+        if self.distance is not None:
+            return self.distance
+        return np.zeros(0)
 
     @property
     def rms(self) -> float:
         """Root mean square of the errors in `main`; 0 without errors."""
-        return float(np.sqrt(np.mean(self.main**2))) if len(self.main) else 0.0
+        sizes = self.main
+        if not len(sizes):
+            return 0.0
+        return float(np.sqrt(np.mean(sizes**2)))
 
     def summary(self) -> ArmErrors:
         """Return the statistics of each kind of error in mm and deg."""
-        sizes = (getattr(self, nature) for nature in ERRORS)
-        return ArmErrors(*(statistics(size, factor) for size, (factor, _) in zip(sizes, ERRORS.values())))
+        factors = {nature: factor for nature, (factor, _) in ERRORS.items()}
+        return ArmErrors(
+            position_mm=statistics(self.position, factors["position"]),
+            orientation_deg=statistics(self.orientation, factors["orientation"]),
+            distance_mm=statistics(self.distance, factors["distance"]),
+        )
 
 
 def errors(cell: Installation, measured: Sequence[PoseMeasurements]) -> Errors:
@@ -96,14 +106,23 @@ def errors(cell: Installation, measured: Sequence[PoseMeasurements]) -> Errors:
         cell: the installation that predicts; it has the stations and tools of the measurements.
         measured: blocks of any kinds.
     """
-    found: dict[str, list[np.ndarray]] = {"position": [], "orientation": [], "distance": []}
+    sizes: dict[str, list[np.ndarray]] = {"position": [], "orientation": [], "distance": []}
     for block in prepare(cell, measured):
         for part in observe(cell, block, _NONE):
-            found[NATURE[part.label]].append(part.sizes())
+            sizes[NATURE[part.label]].append(part.sizes())
         if isinstance(block.measured, Sockets) and not block.measured.links:
-            found["distance"].append(_socket_spread(positions(cell, block), block.measured))
-    joined = {name: np.concatenate(sizes) if sizes else np.zeros(0) for name, sizes in found.items()}
-    return Errors(**{name: sizes if len(sizes) else None for name, sizes in joined.items()})
+            sizes["distance"].append(_socket_spread(positions(cell, block), block.measured))
+    return Errors(
+        position=_concatenated(sizes["position"]),
+        orientation=_concatenated(sizes["orientation"]),
+        distance=_concatenated(sizes["distance"]),
+    )
+
+
+def _concatenated(sizes: list[np.ndarray]) -> np.ndarray | None:
+    """Return all sizes; None without any."""
+    result = np.concatenate([np.zeros(0), *sizes])
+    return result if len(result) else None
 
 
 def statistics(sizes: np.ndarray | None, factor: float = 1.0) -> ErrorStatistics | None:
@@ -111,8 +130,12 @@ def statistics(sizes: np.ndarray | None, factor: float = 1.0) -> ErrorStatistics
     if sizes is None:
         return None
     scaled = factor * sizes
-    rms = float(np.sqrt(np.mean(scaled**2)))
-    return ErrorStatistics(float(scaled.mean()), rms, float(np.percentile(scaled, 95)), float(scaled.max()))
+    return ErrorStatistics(
+        mean=float(scaled.mean()),
+        rms=float(np.sqrt(np.mean(scaled**2))),
+        p95=float(np.percentile(scaled, 95)),
+        max=float(scaled.max()),
+    )
 
 
 def rms_sigma(sizes: np.ndarray) -> float:
@@ -124,8 +147,13 @@ def rms_sigma(sizes: np.ndarray) -> float:
     Returns:
         In the sizes' unit; NaN for fewer than two sizes.
     """
-    rms = float(np.sqrt(np.mean(np.square(sizes)))) if len(sizes) > 1 else 0.0
-    return float(np.std(np.square(sizes), ddof=1) / (2.0 * rms * np.sqrt(len(sizes)))) if rms > 0.0 else np.nan
+    if len(sizes) < 2:
+        return np.nan
+    squares = np.square(sizes)
+    rms = float(np.sqrt(np.mean(squares)))
+    if not rms > 0.0:
+        return np.nan
+    return float(np.std(squares, ddof=1) / (2.0 * rms * np.sqrt(len(sizes))))
 
 
 def pair_errors(
@@ -140,11 +168,14 @@ def pair_errors(
     for block in measured:
         if not isinstance(block, Positions) or len(block) < 2:
             continue
-        used, place = np.unique(_pairs(len(block), limit, generator), return_inverse=True)
-        first, second = place.reshape(2, -1)
-        point, seen = positions(cell, prepare(cell, [take(block, used)])[0]).T, block.position[used]
-        predicted = np.linalg.norm(point[first] - point[second], axis=1)
-        result.append(np.abs(predicted - np.linalg.norm(seen[first] - seen[second], axis=1)))
+        rows, number = np.unique(_pairs(len(block), limit, generator), return_inverse=True)
+        first, second = number.reshape(2, -1)
+        (sample,) = prepare(cell, [take(block, rows)])
+        predicted = positions(cell, sample).T
+        position = block.position[rows]
+        predicted_distance = np.linalg.norm(predicted[first] - predicted[second], axis=1)
+        distance = np.linalg.norm(position[first] - position[second], axis=1)
+        result.append(np.abs(predicted_distance - distance))
     return np.concatenate(result)
 
 
@@ -164,11 +195,20 @@ def _socket_spread(point: np.ndarray, measured: Sockets) -> np.ndarray:
     """
     sockets: dict[str, dict[str, np.ndarray]] = {}
     for number in np.unique(measured.group):
-        name = measured.group_names[number] if measured.group_names else str(number)
-        place, _, socket = name.rpartition("/")
-        sockets.setdefault(place, {})[socket] = point[:, measured.group == number].mean(axis=1)
+        name = str(number)
+        if measured.group_names:
+            name = measured.group_names[number]
+        fixture_position, _, socket = name.rpartition("/")
+        mean = point[:, measured.group == number].mean(axis=1)
+        sockets.setdefault(fixture_position, {})[socket] = mean
     lengths: dict[tuple[str, str], list[float]] = {}
     for means in sockets.values():
         for pair in combinations(sorted(means), 2):
-            lengths.setdefault(pair, []).append(float(np.linalg.norm(means[pair[0]] - means[pair[1]])))
-    return np.concatenate([np.zeros(0), *(np.abs(np.array(d) - np.mean(d)) for d in lengths.values() if len(d) > 1)])
+            length = float(np.linalg.norm(means[pair[0]] - means[pair[1]]))
+            lengths.setdefault(pair, []).append(length)
+    result = [np.zeros(0)]
+    for pair_lengths in lengths.values():
+        deviations = np.abs(np.array(pair_lengths) - np.mean(pair_lengths))
+        if len(pair_lengths) > 1:
+            result.append(deviations)
+    return np.concatenate(result)

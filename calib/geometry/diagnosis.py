@@ -31,70 +31,106 @@ from calib.geometry.weighing import GeometricFit, Settings
 from calib.records import evenly
 from calib.robot.chain import Chain, element_length
 
-MIN_LENGTH = 0.01  # [m]: shorter lengths, and growth that moves targets by less per unit, say nothing of a factor
-MIN_ROWS = 30  # rows below which no pattern is looked for (our choice)
+# [m]: shorter lengths, and growth that moves targets by less per unit, say nothing of a factor
+MIN_LENGTH = 0.01
+# rows below which no pattern is looked for (our choice)
+MIN_ROWS = 30
+# probability that the same rows in another order show such a change of set-up (our choice)
+MAX_CHANCE = 1e-3
+# a set-up's errors over those of the other rows from which on it is worth a finding (our choice)
+MIN_RATIO = 1.6
+# what neighbouring poses differ by, over the residuals, below which these are systematic (our choice)
+MAX_NEIGHBOUR_SHARE = 0.6
+# factor between residuals and a stated uncertainty from which on it is worth a finding (our choice)
+MAX_TIMES = 5.0
+# angles beyond a convention's range were lost
+ROBUST = Settings(loss="cauchy", limit=40, passes=4)
+# of the makers' angles; others are rare (our choice)
+CONVENTIONS = ("vector", "xyz fixed", "xyz moving", "zyx fixed", "zyx moving", "zyz moving", "zxz moving")
+# share of the error that may remain where no second change goes with it, and of a joint's sign (our choice)
+MAX_LEFT = 1.0 / 3.0
+MAX_LEFT_SIGN = 0.8
+# rows of each block by which changes are compared (our choice)
+FEW = 200
+# other zeros of a joint that are tried [rad]
+QUARTERS = (np.pi / 2.0, -np.pi / 2.0, np.pi)
+# signs of the axes of a frame of opposite handedness
+FLIP = np.array([1.0, -1.0, 1.0])
 
 
-def diagnose(found: GeometricFit, with_changes: bool = True) -> list[Finding]:
+def diagnose(fit: GeometricFit, with_changes: bool = True) -> list[Finding]:
     """Return findings on each block: systematic residuals, and `with_changes` rows that fit worse than the others."""
-    result: list[Finding] = []
-    for block, part in _lengths(found):
-        if part.value.shape[1] >= MIN_ROWS:  # pairs of rows count once
-            result += [*(_setup_change(block, part) if with_changes else []), *_systematic(block, part)]
-    return result
+    findings: list[Finding] = []
+    for block, part in _lengths(fit):
+        # pairs of rows count once
+        if part.value.shape[1] < MIN_ROWS:
+            continue
+        if with_changes:
+            findings += _setup_change(block, part)
+        findings += _systematic(block, part)
+    return findings
 
 
-def _lengths(found: GeometricFit) -> list[tuple[Block, Part]]:
+def _lengths(fit: GeometricFit) -> list[tuple[Block, Part]]:
     """Return each block with its first residual part, which is in metres for every kind of measurement."""
-    first = {piece.block: piece.part.per_row() for piece in reversed(found.pieces)}
-    return [(block, first[number]) for number, block in enumerate(found.blocks)]
+    first = {piece.block: piece.part.per_row() for piece in reversed(fit.pieces)}
+    return [(block, first[number]) for number, block in enumerate(fit.blocks)]
 
 
-def _setup_change(block: Block, part: Part, max_chance: float = 1e-3, min_ratio: float = 1.6) -> list[Finding]:
-    """Return a finding if the set-up changed: the residuals before and after one row differ in size and rank.
-
-    `max_chance`: probability that the same rows in another order show such a change (our choice).
-
-    `min_ratio`: a set-up's errors over the rest's from which on it is worth a word (our choice).
-    """
+def _setup_change(block: Block, part: Part) -> list[Finding]:
+    """Return a finding if the set-up changed: the residuals before and after one row differ in size and rank."""
     size = np.linalg.norm(part.value, axis=0)
-    size = np.minimum(size, 4.0 * np.median(size))  # a few gross rows are not a set-up
+    # a few gross rows are not a set-up
+    size = np.minimum(size, 4.0 * np.median(size))
     m = len(size)
-    cuts = np.arange(max(10, m // 20), m - max(10, m // 20))
+    edge = max(10, m // 20)
+    cuts = np.arange(edge, m - edge)
     energy = np.cumsum(size**2)
     before = np.sqrt(energy[cuts - 1] / cuts)
     after = np.sqrt((energy[-1] - energy[cuts - 1]) / (m - cuts))
     ratio = np.maximum(before / np.maximum(after, 1e-15), after / np.maximum(before, 1e-15))
     weight = np.minimum(cuts, m - cuts)
     best = int(np.argmax((ratio - 1.0) * np.sqrt(weight)))
-    cut, first_worse = int(cuts[best]), before[best] > after[best]
-    if ratio[best] < min_ratio:
+    if ratio[best] < MIN_RATIO:
         return []
-    from scipy.stats import mannwhitneyu  # slow to load, and seldom needed
+    # slow to load, and seldom needed
+    from scipy.stats import mannwhitneyu
 
-    if float(mannwhitneyu(size[:cut], size[cut:]).pvalue) * len(cuts) > max_chance:  # Bonferroni: the best of many cuts
+    cut = int(cuts[best])
+    chance = float(mannwhitneyu(size[:cut], size[cut:]).pvalue)
+    # Bonferroni: the best of many cuts
+    if chance * len(cuts) > MAX_CHANCE:
         return []
     rows = block.measured.rows[part.index]
-    bad = (rows[0], rows[cut - 1]) if first_worse else (rows[cut], rows[-1])
-    worse, rest = (before[best], after[best]) if first_worse else (after[best], before[best])
-    return [finding("set-up-changed", file=_name(block), first=bad[0], last=bad[1], worse=worse, rest=rest)]
+    if before[best] > after[best]:
+        first, last = rows[0], rows[cut - 1]
+        worse, better = before[best], after[best]
+    else:
+        first, last = rows[cut], rows[-1]
+        worse, better = after[best], before[best]
+    return [finding("set-up-changed", file=_name(block), first=first, last=last, worse=worse, rest=better)]
 
 
-def _systematic(block: Block, part: Part, max_times: float = 5.0) -> list[Finding]:
-    """Return findings on systematic residuals: noise differs between neighbouring poses, a missing effect does not.
+def _systematic(block: Block, part: Part) -> list[Finding]:
+    """Return findings on systematic residuals: noise differs between neighbouring poses, a missing effect does not."""
+    findings = []
+    name = _name(block)
+    rms = _rms_norm(part.value)
+    floor = neighbour_floor(block.measured.q, part)
+    if floor is not None and floor < MAX_NEIGHBOUR_SHARE * rms:
+        findings.append(finding("systematic-residual", file=name, rms=rms, neighbours=floor))
+    if part.sigma is not None:
+        stated = _rms_norm(part.sigma)
+        if not stated / MAX_TIMES <= rms <= MAX_TIMES * stated:
+            code = "sigma-too-small" if rms > stated else "sigma-too-large"
+            times = max(rms, stated) / max(min(rms, stated), 1e-300)
+            findings.append(finding(code, file=name, rms=rms, stated=stated, times=times))
+    return findings
 
-    `max_times`: factor above a stated uncertainty from which residuals give a finding (our choice).
-    """
-    floor, rms = neighbour_floor(block.measured.q, part), float(np.sqrt(np.mean(np.sum(part.value**2, axis=0))))
-    stated = None if part.sigma is None else float(np.sqrt(np.mean(np.sum(part.sigma**2, axis=0))))
-    result = []
-    if floor is not None and floor < 0.6 * rms:
-        result.append(finding("systematic-residual", file=_name(block), rms=rms, neighbours=floor))
-    if stated is not None and not stated / max_times <= rms <= max_times * stated:
-        code = "sigma-too-small" if rms > stated else "sigma-too-large"
-        times = max(rms, stated) / max(min(rms, stated), 1e-300)
-        result.append(finding(code, file=_name(block), rms=rms, stated=stated, times=times))
-    return result
+
+def _rms_norm(values: np.ndarray) -> float:
+    """Return the rms of the norms of columns (rows, m)."""
+    return float(np.sqrt(np.mean(np.sum(values**2, axis=0))))
 
 
 def _name(block: Block) -> str:
@@ -112,11 +148,13 @@ def neighbour_floor(q: np.ndarray, part: Part) -> float | None:
     if len(q) != part.value.shape[1] or not moving.any():
         return None
     scaled = q[:, moving] / spread[moving]
-    distance, index = KDTree(scaled).query(scaled, k=2)
-    near = distance[:, 1] < np.sqrt(moving.sum()) / 3.0
-    if near.sum() < MIN_ROWS:
+    distances, indices = KDTree(scaled).query(scaled, k=2)
+    # the nearest is the pose itself
+    close = distances[:, 1] < np.sqrt(moving.sum()) / 3.0
+    if close.sum() < MIN_ROWS:
         return None
-    change = part.value[:, near] - part.value[:, np.asarray(index)[near, 1]]
+    neighbour = np.asarray(indices)[close, 1]
+    change = part.value[:, close] - part.value[:, neighbour]
     return float(np.sqrt(np.mean(np.sum(change**2, axis=0)) / 2.0))
 
 
@@ -147,29 +185,35 @@ def scale_of(nominal: Installation, blocks: Sequence[PoseMeasurements]) -> Scale
         nominal: the arm with base and tool placement fitted for it.
         blocks: of any kinds; those that measure positions count.
     """
-    frames, rows, columns = layout(nominal).frame_index, [], []
+    frames = layout(nominal).frame_index
+    residuals, columns = [], []
     for block in prepare(nominal, blocks):
         if not isinstance(block.measured, Positions):
             continue
         part = next(part for part in observe(nominal, block, frames) if part.label == "position")
         # predicted, since the noise of measured positions is no combination of placements
         predicted = positions(nominal, block)[:, part.index]
-        rows.append(part.value.ravel())
-        away = (predicted - predicted.mean(axis=1, keepdims=True)).ravel()
-        columns.append(np.column_stack([part.jacobian.reshape(len(frames), -1).T, away]))
-    if not rows:
+        residuals.append(part.value.ravel())
+        growth = (predicted - predicted.mean(axis=1, keepdims=True)).ravel()
+        columns.append(np.column_stack([part.jacobian.reshape(len(frames), -1).T, growth]))
+    if not residuals:
         return None
-    value, matrix = np.concatenate(rows), np.concatenate(columns)
+    value = np.concatenate(residuals)
+    matrix = np.concatenate(columns)
     sizes = np.maximum(np.linalg.norm(matrix, axis=0), 1e-12)
-    placements, growth = matrix[:, :-1] / sizes[:-1], matrix[:, -1]
+    placements = matrix[:, :-1] / sizes[:-1]
+    growth = matrix[:, -1]
     # what placements do not explain: of the residuals, and of a growth of all lengths
-    residual, lever = (x - placements @ np.linalg.lstsq(placements, x, rcond=1e-9)[0] for x in (value, growth))
-    power, count = float(lever @ lever), len(value) - matrix.shape[1]
-    if count < 1 or power < len(value) * MIN_LENGTH**2:
+    residual = value - placements @ np.linalg.lstsq(placements, value, rcond=1e-9)[0]
+    lever = growth - placements @ np.linalg.lstsq(placements, growth, rcond=1e-9)[0]
+    power = float(lever @ lever)
+    dof = len(value) - matrix.shape[1]
+    if dof < 1 or power < len(value) * MIN_LENGTH**2:
         return None
-    slope, squares = float(lever @ residual) / power, float(residual @ residual)
+    slope = float(lever @ residual) / power
+    squares = float(residual @ residual)
     unexplained = max(squares - slope**2 * power, 0.0)
-    sigma = float(np.sqrt(unexplained / count / power))
+    sigma = float(np.sqrt(unexplained / dof / power))
     return Scale(1.0 + slope, sigma, 1.0 - unexplained / max(squares, 1e-300))
 
 
@@ -181,36 +225,32 @@ def length_factor(fit: GeometricFit) -> Scale | None:
     chain = fit.start.chain
     if fit.split is None:
         return None
-    arm, base = len(chain.elements), fit.base
+    elements = len(chain.elements)
     nominal_length = np.zeros(len(fit.free))
     change = np.zeros(len(fit.free))
     for number, parameter in enumerate(fit.free):
-        if parameter < arm:
+        if parameter < elements:
             nominal_length[number] = element_length(chain, int(parameter))
             change[number] = fit.cell.chain.values[parameter] - chain.values[parameter]
     # base lengths: each with those that merge with it
     combinations = fit.regrouping()
     total = combinations @ nominal_length
-    translates = np.array([k < arm and chain.elements[k].axis[0] == "t" for k in base], dtype=bool)
+    translates = np.zeros(len(fit.base), dtype=bool)
+    for number, parameter in enumerate(fit.base):
+        translates[number] = parameter < elements and chain.elements[parameter].axis[0] == "t"
     index = np.flatnonzero(translates & (np.abs(total) > MIN_LENGTH))
     if len(index) < 2:
         return None
-    lengths, grown = total[index], (combinations @ change)[index]
+    lengths = total[index]
+    growth = (combinations @ change)[index]
     covariance = combinations[index] @ fit.estimate.covariance @ combinations[index].T
     weight = np.linalg.pinv(covariance, hermitian=True)
-    power, common = float(lengths @ weight @ lengths), float(lengths @ weight @ grown)
+    power = float(lengths @ weight @ lengths)
+    common = float(lengths @ weight @ growth)
     if not power > 0.0:
         return None
-    share = common**2 / power / max(float(grown @ weight @ grown), 1e-300)
-    return Scale(1.0 + common / power, power**-0.5, share)
-
-
-SHORT = Settings(limit=20, passes=1)  # where base and tool settle at all they do so sooner
-ROBUST = Settings(loss="cauchy", limit=40, passes=4)  # angles beyond a convention's range were lost
-# of the makers' angles; others are rare (our choice)
-CONVENTIONS = ("vector", "xyz fixed", "xyz moving", "zyx fixed", "zyx moving", "zyz moving", "zxz moving")
-SURELY = 1.0 / 3.0  # share of the error that may be left where no second change goes with it (our choice)
-FLIP = np.array([1.0, -1.0, 1.0])
+    explained = common**2 / power / max(float(growth @ weight @ growth), 1e-300)
+    return Scale(1.0 + common / power, power**-0.5, explained)
 
 
 def wrong_columns(nominal: Installation, blocks: Blocks, mirrored: bool = False) -> Explanation | None:
@@ -221,31 +261,36 @@ def wrong_columns(nominal: Installation, blocks: Blocks, mirrored: bool = False)
         blocks: the rows.
         mirrored: whether an instrument with left-handed axes is tried, too.
     """
-    n = nominal.chain.n
-    table = [Change("joint-sign", _of_joints(reversal(n, j)), (j,), max_left=0.8) for j in range(n)]
-    table += [
-        Change(
-            "joint-without-effect", _of_joints(standing(n, j)), (j,), {"end": _end_without(nominal.chain, j)}, SURELY
-        )
-        for j in range(n)
-    ]
-    table += [
-        Change("joint-coupled", _of_joints(coupling(n, j, k, way)), (j, k), {"way": "+" if way > 0 else "-"}, SURELY)
-        for j, k, way in couplings(n)
-    ]
-    pairs = combinations(range(n), 2)
-    table += [Change("joints-exchanged", _of_joints(exchange(n, *pair)), pair, max_left=SURELY) for pair in pairs]
+    chain = nominal.chain
+    n = chain.n
+    changes: list[Change] = []
+    for joint in range(n):
+        make = _of_joints(reversal(n, joint))
+        changes.append(Change("joint-sign", make, (joint,), max_left=MAX_LEFT_SIGN))
+    for joint in range(n):
+        values = {"end": _end_without(chain, joint)}
+        changes.append(Change("joint-without-effect", _of_joints(standing(n, joint)), (joint,), values, MAX_LEFT))
+    for joint, source, sign in couplings(n):
+        values = {"way": "+" if sign > 0 else "-"}
+        make = _of_joints(coupling(n, joint, source, sign))
+        changes.append(Change("joint-coupled", make, (joint, source), values, MAX_LEFT))
+    for first, second in combinations(range(n), 2):
+        make = _of_joints(exchange(n, first, second))
+        changes.append(Change("joints-exchanged", make, (first, second), max_left=MAX_LEFT))
     if mirrored and any(isinstance(block, Positions) for block in blocks):
-        table.append(Change("left-handed", _mirrored, max_left=SURELY))
-    turning = [j for j in range(n) if nominal.chain.joints[j].kind != "prismatic"]
-    quarters = [(j, angle) for j in turning for angle in (np.pi / 2.0, -np.pi / 2.0, np.pi)]
-    table += [Change("joint-zero", partial(_turned, j, angle), (j,), {"angle": angle}, SURELY) for j, angle in quarters]
-    few = _few(blocks)
-    table += row_shifts(nominal, blocks, SURELY) + two_targets(nominal, few, SURELY)
+        changes.append(Change("left-handed", _mirrored, max_left=MAX_LEFT))
+    for joint in range(n):
+        if chain.joints[joint].kind == "prismatic":
+            continue
+        for angle in QUARTERS:
+            make = partial(_turned, joint, angle)
+            changes.append(Change("joint-zero", make, (joint,), {"angle": angle}, MAX_LEFT))
+    changes += row_shifts(nominal, blocks, MAX_LEFT)
+    changes += two_targets(nominal, _few(blocks), MAX_LEFT)
     return best_changes(
         blocks,
-        table,
-        lambda changed: _left(nominal, _few(changed)),
+        changes,
+        lambda changed: _mean_square(nominal, _few(changed)),
         lambda changed: least_error(nominal, _few(changed)),
         n,
     )
@@ -259,15 +304,18 @@ def wrong_angles(nominal: Installation, blocks: Blocks) -> Explanation | None:
         blocks: the rows.
     """
     few = [block for block in _few(blocks) if isinstance(block, Poses) and block.euler]
-    read_as = {block.euler for block in few}
-    others = [euler for euler in CONVENTIONS if read_as and euler not in read_as]
-    table = [
-        Change("angle-convention", partial(_read_as, euler), (), {"convention": euler}, SURELY) for euler in others
-    ]
-    return best_changes(few, table, partial(_turned_by, nominal)) if table else None
+    stated = {block.euler for block in few}
+    changes = []
+    for convention in CONVENTIONS:
+        if stated and convention not in stated:
+            values = {"convention": convention}
+            changes.append(Change("angle-convention", partial(_read_as, convention), (), values, MAX_LEFT))
+    if not changes:
+        return None
+    return best_changes(few, changes, partial(_median_angle, nominal))
 
 
-def _turned_by(nominal: Installation, blocks: Blocks) -> np.ndarray:
+def _median_angle(nominal: Installation, blocks: Blocks) -> np.ndarray:
     """Return the median squared orientation error [rad²] (1,) with base and tool placement fitted.
 
     Of most rows, since angles beyond the range of the stated convention were lost when they were read.
@@ -277,18 +325,21 @@ def _turned_by(nominal: Installation, blocks: Blocks) -> np.ndarray:
     except CalibError:
         return np.array([np.inf])
     angle = errors(placed, blocks).orientation
-    return np.array([np.inf if angle is None else float(np.median(angle**2))])
+    if angle is None:
+        return np.array([np.inf])
+    return np.array([float(np.median(angle**2))])
 
 
-def _few(blocks: Blocks, max_rows: int = 200) -> Blocks:
-    """Return at most `max_rows` rows of each block."""
-    return [take(block, evenly(len(block), max_rows)) for block in blocks]
+def _few(blocks: Blocks) -> Blocks:
+    """Return at most `FEW` rows of each block."""
+    return [take(block, evenly(len(block), FEW)) for block in blocks]
 
 
 def _turned(joint: int, angle: float, blocks: Blocks) -> Blocks:
     """Return blocks whose zero of a joint is another one."""
-    by = angle * np.eye(blocks[0].q.shape[1])[joint]
-    return [replace(block, q=block.q + by) for block in blocks]
+    turn = np.zeros(blocks[0].q.shape[1])
+    turn[joint] = angle
+    return [replace(block, q=block.q + turn) for block in blocks]
 
 
 def _end_without(chain: Chain, joint: int) -> str | None:
@@ -300,39 +351,42 @@ def _end_without(chain: Chain, joint: int) -> str | None:
 
 
 def _of_joints(matrix: np.ndarray) -> Callable[[Blocks], Blocks]:
+    """Return the change that multiplies all joint values by a matrix (n, n)."""
     return lambda blocks: [replace(block, q=block.q @ matrix.T) for block in blocks]
 
 
 def _mirrored(blocks: Blocks) -> Blocks:
     """Return blocks in a frame of opposite handedness: y changes its sign, a rotation R becomes F R F."""
-    found = []
+    result = []
     for block in blocks:
         if isinstance(block, Positions):
             block = replace(block, position=np.asarray(block.position) * FLIP)
         if isinstance(block, Poses):
             block = replace(block, quaternion=np.asarray(block.quaternion) * [-1.0, 1.0, -1.0, 1.0])
-        found.append(block)
-    return found
+        result.append(block)
+    return result
 
 
 def _read_as(euler: str, blocks: Blocks) -> Blocks:
     """Return blocks with the angles of orientations read by another convention."""
-    found = []
+    result = []
     for block in blocks:
         if isinstance(block, Poses) and block.euler:
             angles = to_angles(Rotation.from_quat(block.quaternion), block.euler)
-            block = replace(block, quaternion=from_angles(angles, euler).as_quat(canonical=True), euler=euler)
-        found.append(block)
-    return found
+            quaternion = from_angles(angles, euler).as_quat(canonical=True)
+            block = replace(block, quaternion=quaternion, euler=euler)
+        result.append(block)
+    return result
 
 
-def _left(nominal: Installation, blocks: Blocks) -> np.ndarray:
+def _mean_square(nominal: Installation, blocks: Blocks) -> np.ndarray:
     """Return the mean squared error of the nominal arm [m²] after fitting base and tool placement.
 
     A placement that was found worse than the one that `nominal` has does not count.
     """
     squares = [np.inf]
-    with suppress(CalibError):  # a second target has no placement yet
+    # a second target has no placement yet
+    with suppress(CalibError):
         squares.append(float(np.mean(errors(nominal, blocks).main ** 2)))
     with suppress(CalibError):
         placed = polish_frames(install(nominal.chain, blocks, nominal.known), blocks, ROBUST).cell

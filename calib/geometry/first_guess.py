@@ -43,19 +43,74 @@ OPTICS: "Point[Callable[[Sequence[Any]], Optics]]" = Point(
     "optics", "optics of kinds that are not the core's; loading it registers guesses and residuals"
 )
 
-LEVER = 0.3  # what a turn counts as [m/rad] (our choice, as the next two)
+# what a turn counts as [m/rad] (our choice)
+LEVER = 0.3
+# rounds of rotation and offset, and of placement and offset
+PLACING_ROUNDS = 5
+# rms turn of the target [rad] below which it tells no offset
+MIN_TURN = 0.01
+# rows by which orientations are checked, and fewest of them (our choice)
+CHECKED_ROWS = 200
+MIN_CHECKED_ROWS = 4
+# median misfit [deg] from which on a file's orientations are not what they are said to be (our choice)
+MIN_ANGLE = 20.0
+# median misfits of another reading that explains them: an angle [deg], and a share of the positions' spread
+MAX_ANGLE = 5.0
+MAX_MISFIT = 0.1
+# readings of orientations that are tried: what to tell the user, and order and signs of the quaternions as read
+READINGS = (
+    (
+        "read as w x y z they agree. If w comes first, name the columns in that order: qw, qx, qy, qz",
+        [1, 2, 3, 0],
+        [1, 1, 1, 1],
+    ),
+    (
+        "inverted they agree. Give the orientation of the target in the instrument's frame",
+        [0, 1, 2, 3],
+        [-1, -1, -1, 1],
+    ),
+)
+# questions about units by the factor of measured over predicted lengths
+UNITS = {
+    1e3: "are they mm, although the header states m",
+    1e-3: "are they m, although the header states mm",
+    39.37: "are they inches, although the header states m",
+    0.0254: "are they m, although the header states in",
+    1e2: "are they cm, although the header states m",
+    25.4: "are they mm, although the header states in",
+    0.03937: "are they inches, although the header states mm",
+}
+# no joint goes further: they may be rad read as deg (our choice)
+MAX_TURN = 2.1 * math.pi * DEG
+# measured over predicted spread of the positions (our choice)
+MAX_RATIO = 15.0
+# spread of predicted positions from which they are held against the measured ones [m] (our choice)
+MIN_SPREAD = 1e-3
+# steps in which the turning of poses counts, and turning from which a tool is told well anyway [rad] (our choice)
+TURN = 0.05
+TURNED = 6.0
+# rows of a block that a guess is made from (our choice)
+MAX_GUESS_ROWS = 300
+# share of the points of an alignment that are trusted, and how many at least
+TRUSTED_SHARE = 0.8
+MIN_TRUSTED = 4
+
+# station and tool (4, 4)
+Placements = tuple[np.ndarray, np.ndarray]
+Guess = tuple[np.ndarray | None, np.ndarray]
 
 
-def misfit(arm: np.ndarray, seen: np.ndarray, station: np.ndarray, tool: np.ndarray, lever: float) -> np.ndarray:
+def misfit(arm: np.ndarray, measured: np.ndarray, station: np.ndarray, tool: np.ndarray, lever: float) -> np.ndarray:
     """Return the distances (m,) [m] between measured poses B_i and predicted poses S A_i X of the target."""
-    distance, turn = _apart(station @ arm @ tool, seen)
+    distance, turn = _differences(station @ arm @ tool, measured)
     return np.hypot(distance, lever * turn)
 
 
-def _apart(predicted: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _differences(predicted: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the distance (m,) [m] and the angle (m,) [rad] between poses (m, 4, 4)."""
-    turn = Rotation.from_matrix(np.swapaxes(predicted[:, :3, :3], 1, 2) @ seen[:, :3, :3]).magnitude()
-    return np.linalg.norm(predicted[:, :3, 3] - seen[:, :3, 3], axis=1), turn
+    rotation = Rotation.from_matrix(np.swapaxes(predicted[:, :3, :3], 1, 2) @ measured[:, :3, :3])
+    distance = np.linalg.norm(predicted[:, :3, 3] - measured[:, :3, 3], axis=1)
+    return distance, rotation.magnitude()
 
 
 def average_pose(poses: np.ndarray) -> np.ndarray:
@@ -63,51 +118,54 @@ def average_pose(poses: np.ndarray) -> np.ndarray:
     return pose(orthonormal(poses[:, :3, :3].mean(axis=0)), np.median(poses[:, :3, 3], axis=0))
 
 
-def place_pose(arm: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def place_pose(arm: np.ndarray, measured: np.ndarray) -> Placements:
     """Solve B_i = S A_i X for S and X: by orientations (Shah 2013) or rotations and displacements; the better of both.
 
     Args:
         arm: (m, 4, 4) poses A_i of the tip in the base.
-        seen: (m, 4, 4) poses B_i of the target in the station's frame.
+        measured: (m, 4, 4) poses B_i of the target in the station's frame.
 
     Returns:
         station (4, 4) and tool (4, 4).
     """
-    placed = [by_orientations(arm, seen), _by_ways(arm, seen)]
-    return min(placed, key=lambda each: float(np.median(misfit(arm, seen, *each, LEVER))))
+    by_shah = by_orientations(arm, measured)
+    by_motions = _by_displacements(arm, measured)
+    if np.median(misfit(arm, measured, *by_motions, LEVER)) < np.median(misfit(arm, measured, *by_shah, LEVER)):
+        return by_motions
+    return by_shah
 
 
-def by_orientations(arm: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def by_orientations(arm: np.ndarray, measured: np.ndarray) -> Placements:
     """Return S and X by Shah's method: accurate if the poses rotate about two axes by much more than their errors."""
-    a, b = arm[:, :3, :3], seen[:, :3, :3]
     # vec(R_S R_A R_X) = vec(R_B): the sum of R_B ⊗ R_A has vec(R_S) and vec(R_X) as its first singular pair
-    kernel = np.einsum("mij,mkl->ikjl", b, a).reshape(9, 9)
+    kernel = np.einsum("mij,mkl->ikjl", measured[:, :3, :3], arm[:, :3, :3]).reshape(9, 9)
     u, _, vt = np.linalg.svd(kernel)
-    station_rotation, tool_transposed = u[:, 0].reshape(3, 3), vt[0].reshape(3, 3)
-    station_rotation = orthonormal(station_rotation * np.sign(np.linalg.det(station_rotation)))
-    tool_rotation = orthonormal(tool_transposed * np.sign(np.linalg.det(tool_transposed))).T
-    station, offset = _translations(arm, seen[:, :3, 3], station_rotation)
+    station_matrix = u[:, 0].reshape(3, 3)
+    tool_matrix = vt[0].reshape(3, 3)
+    station_rotation = orthonormal(station_matrix * np.sign(np.linalg.det(station_matrix)))
+    tool_rotation = orthonormal(tool_matrix * np.sign(np.linalg.det(tool_matrix))).T
+    station, offset = _translations(arm, measured[:, :3, 3], station_rotation)
     return pose(station_rotation, station), pose(tool_rotation, offset)
 
 
-def _by_ways(arm: np.ndarray, seen: np.ndarray, rounds: int = 5) -> tuple[np.ndarray, np.ndarray]:
+def _by_displacements(arm: np.ndarray, measured: np.ndarray) -> Placements:
     """Return S and X from rotations and displacements about the mean: accurate for a line with one orientation.
 
     log(R_B,i R̄_Bᵀ) = R_S log(R_A,i R̄_Aᵀ), the chordal means being turned in the same way, and
     y_i - ȳ = R_S (a_i - ā + (R_i - R̄) t): R_S by Kabsch on both, turns at a lever of `LEVER`, and t by its linear
     solution, in turns.
-
-    `rounds`: rounds of rotation and offset.
     """
-    (a, turns), (b, seen_turns) = (chordal_turns(poses[:, :3, :3]) for poses in (arm, seen))
+    arm_mean, arm_turns = chordal_turns(arm[:, :3, :3])
+    measured_mean, measured_turns = chordal_turns(measured[:, :3, :3])
+    measured_position = measured[:, :3, 3]
+    measured_motions = np.concatenate([measured_position - measured_position.mean(axis=0), LEVER * measured_turns])
     station, offset, rotation = np.zeros(3), np.zeros(3), np.eye(3)
-    for _ in range(rounds):
-        ways = arm[:, :3, 3] + arm[:, :3, :3] @ offset
-        one = np.concatenate([ways - ways.mean(axis=0), LEVER * turns])
-        two = np.concatenate([seen[:, :3, 3] - seen[:, :3, 3].mean(axis=0), LEVER * seen_turns])
-        rotation = Rotation.align_vectors(two, one)[0].as_matrix()
-        station, offset = _translations(arm, seen[:, :3, 3], rotation)
-    return pose(rotation, station), pose((rotation @ a).T @ b, offset)
+    for _ in range(PLACING_ROUNDS):
+        position = arm[:, :3, 3] + arm[:, :3, :3] @ offset
+        motions = np.concatenate([position - position.mean(axis=0), LEVER * arm_turns])
+        rotation = Rotation.align_vectors(measured_motions, motions)[0].as_matrix()
+        station, offset = _translations(arm, measured_position, rotation)
+    return pose(rotation, station), pose((rotation @ arm_mean).T @ measured_mean, offset)
 
 
 def chordal_turns(rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -118,12 +176,14 @@ def chordal_turns(rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _translations(arm: np.ndarray, position: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return p_S (3,) and t (3,) of  y_i - R_S a_i = R_S R_i t + p_S; poorly identifiable components of t are 0."""
-    turned, target = rotation @ arm[:, :3, :3], position - arm[:, :3, 3] @ rotation.T
-    away = turned - turned.mean(axis=0)
-    u, size, vt = np.linalg.svd(away.reshape(-1, 3), full_matrices=False)
-    min_turn = 0.01  # rms turn [rad] below which it tells no offset of the target
-    strong = size > min_turn * np.sqrt(len(arm))
-    offset = vt[strong].T @ ((u[:, strong].T @ (target - target.mean(axis=0)).reshape(-1)) / size[strong])
+    turned = rotation @ arm[:, :3, :3]
+    target = position - arm[:, :3, 3] @ rotation.T
+    turned_from_mean = turned - turned.mean(axis=0)
+    target_from_mean = target - target.mean(axis=0)
+    u, size, vt = np.linalg.svd(turned_from_mean.reshape(-1, 3), full_matrices=False)
+    strong = size > MIN_TURN * np.sqrt(len(arm))
+    components = (u[:, strong].T @ target_from_mean.reshape(-1)) / size[strong]
+    offset = vt[strong].T @ components
     return (target - turned @ offset).mean(axis=0), offset
 
 
@@ -140,27 +200,22 @@ def check_orientations(chain: Chain, block: PoseMeasurements) -> None:
     if not isinstance(block, Poses):
         return
     rows = np.flatnonzero(block.tool == np.argmax(np.bincount(block.tool)))
-    max_rows = 200  # how many are looked at; our choice
-    rows = rows[evenly(len(rows), max_rows)]
-    arm, position, stated = forward(chain, block.q[rows]), block.position[rows], block.quaternion[rows]
-    min_angle = 20.0  # median misfit [deg] from which on the file's orientations are not what they are said to be
-    if len(rows) < 4 or (found := _misfit(arm, position, stated)[0]) <= min_angle:
+    rows = rows[evenly(len(rows), CHECKED_ROWS)]
+    if len(rows) < MIN_CHECKED_ROWS:
         return
-    readings = {
-        "read as w x y z they agree. If w comes first, name the columns in that order: qw, qx, qy, qz": np.roll(
-            stated, -1, axis=1
-        ),
-        "inverted they agree. Give the orientation of the target in the instrument's frame": stated * [-1, -1, -1, 1],
-    }
-    max_misfit = 0.1  # of the positions' spread: their median misfit then
-    max_angle = 5.0  # and below which another reading of them is
-    for words, quaternion in readings.items():
-        angle, distance = _misfit(arm, position, quaternion)
-        if angle < max_angle and distance < max_misfit:
+    arm = forward(chain, block.q[rows])
+    position = block.position[rows]
+    quaternion = block.quaternion[rows]
+    error, _ = _misfit(arm, position, quaternion)
+    if error <= MIN_ANGLE:
+        return
+    for advice, order, signs in READINGS:
+        angle, distance = _misfit(arm, position, quaternion[:, order] * signs)
+        if angle < MAX_ANGLE and distance < MAX_MISFIT:
             refuse_data(
                 block.file,
-                f"the orientations contradict the arm (read as x y z w: median error {found:.0f}° for the best "
-                f"placement of instrument and tool); {words}",
+                f"the orientations contradict the arm (read as x y z w: median error {error:.0f}° for the best "
+                f"placement of instrument and tool); {advice}",
             )
 
 
@@ -175,25 +230,11 @@ def _misfit(arm: np.ndarray, position: np.ndarray, quaternion: np.ndarray) -> tu
     Returns:
         The median angle [deg], and the median distance over the positions' spread.
     """
-    seen = from_quaternion(position, quaternion)
-    station, tool = place_pose(arm, seen)
-    distance, turned = _apart(station @ arm @ tool, seen)
+    measured = from_quaternion(position, quaternion)
+    station, tool = place_pose(arm, measured)
+    distance, angle = _differences(station @ arm @ tool, measured)
     spread = float(np.sqrt(np.sum(np.var(position, axis=0))))
-    return float(np.degrees(np.median(turned))), float(np.median(distance)) / max(spread, 1e-9)
-
-
-UNITS = {
-    1e3: "are they mm, although the header states m",
-    1e-3: "are they m, although the header states mm",
-    39.37: "are they inches, although the header states m",
-    0.0254: "are they m, although the header states in",
-    1e2: "are they cm, although the header states m",
-    25.4: "are they mm, although the header states in",
-    0.03937: "are they inches, although the header states mm",
-}
-MAX_TURN = 2.1 * math.pi * DEG  # no joint goes further: they may be rad read as deg (our choice)
-TURN, TURNED = 0.05, 6.0  # poses that turn by more tell a tool well whatever they turn by [rad] (our choice)
-MAX_GUESS_ROWS = 300  # rows of a block that a guess is made from (our choice)
+    return float(np.degrees(np.median(angle))), float(np.median(distance)) / max(spread, 1e-9)
 
 
 def install(chain: Chain, measured: Sequence[PoseMeasurements], known: Deflection | None = None) -> Installation:
@@ -207,27 +248,37 @@ def install(chain: Chain, measured: Sequence[PoseMeasurements], known: Deflectio
         MeasurementError: too few rows to place an instrument.
     """
     foreign = [block for block in measured if block.kind not in KINDS]
-    optics = OPTICS.one()(foreign) if foreign else NoOptics()  # registers guesses and residuals, too
+    optics = NoOptics()
+    if foreign:
+        # registers guesses and residuals, too
+        optics = OPTICS.one()(foreign)
     stations: dict[str, np.ndarray] = {}
     tools: dict[str, np.ndarray] = {}
-    for block in sorted(measured, key=lambda b: (b.placing, -_turning(chain, b), -len(b))):
-        block = take(block, evenly(len(block), MAX_GUESS_ROWS))
-        arm = forward(chain, block.q)
-        check_scale(block, chain)
-        for number in np.unique(block.tool):
-            name, rows = block.tool_names[number], block.tool == number
-            station, tool = guess(block, arm, rows, stations.get(block.station), tools.get(name))
+    for block in sorted(measured, key=lambda block: (block.placing, -_turning(chain, block), -len(block))):
+        sample = take(block, evenly(len(block), MAX_GUESS_ROWS))
+        arm = forward(chain, sample.q)
+        check_scale(sample, chain)
+        for number in np.unique(sample.tool):
+            name = sample.tool_names[number]
+            rows = sample.tool == number
+            station, tool = guess(sample, arm, rows, stations.get(sample.station), tools.get(name))
             tools.setdefault(name, tool)
-            if block.has_instrument and station is not None:
-                stations.setdefault(block.station, station)
-    station_names = tuple(dict.fromkeys(b.station for b in measured if b.has_instrument)) or ("station",)
-    tool_names = tuple(dict.fromkeys(name for b in measured for name in b.tool_names))
+            if sample.has_instrument and station is not None:
+                stations.setdefault(sample.station, station)
+    station_names: dict[str, None] = {}
+    tool_names: dict[str, None] = {}
+    for block in measured:
+        if block.has_instrument:
+            station_names[block.station] = None
+        tool_names.update(dict.fromkeys(block.tool_names))
+    if not station_names:
+        station_names["station"] = None
     return Installation(
         chain,
-        np.array([stations.get(name, np.eye(4)) for name in station_names]),
-        np.array([tools.get(name, np.eye(4)) for name in tool_names]),
-        station_names,
-        tool_names,
+        stations=np.array([stations.get(name, np.eye(4)) for name in station_names]),
+        tools=np.array([tools.get(name, np.eye(4)) for name in tool_names]),
+        station_names=tuple(station_names),
+        tool_names=tuple(tool_names),
         known=known or Deflection(),
         optics=optics,
     )
@@ -247,26 +298,25 @@ def check_scale(block: PoseMeasurements, chain: Chain) -> None:
     if not isinstance(block, Positions) or len(block) < 3:
         return
     block = take(block, evenly(len(block), MAX_GUESS_ROWS))
-    (measured, second), (predicted, across) = _spread(block.position), _spread(forward(chain, block.q)[:, :3, 3])
-    min_spread = 1e-3  # of predicted positions, from which they are held against the measured ones [m] (our choice)
-    if predicted < min_spread:
+    measured, measured_across = _spread(block.position)
+    predicted, predicted_across = _spread(forward(chain, block.q)[:, :3, 3])
+    if predicted < MIN_SPREAD:
         return
-    max_ratio = 15.0  # measured over predicted spread of the positions (our choice)
-    if not 1.0 / max_ratio < measured / predicted < max_ratio:
-        likely, header = _likely_units(block, chain, measured, predicted)
-        read = "".join(f" The file was {note}." for note in block.notes if note.startswith("read as"))
+    if not 1.0 / MAX_RATIO < measured / predicted < MAX_RATIO:
+        question, header = _likely_units(block, chain, measured, predicted)
+        notes = [f" The file was {note}." for note in block.notes if note.startswith("read as")]
         refuse_data(
             block.file,
             f"the measured positions spread over {measured:.4g} m, {measured / predicted:.3g} times the "
-            f"{predicted:.4g} m of the robot at these joint values{likely}{read} State the unit in the "
+            f"{predicted:.4g} m of the robot at these joint values{question}{''.join(notes)} State the unit in the "
             f"header, as in {header}, or check that this is the right robot",
         )
-    if second < across / max_ratio and across > min_spread:
+    if measured_across < predicted_across / MAX_RATIO and predicted_across > MIN_SPREAD:
         refuse_data(
             block.file,
-            f"the measured positions lie on a line within {1e3 * second:.3g} mm, those of the robot at these joint "
-            f"values within {1e3 * across:.3g} mm: are two of x, y, z constant or the same column, or are poses "
-            "repeated? Measure poses all over the workspace",
+            f"the measured positions lie on a line within {1e3 * measured_across:.3g} mm, those of the robot at these "
+            f"joint values within {1e3 * predicted_across:.3g} mm: are two of x, y, z constant or the same column, or "
+            "are poses repeated? Measure poses all over the workspace",
         )
 
 
@@ -278,16 +328,19 @@ def _spread(positions: np.ndarray) -> tuple[float, float]:
 
 def _likely_units(block: Positions, chain: Chain, measured: float, predicted: float) -> tuple[str, str]:
     """Return a question about the units that would explain the spread, and the column header to write."""
+    # what to ask about the joints, the spread that follows, and the header that states the unit
     guesses = [("", predicted, "'x [mm]'")]
     if np.abs(block.q).max() < MAX_TURN:
         turning = np.array([joint.kind != "prismatic" for joint in chain.joints])
-        moved = _spread(forward(chain, np.where(turning, block.q / DEG, block.q))[:, :3, 3])[0]
-        guesses.insert(0, ("are the joints rad, although the header states deg", moved, "'q1 [rad]'"))
-    for words, size, header in guesses:
-        ratio = max(measured / size, 1e-300)
-        factor = min((1.0, *UNITS), key=lambda each: abs(math.log(ratio / each)))
+        in_rad = np.where(turning, block.q / DEG, block.q)
+        spread, _ = _spread(forward(chain, in_rad)[:, :3, 3])
+        guesses.insert(0, ("are the joints rad, although the header states deg", spread, "'q1 [rad]'"))
+    for question, spread, header in guesses:
+        ratio = max(measured / spread, 1e-300)
+        factor = min((1.0, *UNITS), key=lambda unit: abs(math.log(ratio / unit)))
         if abs(math.log(ratio / factor)) < math.log(2.0):
-            return f": {', and '.join(filter(None, (words, UNITS.get(factor, ''))))}?", header
+            questions = [text for text in (question, UNITS.get(factor, "")) if text]
+            return f": {', and '.join(questions)}?", header
     return ".", guesses[-1][2]
 
 
@@ -297,38 +350,43 @@ def _turning(chain: Chain, block: PoseMeasurements) -> float:
     if len(rows) < 3:
         return 0.0
     _, turns = chordal_turns(forward(chain, block.q[rows])[:, :3, :3])
-    return min(float(np.sqrt(np.clip(np.linalg.eigvalsh(np.cov(turns.T))[1], 0.0, None)) // TURN), TURNED)
-
-
-Guess = tuple[np.ndarray | None, np.ndarray]
+    second_variance = np.linalg.eigvalsh(np.cov(turns.T))[1]
+    turning = float(np.sqrt(np.clip(second_variance, 0.0, None)) // TURN)
+    return min(turning, TURNED)
 
 
 @singledispatch
 def guess(
     block: PoseMeasurements, arm: np.ndarray, rows: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
 ) -> Guess:
-    """Return the placements of station and tool for one target; known placements are kept."""
+    """Return the placements of station and tool for one target; those already guessed stay."""
     arm = arm[rows]
-    if isinstance(block, Positions) and len(arm) < (least := 3 if isinstance(block, Poses) else 4):
-        refuse_data(
-            block.file,
-            f"{len(arm)} usable rows: placing the instrument and the target needs at least {least} different poses, "
-            "a calibration at least about 20; measure more poses",
-        )
+    if isinstance(block, Positions):
+        min_poses = 3 if isinstance(block, Poses) else 4
+        if len(arm) < min_poses:
+            refuse_data(
+                block.file,
+                f"{len(arm)} usable rows: placing the instrument and the target needs at least {min_poses} different "
+                "poses, a calibration at least about 20; measure more poses",
+            )
     if isinstance(block, Poses):
-        seen = from_quaternion(block.position[rows], block.quaternion[rows])
+        measured = from_quaternion(block.position[rows], block.quaternion[rows])
         if station is not None:
-            return station, average_pose(invert(arm) @ invert(station) @ seen)
-        return place_pose(arm, seen) if tool is None else (average_pose(seen @ invert(arm @ tool)), tool)
+            return station, average_pose(invert(arm) @ invert(station) @ measured)
+        if tool is not None:
+            return average_pose(measured @ invert(arm @ tool)), tool
+        return place_pose(arm, measured)
     if isinstance(block, Positions):
         return _place_position(arm, block.position[rows], station, tool)
-    if isinstance(block, Sockets) and tool is None:
+    if tool is not None:
+        return None, tool
+    if isinstance(block, Sockets):
         return None, pose(None, _place_sockets(arm, block.group[rows]))
-    return None, np.eye(4) if tool is None else tool
+    return None, np.eye(4)
 
 
 def _place_position(
-    arm: np.ndarray, seen: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
+    arm: np.ndarray, measured: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Solve y_i = S (R_i t + a_i) linearly for S and t, or for one of them if the other is given.
 
@@ -337,50 +395,62 @@ def _place_position(
 
     Args:
         arm: (m, 4, 4).
-        seen: (m, 3) [m].
+        measured: (m, 3) [m].
     """
-    rotation, position = arm[:, :3, :3], arm[:, :3, 3]
+    rotation = arm[:, :3, :3]
+    position = arm[:, :3, 3]
     if station is not None:
-        inside = (seen - station[:3, 3]) @ station[:3, :3]
-        offset = np.median(np.einsum("mji,mj->mi", rotation, inside - position), axis=0)
-        return station, pose(None, offset)
+        in_base = (measured - station[:3, 3]) @ station[:3, :3]
+        return station, pose(None, _median_offset(rotation, in_base - position))
     if tool is not None:
-        return _align(position + rotation @ tool[:3, 3], seen), tool
-    tried = list[tuple[float, np.ndarray, np.ndarray]]()
-    for offset in (np.zeros(3), _linear_offset(rotation, position, seen)):
-        for _ in range(5):  # alternate: placement by Kabsch, offset by its linear solution
-            placement = _align(position + rotation @ offset, seen)
-            inside = (seen - placement[:3, 3]) @ placement[:3, :3]
-            error = float(np.median(np.linalg.norm(inside - position - rotation @ offset, axis=1)))
-            tried.append((error, placement, offset))
-            offset = np.median(np.einsum("mji,mj->mi", rotation, inside - position), axis=0)
-    _, placement, offset = min(tried, key=lambda one: one[0])
-    return placement, pose(None, offset)
+        return _align(position + rotation @ tool[:3, 3], measured), tool
+    smallest = np.inf
+    best_placement = np.eye(4)
+    best_offset = np.zeros(3)
+    for offset in (np.zeros(3), _linear_offset(rotation, position, measured)):
+        # alternate: placement by Kabsch, offset by its linear solution
+        for _ in range(PLACING_ROUNDS):
+            placement = _align(position + rotation @ offset, measured)
+            in_base = (measured - placement[:3, 3]) @ placement[:3, :3]
+            error = float(np.median(np.linalg.norm(in_base - position - rotation @ offset, axis=1)))
+            if error < smallest:
+                smallest = error
+                best_placement = placement
+                best_offset = offset
+            offset = _median_offset(rotation, in_base - position)
+    return best_placement, pose(None, best_offset)
 
 
-def _linear_offset(rotation: np.ndarray, position: np.ndarray, seen: np.ndarray) -> np.ndarray:
+def _median_offset(rotation: np.ndarray, lever: np.ndarray) -> np.ndarray:
+    """Return the median of the levers (m, 3) in the frames of rotations (m, 3, 3)."""
+    return np.median(np.einsum("mji,mj->mi", rotation, lever), axis=0)
+
+
+def _linear_offset(rotation: np.ndarray, position: np.ndarray, measured: np.ndarray) -> np.ndarray:
     """Return t of R_Sᵀ y - c - R t = a, linear in the nine numbers of R_Sᵀ, c and t."""
-    m = len(seen)
-    centre = seen.mean(axis=0)
+    m = len(measured)
+    centre = measured.mean(axis=0)
     rows = np.zeros((m, 3, 15))
     for axis in range(3):
-        rows[:, axis, 3 * axis : 3 * axis + 3] = seen - centre
+        rows[:, axis, 3 * axis : 3 * axis + 3] = measured - centre
     rows[:, :, 9:12] = np.eye(3)
     rows[:, :, 12:] = -rotation
     return np.linalg.lstsq(rows.reshape(-1, 15), position.reshape(-1), rcond=1e-6)[0][12:]
 
 
-def _align(points: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Return the pose S with seen ≈ S points (Kabsch 1976); the worst fifth is trimmed once."""
-    keep = np.ones(len(points), dtype=bool)
+def _align(points: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """Return the pose S with measured ≈ S points (Kabsch 1976); the worst fifth is trimmed once."""
+    trusted = np.ones(len(points), dtype=bool)
     placement = np.eye(4)
     for _ in range(2):
-        turned = Rotation.align_vectors(seen[keep] - seen[keep].mean(axis=0), points[keep] - points[keep].mean(axis=0))
-        matrix = turned[0].as_matrix()
-        placement = pose(matrix, seen[keep].mean(axis=0) - matrix @ points[keep].mean(axis=0))
-        error = np.linalg.norm(seen - points @ matrix.T - placement[:3, 3], axis=1)
-        keep = error <= max(np.quantile(error, 0.8), 1e-12)
-        if keep.sum() < 4:
+        mean = points[trusted].mean(axis=0)
+        measured_mean = measured[trusted].mean(axis=0)
+        alignment = Rotation.align_vectors(measured[trusted] - measured_mean, points[trusted] - mean)
+        matrix = alignment[0].as_matrix()
+        placement = pose(matrix, measured_mean - matrix @ mean)
+        error = np.linalg.norm(measured - points @ matrix.T - placement[:3, 3], axis=1)
+        trusted = error <= max(np.quantile(error, TRUSTED_SHARE), 1e-12)
+        if trusted.sum() < MIN_TRUSTED:
             break
     return placement
 

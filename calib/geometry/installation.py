@@ -44,8 +44,8 @@ class NoOptics:
     def __len__(self) -> int:
         return 0
 
-    def like(self, other: Any) -> NoOptics:
-        """Return these instruments with the parameter values of `other`."""
+    def like(self, optics: Any) -> NoOptics:
+        """Return these instruments with the parameter values of `optics`."""
         return self
 
     def view(self, measured: PoseMeasurements, free: np.ndarray) -> Any:
@@ -87,15 +87,18 @@ class Installation:
     @property
     def reach(self) -> float:
         """Largest distance of a target from the base of the stretched arm [m], at the joints' zero where they slide."""
-        return self.chain.stretched_length() + float(np.linalg.norm(self.tools[:, :3, 3], axis=1).max(initial=0.0))
+        tool_lengths = np.linalg.norm(self.tools[:, :3, 3], axis=1)
+        return self.chain.stretched_length() + float(tool_lengths.max(initial=0.0))
 
     def merged(self) -> Installation:
         """Return the installation with known and fitted deflections merged."""
         if not self.known.terms:
             return self
         terms = (*self.known.terms, *self.deflection.terms)
-        values = np.concatenate([np.asarray(self.known.coefficients), np.asarray(self.deflection.coefficients)])
-        earlier, reference = self.known.reference, self.deflection.reference or self.known.reference
+        known_values = np.asarray(self.known.coefficients)
+        values = np.concatenate([known_values, np.asarray(self.deflection.coefficients)])
+        earlier = self.known.reference
+        reference = self.deflection.reference or earlier
         # masses that the known compliance was fitted with stay with it
         if reference is not None and reference.inertias is None and earlier is not None:
             reference = replace(reference, inertias=earlier.inertias)
@@ -129,7 +132,7 @@ def see(
     station: int = 0,
     tool: np.ndarray | int = 0,
     bases: np.ndarray | None = None,
-    given: np.ndarray | None = None,
+    displacements: np.ndarray | None = None,
 ) -> Seen:
     """Return the targets in an instrument's frame at joint values q (m, n).
 
@@ -139,21 +142,25 @@ def see(
         station: index of the instrument placement; -1 for the arm's base frame.
         tool: index of the target, one or (m,).
         bases: (E, m) of the deflection's terms at q; evaluated here where None.
-        given: (K, m) displacements by the known deflections; evaluated here where None.
+        displacements: (K, m) of elements by the known deflections; evaluated here where None.
     """
-    extra = extra_displacements(cell.chain, cell.deflection, q, bases)
-    given = extra_displacements(cell.chain, cell.known, q) if given is None else given
-    extra = given if extra is None else extra if given is None else extra + given
-    walked = sweep(cell.chain, q, None if station < 0 else cell.stations[station], extra)
+    fitted = extra_displacements(cell.chain, cell.deflection, q, bases)
+    if displacements is None:
+        displacements = extra_displacements(cell.chain, cell.known, q)
+    if fitted is not None:
+        displacements = fitted if displacements is None else fitted + displacements
+    placement = None if station < 0 else cell.stations[station]
+    walked = sweep(cell.chain, q, placement, displacements)
     if len(cell.tools) == 1 or np.ndim(tool) == 0:
-        placement = cell.tools[0 if len(cell.tools) == 1 else int(np.asarray(tool))]
+        number = 0 if len(cell.tools) == 1 else int(np.asarray(tool))
+        mounting = cell.tools[number]
         flat = walked.rotation.reshape(3, -1)
-        point = walked.position + (placement[:3, 3] @ flat).reshape(walked.position.shape)
-        rotation = (placement[:3, :3].T @ flat).reshape(walked.rotation.shape)
+        point = walked.position + (mounting[:3, 3] @ flat).reshape(walked.position.shape)
+        rotation = (mounting[:3, :3].T @ flat).reshape(walked.rotation.shape)
     else:
-        placement = cell.tools[np.asarray(tool)]
-        point = walked.position + np.einsum("cdm,mc->dm", walked.rotation, placement[:, :3, 3])
-        rotation = np.einsum("cdm,mce->edm", walked.rotation, placement[:, :3, :3])
+        mountings = cell.tools[np.asarray(tool)]
+        point = walked.position + np.einsum("cdm,mc->dm", walked.rotation, mountings[:, :3, 3])
+        rotation = np.einsum("cdm,mce->edm", walked.rotation, mountings[:, :3, :3])
     return Seen(walked, point, rotation)
 
 
@@ -169,11 +176,9 @@ class _Frames:
 
 def frame_tables(cell: Installation) -> dict[str, Any]:
     """Return the tables ``station`` and ``tool`` of an installation, and those of its cameras and boards."""
-    return {
-        **cell.optics.tables(),
-        "station": [{"name": n, **placement_table(t)} for n, t in zip(cell.station_names, cell.stations)],
-        "tool": [{"name": n, **placement_table(t)} for n, t in zip(cell.tool_names, cell.tools)],
-    }
+    stations = [{"name": name, **placement_table(pose)} for name, pose in zip(cell.station_names, cell.stations)]
+    tools = [{"name": name, **placement_table(pose)} for name, pose in zip(cell.tool_names, cell.tools)]
+    return {**cell.optics.tables(), "station": stations, "tool": tools}
 
 
 def read(path: str | Path) -> Installation:
@@ -196,8 +201,8 @@ def read_arms(path: str | Path) -> tuple[Installation, Installation]:
         RobotError: where the file does not say which arm that was.
     """
     robot, extra = calibrated.read_whole(path)
-    known = extra.get("provenance", {})
-    frames = {kind: known.get(f"nominal_{kind}", ()) for kind in ("station", "tool")}
+    provenance = extra.get("provenance", {})
+    frames = {kind: provenance.get(f"nominal_{kind}", ()) for kind in ("station", "tool")}
     nominal = _placed(nominal_of(robot), {**extra, **frames}, f"{path}, provenance")
     if not all(frames.values()):
         none = np.zeros((0, 4, 4))
@@ -205,19 +210,34 @@ def read_arms(path: str | Path) -> tuple[Installation, Installation]:
     return _placed(robot.complete, extra, str(path), robot.deflection), nominal
 
 
-def _placed(chain: Chain, tables: Mapping[str, Any], where: str, deflection: Deflection | None = None) -> Installation:
-    """Return a chain with the stations and tools of the tables; identity frames for an empty list."""
-    with refused_as(RobotError, ValueError, f"{where}: {{}}; expected [[...]] tables, each with a name, xyz and rpy"):
-        found = read_record(_Frames, tables)
-    given: dict[str, Any] = {"deflection": deflection or Deflection()}
-    for kind, entries in (("station", found.station), ("tool", found.tool)):
-        if entries:
-            given[f"{kind}_names"] = tuple(str(entry.get("name", f"{k}")) for k, entry in enumerate(entries, 1))
-            poses = ({key: value for key, value in entry.items() if key != "name"} for entry in entries)
-            given[f"{kind}s"] = np.array([placement(each, f"{where}, {kind}") for each in poses])
-    if found.camera:
-        with refused_as(RobotError, (CalibError, ValueError), f"{where}: {{}}"):
+def _placed(chain: Chain, tables: Mapping[str, Any], source: str, deflection: Deflection | None = None) -> Installation:
+    """Return a chain with the stations and tools of the tables; identity frames for an empty list.
+
+    `source`: of the tables, with which messages begin.
+    """
+    with refused_as(RobotError, ValueError, f"{source}: {{}}; expected [[...]] tables, each with a name, xyz and rpy"):
+        frames = read_record(_Frames, tables)
+    cell = Installation(chain, deflection=deflection or Deflection())
+    if frames.station:
+        names, placements = _placements(frames.station, f"{source}, station")
+        cell = replace(cell, stations=placements, station_names=names)
+    if frames.tool:
+        names, placements = _placements(frames.tool, f"{source}, tool")
+        cell = replace(cell, tools=placements, tool_names=names)
+    if frames.camera:
+        with refused_as(RobotError, (CalibError, ValueError), f"{source}: {{}}"):
             from calib.data.images.optics import read_optics
 
-            given["optics"] = read_optics(found.camera, found.board)
-    return Installation(chain, **given)
+            cell = replace(cell, optics=read_optics(frames.camera, frames.board))
+    return cell
+
+
+def _placements(entries: tuple[Mapping[str, Any], ...], source: str) -> tuple[tuple[str, ...], np.ndarray]:
+    """Return names and placements (k, 4, 4) of the entries of a table; without a name their number."""
+    names = []
+    placements = []
+    for number, entry in enumerate(entries, 1):
+        names.append(str(entry.get("name", f"{number}")))
+        numbers = {key: value for key, value in entry.items() if key != "name"}
+        placements.append(placement(numbers, source))
+    return tuple(names), np.array(placements)

@@ -19,9 +19,22 @@ from calib.geometry.installation import Installation, Seen, see
 from calib.robot.calibrated import evaluate
 from calib.robot.kinematics import joint_jacobian
 
-DONE = 1e-10  # error [m] below which a target is met
-FIRST, LAST = 1e-9, 1e4  # damping, in mean squared singular values of J
-BACK = np.geomspace(1e-4, 1.0, 13)  # weights that hold the joints at the start [m/rad]
+# error [m] below which a target is met
+DONE = 1e-10
+# damping, in mean squared singular values of J
+FIRST = 1e-9
+LAST = 1e4
+# step [rad or m] that changes nothing
+MIN_STEP = 1e-12
+# [m]: an orientation counts as its displacement at this distance (our choice, as all constants here)
+LEVER = 0.3
+# weights that hold the joints at the start [m/rad], and steps with each
+BACK = np.geomspace(1e-4, 1.0, 13)
+HELD_STEPS = 20
+# passes towards the joint values to stay near
+NEAREST_PASSES = 8
+# targets at once: bounds the memory
+CHUNK = 2000
 
 Torques = Callable[[np.ndarray], np.ndarray] | None
 DOF = (6, 5, 3)
@@ -47,9 +60,11 @@ class Goal:
 
 def seen_at(goal: Goal, q: np.ndarray) -> Seen:
     """Return the tool poses (m, 4, 4) at joint values q (m, n), deflections included."""
-    terms = goal.cell.deflection.terms
-    torque = goal.torques(q) if goal.torques is not None and any(term.basis == "torque" for term in terms) else None
-    return see(goal.cell, q, bases=evaluate(goal.cell.deflection, q, torque))
+    deflection = goal.cell.deflection
+    torque = None
+    if goal.torques is not None and any(term.basis == "torque" for term in deflection.terms):
+        torque = goal.torques(q)
+    return see(goal.cell, q, bases=evaluate(deflection, q, torque))
 
 
 def differences(goal: Goal, q: np.ndarray, targets: np.ndarray) -> np.ndarray:
@@ -62,18 +77,21 @@ def differences(goal: Goal, q: np.ndarray, targets: np.ndarray) -> np.ndarray:
 
 
 def _differences(seen: Seen, targets: np.ndarray, dof: int) -> np.ndarray:
-    missing = targets[:, :3, 3] - seen.point.T
+    displacement = targets[:, :3, 3] - seen.point.T
     if dof == 3:
-        return missing
+        return displacement
     rotation = seen.rotation.transpose(2, 1, 0)
     if dof == 6:
         turn = Rotation.from_matrix(targets[:, :3, :3] @ np.swapaxes(rotation, 1, 2)).as_rotvec()
-        return np.hstack([missing, turn])
-    across = np.einsum("mij,mi->mj", rotation, np.cross(rotation[:, :, 2], targets[:, :3, 2]))[:, :2]
+        return np.hstack([displacement, turn])
+    tool_z = rotation[:, :, 2]
+    target_z = targets[:, :3, 2]
+    # the turn's axis times its sine, in the tool's frame
+    across = np.einsum("mij,mi->mj", rotation, np.cross(tool_z, target_z))[:, :2]
     sine = np.linalg.norm(across, axis=1, keepdims=True)
-    cosine = np.einsum("mi,mi->m", rotation[:, :, 2], targets[:, :3, 2])[:, None]
+    cosine = np.einsum("mi,mi->m", tool_z, target_z)[:, None]
     scale = np.where(sine > 1e-9, np.arctan2(sine, cosine) / np.maximum(sine, 1e-9), 1.0)
-    return np.hstack([missing, scale * across])
+    return np.hstack([displacement, scale * across])
 
 
 def differences_jacobian(goal: Goal, seen: Seen) -> np.ndarray:
@@ -96,54 +114,61 @@ def reach(goal: Goal, targets: np.ndarray, start: np.ndarray, iterations: int = 
         start: (m, n) joint values to start from and to stay near; beyond a limit, the limit.
         iterations: at most.
     """
-    chunk = 2000  # targets at once: bounds the memory
-    found = [
-        _reach(goal, targets[k : k + chunk], start[k : k + chunk], iterations) for k in range(0, len(targets), chunk)
-    ]
-    return np.concatenate(found) if found else np.array(start, dtype=float)
+    if not len(targets):
+        return np.array(start, dtype=float)
+    solutions = []
+    for first in range(0, len(targets), CHUNK):
+        chunk = slice(first, first + CHUNK)
+        solutions.append(_reach(goal, targets[chunk], start[chunk], iterations))
+    return np.concatenate(solutions)
 
 
-def _reach(goal: Goal, targets: np.ndarray, start: np.ndarray, iterations: int, min_step: float = 1e-12) -> np.ndarray:
-    # min_step: step [rad or m] that changes nothing
+def _reach(goal: Goal, targets: np.ndarray, start: np.ndarray, iterations: int) -> np.ndarray:
     q = np.clip(start, goal.lower, goal.upper)
     damping = np.full(len(q), FIRST)
     error, jacobian = _weighted(goal, q, targets)
-    going = np.arange(len(q))
+    active = np.arange(len(q))
     for _ in range(iterations):
-        going = going[(np.linalg.norm(error[going], axis=1) > DONE) & (damping[going] < LAST)]
-        if not len(going):
+        size = np.linalg.norm(error[active], axis=1)
+        active = active[(size > DONE) & (damping[active] < LAST)]
+        if not len(active):
             break
-        step = _inside(goal, q[going], error[going], jacobian[going], damping[going])
-        trial = np.clip(q[going] + step, goal.lower, goal.upper)
-        fresh, slope = _weighted(goal, trial, targets[going])
-        better = np.linalg.norm(fresh, axis=1) < np.linalg.norm(error[going], axis=1)
-        won, lost = going[better], going[~better]
-        q[won], error[won], jacobian[won] = trial[better], fresh[better], slope[better]
-        damping[won] = np.maximum(0.1 * damping[won], FIRST)
-        damping[lost] = np.maximum(10.0 * damping[lost], 1e-4)
-        going = going[np.abs(trial - q[going]).max(axis=1) + better > min_step]
+        step = _step_within_limits(goal, q[active], error[active], jacobian[active], damping[active])
+        trial = np.clip(q[active] + step, goal.lower, goal.upper)
+        trial_error, trial_jacobian = _weighted(goal, trial, targets[active])
+        better = np.linalg.norm(trial_error, axis=1) < np.linalg.norm(error[active], axis=1)
+        improved = active[better]
+        worse = active[~better]
+        q[improved] = trial[better]
+        error[improved] = trial_error[better]
+        jacobian[improved] = trial_jacobian[better]
+        damping[improved] = np.maximum(0.1 * damping[improved], FIRST)
+        damping[worse] = np.maximum(10.0 * damping[worse], 1e-4)
+        # a worse step counts by its length; a better one goes on, since q has moved to it
+        length = np.abs(trial - q[active]).max(axis=1)
+        active = active[length + better > MIN_STEP]
     return q
 
 
-def _weighted(goal: Goal, q: np.ndarray, targets: np.ndarray, lever: float = 0.3) -> tuple[np.ndarray, np.ndarray]:
-    """Return error (m, dof) and Jacobian (m, dof, n); orientations are multiplied by `lever` [m].
-
-    `lever`: an orientation counts as its displacement at this distance [m]; as all constants here, our choice.
-    """
+def _weighted(goal: Goal, q: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return error (m, dof) and Jacobian (m, dof, n); orientations are multiplied by `LEVER` [m]."""
     seen = seen_at(goal, q)
-    weight = np.where(np.arange(goal.dof) < 3, 1.0, lever)
-    return weight * _differences(seen, targets, goal.dof), weight[:, None] * differences_jacobian(goal, seen)
+    weight = np.where(np.arange(goal.dof) < 3, 1.0, LEVER)
+    error = weight * _differences(seen, targets, goal.dof)
+    return error, weight[:, None] * differences_jacobian(goal, seen)
 
 
-def _inside(goal: Goal, q: np.ndarray, error: np.ndarray, jacobian: np.ndarray, damping: np.ndarray) -> np.ndarray:
+def _step_within_limits(
+    goal: Goal, q: np.ndarray, error: np.ndarray, jacobian: np.ndarray, damping: np.ndarray
+) -> np.ndarray:
     """Return damped joint steps (m, n); a joint that would exceed its limit stops there, and the others compensate."""
     step = _damped(jacobian, error, damping)
     for _ in range(q.shape[1]):
-        held = ((q <= goal.lower) & (step < 0.0)) | ((q >= goal.upper) & (step > 0.0))
-        if not held.any():
+        stopped = ((q <= goal.lower) & (step < 0.0)) | ((q >= goal.upper) & (step > 0.0))
+        if not stopped.any():
             break
-        jacobian = np.where(held[:, None, :], 0.0, jacobian)
-        step = np.where(held, 0.0, _damped(jacobian, error, damping))
+        jacobian = np.where(stopped[:, None, :], 0.0, jacobian)
+        step = np.where(stopped, 0.0, _damped(jacobian, error, damping))
     return step
 
 
@@ -157,7 +182,7 @@ def _damped(jacobian: np.ndarray, error: np.ndarray, damping: np.ndarray) -> np.
     return (across @ np.linalg.solve(square, error[:, :, None]))[:, :, 0]
 
 
-def nearest(goal: Goal, targets: np.ndarray, start: np.ndarray, q: np.ndarray, passes: int = 8) -> np.ndarray:
+def nearest(goal: Goal, targets: np.ndarray, start: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Return the joint values (m, n) with the tool poses of `q` that are nearest to `start`, for a redundant arm.
 
     Minimises |q - q_start| (radians and metres alike) under e(q) = 0: each pass steps by d + J⁺ (e - J d), d = q_start
@@ -165,40 +190,43 @@ def nearest(goal: Goal, targets: np.ndarray, start: np.ndarray, q: np.ndarray, p
     """
     if q.shape[1] <= goal.dof:
         return q
-    closer, none = q.copy(), np.full(len(q), 1e-12)
-    for _ in range(passes):
+    closer = q.copy()
+    no_damping = np.full(len(q), 1e-12)
+    for _ in range(NEAREST_PASSES):
         error, jacobian = _weighted(goal, closer, targets)
-        wish = start - closer
-        rest = error - np.einsum("mrn,mn->mr", jacobian, wish)
-        closer = np.clip(closer + wish + _damped(jacobian, rest, none), goal.lower, goal.upper)
+        to_start = start - closer
+        remaining = error - np.einsum("mrn,mn->mr", jacobian, to_start)
+        step = to_start + _damped(jacobian, remaining, no_damping)
+        closer = np.clip(closer + step, goal.lower, goal.upper)
     closer = reach(goal, targets, closer, 10)
-    before, after = (np.linalg.norm(_weighted(goal, each, targets)[0], axis=1) for each in (q, closer))
-    keep = (after > np.maximum(before, 10.0 * DONE)) | (
-        np.linalg.norm(closer - start, axis=1) > np.linalg.norm(q - start, axis=1)
-    )
-    return np.where(keep[:, None], q, closer)
+    before = np.linalg.norm(_weighted(goal, q, targets)[0], axis=1)
+    after = np.linalg.norm(_weighted(goal, closer, targets)[0], axis=1)
+    loses_target = after > np.maximum(before, 10.0 * DONE)
+    is_farther = np.linalg.norm(closer - start, axis=1) > np.linalg.norm(q - start, axis=1)
+    return np.where((loses_target | is_farther)[:, None], q, closer)
 
 
-def held_back(goal: Goal, targets: np.ndarray, start: np.ndarray, most: float) -> np.ndarray:
-    """Return joint values (m, n) near the targets with no joint more than `most` away from `start`.
+def held_back(goal: Goal, targets: np.ndarray, start: np.ndarray, max_change: float) -> np.ndarray:
+    """Return joint values (m, n) near the targets with no joint more than `max_change` away from `start`.
 
     For targets near a singularity, where a small correction takes a large motion: minimises |e|² + μ² |q - q_start|²
-    with the smallest μ of `BACK` that keeps to `most` [rad or m].
+    with the smallest μ of `BACK` that keeps to `max_change` [rad or m].
     """
     best = np.clip(start, goal.lower, goal.upper)
-    left = np.arange(len(best))
+    open_rows = np.arange(len(best))
     for weight in BACK:
-        q = best[left].copy()
-        for _ in range(20):
-            error, jacobian = _weighted(goal, q, targets[left])
-            across = np.swapaxes(jacobian, 1, 2)
-            square = across @ jacobian + weight**2 * np.eye(q.shape[1])
-            side = (across @ error[:, :, None])[:, :, 0] + weight**2 * (start[left] - q)
-            q = np.clip(q + np.linalg.solve(square, side[:, :, None])[:, :, 0], goal.lower, goal.upper)
-        kept = np.abs(q - start[left]).max(axis=1) <= most
-        best[left[kept]] = q[kept]
-        left = left[~kept]
-        if not len(left):
+        q = best[open_rows].copy()
+        for _ in range(HELD_STEPS):
+            error, jacobian = _weighted(goal, q, targets[open_rows])
+            transposed = np.swapaxes(jacobian, 1, 2)
+            square = transposed @ jacobian + weight**2 * np.eye(q.shape[1])
+            gradient = (transposed @ error[:, :, None])[:, :, 0] + weight**2 * (start[open_rows] - q)
+            step = np.linalg.solve(square, gradient[:, :, None])[:, :, 0]
+            q = np.clip(q + step, goal.lower, goal.upper)
+        within = np.abs(q - start[open_rows]).max(axis=1) <= max_change
+        best[open_rows[within]] = q[within]
+        open_rows = open_rows[~within]
+        if not len(open_rows):
             break
     return best
 

@@ -24,7 +24,12 @@ from calib.robot.kinematics import element_jacobian
 from calib.transforms import displace
 
 TERM_UNITS = {"torque": "/(N m)", "joint": "/rad"}
+FRAME_UNITS = ("m", "m", "m", "rad", "rad", "rad")
 KINDS = ("arm", "station", "tool", "optics", "deflection")
+# rows observed at once: the Jacobian of so many has 50 MB at 500 parameters (our choice)
+PIECE = 2000
+# poses whose sigmas are computed at once: the Jacobian has a column per parameter
+CHUNK = 500
 
 
 @dataclass(frozen=True)
@@ -62,61 +67,78 @@ class ParameterLayout:
         Raises:
             UsageError: for a name that does not exist.
         """
-        table = {name: k for k, name in enumerate(self.names)}
+        index = {name: k for k, name in enumerate(self.names)}
         for name in names:
-            require(name in table, f"unknown parameter '{name}'; expected one of {', '.join(self.names)}", UsageError)
-        return np.array([table[name] for name in names], dtype=int)
+            require(name in index, f"unknown parameter '{name}'; expected one of {', '.join(self.names)}", UsageError)
+        return np.array([index[name] for name in names], dtype=int)
 
 
 def layout(cell: Installation) -> ParameterLayout:
     """Return the layout of an installation's parameters."""
-    units = ("m", "m", "m", "rad", "rad", "rad")
-    frames = [f"{name}.{axis}" for name in (*cell.station_names, *cell.tool_names) for axis in FRAME_AXES]
-    terms = cell.deflection.terms
-    element_units = dict(zip(cell.chain.names, cell.chain.units))
+    chain = cell.chain
+    frame_names, frame_units = [], []
+    for frame in (*cell.station_names, *cell.tool_names):
+        frame_names += [f"{frame}.{axis}" for axis in FRAME_AXES]
+        frame_units += FRAME_UNITS
+    element_units = dict(zip(chain.names, chain.units))
+    term_units = [element_units[term.element] + TERM_UNITS.get(term.basis, "") for term in cell.deflection.terms]
+    first_of_optics = len(chain.elements) + len(frame_names)
     return ParameterLayout(
-        names=(*cell.chain.names, *frames, *cell.optics.names, *cell.deflection.names(cell.chain)),
-        units=(
-            *cell.chain.units,
-            *(units * (len(frames) // 6)),
-            *cell.optics.units,
-            *(element_units[t.element] + TERM_UNITS.get(t.basis, "") for t in terms),
-        ),
+        names=(*chain.names, *frame_names, *cell.optics.names, *cell.deflection.names(chain)),
+        units=(*chain.units, *frame_units, *cell.optics.units, *term_units),
         kinds=tuple(np.repeat(KINDS, layout_counts(cell)).tolist()),
-        moving=tuple((len(cell.chain.elements) + len(frames) + cell.optics.moving).tolist()),
+        moving=tuple((first_of_optics + cell.optics.moving).tolist()),
     )
 
 
 def families(cell: Installation) -> np.ndarray:
     """Return the family of each parameter (p,): ``offset`` or unit of an arm element, else its kind."""
-    table, moving = layout(cell), {e.name for e in cell.chain.elements if e.joint is not None}
-    arm = ["offset" if name in moving else unit for name, unit in zip(cell.chain.names, cell.chain.units)]
-    return np.array([*arm, *table.kinds[len(arm) :]])
+    table = layout(cell)
+    result = list(table.kinds)
+    for number, element in enumerate(cell.chain.elements):
+        result[number] = table.units[number] if element.joint is None else "offset"
+    return np.array(result)
 
 
 def step(cell: Installation, free: np.ndarray, change: np.ndarray) -> Installation:
     """Return the installation with `change` (f,) added to the parameters `free` (f,); frames move on the manifold."""
-    where = layout_counts(cell)
-    full = np.zeros(sum(where))
+    counts = layout_counts(cell)
+    full = np.zeros(sum(counts))
     full[free] = change
-    arm, stations, tools, optics, terms = np.split(full, np.cumsum(where)[:-1])
-    stations, tools = stations.reshape(-1, 6), tools.reshape(-1, 6)
+    arm, stations, tools, optics, terms = np.split(full, np.cumsum(counts)[:-1])
+    chain = cell.chain
+    if arm.any():
+        chain = chain.with_values(chain.values + arm)
+    deflection = cell.deflection
+    if len(terms):
+        deflection = deflection.with_coefficients(np.asarray(deflection.coefficients) + terms)
+    instruments = cell.optics
+    if optics.any():
+        instruments = instruments.with_values(instruments.values + optics)
     return replace(
         cell,
-        chain=cell.chain.with_values(cell.chain.values + arm) if arm.any() else cell.chain,
-        stations=np.array([displace(s, d) if d.any() else s for s, d in zip(cell.stations, stations)]),
-        tools=np.array([displace(t, d) if d.any() else t for t, d in zip(cell.tools, tools)]),
-        deflection=cell.deflection.with_coefficients(np.asarray(cell.deflection.coefficients) + terms)
-        if len(terms)
-        else cell.deflection,
-        optics=cell.optics.with_values(cell.optics.values + optics) if optics.any() else cell.optics,
+        chain=chain,
+        stations=_displaced(cell.stations, stations.reshape(-1, 6)),
+        tools=_displaced(cell.tools, tools.reshape(-1, 6)),
+        deflection=deflection,
+        optics=instruments,
     )
+
+
+def _displaced(placements: np.ndarray, displacements: np.ndarray) -> np.ndarray:
+    """Return placements (k, 4, 4) displaced by (k, 6) along and about their axes."""
+    result = np.array(placements)
+    for number, displacement in enumerate(displacements):
+        if displacement.any():
+            result[number] = displace(placements[number], displacement)
+    return result
 
 
 def layout_counts(cell: Installation) -> tuple[int, int, int, int, int]:
     """Return the number of parameters of each of `KINDS`."""
-    frames = 6 * len(cell.stations), 6 * len(cell.tools)
-    return len(cell.chain.elements), *frames, len(cell.optics), len(cell.deflection.terms)
+    stations = 6 * len(cell.stations)
+    tools = 6 * len(cell.tools)
+    return len(cell.chain.elements), stations, tools, len(cell.optics), len(cell.deflection.terms)
 
 
 def parameter_values(cell: Installation) -> np.ndarray:
@@ -134,7 +156,8 @@ def fixed_parameters(start: Installation, options: FitOptions) -> np.ndarray:
     table = layout(start)
     fixed = table.find(options.fix)
     if options.free:
-        fixed = np.union1d(fixed, np.setdiff1d(table.index("arm"), table.find(options.free)))
+        not_free = np.setdiff1d(table.index("arm"), table.find(options.free))
+        fixed = np.union1d(fixed, not_free)
     return fixed
 
 
@@ -157,14 +180,14 @@ class Block:
         station: index of their station; -1 for kinds without an instrument, which refer to the arm's base.
         tool: (m,) index of each row's target among the installation's tools.
         bases: (E, m) the deflection's bases, evaluated once; None for a block that `pieces` divides.
-        given: (K, m) displacements by the known deflections, or None.
+        displacements: (K, m) of elements by the known deflections, or None.
     """
 
     measured: PoseMeasurements
     station: int
     tool: np.ndarray
     bases: np.ndarray | None = None
-    given: np.ndarray | None = None
+    displacements: np.ndarray | None = None
 
 
 def prepare(cell: Installation, measured: Sequence[PoseMeasurements]) -> list[Block]:
@@ -174,24 +197,29 @@ def prepare(cell: Installation, measured: Sequence[PoseMeasurements]) -> list[Bl
         UsageError: for a station or tool the installation does not have.
     """
     blocks = []
-    for block in measured:
-        station = _index(cell.station_names, block.station, "station") if block.has_instrument else -1
-        tools = np.array([_index(cell.tool_names, name, "tool") for name in block.tool_names])
-        bare = Block(block, station, tools[block.tool])
-        blocks.append(bare if _divided(block) else rows_of(cell, bare, np.arange(len(block))))
+    for measurements in measured:
+        station = -1
+        if measurements.has_instrument:
+            station = _index(cell.station_names, measurements.station, "station")
+        tools = np.array([_index(cell.tool_names, name, "tool") for name in measurements.tool_names])
+        block = Block(measurements, station, tools[measurements.tool])
+        if not _divided(measurements):
+            block = rows_of(cell, block, np.arange(len(measurements)))
+        blocks.append(block)
     return blocks
 
 
 def rows_of(cell: Installation, block: Block, rows: np.ndarray) -> Block:
     """Return some rows of a block, their deflection bases evaluated."""
     measured = take(block.measured, rows)
-    bases = evaluate(cell.deflection, measured.q, measured.torque) if cell.deflection.terms else None
-    known = evaluate(cell.known, measured.q, measured.torque) if cell.known.terms else None
-    given = extra_displacements(cell.chain, cell.known, measured.q, known)
-    return Block(measured, block.station, block.tool[rows], bases, given)
-
-
-PIECE = 2000  # rows observed at once: the Jacobian of so many has 50 MB at 500 parameters (our choice)
+    bases = None
+    if cell.deflection.terms:
+        bases = evaluate(cell.deflection, measured.q, measured.torque)
+    known_bases = None
+    if cell.known.terms:
+        known_bases = evaluate(cell.known, measured.q, measured.torque)
+    displacements = extra_displacements(cell.chain, cell.known, measured.q, known_bases)
+    return Block(measured, block.station, block.tool[rows], bases, displacements)
 
 
 def _divided(measured: PoseMeasurements) -> bool:
@@ -204,12 +232,13 @@ def pieces(cell: Installation, block: Block) -> Iterator[Block]:
     if not _divided(block.measured):
         yield block
         return
-    for rows in np.array_split(np.arange(len(block.measured)), -(-len(block.measured) // PIECE)):
+    count = len(block.measured)
+    for rows in np.array_split(np.arange(count), -(-count // PIECE)):
         yield rows_of(cell, block, rows)
 
 
-def _index(names: tuple[str, ...], name: str, what: str) -> int:
-    require(name in names, f"{what} '{name}' is not part of the installation; it has {', '.join(names)}", UsageError)
+def _index(names: tuple[str, ...], name: str, kind: str) -> int:
+    require(name in names, f"{kind} '{name}' is not part of the installation; it has {', '.join(names)}", UsageError)
     return names.index(name)
 
 
@@ -218,12 +247,15 @@ def sampled(measured: Sequence[PoseMeasurements], poses: int, seed: int = 0) -> 
 
     `poses`: of all blocks, about; a block keeps at least a tenth of that.
     """
-    generator, result = np.random.default_rng(seed), []
+    generator = np.random.default_rng(seed)
+    total = max(sum(map(len, measured)), 1)
+    result = []
     for block in measured:
-        count = max(poses * len(block) // max(sum(map(len, measured)), 1), poses // 10)
+        count = max(poses * len(block) // total, poses // 10)
         rows = np.arange(len(block))
-        few = _divided(block) and count < len(rows)
-        result.append(np.sort(generator.choice(rows, count, replace=False)) if few else rows)
+        if _divided(block) and count < len(rows):
+            rows = np.sort(generator.choice(rows, count, replace=False))
+        result.append(rows)
     return result
 
 
@@ -234,20 +266,24 @@ def positions(cell: Installation, block: Block) -> np.ndarray:
 
 def predict(cell: Installation, block: Block) -> Seen:
     """Return the predicted targets of a block's rows, or of a piece's, in the instrument's frame."""
-    return see(cell, block.measured.q, block.station, block.tool, block.bases, block.given)
+    return see(cell, block.measured.q, block.station, block.tool, block.bases, block.displacements)
 
 
 def observe(cell: Installation, block: Block, free: np.ndarray) -> list[Part]:
     """Return the residual parts of a block with their Jacobian with respect to the parameters `free` (f,)."""
-    found = [_observe(cell, piece, free) for piece in pieces(cell, block)]
-    return found[0] if len(found) == 1 else [joined(each) for each in zip(*found)]
+    observed = [_observe(cell, piece, free) for piece in pieces(cell, block)]
+    if len(observed) == 1:
+        return observed[0]
+    return [joined(parts_of_pieces) for parts_of_pieces in zip(*observed)]
 
 
 def _observe(cell: Installation, block: Block, free: np.ndarray) -> list[Part]:
     seen = predict(cell, block)
     if len(cell.optics):
-        seen = replace(seen, view=cell.optics.view(block.measured, free - sum(layout_counts(cell)[:3])))
-    return parts(block.measured, seen, target_jacobian(cell, seen, free, block.station, block.tool, block.bases))
+        first_of_optics = sum(layout_counts(cell)[:3])
+        seen = replace(seen, view=cell.optics.view(block.measured, free - first_of_optics))
+    jacobian = target_jacobian(cell, seen, free, block.station, block.tool, block.bases)
+    return parts(block.measured, seen, jacobian)
 
 
 def whitened(
@@ -260,12 +296,13 @@ def whitened(
         scales: for each of its parts, the divisor (rows, m) of its residuals.
         noises: for each of its parts, the noise that its rows share, or None.
     """
-    done = 0
+    start = 0
     for piece in pieces(cell, block):
         for k, part in enumerate(observe(cell, piece, free)):
-            part = replace(part, noise=noises[k]) if noises and noises[k] else part
-            yield part.whitened(scales[k][:, done : done + part.value.shape[1]])
-        done += len(piece.measured)
+            if noises and noises[k]:
+                part = replace(part, noise=noises[k])
+            yield part.whitened(scales[k][:, start : start + part.value.shape[1]])
+        start += len(piece.measured)
 
 
 def target_jacobian(
@@ -273,31 +310,33 @@ def target_jacobian(
 ) -> np.ndarray:
     """Return [v; ω] of the targets per unit of each free parameter, (f, 6, m); last three arguments: see `Block`."""
     arm, stations, tools, optics, _ = layout_counts(cell)
-    m = seen.point.shape[1]
-    jacobian = np.zeros((len(free), 6, m))
+    jacobian = np.zeros((len(free), 6, seen.point.shape[1]))
     section = np.searchsorted(np.cumsum([arm, stations, tools, optics]), free, side="right")
     in_arm = np.flatnonzero(section == 0)
     if len(in_arm) == len(free):
         return element_jacobian(cell.chain, seen.walked, seen.point, free)
     if len(in_arm):
         jacobian[in_arm] = element_jacobian(cell.chain, seen.walked, seen.point, free[in_arm])
-    for place in np.flatnonzero(section == 1):
-        number, axis = divmod(int(free[place]) - arm, 6)
+    for column in np.flatnonzero(section == 1):
+        number, axis = divmod(int(free[column]) - arm, 6)
         if number == station:
-            _station_column(jacobian[place], cell.stations[number], seen, axis)
-    for place in np.flatnonzero(section == 2):
-        number, axis = divmod(int(free[place]) - arm - stations, 6)
-        rows = tool == number
-        jacobian[place][3 * (axis // 3) : 3 * (axis // 3) + 3] = np.where(rows, seen.rotation[axis % 3], 0.0)
+            _station_column(jacobian[column], cell.stations[number], seen, axis)
+    for column in np.flatnonzero(section == 2):
+        number, axis = divmod(int(free[column]) - arm - stations, 6)
+        direction = np.where(tool == number, seen.rotation[axis % 3], 0.0)
+        if axis < 3:
+            jacobian[column, :3] = direction
+        else:
+            jacobian[column, 3:] = direction
     in_terms = np.flatnonzero(section == 4)
     if len(in_terms):
         assert bases is not None
         numbers = free[in_terms] - arm - stations - tools - optics
         targets = target_elements(cell.chain, cell.deflection)[numbers]
-        unique, inverse = np.unique(targets, return_inverse=True)
-        moved = element_jacobian(cell.chain, seen.walked, seen.point, unique)
-        for place, which, number in zip(in_terms, inverse, numbers):
-            np.multiply(moved[which], bases[number], out=jacobian[place])
+        elements, element_of_term = np.unique(targets, return_inverse=True)
+        motions = element_jacobian(cell.chain, seen.walked, seen.point, elements)
+        for column, element, number in zip(in_terms, element_of_term, numbers):
+            np.multiply(motions[element], bases[number], out=jacobian[column])
     return jacobian
 
 
@@ -313,13 +352,18 @@ def _station_column(column: np.ndarray, placement: np.ndarray, seen: Seen, axis:
 
 
 def pose_sigmas(
-    cell: Installation, at: PoseMeasurements, free: np.ndarray, covariance: np.ndarray, station: int = 0, tool: Any = 0
+    cell: Installation,
+    measured: PoseMeasurements,
+    free: np.ndarray,
+    covariance: np.ndarray,
+    station: int = 0,
+    tool: np.ndarray | int = 0,
 ) -> np.ndarray:
     """Return sigmas (m, 2) of a tool's position [m] and orientation [rad]: sqrt(trace J Σ Jᵀ) of each.
 
     Args:
         cell: the fitted installation.
-        at: joint values (m, n), and gravity torques for compliance terms.
+        measured: joint values (m, n), and gravity torques for compliance terms.
         free: (f,) positions in the parameter vector.
         covariance: (f, f) of steps along them.
         station: index of the station of reference; -1 for the arm's base.
@@ -327,12 +371,12 @@ def pose_sigmas(
     """
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.clip(values, 0.0, None))
+    poses = Block(measured, station, np.broadcast_to(tool, len(measured)))
     result = [np.zeros((0, 2))]
-    chunk = 500  # poses at once: the Jacobian has a column per parameter
-    for first in range(0, len(at), chunk):
-        part = np.arange(first, min(first + chunk, len(at)))
-        block = rows_of(cell, Block(at, station, np.broadcast_to(tool, len(at))), part)
+    for start in range(0, len(measured), CHUNK):
+        rows = np.arange(start, min(start + CHUNK, len(measured)))
+        block = rows_of(cell, poses, rows)
         jacobian = target_jacobian(cell, predict(cell, block), free, station, block.tool, block.bases)
-        spread = (root.T @ jacobian.reshape(len(free), -1)).reshape(len(root), 2, 3, len(part))
+        spread = (root.T @ jacobian.reshape(len(free), -1)).reshape(len(root), 2, 3, len(rows))
         result.append(np.sqrt(np.sum(spread**2, axis=(0, 2))).T)
     return np.concatenate(result)

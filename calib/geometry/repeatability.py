@@ -15,9 +15,9 @@ Rows that stand twice in what was measured: copied, or a file given twice. They 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -29,10 +29,16 @@ from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, predict, prepare, rows_of
 from calib.records import stored
 
-SAME = 1e-3  # joints of one commanded pose, as read back, differ by less [rad or m]; our choice, as the next two
+# joints of one commanded pose, as read back, differ by less [rad or m] (our choice)
+SAME = 1e-3
+# directions of approach that differ by more are different ones (our choice)
+APART = np.radians(30.0)
+# cycles that make a repeated pose
+MIN_CYCLES = 3
+# of a validation file's rows that are the fit's: from there on it proves nothing (our choice)
+MAX_COPIED_SHARE = 0.5
 ARMS = ("nominal", "calibrated")
 MeanAndMax = Mapping[str, float]
-APART = np.radians(30.0)  # directions of approach that differ by more are different ones
 
 
 @dataclass(frozen=True)
@@ -63,65 +69,79 @@ class RepeatedPoses:
     @stored
     def cycles(self) -> tuple[int, int]:
         """Smallest and largest number of cycles of a pose."""
-        counts = [len(one.rows) for one in self.each]
+        counts = [len(pose.rows) for pose in self.each]
         return min(counts), max(counts)
 
     @stored
     def repeatability_mm(self) -> MeanAndMax:
         """Position repeatability RP, mean and maximum [mm]."""
-        return _mean_and_max([one.repeatability_mm for one in self.each])
+        return _mean_and_max([pose.repeatability_mm for pose in self.each])
 
     @stored
     def accuracy_mm(self) -> dict[str, MeanAndMax]:
         """Position accuracy AP of each arm, mean and maximum [mm]."""
-        return {arm: _mean_and_max([np.linalg.norm(getattr(one, f"{arm}_mm")) for one in self.each]) for arm in ARMS}
+        return {
+            "nominal": _mean_and_max([_norm(pose.nominal_mm) for pose in self.each]),
+            "calibrated": _mean_and_max([_norm(pose.calibrated_mm) for pose in self.each]),
+        }
 
     @stored
     def orientation_repeatability_deg(self) -> MeanAndMax | None:
         """Orientation repeatability RP, the largest of three axes, mean and maximum [deg]."""
-        return _sizes([max(one.repeatability_deg) for one in self.each if one.repeatability_deg])
+        return _sizes([max(pose.repeatability_deg) for pose in self.each if pose.repeatability_deg])
 
     @stored
     def orientation_accuracy_deg(self) -> dict[str, MeanAndMax | None]:
         """Orientation accuracy AP of each arm, mean and maximum [deg]."""
-        turns = {arm: [getattr(one, f"{arm}_deg") for one in self.each] for arm in ARMS}
-        return {arm: _sizes([np.linalg.norm(turn) for turn in each if turn]) for arm, each in turns.items()}
+        return {
+            "nominal": _sizes([_norm(pose.nominal_deg) for pose in self.each if pose.nominal_deg]),
+            "calibrated": _sizes([_norm(pose.calibrated_deg) for pose in self.each if pose.calibrated_deg]),
+        }
 
     @stored
     def multidirectional_mm(self) -> MeanAndMax | None:
         """Multidirectional variation vAP of the position, mean and maximum [mm]."""
-        return _sizes([one.multidirectional_mm for one in self.each if one.multidirectional_mm is not None])
+        return _sizes([pose.multidirectional_mm for pose in self.each if pose.multidirectional_mm is not None])
 
 
-def _mean_and_max(values: Sequence[Any]) -> MeanAndMax:
+def _norm(values: Sequence[float]) -> float:
+    return float(np.linalg.norm(values))
+
+
+def _mean_and_max(values: Sequence[float]) -> MeanAndMax:
     return {"mean": float(np.mean(values)), "max": float(np.max(values))}
 
 
-def _sizes(values: Sequence[Any]) -> MeanAndMax | None:
+def _sizes(values: Sequence[float]) -> MeanAndMax | None:
+    """Return mean and maximum; None for no values."""
     return _mean_and_max(values) if values else None
 
 
 def repeated_poses(
     cells: tuple[Installation, Installation], measured: Sequence[PoseMeasurements]
 ) -> RepeatedPoses | None:
-    """Return accuracy and repeatability of all poses measured at least `min_cycles` times; None without such poses.
+    """Return accuracy and repeatability of all poses measured at least `MIN_CYCLES` times; None without such poses.
 
     Args:
         cells: the nominal and the calibrated arm, whose predictions are compared.
         measured: blocks; those without an instrument are ignored.
     """
-    ready = zip(measured, *(prepare(cell, measured) for cell in cells))
-    found = [
-        _repeated_pose(cells, blocks, block, index)
-        for block, *blocks in ready
-        if isinstance(block, Positions)
-        for index in repeated_rows(block)
-    ]
-    return RepeatedPoses(tuple(found)) if found else None
+    nominal, calibrated = cells
+    result = []
+    for block, nominal_block, calibrated_block in zip(
+        measured, prepare(nominal, measured), prepare(calibrated, measured)
+    ):
+        if not isinstance(block, Positions):
+            continue
+        for rows in repeated_rows(block):
+            nominal_command = _command(nominal, nominal_block, rows)
+            calibrated_command = _command(calibrated, calibrated_block, rows)
+            result.append(_repeated_pose(block, rows, nominal_command, calibrated_command))
+    return RepeatedPoses(tuple(result)) if result else None
 
 
 def repeated_rows(measured: PoseMeasurements) -> list[np.ndarray]:
-    """Return the row indices of each pose measured at least `min_cycles` times, in the file's order.
+    """Return the row indices of each pose measured at least `MIN_CYCLES` times, in the file's order.
 
     Rows with the very same numbers are copies of one measurement and count once. Empty for kinds without positions.
     """
@@ -130,15 +150,18 @@ def repeated_rows(measured: PoseMeasurements) -> list[np.ndarray]:
     table = np.hstack([measured.q, measured.position, measured.tool[:, None].astype(float)])
     _, first = np.unique(np.round(table, 12), axis=0, return_index=True)
     rows = np.sort(first)
-    key = np.hstack([measured.q[rows], 1e3 * measured.tool[rows, None]])  # another reflector is another pose
-    min_cycles = 3  # cycles that make a repeated pose
-    tree, groups, taken = KDTree(key), [], np.zeros(len(rows), dtype=bool)
-    often = np.flatnonzero(tree.query_ball_point(key, SAME, p=np.inf, return_length=True) >= min_cycles)
-    for k, each in zip(often, tree.query_ball_point(key[often], SAME, p=np.inf)):
-        own = np.array([i for i in each if not taken[i]], dtype=int)
-        if not taken[k] and len(own) >= min_cycles:
-            taken[own] = True
-            groups.append(np.sort(rows[own]))
+    # another reflector is another pose
+    key = np.hstack([measured.q[rows], 1e3 * measured.tool[rows, None]])
+    tree = KDTree(key)
+    counts = tree.query_ball_point(key, SAME, p=np.inf, return_length=True)
+    often = np.flatnonzero(counts >= MIN_CYCLES)
+    grouped = np.zeros(len(rows), dtype=bool)
+    groups = []
+    for row, neighbours in zip(often, tree.query_ball_point(key[often], SAME, p=np.inf)):
+        members = np.array([member for member in neighbours if not grouped[member]], dtype=int)
+        if not grouped[row] and len(members) >= MIN_CYCLES:
+            grouped[members] = True
+            groups.append(np.sort(rows[members]))
     return groups
 
 
@@ -148,27 +171,58 @@ def spread(points: np.ndarray) -> float:
     return float(length.mean() + 3.0 * length.std(ddof=1))
 
 
-def _repeated_pose(
-    cells: Sequence[Installation], blocks: Sequence[Block], measured: Positions, index: np.ndarray
-) -> RepeatedPose:
-    """Return accuracy and repeatability of one pose from its rows."""
-    points = measured.position[index]
-    turns = Rotation.from_quat(measured.quaternion[index]) if isinstance(measured, Poses) else None
-    own: dict[str, Any] = {}
-    for arm, cell, block in reversed(list(zip(ARMS, cells, blocks))):
-        seen, base = predict(cell, rows_of(cell, block, index)), cell.stations[block.station][:3, :3]
-        own[f"{arm}_mm"] = _numbers(1e3 * base.T @ (points.mean(axis=0) - seen.point.mean(axis=1)))
-        if turns is not None:
-            middle, command = turns.mean(), Rotation.from_matrix(seen.rotation.transpose(2, 1, 0)).mean()
-            own[f"{arm}_deg"] = _numbers(np.degrees(base.T @ (middle * command.inv()).as_rotvec()))
-            spread_about = 3.0 * ((turns * middle.inv()).as_rotvec() @ base).std(axis=0, ddof=1)
-            own["repeatability_deg"] = _numbers(np.degrees(spread_about))
-    varied = _variation(points, _directions(measured, index))
-    return RepeatedPose(
-        tuple(int(row) for row in measured.rows[index]),
-        1e3 * spread(points),
-        multidirectional_mm=None if np.isnan(varied) else 1e3 * varied,
-        **own,
+@dataclass(frozen=True, eq=False)
+class Command:
+    """Pose that an arm's model predicts for the mean joints of repeated rows.
+
+    Attributes:
+        base: (3, 3) orientation of the arm's base in the instrument's frame.
+        position: (3,) [m].
+        rotation: of the target.
+    """
+
+    base: np.ndarray
+    position: np.ndarray
+    rotation: Rotation
+
+    def accuracy_mm(self, points: np.ndarray) -> tuple[float, ...]:
+        """Return AP [mm] of points (n, 3) [m] along the axes of the base."""
+        return _numbers(1e3 * self.base.T @ (points.mean(axis=0) - self.position))
+
+    def accuracy_deg(self, mean: Rotation) -> tuple[float, ...]:
+        """Return AP [deg] of a mean rotation about the axes of the base."""
+        return _numbers(np.degrees(self.base.T @ (mean * self.rotation.inv()).as_rotvec()))
+
+
+def _command(cell: Installation, block: Block, rows: np.ndarray) -> Command:
+    """Return the pose that an arm predicts for some rows of a block."""
+    seen = predict(cell, rows_of(cell, block, rows))
+    rotations = Rotation.from_matrix(seen.rotation.transpose(2, 1, 0))
+    return Command(cell.stations[block.station][:3, :3], seen.point.mean(axis=1), rotations.mean())
+
+
+def _repeated_pose(measured: Positions, rows: np.ndarray, nominal: Command, calibrated: Command) -> RepeatedPose:
+    """Return accuracy and repeatability of one pose from its rows, given the command by both arms."""
+    points = measured.position[rows]
+    variation = _variation(points, _directions(measured, rows))
+    result = RepeatedPose(
+        rows=tuple(int(row) for row in measured.rows[rows]),
+        repeatability_mm=1e3 * spread(points),
+        nominal_mm=nominal.accuracy_mm(points),
+        calibrated_mm=calibrated.accuracy_mm(points),
+        multidirectional_mm=None if np.isnan(variation) else 1e3 * variation,
+    )
+    if not isinstance(measured, Poses):
+        return result
+    rotations = Rotation.from_quat(measured.quaternion[rows])
+    mean = rotations.mean()
+    # about the axes of the nominal arm's base
+    turns = (rotations * mean.inv()).as_rotvec() @ nominal.base
+    return replace(
+        result,
+        repeatability_deg=_numbers(np.degrees(3.0 * turns.std(axis=0, ddof=1))),
+        nominal_deg=nominal.accuracy_deg(mean),
+        calibrated_deg=calibrated.accuracy_deg(mean),
     )
 
 
@@ -176,35 +230,36 @@ def _numbers(values: np.ndarray) -> tuple[float, ...]:
     return tuple(values.tolist())
 
 
-def _directions(measured: Positions, index: np.ndarray) -> np.ndarray:
+def _directions(measured: Positions, rows: np.ndarray) -> np.ndarray:
     """Return each row's direction of approach (k, 3), from the previous row of the file; NaN without that row.
 
     Both as measured: what counts is the direction, not the tenths of a millimetre.
     """
-    result = np.full((len(index), 3), np.nan)
-    place = {int(row): k for k, row in reversed(list(enumerate(measured.rows)))}
-    for number, k in enumerate(index):
-        before = place.get(int(measured.rows[k]) - 1)
-        if before is not None and measured.tool[before] == measured.tool[k]:
-            step = measured.position[k] - measured.position[before]
-            length = np.linalg.norm(step)
-            if length > SAME:
-                result[number] = step / length
+    result = np.full((len(rows), 3), np.nan)
+    index = {int(number): row for row, number in reversed(list(enumerate(measured.rows)))}
+    for k, row in enumerate(rows):
+        before = index.get(int(measured.rows[row]) - 1)
+        if before is None or measured.tool[before] != measured.tool[row]:
+            continue
+        step = measured.position[row] - measured.position[before]
+        length = np.linalg.norm(step)
+        if length > SAME:
+            result[k] = step / length
     return result
 
 
 def _variation(points: np.ndarray, directions: np.ndarray) -> float:
     """Return vAP [m] of points (k, 3) approached in directions (k, 3); NaN for fewer than two directions."""
-    left = np.flatnonzero(~np.isnan(directions[:, 0]))
-    centres = []
-    while len(left):
-        parallel = directions[left] @ directions[left[0]] > np.cos(APART)
+    remaining = np.flatnonzero(~np.isnan(directions[:, 0]))
+    centres: list[np.ndarray] = []
+    while len(remaining):
+        parallel = directions[remaining] @ directions[remaining[0]] > np.cos(APART)
         if parallel.sum() > 1:
-            centres.append(points[left[parallel]].mean(axis=0))
-        left = left[~parallel]
+            centres.append(points[remaining[parallel]].mean(axis=0))
+        remaining = remaining[~parallel]
     if len(centres) < 2:
         return float("nan")
-    return max(float(np.linalg.norm(a - b)) for k, a in enumerate(centres) for b in centres[:k])
+    return max(float(np.linalg.norm(first - second)) for first, second in combinations(centres, 2))
 
 
 def repeated(fit: Sequence[PoseMeasurements], unseen: Mapping[str, PoseMeasurements]) -> tuple[set[str], list[str]]:
@@ -212,42 +267,49 @@ def repeated(fit: Sequence[PoseMeasurements], unseen: Mapping[str, PoseMeasureme
 
     Args:
         fit: the fit's blocks.
-        unseen: rows kept from it, by name.
+        unseen: held-out rows, by name.
 
     Returns:
         Names of those in `unseen` that mostly are rows of the fit; and notes for the user.
     """
-    notes, proofless, known = [], set(), set[bytes]()
+    notes = []
+    fitted = set[bytes]()
     for block in fit:
         marks = _marks(block)
-        first = {mark: k for k, mark in reversed(list(enumerate(marks)))}
-        within = _row_numbers(block, [first[mark] < k for k, mark in enumerate(marks)])
-        before = _row_numbers(block, [mark in known for mark in marks])
+        in_file = set[bytes]()
+        repeats_row, repeats_file = [], []
+        for mark in marks:
+            repeats_row.append(mark in in_file)
+            repeats_file.append(mark in fitted)
+            in_file.add(mark)
+        fitted |= in_file
         name = Path(block.file).name
+        within = _row_numbers(block, repeats_row)
         if within:
             notes.append(f"{name}: {_rows(within)} identical to another row of the file: each counts twice")
+        before = _row_numbers(block, repeats_file)
         if before:
             notes.append(f"{name}: {_rows(before)} identical to rows of another fitted file. Is the file given twice?")
-        known.update(marks)
-    # of a validation file's rows that are the fit's: from there on it proves nothing (our choice)
-    max_copied_share = 0.5
-    for name, aside in unseen.items():
-        copied = np.array([mark in known for mark in _marks(aside)], dtype=bool)
-        again = _measured_again(fit, aside) & ~copied
-        for chosen, words in ((copied, "identical to fitted rows"), (again, "at joint values of fitted rows")):
-            if repeats := _row_numbers(aside, chosen):
-                notes.append(f"{name}: {_rows(repeats)} {words}, so they do not count as validation")
-        if len(_row_numbers(aside, again | copied)) > max_copied_share * len(aside):
+    proofless = set()
+    for name, block in unseen.items():
+        copied = np.array([mark in fitted for mark in _marks(block)], dtype=bool)
+        again = _measured_again(fit, block) & ~copied
+        for rows, reason in ((copied, "identical to fitted rows"), (again, "at joint values of fitted rows")):
+            numbers = _row_numbers(block, rows)
+            if numbers:
+                notes.append(f"{name}: {_rows(numbers)} {reason}, so they do not count as validation")
+        if len(_row_numbers(block, again | copied)) > MAX_COPIED_SHARE * len(block):
             proofless.add(name)
     return proofless, notes
 
 
-def _measured_again(fit: Sequence[PoseMeasurements], aside: PoseMeasurements) -> np.ndarray:
+def _measured_again(fit: Sequence[PoseMeasurements], unseen: PoseMeasurements) -> np.ndarray:
     """Return a mask (m,) of the rows with the joint values of a fitted row."""
-    seen = [block.q for block in fit if type(block) is type(aside) and block.has_instrument]
-    if not seen:
-        return np.zeros(len(aside), dtype=bool)
-    return KDTree(np.concatenate(seen)).query(aside.q, p=np.inf)[0] <= SAME
+    fitted = [block.q for block in fit if type(block) is type(unseen) and block.has_instrument]
+    if not fitted:
+        return np.zeros(len(unseen), dtype=bool)
+    distances, _ = KDTree(np.concatenate(fitted)).query(unseen.q, p=np.inf)
+    return distances <= SAME
 
 
 def _marks(block: PoseMeasurements) -> list[bytes]:
@@ -256,10 +318,14 @@ def _marks(block: PoseMeasurements) -> list[bytes]:
     return [row.tobytes() for row in np.round(table, 12) + 0.0]
 
 
-def _row_numbers(block: PoseMeasurements, chosen: Sequence[bool] | np.ndarray) -> list[int]:
-    return [int(row) for row in dict.fromkeys(block.rows[np.array(chosen, dtype=bool)])]
+def _row_numbers(block: PoseMeasurements, mask: Sequence[bool] | np.ndarray) -> list[int]:
+    """Return the numbers of the rows of a mask (m,), each once."""
+    rows = block.rows[np.array(mask, dtype=bool)]
+    return [int(row) for row in dict.fromkeys(rows)]
 
 
 def _rows(numbers: Sequence[int]) -> str:
-    shown = ", ".join(str(number) for number in numbers[:5]) + (", ..." if len(numbers) > 5 else "")
-    return f"{counted(len(numbers), 'row')} ({shown})"
+    listed = ", ".join(str(number) for number in numbers[:5])
+    if len(numbers) > 5:
+        listed += ", ..."
+    return f"{counted(len(numbers), 'row')} ({listed})"

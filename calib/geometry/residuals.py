@@ -20,6 +20,10 @@ from calib.data.poses.measurements import Bars, Distances, Planes, PoseMeasureme
 from calib.errors import refuse_data
 from calib.geometry.installation import Seen
 
+# steps of Gauss–Newton for the centre of a bar, and length of the last one [m]
+CENTRE_STEPS = 20
+MIN_CHANGE = 1e-13
+
 
 @dataclass(frozen=True, eq=False)
 class Part:
@@ -56,7 +60,8 @@ class Part:
 
     def whitened(self, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return residual (height,) and W (height, f), divided by a scale."""
-        residual, matrix = np.empty(self.height), np.empty((len(self.jacobian), self.height))
+        residual = np.empty(self.height)
+        matrix = np.empty((len(self.jacobian), self.height))
         self.fill(residual, matrix, scale)
         return residual, matrix.T
 
@@ -95,15 +100,24 @@ class Part:
 
 def joined(pieces: Sequence[Part]) -> Part:
     """Return the part of consecutive pieces of a block, each with its own rows counted from 0."""
-    edges = np.cumsum([0, *(len(each.index) for each in pieces)])
-    sigma = None if pieces[0].sigma is None else np.concatenate([np.asarray(each.sigma) for each in pieces], axis=1)
+    values, jacobians, sigmas, indices = [], [], [], []
+    nuisances = 0
+    start = 0
+    for piece in pieces:
+        values.append(piece.value)
+        jacobians.append(piece.jacobian)
+        if piece.sigma is not None:
+            sigmas.append(piece.sigma)
+        indices.append(piece.index + start)
+        start += len(piece.index)
+        nuisances += piece.nuisances
     return replace(
         pieces[0],
-        value=np.concatenate([each.value for each in pieces], axis=1),
-        jacobian=np.concatenate([each.jacobian for each in pieces], axis=2),
-        sigma=sigma,
-        nuisances=sum(each.nuisances for each in pieces),
-        index=np.concatenate([each.index + first for each, first in zip(pieces, edges)]),
+        value=np.concatenate(values, axis=1),
+        jacobian=np.concatenate(jacobians, axis=2),
+        sigma=np.concatenate(sigmas, axis=1) if sigmas else None,
+        nuisances=nuisances,
+        index=np.concatenate(indices),
     )
 
 
@@ -127,23 +141,31 @@ def _pose(measured: Poses, seen: Seen, jacobian: np.ndarray) -> list[Part]:
     """Pose residual, measured against predicted: r = [y - p; log(R_y Rᵀ)]; d log = J_r⁻¹(r) ω."""
     predicted = Rotation.from_matrix(seen.rotation.transpose(2, 1, 0))
     turn = (Rotation.from_quat(measured.quaternion) * predicted.inv()).as_rotvec().T
-    sigma = None if measured.sigma_rotation is None else measured.sigma_rotation.T
-    everywhere = np.arange(len(measured))
     angular = inverse_right_jacobian(turn, jacobian[:, 3:])
-    return [*_position(measured, seen, jacobian), Part("orientation", turn, angular, sigma, 0, everywhere)]
+    sigma = None
+    if measured.sigma_rotation is not None:
+        sigma = measured.sigma_rotation.T
+    orientation = Part("orientation", turn, angular, sigma, 0, np.arange(len(measured)))
+    return [*_position(measured, seen, jacobian), orientation]
 
 
 @parts.register
 def _position(measured: Positions, seen: Seen, jacobian: np.ndarray) -> list[Part]:
     """Position residual, measured minus predicted: r = y - p, without the errors that all rows share."""
-    sigma = None if measured.sigma is None else measured.sigma.T
-    value, slopes, shared = measured.position.T - seen.point, jacobian[:, :3], 0
+    value = measured.position.T - seen.point
+    linear = jacobian[:, :3]
+    shared = 0
     if measured.late is not None and len(measured) > 1:
-        rows, shared = np.concatenate([value[None], slopes]).reshape(-1, value.size), measured.late.shape[1]
-        rows = _project(rows, measured.late.transpose(2, 0, 1).reshape(value.size, shared))
-        rows = rows.reshape(-1, *value.shape)
-        value, slopes = rows[0], rows[1:]
-    return [Part("position", value, slopes, sigma, shared, np.arange(len(measured)))]
+        shared = measured.late.shape[1]
+        rows = np.concatenate([value[None], linear]).reshape(-1, value.size)
+        nuisance = measured.late.transpose(2, 0, 1).reshape(value.size, shared)
+        projected = _project(rows, nuisance).reshape(-1, *value.shape)
+        value = projected[0]
+        linear = projected[1:]
+    sigma = None
+    if measured.sigma is not None:
+        sigma = measured.sigma.T
+    return [Part("position", value, linear, sigma, shared, np.arange(len(measured)))]
 
 
 @parts.register
@@ -152,44 +174,55 @@ def _distance(measured: Distances, seen: Seen, jacobian: np.ndarray) -> list[Par
     first, second = _pairs(measured)
     gap = seen.point[:, first] - seen.point[:, second]
     length = np.linalg.norm(gap, axis=0)
-    along = np.einsum("im,fim->fm", gap / length, jacobian[:, :3, first] - jacobian[:, :3, second])
-    sigma = None if measured.sigma is None else measured.sigma[first][None]
-    return [Part("distance", (measured.distance[first] - length)[None], along[:, None], sigma, 0, first)]
+    relative = jacobian[:, :3, first] - jacobian[:, :3, second]
+    along = np.einsum("im,fim->fm", gap / length, relative)
+    value = measured.distance[first] - length
+    sigma = None
+    if measured.sigma is not None:
+        sigma = measured.sigma[first][None]
+    return [Part("distance", value[None], along[:, None], sigma, 0, first)]
 
 
 def _pairs(measured: Distances) -> tuple[np.ndarray, np.ndarray]:
     """Return the row indices of the first and second pose of each pair."""
     order = np.argsort(measured.group, kind="stable")
     groups, counts = np.unique(measured.group, return_counts=True)
-    if np.any(counts != 2):
-        odd = groups[counts != 2][0]
-        row = int(measured.rows[measured.group == odd][0])
-        refuse_data(measured.file, f"pair {odd} has {counts[counts != 2][0]} rows; a distance needs two", row=row)
+    wrong = np.flatnonzero(counts != 2)
+    if len(wrong):
+        pair = groups[wrong[0]]
+        row = int(measured.rows[measured.group == pair][0])
+        refuse_data(measured.file, f"pair {pair} has {counts[wrong[0]]} rows; a distance needs two", row=row)
     return order[0::2], order[1::2]
 
 
 @parts.register
 def _sockets(measured: Sockets, seen: Seen, jacobian: np.ndarray) -> list[Part]:
     """Socket residual: mean of the group minus p, and L - |mean_a - mean_b| for known socket distances L."""
-    groups, inverse, counts = np.unique(measured.group, return_inverse=True, return_counts=True)
+    groups, group_of_row, counts = np.unique(measured.group, return_inverse=True, return_counts=True)
+    rows = np.arange(len(measured))
     average = np.zeros((len(measured), len(groups)))
-    average[np.arange(len(measured)), inverse] = 1.0 / counts[inverse]
+    average[rows, group_of_row] = 1.0 / counts[group_of_row]
     linear = jacobian[:, :3]
-    means, mean_jacobian = seen.point @ average, linear @ average
-    value, spread = means[:, inverse] - seen.point, linear - mean_jacobian[:, :, inverse]
-    sigma = None if measured.sigma is None else measured.sigma.T
-    everywhere = np.arange(len(measured))
-    result = [Part("consistency", value, spread, sigma, 3 * len(groups), everywhere)]
-    place = {int(group): k for k, group in enumerate(groups)}
-    known = [(place[a], place[b], d) for a, b, d in measured.links if a in place and b in place]
-    if known:
-        a, b = (np.array([link[side] for link in known]) for side in (0, 1))
-        gap = means[:, a] - means[:, b]
+    means = seen.point @ average
+    mean_jacobian = linear @ average
+    value = means[:, group_of_row] - seen.point
+    slope = linear - mean_jacobian[:, :, group_of_row]
+    sigma = None
+    if measured.sigma is not None:
+        sigma = measured.sigma.T
+    result = [Part("consistency", value, slope, sigma, 3 * len(groups), rows)]
+    number = {int(group): k for k, group in enumerate(groups)}
+    links = [link for link in measured.links if link[0] in number and link[1] in number]
+    if links:
+        first = np.array([number[link[0]] for link in links])
+        second = np.array([number[link[1]] for link in links])
+        gap = means[:, first] - means[:, second]
         length = np.linalg.norm(gap, axis=0)
-        along = np.einsum("il,fil->fl", gap / length, mean_jacobian[:, :, a] - mean_jacobian[:, :, b])
-        short = np.array([link[2] for link in known]) - length
-        first = np.array([int(np.flatnonzero(inverse == k)[0]) for k in a])
-        result.append(Part("distance", short[None], along[:, None], None, 0, first))
+        relative = mean_jacobian[:, :, first] - mean_jacobian[:, :, second]
+        along = np.einsum("il,fil->fl", gap / length, relative)
+        value = np.array([link[2] for link in links]) - length
+        first_rows = np.array([int(np.flatnonzero(group_of_row == k)[0]) for k in first])
+        result.append(Part("distance", value[None], along[:, None], None, 0, first_rows))
     return result
 
 
@@ -200,43 +233,50 @@ def _fitted(measured: Planes | Bars, seen: Seen, jacobian: np.ndarray) -> list[P
 
     Planes: r = -n · (p - mean). Bars: r = L - |p - c|.
     """
-    flat = isinstance(measured, Planes)
-    value, slope = np.zeros(len(measured)), np.zeros((len(jacobian), len(measured)))
+    value = np.zeros(len(measured))
+    slope = np.zeros((len(jacobian), len(measured)))
     groups, counts = np.unique(measured.group, return_counts=True)
-    for group in groups[counts > 3]:  # three points lie on a plane, and three lengths meet in a centre, anyway
+    # three points lie on a plane, and three lengths meet in a centre, anyway
+    for group in groups[counts > 3]:
         rows = np.flatnonzero(measured.group == group)
         points = seen.point[:, rows]
-        if flat:
-            points = points - points.mean(axis=1, keepdims=True)
-            axes = np.linalg.svd(points, full_matrices=False)[0]
-            value[rows] = -axes[:, 2] @ points
-            unit, nuisance = axes[:, 2:], np.column_stack([np.ones(len(rows)), points.T @ axes[:, :2]])
+        if isinstance(measured, Planes):
+            centred = points - points.mean(axis=1, keepdims=True)
+            axes = np.linalg.svd(centred, full_matrices=False)[0]
+            value[rows] = -axes[:, 2] @ centred
+            direction = axes[:, 2:]
+            nuisance = np.column_stack([np.ones(len(rows)), centred.T @ axes[:, :2]])
         else:
-            away = points - _sphere_centre(points, measured.distance[rows])[:, None]
-            length = np.linalg.norm(away, axis=0)
+            from_centre = points - _sphere_centre(points, measured.distance[rows])[:, None]
+            length = np.linalg.norm(from_centre, axis=0)
             value[rows] = measured.distance[rows] - length
-            unit, nuisance = away / length, (away / length).T
-        along = np.einsum("im,fim->fm", np.broadcast_to(unit, points.shape), jacobian[:, :3, rows])
+            direction = from_centre / length
+            nuisance = direction.T
+        along = np.einsum("im,fim->fm", np.broadcast_to(direction, points.shape), jacobian[:, :3, rows])
         slope[:, rows] = _project(along, nuisance)
-    sigma = None if measured.sigma is None else measured.sigma[None]
-    unknowns = int(np.minimum(counts, 3).sum())  # all numbers of a smaller group
-    label = "plane" if flat else "distance"
+    sigma = None
+    if measured.sigma is not None:
+        sigma = measured.sigma[None]
+    # all numbers of a smaller group
+    unknowns = int(np.minimum(counts, 3).sum())
+    label = "plane" if isinstance(measured, Planes) else "distance"
     return [Part(label, value[None], slope[:, None], sigma, unknowns, np.arange(len(measured)))]
 
 
-def _sphere_centre(points: np.ndarray, lengths: np.ndarray, iterations: int = 20) -> np.ndarray:
+def _sphere_centre(points: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     """Return the centre (3,) whose distances to points (3, m) fit the lengths (m,) best, by Gauss–Newton.
 
     The start is linear: |p|² - L² = 2 p·c - |c|² (algebraic sphere fit).
     """
     matrix = np.column_stack([2.0 * points.T, -np.ones(points.shape[1])])
-    centre = np.linalg.lstsq(matrix, (points**2).sum(axis=0) - lengths**2, rcond=None)[0][:3]
-    for _ in range(iterations):
-        away = centre[:, None] - points
-        length = np.linalg.norm(away, axis=0)
-        change = np.linalg.lstsq((away / length).T, lengths - length, rcond=None)[0]
+    squares = (points**2).sum(axis=0) - lengths**2
+    centre = np.linalg.lstsq(matrix, squares, rcond=None)[0][:3]
+    for _ in range(CENTRE_STEPS):
+        to_centre = centre[:, None] - points
+        length = np.linalg.norm(to_centre, axis=0)
+        change = np.linalg.lstsq((to_centre / length).T, lengths - length, rcond=None)[0]
         centre = centre + change
-        if np.linalg.norm(change) < 1e-13:
+        if np.linalg.norm(change) < MIN_CHANGE:
             break
     return centre
 
@@ -256,9 +296,12 @@ def inverse_right_jacobian(turn: np.ndarray, angular: np.ndarray) -> np.ndarray:
     theta = np.linalg.norm(turn, axis=0)
     if theta.max(initial=0.0) < 1e-9:
         return angular
-    safe = np.where(theta < 1e-4, 1.0, theta)
+    small = theta < 1e-4
+    safe = np.where(small, 1.0, theta)
     exact = 1.0 / safe**2 - (1.0 + np.cos(safe)) / (2.0 * safe * np.sin(safe))
-    factor = np.where(theta < 1e-4, 1.0 / 12.0, exact)
-    once = np.cross(turn.T[None], angular.transpose(0, 2, 1))
+    # the limit of the factor for small angles
+    factor = np.where(small, 1.0 / 12.0, exact)
+    by_row = angular.transpose(0, 2, 1)
+    once = np.cross(turn.T[None], by_row)
     twice = np.cross(turn.T[None], once)
-    return (angular.transpose(0, 2, 1) + 0.5 * once + factor[:, None] * twice).transpose(0, 2, 1)
+    return (by_row + 0.5 * once + factor[:, None] * twice).transpose(0, 2, 1)

@@ -37,16 +37,16 @@ def with_link_motion(robot: CalibratedChain, case: Case, settings: Identificatio
     terms = joint_terms(robot.complete, robot.deflection)
     if rigid or not terms.terms or len(chain.driven) != chain.n:
         return case
-    own = target_elements(chain, terms)
+    elements = target_elements(chain, terms)
     torque = bodies_torques(terms, case, settings)
-    moved = np.zeros((3, *case.motion.q.shape))
-    for j, place in enumerate(chain.moving):
-        chosen = chosen_terms(terms, own == place)
+    positions = np.zeros((3, *case.motion.q.shape))
+    for j, element in enumerate(chain.moving):
+        chosen = chosen_terms(terms, elements == element)
         if len(chosen.terms):
             bases = motion_of_bases(chosen, case.motion, torque)
-            moved[:, :, j] = np.einsum("e,sen->sn", np.asarray(chosen.coefficients), bases)
+            positions[:, :, j] = np.einsum("e,sen->sn", np.asarray(chosen.coefficients), bases)
     motion = case.motion
-    return replace(case, link=tuple(x + dx for x, dx in zip((motion.q, motion.v, motion.a), moved)))
+    return replace(case, link=tuple(x + dx for x, dx in zip((motion.q, motion.v, motion.a), positions)))
 
 
 def joint_terms(chain: Chain, deflection: Deflection) -> Deflection:
@@ -55,7 +55,7 @@ def joint_terms(chain: Chain, deflection: Deflection) -> Deflection:
 
 
 def chosen_terms(deflection: Deflection, mask: np.ndarray) -> Deflection:
-    terms = tuple(term for term, kept in zip(deflection.terms, mask) if kept)
+    terms = tuple(term for term, chosen in zip(deflection.terms, mask) if chosen)
     return replace(deflection, terms=terms, coefficients=np.asarray(deflection.coefficients)[mask])
 
 
@@ -65,10 +65,10 @@ def bodies_torques(terms: Deflection, case: Case, settings: IdentificationSettin
         return None
     model = make_model(terms.reference, settings)
     values = np.zeros(10 * model.bodies.count)
-    known = standard_parameters(terms.reference)
-    values[: len(known)] = known
-    for label, stated in settings.payloads.items():
-        load = settings.payload_values.get(label, stated.parameters)
+    parameters = standard_parameters(terms.reference)
+    values[: len(parameters)] = parameters
+    for label, payload in settings.payloads.items():
+        load = settings.payload_values.get(label, payload.parameters)
         if load is not None:
             first = 10 * model.bodies.labels.index(label)
             values[first : first + 10] = load

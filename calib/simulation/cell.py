@@ -90,7 +90,7 @@ def true_poses(cell: Cell, q: np.ndarray, warm: float = np.inf) -> np.ndarray:
     torque = np.zeros(q.shape) if arm.inertias is None else gravity_torques(arm, q)
     bases = evaluate(cell.truth.deflection, q, torque)
     beyond = displacements(cell.unmodelled, arm, q, torque, warm)
-    seen = see(cell.truth, q, bases=bases, given=beyond).poses()
+    seen = see(cell.truth, q, bases=bases, displacements=beyond).poses()
     return drooping(cell.unmodelled, arm, seen, cell.truth.stations[0])
 
 

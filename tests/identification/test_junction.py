@@ -29,7 +29,7 @@ def geometry(model: str) -> kinematic.Outcome:
     """Return a fit of the planted arm, whose joints deflect."""
     cell = perturbed_cell(planted.arm(), 1, hidden=1.0)
     block: PoseMeasurements = measure(cell, random_joints(cell.nominal, 60, 1), 2)
-    return kinematic.run(Inputs(cell.nominal, Path("planted.toml"), (block,)), wanted=FitSettings(model=model))
+    return kinematic.run(Inputs(cell.nominal, Path("planted.toml"), (block,)), settings=FitSettings(model=model))
 
 
 @pytest.mark.parametrize("model", ["geometry", pytest.param("harmonics", marks=pytest.mark.slow)])

@@ -9,14 +9,13 @@ with W the whitened observation matrix of all rigid parameters, Λ the precision
 target's Jacobian at random postures within the joint limits.
 """
 
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
 
-from calib.data.poses.measurements import PoseMeasurements, Positions
+from calib.data.poses.measurements import Positions
 from calib.errors import CalibError
 from calib.geometry.accuracy import errors
 from calib.geometry.fit import plausible_deviation, polish_frames
@@ -25,9 +24,12 @@ from calib.geometry.observation import layout, pose_sigmas, positions, prepare, 
 from calib.geometry.weighing import GeometricFit
 from calib.robot.chain import random_joints
 
-POSTURES = 300  # random ones
-STILL = 1e-3  # [rad, m]: a joint that moved by less stood; the others are drawn with it where it stood
-MIN_PRECISION = 1e-12  # of the largest one: placements have no prior
+# random postures by which a fit is judged over the whole range
+POSTURES = 300
+# [rad, m]: a joint that moved by less stood; the others are drawn with it where it stood
+STILL = 1e-3
+# of the largest one: placements have no prior
+MIN_PRECISION = 1e-12
 
 
 @dataclass(frozen=True)
@@ -58,27 +60,29 @@ class JointRange:
         return [j for j, (low, high) in enumerate(zip(self.lower, self.upper)) if high - low > STILL]
 
 
-def joint_range(found: GeometricFit, nominal: Installation) -> JointRange:
+def joint_range(fit: GeometricFit, nominal: Installation) -> JointRange:
     """Return the joint range of a rigid fit, with σ over the whole range.
 
     Args:
-        found: the fit without joint corrections.
+        fit: the fit without joint corrections.
         nominal: the arm as it was, placed for the same rows.
     """
-    chain, blocks = found.cell.chain, [block.measured for block in found.blocks]
+    chain = fit.cell.chain
+    blocks = [block.measured for block in fit.blocks]
     q = np.concatenate([block.q for block in blocks])
-    low, high = q.min(axis=0), q.max(axis=0)
+    low = q.min(axis=0)
+    high = q.max(axis=0)
     lower, upper = chain.sampling_limits()
-    whole = np.array([np.inf if joint.kind == "prismatic" else 2.0 * np.pi for joint in chain.joints])
-    whole = np.maximum(np.minimum(upper - lower, whole), STILL)
-    shares = np.minimum((high - low) / whole, 1.0)
-    sigma, worse = None, None
+    turn = np.array([np.inf if joint.kind == "prismatic" else 2.0 * np.pi for joint in chain.joints])
+    full_range = np.maximum(np.minimum(upper - lower, turn), STILL)
+    shares = np.minimum((high - low) / full_range, 1.0)
+    sigma = nominal_error = None
     if any(isinstance(block, Positions) for block in blocks):
         postures = random_joints(chain, POSTURES)
         stood = high - low <= STILL
         postures[:, stood] = np.median(q, axis=0)[stood]
-        sigma = float(np.sqrt(np.mean(sigma_at(found.cell, found, postures) ** 2)))
-        worse = _nominal_error(found, nominal, postures)
+        sigma = float(np.sqrt(np.mean(sigma_at(fit.cell, fit, postures) ** 2)))
+        nominal_error = _nominal_error(fit, nominal, postures)
     return JointRange(
         joints=chain.joint_names,
         units=tuple(joint.unit for joint in chain.joints),
@@ -86,53 +90,62 @@ def joint_range(found: GeometricFit, nominal: Installation) -> JointRange:
         upper=tuple(high.tolist()),
         shares=tuple(shares.tolist()),
         sigma=sigma,
-        nominal=worse,
-        left=errors(found.cell, blocks).rms,
+        nominal=nominal_error,
+        left=errors(fit.cell, blocks).rms,
     )
 
 
-def sigma_at(cell: Installation, found: GeometricFit, q: np.ndarray) -> np.ndarray:
+def sigma_at(cell: Installation, fit: GeometricFit, q: np.ndarray) -> np.ndarray:
     """Return σ of the first target's position (m,) [m] at postures q (m, n), in its station's frame.
 
     The fit's covariance where all rigid parameters were its candidates, else the posterior of its data and
     the prior of making (`calib.geometry.fit.PLAUSIBLE`).
     """
-    table, columns = layout(cell), layout(cell).rigid_index
+    table = layout(cell)
+    columns = table.rigid_index
     arm = np.intersect1d(columns, table.index("arm"))
     # of these, what the fit leaves at nominal has no effect, or displaces base or tool, which the fit places
-    if found.prior is not None and np.isin(arm, found.candidates).all():
-        columns, covariance = found.free, found.estimate.covariance
+    if fit.prior is not None and np.isin(arm, fit.candidates).all():
+        columns = fit.free
+        covariance = fit.estimate.covariance
     else:
-        covariance = _posterior(cell, found, columns)
-    (block,) = _positions_at(cell, found, q)
-    return pose_sigmas(cell, block, columns, covariance)[:, 0]
+        covariance = _posterior(cell, fit, columns)
+    return pose_sigmas(cell, _positions_at(cell, fit, q), columns, covariance)[:, 0]
 
 
-def _posterior(cell: Installation, found: GeometricFit, columns: np.ndarray) -> np.ndarray:
+def _posterior(cell: Installation, fit: GeometricFit, columns: np.ndarray) -> np.ndarray:
     """Return the covariance of the parameters `columns` by the data of a fit and the prior of making."""
     square = np.zeros((len(columns), len(columns)))
-    for number, block in enumerate(found.blocks):
-        scales = [piece.sigma / np.sqrt(piece.weight) for piece in found.pieces if piece.block == number]
-        noises = [piece.part.noise for piece in found.pieces if piece.block == number]
+    for number, block in enumerate(fit.blocks):
+        pieces = [piece for piece in fit.pieces if piece.block == number]
+        scales = [piece.sigma / np.sqrt(piece.weight) for piece in pieces]
+        noises = [piece.part.noise for piece in pieces]
         for _, matrix in whitened(cell, block, columns, scales, noises):
             square += matrix.T @ matrix
-    square /= found.estimate.residual_std**2
+    square /= fit.estimate.residual_std**2
     precision = plausible_deviation(cell, columns) ** -2.0
     ridge = MIN_PRECISION * float(np.diag(square).max())
     return scipy.linalg.inv(square + np.diag(precision + ridge))
 
 
-def _positions_at(cell: Installation, found: GeometricFit, q: np.ndarray) -> Sequence[Positions]:
+def _positions_at(cell: Installation, fit: GeometricFit, q: np.ndarray) -> Positions:
     """Return positions of the first target that an installation would measure at postures (m, n)."""
-    measured = next(block.measured for block in found.blocks if isinstance(block.measured, Positions))
-    names, station = measured.tool_names[:1], measured.station
-    block = Positions(q, measured.joint_names, position=np.zeros((len(q), 3)), tool_names=names, station=station)
-    return [replace(block, position=positions(cell, prepare(cell, [block])[0]).T)]
+    measured = next(block.measured for block in fit.blocks if isinstance(block.measured, Positions))
+    block = Positions(
+        q,
+        measured.joint_names,
+        position=np.zeros((len(q), 3)),
+        tool_names=measured.tool_names[:1],
+        station=measured.station,
+    )
+    (prepared,) = prepare(cell, [block])
+    return replace(block, position=positions(cell, prepared).T)
 
 
-def _nominal_error(found: GeometricFit, nominal: Installation, q: np.ndarray) -> float | None:
+def _nominal_error(fit: GeometricFit, nominal: Installation, q: np.ndarray) -> float | None:
     """Return the rms error [m] of the nominal arm at postures (m, n) if the calibrated one is the true arm."""
-    blocks: Sequence[PoseMeasurements] = _positions_at(found.cell, found, q)
+    block = _positions_at(fit.cell, fit, q)
     with suppress(CalibError):
-        return errors(polish_frames(nominal, blocks).cell, blocks).rms
+        placed = polish_frames(nominal, [block]).cell
+        return errors(placed, [block]).rms
     return None

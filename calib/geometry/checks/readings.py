@@ -11,9 +11,12 @@ from calib.errors import Finding, finding
 from calib.geometry.installation import Installation
 from calib.geometry.observation import positions, prepare
 
-SAME = 1e-8  # [m]: readings that differ by no more are one number; instruments have noise (our choice)
-MIN_APART = 1e-3  # [m] between predicted targets from which on one reading cannot be both (our choice)
-MIN_COPIES = 3  # poses at which a target has the numbers of another (our choice)
+# [m]: readings that differ by no more are one number; instruments have noise (our choice)
+SAME = 1e-8
+# [m] between predicted targets from which on one reading cannot be both (our choice)
+MIN_APART = 1e-3
+# poses at which a target has the numbers of another (our choice)
+MIN_COPIES = 3
 
 
 def repeated_readings(nominal: Installation, blocks: Sequence[PoseMeasurements]) -> list[Finding]:
@@ -23,58 +26,77 @@ def repeated_readings(nominal: Installation, blocks: Sequence[PoseMeasurements])
         nominal: the arm as it was, placed.
         blocks: the rows.
     """
-    result: list[Finding] = []
+    findings: list[Finding] = []
     for block in blocks:
         if isinstance(block, Positions) and len(block) > 1:
             copies = _copied_targets(block)
-            result += [*copies, *_stale(nominal, block, {str(one.values["name"]) for one in copies})]
-    return result
+            names = {str(copy.values["name"]) for copy in copies}
+            findings += copies
+            findings += _stale(nominal, block, names)
+    return findings
 
 
 def _readings(block: Positions) -> np.ndarray:
     """Return the number of each row's reading (m,), the same for equal ones."""
-    return np.unique(np.round(block.position / SAME), axis=0, return_inverse=True)[1].reshape(-1)
+    rounded = np.round(block.position / SAME)
+    _, number = np.unique(rounded, axis=0, return_inverse=True)
+    return number.reshape(-1)
 
 
 def _copied_targets(block: Positions) -> list[Finding]:
     """Return findings on targets that have the readings of another one in all poses that measured both."""
-    reading, result = _readings(block), list[Finding]()
+    readings = _readings(block)
+    # per target: its readings by row number
+    reading_of_row = []
+    for tool in range(len(block.tool_names)):
+        rows = block.tool == tool
+        reading_of_row.append(dict(zip(block.rows[rows].tolist(), readings[rows])))
+    findings = list[Finding]()
     copied: set[int] = set()
     for first, second in combinations(range(len(block.tool_names)), 2):
-        at = [
-            dict(zip(block.rows[block.tool == tool].tolist(), reading[block.tool == tool])) for tool in (first, second)
-        ]
-        common = sorted(at[0].keys() & at[1].keys())
-        equal = [row for row in common if at[0][row] == at[1][row]]
+        first_readings = reading_of_row[first]
+        second_readings = reading_of_row[second]
+        common = sorted(first_readings.keys() & second_readings.keys())
+        equal = [row for row in common if first_readings[row] == second_readings[row]]
         if len(equal) < MIN_COPIES or second in copied:
             continue
         copied.add(second)
-        names = [block.tool_names[tool] for tool in (second, first)]
-        rows = [] if len(equal) == len(common) else [str(row) for row in equal]
-        values = {"name": names[0], "other": names[1], "count": len(equal), "of": len(common), "rows": rows}
-        result.append(finding("target-copied", file=_name(block), share=len(equal) / len(common), **values))
-    return result
+        values = {
+            "name": block.tool_names[second],
+            "other": block.tool_names[first],
+            "count": len(equal),
+            "of": len(common),
+            "rows": [] if len(equal) == len(common) else [str(row) for row in equal],
+        }
+        findings.append(finding("target-copied", file=_name(block), share=len(equal) / len(common), **values))
+    return findings
 
 
 def _stale(nominal: Installation, block: Positions, copied: set[str]) -> list[Finding]:
     """Return findings on the readings of a target that stay while the joints move it."""
     (prepared,) = prepare(nominal, [block])
-    point, readings, result = positions(nominal, prepared).T, _readings(block), list[Finding]()
+    predicted = positions(nominal, prepared).T
+    readings = _readings(block)
+    findings = list[Finding]()
     for tool, name in enumerate(block.tool_names):
         rows = np.flatnonzero(block.tool == tool)
         if name in copied or len(rows) < 2:
             continue
-        numbers, count = np.unique(readings[rows], return_counts=True)
-        for number in numbers[count > 1]:
-            of_reading = rows[readings[rows] == number]
-            apart = float(np.linalg.norm(np.ptp(point[of_reading], axis=0)))
-            if apart < MIN_APART:
+        numbers, counts = np.unique(readings[rows], return_counts=True)
+        for number in numbers[counts > 1]:
+            rows_of_reading = rows[readings[rows] == number]
+            distance = float(np.linalg.norm(np.ptp(predicted[rows_of_reading], axis=0)))
+            if distance < MIN_APART:
                 continue
-            value = [f"{1e3 * axis:.6g}" for axis in block.position[of_reading[0]]]
-            named = [str(row) for row in block.rows[of_reading]]
-            values = {"name": name, "rows": named, "value": value, "apart": apart}
-            result.append(finding("reading-repeated", file=_name(block), **values))
-    return result
+            reading = block.position[rows_of_reading[0]]
+            values = {
+                "name": name,
+                "rows": [str(row) for row in block.rows[rows_of_reading]],
+                "value": [f"{1e3 * axis:.6g}" for axis in reading],
+                "apart": distance,
+            }
+            findings.append(finding("reading-repeated", file=_name(block), **values))
+    return findings
 
 
 def _name(block: PoseMeasurements) -> str:

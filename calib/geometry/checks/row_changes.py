@@ -15,7 +15,7 @@ values or of the target's coordinates, as an effect that the arm's model lacks w
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,17 +29,31 @@ from calib.geometry.observation import Block, layout, observe, parameter_values,
 from calib.geometry.weighing import GeometricFit
 from calib.records import evenly
 
-MIN_ROWS = 20  # of a block, and of its rows before and after a step the third part (our choice)
-MAX_ROWS = 1500  # of a block that are looked at (our choice)
-MAX_CHANCE = 1e-6  # that noise explains as much by one of the hypotheses: residuals are not quite white (our choice)
-MAX_LEFT = 0.75  # of the rms that remains without the change (our choice)
-MAX_LEFT_UNSEEN = 0.85  # the same on rows that did not determine the change (our choice)
-MAX_RIVAL = 0.5  # gain of the best change over another order, of that over the rows (our choice)
-MAX_CHANGES = 3  # that are searched for in one block
-GROSS = 10.0  # times the median residual: rows that are measured wrongly, not of another set-up (our choice)
-MIN_NOISE = 1e-6  # [m, rad] no instrument has less
-FREE = 10.0  # [m, rad] width of the prior of placements
-CHANGED = 0.1  # [m, rad] width of the prior of what changed while measuring
+# of a block, and of its rows before and after a step the third part (our choice)
+MIN_ROWS = 20
+# of a block that are looked at (our choice)
+MAX_ROWS = 1500
+# that noise explains as much by one of the hypotheses: residuals are not quite white (our choice)
+MAX_CHANCE = 1e-6
+# of the rms that remains without the change (our choice)
+MAX_LEFT = 0.75
+# the same on rows that did not determine the change (our choice)
+MAX_LEFT_UNSEEN = 0.85
+# gain of the best change over another order, of that over the rows (our choice)
+MAX_RIVAL = 0.5
+# that are searched for in one block
+MAX_CHANGES = 3
+# times the median residual: rows that are measured wrongly, not of another set-up (our choice)
+GROSS = 10.0
+# [m, rad] no instrument has less
+MIN_NOISE = 1e-6
+# [m, rad] width of the prior of placements
+FREE = 10.0
+# [m, rad] width of the prior of what changed while measuring
+CHANGED = 0.1
+# passes until no gross row leaves; more are seldom needed
+GROSS_PASSES = 5
+# parts of the rows by which a change is tested on rows that did not determine it
 FOLDS = 5
 STEPS = {"station": "station-changed", "target": "target-changed", "zero": "zero-changed", "scale": "scale-changed"}
 DRIFTS = {"station": "station-drifts", "target": "target-wanders", "zero": "zero-drifts", "scale": "scale-drifts"}
@@ -74,28 +88,39 @@ class Rows:
     def with_columns(self, columns: np.ndarray) -> "Rows":
         """Return the rows with further columns (m, d, k), of what changed."""
         count = columns.shape[2]
-        precision = np.append(self.precision, np.full(count, CHANGED**-2.0))
-        matrix = np.concatenate([self.matrix, columns], axis=2)
-        return Rows(self.block, self.residual, matrix, precision, np.append(self.pull, np.zeros(count)), self.metres)
+        return replace(
+            self,
+            matrix=np.concatenate([self.matrix, columns], axis=2),
+            precision=np.append(self.precision, np.full(count, CHANGED**-2.0)),
+            pull=np.append(self.pull, np.zeros(count)),
+        )
 
     def normal(self) -> np.ndarray:
         """Return the matrix of the normal equations (f, f), the prior included."""
         flat = self.matrix.reshape(-1, self.matrix.shape[2])
         square = flat.T @ flat
-        return square + np.diag(self.precision + 1e-13 * np.diag(square).max())  # rounding is no loss of rank
+        # rounding is no loss of rank
+        rounding = 1e-13 * np.diag(square).max()
+        return square + np.diag(self.precision + rounding)
+
+    def residuals(self, estimate: np.ndarray) -> np.ndarray:
+        """Return the residuals (m, d) with an estimate."""
+        return self.residual - self.matrix @ estimate
 
     def solve(self) -> np.ndarray:
         """Return the penalised least-squares estimate (f,)."""
         flat = self.matrix.reshape(-1, self.matrix.shape[2])
         return scipy.linalg.solve(self.normal(), flat.T @ self.residual.ravel() + self.pull, assume_a="pos")
 
-    def left(self, estimate: np.ndarray) -> np.ndarray:
-        """Return the residuals (m, d) with an estimate."""
-        return self.residual - self.matrix @ estimate
-
-    def position_rms(self, left: np.ndarray) -> float:
+    def position_rms(self, residuals: np.ndarray) -> float:
         """Return the rms of position residuals [m] of whitened ones (m, d)."""
-        return float(np.sqrt(np.mean(np.sum(left[:, :3] ** 2, axis=1) * self.metres**2)))
+        squares = np.sum(residuals[:, :3] ** 2, axis=1)
+        return float(np.sqrt(np.mean(squares * self.metres**2)))
+
+    def resting(self) -> float:
+        """Return the number of parameters that rest on their prior."""
+        variances = np.diag(scipy.linalg.inv(self.normal()))
+        return float(np.sum(self.precision * variances))
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,50 +165,53 @@ class Change:
         return self.shape[:, None, None] * self.subject.columns
 
 
-def row_changes(found: GeometricFit) -> list[Finding]:
+def row_changes(fit: GeometricFit) -> list[Finding]:
     """Return findings on what changed while the rows of each block were measured.
 
     Args:
-        found: a fit without joint corrections.
+        fit: a fit without joint corrections.
     """
-    result: list[Finding] = []
-    for number, block in enumerate(found.blocks):
+    findings: list[Finding] = []
+    for number, block in enumerate(fit.blocks):
         if not isinstance(block.measured, Positions) or len(block.measured) < MIN_ROWS:
             continue
-        rows = _without_gross(_rows_of(found, number))
-        subjects = _subjects(found, rows)
+        rows = _without_gross(_rows_of(fit, number))
+        subjects = _subjects(fit, rows)
         for _ in range(MAX_CHANGES):
             change = _best_change(rows, subjects)
             if change is None:
                 break
-            result.append(_described(rows, change))
+            findings.append(_described(rows, change))
             rows = rows.with_columns(change.columns)
-    return result
+    return findings
 
 
-def _rows_of(found: GeometricFit, number: int) -> Rows:
+def _rows_of(fit: GeometricFit, number: int) -> Rows:
     """Return a block's rows, whitened, with the columns of all rigid parameters."""
-    measured = found.blocks[number].measured
-    (block,) = prepare(found.cell, [take(measured, evenly(len(measured), MAX_ROWS))])
-    table = layout(found.cell)
+    measured = fit.blocks[number].measured
+    (block,) = prepare(fit.cell, [take(measured, evenly(len(measured), MAX_ROWS))])
+    table = layout(fit.cell)
     columns = table.index("arm", "station", "tool")
-    used = {label: max(sigma, MIN_NOISE) for label, sigma in found.used_sigmas()[number].items()}
-    parts = observe(found.cell, block, columns)
-    scale = np.concatenate([np.full(len(part.value), used[part.label]) for part in parts])
-    residual = np.concatenate([part.value for part in parts]).T / scale
-    matrix = np.concatenate([part.jacobian for part in parts], axis=1).transpose(2, 1, 0) / scale[:, None]
-    width = np.minimum(plausible_deviation(found.cell, columns), FREE)
-    away = (parameter_values(found.start) - parameter_values(found.cell))[columns]
-    away[np.array(table.kinds)[columns] != "arm"] = 0.0
-    metres = np.full(len(residual), used["position"])
-    return Rows(block, residual, matrix, width**-2.0, away * width**-2.0, metres)
+    sigmas = fit.used_sigmas()[number]
+    values, jacobians, scales = [], [], []
+    for part in observe(fit.cell, block, columns):
+        values.append(part.value)
+        jacobians.append(part.jacobian)
+        scales.append(np.full(len(part.value), max(sigmas[part.label], MIN_NOISE)))
+    scale = np.concatenate(scales)
+    residual = np.concatenate(values).T / scale
+    matrix = np.concatenate(jacobians, axis=1).transpose(2, 1, 0) / scale[:, None]
+    precision = np.minimum(plausible_deviation(fit.cell, columns), FREE) ** -2.0
+    from_nominal = (parameter_values(fit.start) - parameter_values(fit.cell))[columns]
+    from_nominal[np.array(table.kinds)[columns] != "arm"] = 0.0
+    metres = np.full(len(residual), max(sigmas["position"], MIN_NOISE))
+    return Rows(block, residual, matrix, precision, from_nominal * precision, metres)
 
 
 def _without_gross(rows: Rows) -> Rows:
     """Return the rows without those that are far off whatever the rigid arm, which would hide all else."""
-    passes = 5  # until no row leaves; more are seldom needed
-    for _ in range(passes):
-        size = np.linalg.norm(rows.left(rows.solve()), axis=1)
+    for _ in range(GROSS_PASSES):
+        size = np.linalg.norm(rows.residuals(rows.solve()), axis=1)
         fine = size <= GROSS * np.median(size)
         if fine.all() or fine.sum() < MIN_ROWS:
             break
@@ -191,19 +219,23 @@ def _without_gross(rows: Rows) -> Rows:
     return rows
 
 
-def _subjects(found: GeometricFit, rows: Rows) -> list[Subject]:
+def _subjects(fit: GeometricFit, rows: Rows) -> list[Subject]:
     """Return what may have changed: the station, the instrument's scale, each target, and the zero of each joint."""
-    table, cell = layout(found.cell), found.cell
-    place = {table.names[k]: number for number, k in enumerate(table.index("arm", "station", "tool"))}
+    cell = fit.cell
+    table = layout(cell)
+    column = {table.names[k]: number for number, k in enumerate(table.index("arm", "station", "tool"))}
     station = cell.station_names[rows.block.station]
-    names = {station: "station"} | {cell.tool_names[number]: "target" for number in np.unique(rows.block.tool)}
+    codes = {station: "station"}
+    for number in np.unique(rows.block.tool):
+        codes[cell.tool_names[number]] = "target"
     subjects = []
-    for name, code in names.items():
-        columns = rows.matrix[:, :, [place[f"{name}.{axis}"] for axis in FRAME_AXES]]
-        seen = np.linalg.norm(columns, axis=(0, 1)) > 0.0  # a point has no orientation
-        subjects.append(Subject(code, name, columns[:, :, seen]))
+    for name, code in codes.items():
+        columns = rows.matrix[:, :, [column[f"{name}.{axis}"] for axis in FRAME_AXES]]
+        # a point has no orientation
+        visible = np.linalg.norm(columns, axis=(0, 1)) > 0.0
+        subjects.append(Subject(code, name, columns[:, :, visible]))
     for joint, element in zip(cell.chain.joint_names, cell.chain.moving):
-        number = place[cell.chain.names[element]]
+        number = column[cell.chain.names[element]]
         subjects.append(Subject("zero", joint, rows.matrix[:, :, [number]]))
     measured = rows.block.measured
     assert isinstance(measured, Positions)
@@ -215,102 +247,130 @@ def _subjects(found: GeometricFit, rows: Rows) -> list[Subject]:
 
 def _best_change(rows: Rows, subjects: Sequence[Subject]) -> Change | None:
     """Return the change over the rows that explains the residuals; None where none does."""
-    left = rows.left(rows.solve())
-    cost, count = float(np.sum(left**2)), left.size
-    effective = rows.matrix.shape[2] - _held(rows)
-    tried = list(_changes(rows, left, subjects, rows.block.measured.rows))
-    # the fewer numbers a change takes, the more likely it is (Schwarz 1978)
-    best = min(tried, key=lambda one: _information(cost - one.gain, count, one.subject.count), default=None)
-    hypotheses = len(subjects) * len(left)
+    residuals = rows.residuals(rows.solve())
+    cost = float(np.sum(residuals**2))
+    count = residuals.size
+    best = None
+    smallest = np.inf
+    for change in _changes(rows, residuals, subjects, rows.block.measured.rows):
+        # the fewer numbers a change takes, the more likely it is (Schwarz 1978)
+        information = _information(cost - change.gain, count, change.subject.count)
+        if information < smallest:
+            best = change
+            smallest = information
+    effective = rows.matrix.shape[2] - rows.resting()
+    hypotheses = len(subjects) * len(residuals)
     if best is None or not _significant(best, cost, count - effective, hypotheses):
         return None
-    if max(_gains_over_other_orders(rows, left, subjects)) > MAX_RIVAL * best.gain:
+    if max(_gains_over_other_orders(rows, residuals, subjects)) > MAX_RIVAL * best.gain:
         return None
-    return best if _holds_on_unseen(rows, best) else None
-
-
-def _held(rows: Rows) -> float:
-    """Return the number of parameters that rest on their prior."""
-    return float(np.sum(rows.precision * np.diag(scipy.linalg.inv(rows.normal()))))
+    if not _holds_on_held_out(rows, best):
+        return None
+    return best
 
 
 def _information(cost: float, count: int, parameters: int) -> float:
+    """Return Schwarz's criterion of a fit of `count` numbers."""
     return count * np.log(max(cost, 1e-300)) + parameters * np.log(count)
 
 
 def _significant(change: Change, cost: float, dof: float, hypotheses: int) -> bool:
     """Return whether a change explains the residuals by Fisher's test, and leaves little of them."""
-    from scipy.stats import f  # slow to load
+    # slow to load
+    from scipy.stats import f
 
-    number = change.subject.count
-    remains, dof = max(cost - change.gain, 1e-300), max(dof, number + 1.0)
-    variance = remains / (dof - number)
-    chance = float(f.sf(change.gain / number / variance, number, dof - number))
+    count = change.subject.count
+    remaining = max(cost - change.gain, 1e-300)
+    dof = max(dof, count + 1.0)
+    variance = remaining / (dof - count)
+    chance = float(f.sf(change.gain / count / variance, count, dof - count))
     return chance * hypotheses < MAX_CHANCE and variance < MAX_LEFT**2 * cost / dof
 
 
-def _changes(rows: Rows, left: np.ndarray, subjects: Sequence[Subject], order: np.ndarray) -> Iterator[Change]:
+def _changes(rows: Rows, residuals: np.ndarray, subjects: Sequence[Subject], order: np.ndarray) -> Iterator[Change]:
     """Yield the best step and the drift of each subject over an order (m,) of the rows.
 
     Args:
         rows: whitened.
-        left: (m, d) what remains without a change.
+        residuals: (m, d) without a change.
         subjects: what may have changed.
         order: values that order the rows; equal ones stay together.
     """
+    count = len(residuals)
     flat = rows.matrix.reshape(-1, rows.matrix.shape[2])
     root = scipy.linalg.cholesky(rows.normal())
     fitted = scipy.linalg.solve_triangular(root, flat.T, trans=1).T.reshape(rows.matrix.shape)
     rank = np.argsort(order, kind="stable")
-    edge = max(MIN_ROWS // 3, len(left) // 20)
     sorted_order = order[rank]
-    cuts = np.arange(edge, len(left) - edge + 1)
+    edge = max(MIN_ROWS // 3, count // 20)
+    cuts = np.arange(edge, count - edge + 1)
     cuts = cuts[sorted_order[cuts - 1] != sorted_order[cuts]]
     spread = np.ptp(order)
-    ramp = (order - order.min()) / spread - 0.5 if spread > 0.0 else np.zeros(len(left))
+    ramp = np.zeros(count)
+    if spread > 0.0:
+        ramp = (order - order.min()) / spread - 0.5
     for subject in subjects:
         columns = subject.columns
-        score = np.einsum("mdk,md->mk", columns, left)
+        score = np.einsum("mdk,md->mk", columns, residuals)
         square = np.einsum("mdk,mdl->mkl", columns, columns)
         shared = np.einsum("mdk,mdf->mkf", columns, fitted)
         if len(cuts):
-            behind = [np.cumsum(each[rank[::-1]], axis=0)[::-1][cuts] for each in (score, square, shared)]
-            gains = _gains(*behind)
+            gains = _gains(
+                _sums_behind(score, rank, cuts), _sums_behind(square, rank, cuts), _sums_behind(shared, rank, cuts)
+            )
             best = int(np.argmax(gains))
-            shape = np.zeros(len(left))
-            shape[rank[cuts[best] :]] = 1.0
-            between = float(sorted_order[cuts[best] - 1]), float(sorted_order[cuts[best]])
+            cut = cuts[best]
+            shape = np.zeros(count)
+            shape[rank[cut:]] = 1.0
+            between = float(sorted_order[cut - 1]), float(sorted_order[cut])
             yield Change(subject, shape, between, float(gains[best]))
-        weights = ramp, ramp**2, ramp
-        sums = [np.tensordot(weight, each, 1)[None] for weight, each in zip(weights, (score, square, shared))]
-        yield Change(subject, ramp, None, float(_gains(*sums)[0]))
+        gain = _gains(
+            np.tensordot(ramp, score, 1)[None],
+            np.tensordot(ramp**2, square, 1)[None],
+            np.tensordot(ramp, shared, 1)[None],
+        )
+        yield Change(subject, ramp, None, float(gain[0]))
+
+
+def _sums_behind(terms: np.ndarray, rank: np.ndarray, cuts: np.ndarray) -> np.ndarray:
+    """Return the sums (c, …) of terms (m, …) of the rows behind each cut, in the order of `rank`."""
+    from_last = np.cumsum(terms[rank[::-1]], axis=0)
+    return from_last[::-1][cuts]
 
 
 def _gains(score: np.ndarray, square: np.ndarray, shared: np.ndarray) -> np.ndarray:
     """Return gᵀ S⁻¹ g (c,) of sums over rows: g (c, k), Σ HᵀH (c, k, k), Σ HᵀQ (c, k, f)."""
     matrix = square - shared @ shared.transpose(0, 2, 1) + CHANGED**-2.0 * np.eye(score.shape[1])
-    return np.einsum("ck,ck->c", score, np.linalg.solve(matrix, score[:, :, None])[:, :, 0])
+    solution = np.linalg.solve(matrix, score[:, :, None])
+    return np.einsum("ck,ck->c", score, solution[:, :, 0])
 
 
-def _gains_over_other_orders(rows: Rows, left: np.ndarray, subjects: Sequence[Subject]) -> Iterator[float]:
+def _gains_over_other_orders(rows: Rows, residuals: np.ndarray, subjects: Sequence[Subject]) -> Iterator[float]:
     """Yield the gains of changes over joint values and the target's coordinates, which are not of time."""
     measured = rows.block.measured
     assert isinstance(measured, Positions)
     for order in (*measured.q.T, *measured.position.T):
-        for change in _changes(rows, left, subjects, order):
+        for change in _changes(rows, residuals, subjects, order):
             yield change.gain
 
 
-def _holds_on_unseen(rows: Rows, change: Change) -> bool:
+def _holds_on_held_out(rows: Rows, change: Change) -> bool:
     """Return whether the change explains rows that did not determine it."""
-    both = rows, rows.with_columns(change.columns)
-    squares = [0.0, 0.0]
+    changed = rows.with_columns(change.columns)
+    count = len(rows.residual)
+    squares = changed_squares = 0.0
     for fold in range(FOLDS):
-        unseen = np.arange(fold, len(rows.residual), FOLDS)
-        others = np.setdiff1d(np.arange(len(rows.residual)), unseen)
-        for place, each in enumerate(both):
-            squares[place] += float(np.sum(each.some(unseen).left(each.some(others).solve()) ** 2))
-    return squares[1] < MAX_LEFT_UNSEEN**2 * squares[0]
+        held_out = np.arange(fold, count, FOLDS)
+        fitted = np.setdiff1d(np.arange(count), held_out)
+        squares += _squares_on(rows, held_out, fitted)
+        changed_squares += _squares_on(changed, held_out, fitted)
+    return changed_squares < MAX_LEFT_UNSEEN**2 * squares
+
+
+def _squares_on(rows: Rows, held_out: np.ndarray, fitted: np.ndarray) -> float:
+    """Return the sum of squares of some rows with the estimate by others."""
+    residuals = rows.some(held_out).residuals(rows.some(fitted).solve())
+    return float(np.sum(residuals**2))
 
 
 def _described(rows: Rows, change: Change) -> Finding:
@@ -318,17 +378,22 @@ def _described(rows: Rows, change: Change) -> Finding:
     extended = rows.with_columns(change.columns)
     estimate = extended.solve()
     count = change.subject.count
-    after, before = extended.left(estimate), rows.left(rows.solve())
-    dof = max(after.size - extended.matrix.shape[2] + _held(extended), 1.0)
+    before = rows.residuals(rows.solve())
+    after = extended.residuals(estimate)
+    dof = max(after.size - extended.matrix.shape[2] + extended.resting(), 1.0)
     covariance = scipy.linalg.inv(extended.normal()) * float(np.sum(after**2)) / dof
-    moved, spread = estimate[-count:], covariance[-count:, -count:]
+    change_estimate = estimate[-count:]
+    change_covariance = covariance[-count:, -count:]
     if count == 1:
-        size, sigma = float(moved[0]), float(np.sqrt(spread[0, 0]))
-    else:  # at the targets [m], rms over the rows
+        size = float(change_estimate[0])
+        sigma = float(np.sqrt(change_covariance[0, 0]))
+    else:
+        # at the targets [m], rms over the rows
         columns = change.subject.columns[:, :3] * rows.metres[:, None, None]
         weight = np.einsum("mdk,mdl->kl", columns, columns) / len(columns)
-        size = float(np.sqrt(moved @ weight @ moved))
-        sigma = float(np.sqrt(moved @ weight @ spread @ weight @ moved)) / max(size, 1e-300)
+        gradient = change_estimate @ weight
+        size = float(np.sqrt(gradient @ change_estimate))
+        sigma = float(np.sqrt(gradient @ change_covariance @ weight @ change_estimate)) / max(size, 1e-300)
     numbers = rows.block.measured.rows
     values = {
         "file": Path(rows.block.measured.file).name or "measurements",
@@ -342,5 +407,5 @@ def _described(rows: Rows, change: Change) -> Finding:
     }
     if change.between is None:
         return finding(DRIFTS[change.subject.code], **values)
-    last, following = (int(row) for row in change.between)
-    return finding(STEPS[change.subject.code], last=last, next=following, **values)
+    last, following = change.between
+    return finding(STEPS[change.subject.code], last=int(last), next=int(following), **values)

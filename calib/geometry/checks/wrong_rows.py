@@ -4,7 +4,7 @@ Both are judged by what an arm with any placements leaves at least. Positions y 
 by the joints and B, b, p the placements, are linear in B ⊗ p, B and b: 13 numbers per axis of y.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -16,25 +16,33 @@ from calib.geometry.installation import Installation
 from calib.records import evenly
 from calib.robot.kinematics import forward
 
-SHIFTS = (1, -1, 2, -2)  # rows between a measurement and its joints: a lost point, a line of the header
-MIN_SHIFTED = 8  # rows that are shifted at least (our choice)
-MIN_PAIRED = 0.5  # share of the rows whose shifted joints are there, not held out (our choice)
-MAX_CUTS = 120  # first rows of a shift that are tried at once; then those between (our choice)
-MIN_MIXED = 24  # rows in which two targets are looked for (our choice)
-MAX_ROUNDS = 50  # of sorting rows by target; a few are needed
+# rows between a measurement and its joints: a lost point, a line of the header
+SHIFTS = (1, -1, 2, -2)
+# rows that are shifted at least (our choice)
+MIN_SHIFTED = 8
+# share of the rows whose shifted joints are there, not held out (our choice)
+MIN_PAIRED = 0.5
+# first rows of a shift that are tried at once; then those between (our choice)
+MAX_CUTS = 120
+# rows in which two targets are looked for (our choice)
+MIN_MIXED = 24
+# of sorting rows by target; a few are needed
+MAX_ROUNDS = 50
 Blocks = Sequence[PoseMeasurements]
 
 
 def least_error(nominal: Installation, blocks: Blocks) -> np.ndarray:
     """Return the least mean squared error [m²] (1,) that any base and tool placement can reach; 0 if not known."""
-    squares, count = 0.0, 0
+    squares = 0.0
+    count = 0
     for block in blocks:
         if nominal.known.terms or not isinstance(block, Positions):
             return np.zeros(1)
         columns = _columns(nominal, block)
         for tool in np.unique(block.tool):
             rows = block.tool == tool
-            squares += float((_unexplained(columns[rows], block.position[rows]) ** 2).sum())
+            residual = _unexplained(columns[rows], block.position[rows])
+            squares += float((residual**2).sum())
         count += len(block)
     return np.array([squares / count])
 
@@ -46,6 +54,7 @@ def _columns(nominal: Installation, block: Positions) -> np.ndarray:
 
 
 def _unexplained(columns: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Return the residual (m, 3) of the linear fit of positions by columns."""
     return position - columns @ np.linalg.lstsq(columns, position)[0]
 
 
@@ -61,43 +70,46 @@ def row_shifts(nominal: Installation, blocks: Blocks, max_left: float) -> list[C
     for number, block in enumerate(blocks):
         if not isinstance(block, Positions) or nominal.known.terms:
             continue
-        for by in SHIFTS:
-            first = _best_first(nominal, block, by)
-            if first is not None:
-                values = {"first": first, "by": abs(by), "way": "down" if by > 0 else "up", "file": block.file}
-                changes.append(Change("rows-shifted", partial(_shifted_block, number, first, by), (), values, max_left))
+        for shift in SHIFTS:
+            first = _best_first(nominal, block, shift)
+            if first is None:
+                continue
+            direction = "down" if shift > 0 else "up"
+            values = {"first": first, "by": abs(shift), "way": direction, "file": block.file}
+            make = partial(_shifted_block, number, first, shift)
+            changes.append(Change("rows-shifted", make, (), values, max_left))
     return changes
 
 
-def _best_first(nominal: Installation, block: Positions, by: int) -> int | None:
+def _best_first(nominal: Installation, block: Positions, shift: int) -> int | None:
     """Return the number of the row from which on a shift explains most; None for too few rows."""
-    numbers = np.unique(block.rows)[: -MIN_SHIFTED - abs(by)]
-    if len(numbers) < MIN_SHIFTED or len(_shifted(block, 0, by)) < MIN_PAIRED * len(block):
+    numbers = np.unique(block.rows)[: -MIN_SHIFTED - abs(shift)]
+    if len(numbers) < MIN_SHIFTED or len(_shifted(block, 0, shift)) < MIN_PAIRED * len(block):
         return None
 
-    def left(first: int) -> float:
-        return float(least_error(nominal, [_shifted(block, first, by)])[0])
+    def error(first: int) -> float:
+        return float(least_error(nominal, [_shifted(block, first, shift)])[0])
 
-    some = numbers[evenly(len(numbers), MAX_CUTS)]
-    best = int(min(some, key=left))
+    coarse = numbers[evenly(len(numbers), MAX_CUTS)]
+    best = int(min(coarse, key=error))
     around = numbers[np.abs(numbers - best) < max(len(numbers) // MAX_CUTS, 1)]
-    return int(min(around, key=left))
+    return int(min(around, key=error))
 
 
-def _shifted_block(number: int, first: int, by: int, blocks: Blocks) -> Blocks:
+def _shifted_block(number: int, first: int, shift: int, blocks: Blocks) -> Blocks:
     """Return the blocks, one of them shifted."""
     block = blocks[number]
     assert isinstance(block, Positions)
-    return [*blocks[:number], _shifted(block, first, by), *blocks[number + 1 :]]
+    return [*blocks[:number], _shifted(block, first, shift), *blocks[number + 1 :]]
 
 
-def _shifted(block: Positions, first: int, by: int) -> Positions:
-    """Return a block whose rows from number `first` on have the joints of the row `by` further down."""
+def _shifted(block: Positions, first: int, shift: int) -> Positions:
+    """Return a block whose rows from number `first` on have the joints of the row `shift` further down."""
     numbers, index = np.unique(block.rows, return_index=True)
-    source = np.where(block.rows >= first, block.rows + by, block.rows)
-    found = np.minimum(np.searchsorted(numbers, source), len(numbers) - 1)
-    there = np.flatnonzero(numbers[found] == source)
-    return replace(take(block, there), q=block.q[index[found[there]]])
+    source = np.where(block.rows >= first, block.rows + shift, block.rows)
+    position = np.minimum(np.searchsorted(numbers, source), len(numbers) - 1)
+    present = np.flatnonzero(numbers[position] == source)
+    return replace(take(block, present), q=block.q[index[position[present]]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,12 +118,12 @@ class Mixture:
 
     Attributes:
         second: (m,) whether a row was measured on the second target.
-        apart: distance of the targets [m].
+        distance: of the targets [m].
         squares: what remains [m²].
     """
 
     second: np.ndarray
-    apart: float
+    distance: float
     squares: float
 
 
@@ -132,10 +144,15 @@ def two_targets(nominal: Installation, blocks: Blocks, max_left: float) -> list[
         mixture = _sorted_by_target(_columns(nominal, block), block.position)
         if not 0 < mixture.second.sum() < len(block):
             continue
-        rows = [block.rows[mixture.second == which] for which in (False, True)]
-        values = {"apart": mixture.apart, "file": block.file}
-        values |= {name: [str(row) for row in each] for name, each in zip(("rows", "others"), rows)}
-        make: Callable[[Blocks], Blocks] = partial(_divided, number, frozenset(rows[1].tolist()))
+        first_rows = block.rows[~mixture.second]
+        second_rows = block.rows[mixture.second]
+        values = {
+            "apart": mixture.distance,
+            "file": block.file,
+            "rows": [str(row) for row in first_rows],
+            "others": [str(row) for row in second_rows],
+        }
+        make = partial(_divided, number, frozenset(second_rows.tolist()))
         changes.append(Change("two-targets", make, (), values, max_left))
     return changes
 
@@ -144,8 +161,9 @@ def _divided(number: int, second: frozenset[int], blocks: Blocks) -> Blocks:
     """Return the blocks, the rows `second` of one with a second target."""
     block = blocks[number]
     tool = np.isin(block.rows, list(second)).astype(int)
-    names = (block.tool_names[0], f"{block.tool_names[0]} (second)")
-    return [*blocks[:number], replace(block, tool=tool, tool_names=names), *blocks[number + 1 :]]
+    name = block.tool_names[0]
+    divided = replace(block, tool=tool, tool_names=(name, f"{name} (second)"))
+    return [*blocks[:number], divided, *blocks[number + 1 :]]
 
 
 def _sorted_by_target(columns: np.ndarray, position: np.ndarray) -> Mixture:
@@ -157,27 +175,33 @@ def _sorted_by_target(columns: np.ndarray, position: np.ndarray) -> Mixture:
         columns: (m, 13) of R, t and 1.
         position: (m, 3) [m].
     """
-    turns = columns[:, :9].reshape(-1, 3, 3)
-    base = np.linalg.lstsq(columns, position)[0][9:12]  # Bᵀ
-    in_tip = np.einsum("mji,mj->mi", turns, _unexplained(columns, position) @ base.T)
-    axis = np.linalg.svd(in_tip - in_tip.mean(axis=0), full_matrices=False)[2][0]
-    starts = [in_tip @ axis > 0.0, np.arange(len(columns)) % 2 == 0]
-    return min((_settled(columns, position, start) for start in starts), key=lambda one: one.squares)
+    rotations = columns[:, :9].reshape(-1, 3, 3)
+    base_transposed = np.linalg.lstsq(columns, position)[0][9:12]
+    residual_in_base = _unexplained(columns, position) @ base_transposed.T
+    residual_in_tip = np.einsum("mji,mj->mi", rotations, residual_in_base)
+    centred = residual_in_tip - residual_in_tip.mean(axis=0)
+    axis = np.linalg.svd(centred, full_matrices=False)[2][0]
+    by_axis = _settled(columns, position, residual_in_tip @ axis > 0.0)
+    alternating = _settled(columns, position, np.arange(len(columns)) % 2 == 0)
+    return alternating if alternating.squares < by_axis.squares else by_axis
 
 
 def _settled(columns: np.ndarray, position: np.ndarray, second: np.ndarray) -> Mixture:
     """Return the rows sorted by target from a first guess (m,)."""
-    apart, squares = 0.0, np.inf
+    distance = 0.0
+    squares = np.inf
     for _ in range(MAX_ROUNDS):
-        both = np.column_stack([columns, second[:, None] * columns[:, :9]])
-        found = np.linalg.lstsq(both, position)[0]
-        away = position - columns @ found[:13]
-        step = columns[:, :9] @ found[13:]
-        apart = float(np.linalg.norm(found[13:]) / np.sqrt(3.0))  # B ⊗ (p_2 - p_1), B a rotation
-        sizes = np.sum(away**2, axis=1), np.sum((away - step) ** 2, axis=1)
-        squares = float(np.sum(np.where(second, sizes[1], sizes[0])))
-        fits = sizes[1] < sizes[0]
-        if np.array_equal(fits, second) or fits.all() or not fits.any():
+        matrix = np.column_stack([columns, second[:, None] * columns[:, :9]])
+        solution = np.linalg.lstsq(matrix, position)[0]
+        residual = position - columns @ solution[:13]
+        difference = columns[:, :9] @ solution[13:]
+        # B ⊗ (p_2 - p_1), B a rotation
+        distance = float(np.linalg.norm(solution[13:]) / np.sqrt(3.0))
+        first_squares = np.sum(residual**2, axis=1)
+        second_squares = np.sum((residual - difference) ** 2, axis=1)
+        squares = float(np.sum(np.where(second, second_squares, first_squares)))
+        fits_second = second_squares < first_squares
+        if np.array_equal(fits_second, second) or fits_second.all() or not fits_second.any():
             break
-        second = fits
-    return Mixture(second, apart, squares)
+        second = fits_second
+    return Mixture(second, distance, squares)

@@ -53,68 +53,74 @@ class Information(Frozen):
 
     @property
     def b(self) -> int:
+        """Number of estimated parameters."""
         return len(self.names)
 
     @property
     def best(self) -> float:
         """The minimum of ‖R β - z‖² over all β, physically inconsistent ones included."""
-        unit = np.linalg.norm(self.factor[:, :-1], axis=0)
-        scaled = self.factor[:, :-1] / np.where(unit > 0.0, unit, 1.0)
-        found = np.linalg.lstsq(scaled, self.factor[:, -1], rcond=1e-12)[0]
-        return float(np.sum((scaled @ found - self.factor[:, -1]) ** 2))
+        matrix, target = self.factor[:, :-1], self.factor[:, -1]
+        unit = np.linalg.norm(matrix, axis=0)
+        scaled = matrix / np.where(unit > 0.0, unit, 1.0)
+        solution = np.linalg.lstsq(scaled, target, rcond=1e-12)[0]
+        return float(np.sum((scaled @ solution - target) ** 2))
 
     def distance(self, standard: np.ndarray) -> float:
         """Return the Mahalanobis distance of standard parameters (p,) from the data's optimum, in sigmas."""
-        rest = self.factor[:, :-1] @ (self.transform @ standard) - self.factor[:, -1]
-        return float(np.sqrt(max(float(rest @ rest) - self.best, 0.0)))
+        residual = self.factor[:, :-1] @ (self.transform @ standard) - self.factor[:, -1]
+        square = float(residual @ residual) - self.best
+        return float(np.sqrt(max(square, 0.0)))
 
 
-def of(found: Identification, chain: Chain) -> Information:
+def of(identification: Identification, chain: Chain) -> Information:
     """Return the information of the data of an identification in memory."""
-    estimate, standard = found.fitted.estimate, found.dynamics.model.names
-    transform = _transform(found.names, regrouping(found.base), standard)
+    estimate = identification.fitted.estimate
+    standard = identification.dynamics.model.names
     return Information(
-        chain,
-        found.dynamics,
-        found.names,
-        estimate.units,
-        estimate.values,
-        estimate.covariance,
-        transform,
-        _information(found),
+        chain=chain,
+        dynamics=identification.dynamics,
+        names=identification.names,
+        units=estimate.units,
+        values=estimate.values,
+        covariance=estimate.covariance,
+        transform=_transform(identification.names, regrouping(identification.base), standard),
+        factor=_information(identification),
     )
 
 
-def _information(found: Identification) -> np.ndarray:
+def _information(identification: Identification) -> np.ndarray:
     """Return the R factor [R z] (b + 1, b + 1) of an identification's data, without prior or constraints.
 
     Rows count as their residuals' autocorrelation lets them. The ridge of richer friction stays in: those terms have
     no other prior.
     """
-    fitted, own = found.fitted, found.base.b
+    from calib.identification.time_folds import estimate
+
+    fitted = identification.fitted
+    base_count = identification.base.b
     data, std, inflation = fitted.testable()
-    rows = [combine(data, std * np.sqrt(inflation))]
-    count = len(found.names) - own
-    if count:
-        group = np.concatenate([np.full(own, -1), found.friction.groups]).astype(int)
-        from calib.identification.time_folds import estimate
+    factors = [combine(data, std * np.sqrt(inflation))]
+    richer_count = len(identification.names) - base_count
+    if richer_count:
+        group = np.concatenate([np.full(base_count, -1), identification.friction.groups]).astype(int)
+        prior_rows = None
+        if identification.prior is not None:
+            prior_rows = identification.prior.widened(richer_count)
+        _, ridges = estimate(fitted.pooled, fitted.std, fitted.inflation, group, prior_rows)
+        ridge_rows = np.zeros((richer_count, base_count + richer_count + 1))
+        ridge_rows[:, base_count:-1] = np.diag(1.0 / np.maximum(ridges[base_count:], 1e-12))
+        factors.append(ridge_rows)
+    return retriangulate(np.vstack(factors))
 
-        known = None if found.prior is None else found.prior.widened(count)
-        ridges = estimate(fitted.pooled, fitted.std, fitted.inflation, group, known)[1]
-        drawn = np.zeros((count, own + count + 1))
-        drawn[:, own:-1] = np.diag(1.0 / np.maximum(ridges[own:], 1e-12))
-        rows.append(drawn)
-    return retriangulate(np.vstack(rows))
 
-
-def read(folder: str | Path, given: tuple[Chain, Dynamics] | None = None) -> Information:
-    """Return the information of the identification stored in `folder`; `given`: its robot and model, read already.
+def read(folder: str | Path, model: tuple[Chain, Dynamics] | None = None) -> Information:
+    """Return the information of the identification stored in `folder`; `model`: its robot and model, read already.
 
     Raises:
         RobotError: where the folder holds none, or one of a version that did not write how parameters regroup.
     """
     folder = Path(folder)
-    chain, dynamics = given or read_dynamics(folder)
+    chain, dynamics = model or read_dynamics(folder)
     groups = read_table(folder).get("regrouping")
     if groups is None:
         raise RobotError(f"{folder}/dynamics.json lacks the regrouping of parameters; identify again")
@@ -123,14 +129,17 @@ def read(folder: str | Path, given: tuple[Chain, Dynamics] | None = None) -> Inf
         (OSError, KeyError, ValueError),
         f"{folder}: estimate.csv, covariance.csv and dynamics.json do not agree: {{}}",
     ):
-        estimate = read_estimate(folder)
-        names, units = (tuple(getattr(one, key) for one in estimate) for key in ("name", "unit"))
-        values = np.array([one.value for one in estimate])
-        covariance = read_covariance(folder)[1]
+        parameters = read_estimate(folder)
+        names = tuple(parameter.name for parameter in parameters)
+        units = tuple(parameter.unit for parameter in parameters)
+        values = np.array([parameter.value for parameter in parameters])
+        _, covariance = read_covariance(folder)
         transform = _transform(names, groups, dynamics.model.names)
-        data, known = folder / INFORMATION, (folder / INFORMATION).is_file()
-        require(known or (np.diag(covariance) > 0.0).all(), "a parameter without variance", ValueError)
-        factor = np.loadtxt(data, delimiter=",", skiprows=1, ndmin=2) if known else whitened(values, covariance)
+        if (folder / INFORMATION).is_file():
+            factor = np.loadtxt(folder / INFORMATION, delimiter=",", skiprows=1, ndmin=2)
+        else:
+            require((np.diag(covariance) > 0.0).all(), "a parameter without variance", ValueError)
+            factor = whitened(values, covariance)
         if covariance.shape != (len(names), len(names)) or factor.shape[1] != len(names) + 1:
             raise ValueError("files of different sizes")
     return Information(chain, dynamics, names, units, values, covariance, transform, factor)
@@ -138,14 +147,15 @@ def read(folder: str | Path, given: tuple[Chain, Dynamics] | None = None) -> Inf
 
 def _transform(names: tuple[str, ...], groups: dict[str, dict[str, float]], standard: tuple[str, ...]) -> np.ndarray:
     """Return the regrouping matrix T (b, p) of standard parameters; rows of richer friction are unit rows."""
-    place = {name: k for k, name in enumerate(standard)}
-    result = np.zeros((len(names), len(standard)))
+    column_of = {name: column for column, name in enumerate(standard)}
+    transform = np.zeros((len(names), len(standard)))
     for row, name in enumerate(names):
-        for own, coefficient in groups.get(name, {name: 1.0}).items():
-            result[row, place[own]] = coefficient
-    return result
+        coefficients = groups.get(name, {name: 1.0})
+        for standard_name, coefficient in coefficients.items():
+            transform[row, column_of[standard_name]] = coefficient
+    return transform
 
 
-def write(found: Identification, folder: Path) -> None:
+def write(identification: Identification, folder: Path) -> None:
     """Write the R factor of an identification's data (`_information`)."""
-    files.write_numbers(folder / INFORMATION, (*found.names, "target"), _information(found))
+    files.write_numbers(folder / INFORMATION, (*identification.names, "target"), _information(identification))

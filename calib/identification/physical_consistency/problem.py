@@ -30,9 +30,18 @@ from calib.identification.prior import DRIVES, PAYLOAD, RADIUS, ROTOR, rods
 from calib.records import Frozen
 from calib.robot.chain import Chain
 
-THIN = 5e-3  # [m]: no body of a robot's arm has its mass within less, as a standard deviation (our choice)
-LIGHT = 0.02  # of the heaviest body: the mass of one whose CAD has none
-TOTALS = tuple(float(10.0 ** (k / 2)) for k in range(0, 7))  # [kg] of an arm without CAD, 1 kg to 1 t
+THIN = 5e-3
+"""Standard deviation of the mass of an arm's body in any direction, at least [m] (our choice)."""
+LIGHT = 0.02
+"""Mass of a body whose CAD has none, in units of the heaviest body's."""
+TOTALS = tuple(float(10.0 ** (k / 2)) for k in range(0, 7))
+"""Masses of an arm without CAD that are tried, 1 kg to 1 t [kg]."""
+DRIVE = 1.0
+"""Weight of the prior of Ia, Fv, Fc."""
+WEAK = 2.0
+"""γ of payloads: nothing is known of them but the order of size."""
+MAX_TRACE = 1e3
+"""Largest tr(P⁰⁻¹ P) / 4 of a body: keeps what the data do not show finite."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,30 +65,33 @@ class PriorBodies(Frozen):
 
 def find_prior_bodies(chain: Chain, model: IdentificationModel) -> Iterator[PriorBodies]:
     """Yield the candidate priors, to be selected by evidence: CAD values alone, or rods with several total masses."""
-    carried = model.bodies.coordinates < 0
+    is_payload = model.bodies.coordinates < 0
     if chain.inertias is not None and chain.inertias[:, 9].max() > 0.0:
-        yield _cad(chain, model, carried)
+        yield _cad(chain, model, is_payload)
         return
     for total in TOTALS:
-        bodies = rods(chain, model, total)
-        words = f"rods between the joints (the description has no masses), {total:.3g} kg in all by evidence"
-        yield PriorBodies(bodies, ~carried, False, words)
+        source = f"rods between the joints (the description has no masses), {total:.3g} kg in all by evidence"
+        yield PriorBodies(rods(chain, model, total), ~is_payload, False, source)
 
 
-def _cad(chain: Chain, model: IdentificationModel, carried: np.ndarray) -> PriorBodies:
+def _cad(chain: Chain, model: IdentificationModel, is_payload: np.ndarray) -> PriorBodies:
+    """Return the prior of a description's inertias, with inconsistent and missing ones replaced."""
+    described = standard_parameters(chain).reshape(-1, 10)
     bodies = np.zeros((model.bodies.count, 10))
-    own = standard_parameters(chain).reshape(-1, 10)
-    bodies[: len(own)] = own
-    heaviest, notes, drawn = float(own[:, 9].max()), [], ~carried
+    bodies[: len(described)] = described
+    light_mass = LIGHT * float(described[:, 9].max())
+    drawn = ~is_payload
+    notes = []
     for i, label in enumerate(model.bodies.labels):
-        if carried[i]:
+        if is_payload[i]:
             bodies[i] = pseudo_inertia.ball(*PAYLOAD)
-        elif not own[i, 9] > 0.0:
-            bodies[i], drawn[i] = pseudo_inertia.ball(LIGHT * heaviest, RADIUS / 2), False
-            notes.append(f"body {label} has no mass in the CAD: weakly regularised towards {LIGHT * heaviest:.2g} kg")
-        elif pseudo_inertia.margin(own[i]) < THIN:
-            bodies[i] = _thickened(own[i])
-            if pseudo_inertia.margin(own[i]) < 0.0:
+        elif not described[i, 9] > 0.0:
+            bodies[i] = pseudo_inertia.ball(light_mass, RADIUS / 2)
+            drawn[i] = False
+            notes.append(f"body {label} has no mass in the CAD: weakly regularised towards {light_mass:.2g} kg")
+        elif pseudo_inertia.margin(described[i]) < THIN:
+            bodies[i] = _thickened(described[i])
+            if pseudo_inertia.margin(described[i]) < 0.0:
                 notes.append(
                     f"CAD inertia of body {label} is physically inconsistent: the nearest consistent one is used"
                 )
@@ -89,14 +101,13 @@ def _cad(chain: Chain, model: IdentificationModel, carried: np.ndarray) -> Prior
 def _thickened(body: np.ndarray) -> np.ndarray:
     """Return a body's parameters with its mass spread by at least `THIN` in every direction about its centre."""
     pseudo = pseudo_inertia.from_standard(body)
-    mass, centre = pseudo[3, 3], pseudo[:3, 3] / pseudo[3, 3]
-    size, axes = np.linalg.eigh(pseudo[:3, :3] / mass - np.outer(centre, centre))
-    pseudo[:3, :3] = mass * ((axes * np.maximum(size, THIN**2)) @ axes.T + np.outer(centre, centre))
+    mass = pseudo[3, 3]
+    centre = pseudo[:3, 3] / mass
+    centre_square = np.outer(centre, centre)
+    variances, axes = np.linalg.eigh(pseudo[:3, :3] / mass - centre_square)
+    thickened = (axes * np.maximum(variances, THIN**2)) @ axes.T
+    pseudo[:3, :3] = mass * (thickened + centre_square)
     return pseudo_inertia.to_standard(pseudo)
-
-
-DRIVE = 1.0  # weight of the prior of Ia, Fv, Fc
-WEAK = 2.0  # γ of payloads: nothing is known of them but the order of size
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,27 +147,30 @@ class BodyCost:
 def make_problem(information: Information, references: PriorBodies) -> BodyCost:
     """Return the cost function of an identified model; prior sizes of drive terms come from the recorded torque."""
     model = information.dynamics.model
-    bodies = model.bodies.count
-    columns = information.factor[:, :-1] @ information.transform
-    norms, target = np.linalg.norm(columns, axis=0), np.linalg.norm(information.factor[:, -1])
-    usual = np.median(norms[norms > 0.0])  # not the largest: a term that was switched off is pinned to zero
-    norms = norms[10 * bodies :]
-    seen = norms > 1e-8 * usual
-    whole = target / np.where(seen, norms, 1.0)  # would explain all of the torque
-    positive = np.array([one.nonnegative for one in model.columns], dtype=bool)
-    sizes = np.where(positive, 0.1 * whole, DRIVES * whole)
+    inertial = 10 * model.bodies.count
+    matrix, target = information.factor[:, :-1], information.factor[:, -1]
+    columns = matrix @ information.transform
+    norms = np.linalg.norm(columns, axis=0)
+    # The median, not the largest: a term that was switched off is pinned to zero.
+    median = np.median(norms[norms > 0.0])
+    term_norms = norms[inertial:]
+    identified = term_norms > 1e-8 * median
+    # Values that would explain all of the torque.
+    explaining = np.linalg.norm(target) / np.where(identified, term_norms, 1.0)
+    positive = np.array([term.nonnegative for term in model.columns], dtype=bool)
+    sizes = np.where(positive, 0.1 * explaining, DRIVES * explaining)
     mass = float(references.parameters[:, 9].sum())
-    for k, one in enumerate(model.columns):
-        if one.shape == "acceleration" and positive[k]:
+    for k, term in enumerate(model.columns):
+        if term.shape == "acceleration" and positive[k]:
             sizes[k] = min(sizes[k], mass * ROTOR**2)
     return BodyCost(
-        np.column_stack([columns, information.factor[:, -1]]),
-        bodies,
-        pseudo_inertia.from_standard(references.parameters),
-        references.drawn,
-        np.where(seen, sizes, 0.0),
-        positive,
-        information.dynamics.values[10 * bodies :],
+        factor=np.column_stack([columns, target]),
+        bodies=model.bodies.count,
+        references=pseudo_inertia.from_standard(references.parameters),
+        drawn=references.drawn,
+        sizes=np.where(identified, sizes, 0.0),
+        positive=positive,
+        fixed=information.dynamics.values[inertial:],
     )
 
 
@@ -164,52 +178,67 @@ def nearest(problem: BodyCost, spared: int | None = None, pull: float = 0.0) -> 
     """Return the physically consistent standard parameters (p,) nearest to the data's optimum.
 
     Args:
-        spared: a body (counted from 0, or from B on a term) that may be impossible.
+        problem: data, prior bodies and drive terms.
+        spared: a body (counted from 0, or from B on a term) that may be inconsistent.
         pull: γ of the Euclidean prior; 0: none.
 
     Raises:
         NotConverged: where Clarabel finds no optimum.
     """
-    matrix, count = _coordinates(problem), problem.bodies
-    columns = problem.factor[:, :-1] @ matrix
-    fixed = ~problem.free
-    given = np.where(fixed[10 * count :], problem.fixed, 0.0)
-    target = problem.factor[:, -1] - problem.factor[:, 10 * count : -1] @ given
+    count = problem.bodies
+    inertial = 10 * count
+    coordinates = _coordinates(problem)
+    fixed_values = np.where(problem.free[inertial:], 0.0, problem.fixed)
+    columns = problem.factor[:, :-1] @ coordinates
+    target = problem.factor[:, -1] - problem.factor[:, inertial:-1] @ fixed_values
     goal = retriangulate(np.column_stack([columns, target]))[:-1]
     if pull > 0.0:
-        goal = np.vstack([goal, _pulling(problem, pull)])
+        goal = np.vstack([goal, _euclidean_prior(problem, pull)])
     goal = goal / max(1.0, float(np.linalg.norm(goal[:, -1])))
+
+    # Bounds: the trace of each body, except of the spared one, and positive terms.
     bodies = pseudo_inertia.unknown_bodies(count, len(problem.sizes))
     positive = [k for k in np.flatnonzero(problem.positive) if count + k != spared]
-    max_trace = 1e3  # of tr(P⁰⁻¹ P) / 4: keeps what the data do not see finite
-    rows = np.vstack([-np.einsum("irrj->ij", bodies) / (4.0 * max_trace), np.eye(len(matrix))[10 * count :][positive]])
+    traces = -np.einsum("irrj->ij", bodies) / (4.0 * MAX_TRACE)
+    term_rows = np.eye(len(coordinates))[inertial:]
+    rows = np.vstack([traces, term_rows[positive]])
     offset = np.repeat([1.0, 0.0], [count, len(positive)])
-    least = np.where(np.arange(count) == spared, -4.0 * max_trace, 0.0)
-    result = matrix @ minimise(goal[:, :-1], goal[:, -1], rows, offset, bodies, least).values
-    result[10 * count :] += given
-    return np.asarray(result)
+    lower = np.where(np.arange(count) == spared, -4.0 * MAX_TRACE, 0.0)
+    solution = minimise(goal[:, :-1], goal[:, -1], rows, offset, bodies, lower)
+    parameters = coordinates @ solution.values
+    parameters[inertial:] += fixed_values
+    return np.asarray(parameters)
 
 
-def _pulling(problem: BodyCost, pull: float) -> np.ndarray:
+def _euclidean_prior(problem: BodyCost, pull: float) -> np.ndarray:
     """Return the Euclidean prior as rows of [W y] in the coordinates of `_coordinates`."""
-    flat = pseudo_inertia.UNITS.reshape(10, 16).T
-    bodies = [np.sqrt(0.5 * weight) * np.column_stack([flat, np.eye(4).ravel()]) for weight in problem.weights(pull)]
+    basis = pseudo_inertia.UNITS.reshape(10, 16).T
+    identity = np.eye(4).ravel()
+    blocks, targets = [], []
+    for weight in problem.weights(pull):
+        root = np.sqrt(0.5 * weight)
+        blocks.append(root * basis)
+        targets.append(root * identity)
     terms = np.sqrt(np.where(problem.positive, 0.5 * DRIVE, 1.0)) * (problem.sizes > 0.0)
-    unknowns = np.asarray(scipy.linalg.block_diag(*(one[:, :-1] for one in bodies), np.diag(terms)))
-    return np.column_stack([unknowns, np.concatenate([*(one[:, -1] for one in bodies), terms * problem.positive])])
+    blocks.append(np.diag(terms))
+    targets.append(terms * problem.positive)
+    matrix = np.asarray(scipy.linalg.block_diag(*blocks))
+    return np.column_stack([matrix, np.concatenate(targets)])
 
 
-def blame(problem: BodyCost, information: Information, most: int = 3) -> tuple[tuple[str, float], ...]:
+def blame(problem: BodyCost, information: Information, count: int = 3) -> tuple[tuple[str, float], ...]:
     """Return the bodies and terms whose constraint costs most: name, and the distance without this constraint."""
     model = information.dynamics.model
-    found = [(f"body {label}", i) for i, label in enumerate(model.bodies.labels)]
-    found += [
-        (one.name, problem.bodies + k)
-        for k, one in enumerate(model.columns)
-        if problem.positive[k] and problem.sizes[k] > 0.0
-    ]
-    left = sorted((information.distance(nearest(problem, place)), name) for name, place in found)
-    return tuple((name, distance) for distance, name in left[:most])
+    constraints = [(f"body {label}", i) for i, label in enumerate(model.bodies.labels)]
+    for k, term in enumerate(model.columns):
+        if problem.positive[k] and problem.sizes[k] > 0.0:
+            constraints.append((term.name, problem.bodies + k))
+    distances = []
+    for name, number in constraints:
+        without_constraint = nearest(problem, number)
+        distances.append((information.distance(without_constraint), name))
+    distances.sort()
+    return tuple((name, distance) for distance, name in distances[:count])
 
 
 def _coordinates(problem: BodyCost) -> np.ndarray:
@@ -218,5 +247,6 @@ def _coordinates(problem: BodyCost) -> np.ndarray:
     ξ_i are the entries of Q_i by an orthonormal basis.
     """
     roots = np.linalg.cholesky(problem.references)[:, None]
-    blocks = pseudo_inertia.to_standard(roots @ pseudo_inertia.UNITS @ roots.transpose(0, 1, 3, 2))
-    return np.asarray(scipy.linalg.block_diag(*blocks.transpose(0, 2, 1), np.diag(problem.sizes)))
+    pseudo = roots @ pseudo_inertia.UNITS @ roots.transpose(0, 1, 3, 2)
+    blocks = pseudo_inertia.to_standard(pseudo).transpose(0, 2, 1)
+    return np.asarray(scipy.linalg.block_diag(*blocks, np.diag(problem.sizes)))

@@ -20,7 +20,7 @@ degrees of freedom (our observation), so γ has a marginal likelihood,
 
 Laplace's approximation, J the cost and H its curvature at the optimum: the weight is where that is largest (our choice;
 blocks of one poor motion repeat each other, so that cross-validation on them wants no prior at all). γ is not let below
-`min_cad_weight`, where masses may be wrong by √(2/γ), a third (10 for rods, below which Laplace's approximation fails):
+`MIN_CAD_WEIGHT`, where masses may be wrong by √(2/γ), a third (10 for rods, below which Laplace's approximation fails):
 what no model explains must not pass for a wrong CAD. Only where a possible robot is within the estimate's covariance
 and the result is not, γ is lowered until it is.
 
@@ -65,13 +65,50 @@ from calib.identification.prediction import Dynamics
 from calib.records import Frozen
 from calib.robot.chain import Chain
 
+WEIGHTS = tuple(float(10.0 ** (k / 4)) for k in range(0, 19))
+"""γ that are tried, 1 to 30 000."""
+MIN_CAD_WEIGHT = 20.0
+"""Least γ with a CAD."""
+MIN_WEIGHT = 1e-3
+"""Least γ, where the estimate asks for less CAD than the evidence does."""
+WEAK_WEIGHT = 1.0
+"""γ that hardly draws, yet keeps Newton's steps off the border: its distance is at most a tenth larger."""
+MAX_TIMES = 3.0
+"""Times the bound, up to which no semidefinite program is solved for the last tenth of a distance."""
+PRIORS = ("entropic", "euclidean")
+RIDGES = (0.0, 1e-12, 1e-10, 1e-8, 1e-6)
+"""Ridges of a unit diagonal that are tried."""
+SETTLED = 1e-8
+"""Newton decrement² at which the search ends: the cost is within half of it of its minimum."""
+MAX_STEPS = 200
+"""Steps of Newton's method, at most."""
+MIN_STEP = 1e-12
+"""Fraction of a Newton step below which rounding keeps any step from lowering the cost."""
+THIN_MARGIN = 1e-3
+"""Consistency margin below which a body is hardly realistic [m]."""
+
+
 if TYPE_CHECKING:
     from calib.identification.identify import Identification
 
-WEIGHTS = tuple(float(10.0 ** (k / 4)) for k in range(0, 19))  # γ tried, 1 to 30 000
-PRIORS = ("entropic", "euclidean")
-RIDGES = (0.0, 1e-12, 1e-10, 1e-8, 1e-6)  # of a unit diagonal
-SETTLED = 1e-8  # Newton decrement²: the cost is within half of it of its least
+
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    """The optimum of a cost for one prior weight.
+
+    Attributes:
+        evidence: log p(data | γ), up to a constant.
+        gamma: the weight.
+        problem: the cost, with the data's sigmas widened.
+        values: (p,) the optimum.
+        references: the prior bodies.
+    """
+
+    evidence: float
+    gamma: float
+    problem: BodyCost
+    values: np.ndarray
+    references: PriorBodies
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,53 +173,63 @@ def find_possible(information: Information, weight: float | None = None, prior: 
     if not model.torque_rows.has_bodies:
         raise UsageError("the model has only drives (kind 'drive'), no bodies to make consistent")
     allowed = bound(information.b)
-    choices = [
-        (references, make_problem(information, references))
-        for references in find_prior_bodies(information.chain, model)
+    priors = find_prior_bodies(information.chain, model)
+    choices = [(references, make_problem(information, references)) for references in priors]
+
+    # Distance of the nearest consistent robot: of the first and the last choice, whose coordinates differ most.
+    nearest_distance, nearest_problem = np.inf, choices[0][1]
+    for _, problem in choices[:: max(len(choices) - 1, 1)]:
+        distance = information.distance(nearest(problem))
+        if distance < nearest_distance:
+            nearest_distance, nearest_problem = distance, problem
+    blamed = ()
+    if nearest_distance > allowed:
+        blamed = blame(nearest_problem, information)
+
+    # The weight of the prior by evidence, reduced where it alone leaves the estimate's covariance.
+    doubt = max(1.0, nearest_distance / np.sqrt(information.b))
+    candidates = [
+        candidate for references, problem in choices for candidate in _candidates(references, problem, weight, doubt)
     ]
-    away, problem = min(
-        ((information.distance(nearest(problem)), problem) for _, problem in choices[:: max(len(choices) - 1, 1)]),
-        key=lambda pair: pair[0],
-    )
-    blamed = blame(problem, information) if away > allowed else ()
-    doubt = max(1.0, away / np.sqrt(information.b))
-    _, gamma, problem, values, references = max(
-        (candidate for choice in choices for candidate in _candidates(*choice, weight, doubt)), key=lambda one: one[0]
-    )
+    best = max(candidates, key=lambda candidate: candidate.evidence)
+    gamma, problem, values = best.gamma, best.problem, best.values
     euclidean = prior == "euclidean"
-    values = nearest(problem, pull=gamma) if euclidean else values
-    min_gamma = 1e-3  # of γ, where the estimate asks for less CAD than the evidence does
-    while weight is None and away <= allowed < information.distance(values) and gamma > min_gamma:
-        gamma /= 2.0
-        values = nearest(problem, pull=gamma) if euclidean else solve(problem, gamma)
-    curved_at = _reference(problem) if euclidean else values
+    if euclidean:
+        values = nearest(problem, pull=gamma)
+    if weight is None:
+        while nearest_distance <= allowed < information.distance(values) and gamma > MIN_WEIGHT:
+            gamma /= 2.0
+            values = nearest(problem, pull=gamma) if euclidean else solve(problem, gamma)
+    curvature_at = _reference(problem) if euclidean else values
+    margins = [pseudo_inertia.margin(body) for body in _bodies(problem, values)]
     return PossibleBodies(
-        Dynamics(model, values),
-        _covariance(problem, gamma, curved_at),
-        gamma,
-        doubt,
-        np.array([pseudo_inertia.margin(body) for body in _bodies(problem, values)]),
-        information.distance(values),
-        away,
-        allowed,
-        blamed,
-        references.source,
-        prior,
-        (*references.notes, *_notes(model, problem, values)),
+        dynamics=Dynamics(model, values),
+        covariance=_covariance(problem, gamma, curvature_at),
+        weight=gamma,
+        doubt=doubt,
+        margins=np.array(margins),
+        distance=information.distance(values),
+        nearest=nearest_distance,
+        allowed=allowed,
+        blamed=blamed,
+        source=best.references.source,
+        prior=prior,
+        notes=(*best.references.notes, *_notes(model, problem, values)),
     )
 
 
-def _candidates(
-    references: PriorBodies, problem: BodyCost, weight: float | None, doubt: float
-) -> Iterator[tuple[float, float, BodyCost, np.ndarray, PriorBodies]]:
+def _candidates(references: PriorBodies, problem: BodyCost, weight: float | None, doubt: float) -> Iterator[_Candidate]:
     """Yield the optimum for each prior weight with its evidence; the data's sigmas are widened by `doubt`."""
-    doubted = replace(problem, factor=problem.factor / doubt)
-    min_cad_weight = 20.0  # of γ with a CAD
-    usual = [g for g in WEIGHTS if g >= min_cad_weight] if references.cad else WEIGHTS[4::3]
+    widened = replace(problem, factor=problem.factor / doubt)
+    weights: Sequence[float] = WEIGHTS[4::3]
+    if weight is not None:
+        weights = [weight]
+    elif references.cad:
+        weights = [gamma for gamma in WEIGHTS if gamma >= MIN_CAD_WEIGHT]
     values = None
-    for gamma in usual if weight is None else [weight]:
-        values = solve(doubted, gamma, values)
-        yield _evidence(doubted, gamma, values), gamma, doubted, values, references
+    for gamma in weights:
+        values = solve(widened, gamma, values)
+        yield _Candidate(_evidence(widened, gamma, values), gamma, widened, values, references)
 
 
 def solve(problem: BodyCost, gamma: float, start: np.ndarray | None = None) -> np.ndarray:
@@ -198,93 +245,113 @@ def solve(problem: BodyCost, gamma: float, start: np.ndarray | None = None) -> n
     if start is not None:
         return _descend(problem, gamma, start)
     values = _reference(problem)
-    rest = problem.factor[:, :-1] @ values - problem.factor[:, -1]
-    for power in range(max(int(np.ceil(np.log10(1.0 + float(rest @ rest)))), 0), -1, -1):
+    residual = problem.factor[:, :-1] @ values - problem.factor[:, -1]
+    first_power = int(np.ceil(np.log10(1.0 + float(residual @ residual))))
+    for power in range(max(first_power, 0), -1, -1):
         values = _descend(replace(problem, lift=10.0**power), gamma, values)
     return values
 
 
 def _reference(problem: BodyCost) -> np.ndarray:
     """Return the standard parameters (p,) at the centre of the priors."""
-    terms = np.where(problem.sizes > 0.0, np.where(problem.positive, problem.sizes, 0.0), problem.fixed)
+    free_terms = np.where(problem.positive, problem.sizes, 0.0)
+    terms = np.where(problem.sizes > 0.0, free_terms, problem.fixed)
     return np.concatenate([pseudo_inertia.to_standard(problem.references).ravel(), terms])
 
 
-def _descend(problem: BodyCost, gamma: float, values: np.ndarray, max_steps: int = 200) -> np.ndarray:
+def _descend(problem: BodyCost, gamma: float, values: np.ndarray) -> np.ndarray:
     """Return the optimum by Newton's method, with steps halved until the cost decreases (Armijo)."""
-    free, here = problem.free, cost(problem, gamma, values)
-    for _ in range(max_steps):
+    free = problem.free
+    settled = SETTLED if problem.lift == 1.0 else 0.1 * problem.lift
+    current_cost = cost(problem, gamma, values)
+    for _ in range(MAX_STEPS):
         slope, curvature = derivatives(problem, gamma, values)
         step = np.zeros_like(values)
         step[free] = -_solved(curvature[np.ix_(free, free)], slope[free])
         decrement = -float(slope @ step)
-        if decrement < (SETTLED if problem.lift == 1.0 else 0.1 * problem.lift):
+        if decrement < settled:
             return values + step
         size = 1.0
-        while (there := cost(problem, gamma, values + size * step)) > here - 1e-4 * size * decrement:
+        step_cost = cost(problem, gamma, values + size * step)
+        while step_cost > current_cost - 1e-4 * size * decrement:
             size /= 2.0
-            if size < 1e-12:  # rounding: no step lowers the cost any more
+            if size < MIN_STEP:
                 return values
-        values, here = values + size * step, there
-    raise NotConverged(f"the consistent parameters have not converged after {max_steps} Newton steps", values)
+            step_cost = cost(problem, gamma, values + size * step)
+        values = values + size * step
+        current_cost = step_cost
+    raise NotConverged(f"the consistent parameters have not converged after {MAX_STEPS} Newton steps", values)
 
 
 def cost(problem: BodyCost, gamma: float, values: np.ndarray) -> float:
     """Return the cost J(χ) of the module's equation; infinite outside the cone."""
-    rest = problem.factor[:, :-1] @ values - problem.factor[:, -1]
+    residual = problem.factor[:, :-1] @ values - problem.factor[:, -1]
     pseudo = pseudo_inertia.from_standard(_bodies(problem, values))
-    inside = np.linalg.eigvalsh(_scaled(problem, pseudo))[:, 0] > 0.0
-    terms, live = values[10 * problem.bodies :], problem.sizes > 0.0
-    ratio = terms[live & problem.positive] / problem.sizes[live & problem.positive]
-    if not inside.all() or not (ratio > 0.0).all():
+    definite = np.linalg.eigvalsh(_scaled(problem, pseudo))[:, 0] > 0.0
+    terms = values[10 * problem.bodies :]
+    estimated = problem.sizes > 0.0
+    positive = estimated & problem.positive
+    ratio = terms[positive] / problem.sizes[positive]
+    if not definite.all() or not (ratio > 0.0).all():
         return np.inf
-    drawn = sum(
-        weight * pseudo_inertia.divergence(one, known)
-        for weight, one, known in zip(problem.weights(gamma), pseudo, problem.references)
-    )
+    bodies = 0.0
+    for weight, body, reference in zip(problem.weights(gamma), pseudo, problem.references):
+        bodies = bodies + weight * pseudo_inertia.divergence(body, reference)
     drives = problem.lift * DRIVE * float(np.sum(ratio - np.log(ratio) - 1.0))
-    loose = live & ~problem.positive
-    return 0.5 * (float(rest @ rest) + drawn + drives + float(np.sum((terms[loose] / problem.sizes[loose]) ** 2)))
+    unbounded = estimated & ~problem.positive
+    unbounded_terms = float(np.sum((terms[unbounded] / problem.sizes[unbounded]) ** 2))
+    return 0.5 * (float(residual @ residual) + bodies + drives + unbounded_terms)
 
 
 def derivatives(problem: BodyCost, gamma: float, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return gradient (p,) and Hessian (p, p) of the cost."""
-    columns = problem.factor[:, :-1]
-    slope = columns.T @ (columns @ values - problem.factor[:, -1])
+    columns, target = problem.factor[:, :-1], problem.factor[:, -1]
+    slope = columns.T @ (columns @ values - target)
     curvature = columns.T @ columns
     pseudo = pseudo_inertia.from_standard(_bodies(problem, values))
-    for i, (weight, one, known) in enumerate(zip(problem.weights(gamma), pseudo, problem.references)):
-        own, inverse = slice(10 * i, 10 * i + 10), np.linalg.inv(one)
-        turned = inverse @ pseudo_inertia.BASIS
-        slope[own] += 0.5 * weight * np.einsum("ij,kji->k", np.linalg.inv(known) - inverse, pseudo_inertia.BASIS)
-        curvature[own, own] += 0.5 * weight * np.einsum("kij,lji->kl", turned, turned)
-    for k in np.flatnonzero(problem.sizes > 0.0):
-        place, size, x = 10 * problem.bodies + k, problem.sizes[k], values[10 * problem.bodies + k]
-        half = 0.5 * problem.lift * DRIVE
-        slope[place] += half * (1.0 / size - 1.0 / x) if problem.positive[k] else x / size**2
-        curvature[place, place] += half / x**2 if problem.positive[k] else 1.0 / size**2
+    basis = pseudo_inertia.BASIS
+    for i, weight in enumerate(problem.weights(gamma)):
+        part = slice(10 * i, 10 * i + 10)
+        inverse = np.linalg.inv(pseudo[i])
+        reference_inverse = np.linalg.inv(problem.references[i])
+        turned = inverse @ basis
+        slope[part] += 0.5 * weight * np.einsum("ij,kji->k", reference_inverse - inverse, basis)
+        curvature[part, part] += 0.5 * weight * np.einsum("kij,lji->kl", turned, turned)
+    half = 0.5 * problem.lift * DRIVE
+    for term in np.flatnonzero(problem.sizes > 0.0):
+        k = 10 * problem.bodies + term
+        x, size = values[k], problem.sizes[term]
+        if problem.positive[term]:
+            slope[k] += half * (1.0 / size - 1.0 / x)
+            curvature[k, k] += half / x**2
+        else:
+            slope[k] += x / size**2
+            curvature[k, k] += 1.0 / size**2
     return slope, curvature
 
 
 def _evidence(problem: BodyCost, gamma: float, values: np.ndarray) -> float:
     """Return log p(data | γ) by Laplace's approximation, up to a constant."""
     free = problem.free
-    curvature = derivatives(problem, gamma, values)[1][np.ix_(free, free)]
+    _, curvature = derivatives(problem, gamma, values)
+    curvature = curvature[np.ix_(free, free)]
     unit = np.sqrt(np.diag(curvature))
-    half = float(np.log(np.diag(np.linalg.cholesky(curvature / np.outer(unit, unit)))).sum() + np.log(unit).sum())
+    root = np.linalg.cholesky(curvature / np.outer(unit, unit))
+    half_log_det = float(np.log(np.diag(root)).sum() + np.log(unit).sum())
     nu = gamma + 5.0
     norm = 2.0 * nu * np.log(gamma) - 2.0 * gamma - 2.0 * nu * np.log(2.0) - float(multigammaln(nu / 2.0, 4))
-    scale = 2.5 * float(np.linalg.slogdet(problem.references)[1].sum())  # of P⁰: counts where references compete
-    return -cost(problem, gamma, values) - half + norm * float(problem.drawn.sum()) - scale
+    # The scale of P⁰ counts where references compete.
+    scale = 2.5 * float(np.linalg.slogdet(problem.references)[1].sum())
+    return -cost(problem, gamma, values) - half_log_det + norm * float(problem.drawn.sum()) - scale
 
 
 def _covariance(problem: BodyCost, gamma: float, values: np.ndarray) -> np.ndarray:
     """Return the inverse of the cost's curvature (p, p), zero for fixed parameters."""
-    free = problem.free
-    result = np.zeros((len(values), len(values)))
-    curvature = derivatives(problem, gamma, values)[1][np.ix_(free, free)]
-    result[np.ix_(free, free)] = _solved(curvature, np.eye(len(curvature)))
-    return 0.5 * (result + result.T)
+    free = np.ix_(problem.free, problem.free)
+    _, curvature = derivatives(problem, gamma, values)
+    covariance = np.zeros((len(values), len(values)))
+    covariance[free] = _solved(curvature[free], np.eye(int(problem.free.sum())))
+    return 0.5 * (covariance + covariance.T)
 
 
 def _solved(curvature: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -296,10 +363,10 @@ def _solved(curvature: np.ndarray, target: np.ndarray) -> np.ndarray:
         NotConverged: where none does.
     """
     unit = np.sqrt(np.diag(curvature))
-    whole = curvature / np.outer(unit, unit)
+    normalised = curvature / np.outer(unit, unit)
     for ridge in RIDGES:
         with suppress(np.linalg.LinAlgError):
-            root = scipy.linalg.cho_factor(whole + ridge * np.eye(len(unit)))
+            root = scipy.linalg.cho_factor(normalised + ridge * np.eye(len(unit)))
             break
     else:
         raise NotConverged("the consistent parameters cannot be distinguished to within rounding")
@@ -308,6 +375,7 @@ def _solved(curvature: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def _bodies(problem: BodyCost, values: np.ndarray) -> np.ndarray:
+    """Return the standard parameters (B, 10) of the bodies among all parameters (p,)."""
     return values[: 10 * problem.bodies].reshape(-1, 10)
 
 
@@ -319,9 +387,11 @@ def _scaled(problem: BodyCost, pseudo: np.ndarray) -> np.ndarray:
 
 def _notes(model: IdentificationModel, problem: BodyCost, values: np.ndarray) -> Sequence[str]:
     """Return remarks on bodies thinner than a millimetre."""
-    bodies = zip(model.bodies.labels, _bodies(problem, values))
-    thin = [label for label, body in bodies if pseudo_inertia.margin(body) < 1e-3]
-    return [f"body {label} is thinner than a millimetre: hardly realistic" for label in thin]
+    notes = []
+    for label, body in zip(model.bodies.labels, _bodies(problem, values)):
+        if pseudo_inertia.margin(body) < THIN_MARGIN:
+            notes.append(f"body {label} is thinner than a millimetre: hardly realistic")
+    return notes
 
 
 @dataclass(frozen=True)
@@ -329,7 +399,7 @@ class Contradiction:
     """Distance of an estimate from the nearest physically consistent robot.
 
     Attributes:
-        distance: in standard deviations (Mahalanobis); up to `max_times` times `allowed` only an approximation.
+        distance: in standard deviations (Mahalanobis); up to `MAX_TIMES` times `allowed` only an approximation.
         allowed: 95 % limit of the distance for a correct model.
         unexplained: of the weighted torques by the nearest consistent robot, in addition to the estimate [%].
     """
@@ -339,35 +409,29 @@ class Contradiction:
     unexplained: float
 
 
-def contradiction(found: Identification, chain: Chain) -> Contradiction | None:
+def contradiction(identification: Identification, chain: Chain) -> Contradiction | None:
     """Return the distance of an estimate from the nearest physically consistent robot; None where no solver converged.
 
     Args:
-        found: the estimate, of torques.
+        identification: the estimate, of torques.
         chain: the robot it was identified on.
     """
-    model = found.dynamics.model
+    model = identification.dynamics.model
     if not isinstance(model, IdentificationModel) or not model.torque_rows.has_bodies:
         return None
-    information = of(found, chain)
+    information = of(identification, chain)
     allowed = bound(information.b)
-    problems = [make_problem(information, one) for one in find_prior_bodies(chain, model)]
-
-    def distances() -> Iterator[float]:
-        for problem in problems[: max(len(problems) - 1, 1)]:
-            try:
-                yield information.distance(nearest(problem))
-            except NotConverged:
-                continue
-
-    weight = 1.0  # γ that hardly draws, yet keeps Newton's steps off the border: its distance is at most a tenth larger
+    problems = [make_problem(information, references) for references in find_prior_bodies(chain, model)]
     try:
-        away = information.distance(solve(problems[-1], weight))
-    except (NotConverged, ValueError):  # the latter where curvatures overflow
-        away = np.inf
-    max_times = 3.0  # times the bound, up to which no semidefinite program is solved for the last tenth
-    if away > max_times * allowed:
-        away = min((away, *distances()))
-    if not np.isfinite(away):
+        distance = information.distance(solve(problems[-1], WEAK_WEIGHT))
+    except (NotConverged, ValueError):
+        # The latter where curvatures overflow.
+        distance = np.inf
+    if distance > MAX_TIMES * allowed:
+        for problem in problems[: max(len(problems) - 1, 1)]:
+            with suppress(NotConverged):
+                distance = min(distance, information.distance(nearest(problem)))
+    if not np.isfinite(distance):
         return None
-    return Contradiction(float(away), allowed, 100.0 * float(away) / float(np.linalg.norm(information.factor[:, -1])))
+    torque = float(np.linalg.norm(information.factor[:, -1]))
+    return Contradiction(float(distance), allowed, 100.0 * float(distance) / torque)

@@ -50,7 +50,9 @@ def geometry_spread(
     if after is None and isinstance(robot, CalibratedChain):
         covariance = robot.covariance
     else:
-        covariance = calibrated.read(path).covariance if path.suffix == ".toml" else None
+        covariance = None
+        if path.suffix == ".toml":
+            covariance = calibrated.read(path).covariance
     if covariance is None or values is None:
         return None
     if after is not None and not all((after / name).is_file() for name in (SENSITIVITY, TORQUE_COVARIANCE)):
@@ -70,4 +72,4 @@ def geometry_spread(
         if index is None:
             return None
         before = (np.column_stack(columns[: len(errors)]) @ errors)[index]
-    return GeometrySpread(tuple((moved(one), moved(-one)) for one in errors.T), before)
+    return GeometrySpread(tuple((moved(error), moved(-error)) for error in errors.T), before)

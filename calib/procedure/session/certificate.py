@@ -32,7 +32,7 @@ from calib.procedure.session.folder import (
     read_state,
 )
 from calib.procedure.session.geometry_steps import chain_of
-from calib.procedure.session.steps import SessionStep
+from calib.procedure.session.steps import ExportedFile, SessionFile, SessionStep, Setting
 from calib.records import read_json, read_lines
 
 RECORDINGS: Point[Callable[[Path], str]] = Point(
@@ -276,8 +276,27 @@ STEP = SessionStep(
     "certificate",
     "print the certificate",
     certify,
-    f"{VERDICT} 4-fit/report.json 5-validation/metrics.json export/robot.urdf {SELECTION}? {POSES_CHECKED} "
-    f"{MOTION_CHECKED} 8-dynamics/metrics.json 8-dynamics/estimate.csv 8-dynamics/unseen/report.json {MARK}?",
-    " ".join(PAGES),
-    "name created instrument poses fit dynamics.torques,payloads,tolerance_percent certificate",
+    reads=(
+        SessionFile(VERDICT, without_geometry=True),
+        SessionFile("4-fit/report.json"),
+        SessionFile("5-validation/metrics.json"),
+        ExportedFile("robot.urdf"),
+        SessionFile(SELECTION, optional=True),
+        SessionFile(POSES_CHECKED),
+        SessionFile(MOTION_CHECKED),
+        SessionFile("8-dynamics/metrics.json"),
+        SessionFile("8-dynamics/estimate.csv"),
+        SessionFile("8-dynamics/unseen/report.json"),
+        SessionFile(MARK, optional=True),
+    ),
+    makes=PAGES,
+    settings=(
+        Setting("name"),
+        Setting("created"),
+        Setting("instrument"),
+        Setting("poses"),
+        Setting("fit"),
+        Setting("dynamics", ("torques", "payloads", "tolerance_percent")),
+        Setting("certificate"),
+    ),
 )

@@ -32,7 +32,6 @@ from calib.errors import CalibError, Finding, UsageError, finding
 from calib.extensions import Point
 from calib.folders import write_staged
 from calib.geometry.observability import SIGMA_ORIENTATION, observation, targets_of
-from calib.geometry.weighing import Settings
 from calib.identification.model_file import MODEL
 from calib.poses.candidates import draw_candidates
 from calib.poses.space import is_feasible
@@ -314,7 +313,7 @@ def validate(session: Session, say: Say) -> list[str]:
     notes = notes_on(session, chain, read_measured(session, chain, unseen, like), folder.UNSEEN)
     say("comparing on unseen poses")
     given, options, wanted = _gathered(session, unseen), _options_of(session), _fit_settings(session)
-    settings = Settings(wanted.loss or options.loss, options.loss_scale)
+    settings = fitting.weighing_settings(options, wanted)
     asked = replace(wanted, model=wanted.model or options.model)
     found = assess(fit.arms(given, settings), given, fit.findings(), settings, asked)
     rows = [fit_report.rows_of(name, each, each.proves) for name, each in found.validation.items()]

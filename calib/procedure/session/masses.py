@@ -26,12 +26,17 @@ MAX_MOVE = 0.1
 ROUNDS = "rounds.json"
 
 
-def largest_move(before: Path, now: Path) -> float:
+def largest_move(before: Path, after: Path) -> float:
     """Return the largest |Δ| / σ of the parameters of two folders with an estimate; infinite for other parameters."""
     if not (before / ESTIMATE).is_file():
         return float("inf")
-    old, new = ({row.name: row for row in read_estimate(folder)} for folder in (before, now))
-    moves = [abs(one.value - old[name].value) / one.sigma for name, one in new.items() if name in old and one.sigma]
+    old = {row.name: row for row in read_estimate(before)}
+    new = {row.name: row for row in read_estimate(after)}
+    moves = [
+        abs(parameter.value - old[name].value) / parameter.sigma
+        for name, parameter in new.items()
+        if name in old and parameter.sigma
+    ]
     if old.keys() == new.keys():
         return max(moves, default=0.0)
     return float("inf")
@@ -43,28 +48,30 @@ def return_masses(session: Session) -> list[str]:
     The fit takes them where it has compliance or sag; its step is then stale.
     """
     limit = session.settings.fit.rounds
-    place = session.path(MASSES)
-    found = session.identification.path
-    if not limit or not session.geometric or read_table(found).get("unit", TORQUE) != TORQUE:
+    record_path = session.path(MASSES)
+    identification = session.identification.path
+    if not limit or not session.geometric or read_table(identification).get("unit", TORQUE) != TORQUE:
         return []
     if not {"torque", "lever"} & {term.basis for term in calibrated.read(session.fit.path).deflection.terms}:
         return []
-    record = place / ROUNDS
-    done = read_json(record, "calib redo fit", dict[str, int])["rounds"] if record.is_file() else 0
-    geometry = largest_move(place / "geometry", session.fit.path)
-    dynamics = largest_move(place, found)
-    words = f"the geometry has moved by {geometry:.2g} σ, the dynamics by {dynamics:.2g} σ"
-    if not (place / MODEL).is_file():
-        words = "the compliance was fitted to the description's masses"
+    record = record_path / ROUNDS
+    rounds = 0
+    if record.is_file():
+        rounds = read_json(record, "calib redo fit", dict[str, int])["rounds"]
+    geometry = largest_move(record_path / "geometry", session.fit.path)
+    dynamics = largest_move(record_path, identification)
+    message = f"the geometry has moved by {geometry:.2g} σ, the dynamics by {dynamics:.2g} σ"
+    if not (record_path / MODEL).is_file():
+        message = "the compliance was fitted to the description's masses"
     settled = max(geometry, dynamics) <= MAX_MOVE
-    if settled or done >= limit:
+    if settled or rounds >= limit:
         write_json(record, {"rounds": 0})
         end = "settled" if settled else f"not settled, stopped by rounds = {limit}"
-        return [f"identified masses in the fit's gravity torques: after {done} rounds {words}: {end}"]
-    (place / "geometry").mkdir(parents=True, exist_ok=True)
-    shutil.copy(session.fit.path / ESTIMATE, place / "geometry")
-    write_json(record, {"rounds": done + 1})
+        return [f"identified masses in the fit's gravity torques: after {rounds} rounds {message}: {end}"]
+    (record_path / "geometry").mkdir(parents=True, exist_ok=True)
+    shutil.copy(session.fit.path / ESTIMATE, record_path / "geometry")
+    write_json(record, {"rounds": rounds + 1})
     # the last is what the fit depends on
     for name in (calibrated.ROBOT, ESTIMATE, MODEL):
-        shutil.copy(found / name, place)
-    return [f"identified masses return into the fit, round {done + 1} of at most {limit}: {words}"]
+        shutil.copy(identification / name, record_path)
+    return [f"identified masses return into the fit, round {rounds + 1} of at most {limit}: {message}"]

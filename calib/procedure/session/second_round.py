@@ -26,7 +26,7 @@ from calib.procedure.excitation.settings import ExcitationSettings
 from calib.procedure.findings import limit
 from calib.procedure.session.dynamics_steps import next_round, options_of
 from calib.procedure.session.folder import ROUND, Say, Session, read_state
-from calib.procedure.session.steps import SessionStep
+from calib.procedure.session.steps import FITTED_ROBOT, IDENTIFY_OPTIONS, NamedFile, SessionFile, SessionStep, Setting
 from calib.robot.library import load_calibrated
 
 # [%] of torques and σ, where none is stated
@@ -50,14 +50,15 @@ class _Short(NamedTuple):
 
     def left(self, before: np.ndarray, after: np.ndarray) -> float:
         """Return the error [%] that remains once the torques' σ (n,) by the parameters has fallen."""
-        then, now = (100.0 * one[self.joint] / self.size for one in (before, after))
-        return float(np.sqrt(max(self.error**2 - then**2 + now**2, 0.0)))
+        then = 100.0 * before[self.joint] / self.size
+        after_ = 100.0 * after[self.joint] / self.size
+        return float(np.sqrt(max(self.error**2 - then**2 + after_**2, 0.0)))
 
 
 def extend(session: Session, say: Say) -> list[str]:
     """Design a further motion where joints or parameters fall short, and return what it will bring as notes."""
     section = session.settings.dynamics
-    place = session.identification
+    identification = session.identification
     round_name = next_round(session)
     short = _short_joints(session, section.tolerance_percent)
     weak = _weak_parameters(session, section.sigma_percent or np.inf)
@@ -77,14 +78,16 @@ def extend(session: Session, say: Say) -> list[str]:
         loads=("none", *payloads) if payloads else (),
     )
     try:
-        given = read_inputs(session.fit.path, settings, limits=session.named(section.limits), after=place.path)
-        before = prediction.known_sigmas(given, prediction.task_of(given, settings.seed))[0][0]
-        helped = [one for one in short if one.left(before, 0.0 * before) < (1.0 - MIN_GAIN) * one.error]
-        notes = _unmodelled(given, [one for one in short if one not in helped])
+        inputs = read_inputs(
+            session.fit.path, settings, limits=session.named(section.limits), after=identification.path
+        )
+        before = prediction.known_sigmas(inputs, prediction.task_of(inputs, settings.seed))[0][0]
+        helped = [joint for joint in short if joint.left(before, 0.0 * before) < (1.0 - MIN_GAIN) * joint.error]
+        notes = _unmodelled(inputs, [joint for joint in short if joint not in helped])
         if not helped and not weak:
             return notes
         aim = "parameters" if weak else "torque"
-        designed = design.search_motion(given, replace(settings, goals=(aim,)), progress=say)
+        designed = design.search_motion(inputs, replace(settings, goals=(aim,)), progress=say)
     except (CalibError, ValueError) as error:
         return [f"joints or parameters fall short, but no further motion could be designed: {error}"]
     if designed.found.interrupted:
@@ -93,35 +96,39 @@ def extend(session: Session, say: Say) -> list[str]:
     return [*_gains(designed, helped, designed.inputs.columns.aimed_names if weak else ()), *notes]
 
 
-def _short_joints(session: Session, asked: float) -> list[_Short]:
+def _short_joints(session: Session, tolerance: float) -> list[_Short]:
     """Return the joints whose motor torque is worse than tolerated [%], where the torques together are."""
     report = session.identification.unseen.read()
-    worst = max((report.proofs or report.fit).values(), key=lambda one: one.raw.relative_error_percent.total).raw
-    if not asked or worst.relative_error_percent.total <= asked:
+    worst = max(
+        (report.proofs or report.fit).values(), key=lambda report_: report_.raw.relative_error_percent.total
+    ).raw
+    if not tolerance or worst.relative_error_percent.total <= tolerance:
         return []
     n = session.identification.dynamics().model.n
     # the motors' rows come last
     errors = worst.relative_error_percent.joints[-n:]
     rms = worst.rms[-n:]
     rows = enumerate(zip(errors.tolist(), (100.0 * rms / errors).tolist()))
-    return [_Short(j, error, size) for j, (error, size) in rows if error > asked]
+    return [_Short(j, error, size) for j, (error, size) in rows if error > tolerance]
 
 
-def _weak_parameters(session: Session, asked: float) -> tuple[str, ...]:
+def _weak_parameters(session: Session, tolerance: float) -> tuple[str, ...]:
     """Return the essential parameters whose relative σ [%] is above the one asked for, and that a design can aim at."""
-    place = session.identification
-    without = {one.name for one in place.dynamics().model.columns if not one.form.slopes}
-    rows = read_estimate(place.path, _Parameter)
+    identification = session.identification
+    without = {column.name for column in identification.dynamics().model.columns if not column.form.slopes}
+    rows = read_estimate(identification.path, _Parameter)
     return tuple(
-        one.name for one in rows if one.essential is not None and (one.rsd or 0.0) > asked and one.name not in without
+        row.name
+        for row in rows
+        if row.essential is not None and (row.rsd or 0.0) > tolerance and row.name not in without
     )
 
 
-def _unmodelled(given: ExcitationInputs, joints: list[_Short]) -> list[str]:
+def _unmodelled(inputs: ExcitationInputs, joints: list[_Short]) -> list[str]:
     """Return a note on the joints that more motion does not help."""
-    words = listing(f"{given.chain.joint_names[one.joint]} {one.error:.2g} %" for one in joints)
+    names = listing(f"{inputs.chain.joint_names[joint.joint]} {joint.error:.2g} %" for joint in joints)
     if joints:
-        return [f"more motion does not help {words}: what is left is not modelled (friction, elasticity)"]
+        return [f"more motion does not help {names}: what is left is not modelled (friction, elasticity)"]
     return []
 
 
@@ -129,16 +136,19 @@ def _gains(designed: design.Designed, joints: list[_Short], parameters: tuple[st
     """Return a note on what a motion will bring to joints and parameters, the worst first."""
     outlook = designed.outlook
     names = designed.inputs.chain.joint_names
-    rows = sorted(designed.predicted, key=lambda one: -(one.rsd or 0.0))
+    rows = sorted(designed.predicted, key=lambda prediction: -(prediction.rsd or 0.0))
     seconds = designed.playback.run.duration
     if outlook is None or outlook.torque_sigma_before is None:
         return []
     errors = (outlook.torque_sigma_before, outlook.own.torque_sigma)
-    parts = [f"torque error of {names[one.joint]} from {one.error:.2g} to {one.left(*errors):.2g} %" for one in joints]
+    parts = [
+        f"torque error of {names[joint.joint]} from {joint.error:.2g} to {joint.left(*errors):.2g} %"
+        for joint in joints
+    ]
     parts += [
-        f"σ of {one.name} from {100.0 * one.sigma_before / abs(one.value):.2g} to {one.rsd:.2g} %"
-        for one in rows
-        if one.name in parameters and one.value and one.sigma_before and one.rsd is not None
+        f"σ of {row.name} from {100.0 * row.sigma_before / abs(row.value):.2g} to {row.rsd:.2g} %"
+        for row in rows
+        if row.name in parameters and row.value and row.sigma_before and row.rsd is not None
     ]
     return [f"{seconds:.0f} s more, of a motion designed for it, bring the {listing(parts, 6)}"]
 
@@ -165,9 +175,18 @@ def _short_of_default(session: Session) -> tuple[str, ...]:
     joints = _short_joints(session, NEED)
     weak = _weak_parameters(session, NEED)
     names = load_calibrated(session.fit.path).chain.joint_names
-    parts = [f"torque of {names[one.joint]} ({one.error:.2g} %)" for one in joints]
-    own = {one.name: one.rsd or 0.0 for one in read_estimate(session.identification.path, _Parameter)}
-    worst = listing((f"{name} ({own[name]:.2g} %)" for name in sorted(weak, key=lambda one: -own[one])), 4)
+    parts = [f"torque of {names[joint.joint]} ({joint.error:.2g} %)" for joint in joints]
+    deviations = {
+        short_joint.name: short_joint.rsd or 0.0
+        for short_joint in read_estimate(session.identification.path, _Parameter)
+    }
+    worst = listing(
+        (
+            f"{name} ({deviations[name]:.2g} %)"
+            for name in sorted(weak, key=lambda short_joint: -deviations[short_joint])
+        ),
+        4,
+    )
     parts += [f"σ of essential parameters {worst}"] if weak else []
     if not parts:
         return (f"no further motion is needed: torques of joints and σ of essential parameters are within {NEED:g} %",)
@@ -182,8 +201,20 @@ STEP = SessionStep(
     "extend",
     "see whether more motion is needed",
     extend,
-    "fit/robot.toml dynamics:limits dynamics:options 8-dynamics/estimate.csv 8-dynamics/unseen/report.json",
-    f"6-excitation/{ROUND}*/*",
-    "dynamics.tolerance_percent,sigma_percent,period,harmonics,rate,starts,evaluations,repeats seed",
-    "need",
+    reads=(
+        FITTED_ROBOT,
+        NamedFile("dynamics", "limits"),
+        IDENTIFY_OPTIONS,
+        SessionFile("8-dynamics/estimate.csv"),
+        SessionFile("8-dynamics/unseen/report.json"),
+    ),
+    makes=(f"6-excitation/{ROUND}*/*",),
+    settings=(
+        Setting(
+            "dynamics",
+            ("tolerance_percent", "sigma_percent", "period", "harmonics", "rate", "starts", "evaluations", "repeats"),
+        ),
+        Setting("seed"),
+    ),
+    stage="need",
 )

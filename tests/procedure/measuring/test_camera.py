@@ -228,7 +228,7 @@ def test_images_beside_another_instrument_are_another_tool_and_their_coverage_is
     pairs = Distances(q, arm.joint_names, np.repeat(length, 2), group=np.repeat(np.arange(20), 2))
     given = gather("lwr4plus", [images, points, pairs], settings=FitSettings(model="geometry"))
     assert [block.tool_names for block in given.fit] == [("camera",), ("tool",), ("tool",)]
-    found = fitted(given, wanted=FitSettings(model="geometry"))
+    found = fitted(given, settings=FitSettings(model="geometry"))
     assert found.verdict.level == "pass"
     block = complete_camera(arm, images)
     (seen,) = fit_report.collect(found).images
@@ -248,5 +248,5 @@ def test_a_board_printed_too_large_or_too_small_is_no_pass(cell, share, word):
     block = camera.photograph(cell, camera.views(cell, 36, 5), 0.05, 5)
     board = replace(block.board, square=share * block.board.square, marker=share * block.board.marker)
     given = gather("lwr4plus", [replace(block, board=board)])
-    found = fitted(given, wanted=FitSettings(model="geometry"))
+    found = fitted(given, settings=FitSettings(model="geometry"))
     assert found.verdict.level == word and (word == "pass" or "lengths are" in found.verdict.reason)
