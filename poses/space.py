@@ -98,7 +98,7 @@ def central_difference(function: Callable[[np.ndarray], np.ndarray], q: np.ndarr
     """Return ∂f_i/∂q_ik (m, n, ...) of a function (m, n) -> (m, ...) with independent poses, in one batch."""
     m, n = q.shape
     steps = STEP * np.eye(n)
-    both = np.concatenate([q[:, None] + steps, q[:, None] - steps], axis=1).reshape(-1, n)
-    values = np.asarray(function(both), dtype=float)
+    displaced = np.concatenate([q[:, None] + steps, q[:, None] - steps], axis=1).reshape(-1, n)
+    values = np.asarray(function(displaced), dtype=float)
     values = values.reshape(m, 2, n, *values.shape[1:])
     return (values[:, 0] - values[:, 1]) / (2 * STEP)

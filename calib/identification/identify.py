@@ -250,7 +250,9 @@ def _identified(
     say: Progress,
 ) -> Identification[RegressorModel]:
     """Return the identification of a problem by a method: estimate, test of its loop, ripple, essential parameters."""
-    model, base, cases = problem.model, problem.base, problem.cases
+    model = problem.model
+    base = problem.base
+    cases = problem.cases
     say("simulating the closed loop" if method.needs_controller else "estimate")
     fit = method.estimate(problem)
     values = fit.estimate.values

@@ -48,8 +48,11 @@ class LoadedPlatform(PlatformRegressor):
         names = self.model.mechanism.robot.joint_names
         if len(self.loads) == 1:
             return names
-        load_names = ["all payloads" if load is None else " + ".join(load) or "no payload" for load in self.loads]
-        return tuple(f"{name} ({load})" for load in load_names for name in names)
+        row_names = []
+        for load in self.loads:
+            load_name = "all payloads" if load is None else " + ".join(load) or "no payload"
+            row_names += [f"{name} ({load_name})" for name in names]
+        return tuple(row_names)
 
     def torques(self, motion: LoopMotion) -> np.ndarray:
         """Return the actuators' torques (N, loads · n) of a motion, run after run."""
@@ -95,18 +98,19 @@ def read_model(robot: ParallelMechanism, folder: Path | None, drives: str = "") 
     unreadable = f"{path} contains no model of a parallel robot ({{}}); give a folder of calib identify"
     with refused_as(RobotError, (ValueError, KeyError, TypeError, AttributeError), unreadable):
         values_ = {str(name): float(value) for name, value in table["values"].items()}
-        texts = [" ".join(drive for drive in DRIVES if drive + label in values_) for label in tree.labels]
-        passive = next((text for j, text in enumerate(texts) if j not in tree.actuated and text), "")
-        model = make_parallel_model(
-            robot.mechanism,
-            [texts[j] for j in tree.actuated],
-            v0=float(table.get("v0", V0)),
-            payloads=[str(label) for label in table.get("payloads", ())],
-            passive=passive,
-        )
-        model = replace(
-            model, identical_legs=bool(table.get("identical_legs")), preload=tuple(map(float, table.get("preload", ())))
-        )
+        drive_sets = []
+        passive = ""
+        for joint, label in enumerate(tree.labels):
+            drive_set = " ".join(drive for drive in DRIVES if drive + label in values_)
+            drive_sets.append(drive_set)
+            if joint not in tree.actuated:
+                passive = passive or drive_set
+        v0 = float(table.get("v0", V0))
+        payloads = [str(label) for label in table.get("payloads", ())]
+        preload = tuple(map(float, table.get("preload", ())))
+        actuated = [drive_sets[joint] for joint in tree.actuated]
+        model = make_parallel_model(robot.mechanism, actuated, v0=v0, payloads=payloads, passive=passive)
+        model = replace(model, identical_legs=bool(table.get("identical_legs")), preload=preload)
     missing = [name for name in model.names[: model.inertial] if name not in values_]
     if missing:
         raise RobotError(f"{path} is of another robot: parameter {missing[0]} is missing")
@@ -140,7 +144,8 @@ def of_options(
         identify_options = read_options(options)
     refuse_options_of_arms(identify_options.settings, identify_options)
     settings_ = identify_options.settings
-    rows = rows_named(robot.mechanism, "" if settings_.torque_rows.name == MOTOR.name else settings_.torque_rows.name)
+    row_kind = settings_.torque_rows.name
+    rows = rows_named(robot.mechanism, "" if row_kind == MOTOR.name else row_kind)
     model = model_of(robot.mechanism, replace(settings_, torque_rows=rows, v0=(SMOOTH,)))
     payloads, notes = stated_payloads(settings_)
     values = np.append(file_bodies(robot, model), np.zeros(len(model.columns)))
@@ -155,7 +160,10 @@ def of_folder(
     refuse_currents(folder, "an excitation within torque limits")
     model, values = read_model(robot, folder)
     model = replace(model, torque_rows=rows_named(robot.mechanism, read_table(folder).get("kind", "")))
-    return model, values, loads_of(settings.loads, model.payloads, with_payloads=False) if settings.loads else ((),), ()
+    loads: Loads = ((),)
+    if settings.loads:
+        loads = loads_of(settings.loads, model.payloads, with_payloads=False)
+    return model, values, loads, ()
 
 
 def purpose_of(
@@ -184,17 +192,10 @@ def purpose_of(
         base_columns = np.array([standard.index(standard_name(name, standard)) for name in names])
         units = tuple(model.units[k] for k in base_columns)
         chosen = values[base_columns]
-    exact = LoadedPlatform(
-        replace(model, terms=model.terms), base_columns, values, names=names, units=units, loads=loads
-    )
-    smooth = LoadedPlatform(
-        replace(model, terms=tuple(_smoothed(term) for term in model.terms)),
-        base_columns,
-        values,
-        names=names,
-        units=units,
-        loads=loads,
-    )
+    exact_model = replace(model, terms=model.terms)
+    exact = LoadedPlatform(exact_model, base_columns, values, names=names, units=units, loads=loads)
+    smooth_model = replace(model, terms=tuple(map(_smoothed, model.terms)))
+    smooth = LoadedPlatform(smooth_model, base_columns, values, names=names, units=units, loads=loads)
     excited: Any = ExcitedModel(cast(Any, smooth), cast(Any, exact), chosen, covariance, folder is not None, notes)
     prior = read_prior((), excited, cast(Any, model.mechanism.robot), after)
     if prior is None:
@@ -226,23 +227,33 @@ def foretold(excitation: Any, states: int = 400) -> Any:
     times = excitation.period / INSTANTS * np.arange(INSTANTS)
     Y = plan.regressor(*excitation.orders(times)) / sigmas[:, None]
     new = np.einsum("nri,nrj->ij", Y, Y, optimize=True) * (excitation.period / INSTANTS)
-    roots = [np.linalg.cholesky(_inverse(inputs.prior.information + information)) for information in (0.0 * new, new)]
+    root_before = np.linalg.cholesky(_inverse(inputs.prior.information + 0.0 * new))
+    root_after = np.linalg.cholesky(_inverse(inputs.prior.information + new))
     x = rng.uniform(robot.lower, robot.upper, (states, robot.r))
     still = loop_jacobians(mechanism, mechanism.home).readings[0]
-    fast = 0.5 * np.min(inputs.limits.bounds.velocity / np.linalg.norm(still, axis=1)) * np.ones(robot.r)
-    motion = plan.motion(x, *(fast * (2.0 * rng.random((2, states, robot.r)) - 1.0) * [[[1.0]], [[DEFAULT_RISE]]]))
-    W = model_rows(plan, motion)
-    torque = [np.sqrt(np.mean(np.sum((W @ root) ** 2, axis=2), axis=0)) for root in roots]
-    shares = [float(np.sqrt(np.mean((torques / inputs.limits.bounds.torque) ** 2))) for torques in torque]
-    prediction = MotionPrediction(excitation.period, excitation.period, torque[1], shares[1])
-    outlook = MotionOutlook(shares[0], torque[0], prediction, (), shares[0])
-    values = cast(np.ndarray, plan.values)[plan.columns]
-    spread = [np.linalg.norm(root, axis=1).tolist() for root in roots]
-    rows = [
-        PredictedSigma(name, unit, value or None, after, 100.0 * after / abs(value) if value else None, before)
-        for name, unit, value, before, after in zip(plan.names, plan.units, values.tolist(), *spread)
-    ]
-    return replace(excitation, outlook=outlook, predicted=rows)
+    bounds = inputs.limits.bounds
+    fast = 0.5 * np.min(bounds.velocity / np.linalg.norm(still, axis=1)) * np.ones(robot.r)
+    v, a = fast * (2.0 * rng.random((2, states, robot.r)) - 1.0) * [[[1.0]], [[DEFAULT_RISE]]]
+    W = model_rows(plan, plan.motion(x, v, a))
+
+    def torque_sigma(root: np.ndarray) -> np.ndarray:
+        return np.sqrt(np.mean(np.sum((W @ root) ** 2, axis=2), axis=0))
+
+    def share(torques: np.ndarray) -> float:
+        return float(np.sqrt(np.mean((torques / bounds.torque) ** 2)))
+
+    torque_before = torque_sigma(root_before)
+    torque_after = torque_sigma(root_after)
+    prediction = MotionPrediction(excitation.period, excitation.period, torque_after, share(torque_after))
+    outlook = MotionOutlook(share(torque_before), torque_before, prediction, (), share(torque_before))
+    values = cast(np.ndarray, plan.values)[plan.columns].tolist()
+    sigmas_before = np.linalg.norm(root_before, axis=1).tolist()
+    sigmas_after = np.linalg.norm(root_after, axis=1).tolist()
+    predicted = []
+    for name, unit, value, before, after in zip(plan.names, plan.units, values, sigmas_before, sigmas_after):
+        relative = 100.0 * after / abs(value) if value else None
+        predicted.append(PredictedSigma(name, unit, value or None, after, relative, before))
+    return replace(excitation, outlook=outlook, predicted=predicted)
 
 
 def model_rows(plan: LoadedPlatform, motion: LoopMotion) -> np.ndarray:

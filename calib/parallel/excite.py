@@ -1,9 +1,8 @@
 """Design of an exciting motion of a parallel robot, by the search for serial arms in platform coordinates."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from calib.identification.identify_options import IdentifySettings
 from calib.parallel.design_goal import Purpose, foretold, of_folder, of_options, purpose_of, read_model, whole
 from calib.parallel.mechanism.closure import ClosedRobot
 from calib.parallel.mechanism.parallel_model import ParallelModel, PlatformRegressor
+from calib.parallel.mechanism.parallel_robot import ParallelRobot
 from calib.parallel.mechanism.velocities import LoopMotion
 from calib.parallel.robots import ParallelMechanism, refuse_unread
 from calib.procedure.excitation import coefficients, folder, prediction
@@ -88,7 +88,9 @@ class _ActuatorLimit(TwoSided):
     def slopes(self, motion: SampledMotion, weights: np.ndarray) -> np.ndarray:
         k = len(self.limits)
         result = np.zeros((4, *motion.q.shape))
-        result[:3] = self.plan.slopes(motion.q, motion.v, motion.a, self.of, weights[:, :k] - weights[:, k:])
+        # Weights of the upper limits less those of the lower ones.
+        net = weights[:, :k] - weights[:, k:]
+        result[:3] = self.plan.slopes(motion.q, motion.v, motion.a, self.of, net)
         return result
 
 
@@ -119,24 +121,23 @@ class ParallelExcitation(ExcitationDesign):
         """Return the setpoints of the actuators (q, v, a, torques) for setpoints of the platform."""
         motion = self.plan.motion(track.q, track.v, track.a)
         actuated = self.robot.chain.actuated
-        return Setpoints(
-            track.rate,
-            motion.posture.q[:, actuated],
-            motion.v[:, actuated],
-            motion.a[:, actuated],
-            self._torques(motion),
-        )
+        q = motion.posture.q[:, actuated]
+        v = motion.v[:, actuated]
+        a = motion.a[:, actuated]
+        return Setpoints(track.rate, q, v, a, self._torques(motion))
 
     def _torques(self, motion: LoopMotion) -> np.ndarray:
         """Return the torques of the actuators (N, n), each of the load under which it is largest."""
         torques = self.plan.torques(motion).reshape(len(motion.v), -1, self.robot.chain.n)
-        return np.take_along_axis(torques, np.abs(torques).argmax(axis=1, keepdims=True), axis=1)[:, 0]
+        heaviest = np.abs(torques).argmax(axis=1, keepdims=True)
+        return np.take_along_axis(torques, heaviest, axis=1)[:, 0]
 
     @property
     def peaks(self) -> tuple[np.ndarray, np.ndarray]:
         """Largest torque of each actuator (n,) [N m or N] and acceleration of each platform coordinate (r,)."""
-        orders = self.orders(self.period / INSTANTS * np.arange(INSTANTS))
-        return np.abs(self._torques(self.plan.motion(*orders))).max(axis=0), np.abs(orders[2]).max(axis=0)
+        x, v, a = self.orders(self.period / INSTANTS * np.arange(INSTANTS))
+        torques = self._torques(self.plan.motion(x, v, a))
+        return np.abs(torques).max(axis=0), np.abs(a).max(axis=0)
 
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write the result folder of `calib excite`: one period at the controller's rate, and the actuators' series."""
@@ -145,7 +146,7 @@ class ParallelExcitation(ExcitationDesign):
         period_motion = folder.one_period(self)
         bounds = self.inputs.limits.bounds
 
-        def more(target: Path) -> None:
+        def write_series(target: Path) -> None:
             series = coefficients.table(self._series(), ROBOT, bounds.lines())
             files.write(target / coefficients.NAME, dumps(series))
             if self.predicted:
@@ -153,9 +154,8 @@ class ParallelExcitation(ExcitationDesign):
             if plots:
                 motion_figures.write_design(self, target)
 
-        return write_motion(
-            self.robot, Path(out), self._actuators(period_motion), period_motion.q, bounds, self.to_dict(), more
-        )
+        track = self._actuators(period_motion)
+        return write_motion(self.robot, Path(out), track, period_motion.q, bounds, self.to_dict(), write_series)
 
     def _series(self, max_error: float = 1e-8, samples: int = 2048) -> coefficients.Periodic:
         """Return the periodic motion of the actuators as Fourier series.
@@ -165,26 +165,36 @@ class ParallelExcitation(ExcitationDesign):
             samples: over the period, of which the series are made.
         """
         x, _, _ = self.orders(self.period / samples * np.arange(samples))
-        lines = np.fft.rfft(self.robot.mechanism.place(x).q[:, self.robot.chain.actuated], axis=0) / samples
-        above = np.cumsum(2.0 * np.abs(lines[::-1]), axis=0)[::-1].max(axis=1)
-        last = 1 + max(1, int((above[1:] > max_error).sum()))
-        line_coefficients = tuple(
-            np.concatenate([[c[0].real], -2.0 * c[1:last].imag, 2.0 * c[1:last].real]) for c in lines.T
-        )
-        names, kinds = zip(*((joint.name, joint.kind) for joint in self.robot.chain.joints))
-        return coefficients.Periodic(names, kinds, self.period, self.settings.rate, 1, "fourier", line_coefficients)
+        robot = self.robot.chain
+        q = self.robot.mechanism.place(x).q[:, robot.actuated]
+        lines = np.fft.rfft(q, axis=0) / samples
+        # What the harmonics from each on add to the motion, at most.
+        remainder = np.cumsum(2.0 * np.abs(lines[::-1]), axis=0)[::-1].max(axis=1)
+        last = 1 + max(1, int((remainder[1:] > max_error).sum()))
+        series = []
+        for line in lines.T:
+            sines = -2.0 * line[1:last].imag
+            cosines = 2.0 * line[1:last].real
+            series.append(np.concatenate([[line[0].real], sines, cosines]))
+        kinds = tuple(joint.kind for joint in robot.joints)
+        rate = self.settings.rate
+        return coefficients.Periodic(robot.joint_names, kinds, self.period, rate, 1, "fourier", tuple(series))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics of ``metrics.json``."""
-        torque, acceleration = (peaks.tolist() for peaks in self.peaks)
-        content = {"robot": self.robot.chain.name, "peak_torque": torque, "peak_acceleration": acceleration}
-        return super().to_dict() | content
+        torque, acceleration = self.peaks
+        return super().to_dict() | {
+            "robot": self.robot.chain.name,
+            "peak_torque": torque.tolist(),
+            "peak_acceleration": acceleration.tolist(),
+        }
 
     def __repr__(self) -> str:
         return f"<ParallelExcitation for {self.robot.chain.name}: {self.period:g} s>"
 
     def __str__(self) -> str:
-        peaks = (f"{name} {peak:.3g}" for name, peak in zip(self.robot.chain.joint_names, self.peaks[0]))
+        torques, _ = self.peaks
+        peaks = [f"{name} {torque:.3g}" for name, torque in zip(self.robot.chain.joint_names, torques)]
         return f"{super().__str__()}\npeak torques: {', '.join(peaks)}"
 
 
@@ -270,28 +280,44 @@ def design_parallel(
     constraints: list[MotionConstraint] = [BoxLimit(0, parallel_robot.lower, parallel_robot.upper, rows=coordinates)]
     if acceleration is not None:
         constraints.append(BoxLimit(2, -acceleration, acceleration, rows=coordinates))
-    constraints += [
-        _ActuatorLimit(plan, plan.torques, np.resize((1.0 - GUARD) * bounds.torque, len(rows)), rows),
-        _ActuatorLimit(plan, plan.speeds, bounds.velocity, parallel_robot.joint_names, "velocity", "rad/s"),
-    ]
-    joints = tuple(Joint(name, "revolute" if "r" in name else "prismatic") for name in parallel_robot.freedom)
-    # like an arm's
-    platform: Any = SimpleNamespace(
-        name=parallel_robot.name, n=parallel_robot.r, joint_names=parallel_robot.freedom, joints=joints
-    )
+    torque_limits = np.resize((1.0 - GUARD) * bounds.torque, len(rows))
+    constraints.append(_ActuatorLimit(plan, plan.torques, torque_limits, rows))
+    names = parallel_robot.joint_names
+    constraints.append(_ActuatorLimit(plan, plan.speeds, bounds.velocity, names, "velocity", "rad/s"))
+    platform: Any = _PlatformAxes(parallel_robot)
     free = np.full(parallel_robot.r, np.inf)
-    inputs = ExcitationInputs(
-        platform,
-        MotionLimits(tuple(constraints), bounds, free, None, 0.0, None, None, ()),
-        replace(purpose.model, values=None, covariance=None),
-        {},
-        purpose.columns,
-        purpose.prior,
-    )
+    limits = MotionLimits(tuple(constraints), bounds, free, None, 0.0, None, None, ())
+    excited = replace(purpose.model, values=None, covariance=None)
+    inputs = ExcitationInputs(platform, limits, excited, {}, purpose.columns, purpose.prior)
     goals = settings.goals or ("logdet",)
     harmonics = settings.harmonics or COARSE
     design_settings = replace(settings, goals=goals, harmonics=harmonics, samples=SAMPLES)
-    return ParallelExcitation(**vars(search_motion(inputs, design_settings, map, progress)), robot=robot, plan=plan)
+    design = search_motion(inputs, design_settings, map, progress)
+    design_fields = {field.name: getattr(design, field.name) for field in fields(design) if field.init}
+    return ParallelExcitation(**design_fields, robot=robot, plan=plan)
+
+
+@dataclass(frozen=True)
+class _PlatformAxes:
+    """The coordinates of a platform as the joints of an arm, whose motion is searched for."""
+
+    robot: ParallelRobot
+
+    @property
+    def name(self) -> str:
+        return self.robot.name
+
+    @property
+    def n(self) -> int:
+        return self.robot.r
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        return self.robot.freedom
+
+    @property
+    def joints(self) -> tuple[Joint, ...]:
+        return tuple(Joint(name, "revolute" if "r" in name else "prismatic") for name in self.robot.freedom)
 
 
 def actuator_bounds(mechanism: ClosedRobot) -> MotionBounds:
@@ -323,15 +349,19 @@ def write_motion(
     metrics: dict[str, Any],
     write_files: Callable[[Path], None],
 ) -> Path:
-    """Write the folder of a motion: ``robot.toml``, ``motion.csv``, ``metrics.json`` and what `more` adds.
+    """Write the folder of a motion: ``robot.toml``, ``motion.csv``, ``metrics.json`` and what `write_files` adds.
 
     Args:
         track: of the actuators; coordinates: (N, r) of the platform; both stand in ``motion.csv``.
         bounds: which the motion keeps; they stand at the head of the file.
     """
     parts = {"q": track.q, "v": track.v, "tau": track.tau}
-    names = [f"{name} [{'rad' if name[0] == 'r' else 'm'}]" for name in robot.chain.freedom]
-    names += [name for part in parts for name in headings(part, robot.chain.joints)]
+    names = []
+    for name in robot.chain.freedom:
+        unit = "rad" if name.startswith("r") else "m"
+        names.append(f"{name} [{unit}]")
+    for part in parts:
+        names += headings(part, robot.chain.joints)
     table = np.hstack([track.times[:, None], coordinates, *parts.values()])
 
     def write(folder: Path) -> None:

@@ -131,13 +131,13 @@ class OpenedRobot:
             if leg.end == "rigid":
                 T_tip = leg.chain.tail @ invert(leg.attachment)
                 bodies[-1] = transform_body(self.free / len(self.rigid), T_tip)
-            joints = tuple(
-                replace(joint, name=f"{leg.name}_{joint.name}") if names.count(joint.name) > 1 else joint
-                for joint in leg.chain.joints
-            )
-            chains.append(
-                replace(leg.chain, joints=joints, base="base", tip=f"{leg.name}_end", inertias=bodies, links=())
-            )
+            joints = []
+            for joint in leg.chain.joints:
+                if names.count(joint.name) > 1:
+                    joint = replace(joint, name=f"{leg.name}_{joint.name}")
+                joints.append(joint)
+            tip = f"{leg.name}_end"
+            chains.append(replace(leg.chain, joints=tuple(joints), base="base", tip=tip, inertias=bodies, links=()))
         return chains
 
     @property
@@ -180,18 +180,20 @@ class OpenedRobot:
             name = f"{leg.name}_attachment"
             add_joint(root, f"{name}_fixed", "fixed", PLATFORM, name, np.asarray(leg.attachment))
         text = f'<?xml version="1.0"?>\n<!-- loops are open here: {CLOSURES} closes them -->\n' + xml_text(root)
-        friction = {joint.name: (row[1], row[2]) for joint, row in zip(self.joints, self.drives.values.tolist())}
-        return put(text, URDF, {}, {name: pair for name, pair in friction.items() if any(pair)})
+        friction = {}
+        for joint, row in zip(self.joints, self.drives.values.tolist()):
+            if row[1] or row[2]:
+                friction[joint.name] = (row[1], row[2])
+        return put(text, URDF, {}, friction)
 
     def closures(self) -> str:
         """Return the text of ``robot.yaml``."""
-        table = {
-            "closed_loop": [[f"{leg.name}_end", f"{leg.name}_attachment"] for leg in self.closing],
-            "type": ["6d" if leg.end == "rigid" else "3d" for leg in self.closing],
-            "name_mot": self.actuated,
-            "joint_name": [],
-            "joint_type": [],
-        }
+        pairs = []
+        types = []
+        for leg in self.closing:
+            pairs.append([f"{leg.name}_end", f"{leg.name}_attachment"])
+            types.append("6d" if leg.end == "rigid" else "3d")
+        table = {"closed_loop": pairs, "type": types, "name_mot": self.actuated, "joint_name": [], "joint_type": []}
         lines = [f"{key}: {json.dumps(value)}" for key, value in table.items()]
         lines += ["home:", *(f"  {json.dumps(name)}: {value:.12f}" for name, value in self.home.items())]
         return "\n".join(["# Loops of robot.urdf: pairs of links that coincide; values at home [rad or m]", *lines, ""])
@@ -257,8 +259,12 @@ def _side_by_side(model: ParallelModel, bodies: np.ndarray | None) -> tuple[Any,
     if bodies is None:
         rods = [pseudo_inertia.ball(1.0, RADIUS)] * count
         legs = model.mechanism.robot.legs[: 1 if model.identical_legs else None]
-        ends = [x[:3, 3] for leg in legs for x in _next_frames(leg)[: leg.bodies]]
-        bodies = np.array([*(pseudo_inertia.rod(1.0, end, RADIUS / 4) for end in ends), *rods[len(ends) :]])
+        count_of_rods = 0
+        for leg in legs:
+            for frame in _next_frames(leg)[: leg.bodies]:
+                rods[count_of_rods] = pseudo_inertia.rod(1.0, frame[:3, 3], RADIUS / 4)
+                count_of_rods += 1
+        bodies = np.array(rods)
     rows = bodies.reshape(-1, 10)[:count]
     joints = tuple(Joint(label) for label in labels[:count])
     elements = tuple(Element(joint.name, "rz", joint=k, owner=k) for k, joint in enumerate(joints))
@@ -295,14 +301,24 @@ def _identified(robot: ParallelMechanism, folder: Path, prior: str) -> _Source:
     single = model.single
     values = model.spread(possible.dynamics.values)
     covariance = possible.covariance[np.ix_(model.owners, model.owners)]
-    drives = drive_table(Dynamics(_side_by_side(single, single.known_parameters())[1], values), covariance)
+    _, single_arm = _side_by_side(single, single.known_parameters())
+    drives = drive_table(Dynamics(single_arm, values), covariance)
     keys = ("possible", "nearest", "distance", "allowed", "weight", "prior", "notes")
-    table = {
-        "base": {key: getattr(estimate, key) for key in ("names", "units", "values", "covariance")},
-        "standard": {"names": single.names, "units": single.units, "values": values}
-        | {"covariance": covariance, "frames": "about the frame of each link (robot.toml)"},
-        "consistency": {key: getattr(possible, key) for key in keys},
+    standard = {
+        "names": single.names,
+        "units": single.units,
+        "values": values,
+        "covariance": covariance,
+        "frames": "about the frame of each link (robot.toml)",
     }
+    base = {
+        "names": estimate.names,
+        "units": estimate.units,
+        "values": estimate.values,
+        "covariance": estimate.covariance,
+    }
+    consistency = {key: getattr(possible, key) for key in keys}
+    table = {"base": base, "standard": standard, "consistency": consistency}
     notes = [_consistency(possible, estimate.b), *possible.notes]
     if drives.left or np.any(drives.values[:, 3]):
         notes.append(f"not in URDF and MJCF, but in parameters.json: {', '.join(('offsets', *drives.left))}")
@@ -315,7 +331,9 @@ def _consistency(possible: PossibleBodies, count: int) -> str:
     head = f"consistent inertias {possible.distance:.2g} σ from the estimate of {count} parameters"
     limit = f"95 % of correct models are within {possible.allowed:.2g}"
     worst = "; ".join(f"{name} (without it {ratio:.3g})" for name, ratio in possible.blamed)
-    return f"{head}; {limit}" + (f"; contradicted most by {worst}" if worst else "")
+    if not worst:
+        return f"{head}; {limit}"
+    return f"{head}; {limit}; contradicted most by {worst}"
 
 
 def _calibrated(robot: ParallelMechanism, folder: Path) -> _Source:
@@ -334,11 +352,16 @@ def _calibrated(robot: ParallelMechanism, folder: Path) -> _Source:
     prior_bodies = next(find_prior_bodies(chain, arm))
     estimate = read_estimate(folder)
     covariance = read_covariance(folder / COVARIANCE)[1]
-    table = {key: [getattr(row, key[:-1]) for row in estimate] for key in ("names", "units", "values")}
+    table: dict[str, Any] = {
+        "names": [row.name for row in estimate],
+        "units": [row.unit for row in estimate],
+        "values": [row.value for row in estimate],
+        "covariance": covariance,
+    }
     drives = drive_table(Dynamics(arm, np.zeros(model.p)))
     notes = ("masses are those of the robot's file, not identified; no friction", *prior_bodies.notes)
     opened = OpenedRobot(model, prior_bodies.parameters.ravel(), drives)
-    return _Source(opened, {"geometry": {**table, "covariance": covariance}}, notes)
+    return _Source(opened, {"geometry": table}, notes)
 
 
 def export_parallel(robot: ParallelMechanism, folder: Path, into: Path, prior: str = "entropic") -> tuple[str, ...]:

@@ -78,23 +78,17 @@ def drive_gains(
         motion = case.motion
         J = loop_jacobians(mechanism, mechanism.locate(motion.q)).readings.transpose(0, 2, 1)
         currents = J * case.target[:, None]
-        projected = replace(
-            case,
-            target=currents.sum(axis=2),
-            torque_rows=model.torque_rows,
-            present=model.torque_rows.of_joints(case.present),
-        )
+        rows_kind = model.torque_rows
+        present = rows_kind.of_joints(case.present)
+        projected = replace(case, target=currents.sum(axis=2), torque_rows=rows_kind, present=present)
         row_set = observe(model, base.kept, projected, decimator)
-        matrix = np.concatenate([decimate(currents, decimator, motion.segment), -row_set.matrix[:, :, ~fixed]], axis=2)
-        rows.append(
-            replace(
-                row_set,
-                matrix=matrix,
-                target=row_set.matrix @ drive_values,
-                names=(*robot.joint_names, *np.array(names)[~fixed]),
-                units=("",) * matrix.shape[2],
-            )
-        )
+        # Unknown: gains of the currents, and the parameters that are not stated.
+        currents = decimate(currents, decimator, motion.segment)
+        matrix = np.concatenate([currents, -row_set.matrix[:, :, ~fixed]], axis=2)
+        unknowns = (*robot.joint_names, *np.array(names)[~fixed])
+        target = row_set.matrix @ drive_values
+        units = ("",) * matrix.shape[2]
+        rows.append(replace(row_set, matrix=matrix, target=target, names=unknowns, units=units))
         squares.append(np.mean(J**2, axis=0))
         noises.append(np.mean((case.target - motion.in_band(case.target)) ** 2, axis=0))
     noise = np.mean(noises, axis=0) + 1e-12 * np.mean(noises)
@@ -111,16 +105,12 @@ def drive_gains(
     jackknife = np.sqrt((len(pseudo_values) - 1) * np.var(pseudo_values, axis=0))
     wider = np.maximum(1.0, jackknife / np.sqrt(np.diag(solution.covariance)))
     values = np.zeros(len(names))
-    values[fixed], values[~fixed] = drive_values[fixed], solution.remaining
+    values[fixed] = drive_values[fixed]
+    values[~fixed] = solution.remaining
     scale = ", ".join(f"{name} = {value:g}" for name, value in known_values.items())
-    return DriveGains(
-        frozen(solution.gains),
-        frozen(solution.covariance * np.outer(wider, wider)),
-        tuple(names),
-        frozen(values),
-        frozen(np.sqrt(solution.share * noise)),
-        scale,
-    )
+    covariance = solution.covariance * np.outer(wider, wider)
+    sigma = np.sqrt(solution.share * noise)
+    return DriveGains(frozen(solution.gains), frozen(covariance), tuple(names), frozen(values), frozen(sigma), scale)
 
 
 class _Solution(NamedTuple):
@@ -172,4 +162,6 @@ def _total_least_squares(
     inverse = np.linalg.pinv(flat) / size[:-1, None]
     variance = float(weighted @ weighted) / max((data.rows / tau).sum() - len(x), 1.0)
     squared = np.sum(residual**2 / scatter[:, None]) / max(data.rows.sum() - len(x), 1)
-    return _Solution(x[:n] / size[:n], variance * (inverse @ inverse.T)[:n, :n], x[n:] / size[n:-1], float(squared))
+    gains = x[:n] / size[:n]
+    covariance = variance * (inverse @ inverse.T)[:n, :n]
+    return _Solution(gains, covariance, x[n:] / size[n:-1], float(squared))

@@ -60,13 +60,16 @@ def propagate(
     deviations = np.sqrt(np.clip(np.diag(covariance.matrix), 0.0, None))
     names = tuple(parameter.name for parameter in parameters)
     units = tuple(parameter.unit for parameter in parameters)
+    # The directions of gravity have no stated uncertainty, nor have constants that were not fitted.
+    sigma = np.full(len(parameters) + len(TILTS), np.nan)
+    sigma[: len(parameters)] = np.where(deviations > 0.0, deviations, np.nan)
     return GeometryUncertainty(
         identification.names,
         (*names, *TILTS),
-        (*units, *("rad" for _ in TILTS)),
+        (*units, *["rad"] * len(TILTS)),
         matrix,
         identification.fitted.estimate.covariance,
-        np.append(np.where(deviations > 0.0, deviations, np.nan), np.full(len(TILTS), np.nan)),
+        sigma,
         frozen(slopes @ covariance.matrix @ slopes.T),
         felt,
         residual,
@@ -104,10 +107,15 @@ class _Differences:
             return replace(model, mechanism=closed(robot))
 
         robot = model.mechanism.robot
-        steps = STEP * directions.T
-        pairs = [(on(changed(robot, parameters, step)), on(changed(robot, parameters, -step))) for step in steps]
-        pairs += [(on(robot.tilted(axis)), on(robot.tilted(-axis))) for axis in STEP * np.eye(3)[: len(TILTS)]]
-        return cls(identification, pairs, np.array(scipy.linalg.block_diag(directions.T, np.eye(len(TILTS)))), torques)
+        pairs = []
+        for step in STEP * directions.T:
+            forth = changed(robot, parameters, step)
+            back = changed(robot, parameters, -step)
+            pairs.append((on(forth), on(back)))
+        axes = STEP * np.eye(3)[: len(TILTS)]
+        pairs += [(on(robot.tilted(axis)), on(robot.tilted(-axis))) for axis in axes]
+        by_direction = scipy.linalg.block_diag(directions.T, np.eye(len(TILTS)))
+        return cls(identification, pairs, np.array(by_direction), torques)
 
     def __call__(
         self, case: Case, span: slice, weighed: np.ndarray, decimator: Decimator
@@ -121,15 +129,20 @@ class _Differences:
         values = self.identification.fitted.estimate.values
         rows = self.identification.dynamics.model.rows
         posture = self.identification.dynamics.model.mechanism.locate(case.motion.q[span])
-        felt = spread(weighed if weighed.shape[1] == rows else weighed.sum(axis=1)[:, None], decimator, len(posture))
+        if weighed.shape[1] != rows:
+            weighed = weighed.sum(axis=1)[:, None]
+        felt = spread(weighed, decimator, len(posture))
         change = np.empty((len(posture), rows, len(self.pairs)))
         pulled = np.empty((len(columns), len(self.pairs)))
-        for k, pair in enumerate(self.pairs):
-            ends = []
-            for model in pair:
-                W, target = self._observed(model, case, span, posture)
-                ends.append((W @ values - target, np.einsum("nrp,nr->p", W, felt)))
-            change[:, :, k], pulled[:, k] = ((upper - two) / (2.0 * STEP) for upper, two in zip(*ends))
+        for k, (forth, back) in enumerate(self.pairs):
+            W, target = self._observed(forth, case, span, posture)
+            residual_forth = W @ values - target
+            pull_forth = np.einsum("nrp,nr->p", W, felt)
+            W, target = self._observed(back, case, span, posture)
+            residual_back = W @ values - target
+            pull_back = np.einsum("nrp,nr->p", W, felt)
+            change[:, :, k] = (residual_forth - residual_back) / (2.0 * STEP)
+            pulled[:, k] = (pull_forth - pull_back) / (2.0 * STEP)
         return decimate(change, decimator) @ self.by_direction, pulled @ self.by_direction
 
     def _observed(
@@ -139,12 +152,15 @@ class _Differences:
         columns = self.identification.base.kept
         if model.torque_rows.name == POWER.name:
             segment = next(slice(a, b) for a, b in segments(case.motion.segment) if a <= span.start < b)
-            return power_block(model, columns, case, span, np.zeros((0, len(case.motion))), segment).T[:, None], 0.0
+            no_payloads = np.zeros((0, len(case.motion)))
+            block = power_block(model, columns, case, span, no_payloads, segment)
+            return block.T[:, None], 0.0
         q = np.asarray(case.motion.q[span])
         v = np.asarray(case.motion.v[span])
         a = np.asarray(case.motion.a[span])
         motion = model.moved(q, v, a, posture)
-        W = model.on_rows(model.platform_regressor(motion, case.carried), motion)[:, :, columns]
+        regressor = model.platform_regressor(motion, case.carried)
+        W = model.on_rows(regressor, motion)[:, :, columns]
         if model.torque_rows.name != PLATFORM:
             return W, 0.0
         return W, np.einsum("nar,na->nr", motion.jacobians.readings, self.torques(case)[span])

@@ -26,7 +26,7 @@ def legs_differ(
     """Return the finding that legs are not identical, with the parameters that differ most; none where they may be.
 
     Args:
-        found: identification with identical legs; cases: its training data.
+        identification: with identical legs; cases: its training data.
         level: probability of a finding on legs that are identical (our choice).
     """
     model = identification.dynamics.model
@@ -38,21 +38,22 @@ def legs_differ(
     if len(fitted.std) != model.rows:
         rows = [part.by_recording(k, len(cases)) for k, part in enumerate(rows)]
     data = pool(triangulate(rows), len(fitted.std))
-    fits = [wls(data_, fitted.std, fitted.inflation).estimate for data_ in (fitted.pooled, data)]
-    squares = [
-        np.sum(data_.residual_squares(fit.values) / fitted.std**2 / fitted.inflation)
-        for data_, fit in zip((fitted.pooled, data), fits)
-    ]
+    shared_fit = wls(fitted.pooled, fitted.std, fitted.inflation).estimate
+    single_fit = wls(data, fitted.std, fitted.inflation).estimate
+    shared_rss = np.sum(fitted.pooled.residual_squares(shared_fit.values) / fitted.std**2 / fitted.inflation)
+    single_rss = np.sum(data.residual_squares(single_fit.values) / fitted.std**2 / fitted.inflation)
     added = data.parameters - fitted.pooled.parameters
-    dof = fits[1].dof
-    f = (squares[0] - squares[1]) / max(added, 1) / (squares[1] / dof)
+    dof = single_fit.dof
+    f = (shared_rss - single_rss) / max(added, 1) / (single_rss / dof)
     p = 1.0
     if added:
         p = float(fdtrc(added, dof, max(f, 0.0)))
     if p >= level:
         return []
-    alike = base.transform @ model.spread(identification.base.to_standard(fits[0].values[: identification.base.b]))
+    standard = identification.base.to_standard(shared_fit.values[: identification.base.b])
+    alike = base.transform @ model.spread(standard)
     shared = np.bincount(model.owners)[model.owners[base.kept]] > 1
-    away = np.where(shared, np.abs(fits[1].values - alike) / fits[1].sigma, 0.0)
-    names = [f"{base.names[k]} ({away[k]:.2g} σ)" for k in np.argsort(-away)[: shared.sum()]]
+    away = np.where(shared, np.abs(single_fit.values - alike) / single_fit.sigma, 0.0)
+    order = np.argsort(-away)[: shared.sum()]
+    names = [f"{base.names[k]} ({away[k]:.2g} σ)" for k in order]
     return [finding("legs-differ", p=p, names=names)]

@@ -64,7 +64,8 @@ class ParallelDynamics(DynamicsModel):
         their power [W]: as the model was identified.
         """
         dynamics: Any = self.found.dynamics
-        return dynamics.model.torque(dynamics.values, *(np.asarray(x, dtype=float) for x in (q, v, a)), ())
+        states = [np.asarray(q, dtype=float), np.asarray(v, dtype=float), np.asarray(a, dtype=float)]
+        return dynamics.model.torque(dynamics.values, *states, ())
 
 
 def identify_parallel(
@@ -97,10 +98,13 @@ def identify_parallel(
     mechanism = robot.mechanism
     row_kind = options.settings.torque_rows.name
     rows = rows_named(mechanism, "" if row_kind == "motor" else row_kind)
-    chosen = {key: value for key, value in (("method", method), ("friction", friction)) if value is not None}
-    options = replace(options, settings=replace(options.settings, torque_rows=rows, seed=seed, **chosen))
-    refuse_options_of_arms(options.settings, options)
-    settings = options.settings
+    settings = replace(options.settings, torque_rows=rows, seed=seed)
+    if method is not None:
+        settings = replace(settings, method=method)
+    if friction is not None:
+        settings = replace(settings, friction=friction)
+    options = replace(options, settings=settings)
+    refuse_options_of_arms(settings, options)
     inputs = gather(robot, recordings, validate, options=options, seed=seed, designed=designed, progress=progress)
     if on_read is not None:
         on_read(inputs)
@@ -112,18 +116,20 @@ def identify_parallel(
     if mechanism.robot.redundant:
         noticed.append(finding("torques-projected", actuators=mechanism.robot.n, freedoms=mechanism.robot.r))
         preloads = [_preload(mechanism, inputs, case) for case in inputs.cases]
-        noticed += [item for preload in preloads for item in preload]
-        mean = np.mean([[item.values["mean"] for item in preload] for preload in preloads], axis=0)
-        identification = replace(
-            identification,
-            dynamics=replace(identification.dynamics, model=replace(model, preload=tuple(mean.tolist()))),
-        )
+        means = []
+        for preload in preloads:
+            noticed += preload
+            means.append([item.values["mean"] for item in preload])
+        mean = np.mean(means, axis=0)
+        preloaded = replace(model, preload=tuple(mean.tolist()))
+        identification = replace(identification, dynamics=replace(identification.dynamics, model=preloaded))
     noticed = (*parameter_findings(identification), *identification.loop.findings, *settle(noticed))
     findings = ModelFindings(resting_parameters(identification), noticed=noticed)
     assessment = assess(inputs, identification, findings)
     carried = None
     if robot.covariance is not None:
-        (progress or (lambda message: None))("the geometry's share of the covariance")
+        if progress is not None:
+            progress("the geometry's share of the covariance")
         carried = propagate(identification, robot.covariance, inputs.cases, partial(actuator_torques, inputs), progress)
     return ParallelDynamics(
         **vars(assessment), inputs=inputs, found=identification, findings=findings, carried=carried, seed=settings.seed
@@ -158,18 +164,16 @@ def _preload(mechanism: ClosedRobot, inputs: IdentificationInputs, case: Case) -
     unit = "N m"
     if mechanism.robot.joints[0].kind == "prismatic":
         unit = "N"
-    return [
-        finding(
-            "preload",
-            file=case.name,
-            number=k,
-            mean=x.mean(),
-            spread=x.std(),
-            unit=unit,
-            sigma=x.std() * np.sqrt(inflation(x) / len(x)),
+    findings = []
+    for number, force in enumerate(forces.T, 1):
+        mean = force.mean()
+        spread = force.std()
+        # Neighbouring samples are alike: of the mean, the number of independent ones counts.
+        sigma = spread * np.sqrt(inflation(force) / len(force))
+        findings.append(
+            finding("preload", file=case.name, number=number, mean=mean, spread=spread, unit=unit, sigma=sigma)
         )
-        for k, x in enumerate(forces.T, 1)
-    ]
+    return findings
 
 
 def assess(
@@ -216,15 +220,15 @@ def _driven_joints(
     total = 0.0
     for case in cases:
         step = max(1, len(case.motion) // (10 * MAX_SAMPLES))
-        q, v, a = (getattr(case.motion, key)[::step] for key in "qva")
-        motion = model.moved(q, v, a)
+        v = case.motion.v[::step]
+        motion = model.moved(case.motion.q[::step], v, case.motion.a[::step])
         target = case.target[::step]
+        # Speeds that the target's forces act along; of power rows the target is the power.
+        speeds: np.ndarray | float = 1.0
         if case.torque_rows.name == PLATFORM:
             speeds = motion.rate
-        else:
-            speeds = 1.0
-            if target.shape[1] == model.n:
-                speeds = v
+        elif target.shape[1] == model.n:
+            speeds = v
         total += np.abs((target * speeds).sum(axis=1)).sum()
         energy += (model.tree_torque(values, motion) * motion.v).sum(axis=0)
     return tuple(name for name, joint_energy in zip(joints, energy) if joint_energy < MIN_ENERGY_SHARE * total)
@@ -254,10 +258,10 @@ def _encoders(mechanism: ClosedRobot, cases: Sequence[Case]) -> Iterator[Finding
     passive = [joint.name for leg in robot.legs for joint in leg.chain.joints if joint.name not in robot.joint_names]
     for case in cases:
         q = case.motion.q[:: max(1, len(case.motion) // MAX_SAMPLES)]
+        difference = 0.0
         if robot.redundant:
-            difference = float(np.sqrt(np.mean((q - mechanism.locate(q).q[:, robot.actuated]) ** 2)))
-        else:
-            difference = 0.0
+            closed_q = mechanism.locate(q).q[:, robot.actuated]
+            difference = float(np.sqrt(np.mean((q - closed_q) ** 2)))
         yield finding("encoders-contradict", file=case.name, count=robot.n, rms=difference)
         unread = " ".join(note for note in case.motion.notes if note.startswith("not read: "))
         unread_names = [name for name in passive if name in unread]
@@ -267,9 +271,8 @@ def _encoders(mechanism: ClosedRobot, cases: Sequence[Case]) -> Iterator[Finding
 
 def _payloads(model: ParallelModel, identification: Identification[Any], cases: Sequence[Case]) -> Iterator[Finding]:
     """Yield findings on each payload: always or never attached in the recordings, or identified with negative mass."""
-    masses = dict(
-        zip(identification.base.names, zip(identification.fitted.estimate.values, identification.fitted.estimate.sigma))
-    )
+    estimate = identification.fitted.estimate
+    masses = dict(zip(identification.base.names, zip(estimate.values, estimate.sigma)))
     for label in model.payloads:
         on = sum(label in case.carried for case in cases)
         if on in (0, len(cases)):

@@ -56,6 +56,8 @@ READ = ("holdout", "tolerance", "seed")
 FIGURES = "plot_*.png"
 FIT = (ROBOT, METRICS, ESTIMATE, COVARIANCE, calibrated.COVARIANCE, RESIDUALS, REPORT, *PAGES, FIGURES)
 HEADER = ("name", "unit", "value", "sigma")
+# of a cross-validation, where no rows are unseen (our choice)
+FOLDS = 4
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -106,7 +108,9 @@ class ParallelFit(Drawn, Judged):
         for (where, errors), (kind, (columns, unit)) in product(self.unseen.items(), kinds.items()):
             if not columns.any():
                 continue
-            before, after = (_rms(error[:, columns]) for error in errors)
+            nominal, calibrated = errors
+            before = _rms(nominal[:, columns])
+            after = _rms(calibrated[:, columns])
             figures.append(f"{kind} {1e3 * after:.3g} {unit} rms on {where} rows (nominal {1e3 * before:.3g})")
             tolerance = self.settings.tolerance
             if tolerance is not None and kind == "position":
@@ -114,12 +118,12 @@ class ParallelFit(Drawn, Judged):
                 figures[-1] += f", tolerance {1e3 * tolerance:g} mm"
             share = after / max(before, 1e-300)
             times = after / max(_rms(self.errors[1][:, columns]), 1e-300)
-            rules += [
-                finding("worse-than-nominal", times=share),
-                finding("no-transfer", times=times, remedy=""),
-                finding("small-gain", left=share),
-            ]
-        return Verdict.of("; ".join(figures), rules if figures else [finding("no-unseen-poses")])
+            rules.append(finding("worse-than-nominal", times=share))
+            rules.append(finding("no-transfer", times=times, remedy=""))
+            rules.append(finding("small-gain", left=share))
+        if not figures:
+            rules = [finding("no-unseen-poses")]
+        return Verdict.of("; ".join(figures), rules)
 
     @property
     def measured(self) -> bool:
@@ -179,13 +183,19 @@ class ParallelFit(Drawn, Judged):
         head = ["set", *(f"{joint.name} [{joint.unit}]" for joint in robot.joints)]
         if self.measured:
             scale = np.where(robot.selected < 3, 1e3, np.degrees(1.0))
-            headings = [f"{name} [{'mm' if k < 3 else 'deg'}]" for name, k in zip(robot.freedom, robot.selected)]
-            head += [*headings, *(f"d{name}" for name in headings), *(f"nominal d{name}" for name in headings)]
+            coordinates = []
+            for name, coordinate in zip(robot.freedom, robot.selected):
+                unit = "mm" if coordinate < 3 else "deg"
+                coordinates.append(f"{name} [{unit}]")
+            head += coordinates
+            errors = [f"d{heading}" for heading in coordinates]
         else:
-            head += [*self.columns, *(f"nominal {name}" for name in self.columns)]
-        parts = {"fit": (self.rows, self.errors)} | {
-            name: (unseen_rows, self.unseen[name]) for name, unseen_rows in self.unseen_rows.items()
-        }
+            errors = list(self.columns)
+        head += errors
+        head += [f"nominal {heading}" for heading in errors]
+        parts = {"fit": (self.rows, self.errors)}
+        for name, unseen_rows in self.unseen_rows.items():
+            parts[name] = (unseen_rows, self.unseen[name])
         for name, (table_rows, (before, after)) in parts.items():
             readings = table_rows[:, : robot.n]
             coordinates = scale * table_rows[:, robot.n :]
@@ -202,10 +212,8 @@ class ParallelFit(Drawn, Judged):
         fit = self.fit
         verdict = self.verdict
         all_errors = np.concatenate(list(self.judged.values()), axis=1)
-        errors = {
-            key: dict(zip(self.columns, row.tolist()))
-            for key, row in zip(("nominal", "calibrated"), np.sqrt(np.mean(all_errors**2, axis=1)))
-        }
+        nominal, calibrated = np.sqrt(np.mean(all_errors**2, axis=1)).tolist()
+        errors = {"nominal": dict(zip(self.columns, nominal)), "calibrated": dict(zip(self.columns, calibrated))}
         return {
             "robot": self.nominal.chain.name,
             "parameters": len(fit.parameters),
@@ -230,11 +238,11 @@ class ParallelFit(Drawn, Judged):
             f"encoders off by {fit.before:.3g}, calibrated by {fit.after:.3g} (rms, rad or m)"
         ]
         for where, errors in self.judged.items():
-            for name, (before, after) in zip(self.columns, 1e3 * np.sqrt(np.mean(errors**2, axis=1)).T):
-                if name in COORDINATES[:3]:
-                    unit = "mm"
-                else:
-                    unit = "mrad" if name in COORDINATES else "mrad (or mm)"
+            rms = 1e3 * np.sqrt(np.mean(errors**2, axis=1))
+            for name, (before, after) in zip(self.columns, rms.T):
+                unit = "mrad (or mm)"
+                if name in COORDINATES:
+                    unit = "mm" if name in COORDINATES[:3] else "mrad"
                 lines.append(f"  {name} on {where} rows: {before:.3g} -> {after:.3g} {unit} rms")
         return Section("", (Text("", lines),), verdict.level, verdict.reason)
 
@@ -248,7 +256,8 @@ class ParallelFit(Drawn, Judged):
         unseen_rows = dict(self.unseen_rows)
         for path, rows in zip(validate, _read(self.nominal.chain, validate, self.rows.shape[1])):
             name = f"{path.name}, unseen"
-            proofs[name], unseen_rows[name] = _errors(self.nominal.mechanism, self.fit.mechanism, rows), rows
+            proofs[name] = _errors(self.nominal.mechanism, self.fit.mechanism, rows)
+            unseen_rows[name] = rows
         return replace(self, unseen=proofs, unseen_rows=unseen_rows, files=(*self.files, *validate))
 
 
@@ -285,24 +294,25 @@ def fit_parallel(
     fixed = _held(mechanism, settings, options or FitOptions())
     tables = _read(mechanism.robot, (*measured, *validate))
     rows = np.concatenate(tables[: len(measured)])
-    unseen_rows = {
-        f"{path.name}, unseen": table for path, table in zip(validate, tables[len(measured) :]) if len(table)
-    }
-    if settings.tolerance is not None and not (
-        rows.shape[1] > mechanism.robot.n and (mechanism.robot.selected < 3).any()
-    ):
+    unseen_rows = {}
+    for path, table in zip(validate, tables[len(measured) :]):
+        if len(table):
+            unseen_rows[f"{path.name}, unseen"] = table
+    has_position = rows.shape[1] > mechanism.robot.n and (mechanism.robot.selected < 3).any()
+    if settings.tolerance is not None and not has_position:
         raise UsageError("a tolerance needs a measured platform position; none was measured")
     if settings.holdout:
         order = np.random.default_rng(settings.seed).permutation(len(rows))
         count = len(rows) - round(settings.holdout * len(rows))
         held_out = rows[order[count:]]
         rows = rows[order[:count]]
-        unseen_rows |= {"held out, unseen": held_out} if len(held_out) else {}
+        if len(held_out):
+            unseen_rows["held out, unseen"] = held_out
     say("fitting")
     try:
         fit = fit_loops(mechanism, *_parts(mechanism, rows), fixed=fixed)
         say("judging")
-        proofs = {name: _errors(mechanism, fit.mechanism, fit_errors) for name, fit_errors in unseen_rows.items()}
+        proofs = {name: _errors(mechanism, fit.mechanism, table) for name, table in unseen_rows.items()}
         fit_errors = _errors(mechanism, fit.mechanism, rows)
     except NoPosture as error:
         raise MeasurementError(f"{error}", measured[0]) from error
@@ -325,14 +335,18 @@ def read_rows(path: Path, robot: ParallelRobot) -> np.ndarray:
     """
     table = read_table(path)
     passive = [joint.name for leg in robot.legs for joint in leg.chain.joints if joint.name not in robot.joint_names]
-    readings = [table.numbers(joint.name, "angle" if joint.kind == "revolute" else "length") for joint in robot.joints]
+    readings = []
+    for joint in robot.joints:
+        quantity = "angle" if joint.kind == "revolute" else "length"
+        readings.append(table.numbers(joint.name, quantity))
     for name in table.header:
         if name in passive:
             table.fail("belongs to a passive joint, whose encoder cannot be used; remove the column", name)
         if name in COORDINATES and name not in robot.freedom:
             table.fail(f"is not a platform coordinate ({', '.join(robot.freedom)}); remove the column", name)
-    measured = any(name in table for name in robot.freedom)
-    return np.column_stack([*readings, *(read_coordinates(table, robot).T if measured else ())])
+    if any(name in table for name in robot.freedom):
+        readings.extend(read_coordinates(table, robot).T)
+    return np.column_stack(readings)
 
 
 def read_coordinates(table: Table, robot: ParallelRobot) -> np.ndarray:
@@ -341,7 +355,10 @@ def read_coordinates(table: Table, robot: ParallelRobot) -> np.ndarray:
     Raises:
         MeasurementError: naming the column that is missing.
     """
-    columns = [table.numbers(name, "length" if name in COORDINATES[:3] else "angle") for name in robot.freedom]
+    columns = []
+    for name in robot.freedom:
+        quantity = "length" if name in COORDINATES[:3] else "angle"
+        columns.append(table.numbers(name, quantity))
     return np.column_stack(columns)
 
 
@@ -368,24 +385,27 @@ def _read(robot: ParallelRobot, paths: Sequence[Path], width: int = 0) -> list[n
 def _parts(mechanism: ClosedRobot, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     """Return the readings (m, n) of rows, and the platform's coordinates (m, r) or None."""
     n = mechanism.robot.n
-    return rows[:, :n], rows[:, n:] if rows.shape[1] > n else None
+    if rows.shape[1] == n:
+        return rows, None
+    return rows[:, :n], rows[:, n:]
 
 
 def _errors(nominal: ClosedRobot, calibrated: ClosedRobot, rows: np.ndarray) -> np.ndarray:
     """Return the errors (2, m, k) of nominal and calibrated robot: platform coordinates, or `contradictions`."""
     readings, coordinates = _parts(nominal, rows)
     if coordinates is None:
-        return np.array([contradictions(mechanism, readings) for mechanism in (nominal, calibrated)])
-    return np.array([platform_errors(mechanism, readings, coordinates) for mechanism in (nominal, calibrated)])
+        return np.array([contradictions(nominal, readings), contradictions(calibrated, readings)])
+    before = platform_errors(nominal, readings, coordinates)
+    after = platform_errors(calibrated, readings, coordinates)
+    return np.array([before, after])
 
 
 def _cross_validated(
     mechanism: ClosedRobot, rows: np.ndarray, fixed: Sequence[str], seed: int
 ) -> dict[str, np.ndarray]:
     """Return the cross-validated errors of all rows; empty if a fold cannot be fitted."""
-    # of the rows, where none are unseen
-    folds_wanted = 4
-    folds = np.array_split(np.random.default_rng(seed).permutation(len(rows)), folds_wanted)
+    order = np.random.default_rng(seed).permutation(len(rows))
+    folds = np.array_split(order, FOLDS)
     errors = []
     for k, fold in enumerate(folds):
         training = rows[np.concatenate(folds[:k] + folds[k + 1 :])]

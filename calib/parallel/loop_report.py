@@ -46,6 +46,8 @@ class ReportedFit(Protocol):
 
 # the one model of a parallel robot's geometry
 MODEL = "loops"
+# correlation of two parameters from which on a report states it (our choice)
+CORRELATED = 0.9
 
 
 def report_of(fit: ReportedFit) -> Report:
@@ -54,31 +56,33 @@ def report_of(fit: ReportedFit) -> Report:
     Encoders that contradict each other measure neither position nor orientation: of readings alone it states no errors.
     """
     robot = fit.nominal.chain
-    fit_ = fit.fit
     estimate = fit.estimate
-    sets = {"fit": fit.errors} | _unseen(fit)
     parameters = []
-    for parameter, change, sigma in zip(fit_.parameters, estimate.values.tolist(), estimate.sigma.tolist()):
+    for parameter, change, sigma in zip(fit.fit.parameters, estimate.values.tolist(), estimate.sigma.tolist()):
         nominal = _nominal_value(robot, parameter)
         value = nominal + change
-        parameters.append(
-            FittedParameter(parameter.name, parameter.unit, nominal, value, sigma, _relative(sigma, value), "arm")
-        )
+        relative = _relative(sigma, value)
+        parameters.append(FittedParameter(parameter.name, parameter.unit, nominal, value, sigma, relative, "arm"))
+    sets = [_row_errors(fit, "fit", fit.errors)]
+    for name, errors in _unseen(fit).items():
+        sets.append(_row_errors(fit, name, errors))
+    prismatic = [joint.kind == "prismatic" for joint in robot.joints]
+    correlations = [CorrelatedPair(*pair) for pair in estimate.strong_correlations(CORRELATED)]
     return Report(
         schema=fit_report.SCHEMA,
         robot=robot.name,
         base="base",
         tip="platform",
         joints=robot.joint_names,
-        prismatic=tuple(joint.kind == "prismatic" for joint in robot.joints),
+        prismatic=tuple(prismatic),
         metrics=_metrics(fit),
         parameters=tuple(parameters),
         kept=(),
-        correlations=tuple(CorrelatedPair(*pair) for pair in estimate.strong_correlations(0.9)),
+        correlations=tuple(correlations),
         correlated=fit_report.most_correlated(estimate.names, estimate.covariance),
         singular_values=(),
         rank=0,
-        sets=tuple(_row_errors(fit, name, errors) for name, errors in sets.items()),
+        sets=tuple(sets),
         noise={"position": None, "orientation": None},
         files=_files(fit),
         source=str(fit.nominal.source),
@@ -87,13 +91,12 @@ def report_of(fit: ReportedFit) -> Report:
 
 def write(fit: ReportedFit, folder: Path, plots: bool) -> None:
     """Write ``report.json``, figures (if `plots`) and its certificate into a fit's folder."""
+    from calib.procedure.report.certificate import results
     from calib.procedure.report.charts import saved
     from calib.procedure.report.geometry_figures import captioned
 
     report = report_of(fit)
     fit_report.write(report, folder / REPORT)
-    from calib.procedure.report.certificate import results
-
     drawn = {}
     if plots:
         drawn = saved(captioned(report), folder)
@@ -103,9 +106,13 @@ def write(fit: ReportedFit, folder: Path, plots: bool) -> None:
 def _metrics(fit: ReportedFit) -> FitMetrics:
     verdict = fit.verdict
     tolerance = fit.settings.tolerance
-    vague = fit.fit.vague
+    tolerance_mm = None if tolerance is None else 1e3 * tolerance
+    not_identifiable: tuple[str, ...] = ()
+    if fit.fit.vague:
+        not_identifiable = (f"hardly identified by these poses: {', '.join(fit.fit.vague)}",)
+    validation = {name: _compared(fit, errors) for name, errors in _unseen(fit).items()}
     return FitMetrics(
-        validation={name: _compared(fit, errors) for name, errors in _unseen(fit).items()},
+        validation=validation,
         verdict=verdict.level,
         reason=verdict.reason,
         warnings=(),
@@ -115,21 +122,23 @@ def _metrics(fit: ReportedFit) -> FitMetrics:
         model=MODEL,
         ladder=(),
         seed=fit.settings.seed,
-        tolerance_mm=None if tolerance is None else 1e3 * tolerance,
-        not_identifiable=(f"hardly identified by these poses: {', '.join(vague)}",) if vague else (),
+        tolerance_mm=tolerance_mm,
+        not_identifiable=not_identifiable,
         outliers=(),
     )
 
 
 def _unseen(fit: ReportedFit) -> dict[str, np.ndarray]:
     """Return the errors of both robots on rows that were not fitted, by the names that reports have for them."""
-    return {fit_report.CROSS_VALIDATED if name == LEFT_OUT else name: errors for name, errors in fit.unseen.items()}
+    renamed = {LEFT_OUT: fit_report.CROSS_VALIDATED}
+    return {renamed.get(name, name): errors for name, errors in fit.unseen.items()}
 
 
 def _compared(fit: ReportedFit, errors: np.ndarray, unseen: bool = True, parameters: int = 0) -> ComparedRows:
     """Return the statistics of the errors (2, m, k) of both robots on some rows."""
-    nominal, calibrated = (_errors(fit, joint_errors).summary() for joint_errors in errors)
-    return ComparedRows(errors.shape[1], "the file's own", nominal, calibrated, unseen=unseen, parameters=parameters)
+    nominal, calibrated = errors
+    statistics = _errors(fit, nominal).summary(), _errors(fit, calibrated).summary()
+    return ComparedRows(errors.shape[1], "the file's own", *statistics, unseen=unseen, parameters=parameters)
 
 
 def _errors(fit: ReportedFit, joint_errors: np.ndarray) -> Errors:
@@ -147,15 +156,19 @@ def _errors(fit: ReportedFit, joint_errors: np.ndarray) -> Errors:
 
 
 def _row_errors(fit: ReportedFit, name: str, errors: np.ndarray) -> RowErrors:
-    nominal, calibrated = (
-        {
-            nature: tuple(size.tolist())
-            for nature in ("position", "orientation")
-            if (size := getattr(summary, nature)) is not None
-        }
-        for summary in (_errors(fit, joint_errors) for joint_errors in errors)
-    )
-    return RowErrors(name, name != "fit", errors.shape[1], nominal, calibrated)
+    nominal, calibrated = errors
+    return RowErrors(name, name != "fit", errors.shape[1], _sizes(fit, nominal), _sizes(fit, calibrated))
+
+
+def _sizes(fit: ReportedFit, errors: np.ndarray) -> dict[str, tuple[float, ...]]:
+    """Return the sizes of errors (m, k) of one robot by kind, of those that were measured."""
+    sizes = _errors(fit, errors)
+    by_kind = {}
+    if sizes.position is not None:
+        by_kind["position"] = tuple(sizes.position.tolist())
+    if sizes.orientation is not None:
+        by_kind["orientation"] = tuple(sizes.orientation.tolist())
+    return by_kind
 
 
 def _nominal_value(robot: ParallelRobot, parameter: LoopParameter) -> float:
@@ -171,4 +184,5 @@ def _relative(sigma: float, value: float) -> float | None:
 
 def _files(fit: ReportedFit) -> tuple[fit_report.FileRow, ...]:
     roles = {fit.nominal.source: "nominal robot"} | dict.fromkeys(fit.files, "measured")
-    return tuple(fit_report.file_row(path.name, role, path) for path, role in roles.items() if path.is_file())
+    rows = [fit_report.file_row(path.name, role, path) for path, role in roles.items() if path.is_file()]
+    return tuple(rows)

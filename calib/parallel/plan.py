@@ -97,19 +97,21 @@ class ParallelPlan(MotionPlan):
         """Write the result folder of `calib plan`."""
         from calib.procedure.report import motion_figures
 
-        def more(target: Path) -> None:
+        def write_figures(target: Path) -> None:
             if plots:
                 motion_figures.write_plan(self, target)
 
-        return write_motion(self.robot, Path(out), self.track, self.coordinates, self.bounds, self.to_dict(), more)
+        metrics = self.to_dict()
+        return write_motion(self.robot, Path(out), self.track, self.coordinates, self.bounds, metrics, write_figures)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics of ``metrics.json``."""
         track: Any = self.track
-        peaks = {
-            f"peak_{key}": np.abs(x).max(axis=0).tolist() for key, x in (("torque", track.tau), ("speed", track.v))
+        return super().to_dict() | {
+            "robot": self.robot.chain.name,
+            "peak_torque": np.abs(track.tau).max(axis=0).tolist(),
+            "peak_speed": np.abs(track.v).max(axis=0).tolist(),
         }
-        return super().to_dict() | {"robot": self.robot.chain.name} | peaks
 
 
 def plan_parallel(
@@ -178,7 +180,8 @@ def _read_waypoints(path: Path | np.ndarray, mechanism: ClosedRobot) -> np.ndarr
             f"({', '.join(mechanism.robot.joint_names)}) are among its columns: {', '.join(table.header)}",
         )
     try:
-        return coordinates_of(mechanism, mechanism.locate(read_rows(path, mechanism.robot)[:, : mechanism.robot.n]))
+        readings = read_rows(path, mechanism.robot)[:, : mechanism.robot.n]
+        return coordinates_of(mechanism, mechanism.locate(readings))
     except NoPosture as error:
         raise MeasurementError(f"waypoint out of reach: {error}", path) from error
 
@@ -193,8 +196,12 @@ def _law(robot: ParallelMechanism, folder: Path | None, payloads: tuple[str, ...
         refuse_option(folder, f"no payload '{unknown[0]}' was identified; known: {', '.join(model.payloads) or 'none'}")
     # smoothing of Coulomb's sign: along a path its direction is known
     smoothing = 1e-9
-    terms = tuple(replace(term, settings=(smoothing,)) if term.shape == "sign" else term for term in model.terms)
-    return _PlatformDynamics(replace(model, terms=terms), values, payloads)
+    terms = []
+    for term in model.terms:
+        if term.shape == "sign":
+            term = replace(term, settings=(smoothing,))
+        terms.append(term)
+    return _PlatformDynamics(replace(model, terms=tuple(terms)), values, payloads)
 
 
 def _paths(mechanism: ClosedRobot, points: np.ndarray, lines: bool, lever: float = 0.1) -> list[JointPath]:
@@ -202,7 +209,9 @@ def _paths(mechanism: ClosedRobot, points: np.ndarray, lines: bool, lever: float
     scale = np.where(mechanism.robot.selected < 3, 1.0, 1.0 / lever)
     if not lines:
         return [spline(points, scale=scale)]
-    return [spline(points[k : k + 2], scale=scale) for k in range(len(points) - 1)] or [spline(points)]
+    if len(points) < 2:
+        return [spline(points)]
+    return [spline(points[k : k + 2], scale=scale) for k in range(len(points) - 1)]
 
 
 def _of_actuators(mechanism: ClosedRobot, path: JointPath, places_per_span: int = 100) -> JointPath:

@@ -15,7 +15,9 @@ from calib.procedure.kinematic_stage.folder import FitFolder
 from calib.robot.chain import Joint
 from calib.robot.kinematics import forward, joint_frames
 
-DIMENSIONS = {name: "length" if k < 3 else "angle" for k, name in enumerate(COORDINATES)}
+DIMENSIONS: dict[str, str] = {}
+DIMENSIONS.update(dict.fromkeys(COORDINATES[:3], "length"))
+DIMENSIONS.update(dict.fromkeys(COORDINATES[3:], "angle"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +55,8 @@ class Picture:
             joints = joint_frames(leg.chain, q_leg)[:, :, :3, 3].transpose(1, 0, 2)
             end = forward(leg.chain, q_leg)[:, :3, 3]
             attachment = (posture.pose @ leg.attachment)[:, :3, 3]
-            legs.append(np.concatenate([joints, np.stack([end, attachment, posture.pose[:, :3, 3]], axis=1)], axis=1))
+            beyond_joints = np.stack([end, attachment, posture.pose[:, :3, 3]], axis=1)
+            legs.append(np.concatenate([joints, beyond_joints], axis=1))
             ends.append(attachment)
         return [*legs, np.stack([*ends, ends[0]], axis=1)]
 
@@ -86,13 +89,11 @@ class Picture:
             measured_pose = pose_of(self.mechanism, at)
             nominal = pose_of(self.mechanism, at - before)
             still = pose_of(self.mechanism, at - after)
-            places = [
-                pose[:, :3, 3] - still[:, :3, 3] + calibrated[:, :3, 3] for pose in (measured_pose, nominal, still)
-            ]
+            poses = (measured_pose, nominal, still)
+            places = [pose[:, :3, 3] - still[:, :3, 3] + calibrated[:, :3, 3] for pose in poses]
             if (robot.selected > 2).any():
-                turned = Rotation.from_matrix(
-                    measured_pose[:, :3, :3] @ still[:, :3, :3].transpose(0, 2, 1)
-                ).as_rotvec()
+                rotation = measured_pose[:, :3, :3] @ still[:, :3, :3].transpose(0, 2, 1)
+                turned = Rotation.from_matrix(rotation).as_rotvec()
         return q, *places, np.array(table.texts("set")) != "fit", turned
 
 

@@ -115,8 +115,9 @@ def mechanism(robot: object) -> Mechanism | None:
     if isinstance(robot, Mechanism):
         return robot
     for kind in ROBOTS.all():
-        if (found := kind.find(robot)) is not None:
-            return found
+        machine = kind.find(robot)
+        if machine is not None:
+            return machine
     return None
 
 
@@ -129,28 +130,34 @@ def stage_of(robot: object, verb: str, base: str | None = None, tip: str | None 
     Raises:
         UsageError: for a command that this kind of robot does not support, and for links.
     """
-    found = mechanism(robot)
-    if found is None:
+    machine = mechanism(robot)
+    if machine is None:
         return None
-    stages = next(kind for kind in ROBOTS.all() if found.kind == kind.KIND).stages()
+    stages = next(kind for kind in ROBOTS.all() if machine.kind == kind.KIND).stages()
     if verb not in stages:
-        instead = found.instead.get(verb, f"{', '.join(stages)} take it")
-        named = robot if isinstance(robot, (str, Path)) else found.source
-        raise UsageError(f"{named} is a {found.kind}, and {verb} is for serial arms only; {instead}")
-    for key, value in (("base", base), ("tip", tip)):
-        if value:
-            raise UsageError(f"{key} '{value}' is a link of a URDF; a {found.kind} has no such links")
-    return replace(stages[verb], run=partial(_run, stages[verb].run, found))
+        advice = machine.instead.get(verb, f"{', '.join(stages)} take it")
+        name = machine.source
+        if isinstance(robot, (str, Path)):
+            name = robot
+        raise UsageError(f"{name} is a {machine.kind}, and {verb} is for serial arms only; {advice}")
+    for key, link in (("base", base), ("tip", tip)):
+        if link:
+            raise UsageError(f"{key} '{link}' is a link of a URDF; a {machine.kind} has no such links")
+    stage = stages[verb]
+    return replace(stage, run=partial(_run, stage.run, machine))
 
 
-def _run(run: Callable[..., Any], found: Mechanism, *args: Any, **given: Any) -> Any:
-    """Return the result of a command; raise UsageError for an argument that is given but only serial arms have."""
-    known = signature(run).parameters
-    for key in given.keys() - known.keys():
-        if given[key] is not None:
-            instead = found.instead.get(key, "leave it out")
-            raise UsageError(f"{key} is for serial arms only, not for a {found.kind}; {instead}")
-    return run(found, *args, **{key: value for key, value in given.items() if key in known})
+def _run(run: Callable[..., Any], machine: Mechanism, *args: Any, **options: Any) -> Any:
+    """Return the result of a command; raise UsageError for an argument that is stated but only serial arms have."""
+    parameters = signature(run).parameters
+    run_options = {}
+    for key, value in options.items():
+        if key in parameters:
+            run_options[key] = value
+        elif value is not None:
+            advice = machine.instead.get(key, "leave it out")
+            raise UsageError(f"{key} is for serial arms only, not for a {machine.kind}; {advice}")
+    return run(machine, *args, **run_options)
 
 
 def joints_of(chain: Any) -> Joints:
@@ -161,5 +168,7 @@ def joints_of(chain: Any) -> Joints:
     from calib.data.schema import Joints
     from calib.robot.chain import joint_kinds
 
-    limits = (np.array([getattr(joint, key) for joint in chain.joints]) for key in ("lower", "upper", "effort"))
-    return Joints(chain.joint_names, tuple(joint_kinds(chain)), *limits)
+    lower = np.array([joint.lower for joint in chain.joints])
+    upper = np.array([joint.upper for joint in chain.joints])
+    effort = np.array([joint.effort for joint in chain.joints])
+    return Joints(chain.joint_names, tuple(joint_kinds(chain)), lower, upper, effort)

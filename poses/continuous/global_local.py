@@ -41,11 +41,11 @@ def mlsl_search(
         evaluations: most of the index, of both parts together.
         seconds: of processor time, of both parts together.
     """
-    began, spent, best, found, interrupted = time.process_time(), 0, -np.inf, start, False
-    solver, local = (nlopt.opt(one, start.size) for one in (nlopt.G_MLSL_LDS, nlopt.LD_CCSAQ))
+    began, spent, best, best_q, interrupted = time.process_time(), 0, -np.inf, start, False
+    solver, local = (nlopt.opt(algorithm, start.size) for algorithm in (nlopt.G_MLSL_LDS, nlopt.LD_CCSAQ))
 
     def charged(x: np.ndarray, slope: np.ndarray) -> float:
-        nonlocal spent, best, found, interrupted
+        nonlocal spent, best, best_q, interrupted
         spent += 1
         try:
             value, gradient = _charged(space, x.reshape(start.shape), index, existing)
@@ -56,7 +56,7 @@ def mlsl_search(
         if slope.size:
             slope[:] = -gradient.ravel()
         if value > best:
-            best, found = value, x.reshape(start.shape).copy()
+            best, best_q = value, x.reshape(start.shape).copy()
         return -value
 
     local.set_ftol_rel(1e-4)
@@ -69,11 +69,11 @@ def mlsl_search(
     solver.set_maxeval(max(1, evaluations // 2))
     with suppress(nlopt.ForcedStop, nlopt.RoundoffLimited):  # the best set stands
         solver.optimize(start.ravel())
-    found = restored(space, found)
-    bad = ~is_feasible(space, found, FEASIBLE)
-    found[bad] = start[bad]
-    left = 0.0 if interrupted else seconds - (time.process_time() - began)
-    run = improved(space, found, index, existing, evaluations=max(1, evaluations - spent), seconds=left)
+    best_q = restored(space, best_q)
+    bad = ~is_feasible(space, best_q, FEASIBLE)
+    best_q[bad] = start[bad]
+    remaining = 0.0 if interrupted else seconds - (time.process_time() - began)
+    run = improved(space, best_q, index, existing, evaluations=max(1, evaluations - spent), seconds=remaining)
     return replace(run, evaluations=spent + run.evaluations, interrupted=interrupted or run.interrupted)
 
 

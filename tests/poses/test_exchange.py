@@ -200,7 +200,7 @@ def test_candidates_keep_limits_and_predicate():
 
 def test_nothing_feasible_gives_the_share():
     with pytest.raises(NothingFeasible, match=r"0 of 4096 random poses are feasible \(0 %\)") as caught:
-        draw_candidates(np.zeros(3), np.ones(3), 10, lambda q: np.zeros(len(q), bool), most=4096)
+        draw_candidates(np.zeros(3), np.ones(3), 10, lambda q: np.zeros(len(q), bool), max_draws=4096)
     assert (caught.value.found, caught.value.draws) == (0, 4096)
 
 

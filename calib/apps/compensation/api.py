@@ -15,6 +15,7 @@ from calib.arguments import checked
 from calib.data.poses.pose_lists import Targets, read_targets
 from calib.errors import CalibError
 from calib.procedure.robot_kinds import joints_of, stage_of
+from calib.records import as_subclass
 
 
 class JointCommands(Shown, joint_commands.Commands):
@@ -97,4 +98,4 @@ def compensate(
         seed=seed,
         progress=progress,
     )
-    return JointCommands(**vars(commands))
+    return as_subclass(commands, JointCommands)

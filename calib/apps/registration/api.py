@@ -20,6 +20,7 @@ from calib.data.poses.fit_options import FitOptions
 from calib.estimation.estimate import Estimate
 from calib.geometry.installation import FRAME_AXES
 from calib.procedure.kinematic_stage.settings import FitSettings
+from calib.records import as_subclass
 from calib.robot.calibrated import CalibratedChain
 from calib.transforms import invert
 from calib.units import DEG
@@ -130,7 +131,7 @@ def tool(
     """
     asked = FitSettings(model="frames", holdout=settings.holdout, tolerance=settings.tolerance)
     found = fit_geometry(robot, measured, asked, options=options, base=base, tip=tip, progress=progress)
-    return Placements(**vars(found))
+    return as_subclass(found, Placements)
 
 
 def base(robot: Arm, measured: Several, settings: PlacementSettings = DEFAULT_PLACEMENT, **more: Any) -> Placements:

@@ -199,7 +199,8 @@ def data_set(condition: Condition, seed: int) -> Experiment:
     case = _recorded(condition, setup, robots.true, controller, seed)
     decimator = case.motion.decimator
     rows = observe(model, base.kept, case, decimator)
-    terms = [None if column < model.inertial else model.columns[column - model.inertial] for column in base.kept]
+    all_terms = [*[None] * model.inertial, *model.columns]
+    terms = [all_terms[column] for column in base.kept]
     problem = IdentificationProblem(
         model,
         base,
@@ -297,14 +298,12 @@ def _loop(condition: Condition, controller: Controller) -> LoopSettings:
     """Return the loop settings for the methods, with the errors of the condition."""
     kp, kd = BELIEVED if condition.mismatch == "controller" else (1.0, 1.0)
     truth = known_robots.truth(condition.robot)
-    return LoopSettings(
-        "pd",
-        kp=tuple(kp * controller.kp),
-        kd=tuple(kd * controller.kd),
-        limit=tuple(controller.limit),
-        rate=float(truth["control"]["rate"]),
-        inertia=tuple(truth["drives"]["Ia"]),
-    )
+    believed_kp = tuple(kp * controller.kp)
+    believed_kd = tuple(kd * controller.kd)
+    limit = tuple(controller.limit)
+    rate = float(truth["control"]["rate"])
+    inertia = tuple(truth["drives"]["Ia"])
+    return LoopSettings("pd", kp=believed_kp, kd=believed_kd, limit=limit, rate=rate, inertia=inertia)
 
 
 def _guess(plant: Plant, spread: float, seed: int) -> np.ndarray:

@@ -224,7 +224,8 @@ def _errors(model: Identification, inputs: IdentificationInputs, same_unit: np.n
     """Return the errors of a method's model, and their sums by block of time."""
     unseen = _sums(model, inputs.unseen)
     training = _sums(model, inputs.cases)
-    joint_errors = 100.0 * np.sqrt(unseen.error.sum(axis=0) / np.maximum(unseen.size.sum(axis=0), 1e-300))
+    joint_sizes = np.maximum(unseen.size.sum(axis=0), 1e-300)
+    joint_errors = 100.0 * np.sqrt(unseen.error.sum(axis=0) / joint_sizes)
     worst = int(np.argmax(np.where(same_unit, joint_errors, -1.0)))
     fitted = model.fitted
     compared = ComparedMethod(

@@ -156,9 +156,16 @@ def _read(database: sqlite3.Connection, path: Path) -> list[TrialRow]:
 
 def _cells(row: TrialRow) -> list[Cell | None]:
     """Return a row as SQLite stores it: NaN as NULL."""
-    return [None if isinstance(cell, float) and math.isnan(cell) else cell for cell in astuple(row)]
+    cells = list(astuple(row))
+    for index, cell in enumerate(cells):
+        if isinstance(cell, float) and math.isnan(cell):
+            cells[index] = None
+    return cells
 
 
 def _row(cells: Sequence[Cell | None]) -> TrialRow:
-    values: dict = {column: math.nan if cell is None else cell for column, cell in zip(COLUMNS, cells)}
+    values: dict = dict(zip(COLUMNS, cells))
+    for column, cell in values.items():
+        if cell is None:
+            values[column] = math.nan
     return TrialRow(**values)

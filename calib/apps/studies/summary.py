@@ -195,11 +195,16 @@ def _median_ratio(errors: Mapping[int, float], reference: Mapping[int, float]) -
     return float("inf")
 
 
+def _seed(row: TrialRow) -> int:
+    return row.seed
+
+
 def _summary(name: str, rows: Sequence[TrialRow]) -> MethodSummary:
     failures = Counter(row.status for row in rows if not row.found)
     examples = {}
     for status in failures:
-        first = min((row for row in rows if row.status == status), key=lambda row: row.seed)
+        same_status = [row for row in rows if row.status == status]
+        first = min(same_status, key=_seed)
         examples[status] = f"data set {first.seed}: {first.message}"
     figures = {}
     for figure in FIGURES:

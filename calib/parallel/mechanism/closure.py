@@ -65,7 +65,10 @@ class LegLinks:
 def leg_links(robot: ParallelRobot, posture: Posture) -> list[LegLinks]:
     """Return every leg's Jacobian, attachment and gap at postures, by rigid-body relations alone."""
     starts = robot.starts
-    return [links_of(leg, posture.q[:, a:b], posture.pose) for leg, a, b in zip(robot.legs, starts, starts[1:])]
+    links = []
+    for leg, start, end in zip(robot.legs, starts, starts[1:]):
+        links.append(links_of(leg, posture.q[:, start:end], posture.pose))
+    return links
 
 
 def pseudo_inverse(J: np.ndarray) -> np.ndarray:
@@ -199,7 +202,10 @@ def _why_singular(robot: ParallelRobot, home: Posture, leg: Leg) -> str:
     """Return the reason why a leg is singular: at home only, or in all postures."""
     rng = np.random.default_rng(0)
     k = robot.legs.index(leg)
-    elsewhere = [Posture(home.q + rng.uniform(-1.0, 1.0, home.q.shape), home.pose) for _ in range(4)]
+    elsewhere = []
+    for _ in range(4):
+        turned_q = home.q + rng.uniform(-1.0, 1.0, home.q.shape)
+        elsewhere.append(Posture(turned_q, home.pose))
     if all(
         float(_leg_rcond(leg_link, leg_link)[0]) < SINGULAR
         for leg_link in (leg_links(robot, posture_)[k] for posture_ in elsewhere)
@@ -216,7 +222,8 @@ def coordinates_of(mechanism: ClosedRobot, posture: Posture) -> np.ndarray:
     home = mechanism.robot.home
     turned = posture.pose[:, :3, :3] @ home[:3, :3].T
     angles = Rotation.from_matrix(turned).as_euler("xyz")
-    return np.hstack([posture.pose[:, :3, 3] - home[:3, 3], angles])[:, mechanism.robot.selected]
+    shift = posture.pose[:, :3, 3] - home[:3, 3]
+    return np.hstack([shift, angles])[:, mechanism.robot.selected]
 
 
 def pose_of(mechanism: ClosedRobot, coordinates: np.ndarray) -> np.ndarray:
@@ -225,7 +232,8 @@ def pose_of(mechanism: ClosedRobot, coordinates: np.ndarray) -> np.ndarray:
     full[:, mechanism.robot.selected] = coordinates
     pose = np.tile(mechanism.robot.home, (len(full), 1, 1))
     pose[:, :3, 3] += full[:, :3]
-    pose[:, :3, :3] = Rotation.from_euler("xyz", full[:, 3:]).as_matrix() @ mechanism.robot.home[:3, :3]
+    turn = Rotation.from_euler("xyz", full[:, 3:]).as_matrix()
+    pose[:, :3, :3] = turn @ mechanism.robot.home[:3, :3]
     return pose
 
 
@@ -259,7 +267,8 @@ def twists(
 def _reading_rows(mechanism: ClosedRobot, links: Sequence[LegLinks]) -> np.ndarray:
     """Return J_p^inv (N, n, r), which maps the twist's independent parts to encoder rates (eqs 5, 15; B_p = -1)."""
     D, _ = twists(mechanism, links)
-    return np.concatenate([link.inverse @ (link.carried @ D) for link in links], axis=1)[:, mechanism.robot.actuated]
+    joints = np.concatenate([link.inverse @ (link.carried @ D) for link in links], axis=1)
+    return joints[:, mechanism.robot.actuated]
 
 
 def _check_postures(mechanism: ClosedRobot, posture: Posture) -> None:
@@ -341,7 +350,8 @@ def _newton(mechanism: ClosedRobot, start: Posture, goals: np.ndarray, aim: _Aim
         links = leg_links(mechanism.robot, posture)
         D, t = twists(mechanism, links, [link.gap for link in links])
         twist = t + times(D, aim(mechanism, links, D, t, posture, goals[open_rows]))
-        steps = np.concatenate([times(link.inverse, times(link.carried, twist) - link.gap) for link in links], axis=1)
+        leg_steps = [times(link.inverse, times(link.carried, twist) - link.gap) for link in links]
+        steps = np.concatenate(leg_steps, axis=1)
         size = np.maximum(np.abs(steps).max(axis=1), np.abs(twist).max(axis=1))
         share = np.minimum(1.0, BOUND / np.maximum(size, 1e-300))[:, None]
         q[open_rows] += share * steps
@@ -362,7 +372,10 @@ def _tell_unreached(mechanism: ClosedRobot, posture: Posture, unreached: np.ndar
     links = dict(zip((leg.name for leg in mechanism.robot.legs), leg_links(mechanism.robot, first)))
     worst = max(links, key=lambda name: float(np.abs(links[name].gap).max()))
     gap = 1e3 * float(np.abs(links[worst].gap).max())
-    weak = [n for (n, link), home in zip(links.items(), at_home) if float(_leg_rcond(link, home)[0]) < max_rcond]
+    weak = []
+    for (name, link), home in zip(links.items(), at_home):
+        if float(_leg_rcond(link, home)[0]) < max_rcond:
+            weak.append(name)
     if gap > 1.0:
         reason = f"{worst} stays {gap:.3g} mm from its attachment: out of reach"
     else:
@@ -393,8 +406,10 @@ def _from_coordinates(
 ) -> np.ndarray:
     """Return the independent twist components (N, r) that move the platform to target coordinates (N, r)."""
     target = pose_of(mechanism, goals)
-    turn = Rotation.from_matrix(target[:, :3, :3] @ posture.pose[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
-    return np.hstack([target[:, :3, 3] - posture.pose[:, :3, 3], turn])[:, mechanism.robot.selected]
+    rotation = target[:, :3, :3] @ posture.pose[:, :3, :3].transpose(0, 2, 1)
+    turn = Rotation.from_matrix(rotation).as_rotvec()
+    shift = target[:, :3, 3] - posture.pose[:, :3, 3]
+    return np.hstack([shift, turn])[:, mechanism.robot.selected]
 
 
 def _moved(pose: np.ndarray, twist: np.ndarray) -> np.ndarray:
@@ -410,7 +425,8 @@ def _leg_rcond(links: LegLinks, home: LegLinks) -> np.ndarray:
     travel = np.linalg.norm(home.full[0, :3], axis=0)
     turns = np.linalg.norm(home.full[0, 3:], axis=0) > 0.5
     length = max(float(travel[turns].max(initial=0.0)), 1e-6)
-    by_row = np.where(np.arange(links.jacobian.shape[1]) < 3, length, 1.0)[:, None] / np.where(turns, 1.0, length)
+    row_length = np.where(np.arange(links.jacobian.shape[1]) < 3, length, 1.0)
+    by_row = row_length[:, None] / np.where(turns, 1.0, length)
     return _rcond(links.jacobian / by_row, links.inverse * by_row.T)
 
 
@@ -431,7 +447,9 @@ def _rcond(J: np.ndarray, inverse: np.ndarray) -> np.ndarray:
 
 def _determinants(mechanism: ClosedRobot, links: Sequence[LegLinks]) -> np.ndarray:
     """Return the signs (N, L + 1) of the legs' minors, and of the platform's determinant if J_p^inv is square."""
-    signs = [np.sign(np.linalg.det(link.jacobian[:, minor])) for link, minor in zip(links, mechanism.minors)]
+    signs = []
+    for link, minor in zip(links, mechanism.minors):
+        signs.append(np.sign(np.linalg.det(link.jacobian[:, minor])))
     last = np.zeros(len(links[0].gap))
     if not mechanism.robot.redundant:
         last = np.sign(np.linalg.det(_reading_rows(mechanism, links)))
@@ -455,7 +473,10 @@ def _check_freedom(robot: ParallelRobot, home: Posture, links: Sequence[LegLinks
     rng = np.random.default_rng(0)
     free = ClosedRobot(robot, home, (), np.zeros(0), False)
     for trial in range(4):
-        rows = [(np.eye(link.gap.shape[1]) - link.jacobian @ link.inverse) @ link.carried for link in links]
+        rows = []
+        for link in links:
+            projection = np.eye(link.gap.shape[1]) - link.jacobian @ link.inverse
+            rows.append(projection @ link.carried)
         values = np.linalg.svd(np.concatenate(rows, axis=1)[0])
         remaining = 6 - int((values[1] > 1e-9 * max(1.0, values[1][0])).sum())
         if remaining != robot.r:
@@ -464,10 +485,8 @@ def _check_freedom(robot: ParallelRobot, home: Posture, links: Sequence[LegLinks
                 f"({', '.join(robot.freedom)}); its free motions are {_motions(values[2][6 - remaining :])}"
             )
         if np.linalg.cond(values[2][6 - remaining :, robot.selected]) > 1e8:
-            robot.refuse(
-                f"the platform can move in {_motions(values[2][6 - remaining :])}; "
-                f"freedom lists {', '.join(robot.freedom)}"
-            )
+            motions = _motions(values[2][6 - remaining :])
+            robot.refuse(f"the platform can move in {motions}; freedom lists {', '.join(robot.freedom)}")
         fixed = fixed and float(np.abs(np.concatenate(rows, axis=1)[0] @ freedoms).max()) < 1e-9
         if trial == 3:
             break
@@ -480,4 +499,6 @@ def _check_freedom(robot: ParallelRobot, home: Posture, links: Sequence[LegLinks
 
 def _motions(rows: np.ndarray) -> str:
     """Return the names of a twist's components that are nonzero in rows (k, 6)."""
-    return ", ".join(name for name, size in zip(COORDINATES, np.linalg.norm(rows, axis=0)) if size > 1e-6) or "none"
+    sizes = np.linalg.norm(rows, axis=0)
+    names = [name for name, size in zip(COORDINATES, sizes) if size > 1e-6]
+    return ", ".join(names) or "none"

@@ -180,15 +180,16 @@ def fit_loops(
         mechanism = closed(changed(nominal.robot, parameters, changes))
     else:
         raise NotConverged(f"the geometry of '{robot.name}' does not settle within {LIMIT} steps", mechanism)
-    inverse = np.linalg.inv(np.linalg.qr(np.vstack([W / max(std, 1e-12), np.eye(count) / SPREAD]), mode="r"))
+    # Rows of the measurements, and of what was known of the parameters beforehand.
+    white = np.vstack([W / max(std, 1e-12), np.eye(count) / SPREAD])
+    inverse = np.linalg.inv(np.linalg.qr(white, mode="r"))
     covariance = inverse @ inverse.T
-    out = tuple(
-        parameter.name for parameter, sigma in zip(parameters, np.sqrt(np.diag(covariance))) if sigma > 0.5 * SPREAD
-    )
+    sigmas = np.sqrt(np.diag(covariance))
+    vague = tuple(parameter.name for parameter, sigma in zip(parameters, sigmas) if sigma > 0.5 * SPREAD)
     names = tuple(parameter.name for parameter in parameters)
     units = tuple(parameter.unit for parameter in parameters)
     estimate = Estimate(names, units, changes, covariance, std, len(residual) - rank)
-    return LoopFit(mechanism, parameters, estimate, out, before, float(np.sqrt(np.mean(residual**2))), iteration)
+    return LoopFit(mechanism, parameters, estimate, vague, before, float(np.sqrt(np.mean(residual**2))), iteration)
 
 
 def visible_directions(mechanism: ClosedRobot, parameters: Sequence[LoopParameter], postures: int = 100) -> np.ndarray:
@@ -199,9 +200,8 @@ def visible_directions(mechanism: ClosedRobot, parameters: Sequence[LoopParamete
     robot = mechanism.robot
     coordinates = np.random.default_rng(0).uniform(robot.lower, robot.upper, (postures, robot.r))
     readings = mechanism.place(coordinates).q[:, robot.actuated]
-    _, sizes, directions = np.linalg.svd(
-        _observed(mechanism, readings, coordinates, parameters)[1], full_matrices=False
-    )
+    _, jacobian = _observed(mechanism, readings, coordinates, parameters)
+    _, sizes, directions = np.linalg.svd(jacobian, full_matrices=False)
     return directions[sizes > TOLERANCE * sizes[0]].T
 
 
@@ -238,7 +238,8 @@ def _observed(
     links = leg_links(robot, posture)
     residual = readings - posture.q[:, robot.actuated]
     W = np.zeros((len(readings), robot.n, len(parameters)))
-    first = np.concatenate([[0], np.cumsum([len(leg.actuated) for leg in robot.legs])]).astype(int)
+    counts = [len(leg.actuated) for leg in robot.legs]
+    first = np.concatenate([[0], np.cumsum(counts)]).astype(int)
     for p, parameter in enumerate(parameters):
         rows = slice(first[parameter.leg], first[parameter.leg + 1])
         inverse = links[parameter.leg].inverse[:, list(robot.legs[parameter.leg].actuated)]
@@ -262,17 +263,15 @@ def _gap_slope(robot: ParallelRobot, posture: Posture, parameter: LoopParameter)
 
 
 def _candidates(leg: Leg, k: int) -> list[LoopParameter]:
-    elements = [
-        LoopParameter(f"{leg.name}.{element.name}", element.unit, k, "element", e)
-        for e, element in enumerate(leg.chain.elements)
-    ]
-    places = [
-        LoopParameter(f"{leg.name}.{part}.{axis}", "m" if i < 3 else "rad", k, part, i)
-        for part in ("base", "attachment")
-        for i, axis in enumerate(COORDINATES)
-        if part == "base" or i < leg.held
-    ]
-    return elements + places
+    candidates = []
+    for index, element in enumerate(leg.chain.elements):
+        candidates.append(LoopParameter(f"{leg.name}.{element.name}", element.unit, k, "element", index))
+    # A leg that ends in a point holds the platform's attachment by its position alone.
+    for part, count in (("base", len(COORDINATES)), ("attachment", leg.held)):
+        for index, axis in enumerate(COORDINATES[:count]):
+            unit = "m" if index < 3 else "rad"
+            candidates.append(LoopParameter(f"{leg.name}.{part}.{axis}", unit, k, part, index))
+    return candidates
 
 
 def _changed_leg(leg: Leg, parameter: LoopParameter, value: float) -> Leg:

@@ -113,9 +113,11 @@ class ParallelModel:
 
     def __post_init__(self) -> None:
         legs = self.mechanism.robot.legs
-        kinds = [(leg.bodies, [joint.kind for joint in leg.chain.joints]) for leg in legs]
-        for leg, kind in zip(legs, kinds if self.identical_legs else ()):
-            require(kind == kinds[0], f"identical_legs: {leg.name} is built unlike {legs[0].name}", UsageError)
+        if self.identical_legs:
+            kinds = [joint.kind for joint in legs[0].chain.joints]
+            for leg in legs:
+                alike = leg.bodies == legs[0].bodies and [joint.kind for joint in leg.chain.joints] == kinds
+                require(alike, f"identical_legs: {leg.name} is built unlike {legs[0].name}", UsageError)
         doubled = sorted({name for name in self.names if self.names.count(name) > 1})
         if doubled:
             raise CalibError(f"parameter '{doubled[0]}' occurs twice; give the payload or term another name")
@@ -129,8 +131,10 @@ class ParallelModel:
     def labels(self) -> tuple[str, ...]:
         """Labels of the bodies: the legs', the platform's, the payloads'."""
         robot = self.mechanism.robot
-        legs = [robot.labels[a + j] for leg, a in zip(robot.legs, robot.starts) for j in range(leg.bodies)]
-        return (*legs, robot.platform_label, *self.payloads)
+        labels: list[str] = []
+        for leg, start in zip(robot.legs, robot.starts):
+            labels += robot.labels[start : start + leg.bodies]
+        return (*labels, robot.platform_label, *self.payloads)
 
     @cached_property
     def single(self) -> ParallelModel:
@@ -224,10 +228,12 @@ class ParallelModel:
         """For each leg: its bodies, its joints' indices in the tree, and its bodies' columns."""
         robot = self.mechanism.robot
         ends = 10 * np.cumsum([0, *(leg.bodies for leg in robot.legs)])
-        return tuple(
-            (bodies_of(leg.chain), slice(*robot.starts[k : k + 2]), slice(*ends[k : k + 2]))
-            for k, leg in enumerate(robot.legs)
-        )
+        legs = []
+        for k, leg in enumerate(robot.legs):
+            joints = slice(*robot.starts[k : k + 2])
+            columns = slice(*ends[k : k + 2])
+            legs.append((bodies_of(leg.chain), joints, columns))
+        return tuple(legs)
 
     def regressor(
         self,
@@ -300,23 +306,28 @@ class ParallelModel:
 
     def tree_torque(self, values: np.ndarray, motion: LoopMotion) -> np.ndarray:
         """Return the torques (N, n_t) of the opened legs with their drives, without the platform."""
-        states = [motion.posture.q, motion.v, motion.a]
-        parts = [
-            rigid_body.inverse_dynamics(bodies, parameters, *(x[:, joints] for x in states))
-            for (bodies, joints, _), parameters in zip(self.legs, self.leg_parameters(values))
-        ]
-        result = np.concatenate(parts, axis=1)
+        q = motion.posture.q
+        v = motion.v
+        a = motion.a
+        torques = []
+        for (bodies, joints, _), parameters in zip(self.legs, self.leg_parameters(values)):
+            torques.append(rigid_body.inverse_dynamics(bodies, parameters, q[:, joints], v[:, joints], a[:, joints]))
+        result = np.concatenate(torques, axis=1)
+        no_payloads = np.zeros((0, len(result)))
         for term, value in zip(self.terms, self.spread(values)[self._bodies :]):
-            for joint, column in term.acting([*(x.T for x in states), None], np.zeros((0, len(result)))):
+            for joint, column in term.acting([q.T, v.T, a.T, None], no_payloads):
                 result[:, joint] += value * column
         return result
 
     def leg_parameters(self, values: np.ndarray) -> list[np.ndarray]:
         """Return the parameters of each leg's bodies; those of a last link that is the platform are zero."""
-        return [
-            np.append(self.spread(values)[columns], np.zeros(10 * bodies.count + columns.start - columns.stop))
-            for bodies, _, columns in self.legs
-        ]
+        standard = self.spread(values)
+        parameters = []
+        for bodies, _, columns in self.legs:
+            leg_values = np.zeros(10 * bodies.count)
+            leg_values[: columns.stop - columns.start] = standard[columns]
+            parameters.append(leg_values)
+        return parameters
 
     def platform_parameters(self, values: np.ndarray, carried: Collection[str] | None = None) -> np.ndarray:
         """Return the ten standard parameters of the platform together with the payloads on board."""
@@ -347,16 +358,22 @@ class ParallelModel:
 
     def acting(self) -> np.ndarray:
         states = self.sample(4, np.random.default_rng(0))
-        return np.asarray((np.abs(self.regressor(states.q, states.v, states.a)) > 1e-12).any(axis=0)).T
+        regressor = self.regressor(states.q, states.v, states.a)
+        return np.asarray((np.abs(regressor) > 1e-12).any(axis=0)).T
 
     def preference(self) -> np.ndarray:
         """Return the columns in the order of selection: platform, first moments, inertias, drives, masses, payloads.
 
         Of bodies next to the platform, inertia and mass regroup on it and on the links before (Khalil & Ibrahim 2007).
         """
-        body_order = [(bodies, (columns.stop - columns.start) // 10) for bodies, _, columns in self.legs]
-        order = np.concatenate([b.order[:k] for b, k in body_order])
-        kinds = np.concatenate([b.kinds[:k] for b, k in body_order])
+        orders = []
+        leg_kinds = []
+        for bodies, _, columns in self.legs:
+            count = (columns.stop - columns.start) // 10
+            orders.append(bodies.order[:count])
+            leg_kinds.append(bodies.kinds[:count])
+        order = np.concatenate(orders)
+        kinds = np.concatenate(leg_kinds)
         ranks: dict[str, list[int]] = {"moments": [], "inertias": [], "late": []}
         for i, (body_order, kind) in enumerate(zip(order, kinds)):
             last = KEPT_LAST["prismatic" if kind == PRISMATIC else "revolute"]
@@ -378,8 +395,10 @@ class ParallelModel:
         # stands on this module
         from calib.parallel.mechanism.simulation import ParallelPlant
 
-        joints = [int(self.mechanism.robot.actuated[term.acts[0][0]]) for term in terms]
-        actuated_terms = (replace(term, acts=((j, ((j, 1.0),)),)) for term, j in zip(terms, joints))
+        actuated_terms = []
+        for term in terms:
+            joint = int(self.mechanism.robot.actuated[term.acts[0][0]])
+            actuated_terms.append(replace(term, acts=((joint, ((joint, 1.0),)),)))
         return ParallelPlant(replace(self, terms=(*self.terms, *actuated_terms)), values)
 
     def joint_noise(self, noise: np.ndarray) -> np.ndarray:
@@ -411,7 +430,8 @@ class ParallelModel:
         parts = [leg.chain.inertias[: leg.bodies] for leg in robot.legs if leg.chain.inertias is not None]
         if len(parts) < len(robot.legs) or robot.platform is None:
             return None
-        parameters = np.concatenate([*parts, robot.platform[None], np.zeros((len(self.payloads), 10))]).ravel()
+        payloads = np.zeros((len(self.payloads), 10))
+        parameters = np.concatenate([*parts, robot.platform[None], payloads]).ravel()
         owners = self.owners[: self._bodies]
         return np.bincount(owners, parameters) / np.bincount(owners)
 

@@ -178,12 +178,16 @@ class ParallelRobot(Frozen):
     @cached_property
     def starts(self) -> np.ndarray:
         """Index (L + 1,) of each leg's first joint among all joints of the tree; the last entry is their number."""
-        return np.concatenate([[0], np.cumsum([leg.chain.n for leg in self.legs])]).astype(int)
+        counts = [leg.chain.n for leg in self.legs]
+        return np.concatenate([[0], np.cumsum(counts)]).astype(int)
 
     @cached_property
     def actuated(self) -> np.ndarray:
         """Indices (n,) of the actuated joints among all joints of the tree."""
-        return np.array([self.starts[k] + j for k, leg in enumerate(self.legs) for j in leg.actuated], dtype=int)
+        indices: list[int] = []
+        for start, leg in zip(self.starts, self.legs):
+            indices += [start + joint for joint in leg.actuated]
+        return np.array(indices, dtype=int)
 
     @property
     def joints(self) -> tuple[Joint, ...]:
@@ -199,11 +203,11 @@ class ParallelRobot(Frozen):
     def labels(self) -> tuple[str, ...]:
         """Labels of the tree's joints: joint j of leg k is ``jk``, as in the papers (``j.k`` above 9)."""
         wide = len(self.legs) > 9 or max(leg.chain.n for leg in self.legs) > 9
-        return tuple(
-            f"{j + 1}.{k + 1}" if wide else f"{j + 1}{k + 1}"
-            for k, leg in enumerate(self.legs)
-            for j in range(leg.chain.n)
-        )
+        separator = "." if wide else ""
+        labels: list[str] = []
+        for count, leg in enumerate(self.legs, 1):
+            labels += [f"{joint}{separator}{count}" for joint in range(1, leg.chain.n + 1)]
+        return tuple(labels)
 
     @property
     def platform_label(self) -> str:
@@ -265,14 +269,22 @@ def _from_table(table: Mapping[str, Any], where: str) -> ParallelRobot:
     legs = table.get("leg")
     if not isinstance(legs, list) or not legs or not all(isinstance(leg, Mapping) for leg in legs):
         refuse_robot(where, "no [[leg]] tables found; a parallel robot needs one per leg")
+    name = word(table, "name", where)
+    parsed_legs = [_leg(leg, k, gravity, where) for k, leg in enumerate(legs)]
+    home = placement(platform.get("home", {}), f"{location}, home")
+    lower = _values(platform.get("lower"), turns, f"{location}, lower", "coordinate of freedom")
+    upper = _values(platform.get("upper"), turns, f"{location}, upper", "coordinate of freedom")
+    inertia = None
+    if "inertia" in platform:
+        inertia = frozen(vector(platform["inertia"], 10, f"{location}, inertia"))
     return ParallelRobot(
-        name=word(table, "name", where),
-        legs=tuple(_leg(leg, k, gravity, where) for k, leg in enumerate(legs)),
+        name=name,
+        legs=tuple(parsed_legs),
         freedom=freedom,
-        home=placement(platform.get("home", {}), f"{location}, home"),
-        lower=_values(platform.get("lower"), turns, f"{location}, lower", "coordinate of freedom"),
-        upper=_values(platform.get("upper"), turns, f"{location}, upper", "coordinate of freedom"),
-        platform=frozen(vector(platform["inertia"], 10, f"{location}, inertia")) if "inertia" in platform else None,
+        home=home,
+        lower=lower,
+        upper=upper,
+        platform=inertia,
         gravity=gravity,
     )
 
@@ -281,7 +293,10 @@ def write(
     path: str | Path, robot: ParallelRobot, source: str = "", provenance: Mapping[str, Any] | None = None
 ) -> Path:
     """Write a parallel robot as a TOML file that `read` reproduces to the last bit."""
-    return files.write(path, dumps(to_table(robot, source) | ({"provenance": provenance} if provenance else {})))
+    table = to_table(robot, source)
+    if provenance:
+        table["provenance"] = provenance
+    return files.write(path, dumps(table))
 
 
 def to_table(robot: ParallelRobot, source: str = "") -> dict[str, Any]:
@@ -311,14 +326,11 @@ def _leg(entry: Mapping[str, Any], number_: int, gravity: np.ndarray, where: str
         rows["tail"] = entry["tail"]
     chain = _based(mdh.from_table(rows, location), placement(entry.get("base", {}), f"{location}, base"))
     turns = [joint.kind == "revolute" for joint in chain.joints]
-    return Leg(
-        name,
-        chain,
-        _actuated(entry, chain, location),
-        _values(entry.get("home", [0.0] * chain.n), turns, f"{location}, home", "joint"),
-        placement(entry.get("attachment", {}), f"{location}, attachment"),
-        word(entry, "end", location, "rigid"),
-    )
+    actuated = _actuated(entry, chain, location)
+    home = _values(entry.get("home", [0.0] * chain.n), turns, f"{location}, home", "joint")
+    attachment = placement(entry.get("attachment", {}), f"{location}, attachment")
+    end = word(entry, "end", location, "rigid")
+    return Leg(name, chain, actuated, home, attachment, end)
 
 
 def _based(chain: Chain, base: np.ndarray) -> Chain:
@@ -335,7 +347,7 @@ def _actuated(entry: Mapping[str, Any], chain: Chain, location: str) -> tuple[in
             refuse_robot(
                 location, f"actuated '{name}' is not one of its joints{advice}: {', '.join(chain.joint_names)}"
             )
-    return tuple(sorted(chain.joint_names.index(fromkey) for fromkey in dict.fromkeys(names)))
+    return tuple(sorted({chain.joint_names.index(name) for name in names}))
 
 
 def _words(value: Any, where: str) -> tuple[str, ...]:
@@ -348,7 +360,11 @@ def _values(values: Any, turns: Sequence[bool], location: str, quantity: str) ->
     """Return a list of values [rad where `turns`, else m], one per `each`."""
     if not isinstance(values, list) or len(values) != len(turns):
         refuse_robot(location, f"expected one value per {quantity}, {len(turns)}; found {shown(values)}")
-    return np.array([number(value, location, "angle" if turn else "length") for value, turn in zip(values, turns)])
+    parsed = []
+    for value, turn in zip(values, turns):
+        unit = "angle" if turn else "length"
+        parsed.append(number(value, location, unit))
+    return np.array(parsed)
 
 
 def _leg_table(leg: Leg) -> dict[str, Any]:

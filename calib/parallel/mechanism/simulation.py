@@ -101,13 +101,15 @@ class ParallelPlant:
         rate = np.linalg.pinv(loop_jacobians(mechanism, start).readings[0]) @ reference.v[0]
         out = np.empty((3, *shape))
         period = reference.period
+        if mixing is None:
+            mixing = np.empty((0, n, n))
         status, reached = simulation_kernels.run(
             _robot(self.model),
             self._values(),
             np.array(start.q[0]),
             np.array(start.pose[0]),
             rate,
-            np.empty((0, n, n)) if mixing is None else np.ascontiguousarray(mixing),
+            np.ascontiguousarray(mixing),
             controller.rows,
             reference.sampled(controller.ahead),
             encoder,
@@ -122,10 +124,13 @@ class ParallelPlant:
         tick = sample_ticks(len(out[0]), sensing.every)
         ticks = tick.astype(int)
         spline = CubicSpline(np.arange(len(out[0])), out[0])
-        q, v, a = (spline(tick, order) / period**order for order in range(3))
+        q = spline(tick, 0) / period**0
+        v = spline(tick, 1) / period**1
+        a = spline(tick, 2) / period**2
         t = reference.t[0] + tick * period
-        noise = encoder[ticks]
-        return SimulatedRun(t, frozen(q), v, a, frozen(q + noise), frozen(out[2, ticks] + heard[ticks]), out[2, ticks])
+        measured = q + encoder[ticks]
+        torque = out[2, ticks]
+        return SimulatedRun(t, frozen(q), v, a, frozen(measured), frozen(torque + heard[ticks]), torque)
 
     def _values(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the parameters of legs, platform and drives as `simulation_kernels.run` takes them."""
@@ -133,7 +138,8 @@ class ParallelPlant:
         values = self.parameters
         drives = np.zeros((int(model.mechanism.robot.starts[-1]), 5))
         drives[:, 4] = 1.0
-        for term, value in zip(model.terms, model.spread(values)[-len(model.terms) :] if model.terms else ()):
+        # Without terms the slice is of all parameters, and the loop has no round.
+        for term, value in zip(model.terms, model.spread(values)[-len(model.terms) :]):
             require(term.shape in SHAPES, f"term '{term.name}' ({term.shape}) cannot be simulated", UsageError)
             drives[term.joint, SHAPES[term.shape]] += value
             if term.shape == "sign":
@@ -148,8 +154,10 @@ def _robot(model: Any) -> tuple:
     """Return the arrays that describe a robot to `simulation_kernels.run`."""
     robot = model.mechanism.robot
     legs = [compiled(leg) for leg in robot.legs]
-    kinds = [bodies.links for bodies, _ in legs], [bodies.constants for bodies, _ in legs], [tail for _, tail in legs]
-    links, constants, tails, attachments = map(_stacked, (*kinds, [leg.attachment for leg in robot.legs]))
+    links = _stacked([bodies.links for bodies, _ in legs])
+    constants = _stacked([bodies.constants for bodies, _ in legs])
+    tails = _stacked([tail for _, tail in legs])
+    attachments = _stacked([leg.attachment for leg in robot.legs])
     return (
         frozen(links, np.int64),
         frozen(constants),

@@ -52,13 +52,13 @@ class Playback:
     notes: tuple[str, ...]
 
 
-def play(family: Family, found: SearchResult, inputs: ExcitationInputs, settings: ExcitationSettings) -> Playback:
+def play(family: Family, result: SearchResult, inputs: ExcitationInputs, settings: ExcitationSettings) -> Playback:
     """Return the setpoints of a designed motion: approach, periods and rehearsal, as set."""
     model, limits, chain = inputs.model, inputs.limits, inputs.chain
     # a period holds a whole number of the controller's samples
-    period = family.period * found.factor
+    period = family.period * result.factor
     count = round(period * settings.rate)
-    motion = dense_motion(family, found.x, np.arange(count + 1) * (period / count), found.factor)
+    motion = dense_motion(family, result.x, np.arange(count + 1) * (period / count), result.factor)
     once = _with_torque(Setpoints(settings.rate, motion.q, motion.v, motion.a), model)
     approach, notes = approach_to(settings.start, once.q[0], settings.rate, limits, chain)
     before: list[Setpoints] = []

@@ -133,7 +133,9 @@ def foretell(
     if not np.isfinite(limits).all():
         return None, ()
     if noise is None:
-        share = DEFAULT_NOISE if settings.noise is None else settings.noise
+        share = DEFAULT_NOISE
+        if settings.noise is not None:
+            share = settings.noise
         noise = share * limits
     noise_share = float(np.sqrt(np.mean((noise / limits) ** 2)))
     task = task_of(inputs, settings.seed)
@@ -344,7 +346,8 @@ def _shortened(
 
 def write(rows: Sequence[PredictedSigma], folder: Path) -> Path:
     """Write the parameters' predicted sigmas as CSV; value and rsd [%] are empty where the value is not known."""
-    header = [f"{name} [%]" if name == "rsd" else name for name in PredictedSigma._fields]
+    header = list(PredictedSigma._fields)
+    header[header.index("rsd")] = "rsd [%]"
     return files.write_table(folder / NAME, header, rows)
 
 

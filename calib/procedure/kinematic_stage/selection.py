@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, cast
 
@@ -90,7 +91,9 @@ class Chosen:
     @property
     def prediction(self) -> SelectionPrediction | None:
         """Prediction stored next to the poses; None if a parameter is not identifiable."""
-        return self.outlook.poses if np.isfinite(self.outlook.poses.rms) else None
+        if not np.isfinite(self.outlook.poses.rms):
+            return None
+        return self.outlook.poses
 
     @property
     def figures(self) -> tuple[str, ...]:
@@ -187,7 +190,9 @@ def choose(
         None, m, search, q=candidates, space=space, existing=existing_jacobian, map=map, progress=progress
     )
     # the selection without sight limits is not polished: the start of a polished one compares with it
-    comparable = float(selection.history[0]) if method == "polish" else selection.value
+    comparable = selection.value
+    if method == "polish":
+        comparable = float(selection.history[0])
     if view is not None:
         notes.append(view.assumed)
 
@@ -248,7 +253,7 @@ def _draw_feasible(space: SearchSpace, limits: Limits, settings: SelectionSettin
         for constraint in space.constraints:
             satisfied = (np.asarray(constraint.function(q)) <= 0.0).all(1)
             shares.append((constraint.name, satisfied.mean()))
-        shares.sort(key=lambda named_share: named_share[1])
+        shares.sort(key=itemgetter(1))
         listed = ", ".join(f"{name} {100 * share:.2g} %" for name, share in shares)
         hint = ""
         if limits.sight is not None:
