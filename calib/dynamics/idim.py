@@ -168,7 +168,7 @@ class IdentificationModel:
         drive_terms = self.columns
         terms = [drive_terms[column - self.inertial] for column in columns[body_count:]]
         term_weights = weights[:, :, body_count:].transpose(2, 1, 0)
-        by_q, by_v, by_a = gradients
+        by_q, by_v, by_a = gradients[0], gradients[1], gradients[2]
         motions = _columns_of(q, v, a)
         drives.slopes(terms, motions, term_weights, [by_q.T, by_v.T, by_a.T])
         return by_q, by_v, by_a
@@ -196,7 +196,7 @@ class IdentificationModel:
             if value:
                 terms.append(term)
                 term_weights.append(value * side_weights[term.side].T)
-        by_q, by_v, by_a = gradients
+        by_q, by_v, by_a = gradients[0], gradients[1], gradients[2]
         motions = _columns_of(q, v, a)
         drives.slopes(terms, motions, np.array(term_weights), [by_q.T, by_v.T, by_a.T])
         return by_q, by_v, by_a

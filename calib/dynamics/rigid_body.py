@@ -108,7 +108,7 @@ def regressor_gradient(
     shape = (len(q), bodies.n, 10 * bodies.count)
     weights = _plain(shaped(weights, shape, "weights of the regressor"))
     amount, cosine, sine = _placed(bodies, q)
-    by_q, by_v, by_a = np.zeros((3, *q.shape))
+    by_q, by_v, by_a = np.zeros(q.shape), np.zeros(q.shape), np.zeros(q.shape)
     gradient_kernels.regressor_gradient(
         bodies.links, bodies.constants, bodies.order, amount, cosine, sine, v, a, weights, by_q, by_v, by_a
     )
@@ -134,7 +134,7 @@ def torque_gradient(
     links, constants, order = bodies.links, bodies.constants, bodies.order
     chain = gradient_kernels.hung_on_one(links)
     amount, cosine, sine = _placed(bodies, q)
-    by_q, by_v, by_a = np.zeros((3, *q.shape))
+    by_q, by_v, by_a = np.zeros(q.shape), np.zeros(q.shape), np.zeros(q.shape)
     gradient_kernels.torque_gradient(
         links, chain, constants, order, amount, cosine, sine, v, a, chi, weights, by_q, by_v, by_a
     )
