@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from calib.api.kinematic import GeometryFit, PoseSelection, fit_geometry, select_poses
     from calib.api.motions import ExcitationDesign, MotionPlan, design_excitation, plan_motion
     from calib.api.reading import load, read_poses, read_recording
+    from calib.apps.joining.joining import join
     from calib.errors import CalibError
     from calib.identification.identify_options import IdentifySettings
     from calib.procedure.excitation.settings import ExcitationSettings, PlanSettings
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
     from calib.robot.calibrated import CalibratedChain
     from calib.rooms.compensation.api import JointCommands, compensate
     from calib.rooms.fleet.fleet import run_sessions
-    from calib.rooms.instruments.joining import join
     from calib.rooms.over_time.comparison.robot_change import diff
     from calib.rooms.placements.api import base, hand_eye, tool
 
@@ -51,7 +51,7 @@ _HOMES = {
     "rooms.fleet.fleet": ("run_sessions",),
     "robot.calibrated": ("CalibratedChain",),
     "rooms.compensation.api": ("compensate", "JointCommands"),
-    "rooms.instruments.joining": ("join",),
+    "apps.joining.joining": ("join",),
     "rooms.over_time.comparison.robot_change": ("diff",),
     "rooms.placements.api": ("tool", "base", "hand_eye"),
     "procedure.kinematic_stage.settings": ("SelectionSettings", "FitSettings"),

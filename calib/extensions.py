@@ -1,8 +1,8 @@
 """Extension points: where several packages add to one table, each loaded at first use.
 
-A package directly below `calib.rooms` adds by a table ``OFFERS`` in its ``__init__.py``: name of a point →
-``module:name`` below the package (``:name`` for the package itself, ``module:`` for a module). The module that asks
-declares the point with the type of what is offered there::
+A package directly below one of `HOSTS` adds by a table ``OFFERS`` in its ``__init__.py``: name of a point →
+``module:name`` below the package (``:name`` for the package itself, ``module:`` for a module), or several of them. The
+module that asks declares the point with the type of what is offered there::
 
     METHODS: Point[Sequence[Method]] = Point("methods", "methods of identification")
     methods = [method for methods in METHODS.all() for method in methods]
@@ -21,50 +21,21 @@ from typing import Any, Generic, TypeVar
 
 from calib.errors import CalibError, UsageError, suggestion
 
-ROOMS = "calib.rooms"
+HOSTS = ("calib", "calib.apps", "calib.rooms")
 POINTS = (
-    "as_described",
-    "camera_guess",
-    "camera_view",
-    "check_controller",
     "commands",
-    "deflection_sensitivity",
     "descriptions",
-    "drift",
     "drive_gains",
-    "endings",
     "exports",
-    "fit_notes",
-    "fit_pages",
-    "geometry_spread",
-    "identified_masses",
-    "image_coverage",
-    "image_folders",
-    "image_words",
-    "joint_origins",
     "library",
-    "limit_tables",
-    "link_motion",
-    "model_pages",
-    "motors_as_described",
-    "notebook",
     "optics",
     "planned_poses",
-    "pose_forms",
-    "read_bag",
-    "read_board",
-    "read_lens",
-    "read_optics",
     "recordings",
-    "reprojection",
-    "return_masses",
     "robots",
-    "ros2_package",
     "schemas",
     "stages",
     "steps",
     "topics",
-    "ur_kinematics",
     "write_program",
 )
 T = TypeVar("T")
@@ -90,7 +61,7 @@ class Point(Generic[T]):
         Raises:
             UsageError: where a table names a point that does not exist, or what it offers cannot be loaded.
         """
-        return [_load(package, table[self.name]) for package, table in _offers().items() if self.name in table]
+        return [_load(package, place) for package, table in _offers().items() for place in table.get(self.name, ())]
 
     def one(self) -> T:
         """Return the first offer.
@@ -100,7 +71,7 @@ class Point(Generic[T]):
         """
         for offer in self.all():
             return offer
-        words = f"{self.name.replace('_', ' ')}: no package of {ROOMS} provides it; install the toolkit again"
+        words = f"{self.name.replace('_', ' ')}: no package provides it; install the toolkit again"
         raise UsageError(words)
 
 
@@ -110,20 +81,28 @@ def merged(point: Point[Mapping[str, T]]) -> dict[str, T]:
 
 
 @cache
-def _offers() -> dict[str, dict[str, str]]:
+def _offers() -> dict[str, dict[str, tuple[str, ...]]]:
     """Return each package's table of offers, by the package's full name; refuse misspelt names of points."""
-    try:
-        host = import_module(ROOMS)
-    except ImportError:
-        return {}
     tables = {}
-    for name in sorted(f"{ROOMS}.{module.name}" for module in pkgutil.iter_modules(host.__path__)):
-        table = _import(name).OFFERS
+    for name in _packages():
+        table = getattr(_import(name), "OFFERS", {})
         for point in table:
             if point not in POINTS:
                 raise UsageError(f"{name}: OFFERS: there is no extension point '{point}'{suggestion(point, POINTS)}")
-        tables[name] = table
+        tables[name] = {point: (places,) if isinstance(places, str) else places for point, places in table.items()}
     return tables
+
+
+def _packages() -> list[str]:
+    """Return the full names of the packages directly below one of `HOSTS`, sorted by their own names."""
+    found = []
+    for host in HOSTS:
+        try:
+            folders = import_module(host).__path__
+        except ModuleNotFoundError:
+            continue
+        found += [f"{host}.{module.name}" for module in pkgutil.iter_modules(folders) if module.ispkg]
+    return sorted(set(found) - set(HOSTS), key=lambda name: name.rpartition(".")[2])
 
 
 def _load(package: str, place: str) -> Any:

@@ -28,7 +28,7 @@ from calib.data.poses.measurements import take
 from calib.geometry.model_choice.folds import region_folds
 from calib.identification.identify import Identification, identify
 from calib.identification.identify_options import parse_options
-from calib.identification.torque_errors import TorqueIntervals
+from calib.identification.uncertainty.torque_errors import TorqueIntervals
 from calib.procedure.dynamic_stage.inputs import gather as gather_logs
 from calib.procedure.kinematic_stage.inputs import gather
 from calib.procedure.kinematic_stage.settings import FitSettings

@@ -160,7 +160,7 @@ def platform(folder: str) -> None:
 
     The true legs are 1 mm and 1 mrad (1 sigma) off their nominal in the poses; the torques are the model's, with noise.
     """
-    known, place, rng = find("dualv").known, Path(folder), np.random.default_rng(0)
+    known, place, rng = find("dualv").mechanism, Path(folder), np.random.default_rng(0)
     motors = known.robot.joint_names
     parameters = loop_parameters(known)
     true = closed(changed(known.robot, parameters, 1e-3 * rng.normal(size=len(parameters))))

@@ -31,15 +31,15 @@ HOMES = {
     ],
     "yourdfpy": ["calib.robot.formats.simulators"],
     "cv2": [
-        "calib.rooms.camera.pictures.detection",
-        "calib.rooms.camera.pictures.images",
-        "calib.rooms.camera.board_and_lens",
-        "calib.rooms.camera.pictures.board_print",
+        "calib.data.images.detection",
+        "calib.data.images.images",
+        "calib.data.images.board_and_lens",
+        "calib.data.images.board_print",
         "calib.rooms.cells.rendered_camera",
     ],
-    "ruamel": ["calib.rooms.camera.lens", "calib.rooms.descriptions.moveit"],
-    "mcap": ["calib.data.", "calib.rooms.camera."],
-    "rosbags": ["calib.rooms.controllers.bags", "calib.rooms.camera."],
+    "ruamel": ["calib.data.images.lens", "calib.procedure.measuring.moveit"],
+    "mcap": ["calib.data."],
+    "rosbags": ["calib.data.recordings.bags", "calib.data.images."],
     "pandas": ["calib.api.rendering"],
     "starlette": ["calib.rooms.serve.pages"],
     "uvicorn": ["calib.rooms.serve.commands"],
@@ -50,17 +50,17 @@ HOMES = {
     "ruckig": ["trajectories."],
     "clarabel": ["calib.estimation."],
     "cvxpy": [],  # the tests' independent solver
-    "matplotlib": ["calib.procedure.", "calib.api.", "calib.rooms."],
-    "jinja2": ["calib.procedure.report.templates", "calib.rooms.controllers.program"],
-    "typst": ["calib.rooms.certificate.rendering"],
+    "matplotlib": ["calib.procedure.", "calib.api.", "calib.rooms.", "calib.apps."],
+    "jinja2": ["calib.procedure.report.templates", "calib.apps.controller_programs.program"],
+    "typst": ["calib.procedure.report.certificate.rendering"],
     "dask": ["calib.workers.cluster"],
     "distributed": ["calib.workers.cluster"],
     "fsspec": ["calib.rooms.fleet.stores"],
     "cloudpickle": ["calib.workers.cluster"],
     "threadpoolctl": ["calib.workers.threads"],
-    "typer": ["calib.cli", "calib.cli.", "calib.rooms."],
+    "typer": ["calib.cli", "calib.cli.", "calib.rooms.", "calib.apps."],
     "click": ["calib.cli", "calib.cli."],
-    "rich": ["calib.cli", "calib.cli.", "calib.api.rendering", "calib.procedure.", "calib.rooms."],
+    "rich": ["calib.cli", "calib.cli.", "calib.api.rendering", "calib.procedure.", "calib.rooms.", "calib.apps."],
 }
 
 
@@ -132,11 +132,10 @@ def test_the_walker_sees_every_form_of_import():
 
 def test_no_core_module_names_a_room():
     """Except the list of what `import calib` offers, whose entries are loaded when first used."""
-    others = [
-        path for path in SOURCES if path.parts[len(ROOT.parts) + 1] != "rooms" and path != ROOT / "calib/__init__.py"
-    ]
-    core = {path: path.read_text(encoding="utf-8") for path in others}
-    assert [path for path in core if re.search(r"(import|from) calib\.rooms", path.read_text(encoding="utf-8"))] == []
+    upper = [path for folder in ("rooms", "apps") for path in (ROOT / "calib" / folder).rglob("*.py")]
+    core = [path for path in SOURCES if path not in upper and path != ROOT / "calib/__init__.py"]
+    named = re.compile(r"(import|from) calib\.(rooms|apps)")
+    assert [path for path in core if named.search(path.read_text(encoding="utf-8"))] == []
 
 
 def test_the_rooms_can_be_shut(monkeypatch):
@@ -150,8 +149,9 @@ def test_the_rooms_can_be_shut(monkeypatch):
     monkeypatch.setattr(extensions, "_offers", dict)
     assert extensions.Point("commands", "").all() == []
     with pytest.raises(UsageError):
-        extensions.Point("camera_guess", "").one()
-    code = "import sys; sys.modules['calib.rooms'] = None; import calib; from calib.cli import run; "
+        extensions.Point("optics", "").one()
+    code = "import sys; sys.modules['calib.rooms'] = sys.modules['calib.apps'] = None; "
+    code += "import calib; from calib.cli import run; "
     code += "from calib.data.poses.measurements import PoseMeasurements as Measured; import numpy as np; "
     code += "rng = np.random.default_rng(0); q = rng.uniform(-1, 1, (40, 6)); robot = calib.load('tx40'); "
     code += "seen = Measured.of(q, robot.forward(q)[:, :3, 3] + rng.normal(0, 1e-4, (40, 3))); "

@@ -15,6 +15,13 @@ from hypothesis import strategies as st
 from option_files import FILES
 from strategies import damaged
 
+from calib.data.images.board import Board, read_board, write_board
+from calib.data.images.board_print import raster
+from calib.data.images.detection import detect
+from calib.data.images.images import decode as read_image_of
+from calib.data.images.images import read_image
+from calib.data.images.lens import Lens, read_lens, write_lens
+from calib.data.images.pixels import Found, read_corners, write_corners
 from calib.data.poses.fit_options import read_options
 from calib.data.poses.pose_files import read_measurements
 from calib.data.poses.pose_lists import read_poses, read_targets
@@ -33,13 +40,6 @@ from calib.robot import description
 from calib.robot.formats import urdf_write
 from calib.robot.library import load
 from calib.robot.tables import dumps
-from calib.rooms.camera.board import Board, read_board, write_board
-from calib.rooms.camera.lens import Lens, read_lens, write_lens
-from calib.rooms.camera.pictures.board_print import raster
-from calib.rooms.camera.pictures.detection import detect
-from calib.rooms.camera.pictures.images import decode as read_image_of
-from calib.rooms.camera.pictures.images import read_image
-from calib.rooms.camera.pixels import Found, read_corners, write_corners
 
 LENS = Lens("pinhole", np.array([900.0, 900.0, 319.5, 239.5, 0, 0, 0, 0, 0]), (640, 480))
 

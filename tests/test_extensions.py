@@ -14,7 +14,7 @@ from calib.errors import UsageError
 from calib.extensions import POINTS, Point
 
 ROOT = Path(__file__).parents[1]
-HOST = import_module(extensions.ROOMS)
+HOST = import_module("calib.apps")
 DECLARED = re.compile(r"""^[A-Z0-9_]+: "?Point\[[^=]*\]"? = \(?\s*Point\(\s*"(?P<name>\w+)\b""", re.M)
 
 
@@ -46,7 +46,7 @@ def test_every_point_is_declared_once_with_its_type():
 
 def test_a_misspelt_point_is_told(add):
     add("extra", "OFFERS = {'comands': 'commands:app'}")
-    words = r"calib\.\w+\.extra: OFFERS: there is no extension point 'comands' \(did you mean 'commands'\?\)"
+    words = r"calib\.apps\.extra: OFFERS: there is no extension point 'comands' \(did you mean 'commands'\?\)"
     with pytest.raises(UsageError, match=words):
         Point("topics", "").all()
     with pytest.raises(ValueError, match="did you mean 'topics'"):
@@ -61,7 +61,7 @@ def test_a_misspelt_name_is_told(add):
 
 def test_an_extension_that_raises_is_told(add):
     add("extra", "OFFERS = {'commands': 'commands:app'}\nimport nothing_of_the_kind")
-    words = r"the extension calib\.\w+\.extra does not load: ModuleNotFoundError: .*'nothing_of_the_kind'; mend it"
+    words = r"the extension calib\.apps\.extra does not load: ModuleNotFoundError: .*'nothing_of_the_kind'; mend it"
     with pytest.raises(UsageError, match=words):
         Point("commands", "").all()
 

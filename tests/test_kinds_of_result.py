@@ -193,7 +193,7 @@ def test_programs_of_motions_are_written_where_asked(tmp_path, capsys):
 def test_a_parallel_fit_has_the_pages_and_figures_of_an_arms(tmp_path):
     robot, rng = find("fivebar"), np.random.default_rng(0)
     assert robot is not None
-    parameters = loop_parameters(robot.known)
+    parameters = loop_parameters(robot.mechanism)
     true = closed(changed(robot.chain, parameters, 1e-3 * rng.normal(size=len(parameters))))
     x = 0.8 * rng.uniform(robot.chain.lower, robot.chain.upper, (20, 2))
     q = true.place(x).q[:, robot.chain.actuated] + 1e-5 * rng.normal(size=(20, 2))

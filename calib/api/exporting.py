@@ -4,7 +4,7 @@ Validation compares a result with measurements that it was not estimated from.
 """
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, overload
@@ -14,7 +14,6 @@ from calib.api.kinematic import GeometryFit, Measured, Several
 from calib.api.rendering import listed, optional, saved
 from calib.arguments import checked
 from calib.errors import CalibWarning, RobotError, UsageError, refused_as, require
-from calib.extensions import Point
 from calib.procedure.dynamic_stage import identify as arm_identify
 from calib.procedure.export import delivery, geometry
 from calib.procedure.export.identified import is_identified
@@ -22,10 +21,6 @@ from calib.procedure.kinematic_stage import fit as arm_fit
 from calib.procedure.kinematic_stage import inputs as measured
 from calib.procedure.robot_kinds import MechanismResult, stage_of
 from calib.robot.library import resolve
-
-ROS2_PACKAGE: Point[Callable[..., list[str]]] = Point(
-    "ros2_package", "writes a ROS 2 package, see `calib.rooms.descriptions.ros2_package`"
-)
 
 
 @overload
@@ -109,7 +104,9 @@ def export(
         if ros2:
             wanted = replace(wanted, remark=delivery.verdicts(place).of("urdf", dynamics=True).remark)
             own = {"moveit": [*map(Path, moveit)], "control": control, "overwrite": overwrite}
-            return ROS2_PACKAGE.one()(wanted, ros2, into, **own)
+            from calib.procedure.export.ros2_package import write_package
+
+            return write_package(wanted, ros2, into, **own)
         delivery.check_into(wanted, into, place)
         lines = delivery.deliver(wanted, into)
         judged = delivery.mark(into, delivery.verdicts(place))

@@ -15,10 +15,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, ClassVar, Self, overload
 
 from calib.errors import UsageError, one_of, refused_as
-from calib.extensions import Point
 from calib.workers.threads import one_blas_thread
-
-NOTEBOOK: Point[Callable[[Any], str]] = Point("notebook", "HTML of a result")
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -121,7 +118,9 @@ class Judged(Shown, ABC):
 
     def _repr_html_(self) -> str | None:
         """Return the result as a page, as notebooks show it."""
-        return next((page(self) for page in NOTEBOOK.all()), None)
+        from calib.procedure.report.certificate.results import notebook
+
+        return notebook(self)
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, str]:
         """Return the page in a frame of its own, so that its style does not become the notebook's."""

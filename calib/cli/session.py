@@ -9,7 +9,7 @@ import typer
 from calib.cli.completion import codes, topics
 from calib.cli.shared import Seed, command, exit_failed, reporting, say
 from calib.errors import CalibError, UsageError, command_line, require
-from calib.procedure.session.answers import Answers
+from calib.procedure.answers import Answers
 
 app = typer.Typer()
 

@@ -1,0 +1,1 @@
+OFFERS = {"exports": ("recordings.controller_logs:translated", "poses.exports:translated")}

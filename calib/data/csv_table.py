@@ -33,11 +33,17 @@ EXPORTS: Point[Callable[[str | Path], IO[str] | None]] = Point(
 )
 
 _HEADING = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
-_UNIT_APART = re.compile(r"[ ]+([\[(])")  # q1 [deg], where blanks part the names
-_ERROR = re.compile(r"#(REF!|N/A|NUM!|DIV/0!|VALUE!|NAME\?|NULL!)", re.I)  # a cell of a spreadsheet, not a comment
+# q1 [deg], where blanks separate the names
+_DETACHED_UNIT = re.compile(r"[ ]+([\[(])")
+# A cell of a spreadsheet, not a comment.
+_ERROR = re.compile(r"#(REF!|N/A|NUM!|DIV/0!|VALUE!|NAME\?|NULL!)", re.I)
 _DECIMAL_COMMA = re.compile(r"^[+-]?\d*,\d+([eE][+-]?\d+)?$")
+# Rows read at a time.
 _CHUNK = 20_000
-LONGEST = 1 << 20  # letters of a line (our choice)
+# Letters of a line (our choice).
+LONGEST = 1 << 20
+# A row this many times as wide as the header probably has decimal commas.
+MAX_WIDTH_RATIO = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,19 +79,23 @@ class Table:
     def index(self, name: str) -> int:
         """Return the index of column `name`; refuse a missing column and suggest the nearest name."""
         if name not in self.header:
-            found = ", ".join(self.header)
-            self.fail(f"column '{name}' is missing{suggestion(name, self.header)}; found: {found}")
+            headings = ", ".join(self.header)
+            self.fail(f"column '{name}' is missing{suggestion(name, self.header)}; found: {headings}")
         return self.header.index(name)
 
     def texts(self, name: str) -> list[str]:
         """Return a column (m,) as texts; numbers in their shortest form (``0``, not ``0.0``)."""
         cells = self.cells[self.index(name)]
-        return [f"{cell:.12g}" for cell in cells] if cells.dtype == float else [plain_text(str(cell)) for cell in cells]
+        if cells.dtype == float:
+            return [f"{cell:.12g}" for cell in cells]
+        return [plain_text(str(cell)) for cell in cells]
 
     def block(self, head: str) -> np.ndarray | None:
         """Return the columns head_joint1 …, or head1 …, as one array (m, n), as they are; None if there are none."""
         names = [name for name in self.header if re.fullmatch(rf"{head}(\d+|_.+)", name)]
-        return np.column_stack([self.numbers(name, None) for name in names]) if names else None
+        if not names:
+            return None
+        return np.column_stack([self.numbers(name, None) for name in names])
 
     def numbers(self, name: str, dimension: str | None = "", unit: str = "", gaps: bool = False) -> np.ndarray:
         """Return a column (m,) as floats in SI.
@@ -103,9 +113,9 @@ class Table:
         (cells,) = self.check((name,), (name,) if gaps else ())
         if dimension is None:
             return cells
-        known = {"angle": ANGLES, "length": LENGTHS, "joint": ANGLES | LENGTHS, "": {"1": 1.0, "-": 1.0}}
-        known |= {"speed": QUANTITIES["speed"], "time": TIMES}
-        return cells * self.factor(column, known[dimension], unit)
+        units = {"angle": ANGLES, "length": LENGTHS, "joint": ANGLES | LENGTHS, "": {"1": 1.0, "-": 1.0}}
+        units |= {"speed": QUANTITIES["speed"], "time": TIMES}
+        return cells * self.factor(column, units[dimension], unit)
 
     def check(self, names: Sequence[str], gaps: Collection[str] = ()) -> list[np.ndarray]:
         """Return columns (m,) as floats, as they are; refuse the table where a cell of them is no finite number.
@@ -118,21 +128,27 @@ class Table:
             MeasurementError: at the first such row of the file, with the number of such rows, in all and by column.
         """
         cells = [self.cells[self.index(name)] for name in names]
-        values = [own if own.dtype == float else _as_floats(own) for own in cells]
-        bad = [np.isinf(own) if name in gaps else ~np.isfinite(own) for name, own in zip(names, values)]
-        refuse(self, np.column_stack(bad), names, lambda row, k: _not_a_number(cells[k][row]))
-        return values
+        columns = []
+        invalid = []
+        for name, column in zip(names, cells):
+            values = column if column.dtype == float else _as_floats(column)
+            columns.append(values)
+            invalid.append(np.isinf(values) if name in gaps else ~np.isfinite(values))
+        refuse(self, np.column_stack(invalid), names, lambda row, k: _not_a_number(cells[k][row]))
+        return columns
 
-    def factor(self, column: int, known: Mapping[str, float], unit: str) -> float:
-        """Return the factor to SI of a column; the unit is in its header or in `unit`, and one of `known`."""
-        name, own = self.header[column], self.units[column]
-        if own and unit and own != unit:
-            self.fail(f"the header states [{own}], the options state {unit}: remove one of them", name)
-        unit = own or unit
-        if unit and unit.lower() not in known:
-            expected = ", ".join(name for name in known if name.isascii())
+    def factor(self, column: int, factors: Mapping[str, float], unit: str) -> float:
+        """Return the factor to SI of a column; the unit is in its header or in `unit`, and one of `factors`."""
+        name, header_unit = self.header[column], self.units[column]
+        if header_unit and unit and header_unit != unit:
+            self.fail(f"the header states [{header_unit}], the options state {unit}: remove one of them", name)
+        unit = header_unit or unit
+        if not unit:
+            return 1.0
+        if unit.lower() not in factors:
+            expected = ", ".join(name for name in factors if name.isascii())
             self.fail(f"unit [{unit}] is not one of {expected}", name)
-        return known[unit.lower()] if unit else 1.0
+        return factors[unit.lower()]
 
     def where(self, keep: np.ndarray) -> Table:
         """Return the table of the rows selected by the mask `keep` (m,)."""
@@ -150,24 +166,35 @@ def read_table(path: str | Path, header: Sequence[str] | None = None, doubles: b
         MeasurementError: for a file that is missing, empty, not UTF-8, without a header, or with decimal commas; for
             a name that occurs twice; for a row of another length than the header.
     """
-    with opened(path, header is None) as (lines, separator, found):
-        names, units = (tuple(header), ("",) * len(header)) if header is not None else split_units(found)
-        if not doubles and len(set(names)) < len(names):
-            name = next(name for i, name in enumerate(names) if name in names[:i])
-            places = " and ".join(str(i + 1) for i, other in enumerate(names) if other == name)
-            refuse_data(path, f"occurs more than once in the header (columns {places})", name)
-        cells, notes = _read_columns(lines, separator, names, path), getattr(lines, "notes", ())
+    with opened(path, header is None) as (lines, separator, first_line):
+        if header is None:
+            names, units = split_units(first_line)
+        else:
+            names, units = tuple(header), ("",) * len(header)
+        if not doubles:
+            _refuse_doubles(names, path)
+        cells = _read_columns(lines, separator, names, path)
+        notes = getattr(lines, "notes", ())
     require(len(cells[0]), "has a header but no data rows", MeasurementError, path)
     rows = frozen(np.arange(1, len(cells[0]) + 1), int)
+    # Each line ends with a separator.
     if header is None and names[-1] == f"column {len(names)}" and not _filled(cells[-1]):
-        names, units, cells = names[:-1], units[:-1], cells[:-1]  # each line ends with a separator
+        names, units, cells = names[:-1], units[:-1], cells[:-1]
     return Table(str(path), names, units, cells, rows, notes)
+
+
+def _refuse_doubles(names: tuple[str, ...], path: str | Path) -> None:
+    """Refuse a header in which a name occurs twice."""
+    for index, name in enumerate(names):
+        if name in names[:index]:
+            columns = " and ".join(str(column) for column, heading in enumerate(names, 1) if heading == name)
+            refuse_data(path, f"occurs more than once in the header (columns {columns})", name)
 
 
 def read_header(path: str | Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the column names and units of the CSV file at `path` without reading its rows."""
-    with opened(path, True) as (_, _, found):
-        return split_units(found)
+    with opened(path, True) as (_, _, header):
+        return split_units(header)
 
 
 def row_width(path: str | Path) -> int:
@@ -183,17 +210,29 @@ def opened(path: str | Path, headed: bool) -> Iterator[tuple[IO[str], str, list[
         check_regular(path)
         raw = open(path, encoding="utf-8-sig", newline="")  # noqa: SIM115 (closed below)
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        raise MeasurementError(f"cannot be read: {getattr(error, 'strerror', None) or error}", path) from error
-    with raw as own:
-        exports = (export for room in EXPORTS.all() if headed and (export := room(path)) is not None)
-        file = next(exports, own)
+        reason = getattr(error, "strerror", None) or error
+        raise MeasurementError(f"cannot be read: {reason}", path) from error
+    with raw as file:
+        export = _as_our_text(path) if headed else None
+        if export is not None:
+            file = export
         yield file, *_first_line(file, path, headed)
+
+
+def _as_our_text(path: str | Path) -> IO[str] | None:
+    """Return another program's export as a stream of our text; None where the file is our table already."""
+    for read_export in EXPORTS.all():
+        export = read_export(path)
+        if export is not None:
+            return export
+    return None
 
 
 def _first_line(file: IO[str], path: str | Path, headed: bool) -> tuple[str, list[str]]:
     """Return the separator and the header's cells; the file is then positioned after its header line."""
     try:
-        comment, place = "", 0
+        comment = ""
+        line_start = 0
         for line in iter(partial(file.readline, LONGEST), ""):
             if len(line) == LONGEST:
                 refuse_data(path, f"has a line of more than {LONGEST} characters: not a table")
@@ -201,23 +240,33 @@ def _first_line(file: IO[str], path: str | Path, headed: bool) -> tuple[str, lis
             if text.startswith("#"):
                 comment = text
             elif text:
-                # a quoted name that holds a line break goes on in the next line
-                while line.count('"') % 2 and len(line) < LONGEST and (more := file.readline(LONGEST)):
-                    line += more
-                separator = _separator(line.strip(), partial(_ahead, file))
-                line = _UNIT_APART.sub(r"\1", line) if separator == " " else line
+                line = _with_quoted_breaks(line, file)
+                separator = _separator(line.strip(), partial(_next_row, file))
+                if separator == " ":
+                    line = _DETACHED_UNIT.sub(r"\1", line)
                 lines = line.strip("\r\n").splitlines(keepends=True)
-                first = next(csv.reader(lines, delimiter=separator, skipinitialspace=True))
-                if _headless(first, path) or not headed:
-                    file.seek(place)
-                    first = _comment_header(comment, separator, len(first), path) if headed else first
-                return separator, [cell.strip() for cell in first]
-            place = file.tell()
+                cells = next(csv.reader(lines, delimiter=separator, skipinitialspace=True))
+                if _headless(cells, path) or not headed:
+                    file.seek(line_start)
+                    if headed:
+                        cells = _comment_header(comment, separator, len(cells), path)
+                return separator, [cell.strip() for cell in cells]
+            line_start = file.tell()
     except UnicodeDecodeError as error:
         raise _not_utf8(error, path) from error
     except (csv.Error, StopIteration) as error:
         raise MeasurementError(f"is no CSV: {error}", path) from error
     refuse_data(path, "is empty: no header and no rows")
+
+
+def _with_quoted_breaks(line: str, file: IO[str]) -> str:
+    """Return a line with those after it, where a quoted name holds line breaks."""
+    while line.count('"') % 2 and len(line) < LONGEST:
+        continuation = file.readline(LONGEST)
+        if not continuation:
+            break
+        line += continuation
+    return line
 
 
 def _headless(cells: Sequence[str], path: str | Path) -> bool:
@@ -227,24 +276,32 @@ def _headless(cells: Sequence[str], path: str | Path) -> bool:
     return sum(is_number(cell) for cell in cells) > len(cells) / 2
 
 
-def _separator(line: str, ahead: Callable[[], str]) -> str:
-    """Return the separator of a first line; `ahead` returns the line after it."""
+def _separator(line: str, next_row: Callable[[], str]) -> str:
+    """Return the separator of a first line; `next_row` returns the line after it."""
     line = re.sub(r'"[^"]*"', "", line)
-    if mark := next((mark for mark in "\t;,|" if mark in line), ""):
-        return mark
+    for mark in "\t;,|":
+        if mark in line:
+            return mark
+    # numpy's savetxt
     if all(is_number(cell) for cell in line.split()):
-        return " "  # numpy's savetxt
-    names, numbers = _UNIT_APART.sub(r"\1", line).split(), ahead().split()
-    return " " if 1 < len(names) == len(numbers) and all(is_number(cell) for cell in numbers) else ","
+        return " "
+    names = _DETACHED_UNIT.sub(r"\1", line).split()
+    numbers = next_row().split()
+    if 1 < len(names) == len(numbers) and all(is_number(cell) for cell in numbers):
+        return " "
+    return ","
 
 
-def _ahead(file: IO[str]) -> str:
+def _next_row(file: IO[str]) -> str:
     """Return the next line that is neither empty nor a comment; the file position is unchanged."""
-    place = file.tell()
-    lines = iter(partial(file.readline, LONGEST), "")
-    found = next((line for line in lines if line.strip() and not line.startswith("#")), "")
-    file.seek(place)
-    return found
+    position = file.tell()
+    row = ""
+    for line in iter(partial(file.readline, LONGEST), ""):
+        if line.strip() and not line.startswith("#"):
+            row = line
+            break
+    file.seek(position)
+    return row
 
 
 def _comment_header(comment: str, separator: str, width: int, path: str | Path) -> list[str]:
@@ -261,17 +318,20 @@ def _comment_header(comment: str, separator: str, width: int, path: str | Path) 
 def split_units(cells: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return names and units of a header's cells: ``q1 [deg]`` is ``q1`` in ``deg``; "" without a unit."""
     names, units = [], []
-    for i, cell in enumerate(map(plain_text, cells)):
-        match = _HEADING.match(cell)
-        names.append((match["name"] if match else cell) or f"column {i + 1}")
-        units.append(match["unit"].strip() if match else "")
+    for number, cell in enumerate(cells, 1):
+        name, unit = plain_text(cell), ""
+        match = _HEADING.match(name)
+        if match:
+            name, unit = match["name"], match["unit"].strip()
+        names.append(name or f"column {number}")
+        units.append(unit)
     return tuple(names), tuple(units)
 
 
 def _read_columns(lines: IO[str], separator: str, names: tuple[str, ...], path: str | Path) -> tuple[np.ndarray, ...]:
     """Return the columns below the header. Blocks of nothing but numbers, one in each cell, are read by numpy, some
     five times as fast; from the first block on that is anything else, cell by cell."""
-    body = (line for line in lines if (text := line.lstrip()) and (text[0] != "#" or _ERROR.match(text)))
+    body = _without_comments(lines)
     blocks: list[np.ndarray] = []
     try:
         while block := list(islice(body, _CHUNK)):
@@ -280,8 +340,8 @@ def _read_columns(lines: IO[str], separator: str, names: tuple[str, ...], path: 
                 body = chain(block, body)
                 break
             blocks.append(numbers)
-        done = sum(len(block) for block in blocks)
-        parts = _read_cells(body, separator, names, path, done)
+        row_count = sum(len(block) for block in blocks)
+        parts = _read_cells(body, separator, names, path, row_count)
     except UnicodeDecodeError as error:
         raise _not_utf8(error, path) from error
     table = _transposed(blocks, len(names))
@@ -290,44 +350,55 @@ def _read_columns(lines: IO[str], separator: str, names: tuple[str, ...], path: 
     return tuple(_join([column, *part]) for column, part in zip(table, parts))
 
 
+def _without_comments(lines: IO[str]) -> Iterator[str]:
+    """Yield the lines that are neither empty nor a comment."""
+    for line in lines:
+        text = line.lstrip()
+        if text and (text[0] != "#" or _ERROR.match(text)):
+            yield line
+
+
 def plain_rows(block: list[str], separator: str, width: int) -> np.ndarray | None:
     """Return the lines as an array (m, width); None if a cell is not a number or the widths of rows differ."""
     delimiter = None if separator == " " else separator
     try:
-        found = np.loadtxt(block, delimiter=delimiter, comments=None, quotechar='"', ndmin=2)
+        values = np.loadtxt(block, delimiter=delimiter, comments=None, quotechar='"', ndmin=2)
     except ValueError:
         return None
-    return found if found.shape == (len(block), width) else None
+    return values if values.shape == (len(block), width) else None
 
 
 def _transposed(blocks: list[np.ndarray], width: int) -> np.ndarray:
     """Return blocks (m_i, width) as one array (width, m) of contiguous columns; empties `blocks`."""
-    table, place = np.empty((width, sum(len(block) for block in blocks))), 0
+    table = np.empty((width, sum(len(block) for block in blocks)))
+    start = 0
     blocks.reverse()
-    while blocks:  # an hour's log is held once, not twice
+    # Blocks go as they are copied: an hour's log is held once, not twice.
+    while blocks:
         block = blocks.pop()
-        table[:, place : place + len(block)] = block.T
-        place += len(block)
+        table[:, start : start + len(block)] = block.T
+        start += len(block)
     return read_only(table)
 
 
 def _read_cells(
-    body: Iterator[str], separator: str, names: tuple[str, ...], path: str | Path, done: int
+    body: Iterator[str], separator: str, names: tuple[str, ...], path: str | Path, row_count: int
 ) -> list[list[np.ndarray]]:
-    """Return the columns in parts, each of floats or of texts; `done` rows precede them."""
+    """Return the columns in parts, each of floats or of texts; `row_count` rows precede them."""
     parts: list[list[np.ndarray]] = [[] for _ in names]
-    rows = (row for row in csv.reader(body, delimiter=separator, skipinitialspace=True) if any(row))
+    reader = csv.reader(body, delimiter=separator, skipinitialspace=True)
+    rows = (row for row in reader if any(row))
     try:
         while chunk := list(islice(rows, _CHUNK)):
-            ragged = next((i for i, row in enumerate(chunk) if len(row) != len(names)), None)
-            if ragged is not None:
-                last = ragged == len(chunk) - 1 and next(rows, None) is None
-                refuse_data(path, _ragged(chunk[ragged], names, separator, last), row=done + ragged + 1)
+            for index, row in enumerate(chunk):
+                if len(row) != len(names):
+                    is_last = index == len(chunk) - 1 and next(rows, None) is None
+                    refuse_data(path, _ragged(row, names, separator, is_last), row=row_count + index + 1)
             for part, column in zip(parts, zip(*chunk)):
                 part.append(_convert(column))
-            done += len(chunk)
+            row_count += len(chunk)
     except csv.Error as error:
-        raise MeasurementError(f"is no CSV: {error}", path, done + 1) from error
+        raise MeasurementError(f"is no CSV: {error}", path, row_count + 1) from error
     return parts
 
 
@@ -339,20 +410,24 @@ def _convert(column: Sequence[str]) -> np.ndarray:
             raise ValueError("digits that Python alone takes for such")
         return np.array(column, dtype=float)
     except ValueError:
-        if all(not cell.strip() or is_number(cell) for cell in column):
-            return np.array([float(cell) if cell.strip() else math.nan for cell in column])
-        return np.array([cell.strip() for cell in column], dtype=object)
+        texts = [cell.strip() for cell in column]
+        if all(not text or is_number(text) for text in texts):
+            return np.array([float(text or "nan") for text in texts])
+        return np.array(texts, dtype=object)
 
 
 def _join(parts: Sequence[np.ndarray]) -> np.ndarray:
+    if not parts:
+        return frozen([])
     if all(part.dtype == float for part in parts):
-        return frozen(np.concatenate(parts)) if parts else frozen([])
+        return frozen(np.concatenate(parts))
     texts = [part if part.dtype == object else _as_texts(part) for part in parts]
     return read_only(np.concatenate(texts))
 
 
 def _as_texts(part: np.ndarray) -> np.ndarray:
-    return np.array(["" if math.isnan(value) else f"{value:.12g}" for value in part], dtype=object)
+    texts = ["" if math.isnan(value) else f"{value:.12g}" for value in part]
+    return np.array(texts, dtype=object)
 
 
 def _filled(cells: np.ndarray) -> bool:
@@ -361,23 +436,29 @@ def _filled(cells: np.ndarray) -> bool:
 
 def _as_floats(texts: np.ndarray) -> np.ndarray:
     """Return texts (m,) as floats: NaN where they are empty, infinite where they are no numbers."""
-    return np.array([math.nan if not text else float(text) if is_number(text) else math.inf for text in texts])
+    values = np.full(len(texts), math.inf)
+    for row, text in enumerate(texts):
+        if not text:
+            values[row] = math.nan
+        elif is_number(text):
+            values[row] = float(text)
+    return values
 
 
 def _not_a_number(cell: str | float) -> str:
     text = str(cell)
     if _DECIMAL_COMMA.match(text):
         return f"found '{text}', with a decimal comma: save the table with decimal points (1.5, not 1,5)"
-    found = "an empty or NaN cell" if text.lower() in ("", "nan") else f"'{text}'"
+    content = "an empty or NaN cell" if text.lower() in ("", "nan") else f"'{text}'"
     advice = "rows are counted without the header; leave such rows out, or measure them again"
-    return f"found {found} where a number is needed; {advice}"
+    return f"found {content} where a number is needed; {advice}"
 
 
 def _ragged(row: Sequence[str], names: Sequence[str], separator: str, last: bool) -> str:
     message = f"has {len(row)} cells, the header has {len(names)} columns"
     if last and len(row) < len(names):
         return f"{message}: the file ends here, in the middle of a line (power lost, disk full?); delete its last line"
-    if separator == "," and len(row) > 1.5 * len(names):
+    if separator == "," and len(row) > MAX_WIDTH_RATIO * len(names):
         message += "; if these are decimal commas, save the table with decimal points and commas between columns"
     return message
 

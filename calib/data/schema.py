@@ -15,7 +15,6 @@ from typing import Protocol
 import numpy as np
 
 from calib.errors import MeasurementError, counted, listing, refuse_option
-from calib.extensions import Point
 from calib.records import frozen
 from calib.units import DEG
 
@@ -42,12 +41,6 @@ class Bounds:
 
 
 BOUNDS = Bounds()
-AS_DESCRIBED: Point[Callable[[str, np.ndarray], np.ndarray]] = Point(
-    "as_described", "controller's name, joints as it shows them → the description's joints"
-)
-MOTORS_AS_DESCRIBED: Point[Callable[[str, np.ndarray], np.ndarray]] = Point(
-    "motors_as_described", "the same of motors' torques and currents"
-)
 
 
 @dataclass(frozen=True, eq=False)

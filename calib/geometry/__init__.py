@@ -1,0 +1,1 @@
+OFFERS = {"optics": "camera.camera_guess:optics_of"}

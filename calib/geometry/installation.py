@@ -7,14 +7,14 @@ In ``robot.toml``, besides the calibrated robot itself (`calib.robot.description
     xyz = [1.0, 0.0, 0.3]            # and rpy; or matrix
     [[tool]]                         # pose of the target in the tip's frame
     name = "tool"
-    [[camera]]                       # and [[board]], of images: see `calib.rooms.camera.optics`
+    [[camera]]                       # and [[board]], of images: see `calib.data.images.optics`
     [provenance]
     nominal_station = [...]          # and nominal_tool: the frames that let the nominal arm fit best
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -23,15 +23,12 @@ import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import CalibError, RobotError, refused_as
-from calib.extensions import Point
 from calib.records import frozen, read_record
 from calib.robot import calibrated
 from calib.robot.calibrated import Deflection, extra_displacements, nominal_of
 from calib.robot.chain import Chain
 from calib.robot.kinematics import Sweep, sweep
 from calib.robot.tables import placement, placement_table
-
-READ_OPTICS: Point[Callable[[Any, Any], Any]] = Point("read_optics", "optics from the tables of a fit's robot.toml")
 
 FRAME_AXES = ("x", "y", "z", "rx", "ry", "rz")
 
@@ -229,7 +226,9 @@ def _placed(chain: Chain, tables: Mapping[str, Any], source: str, deflection: De
         cell = replace(cell, tools=placements, tool_names=names)
     if frames.camera:
         with refused_as(RobotError, (CalibError, ValueError), f"{source}: {{}}"):
-            cell = replace(cell, optics=READ_OPTICS.one()(frames.camera, frames.board))
+            from calib.data.images.optics import read_optics
+
+            cell = replace(cell, optics=read_optics(frames.camera, frames.board))
     return cell
 
 

@@ -26,7 +26,28 @@ from calib.estimation.triangles import Triangles, retriangulate
 from calib.identification.rows import pool
 from calib.records import Array, frozen
 
-LEFT = 1.6  # by which relative gains are further off than noise and blocks of time show: what the model leaves moves
+LEFT = 1.6
+"""Factor by which relative gains are further off than noise and blocks of time show.
+
+What the model leaves moves them alike all along a recording: 13 gains of a UR10e, of four recordings, are rms 1.6 such
+sigmas from the maker's.
+"""
+ROUNDING = 1e-9
+"""Sigma of a gain that is set, in units of the gain: rounding."""
+MAX_ROUNDS = 60
+"""Rounds of Gauss and Newton."""
+MAX_LOG_STEP = 0.7
+"""Largest step of the logarithm of a gain."""
+CONVERGED = 1e-7
+"""Step of the logarithms of the gains at which the search has converged."""
+MAX_SIGMA = 0.3
+"""Sigma of a relative gain, in units of the gain, up to which the motion identifies it (our choice)."""
+MAX_FACTOR = 10.0
+"""Factor between gains of one robot's motors beyond which one counts as not identified (our choice)."""
+MIN_START = 0.05
+"""Least start value of a gain, in units of the median of all."""
+
+
 # them alike all along a recording. 13 gains of a UR10e, of four recordings, are rms 1.6 such sigmas from the maker's
 
 
@@ -53,17 +74,21 @@ class DriveGains:
 
     @property
     def sigma(self) -> np.ndarray:
+        """Standard deviations of the gains (n,) [N m/A or N/A]."""
         return np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
 
     @property
     def told(self) -> tuple[str, ...]:
         """Status of each gain: identified (``told``), ``reference`` of the others, or unidentified (``not told``)."""
-        sigma = self.sigma
-        rounding = 1e-9  # sigma of a gain that is set, of it: rounding
-        return tuple(
-            "not told" if j in self.own else "reference" if sigma[j] < rounding * self.gains[j] else "told"
-            for j in range(len(self.gains))
-        )
+        status = []
+        for joint, (gain, sigma) in enumerate(zip(self.gains, self.sigma)):
+            if joint in self.own:
+                status.append("not told")
+            elif sigma < ROUNDING * gain:
+                status.append("reference")
+            else:
+                status.append("told")
+        return tuple(status)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,22 +111,22 @@ class GainRecord:
     scale: str
 
     @classmethod
-    def of(cls, found: DriveGains, unit: str) -> GainRecord:
+    def of(cls, gains: DriveGains, unit: str) -> GainRecord:
         """Return the record of estimated gains; `unit` is the torques' unit."""
-        told = np.array(found.told)
+        status = np.array(gains.told)
         return cls(
-            np.where(told == "not told", np.nan, found.gains),
-            np.where(told == "told", found.sigma, np.nan),
-            found.told,
-            found.covariance,
-            f"{unit} per A",
-            found.scale,
+            values=np.where(status == "not told", np.nan, gains.gains),
+            sigma=np.where(status == "told", gains.sigma, np.nan),
+            told=gains.told,
+            covariance=gains.covariance,
+            unit=f"{unit} per A",
+            scale=gains.scale,
         )
 
 
 def identify_gains(
     currents: Triangles,
-    known: Mapping[str, float],
+    payload: Mapping[str, float],
     inflation: np.ndarray | None = None,
     start: Sequence[float] | None = None,
     reference: int | None = None,
@@ -111,139 +136,177 @@ def identify_gains(
 
     Args:
         currents: columns of the model with the payload, target the currents.
-        known: parameters whose values are known (a payload's mass, its centre of mass), in SI.
+        payload: parameters whose values are known (a payload's mass, its centre of mass), in SI.
         inflation: (n,) how many rows count as one.
-        start: (n,) first guess of the gains; None: from least squares on the torques of the known ones.
+        start: (n,) first guess of the gains; None: from least squares on the torques of the known parameters.
         reference: where nothing is known, the joint whose gain is set to 1: the others follow relative to it, and
             torques come out in amperes of that joint.
         own: joints whose gain stays at one, their torque in amperes of their own.
 
     Raises:
-        Unidentifiable: where nothing known is felt by a joint, directly or through others.
+        Unidentifiable: where no joint feels a known parameter, directly or through others.
     """
     n, names = currents.groups, currents.names
-    fixed = np.array([names.index(name) for name in known], dtype=int)
+    fixed = np.array([names.index(name) for name in payload], dtype=int)
     free = np.setdiff1d(np.arange(len(names)), fixed)
-    given = np.array([known[names[k]] for k in fixed])
-    if reference is None and (not len(fixed) or not np.any(given)):
+    fixed_values = np.array([payload[names[column]] for column in fixed])
+    if reference is None and (not len(fixed) or not np.any(fixed_values)):
         raise Unidentifiable(
             "gains need a payload of known mass: without it, currents identify torques only up to a scale", names
         )
-    tau = np.ones(n) if inflation is None else inflation
+    if inflation is None:
+        inflation = np.ones(n)
+
+    # Columns in units of their norm; what the known parameters contribute to the torque.
     factors = np.array(currents.factors)
     norms = np.linalg.norm(factors[:, :, free], axis=(0, 1))
     norms = np.where(norms > 0.0, norms, 1.0)
-    body, load, current = factors[:, :, free] / norms, factors[:, :, fixed] @ given, factors[:, :, -1]
-    if start is not None or reference is not None:
-        gain = np.ones(n) if start is None else np.array(start, dtype=float)
+    columns = factors[:, :, free] / norms
+    load = factors[:, :, fixed] @ fixed_values
+    current = factors[:, :, -1]
+    if start is not None:
+        gains = np.array(start, dtype=float)
+    elif reference is not None:
+        gains = np.ones(n)
     else:
-        gain = _start(body, load, current)
-    x = _parameters(body, load, current, gain)
-    moving = np.array([j for j in range(n) if j != reference and j not in own], dtype=int)
-    max_rounds = 60
-    for _ in range(max_rounds):
-        torque = body @ x + load
-        residual = torque / gain[:, None] - current
+        gains = _start(columns, load, current)
+    x = _parameters(columns, load, current, gains)
+    moving = np.array([joint for joint in range(n) if joint != reference and joint not in own], dtype=int)
+    for _ in range(MAX_ROUNDS):
+        torque = columns @ x + load
+        residual = torque / gains[:, None] - current
         std = np.sqrt(np.sum(residual**2, axis=1) / currents.rows)
+        # Derivatives by the logarithms of the gains.
         by_gain = np.zeros((n, factors.shape[1], n))
-        by_gain[moving, :, moving] = -torque[moving] / gain[moving, None]  # by log K_j
-        rows = np.concatenate([body / gain[:, None, None], by_gain, residual[:, :, None]], axis=2)
-        rows = rows / (std * np.sqrt(tau))[:, None, None]
-        stacked = retriangulate(rows.reshape(-1, rows.shape[2]))
-        upper = stacked[:-1, :-1]
-        step = -np.linalg.lstsq(upper, stacked[:-1, -1], rcond=1e-12)[0]
-        size = min(1.0, 0.7 / max(float(np.abs(step[len(free) :]).max()), 1e-12))
-        x, gain = x + size * step[: len(free)], gain * np.exp(size * step[len(free) :])
-        if np.abs(step[len(free) :]).max() < 1e-7:
-            inverse = np.linalg.pinv(upper, rcond=1e-12)
-            covariance = (inverse @ inverse.T)[len(free) :, len(free) :] * np.outer(gain, gain)
-            values = np.zeros(len(names))
-            values[free], values[fixed] = x / norms, given
-            scale = ", ".join(f"{name} = {value:g}" for name, value in known.items())
-            scale = scale if reference is None else f"gain of joint {reference + 1} = 1"
-            return DriveGains(frozen(gain), frozen(covariance), names, frozen(values), frozen(std), scale, tuple(own))
+        by_gain[moving, :, moving] = -torque[moving] / gains[moving, None]
+        rows = np.concatenate([columns / gains[:, None, None], by_gain, residual[:, :, None]], axis=2)
+        rows = rows / (std * np.sqrt(inflation))[:, None, None]
+        triangle = retriangulate(rows.reshape(-1, rows.shape[2]))
+        upper = triangle[:-1, :-1]
+        step = -np.linalg.lstsq(upper, triangle[:-1, -1], rcond=1e-12)[0]
+        x_step, gain_step = step[: len(free)], step[len(free) :]
+        largest = float(np.abs(gain_step).max())
+        size = min(1.0, MAX_LOG_STEP / max(largest, 1e-12))
+        x = x + size * x_step
+        gains = gains * np.exp(size * gain_step)
+        if largest < CONVERGED:
+            break
+    else:
+        if reference is None:
+            raise NotConverged("the drive gains do not converge; check that the payload loads every joint", gains)
+        raise NotConverged(
+            f"without gains or a payload of known mass, currents identify gains only through the coupling of joints, "
+            f"relative to joint {reference + 1}; this motion does not identify them. State the gains (options: gains), "
+            "or record runs without and with a payload ([gain_identification])",
+            gains,
+        )
+    inverse = np.linalg.pinv(upper, rcond=1e-12)
+    covariance = (inverse @ inverse.T)[len(free) :, len(free) :] * np.outer(gains, gains)
+    values = np.zeros(len(names))
+    values[free] = x / norms
+    values[fixed] = fixed_values
     if reference is None:
-        raise NotConverged("the drive gains do not converge; check that the payload loads every joint", gain)
-    raise NotConverged(
-        f"without gains or a payload of known mass, currents identify gains only through the coupling of joints, "
-        f"relative to joint {reference + 1}; this motion does not identify them. State the gains (options: gains), "
-        "or record runs without and with a payload ([gain_identification])",
-        gain,
-    )
+        scale = ", ".join(f"{name} = {value:g}" for name, value in payload.items())
+    else:
+        scale = f"gain of joint {reference + 1} = 1"
+    return DriveGains(frozen(gains), frozen(covariance), names, frozen(values), frozen(std), scale, tuple(own))
 
 
 def identify_relative_gains(data: Triangles, joints: int, inflation: np.ndarray, reference: int) -> DriveGains:
     """Return the gains relative to that of a reference joint; gains that the motion does not identify are set to one.
 
     Sigmas are the larger of the residuals' and of a jackknife over blocks of time (Efron & Tibshirani 1993, eq. 11.5),
-    which sees part of what the model leaves, times `LEFT`. A gain is identified where its sigma is below `max_sigma` of
-    it and it is within a factor `max_factor` of the others: what links share with one motor at the wrist is little
+    which sees part of what the model leaves, times `LEFT`. A gain is identified where its sigma is below `MAX_SIGMA` of
+    it and it is within a factor `MAX_FACTOR` of the others: what links share with one motor at the wrist is little
     beside friction, and a fit then takes what the model leaves for inertia (our choice). Where the search does not
     settle, the gain that ran away furthest is not identified.
 
     Args:
         data: triangles of [W i] by block and joint, group = block · joints + joint.
+        joints: number of joints.
         inflation: (joints,) how many rows count as one.
         reference: the joint whose gain is one.
     """
-    blocks = [k for k in range(data.groups // joints) if data.rows[k * joints : (k + 1) * joints].any()]
-    own: tuple[int, ...] = ()
-    max_sigma = 0.3  # sigma of a relative gain, of it, up to which the motion tells it
-    max_factor = 10.0  # factor between gains of one robot's motors beyond which one counts as not identified
+    rows_of_block = np.asarray(data.rows).reshape(-1, joints).sum(axis=1)
+    blocks = np.flatnonzero(rows_of_block).tolist()
+    unidentified: tuple[int, ...] = ()
     while True:
         try:
-            found = identify_gains(pool(data, joints, blocks), {}, inflation, reference=reference, own=own)
+            fit = identify_gains(pool(data, joints, blocks), {}, inflation, reference=reference, own=unidentified)
         except NotConverged as error:
-            own = (*own, _astray(error, reference, own))
+            unidentified = (*unidentified, _most_distant(error, reference, unidentified))
             continue
-        logs, again = np.log(found.gains), []
-        for block in blocks if len(blocks) > 2 else ():
-            others = pool(data, joints, [other for other in blocks if other != block])
-            try:
-                again.append(np.log(identify_gains(others, {}, inflation, found.gains.tolist(), reference, own).gains))
-            except NotConverged:
-                again.append(np.where(np.arange(joints) == reference, 0.0, np.inf))
-        formal = found.sigma / found.gains
-        with np.errstate(invalid="ignore"):
-            spread = np.array(again) - np.mean(again, axis=0) if again else np.zeros((1, joints))
-        jackknife = np.sqrt((len(spread) - 1) / len(spread) * np.sum(np.nan_to_num(spread, nan=np.inf) ** 2, axis=0))
-        sigma = LEFT * np.maximum(formal, jackknife)
-        free = np.array([j != reference and j not in own for j in range(joints)])
-        apart = np.abs(logs - np.median(logs))
-        doubt = np.where(free, np.maximum(sigma / max_sigma, apart / np.log(max_factor)), 0.0)
+        formal_sigma = fit.sigma / fit.gains
+        jackknife_sigma = _jackknife(data, blocks, fit, inflation, reference, unidentified)
+        sigma = LEFT * np.maximum(formal_sigma, jackknife_sigma)
+        free = np.ones(joints, dtype=bool)
+        free[[reference, *unidentified]] = False
+        log_gains = np.log(fit.gains)
+        distance = np.abs(log_gains - np.median(log_gains))
+        doubt = np.where(free, np.maximum(sigma / MAX_SIGMA, distance / np.log(MAX_FACTOR)), 0.0)
         if doubt.max() <= 1.0:
-            factor = np.where(free & (formal > 0.0), sigma / np.where(formal > 0.0, formal, 1.0), 1.0)
-            return replace(found, covariance=frozen(found.covariance * np.outer(factor, factor)))
-        own = (*own, int(np.argmax(doubt)))
+            estimated = free & (formal_sigma > 0.0)
+            factor = np.where(estimated, sigma / np.where(formal_sigma > 0.0, formal_sigma, 1.0), 1.0)
+            return replace(fit, covariance=frozen(fit.covariance * np.outer(factor, factor)))
+        unidentified = (*unidentified, int(np.argmax(doubt)))
 
 
-def _astray(error: NotConverged, reference: int, own: Sequence[int]) -> int:
+def _jackknife(
+    data: Triangles,
+    blocks: Sequence[int],
+    fit: DriveGains,
+    inflation: np.ndarray,
+    reference: int,
+    unidentified: tuple[int, ...],
+) -> np.ndarray:
+    """Return the jackknife's standard deviations of the log gains (joints,); zero with fewer than three blocks."""
+    joints = len(fit.gains)
+    if len(blocks) <= 2:
+        return np.zeros(joints)
+    log_gains = []
+    for block in blocks:
+        remaining = pool(data, joints, [other for other in blocks if other != block])
+        try:
+            part = identify_gains(remaining, {}, inflation, fit.gains.tolist(), reference, unidentified)
+            log_gains.append(np.log(part.gains))
+        except NotConverged:
+            log_gains.append(np.where(np.arange(joints) == reference, 0.0, np.inf))
+    with np.errstate(invalid="ignore"):
+        deviation = np.array(log_gains) - np.mean(log_gains, axis=0)
+    squares = np.nan_to_num(deviation, nan=np.inf) ** 2
+    return np.sqrt((len(blocks) - 1) / len(blocks) * np.sum(squares, axis=0))
+
+
+def _most_distant(error: NotConverged, reference: int, unidentified: Sequence[int]) -> int:
     """Return the joint whose gain diverged most (gains not converged): the motion does not identify this gain.
 
     Raises:
-        NotConverged: the error, where no joint is left.
+        NotConverged: the error, where no joint remains.
     """
-    last = np.array(error.last, dtype=float)
-    logs = np.nan_to_num(np.log(last), nan=np.inf)
-    apart = np.abs(logs - np.median(logs))
-    apart[[reference, *own]] = -1.0
-    if not apart.max() >= 0.0:
+    gains = np.array(error.last, dtype=float)
+    log_gains = np.nan_to_num(np.log(gains), nan=np.inf)
+    distance = np.abs(log_gains - np.median(log_gains))
+    distance[[reference, *unidentified]] = -1.0
+    if not distance.max() >= 0.0:
         raise error
-    return int(np.argmax(apart))
+    return int(np.argmax(distance))
 
 
-def _start(body: np.ndarray, load: np.ndarray, current: np.ndarray) -> np.ndarray:
+def _start(columns: np.ndarray, load: np.ndarray, current: np.ndarray) -> np.ndarray:
     """Return start values of the gains, least squares of [i -W] [K; χ] = P m: biased towards zero."""
-    n, size, p = body.shape
+    n, size, p = columns.shape
     matrix = np.zeros((n, size, n + p))
-    for j in range(n):
-        matrix[j, :, j] = current[j]
-    matrix[:, :, n:] = -body
-    found = np.linalg.lstsq(matrix.reshape(-1, n + p), load.ravel(), rcond=1e-12)[0][:n]
-    usual = float(np.median(np.abs(found)))
-    return np.where(np.abs(found) > 0.05 * usual, np.abs(found), max(usual, 1e-3))
+    for joint in range(n):
+        matrix[joint, :, joint] = current[joint]
+    matrix[:, :, n:] = -columns
+    solution = np.linalg.lstsq(matrix.reshape(-1, n + p), load.ravel(), rcond=1e-12)[0]
+    gains = np.abs(solution[:n])
+    median = float(np.median(gains))
+    return np.where(gains > MIN_START * median, gains, max(median, 1e-3))
 
 
-def _parameters(body: np.ndarray, load: np.ndarray, current: np.ndarray, gain: np.ndarray) -> np.ndarray:
-    matrix, target = body / gain[:, None, None], current - load / gain[:, None]
-    return np.linalg.lstsq(matrix.reshape(-1, body.shape[2]), target.ravel(), rcond=1e-12)[0]
+def _parameters(columns: np.ndarray, load: np.ndarray, current: np.ndarray, gains: np.ndarray) -> np.ndarray:
+    """Return the least-squares parameters (p,) at these gains."""
+    matrix = columns / gains[:, None, None]
+    target = current - load / gains[:, None]
+    return np.linalg.lstsq(matrix.reshape(-1, columns.shape[2]), target.ravel(), rcond=1e-12)[0]

@@ -34,6 +34,12 @@ from calib.identification.time_folds import regimes
 from calib.robot.calibrated import CalibratedChain, as_calibrated
 from calib.robot.chain import Chain
 
+MIN_MOTION = 1e-3
+"""Motion of a joint in a recording that identifies anything [rad or m] (our choice)."""
+MAX_RATE_RATIO = 1.02
+"""Largest ratio of sampling rates of recordings that are combined."""
+
+
 Progress = Callable[[str], None]
 
 
@@ -72,7 +78,8 @@ class Identification(Generic[Model]):
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the estimate's parameters: base parameters, then richer friction."""
-        return (*self.base.names, *(one.name for one in self.friction.terms))
+        friction_names = [term.name for term in self.friction.terms]
+        return (*self.base.names, *friction_names)
 
 
 def identify(
@@ -90,23 +97,32 @@ def identify(
         settings: the choices; None: those that suit a serial arm with motor torques.
         progress: called with a few words at each stage.
     """
-    settings, robot = settings or IdentificationSettings(), as_calibrated(robot)
-    chain = robot.chain if any(case.link is None for case in cases) else robot.complete
+    settings = settings or IdentificationSettings()
+    robot = as_calibrated(robot)
+    chain = robot.complete
+    if any(case.link is None for case in cases):
+        chain = robot.chain
     model = make_model(chain, settings)
-    nominal = None if robot.nominal is None or not robot.moved else make_model(robot.nominal, settings)
-    states = chain_states(chain, nominal or model, settings.seed)
-    found = identify_model(
+    nominal = None
+    if robot.nominal is not None and robot.moved:
+        nominal = make_model(robot.nominal, settings)
+    cad = None
+    if chain.inertias is not None and np.any(chain.inertias[:, 9] > 0.0):
+        cad = standard_parameters(chain)
+    moves = model.bodies.coordinates[:, None] >= 0
+    identification = identify_model(
         model,
         cases,
         settings,
         nominal=nominal,
-        states=states,
-        cad=_known_masses(chain),
-        shape=np.where(model.bodies.coordinates[:, None] >= 0, rods(chain, model), 0.0).ravel(),
+        states=chain_states(chain, nominal or model, settings.seed),
+        cad=cad,
+        shape=np.where(moves, rods(chain, model), 0.0).ravel(),
         effort=_torque_limits(chain),
         progress=progress,
     )
-    return cast(Identification, found)  # its model is the chain's
+    # The model is that of the chain.
+    return cast(Identification, identification)
 
 
 def identify_model(
@@ -123,8 +139,8 @@ def identify_model(
 ) -> Identification[RegressorModel]:
     """Return the identification of a model, linear in its parameters, from recordings.
 
-    Base columns, what is known beforehand, richer friction, the method's estimate, ripple, essential parameters: a
-    sequence of steps around one method, each of which says what it accepts.
+    Base columns, prior, richer friction, the method's estimate, ripple, essential parameters: a sequence of steps
+    around one method, each of which says what it accepts.
 
     Args:
         model: of a serial chain, or of anything else that meets the protocol.
@@ -140,60 +156,90 @@ def identify_model(
     Raises:
         CalibError: the method's failure, where there is no estimate.
     """
-    settings, say = settings or IdentificationSettings(), progress or (lambda words: None)
+    settings = settings or IdentificationSettings()
+    say = progress or (lambda message: None)
     require(cases, "no recording to identify the model from", UsageError)
     method = method_named(settings.method)
     settings = require_usable(settings, method)
     _require_constrainable(method, settings)
     _require_motion(cases)
     noise = _repeats_noise(cases, settings)
+
     say("base parameters")
-    states = bases.random_samples(model, seed=settings.seed) if states is None else states
+    if states is None:
+        states = bases.random_samples(model, seed=settings.seed)
     base = find_base(model, cases, states, nominal)
     decimator = common_decimator(cases, settings)
+
     say("observation matrix")
-    rows = with_blocks([observe(model, base.kept, case, decimator) for case in cases], settings.folds)
+    rows = _observed(model, base, cases, decimator, settings, method)
+
+    say("first fit")
+    robot, source = (shape, "sizes") if cad is None else (cad, "cad")
+    find = partial(find_prior, model, base, robot=robot, source=source, noise=noise, effort=effort)
+    prior = None
+    if _takes_prior(method, model, settings, source):
+        prior = find(rows)
+        rows = with_weights(rows, prior.first.rest_weights)
+        prior = tempered_prior(find, prior, rows, regimes(rows, cases, decimator))
+    first = first_fit(rows, noise) if prior is None else prior.first
+    rows = with_weights(rows, first.rest_weights)
+
+    friction, loads = _richer_friction(model, base, rows, cases, decimator, first, prior, settings, progress)
+    richer_rows = []
+    for part, case, load in zip(rows, cases, loads):
+        columns = observe_terms(friction.terms, case, decimator, load, model.torque_rows)
+        richer_rows.append(part.extend(friction.terms, columns))
+    if prior is not None and friction.terms:
+        say("sizes beside richer friction")
+        prior = find(richer_rows, groups=np.array(friction.groups), start=prior, tempering=prior.tempering)
+        richer_rows = with_weights(richer_rows, prior.first.rest_weights)
+
+    base_terms = [None if column < model.inertial else model.columns[column - model.inertial] for column in base.kept]
+    problem = IdentificationProblem(
+        model=model,
+        base=base,
+        cases=cases,
+        decimator=decimator,
+        rows=tuple(richer_rows),
+        terms=(*base_terms, *friction.terms),
+        groups=np.concatenate([np.full(base.b, -1), friction.groups]),
+        noise=noise,
+        prior=prior,
+        loop=settings.loop,
+        cad=cad,
+        constraints=settings.constraints,
+    )
+    return _identified(problem, method, friction, settings, say)
+
+
+def _observed(
+    model: RegressorModel,
+    base: Base,
+    cases: Sequence[Case],
+    decimator: Decimator,
+    settings: IdentificationSettings,
+    method: Method,
+) -> list[ObservationRows]:
+    """Return the rows of all cases in the base columns: time blocks numbered, standstills marked.
+
+    Raises:
+        MeasurementError: for fewer rows than twice the base parameters.
+    """
+    rows = [observe(model, base.kept, case, decimator) for case in cases]
+    rows = with_blocks(rows, settings.folds)
     if model.torque_rows == POWER and len(cases) > 1:
-        rows = [part.by_recording(k, len(cases)) for k, part in enumerate(rows)]
+        rows = [part.by_recording(number, len(cases)) for number, part in enumerate(rows)]
     if isinstance(method, LeastSquares) and isinstance(model, IdentificationModel):
         width = np.array(per_joint(settings.v0, cases[0].motion.n, "v0"))
         rows = with_standstills(rows, cases, decimator, model, base.kept, width)
-    _require_enough(rows, base)
-    say("first fit")
-    whole, source = (shape, "sizes") if cad is None else (cad, "cad")
-    prior = None
-    found = partial(find_prior, model, base, robot=whole, source=source, noise=noise, effort=effort)
-    if _takes_prior(method, model, settings, source):
-        prior = found(rows)
-        rows = with_weights(rows, prior.first.rest_weights)
-        prior = tempered_prior(found, prior, rows, regimes(rows, cases, decimator))
-    first = first_fit(rows, noise) if prior is None else prior.first
-    rows = with_weights(rows, first.rest_weights)
-    friction, loads = _richer_friction(model, base, rows, cases, decimator, first, prior, settings, progress)
-    own = [None if k < model.inertial else model.columns[k - model.inertial] for k in base.kept]
-    full = tuple(
-        part.extend(friction.terms, observe_terms(friction.terms, case, decimator, load, model.torque_rows))
-        for part, case, load in zip(rows, cases, loads)
+    count = sum(int(part.present.sum()) for part in rows)
+    message = (
+        f"{count} rows remain for {base.b} base parameters after filtering and decimation: "
+        "record longer, or raise the identification band ([filter] band)"
     )
-    if prior is not None and friction.terms:
-        say("sizes beside richer friction")
-        prior = found(full, groups=np.array(friction.groups), start=prior, tempering=prior.tempering)
-        full = tuple(with_weights(full, prior.first.rest_weights))
-    problem = IdentificationProblem(
-        model,
-        base,
-        cases,
-        decimator,
-        full,
-        (*own, *friction.terms),
-        np.concatenate([np.full(base.b, -1), friction.groups]),
-        noise,
-        prior,
-        settings.loop,
-        cad,
-        settings.constraints,
-    )
-    return _identified(problem, method, friction, settings, say)
+    require(count >= 2 * base.b, message, MeasurementError)
+    return rows
 
 
 def _identified(
@@ -206,21 +252,39 @@ def _identified(
     """Return the identification of a problem by a method: estimate, test of its loop, ripple, essential parameters."""
     model, base, cases = problem.model, problem.base, problem.cases
     say("simulating the closed loop" if method.needs_controller else "estimate")
-    found = method.estimate(problem)
-    values = found.estimate.values
-    friction = friction.fitted(found.estimate.sigma[base.b :])
-    if settings.loop is not None and not method.needs_controller:
-        say("simulating the closed loop")
-    loop = LoopResults() if settings.loop is None else loop_results(problem, found)
-    richer = model.with_terms(*friction.terms) if _sees_drives(model) else model
-    dynamics = Dynamics(richer, np.concatenate([base.to_standard(values[: base.b]), values[base.b :]]))
+    fit = method.estimate(problem)
+    values = fit.estimate.values
+    friction = friction.fitted(fit.estimate.sigma[base.b :])
+    loop = LoopResults()
+    if settings.loop is not None:
+        if not method.needs_controller:
+            say("simulating the closed loop")
+        loop = loop_results(problem, fit)
+
+    if _has_drives(model):
+        model = model.with_terms(*friction.terms)
+    standard = base.to_standard(values[: base.b])
+    dynamics = Dynamics(model, np.concatenate([standard, values[base.b :]]))
     dynamics, ripples = _with_ripple(dynamics, cases, settings, say)
     dynamics = _with_payloads(dynamics, cases, settings)
+
     say("essential parameters")
-    gone = _essential(found, settings)
-    condition = condition_numbers(problem.pooled.factors.reshape(-1, len(values) + 1)[:, : base.b])
-    rows, terms, prior = problem.rows, problem.terms, problem.prior
-    return Identification(dynamics, base, found, gone, friction, settings, rows, terms, condition, prior, ripples, loop)
+    elimination = _essential(fit, settings)
+    base_columns = problem.pooled.factors.reshape(-1, len(values) + 1)[:, : base.b]
+    return Identification(
+        dynamics=dynamics,
+        base=base,
+        fitted=fit,
+        elimination=elimination,
+        friction=friction,
+        settings=settings,
+        rows=problem.rows,
+        terms=problem.terms,
+        condition=condition_numbers(base_columns),
+        prior=problem.prior,
+        ripples=ripples,
+        loop=loop,
+    )
 
 
 def chain_states(chain: Chain, model: RegressorModel, seed: int = 0) -> States:
@@ -233,23 +297,18 @@ def find_base(
     model: RegressorModel, cases: Sequence[Case], states: States, nominal: RegressorModel | None = None
 ) -> Base:
     """Return the base columns of a model, selected over states and payloads on the nominal geometry if one is given."""
-    loads = tuple(dict.fromkeys(tuple(sorted(case.carried)) for case in cases))
-    return bases.find(model, states, loads, nominal=nominal)
-
-
-def _known_masses(chain: Chain) -> np.ndarray | None:
-    """Return the standard parameters (10 B,) from a chain's description; None where it states no masses."""
-    known = chain.inertias is not None and np.any(chain.inertias[:, 9] > 0.0)
-    return standard_parameters(chain) if known else None
+    payloads = [tuple(sorted(case.carried)) for case in cases]
+    return bases.find(model, states, tuple(dict.fromkeys(payloads)), nominal=nominal)
 
 
 def _torque_limits(chain: Chain) -> np.ndarray | None:
     """Return the joints' torque limits (n,) from the robot's description; None if any limit is missing."""
     limits = np.array([joint.effort for joint in chain.joints])
-    return limits if (np.isfinite(limits) & (limits > 0.0)).all() else None
+    usable = np.isfinite(limits) & (limits > 0.0)
+    return limits if usable.all() else None
 
 
-def _sees_drives(model: RegressorModel) -> TypeGuard[IdentificationModel]:
+def _has_drives(model: RegressorModel) -> TypeGuard[IdentificationModel]:
     """Return whether a model accepts richer friction, which acts on the motors of single joints."""
     return isinstance(model, IdentificationModel) and model.torque_rows.with_motors
 
@@ -266,25 +325,32 @@ def _richer_friction(
     progress: Progress | None,
 ) -> tuple[FrictionSelection, Sequence[np.ndarray | None]]:
     """Return the friction selected on held-out time, and the torques (N, n) that load-dependent terms depend on."""
-    nothing: list[np.ndarray | None] = [None] * len(cases)
-    if not _sees_drives(model):
-        return FrictionSelection((), (), ()), nothing
-    std, tau, values, _ = first
-    plain = Dynamics(model, base.to_standard(values))
-    loads = nothing if settings.friction in ("standard", "ripple") else [plain.transmitted(case) for case in cases]
+    loads: list[np.ndarray | None] = [None] * len(cases)
+    if not _has_drives(model):
+        return FrictionSelection((), (), ()), loads
+    if settings.friction not in ("standard", "ripple"):
+        plain = Dynamics(model, base.to_standard(first.values))
+        loads = [plain.transmitted(case) for case in cases]
+    inflation = first.inflation
+    if prior is not None:
+        inflation = inflation * prior.tempering / TEMPERING
+    coupled = set()
+    for term in model.columns:
+        if len(term.acts) > 1:
+            coupled.add(tuple(sorted({row for row, _ in term.acts})))
     candidates = FrictionCandidates(
-        cases,
-        rows,
-        loads,
-        decimator,
-        std,
-        tau if prior is None else tau * prior.tempering / TEMPERING,
-        np.array(per_joint(settings.v0, model.n, "v0")),
-        model.prismatic,
-        prior,
-        settings.apart,
-        model.torque_rows,
-        frozenset(tuple(sorted({row for row, _ in one.acts})) for one in model.columns if len(one.acts) > 1),
+        cases=cases,
+        rows=rows,
+        loads=loads,
+        decimator=decimator,
+        std=first.std,
+        inflation=inflation,
+        v0=np.array(per_joint(settings.v0, model.n, "v0")),
+        linear=model.prismatic,
+        prior=prior,
+        apart=settings.apart,
+        torque_rows=model.torque_rows,
+        coupled=frozenset(coupled),
     )
     return select_friction(candidates, settings.friction, progress), loads
 
@@ -294,25 +360,31 @@ def _with_ripple(
 ) -> tuple[Dynamics[RegressorModel], tuple[Ripple, ...]]:
     """Return the model with gear ripple identified from its residuals, if the settings request it."""
     model = dynamics.model
-    if not _sees_drives(model) or not model.torque_rows.motors_alone or settings.friction not in ("auto", "ripple"):
+    if not _has_drives(model) or not model.torque_rows.motors_alone or settings.friction not in ("auto", "ripple"):
         return dynamics, ()
     say("ripple")
-    ripples = tuple(find_all(cases, [case.target - predict(dynamics, case) for case in cases]))
-    richer = model.with_terms(*(one for ripple in ripples for one in ripple.terms))
-    return Dynamics(richer, np.concatenate([dynamics.values, *(ripple.values for ripple in ripples)])), ripples
+    residuals = [case.target - predict(dynamics, case) for case in cases]
+    ripples = tuple(find_all(cases, residuals))
+    terms: list[DriveTerm] = []
+    values = [dynamics.values]
+    for ripple in ripples:
+        terms += ripple.terms
+        values.append(ripple.values)
+    return Dynamics(model.with_terms(*terms), np.concatenate(values)), ripples
 
 
 def _with_payloads(
     dynamics: Dynamics[RegressorModel], cases: Sequence[Case], settings: IdentificationSettings
 ) -> Dynamics[RegressorModel]:
     """Return the model with the known parameters of payloads that occur in no training recording."""
-    model, values = dynamics.model, np.array(dynamics.values)
-    for label, stated in settings.payloads.items():
-        known = settings.payload_values.get(label, stated.parameters)
-        unseen = known is not None and not any(label in case.carried for case in cases)
-        if isinstance(model, IdentificationModel) and unseen:
+    model = dynamics.model
+    values = np.array(dynamics.values)
+    for label, payload in settings.payloads.items():
+        parameters = settings.payload_values.get(label, payload.parameters)
+        in_training = any(label in case.carried for case in cases)
+        if isinstance(model, IdentificationModel) and parameters is not None and not in_training:
             first = 10 * model.bodies.labels.index(label)
-            values[first : first + 10] = known
+            values[first : first + 10] = parameters
     return Dynamics(model, values)
 
 
@@ -324,12 +396,13 @@ def common_decimator(cases: Sequence[Case], settings: IdentificationSettings) ->
     of fast motion no other row identifies.
     """
     rates = [case.motion.rate for case in cases]
-    words = f"recordings of {min(rates):.4g} Hz and {max(rates):.4g} Hz cannot be combined; resample one of them"
-    require(max(rates) <= 1.02 * min(rates), words, MeasurementError)
+    message = f"recordings of {min(rates):.4g} Hz and {max(rates):.4g} Hz cannot be combined; resample one of them"
+    require(max(rates) <= MAX_RATE_RATIO * min(rates), message, MeasurementError)
     total = sum(len(case.motion) for case in cases)
     widest = design_decimator(rates[0], min(case.motion.decimator.factor for case in cases))
-    one_in = -(-total // (widest.factor * settings.samples))  # what the memory asks for
-    return replace(widest, factor=one_in * widest.factor)
+    max_rows = widest.factor * settings.samples
+    step = -(-total // max_rows)
+    return replace(widest, factor=step * widest.factor)
 
 
 def _repeats_noise(cases: Sequence[Case], settings: IdentificationSettings) -> np.ndarray | None:
@@ -346,6 +419,7 @@ def _repeats_noise(cases: Sequence[Case], settings: IdentificationSettings) -> n
             f'weights = "repeats" needs method wls and rows motor; the options state {settings.method} and '
             f"{settings.torque_rows.name}"
         )
+    variances, lengths = [], []
     for case in cases:
         if case.noise is None:
             refuse_data(
@@ -359,8 +433,9 @@ def _repeats_noise(cases: Sequence[Case], settings: IdentificationSettings) -> n
                 case.motion.file,
                 f'joint {silent} has no variance over the periods: it cannot be weighted; use weights = "residuals"',
             )
-    squares = np.array([case.noise**2 for case in cases if case.noise is not None])
-    return np.asarray(np.sqrt(np.average(squares, axis=0, weights=[len(case.motion) for case in cases])))
+        variances.append(case.noise**2)
+        lengths.append(len(case.motion))
+    return np.asarray(np.sqrt(np.average(variances, axis=0, weights=lengths)))
 
 
 def _takes_prior(method: Method, model: RegressorModel, settings: IdentificationSettings, source: str) -> bool:
@@ -374,11 +449,11 @@ def _takes_prior(method: Method, model: RegressorModel, settings: Identification
     return settings.prior != "none" and method.takes_prior and model.inertial > 0
 
 
-def _essential(found: MethodEstimate, settings: IdentificationSettings) -> Elimination | None:
+def _essential(fit: MethodEstimate, settings: IdentificationSettings) -> Elimination | None:
     """Return the elimination of parameters, or None if it is not requested."""
     if settings.essential == "none":
         return None
-    data, std, inflation = found.testable()
+    data, std, inflation = fit.testable()
     return eliminate(
         data,
         Rule(settings.essential),
@@ -393,21 +468,17 @@ def _essential(found: MethodEstimate, settings: IdentificationSettings) -> Elimi
 
 def _require_constrainable(method: Method, settings: IdentificationSettings) -> None:
     """Raise a UsageError for constraints that the method does not support."""
-    if settings.constraints is not None and not method.takes_constraints:
-        known = [name for name, one in METHODS.items() if one.takes_constraints]
-        own = f"pc-{method.name}"
-        advice = f"use '{own}'" if own in known else f"methods that do: {', '.join(known)}"
-        raise UsageError(f"[constraints]: method '{method.name}' does not support them; {advice}")
+    if settings.constraints is None or method.takes_constraints:
+        return
+    supporting = [name for name, candidate in METHODS.items() if candidate.takes_constraints]
+    constrained = f"pc-{method.name}"
+    advice = f"methods that do: {', '.join(supporting)}"
+    if constrained in supporting:
+        advice = f"use '{constrained}'"
+    raise UsageError(f"[constraints]: method '{method.name}' does not support them; {advice}")
 
 
 def _require_motion(cases: Sequence[Case]) -> None:
-    """Raise an error for training cases without motion (our choice: less than a milliradian or millimetre)."""
-    if all((np.ptp(case.motion.q, axis=0) < 1e-3).all() for case in cases):
+    """Raise an error for training cases without motion."""
+    if all((np.ptp(case.motion.q, axis=0) < MIN_MOTION).all() for case in cases):
         refuse_data(cases[0].motion.file, "no joint moves: only gravity in one pose is identifiable")
-
-
-def _require_enough(rows: Sequence[ObservationRows], base: Base) -> None:
-    count = sum(int(part.present.sum()) for part in rows)
-    words = f"{count} rows remain for {base.b} base parameters after filtering and decimation"
-    advice = "record longer, or raise the identification band ([filter] band)"
-    require(count >= 2 * base.b, f"{words}: {advice}", MeasurementError)

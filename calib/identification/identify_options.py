@@ -101,18 +101,22 @@ from calib.config_types import Checked, Expect, JointNumber, Name, Names, OneOf,
 from calib.data.recordings.recording import parse_cut
 from calib.data.recordings.recording_options import RecordingOptions
 from calib.data.signals.motion import FilterOptions
-from calib.dynamics.drives import DriveTerm, term
+from calib.dynamics.drives import term
 from calib.dynamics.shapes import SHAPES
 from calib.dynamics.torque_rows import MOTOR, ROWS
 from calib.errors import CalibError, UsageError, refuse_option, refused_as
 from calib.identification.settings import Choices, Coupling, IdentificationSettings, Payload
 
-USED = 600_000  # samples of a recording, unless stated: ten minutes at 1 kHz (our choice)
+USED = 600_000
+"""Samples of a recording, unless stated: ten minutes at 1 kHz (our choice)."""
 
 
 def _no_zero(value: Any) -> Any:
-    if isinstance(value, list) and any(type(x) in (int, float) and x == 0 for x in value):
-        raise ValueError(f"expected finite numbers other than zero, found {shown(value)}")
+    """Refuse a list of numbers with a zero."""
+    if isinstance(value, list):
+        for number in value:
+            if type(number) in (int, float) and number == 0:
+                raise ValueError(f"expected finite numbers other than zero, found {shown(value)}")
     return value
 
 
@@ -222,10 +226,16 @@ class IdentifyOptions:
 
     def file_settings(self, path: str | Path) -> FileSettings:
         """Return the settings of a recording (or a cut of one), with the torques that the model's rows explain."""
-        found = own_table(self.files, parse_cut(str(path))[0]) or self.every
-        rows, samples = self.settings.torque_rows, found.recording.samples or USED
-        explained = {"rows": rows.name, "motors": rows.driven, "sensors": rows.sensed}
-        return replace(found, recording=replace(found.recording, samples=samples, **explained))
+        settings = own_table(self.files, parse_cut(str(path))[0]) or self.every
+        rows = self.settings.torque_rows
+        recording = replace(
+            settings.recording,
+            samples=settings.recording.samples or USED,
+            rows=rows.name,
+            motors=rows.driven,
+            sensors=rows.sensed,
+        )
+        return replace(settings, recording=recording)
 
 
 def read_options(path: str | Path | None = None) -> IdentifyOptions:
@@ -234,45 +244,54 @@ def read_options(path: str | Path | None = None) -> IdentifyOptions:
     Raises:
         UsageError: for a missing file, invalid TOML, an unknown key, or an invalid value.
     """
-    return IdentifyOptions() if path is None else parse_options(read_toml(path), str(path))
+    if path is None:
+        return IdentifyOptions()
+    return parse_options(read_toml(path), str(path))
 
 
 def parse_options(table: Mapping[str, Any], source: str = "options") -> IdentifyOptions:
     """Return the options in a parsed TOML table; `source` names the file in messages."""
     for key in table.keys() & REMOVED.keys():
         refuse_option(f"{source}: {key}", REMOVED[key])
-    own = {key: table[key] for key in ("payload",) if key in table}  # bodies; in [files] their labels: not handed down
-    rest = inherited({key: value for key, value in table.items() if key not in own}, FileSettings)
-    return options_of(parse(IdentifySettings, rest | own, source), source)
+    # Payloads are bodies here and their labels in [files], so that they are not handed down.
+    handed_down = {key: value for key, value in table.items() if key != "payload"}
+    keys = inherited(handed_down, FileSettings)
+    if "payload" in table:
+        keys = {**keys, "payload": table["payload"]}
+    return options_of(parse(IdentifySettings, keys, source), source)
 
 
-def options_of(read: IdentifySettings, source: str = "settings") -> IdentifyOptions:
+def options_of(keys: IdentifySettings, source: str = "settings") -> IdentifyOptions:
     """Return the options of an identification from the keys of an options file.
 
     Args:
-        read: the keys of an options file.
+        keys: of an options file.
         source: name of the file in messages.
 
     Raises:
         UsageError: for an invalid term, or an unknown payload of a file.
     """
-    settings = IdentificationSettings(
-        **{key.name: getattr(read, key.name) for key in fields(Choices)},
-        sets=read.drives,
-        torque_rows=ROWS[read.rows],
-        couplings=read.coupling,
-        terms=_terms(read.term, source),
-        payloads=read.payload,
-    )
-    for name, file in read.files.items():
-        check_keys(dict.fromkeys(file.payload), read.payload, f'{source}: files."{name}".payload')
-    every = FileSettings(read.recording, read.filter, gains=read.gains)
-    return IdentifyOptions(settings, every, read.files, read.slow, read.gain_identification, read.accept, source)
-
-
-def _terms(tables: tuple[TermTable, ...], source: str) -> tuple[DriveTerm, ...]:
-    result = []
-    for number, one in enumerate(tables, 1):
+    choices = {choice.name: getattr(keys, choice.name) for choice in fields(Choices)}
+    terms = []
+    for number, row in enumerate(keys.term, 1):
         with refused_as(UsageError, CalibError, f"{source}: [[term]] number {number}: {{}}"):
-            result.append(term(one.name, one.shape, one.joint, *one.settings, side=one.side))
-    return tuple(result)
+            terms.append(term(row.name, row.shape, row.joint, *row.settings, side=row.side))
+    settings = IdentificationSettings(
+        **choices,
+        sets=keys.drives,
+        torque_rows=ROWS[keys.rows],
+        couplings=keys.coupling,
+        terms=tuple(terms),
+        payloads=keys.payload,
+    )
+    for name, file in keys.files.items():
+        check_keys(dict.fromkeys(file.payload), keys.payload, f'{source}: files."{name}".payload')
+    return IdentifyOptions(
+        settings=settings,
+        every=FileSettings(keys.recording, keys.filter, gains=keys.gains),
+        files=keys.files,
+        slow=keys.slow,
+        gain_pair=keys.gain_identification,
+        accept=keys.accept,
+        source=source,
+    )

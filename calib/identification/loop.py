@@ -116,9 +116,10 @@ class LoopSettings:
         Raises:
             UsageError: with the key.
         """
-        for key in (one.name for one in fields(self) if isinstance(getattr(self, one.name), tuple)):
-            if key != "positive" and getattr(self, key):
-                self.per_joint(key, n)
+        for field in fields(self):
+            values = getattr(self, field.name)
+            if isinstance(values, tuple) and values and field.name != "positive":
+                self.per_joint(field.name, n)
 
     def per_joint(self, key: str, n: int) -> np.ndarray:
         """Return the values (n,) of a key that has one value or n."""
@@ -129,7 +130,9 @@ def per_joint(values: Sequence[T], n: int, name: str) -> tuple[T, ...]:
     """Return n values from a list of one or n."""
     if len(values) not in (1, n):
         refuse_option(name, f"{len(values)} values for {n} joints; give one, or one per joint")
-    return tuple(values) * n if len(values) == 1 else tuple(values)
+    if len(values) == 1:
+        return tuple(values) * n
+    return tuple(values)
 
 
 def check_loop(table: Any) -> Any:

@@ -63,6 +63,10 @@ from calib.robot.chain import Chain, random_joints
 from calib.robot.kinematics import forward
 from calib.units import TORQUE, per_ampere, without_gains
 
+MAX_TIP_DISTANCE = 0.05
+"""Distance of the tips of two arms of one type, in units of the reach; they agree within a percent (our choice)."""
+
+
 MODEL = "dynamics.json"
 NOTE = "regrouped parameters have base values, all others are zero: torques are right, single parameters may not be"
 
@@ -76,8 +80,8 @@ def read_dynamics(folder: str | Path) -> tuple[Chain, Dynamics]:
     folder = Path(folder)
     table = read_table(folder)
     chain = description.read(folder / ROBOT)
-    words = f"{folder}/dynamics.json is damaged or of another version ({{}}); identify again"
-    with refused_as(RobotError, (KeyError, TypeError, ValueError, IndexError), words):
+    message = f"{folder}/dynamics.json is damaged or of another version ({{}}); identify again"
+    with refused_as(RobotError, (KeyError, TypeError, ValueError, IndexError), message):
         return chain, from_table(chain, table)
 
 
@@ -92,10 +96,10 @@ def read_table(folder: Path) -> dict[str, Any]:
         (OSError, UnicodeDecodeError, json.JSONDecodeError),
         f"{folder} contains no identified model (dynamics.json): {{}}; give the folder of an identification",
     ):
-        found = json.loads((folder / MODEL).read_text(encoding="utf-8"))
-    if not isinstance(found, dict):
+        table = json.loads((folder / MODEL).read_text(encoding="utf-8"))
+    if not isinstance(table, dict):
         raise RobotError(f"{folder}/dynamics.json is damaged or of another version: it contains no table")
-    return found
+    return table
 
 
 def refuse_currents(folder: Path, task: str) -> None:
@@ -115,52 +119,61 @@ def refuse_currents(folder: Path, task: str) -> None:
         )
 
 
-def refuse_other_arm(folder: Path, chain: Chain, max_miss: float = 0.05) -> None:
+def refuse_other_arm(folder: Path, chain: Chain) -> None:
     """Raise an error for an identification of another arm than `chain`.
-
-    `max_miss`: of the tip, as a share of the reach; arms of one type agree within a percent (our choice).
 
     Raises:
         UsageError: for another number of joints, or a tip elsewhere at the same joint values.
         RobotError: where the folder's robot cannot be read.
     """
-    theirs = description.read(folder / ROBOT)
-    if theirs.n != chain.n:
-        refuse_option(folder, f"is of a robot with {theirs.n} joints ({theirs.name}), {chain.name} has {chain.n}")
-    q = random_joints(chain, 20, 0)
-    tips = [forward(one, q)[:, :3, 3] for one in (chain, theirs)]
-    miss = float(np.median(np.linalg.norm(tips[0] - tips[1], axis=1)))
-    if miss > max_miss * float(np.linalg.norm(tips[0], axis=1).max()):
+    identified = description.read(folder / ROBOT)
+    if identified.n != chain.n:
         refuse_option(
-            folder, f"is of another robot ({theirs.name}): its tip is {miss:.3g} m from {chain.name}'s (median)"
+            folder, f"is of a robot with {identified.n} joints ({identified.name}), {chain.name} has {chain.n}"
+        )
+    q = random_joints(chain, 20, 0)
+    tips = forward(chain, q)[:, :3, 3]
+    identified_tips = forward(identified, q)[:, :3, 3]
+    distance = float(np.median(np.linalg.norm(tips - identified_tips, axis=1)))
+    reach = float(np.linalg.norm(tips, axis=1).max())
+    if distance > MAX_TIP_DISTANCE * reach:
+        refuse_option(
+            folder, f"is of another robot ({identified.name}): its tip is {distance:.3g} m from {chain.name}'s (median)"
         )
 
 
 def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, Any]:
     """Return the model as a table for JSON; `unit`: that of its torques."""
     model = dynamics.model
-    bodies = model.inertial
-    payloads = [label for label, coordinate in zip(model.bodies.labels, model.bodies.coordinates) if coordinate < 0]
+    inertial = model.inertial
+    payloads = []
+    for label, coordinate in zip(model.bodies.labels, model.bodies.coordinates):
+        if coordinate < 0:
+            payloads.append(label)
+    terms = []
+    for term, value in zip(model.columns, dynamics.values[inertial:]):
+        acts = [[row, [list(pair) for pair in motion]] for row, motion in term.acts]
+        settings = [float(setting) if np.isfinite(setting) else "inf" for setting in term.settings]
+        terms.append(
+            {
+                "name": term.name,
+                "shape": term.shape,
+                "acts": acts,
+                "settings": settings,
+                "side": term.side,
+                "linear": term.linear,
+                "value": float(value),
+                "unit": per_ampere(term.unit, unit),
+            }
+        )
     return {
         "robot": ROBOT,
         "kind": model.torque_rows.name,
         "unit": unit,
         "gravity": model.bodies.gravity.tolist(),
         "payloads": payloads,
-        "bodies": dict(zip(model.names[:bodies], dynamics.values[:bodies].tolist())),
-        "terms": [
-            {
-                "name": one.name,
-                "shape": one.shape,
-                "acts": [[row, [list(pair) for pair in motion]] for row, motion in one.acts],
-                "settings": [float(x) if np.isfinite(x) else "inf" for x in one.settings],
-                "side": one.side,
-                "linear": one.linear,
-                "value": float(value),
-                "unit": per_ampere(one.unit, unit),
-            }
-            for one, value in zip(model.columns, dynamics.values[bodies:])
-        ],
+        "bodies": dict(zip(model.names[:inertial], dynamics.values[:inertial].tolist())),
+        "terms": terms,
         "base": dict(zip(base.names, expressions(base))),
         "regrouping": regrouping(base),
         "covariance": folders.COVARIANCE,
@@ -170,8 +183,10 @@ def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, An
 
 def regrouping(base: Base) -> dict[str, dict[str, float]]:
     """Return for each base parameter its standard parameters and their coefficients."""
-    rows = zip(base.names, base.transform)
-    return {name: {base.standard[k]: float(row[k]) for k in np.flatnonzero(row)} for name, row in rows}
+    coefficients = {}
+    for name, row in zip(base.names, base.transform):
+        coefficients[name] = {base.standard[column]: float(row[column]) for column in np.flatnonzero(row)}
+    return coefficients
 
 
 def from_table(chain: Chain, table: Mapping[str, Any]) -> Dynamics:
@@ -181,15 +196,43 @@ def from_table(chain: Chain, table: Mapping[str, Any]) -> Dynamics:
         bodies = with_payload(bodies, np.asarray(chain.tail), label, on=chain.n - 1)
     terms = tuple(_term(entry) for entry in table["terms"])
     model = IdentificationModel(bodies, terms, torque_rows(table.get("kind", "motor")))
-    own = table["bodies"]
-    standard = [float(own[name]) for name in bodies.names[: model.inertial]]
-    values = np.array([*standard, *(float(entry["value"]) for entry in table["terms"])])
-    if len(values) != model.p or len(own) != len(standard):
+    inertial_values = table["bodies"]
+    values = [float(inertial_values[name]) for name in bodies.names[: model.inertial]]
+    inertial_count = len(values)
+    values += [float(entry["value"]) for entry in table["terms"]]
+    if len(values) != model.p or len(inertial_values) != inertial_count:
         raise ValueError(f"{len(values)} values for {model.p} parameters")
-    return Dynamics(model, values)
+    return Dynamics(model, np.array(values))
 
 
 def _term(entry: Mapping[str, Any]) -> DriveTerm:
-    acts = tuple((int(row), tuple((int(j), float(w)) for j, w in motion)) for row, motion in entry["acts"])
-    settings = tuple(float(x) for x in entry["settings"])
-    return DriveTerm(entry["name"], entry["shape"], acts, settings, entry["side"], bool(entry["linear"]))
+    """Return the drive term of an entry of the table."""
+    acts = []
+    for row, motion in entry["acts"]:
+        weights = tuple((int(joint), float(weight)) for joint, weight in motion)
+        acts.append((int(row), weights))
+    settings = tuple(float(setting) for setting in entry["settings"])
+    return DriveTerm(entry["name"], entry["shape"], tuple(acts), settings, entry["side"], bool(entry["linear"]))
+
+
+def identified_masses(folder: str | Path, chain: Chain) -> np.ndarray:
+    """Return the standard parameters (n, 10) of an arm's bodies from an identification's folder.
+
+    Their gravity torques are right on the geometry that they were identified on, single parameters are not
+    (`calib.dynamics.base.to_standard`); payloads are left out.
+
+    Raises:
+        UsageError: for an identification of another arm, in amperes, or without bodies.
+    """
+    folder = Path(folder)
+    refuse_currents(folder, "a fit of the compliance")
+    refuse_other_arm(folder, chain)
+    _, dynamics = read_dynamics(folder)
+    bodies = dynamics.model.bodies
+    result = np.zeros((chain.n, 10))
+    if not dynamics.model.inertial:
+        refuse_option(folder, "has identified no bodies, hence no gravity torques; identify with motor or link torques")
+    for row, label in enumerate(bodies.labels):
+        if label.isdigit():
+            result[int(label) - 1] = dynamics.values[10 * row : 10 * row + 10]
+    return result

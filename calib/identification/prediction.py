@@ -20,7 +20,14 @@ from calib.estimation.whiteness import Whiteness, examine, r_squared
 from calib.identification.rows import BLOCK, Case, segmented_states
 from calib.records import Array, Frozen, Number
 
-REST_SHARE = 0.05  # of a recording's rows at rest, above which errors in motion and at rest are told apart (our choice)
+REST_SHARE = 0.05
+"""Share of a recording's rows at rest above which errors in motion and at rest are stated separately (our choice)."""
+JACKKNIFE_BLOCKS = 10
+"""Blocks of time of the jackknife (our choice)."""
+MIN_WHITENESS_SAMPLES = 40
+"""Decimated samples above which the whiteness of residuals is tested."""
+MAX_LAGS = 30
+"""Lags of the test of whiteness."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +134,7 @@ class Score:
         return f"{self.standing.total:.2f} %" if self.stands else ""
 
 
-def relative_error_sigma(measured: np.ndarray, predicted: np.ndarray, blocks: int = 10) -> float:
+def relative_error_sigma(measured: np.ndarray, predicted: np.ndarray) -> float:
     """Return the standard error of 100 ‖τ - τ̂‖ / ‖τ‖ [%]: a jackknife over blocks of time, as residuals are not white.
 
     Efron and Tibshirani 1993, eq. 11.5, with a block left out in place of a sample (Künsch 1989); ten blocks are our
@@ -140,14 +147,17 @@ def relative_error_sigma(measured: np.ndarray, predicted: np.ndarray, blocks: in
         NaN where there are fewer samples than two for each block, or no torque.
     """
     count = measured.shape[1]
-    if count < 2 * blocks:
+    if count < 2 * JACKKNIFE_BLOCKS:
         return np.nan
-    starts = np.linspace(0, count, blocks, endpoint=False).astype(int)
-    left, whole = (np.add.reduceat(np.sum(x**2, axis=0), starts) for x in (measured - predicted, measured))
-    if not (whole.sum() - whole > 0.0).all():
+    starts = np.linspace(0, count, JACKKNIFE_BLOCKS, endpoint=False).astype(int)
+    error = np.add.reduceat(np.sum((measured - predicted) ** 2, axis=0), starts)
+    torque = np.add.reduceat(np.sum(measured**2, axis=0), starts)
+    remaining_torque = torque.sum() - torque
+    if not (remaining_torque > 0.0).all():
         return np.nan
-    each = 100.0 * np.sqrt((left.sum() - left) / (whole.sum() - whole))
-    return float(np.sqrt((blocks - 1) / blocks * np.sum((each - each.mean()) ** 2)))
+    percent = 100.0 * np.sqrt((error.sum() - error) / remaining_torque)
+    squares = np.sum((percent - percent.mean()) ** 2)
+    return float(np.sqrt((JACKKNIFE_BLOCKS - 1) / JACKKNIFE_BLOCKS * squares))
 
 
 def score(
@@ -156,20 +166,63 @@ def score(
     """Return the errors of a prediction (N, rows) at the full rate, without lost samples.
 
     Args:
+        case: the recording.
+        predicted: (N, rows) torques.
         slow: what stands, see `calib.data.signals.motion.moving`.
         apart: rows in a unit of their own, which no total holds.
     """
     motion = case.motion
-    known = motion.weight > 0.5
     moves = moving(motion) if slow is None else moving(motion, slow)
-    count = case.target.shape[1]
-    rows = [_row(case, np.asarray(predicted)[:, k], k, known, moves[:, k % motion.n]) for k in range(count)]
-    sums, above, explained, low = zip(*rows)
-    every, residual = motion.decimator.factor, np.stack(low, axis=1)
-    raw, filtered, moved, stood = (_together([one[k] for one in sums], apart) for k in range(4))
-    white, share = _whiteness(residual, motion.segment[::every]), float(moves.mean())
-    rate, shares = motion.rate / every, (np.array(above), np.array(explained))
-    return Score(raw, filtered, moved, stood, *shares, white, rate, share)
+    sums, above, explained, residuals = [], [], [], []
+    for row in range(case.target.shape[1]):
+        row_moves = moves[:, row % motion.n]
+        row_sums, row_above, row_explained, residual = _score_row(case, np.asarray(predicted)[:, row], row, row_moves)
+        sums.append(row_sums)
+        above.append(row_above)
+        explained.append(row_explained)
+        residuals.append(residual)
+    raw, filtered, in_motion, at_rest = np.stack(sums, axis=1)
+    step = motion.decimator.factor
+    return Score(
+        raw=_prediction_errors(raw, apart),
+        filtered=_prediction_errors(filtered, apart),
+        moving=_prediction_errors(in_motion, apart),
+        standing=_prediction_errors(at_rest, apart),
+        above_band_percent=np.array(above),
+        r_squared=np.array(explained),
+        whiteness=_whiteness(np.stack(residuals, axis=1), motion.segment[::step]),
+        rate=motion.rate / step,
+        motion_share=float(moves.mean()),
+    )
+
+
+def _score_row(
+    case: Case, predicted: np.ndarray, row: int, moves: np.ndarray
+) -> tuple[np.ndarray, float, float, np.ndarray]:
+    """Return the sums of one torque row for a score; rows are processed one by one to save memory.
+
+    Returns:
+        (4, 3) Σ (τ - τ̂)², Σ τ² and their number of all samples, raw and in the band, of moving and of standing ones;
+        `Score.above_band_percent` and `Score.r_squared` of the row; (M,) the residual in the band, thinned.
+    """
+    motion = case.motion
+    valid = motion.weight > 0.5
+    target = case.target[:, row]
+    residual = target - predicted
+    target_in_band, predicted_in_band = motion.in_band(np.stack([target, predicted], axis=1)).T
+    residual_in_band = target_in_band - predicted_in_band
+    sums = [
+        _sums(target, residual, valid),
+        _sums(target_in_band, residual_in_band, valid),
+        _sums(target, residual, valid & moves),
+        _sums(target, residual, valid & ~moves),
+    ]
+    size = float(np.linalg.norm(target))
+    above = 0.0
+    if size > 0.0:
+        above = 100.0 * float(np.linalg.norm(target - target_in_band)) / size
+    thinned = residual_in_band[:: motion.decimator.factor]
+    return np.array(sums), above, r_squared(target[valid], residual[valid]), thinned
 
 
 def _row(
@@ -191,29 +244,32 @@ def _row(
     return np.array(sums), above, r_squared(target[known], residual[known]), own[:: motion.decimator.factor]
 
 
-def _sums(target: np.ndarray, residual: np.ndarray, used: np.ndarray) -> tuple[float, float, float]:
-    return float(np.sum(residual[used] ** 2)), float(np.sum(target[used] ** 2)), float(used.sum())
+def _sums(target: np.ndarray, residual: np.ndarray, selected: np.ndarray) -> tuple[float, float, float]:
+    """Return Σ (τ - τ̂)², Σ τ² and the number of some samples."""
+    return float(np.sum(residual[selected] ** 2)), float(np.sum(target[selected] ** 2)), float(selected.sum())
 
 
-def _together(sums: Sequence[np.ndarray], apart: Sequence[int]) -> PredictionErrors:
-    """Return prediction errors from the sums (3,) of each torque row; the total excludes the rows `apart`."""
+def _prediction_errors(sums: np.ndarray, apart: Sequence[int]) -> PredictionErrors:
+    """Return prediction errors from the sums (rows, 3) of the torque rows; the total excludes the rows `apart`."""
     square, size, count = np.array(sums).T
-    alike = ~np.isin(np.arange(len(square)), apart)
+    same_unit = ~np.isin(np.arange(len(square)), apart)
     with np.errstate(divide="ignore", invalid="ignore"):
         joints = 100.0 * np.sqrt(square / size)
         rms = np.sqrt(square / count)
-        total = float(100.0 * np.sqrt(square[alike].sum() / size[alike].sum()))
+        total = float(100.0 * np.sqrt(square[same_unit].sum() / size[same_unit].sum()))
     relative = RelativeErrors(total, np.where(size > 0.0, joints, np.nan))
     return PredictionErrors(relative, np.where(count > 0, rms, np.nan), int(count.sum()))
 
 
 def _whiteness(residual: np.ndarray, segment: np.ndarray) -> tuple[Whiteness | None, ...]:
     """Return the whiteness tests of the longest segment of the decimated residuals (M, rows)."""
-    found: list[Whiteness | None] = []
+    tests: list[Whiteness | None] = []
     for column in residual[longest(segment)].T:
-        enough = len(column) > 40 and np.ptp(column) > 0.0
-        found.append(examine(column, min(30, len(column) // 2)) if enough else None)
-    return tuple(found)
+        if len(column) > MIN_WHITENESS_SAMPLES and np.ptp(column) > 0.0:
+            tests.append(examine(column, min(MAX_LAGS, len(column) // 2)))
+        else:
+            tests.append(None)
+    return tuple(tests)
 
 
 Model = TypeVar("Model", bound=RegressorModel, default=IdentificationModel, covariant=True)
@@ -234,11 +290,11 @@ class Dynamics(Frozen, Generic[Model]):
 
     def transmitted(self: Dynamics[IdentificationModel], case: Case) -> np.ndarray:
         """Return the torques (N, n) that the gears transmit to the bodies, for load-dependent friction."""
+        q, v, a = case.links
         result = np.empty(case.motion.q.shape)
         for start in range(0, len(case.motion), BLOCK):
             part = slice(start, start + BLOCK)
-            q, v, a = (x[part] for x in case.links)
-            result[part] = self.model.transmitted(self.values, q, v, a, case.carried)
+            result[part] = self.model.transmitted(self.values, q[part], v[part], a[part], case.carried)
         return result
 
 

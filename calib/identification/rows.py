@@ -22,6 +22,13 @@ from calib.errors import UsageError, refuse_data
 from calib.estimation.triangles import Triangles, absorb, empty, retriangulate
 from calib.records import frozen
 
+BLOCK = 4096
+"""Samples of the full rate at a time."""
+CUT_MARGIN = 2
+"""Decimated samples beside a cut between time blocks that share a filter window with it."""
+DIFFERENCE_REACH = 4
+"""Samples beside a block that differences of its energies reach."""
+
 
 @dataclass(frozen=True, eq=False)
 class Case:
@@ -55,7 +62,10 @@ class Case:
 
     def deflected(self, part: slice) -> dict[str, Any]:
         """Return the argument ``link`` of a model's regressor at a part of the samples; none where joints are stiff."""
-        return {} if self.link is None else {"link": tuple(x[part] for x in self.link)}
+        if self.link is None:
+            return {}
+        q, v, a = self.link
+        return {"link": (q[part], v[part], a[part])}
 
     @property
     def duration(self) -> float:
@@ -69,23 +79,35 @@ def make_case(
     """Return the case of a motion and its torques.
 
     Args:
+        name: unique name of the recording.
+        motion: q, v, a and efforts at the full rate.
         rows: which torques the model explains; all but the motors' need joint torque sensors (`Motion.tau_link`).
         gains: (n,) torque per unit of the effort; None: 1.
         carried: labels of payloads.
     """
-    effort = np.array(motion.effort) if gains is None else motion.effort * gains
+    effort = np.array(motion.effort)
+    if gains is not None:
+        effort = motion.effort * gains
     if rows.sensed and motion.tau_link is None:
         refuse_data(
             motion.file,
             f"rows '{rows.name}' need torques of motors, and of sensors behind the gear (columns tau_l1 …, "
             "tau_sensor1 …)",
         )
-    target = rows.target(effort, motion.tau_link, motion.q, motion.v)
-    known = np.repeat(motion.weight[:, None] > 0.5, motion.n, axis=1)
     noise = None
     if motion.effort_variance is not None and rows.motors_alone:
-        noise = frozen(np.sqrt(motion.effort_variance) * (1.0 if gains is None else np.abs(gains)))
-    return Case(name, motion, frozen(target), tuple(carried), frozen(rows.of_joints(known), bool), noise, rows)
+        factor = 1.0 if gains is None else np.abs(gains)
+        noise = frozen(np.sqrt(motion.effort_variance) * factor)
+    valid = np.repeat(motion.weight[:, None] > 0.5, motion.n, axis=1)
+    return Case(
+        name=name,
+        motion=motion,
+        target=frozen(rows.target(effort, motion.tau_link, motion.q, motion.v)),
+        carried=tuple(carried),
+        present=frozen(rows.of_joints(valid), bool),
+        noise=noise,
+        torque_rows=rows,
+    )
 
 
 def case_names(paths: Sequence[str]) -> tuple[str, ...]:
@@ -94,22 +116,24 @@ def case_names(paths: Sequence[str]) -> tuple[str, ...]:
     Raises:
         UsageError: where the same recording and cut is given twice.
     """
-    twice = sorted({path for path in paths if list(paths).count(path) > 1})
-    if twice:
-        raise UsageError(f"{twice[0]} is given twice")
-    plain = [_file(path) for path in paths]
-    tail = [path.replace("\\", "/").rsplit("/", 1)[-1] for path in paths]
-    chosen = [p if plain.count(p) == 1 else t for p, t in zip(plain, tail)]
-    return tuple(c if chosen.count(c) == 1 else path for c, path in zip(chosen, paths))
+    repeated = sorted({path for path in paths if list(paths).count(path) > 1})
+    if repeated:
+        raise UsageError(f"{repeated[0]} is given twice")
+    file_names = [_file(path) for path in paths]
+    candidates = []
+    for path, file_name in zip(paths, file_names):
+        if file_names.count(file_name) == 1:
+            candidates.append(file_name)
+        else:
+            with_cut = path.replace("\\", "/").rsplit("/", 1)[-1]
+            candidates.append(with_cut)
+    return tuple(name if candidates.count(name) == 1 else path for name, path in zip(candidates, paths))
 
 
 def _file(path: str) -> str:
     from calib.data.recordings.recording import parse_cut
 
     return parse_cut(path)[0].replace("\\", "/").rstrip("/").rsplit("/", 1)[-1]
-
-
-BLOCK = 4096  # samples of the full rate at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,17 +196,17 @@ class ObservationRows:
         """How many values of the friction at rest each row stands for (M, rows)."""
         return self.standing * (1.0 + self.swing / self.rest.reach)
 
-    def by_recording(self, own: int, count: int) -> ObservationRows:
-        """Return rows with separate torque rows per recording: those of recording `own` of `count` are filled.
+    def by_recording(self, recording: int, count: int) -> ObservationRows:
+        """Return rows with separate torque rows per recording: those of one `recording` of `count` are filled.
 
-        So that recordings are weighed apart, as joints are where a sample has a row for each.
+        So that recordings are weighed separately, as joints are where a sample has a row for each.
         """
-        place = np.arange(count) == own
+        filled = np.arange(count) == recording
         return replace(
             self,
-            matrix=np.where(place[:, None], self.matrix, 0.0),
-            target=np.where(place, self.target, 0.0),
-            present=self.present & place,
+            matrix=np.where(filled[:, None], self.matrix, 0.0),
+            target=np.where(filled, self.target, 0.0),
+            present=self.present & filled,
             standing=np.repeat(self.standing, count, axis=1),
             swing=np.repeat(self.swing, count, axis=1),
             rest=_no_rest(count),
@@ -193,17 +217,19 @@ class ObservationRows:
         """Return rows with columns (M, rows, k) appended."""
         if not terms:
             return self
-        undecided = np.array([one.form.undecided_at_rest for one in terms])
-        signs = np.array([one.shape == "sign" for one in terms])
-        holding = np.asarray(self.coulomb.any(axis=1))
-        coulomb = np.any(columns, axis=0) & signs & holding[:, None]
+        undecided_at_rest = np.array([term.form.undecided_at_rest for term in terms])
+        is_sign = np.array([term.shape == "sign" for term in terms])
+        has_coulomb = np.asarray(self.coulomb.any(axis=1))
+        coulomb = np.any(columns, axis=0) & is_sign & has_coulomb[:, None]
         at_rest = np.greater(self.standing, 0.0)[:, :, None]
-        columns = np.where(at_rest & undecided, 0.0, columns)
+        columns = np.where(at_rest & undecided_at_rest, 0.0, columns)
+        names = [term.name for term in terms]
+        units = [term.unit for term in terms]
         return replace(
             self,
             coulomb=np.hstack([self.coulomb, coulomb]),
-            names=(*self.names, *(one.name for one in terms)),
-            units=(*self.units, *(one.unit for one in terms)),
+            names=(*self.names, *names),
+            units=(*self.units, *units),
             matrix=np.concatenate([self.matrix, columns], axis=2),
         )
 
@@ -214,46 +240,62 @@ def observe(model: RegressorModel, columns: np.ndarray, case: Case, decimator: D
     A body's parameters reach the joints before it, a drive's its own: half of all entries, or less, can differ from 0.
     """
     motion = case.motion
-    column, row = np.nonzero(model.acting()[columns])
-    source = model.torque_rows.repeated(motion.n)  # rows that repeat others are copied, not filtered anew
-    own, again = source[row] == row, source[row] != row
-    seen = columns[column[own]]
-    size = len(kept(motion.segment, decimator))
-    matrix = np.zeros((model.rows, len(columns), size)).transpose(2, 0, 1)  # whoever reads it takes a row's columns
+    segment = motion.segment
+    # Entries that can differ from zero; rows that repeat others are copied, not filtered anew.
+    entry_column, entry_row = np.nonzero(model.acting()[columns])
+    source = model.torque_rows.repeated(motion.n)
+    is_source = source[entry_row] == entry_row
+    filtered_row, filtered_column = entry_row[is_source], entry_column[is_source]
+    copied_row, copied_column = entry_row[~is_source], entry_column[~is_source]
+    model_column = columns[filtered_column]
+
+    # Transposed, because readers take the columns of one row.
+    sample_count = len(kept(segment, decimator))
+    matrix = np.zeros((model.rows, len(columns), sample_count)).transpose(2, 0, 1)
     states = segmented_states(model.columns, case)
-    step, place = max(1, BLOCK // decimator.factor) * decimator.factor, 0
-    for start, stop in segments(motion.segment):
-        spans = [slice(i, min(i + step, stop)) for i in range(start, stop, step)]
+    step = max(1, BLOCK // decimator.factor) * decimator.factor
+    first = 0
+    for start, stop in segments(segment):
+        parts = [slice(i, min(i + step, stop)) for i in range(start, stop, step)]
         if len(decimator.taps) == 1 and model.torque_rows != POWER:
-            for part in spans:  # nothing to filter: no need to turn entries into series and back
+            # Nothing to filter: entries need not be turned into series and back.
+            for part in parts:
                 matrix[part] = _regressor(model, case, part, states)[:, :, columns]
             continue
         if model.torque_rows == POWER:
-            blocks = (power_block(model, seen, case, part, states, slice(start, stop)) for part in spans)
+            segment_slice = slice(start, stop)
+            blocks = (power_block(model, model_column, case, part, states, segment_slice) for part in parts)
         else:
-            entries = (_regressor(model, case, part, states).transpose(2, 1, 0) for part in spans)
-            blocks = (each[seen, row[own]] for each in entries)
-        for part in decimate_blocks(blocks, decimator):
-            matrix[place : place + part.shape[1], row[own], column[own]] = part.T
-            place += part.shape[1]
-    matrix[:, row[again], column[again]] = matrix[:, source[row[again]], column[again]]
-    names, units = (tuple(one[k] for k in columns) for one in (model.names, model.units))
-    target, present = decimate(case.target, decimator, motion.segment), thinned(case.present, motion.segment, decimator)
-    rate, block = motion.rate / decimator.factor, np.zeros(len(target), dtype=int)
-    standing, coulomb = np.zeros(target.shape), np.zeros((model.rows, len(columns)), dtype=bool)
+            blocks = _entry_blocks(model, case, parts, states, model_column, filtered_row)
+        for block in decimate_blocks(blocks, decimator):
+            samples = slice(first, first + block.shape[1])
+            matrix[samples, filtered_row, filtered_column] = block.T
+            first += block.shape[1]
+    matrix[:, copied_row, copied_column] = matrix[:, source[copied_row], copied_column]
+
+    target = decimate(case.target, decimator, segment)
     return ObservationRows(
-        names,
-        units,
-        matrix,
-        target,
-        present,
-        block,
-        rate,
-        standing,
-        np.zeros(target.shape),
-        _no_rest(model.rows),
-        coulomb,
+        names=tuple(model.names[column] for column in columns),
+        units=tuple(model.units[column] for column in columns),
+        matrix=matrix,
+        target=target,
+        present=thinned(case.present, segment, decimator),
+        block=np.zeros(len(target), dtype=int),
+        rate=motion.rate / decimator.factor,
+        standing=np.zeros(target.shape),
+        swing=np.zeros(target.shape),
+        rest=_no_rest(model.rows),
+        coulomb=np.zeros((model.rows, len(columns)), dtype=bool),
     )
+
+
+def _entry_blocks(
+    model: RegressorModel, case: Case, parts: Sequence[slice], states: np.ndarray, columns: np.ndarray, rows: np.ndarray
+) -> Iterator[np.ndarray]:
+    """Yield entries (k, N_i) of the regressor, given by column and row, at each part of the samples."""
+    for part in parts:
+        regressor = _regressor(model, case, part, states)
+        yield regressor.transpose(2, 1, 0)[columns, rows]
 
 
 def _no_rest(rows: int) -> RestWeights:
@@ -273,49 +315,54 @@ def observe_terms(
     One column at a time at the full rate: an hour of all friction there is would fill 15 GB.
     """
     segment, n = case.motion.segment, case.motion.n
-    out = np.zeros((len(kept(segment, decimator)), torque_rows.count(n), len(terms)))
-    for k, one in enumerate(terms):
-        for row, values in term_columns(one, case, load):
-            out[:, torque_rows.of_side(one.side, row, n), k] += decimate(values, decimator, segment)[:, None]
-    return out
+    sample_count = len(kept(segment, decimator))
+    columns = np.zeros((sample_count, torque_rows.count(n), len(terms)))
+    for k, term in enumerate(terms):
+        for joint, values in term_columns(term, case, load):
+            rows = torque_rows.of_side(term.side, joint, n)
+            columns[:, rows, k] += decimate(values, decimator, segment)[:, None]
+    return columns
 
 
-def term_columns(one: DriveTerm, case: Case, load: np.ndarray | None = None) -> Iterator[tuple[int, np.ndarray]]:
+def term_columns(term: DriveTerm, case: Case, load: np.ndarray | None = None) -> Iterator[tuple[int, np.ndarray]]:
     """Yield the torque rows that a drive term acts on, each with its column (N,) at the full rate."""
     motion = case.motion
     motions = [motion.q.T, motion.v.T, motion.a.T, None if load is None else load.T]
-    return one.acting(motions, segmented_states([one], case))
+    return term.acting(motions, segmented_states([term], case))
 
 
 def segmented_states(terms: Sequence[DriveTerm], case: Case) -> np.ndarray:
     """Return the states (s, N) of friction with hysteresis, zero at the start of each segment."""
-    parts = [drives.friction_states(terms, case.motion.q[a:b].T) for a, b in segments(case.motion.segment)]
-    return np.concatenate(parts, axis=1)
+    motion = case.motion
+    states = [drives.friction_states(terms, motion.q[start:stop].T) for start, stop in segments(motion.segment)]
+    return np.concatenate(states, axis=1)
 
 
 def segments(segment: np.ndarray) -> list[tuple[int, int]]:
     """Return (start, stop) of each run of equal numbers in an array."""
     edges = np.concatenate([[0], np.flatnonzero(np.diff(segment)) + 1, [len(segment)]])
-    return [(int(a), int(b)) for a, b in pairwise(edges)]
+    return list(pairwise(edges.tolist()))
 
 
 def with_blocks(all_rows: Sequence[ObservationRows], count: int) -> list[ObservationRows]:
     """Return rows with time blocks numbered over all cases: contiguous, about `count`, at least one per case.
 
-    Samples within `margin` of a cut get -1: the filter's window reaches over it.
+    Samples within `CUT_MARGIN` of a cut get -1: the filter's window reaches over it.
     """
     total = sum(len(rows.target) for rows in all_rows)
-    result, first = [], 0
-    margin = 2  # thinned samples beside a cut between blocks that share a filter window: not judged
+    numbered = []
+    first = 0
     for rows in all_rows:
         size = len(rows.target)
-        own = 1 if len(all_rows) >= count else max(1, round(count * size / max(total, 1)))
-        number = first + (np.arange(size) * own) // max(size, 1)
-        cut = np.flatnonzero(np.diff(number)) + 1
-        near = np.abs(np.arange(size)[:, None] - cut[None, :]).min(axis=1, initial=size) <= margin
-        result.append(replace(rows, block=np.where(near, -1, number)))
-        first += own
-    return result
+        case_blocks = 1
+        if len(all_rows) < count:
+            case_blocks = max(1, round(count * size / max(total, 1)))
+        number = first + (np.arange(size) * case_blocks) // max(size, 1)
+        cuts = np.flatnonzero(np.diff(number)) + 1
+        distance = np.abs(np.arange(size)[:, None] - cuts[None, :]).min(axis=1, initial=size)
+        numbered.append(replace(rows, block=np.where(distance <= CUT_MARGIN, -1, number)))
+        first += case_blocks
+    return numbered
 
 
 def triangulate(all_rows: Sequence[ObservationRows]) -> Triangles:
@@ -323,39 +370,41 @@ def triangulate(all_rows: Sequence[ObservationRows]) -> Triangles:
 
     The last block holds the samples beside cuts. Rows of standstills have their weights.
     """
-    rows = all_rows[0].target.shape[1]
-    blocks = 1 + max((int(part.block.max(initial=-1)) for part in all_rows), default=-1)
-    result = empty(all_rows[0].names, all_rows[0].units, (blocks + 1) * rows)
+    row_count = all_rows[0].target.shape[1]
+    block_count = 1 + max((int(rows.block.max(initial=-1)) for rows in all_rows), default=-1)
+    result = empty(all_rows[0].names, all_rows[0].units, (block_count + 1) * row_count)
     counts = np.zeros(result.groups)
-    for part in all_rows:
-        block = np.where(part.block < 0, blocks, part.block)
-        for row in range(rows):
-            used = part.present[:, row]
-            group = block[used] * rows + row
-            matrix, target = part.matrix[used, row], part.target[used, row]
-            if part.standing[:, row].any():
-                weight = part.weight[used, row]
-                matrix, target = matrix * weight[:, None], target * weight
+    for rows in all_rows:
+        block = np.where(rows.block < 0, block_count, rows.block)
+        for row in range(row_count):
+            present = rows.present[:, row]
+            group = block[present] * row_count + row
+            matrix, target = rows.matrix[present, row], rows.target[present, row]
+            if rows.standing[:, row].any():
+                weight = rows.weight[present, row]
+                matrix = matrix * weight[:, None]
+                target = target * weight
             result = absorb(result, matrix, target, group)
-            counts += np.bincount(group, part.counted[used, row], result.groups)
+            counts += np.bincount(group, rows.counted[present, row], result.groups)
     return replace(result, rows=frozen(np.round(counts), int))
 
 
 def pool(data: Triangles, rows: int, blocks: Sequence[int] | None = None) -> Triangles:
     """Return R factors with one group per torque row, over all blocks or the given ones."""
-    count = data.groups // rows
-    wanted = range(count) if blocks is None else blocks
-    index = np.array([[block * rows + row for block in wanted] for row in range(rows)], dtype=int)
+    if blocks is None:
+        blocks = range(data.groups // rows)
+    # Groups of each row (rows, blocks).
+    index = np.add.outer(np.arange(rows), rows * np.array(blocks, dtype=int))
     size = data.parameters + 1
-    factors = np.stack([retriangulate(data.factors[own].reshape(-1, size)) for own in index])
-    return replace(data, factors=factors, rows=data.rows[index].sum(axis=1))
+    factors = [retriangulate(data.factors[groups].reshape(-1, size)) for groups in index]
+    return replace(data, factors=np.stack(factors), rows=data.rows[index].sum(axis=1))
 
 
 def _regressor(model: RegressorModel, case: Case, part: slice, states: np.ndarray) -> np.ndarray:
     """Return the regressor (N_i, rows, p) at a part of the samples."""
     motion = case.motion
-    given = motion.q[part], motion.v[part], motion.a[part], None, case.carried, states[:, part]
-    return model.regressor(*given, **case.deflected(part))
+    q, v, a = motion.q[part], motion.v[part], motion.a[part]
+    return model.regressor(q, v, a, None, case.carried, states[:, part], **case.deflected(part))
 
 
 def power_block(
@@ -369,16 +418,24 @@ def power_block(
     if not isinstance(model, _HasEnergy):
         raise UsageError("rows = 'power' requires a model with energies")
     motion = case.motion
-    edge = 4  # samples beside a block that differences of its energies reach
-    near = slice(max(segment.start, part.start - edge), min(segment.stop, part.stop + edge))
-    h = model.energy_columns(motion.q[near], motion.v[near], case.carried)[:, columns]
-    rising = slope(h, motion.rate)
-    plain = np.gradient(h, 1.0 / motion.rate, axis=0) if len(h) > 1 else np.zeros_like(h)
-    rising = np.where(np.isfinite(rising), rising, plain)[part.start - near.start :][: part.stop - part.start].T
+    start = max(segment.start, part.start - DIFFERENCE_REACH)
+    stop = min(segment.stop, part.stop + DIFFERENCE_REACH)
+    energies = model.energy_columns(motion.q[start:stop], motion.v[start:stop], case.carried)[:, columns]
+    power = slope(energies, motion.rate)
+    plain_power = np.zeros_like(energies)
+    if len(energies) > 1:
+        plain_power = np.gradient(energies, 1.0 / motion.rate, axis=0)
+    power = np.where(np.isfinite(power), power, plain_power)
+    power = power[part.start - start :][: part.stop - part.start].T
+
     q, v = motion.q[part], motion.v[part]
-    losses = model.regressor(q, v, np.zeros_like(v), None, case.carried, states[:, part]).transpose(2, 1, 0)[columns, 0]
-    stored = [k < model.inertial or model.columns[k - model.inertial].shape == "acceleration" for k in columns]
-    return np.where(np.array(stored)[:, None], rising, losses)
+    regressor = model.regressor(q, v, np.zeros_like(v), None, case.carried, states[:, part])
+    losses = regressor.transpose(2, 1, 0)[columns, 0]
+    stores_energy = []
+    for column in columns:
+        drive = column - model.inertial
+        stores_energy.append(drive < 0 or model.columns[drive].shape == "acceleration")
+    return np.where(np.array(stores_energy)[:, None], power, losses)
 
 
 @runtime_checkable
@@ -388,5 +445,7 @@ class _HasEnergy(Protocol):
 
 def thinned(mask: np.ndarray, segment: np.ndarray, decimator: Decimator) -> np.ndarray:
     """Return the decimated mask (M, rows): true where more than half of the samples of a mask (N, rows) are true."""
-    share = decimate(mask.astype(float), decimator, segment)
-    return (share > 0.5) & mask[kept(segment, decimator)] if len(decimator.taps) == 1 else share > 0.5
+    majority = decimate(mask.astype(float), decimator, segment) > 0.5
+    if len(decimator.taps) == 1:
+        return majority & mask[kept(segment, decimator)]
+    return majority

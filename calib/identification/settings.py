@@ -51,7 +51,8 @@ class Payload:
             return None
         x, y, z = self.com
         inertia = (y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y)
-        return tuple(self.mass * value for value in (*inertia, x, y, z, 1.0))
+        per_mass = (*inertia, x, y, z, 1.0)
+        return tuple(self.mass * value for value in per_mass)
 
 
 @dataclass(frozen=True)
@@ -131,15 +132,24 @@ def make_model(chain: Chain, settings: IdentificationSettings) -> Identification
     linear = [joint.kind == "prismatic" for joint in chain.joints]
     sets = per_joint(settings.sets or (settings.torque_rows.drives,), chain.n, "drives")
     v0 = per_joint(settings.v0, chain.n, "v0")
-    own = list(drives.standard(sets, v0, linear))
+    terms = list(drives.standard(sets, v0, linear))
     for coupling in settings.couplings:
-        made = drives.coupled(*coupling.joints, v0=v0[coupling.joints[1]], label=coupling.label or None)
-        for name in {one.name for one in made} & {one.name for one in own}:
-            other = "_".join(str(j + 1) for j in coupling.joints)
-            raise UsageError(f'coupling: parameter {name} is a joint\'s own; add another label: label = "{other}"')
-        own += made
-    own += [replace(one, linear=linear[one.acts[0][0]]) if one.acts else one for one in settings.terms]
-    return IdentificationModel(make_bodies(chain, settings), tuple(own), settings.torque_rows)
+        first, second = coupling.joints
+        names = {term.name for term in terms}
+        coupled = drives.coupled(first, second, v0=v0[second], label=coupling.label or None)
+        for term in coupled:
+            if term.name in names:
+                label = f"{first + 1}_{second + 1}"
+                raise UsageError(
+                    f'coupling: parameter {term.name} is a joint\'s own; add another label: label = "{label}"'
+                )
+        terms += coupled
+    for term in settings.terms:
+        if term.acts:
+            first_row, _ = term.acts[0]
+            term = replace(term, linear=linear[first_row])
+        terms.append(term)
+    return IdentificationModel(make_bodies(chain, settings), tuple(terms), settings.torque_rows)
 
 
 def make_bodies(chain: Chain, settings: IdentificationSettings) -> Bodies:
@@ -154,17 +164,21 @@ def make_bodies(chain: Chain, settings: IdentificationSettings) -> Bodies:
 
 def _check_joints(n: int, settings: IdentificationSettings) -> None:
     """Raise an error for couplings or terms of unknown joints, and for a joint coupled with itself."""
-    named: list[tuple[str, tuple[int, ...]]] = [
-        (f"coupling: joints {[j + 1 for j in one.joints]}", one.joints) for one in settings.couplings
-    ]
-    for one in settings.terms:
-        joints = [j for row, motion in one.acts for j in (row, *(k for k, _ in motion))]
-        named.append((f"term '{one.name}': joint {max(joints, default=0) + 1}", tuple(joints)))
-    for place, joints in named:
-        require(max(joints, default=0) < n, f"{place}: the robot has joints 1 to {n}", UsageError)
     for coupling in settings.couplings:
-        if coupling.joints[0] == coupling.joints[1]:
-            raise UsageError(f"coupling: joint {coupling.joints[0] + 1} is coupled with itself; name two joints")
+        numbers = [joint + 1 for joint in coupling.joints]
+        require(max(numbers) <= n, f"coupling: joints {numbers}: the robot has joints 1 to {n}", UsageError)
+    for term in settings.terms:
+        joints = []
+        for row, motion in term.acts:
+            joints.append(row)
+            joints += [joint for joint, _ in motion]
+        number = max(joints, default=0) + 1
+        message = f"term '{term.name}': joint {number}: the robot has joints 1 to {n}"
+        require(number <= n, message, UsageError)
+    for coupling in settings.couplings:
+        first, second = coupling.joints
+        if first == second:
+            raise UsageError(f"coupling: joint {first + 1} is coupled with itself; name two joints")
 
 
 def require_usable(settings: IdentificationSettings, method: Method) -> IdentificationSettings:
@@ -174,19 +188,23 @@ def require_usable(settings: IdentificationSettings, method: Method) -> Identifi
         UsageError: for a missing loop, torque rows that the method does not take, or richer friction; the message
             names all methods that do.
     """
-    place, rows, friction = f"method '{method.name}'", settings.torque_rows, settings.friction
+    option = f"method '{method.name}'"
+    rows, friction = settings.torque_rows, settings.friction
     if method.needs_controller and settings.loop is None:
-        words = (
+        refuse_option(
+            option,
             "state the controller in the options file, [loop] controller = … (calib formats "
-            "identify-options), and log or state the reference; from q and torque alone use wls or irls"
+            "identify-options), and log or state the reference; from q and torque alone use wls or irls",
         )
-        refuse_option(place, words)
     if not method.takes(rows):
-        known = ", ".join(name for name, one in METHODS.items() if one.takes(rows))
-        refuse_option(place, f"rows = '{rows.name}' is not supported; methods that do: {known}")
+        supporting = [name for name, candidate in METHODS.items() if candidate.takes(rows)]
+        refuse_option(option, f"rows = '{rows.name}' is not supported; methods that do: {', '.join(supporting)}")
     if friction == "auto":
         return replace(settings, friction=method.auto_friction)
     if friction != "standard" and not method.takes_models:
-        known = ", ".join(name for name, one in METHODS.items() if one.takes_models)
-        refuse_option(place, f"standard friction only, not friction = '{friction}'; methods that take it: {known}")
+        supporting = [name for name, candidate in METHODS.items() if candidate.takes_models]
+        refuse_option(
+            option,
+            f"standard friction only, not friction = '{friction}'; methods that take it: {', '.join(supporting)}",
+        )
     return settings

@@ -1,0 +1,1 @@
+OFFERS = {"steps": ("session.certificate:STEP", "session.second_round:STEP")}

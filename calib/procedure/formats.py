@@ -26,7 +26,7 @@ TOPICS: Mapping[str, tuple[str, str]] = {
     ),
     "exports": (
         "files that calib export --into writes",
-        "calib.procedure.export.delivery calib.identification.possible.solve",
+        "calib.procedure.export.delivery calib.identification.physical_consistency.solve",
     ),
     "constraints": ("the TOML file of calib select --constraints", "calib.procedure.measuring.constraints_file"),
     "mdh": ("a robot as a table of modified Denavit-Hartenberg rows", "calib.robot.mdh calib.robot.tables"),
@@ -45,6 +45,23 @@ TOPICS: Mapping[str, tuple[str, str]] = {
         "recordings of motion, for calib identify",
         "calib.data.recordings.recording_options calib.data.recordings.recording_files calib.data.recordings.archives",
     ),
+    "images": (
+        "a folder of images of a board, its board.toml, camera.yaml, corners.csv",
+        "calib.data.images.image_folders calib.data.images.board calib.data.images.lens calib.data.images.pixels "
+        "calib.data.images.image_bags",
+    ),
+    "logs": (
+        "logs of robot controllers, by brand, and ROS bags",
+        "calib.data.recordings.controller_logs calib.data.recordings.bags",
+    ),
+    "descriptions": (
+        "robots as xacro, MJCF and a UR's calibration.conf",
+        "calib.robot.descriptions.xacro_files calib.robot.descriptions.mjcf calib.robot.descriptions.ur_calibration",
+    ),
+    "moveit": ("MoveIt's joint_limits.yaml and SRDF as limits", "calib.procedure.measuring.moveit"),
+    "ros2": ("ROS 2 package of a calibrated robot, of calib export --ros2", "calib.procedure.export.ros2_package"),
+    "robodk": ("CSV of RoboDK, and of three reflectors without a header", "calib.data.poses.robodk"),
+    "instruments": ("text exports of trackers, CMMs and motion capture", "calib.data.poses.exports"),
     **merged(TOPICS_OF_ROOMS),
 }
 """Topic → short description, and the modules whose docstrings document the topic."""

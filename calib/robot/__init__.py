@@ -1,0 +1,1 @@
+OFFERS = {"descriptions": "descriptions.reading:"}

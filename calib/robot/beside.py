@@ -6,7 +6,8 @@ Links without masses, pictures and shapes are mere frames and take no space, unl
 them.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -14,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from calib.robot.capsules import Attached
 from calib.robot.chain import Chain
 from calib.robot.formats.urdf import align
-from calib.robot.formats.urdf_tree import JointTag, UrdfTree, parse, read
+from calib.robot.formats.urdf_tree import JointTag, UrdfTree, is_urdf, parse, read, text
 from calib.transforms import invert, pose
 
 # Length [m] below which a capsule is a sphere.
@@ -115,3 +116,10 @@ def _still_pose(tree: UrdfTree, link: str, posture: Mapping[str, float]) -> np.n
             motion = pose(Rotation.from_rotvec(displacement))
         result = result @ joint.origin @ motion
     return result
+
+
+def links_of(chain: Chain, source: Path | None) -> Collection[str]:
+    """Return the names of a robot's links: of all in its URDF, else of the arm's capsules."""
+    if source is not None and is_urdf(source):
+        return read(text(source)[0], str(source)).bodies
+    return (chain.base, *(chain.links or [f"{name}_link" for name in chain.joint_names]), chain.tip)

@@ -32,16 +32,16 @@ from typing import Any
 import numpy as np
 
 from calib import files
+from calib.data.images.image_folders import find_corners, read_images
+from calib.data.images.lens import Lens
+from calib.data.images.pixels import Pixels
 from calib.data.poses import IN_HAND
 from calib.data.poses.measurements import PoseMeasurements, take
+from calib.geometry.camera.camera_guess import complete_camera, pnp_poses
 from calib.geometry.first_guess import install
 from calib.geometry.fit import GeometricFit, fit
 from calib.geometry.observation import layout
 from calib.robot.chain import random_joints
-from calib.rooms.camera.camera_guess import complete_camera, pnp_poses
-from calib.rooms.camera.lens import Lens
-from calib.rooms.camera.pictures.image_folders import find_corners, read_images
-from calib.rooms.camera.pixels import Pixels
 from calib.rooms.cells.camera_cell import (
     FIVE_MEGAPIXEL,
     CameraCell,

@@ -76,7 +76,7 @@ def simulate(
     Raises:
         NotConverged: for a run that leaves its reference.
     """
-    robot, motion = model.known.robot, along(model.known, x, v, a)
+    robot, motion = model.mechanism.robot, along(model.mechanism, x, v, a)
     q, t = motion.posture.q[:, robot.actuated], np.arange(len(x)) / controller.rate
     speed = np.vstack([motion.v[:1, robot.actuated], np.diff(q, axis=0) * controller.rate])
     preload = replace(model, preload=(controller.preload,) * (robot.n - robot.r))
@@ -100,7 +100,7 @@ def _platform_inertia(
     model: ParallelModel, values: np.ndarray, motion: LoopMotion, carried: Collection[str] | None = None
 ) -> np.ndarray:
     """Return M (N, r, r) = Σ J_kᵀ M_k J_k + Dᵀ M_platform D, the inertia that the platform's coordinates feel."""
-    robot, J = model.known.robot, motion.jacobians
+    robot, J = model.mechanism.robot, motion.jacobians
     drives = added_inertia(model.terms, values[model.inertial :], int(robot.starts[-1]))
     result = J.joints.transpose(0, 2, 1) @ drives @ J.joints
     for (bodies, joints, _), parameters in zip(model.legs, model.leg_parameters(values)):

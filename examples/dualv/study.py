@@ -115,8 +115,8 @@ class Robot:
     """The simulated robot: library geometry, parameters of its file, friction, and a payload that may be on board."""
 
     def __init__(self) -> None:
-        self.known = find("dualv").known
-        self.model = make_parallel_model(self.known, ["Fv Fc"], v0=0.05, payloads=["5"])
+        self.mechanism = find("dualv").mechanism
+        self.model = make_parallel_model(self.mechanism, ["Fv Fc"], v0=0.05, payloads=["5"])
         bodies = self.model.known_parameters()
         self.values = np.concatenate([bodies, [FRICTION[one.name[:2]] for one in self.model.terms]])
         for name, value in PAYLOAD.items():
@@ -132,12 +132,12 @@ class Method:
     """What one method makes of the recordings: IDIM on the platform's coordinates, or PIM on the power."""
 
     def __init__(self, robot: Robot, name: str, seen: tuple[Runs, Runs], other: Runs):
-        rows = rows_named(robot.known, "platform" if name == "idim" else "power")
-        self.model = make_parallel_model(robot.known, ["Ia Fv Fc"], v0=0.05, rows=rows, payloads=["5"])
+        rows = rows_named(robot.mechanism, "platform" if name == "idim" else "power")
+        self.model = make_parallel_model(robot.mechanism, ["Ia Fv Fc"], v0=0.05, rows=rows, payloads=["5"])
 
         def case(motion: int, runs: Runs, load: str) -> Case:
             run, label = runs[load], f"{load}, motion {motion}"
-            recording = Recording(run.t, run.q, run.tau, "torque", robot.known.robot.joint_names, file=label)
+            recording = Recording(run.t, run.q, run.tau, "torque", robot.mechanism.robot.joint_names, file=label)
             return make_case(label, make_motion(recording, FILTER), rows, carried=LOADS[load])
 
         self.unseen = case(2, other, "loaded")
@@ -279,9 +279,9 @@ def figures(robot: Robot, trial: Trial, out: Path) -> None:
     _draw(t, y[span], found[span], [f"F{c} [N]" if c != "rz" else "Mz [N m]" for c in COORDINATES], out / "forces.png")
     motion = idim.model.moved(case.motion.q[span], case.motion.v[span], case.motion.a[span])
     tau = case.motion.in_band(np.array(case.motion.effort))[span]
-    c = overconstraint(robot.known, motion.jacobians, tau)
-    rebuilt = distributed(robot.known, motion.jacobians, found[span], c)
-    _draw(t, tau, rebuilt, [f"{name} [N m]" for name in robot.known.robot.joint_names], out / "torques.png")
+    c = overconstraint(robot.mechanism, motion.jacobians, tau)
+    rebuilt = distributed(robot.mechanism, motion.jacobians, found[span], c)
+    _draw(t, tau, rebuilt, [f"{name} [N m]" for name in robot.mechanism.robot.joint_names], out / "torques.png")
     _draw(t, c, np.full_like(c, PRELOAD), ["overconstraint [N m]"], out / "overconstraint.png")
     P, model = (pim.unseen.motion.in_band(x) for x in (pim.unseen.target, pim.predicted(pim.nine)))
     _draw(t, P[span], model[span], ["power [W]"], out / "power.png")

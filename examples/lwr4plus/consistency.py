@@ -36,11 +36,11 @@ from calib.errors import TaskLost
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit
 from calib.geometry.weighing import calibrated_chain
-from calib.identification import geometry_uncertainty
 from calib.identification.closed_loop.controllers import Reference
 from calib.identification.identify import Identification, chain_states, common_decimator, find_base, identify
 from calib.identification.rows import Case, make_case
 from calib.identification.settings import IdentificationSettings, Payload, make_model
+from calib.identification.uncertainty import geometry_uncertainty
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, random_joints
 from calib.rooms.cells import known_robots

@@ -197,7 +197,7 @@ def consistent(study: Study, result: Instrumental) -> LinearFit:
     bounds = dict.fromkeys(signs(result.names), (0.0, np.inf))
     settings = ConstraintSettings(signs=False, inertia=0, bounds=bounds)
     asked = make_constraints(settings, study.model, study.base, result.names, [None] * study.base.b)
-    return hold(result.ordinary, combine(data, std), data, std, asked, stated=True)[0]
+    return hold(result.ordinary, combine(data, std), data, std, asked, stated_noise=True)[0]
 
 
 def finite(result: Instrumental) -> list[Round]:

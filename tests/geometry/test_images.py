@@ -9,23 +9,23 @@ from differences import check
 from planted import perturb
 from scipy.spatial.transform import Rotation
 
+from calib.data.images.board_and_lens import board_poses
+from calib.data.images.lens import Lens
+from calib.data.images.optics import SHAPE, BoardShape
+from calib.data.images.pixels import Pixels
 from calib.data.poses import IN_HAND, TO_HAND
 from calib.data.poses.measurements import Positions, take
 from calib.errors import MeasurementError
+from calib.geometry.camera.camera_guess import complete_camera
+from calib.geometry.camera.robust_placement import place_robustly
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit, placed_on
 from calib.geometry.installation import see
 from calib.geometry.observation import layout, observe, prepare, step
 from calib.geometry.weighing import Settings
+from calib.procedure.kinematic_stage.image_findings import image_notes
 from calib.robot.calibrated import Deflection
 from calib.robot.library import load
-from calib.rooms.camera.board_and_lens import board_poses
-from calib.rooms.camera.camera_guess import complete_camera
-from calib.rooms.camera.image_findings import image_notes
-from calib.rooms.camera.lens import Lens
-from calib.rooms.camera.optics import SHAPE, BoardShape
-from calib.rooms.camera.pixels import Pixels
-from calib.rooms.camera.robust_placement import place_robustly
 from calib.rooms.cells import camera_cell as camera
 from calib.rooms.cells.cell import Cell, SimulatedInstrument, measure
 from calib.rooms.cells.truth import position_errors
@@ -288,8 +288,8 @@ def test_a_flat_board_has_one_pose_even_from_afar():
 
 @pytest.mark.parametrize("method", ["Shah", "Li", "Park-Martin"])
 def test_every_closed_form_places_exact_poses(method, monkeypatch):
+    from calib.geometry.camera import robust_placement as robust
     from calib.geometry.first_guess import place_pose
-    from calib.rooms.camera import robust_placement as robust
 
     rng = np.random.default_rng(1)
     arm, station, tool = (pose(Rotation.random(n, rng=rng), rng.normal(size=(n, 3))) for n in (12, 1, 1))

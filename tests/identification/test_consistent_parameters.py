@@ -12,9 +12,9 @@ from calib.dynamics import pseudo_inertia
 from calib.dynamics.idim import IdentificationModel, from_chain
 from calib.errors import UsageError
 from calib.estimation.estimate import whitened
-from calib.identification.possible import solve
-from calib.identification.possible.information import Information
-from calib.identification.possible.problem import BodyCost, find_prior_bodies, make_problem, nearest
+from calib.identification.physical_consistency import solve
+from calib.identification.physical_consistency.information import Information
+from calib.identification.physical_consistency.problem import BodyCost, find_prior_bodies, make_problem, nearest
 from calib.identification.prediction import Dynamics
 from calib.robot.chain import Chain, Element, Joint
 

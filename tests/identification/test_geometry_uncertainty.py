@@ -18,9 +18,9 @@ from calib.dynamics import rigid_body
 from calib.dynamics.bodies import bodies_of
 from calib.errors import RobotError
 from calib.geometry.weighing import calibrated_chain
-from calib.identification import geometry_uncertainty
 from calib.identification.identify import identify
 from calib.identification.settings import IdentificationSettings
+from calib.identification.uncertainty import geometry_uncertainty
 from calib.procedure.dynamic_stage import geometry_tables
 from calib.robot import calibrated
 from calib.robot.calibrated import CalibratedChain

@@ -9,8 +9,8 @@ import pytest
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import UsageError
 from calib.geometry.weighing import calibrated_chain
-from calib.identification.geometry_uncertainty import propagate
 from calib.identification.identify import identify
+from calib.identification.uncertainty.geometry_uncertainty import propagate
 from calib.procedure.dynamic_stage import folder as identified
 from calib.procedure.dynamic_stage import identify as dynamic
 from calib.procedure.dynamic_stage.inputs import gather
@@ -29,7 +29,7 @@ def geometry(model: str) -> kinematic.Outcome:
     """Return a fit of the planted arm, whose joints deflect."""
     cell = perturbed_cell(planted.arm(), 1, hidden=1.0)
     block: PoseMeasurements = measure(cell, random_joints(cell.nominal, 60, 1), 2)
-    return kinematic.run(Inputs(cell.nominal, Path("planted.toml"), (block,)), wanted=FitSettings(model=model))
+    return kinematic.run(Inputs(cell.nominal, Path("planted.toml"), (block,)), settings=FitSettings(model=model))
 
 
 @pytest.mark.parametrize("model", ["geometry", pytest.param("harmonics", marks=pytest.mark.slow)])

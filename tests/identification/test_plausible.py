@@ -16,7 +16,7 @@ from calib.dynamics.rigid_body import inverse_dynamics
 from calib.errors import Finding, MeasurementError, finding
 from calib.identification.checks.recording_sizes import compare_sizes, signs_of
 from calib.identification.identify import identify
-from calib.identification.possible.solve import Contradiction, contradiction
+from calib.identification.physical_consistency.solve import Contradiction, contradiction
 from calib.identification.rows import Case, make_case
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.plausibility import described, findings, impossible, wrong_joints

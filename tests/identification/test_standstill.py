@@ -16,7 +16,7 @@ from calib.identification.prediction import predict, score
 from calib.identification.rows import Case, ObservationRows, make_case, observe, with_blocks
 from calib.identification.settings import IdentificationSettings, make_model
 from calib.identification.standstill import divided, standing_joints, with_standstills
-from calib.identification.torque_errors import intervals, learn_torque_errors
+from calib.identification.uncertainty.torque_errors import intervals, learn_torque_errors
 
 PLAIN = IdentificationSettings(friction="standard", essential="none")
 WIDTH = np.full(planted.N, 0.01)  # of Coulomb's sign [rad/s]

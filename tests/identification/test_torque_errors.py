@@ -10,7 +10,7 @@ from calib.identification.identify import Identification, identify
 from calib.identification.prediction import predict
 from calib.identification.rows import Case
 from calib.identification.settings import IdentificationSettings
-from calib.identification.torque_errors import (
+from calib.identification.uncertainty.torque_errors import (
     TorqueErrorModel,
     TorqueIntervals,
     intervals,

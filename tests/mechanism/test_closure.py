@@ -25,7 +25,7 @@ def made(tmp_path, content: str):
 @pytest.mark.parametrize("name", ROBOTS)
 def test_encoders_and_platform_find_the_same_postures(name):
     """Coordinates → joints → coordinates, on the branch of home, loops closed to rounding; records as random ones."""
-    known, rng = find(name).known, np.random.default_rng(0)
+    known, rng = find(name).mechanism, np.random.default_rng(0)
     robot = known.robot
     x = rng.uniform(robot.lower, robot.upper, (60, robot.r))
     posture = known.place(x)
@@ -39,7 +39,7 @@ def test_encoders_and_platform_find_the_same_postures(name):
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_velocities_and_accelerations_are_derivatives(name):
-    known, h = find(name).known, 1e-4
+    known, h = find(name).mechanism, 1e-4
     robot, rng = known.robot, np.random.default_rng(1)
     x = 0.5 * rng.uniform(robot.lower, robot.upper)
     rate = np.where(robot.selected < 3, rng.normal(size=robot.r), 0.0)  # roll-pitch-yaw is no integral of the twist
@@ -62,7 +62,7 @@ def test_files_are_read_back_exactly(name, tmp_path):
 
 
 def test_poses_out_of_reach_are_named():
-    known = find("dualv").known
+    known = find("dualv").mechanism
     with pytest.raises(NoPosture, match=r"sample 2: .*leg\d stays .* mm from its attachment: out of reach") as told:
         known.place(np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]]))
     assert told.value.samples == (1,)
@@ -70,7 +70,7 @@ def test_poses_out_of_reach_are_named():
 
 def test_a_stretched_leg_is_a_singularity_of_type_1():
     """Leg 1 of the DualV at full reach, its attachment 0.56 m from its pivot, the other loops still closed."""
-    known = find("dualv").known
+    known = find("dualv").mechanism
     pivot = 0.41 * np.array([np.cos(np.radians(15.52)), np.sin(np.radians(15.52))])
     with pytest.raises(NoPosture, match=r"leg[14] is (singular|stretched or folded).*type 1"):
         known.place(np.array([[pivot[0] - 0.56 * (1 - 1e-11), pivot[1] - 0.11, 0.0]]))
@@ -81,13 +81,13 @@ def test_a_stretched_leg_is_a_singularity_of_type_1():
 )
 def test_a_five_bar_in_its_type_2_singularity_and_beyond_is_told(y, words):
     """Distal links in line, at y² = 0.3² - 0.28²: locked motors do not hold the tip."""
-    known = find("fivebar").known
+    known = find("fivebar").mechanism
     with pytest.raises(NoPosture, match=words):
         known.place(np.array([[0.0, y - 0.5]]))
 
 
 def test_a_stewart_platform_upside_down_is_beyond_a_type_2_singularity():
-    known = find("stewart").known
+    known = find("stewart").mechanism
     with pytest.raises(NoPosture, match="type 2"):
         known.place(np.array([[0.0, 0.0, -0.5, 0.0, 0.0, 0.0]]))
 

@@ -7,10 +7,10 @@ import pytest
 from platform_sines import fitted, recorded
 
 from calib.folders import read_covariance
-from calib.identification.geometry_uncertainty import estimate, estimator
 from calib.identification.identify import common_decimator
 from calib.identification.identify_options import parse_options
 from calib.identification.rows import make_case, observe
+from calib.identification.uncertainty.geometry_uncertainty import estimate, estimator
 from calib.rooms.parallel.identification import ParallelDynamics, identify_parallel
 from calib.rooms.parallel.mechanism.closure import ClosedRobot, closed
 from calib.rooms.parallel.mechanism.geometric_fit import changed, visible_directions
@@ -23,7 +23,7 @@ LOADED = {"payload": {"5": {}}, "files": {"load1.csv": {"payload": ["5"]}}, "ess
 def refitted(found: ParallelDynamics, known: ClosedRobot) -> np.ndarray:
     """Return the estimate of an identification from the same torques and weights on another geometry."""
     own, cases = found.found, found.inputs.cases
-    model = replace(own.dynamics.model, known=known, torque_rows=rows_named(known, own.settings.torque_rows.name))
+    model = replace(own.dynamics.model, mechanism=known, torque_rows=rows_named(known, own.settings.torque_rows.name))
     decimator, rows = common_decimator(cases, own.settings), []
     for k, (part, case) in enumerate(zip(own.rows, cases)):
         again = make_case(case.name, case.motion, model.torque_rows, carried=case.carried)
@@ -40,11 +40,11 @@ def refitted(found: ParallelDynamics, known: ClosedRobot) -> np.ndarray:
 )  # fmt: skip
 def test_sensitivities_are_those_of_identifications_on_other_geometries(name, rows):
     """On platform, motor and power rows, with a prior; constants that are choices of frames have none."""
-    robot = fitted(find(name).known)
-    logs = [recorded(robot.known, load, seed=k, samples=200) for k, load in enumerate(((), ("5",)))]
+    robot = fitted(find(name).mechanism)
+    logs = [recorded(robot.mechanism, load, seed=k, samples=200) for k, load in enumerate(((), ("5",)))]
     found = identify_parallel(robot, logs, options=parse_options(LOADED | {"rows": rows}))
-    carried, parameters = found.carried, robot.covariance.of(robot.known)
-    directions = visible_directions(robot.known, parameters)
+    carried, parameters = found.carried, robot.covariance.of(robot.mechanism)
+    directions = visible_directions(robot.mechanism, parameters)
     direction = directions @ np.random.default_rng(1).normal(size=directions.shape[1])
     step = 2e-5 * direction / np.linalg.norm(direction)
     ends = [refitted(found, closed(changed(robot.chain, parameters, own))) for own in (step, -step)]
@@ -57,11 +57,11 @@ def test_sensitivities_are_those_of_identifications_on_other_geometries(name, ro
 @pytest.mark.slow
 def test_geometries_that_fits_find_move_the_dynamics_as_stated(tmp_path):
     """Twelve fits of a DualV from other noise, the same torques: shifts of its 27 parameters, in sigma_geometry."""
-    known = find("dualv").known
+    known = find("dualv").mechanism
     logs = [recorded(known, load, seed=k) for k, load in enumerate(((), ("5",)))]
     robot = fitted(known)
     found = identify_parallel(robot, logs, options=parse_options(LOADED))
-    fits = [refitted(found, fitted(known, seed).known) for seed in range(12)]
+    fits = [refitted(found, fitted(known, seed).mechanism) for seed in range(12)]
     shifts = (np.array(fits) - refitted(found, known)) / found.carried.sigma_geometry
     assert 0.75 < np.sqrt(np.mean(shifts**2)) < 1.3
     out = found.save(tmp_path / "id", plots=False)

@@ -18,9 +18,9 @@ DUALV = find("dualv")
 
 def identified(change: float = 1.0, **options) -> ParallelDynamics:
     """Return the dynamics of a DualV from a run without and one with payload; leg 3's motor link times `change`."""
-    values = truth(DUALV.known)[1]
-    values[truth(DUALV.known)[0].names.index("ZZ13")] *= change
-    logs = [recorded(DUALV.known, load, seed=k, values=values) for k, load in enumerate(((), ("5",)))]
+    values = truth(DUALV.mechanism)[1]
+    values[truth(DUALV.mechanism)[0].names.index("ZZ13")] *= change
+    logs = [recorded(DUALV.mechanism, load, seed=k, values=values) for k, load in enumerate(((), ("5",)))]
     table = {"payload": {"5": {}}, "files": {"load1.csv": {"payload": ["5"]}}, "drives": "Fv Fc", "v0": 0.05}
     return identify_parallel(DUALV, logs, options=parse_options(table | options))
 
@@ -32,7 +32,7 @@ def codes(found: ParallelDynamics) -> set[str]:
 @pytest.mark.parametrize("rows", ["platform", "power"])
 def test_columns_are_sums_over_the_legs(rows):
     model = make_parallel_model(
-        DUALV.known, rows=rows_named(DUALV.known, rows), payloads=["5"], passive="Fv", identical_legs=True
+        DUALV.mechanism, rows=rows_named(DUALV.mechanism, rows), payloads=["5"], passive="Fv", identical_legs=True
     )
     rng = np.random.default_rng(0)
     values, states = rng.normal(size=model.p), model.sample(10, rng)
@@ -55,7 +55,7 @@ def test_identical_legs_have_smaller_sigma_and_are_tested(tmp_path):
     alike, apart = identified(identical_legs=True, prior="none"), identified(prior="none")
     own, other = (dict(zip(x.estimate.names, x.estimate.sigma)) for x in (alike, apart))
     assert own["ZZ11"] < 0.7 * other["ZZ11"] and len(own) < len(other)
-    model, values = truth(DUALV.known)
+    model, values = truth(DUALV.mechanism)
     standard = dict(zip(model.names, values))
     wanted = alike.found.base.transform @ [standard[name] for name in alike.found.base.standard]
     assert (np.abs(alike.estimate.values - wanted) < 4.0 * alike.estimate.sigma).all()
@@ -83,4 +83,4 @@ def test_identical_legs_are_exported_as_legs(tmp_path):
 
 def test_legs_of_different_build_are_refused():
     with pytest.raises(UsageError, match="right is built unlike left"):
-        make_parallel_model(find("fivebar").known, identical_legs=True)
+        make_parallel_model(find("fivebar").mechanism, identical_legs=True)

@@ -16,7 +16,7 @@ ROBOTS = ("dualv", "fivebar", "stewart")
 
 
 def robot(name: str) -> ClosedRobot:
-    return find(name).known
+    return find(name).mechanism
 
 
 def bodies(count: int, rng: np.random.Generator) -> np.ndarray:
@@ -119,7 +119,7 @@ def test_redundant_actuators_have_no_motor_rows():
 
 def test_the_rows_of_a_motion_under_several_loads_are_those_of_each_load():
     """Functions of the platform's coordinates for designs, against the regressor at the encoders' motion."""
-    known = find("fivebar").known
+    known = find("fivebar").mechanism
     model = make_parallel_model(known, ["Ia Fv Fc off"], payloads=["tool"])
     values = np.concatenate([model.known_parameters(), np.full(len(model.terms), 0.1)])
     values[model.names.index("Mtool")] = 2.0

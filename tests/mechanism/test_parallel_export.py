@@ -24,21 +24,21 @@ NAMES = ("dualv", "fivebar", "stewart")
 
 def opened(name: str) -> OpenedRobot:
     """Return a robot with bodies that can exist, viscous friction and motor inertia left out."""
-    model = make_parallel_model(find(name).known, ("",))
+    model = make_parallel_model(find(name).mechanism, ("",))
     rng = np.random.default_rng(0)
     bodies = np.array([ball(m, 0.1, c) for m, c in zip(rng.uniform(1, 2, 40), rng.uniform(-0.1, 0.1, (40, 3)))])
-    n = int(model.known.robot.starts[-1])
+    n = int(model.mechanism.robot.starts[-1])
     drives = Drives(np.zeros((n, 4)), (), np.zeros((0, 4)))
     return OpenedRobot(model, bodies[: len(model.labels)].ravel(), drives)
 
 
 def moved(robot: OpenedRobot, t: np.ndarray):
     """Return a motion from rest at home and the actuators' torques that it needs."""
-    own, f = robot.known.robot, 2.0 * np.pi * (1 + np.arange(robot.known.robot.r) % 2)
+    own, f = robot.mechanism.robot, 2.0 * np.pi * (1 + np.arange(robot.mechanism.robot.r) % 2)
     wave = f * t[:, None]
     size = 0.15 * own.upper
-    motion = along(robot.known, size * (1 - np.cos(wave)), size * f * np.sin(wave), size * f**2 * np.cos(wave))
-    return motion, distributed(robot.known, motion.jacobians, robot.model.platform_force(robot.values, motion, ()))
+    motion = along(robot.mechanism, size * (1 - np.cos(wave)), size * f * np.sin(wave), size * f**2 * np.cos(wave))
+    return motion, distributed(robot.mechanism, motion.jacobians, robot.model.platform_force(robot.values, motion, ()))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -47,14 +47,14 @@ def test_pinocchio_closes_the_urdf_by_the_yaml_and_accelerates_alike(name):
     robot = opened(name)
     motion, tau = moved(robot, np.array([0.1, 0.3]))
     model = pin.buildModelFromXML(robot.urdf())
-    model.gravity = pin.Motion(np.array(robot.known.robot.gravity), np.zeros(3))
+    model.gravity = pin.Motion(np.array(robot.mechanism.robot.gravity), np.zeros(3))
     table = dict(line.split(": ", 1) for line in robot.closures().splitlines() if ": [" in line)
     contacts = pin.StdVec_RigidConstraintModel()
     for (end, held), kind in zip(json.loads(table["closed_loop"]), json.loads(table["type"])):
         a, b = (model.frames[model.getFrameId(one)] for one in (end, held))
         kind = pin.ContactType.CONTACT_6D if kind == "6d" else pin.ContactType.CONTACT_3D
         contacts.append(pin.RigidConstraintModel(kind, model, a.parentJoint, a.placement, b.parentJoint, b.placement))
-    data, home = model.createData(), np.linalg.inv(robot.known.robot.home)
+    data, home = model.createData(), np.linalg.inv(robot.mechanism.robot.home)
     joints = [model.joints[model.getJointId(one.name)] for one in robot.joints]
     motors = [model.joints[model.getJointId(one)].idx_v for one in json.loads(table["name_mot"])]
     for m in range(2):

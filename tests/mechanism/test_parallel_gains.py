@@ -15,7 +15,7 @@ def found(name: str, noise: float, seed: int, changes: dict | None = None, sampl
     robot = find(name)
     gains = np.linspace(1.5, 2.5, robot.chain.n)
     own = {"samples": samples, "preload": 10.0 * robot.chain.redundant, "noise": noise, "gains": gains}
-    runs = [recorded(robot.known, load, seed=10 * seed + k, **own) for k, load in enumerate(((), ("5",)) * 2)]
+    runs = [recorded(robot.mechanism, load, seed=10 * seed + k, **own) for k, load in enumerate(((), ("5",)) * 2)]
     empty, loaded = ([run.file for run in part] for part in (runs[::2], runs[1::2]))
     table = {
         "payload": {"5": {"mass": 5.37}}, "files": {file: {"payload": ["5"]} for file in loaded}, "v0": 0.05,

@@ -26,7 +26,7 @@ def gains(name: str, kp: float, kd: float) -> Controller:
 
 def asked(name: str, seconds: float, rate: float = 1000.0) -> Reference:
     """Return a reference of the actuators: sines of the platform's coordinates."""
-    known, t = find(name).known, np.arange(int(seconds * rate)) / rate
+    known, t = find(name).mechanism, np.arange(int(seconds * rate)) / rate
     size = 0.05 * (known.robot.upper - known.robot.lower)
     motion = along(known, *sines(t, (0.5, 1.1, 1.9, 2.7), size, np.random.default_rng(1)))
     own = known.robot.actuated
@@ -35,7 +35,7 @@ def asked(name: str, seconds: float, rate: float = 1000.0) -> Reference:
 
 def logs(name: str, kp: float, kd: float, noise: float, seconds: float) -> list[Recording]:
     """Return recordings without and with the payload, with noise of the encoders that the controller acts on."""
-    known, result = find(name).known, []
+    known, result = find(name).mechanism, []
     model, values = truth(known, "Ia Fv Fc")
     for k, carried in enumerate(((), ("5",))):
         reference, plant = asked(name, seconds), model.plant(values).carrying(carried)
@@ -55,7 +55,7 @@ def options(method: str, kp: float, kd: float, cutoff: float, **more):
 
 def away(found, name: str) -> np.ndarray:
     """Return the errors of an estimate (b,) in its standard deviations."""
-    model, values = truth(find(name).known, "Ia Fv Fc")
+    model, values = truth(find(name).mechanism, "Ia Fv Fc")
     known, base = dict(zip(model.names, values)), found.found.base
     return (found.estimate.values - base.transform @ [known[k] for k in base.standard]) / found.estimate.sigma
 
@@ -95,11 +95,11 @@ def test_gains_of_another_controller_are_noticed():
 @pytest.mark.parametrize("method", ["iv", "didim"])
 def test_the_geometrys_share_is_that_of_whole_identifications(method):
     """Derivative of the estimate by the loops' constants, against identifications on two geometries: to 2 % in σ."""
-    robot, recordings = fitted(find("fivebar").known), logs("fivebar", 4000.0, 40.0, 1e-4, 3.0)
+    robot, recordings = fitted(find("fivebar").mechanism), logs("fivebar", 4000.0, 40.0, 1e-4, 3.0)
     chosen = options(method, 4000.0, 40.0, 40.0)
     chosen = replace(chosen, settings=replace(chosen.settings, loop=replace(chosen.settings.loop, timing="stated")))
-    found, parameters = identify_parallel(robot, recordings, options=chosen), robot.covariance.of(robot.known)
-    directions = visible_directions(robot.known, parameters)
+    found, parameters = identify_parallel(robot, recordings, options=chosen), robot.covariance.of(robot.mechanism)
+    directions = visible_directions(robot.mechanism, parameters)
     step = directions @ np.random.default_rng(1).normal(size=directions.shape[1])
     step *= 1e-4 / np.linalg.norm(step)
     moved = (ParallelMechanism(closed(changed(robot.chain, parameters, x)), robot.source) for x in (step, -step))
@@ -112,7 +112,7 @@ def test_the_geometrys_share_is_that_of_whole_identifications(method):
 @pytest.mark.slow
 def test_the_simulated_robot_meets_its_equations_with_stiff_friction_too():
     """Held torques meet those of the model as 1 / rate; friction that no single step could follow does not chatter."""
-    known, wrong = find("fivebar").known, []
+    known, wrong = find("fivebar").mechanism, []
     model, values = truth(known, "Ia Fv Fc")
     for rate in (1000.0, 4000.0):
         run = model.plant(values).run(gains("fivebar", 4000.0, 40.0), asked("fivebar", 1.0, rate))
@@ -131,7 +131,7 @@ def test_the_simulated_robot_meets_its_equations_with_stiff_friction_too():
 
 @pytest.mark.slow
 def test_what_no_simulation_can_follow_is_said():
-    model, values = truth(find("dualv").known, "Ia Fv Fc")
+    model, values = truth(find("dualv").mechanism, "Ia Fv Fc")
     with pytest.raises(CannotSimulate, match="not positive definite"):
         model.plant(-values).run(gains("dualv", 1000.0, 8.0), asked("dualv", 0.2))
     with pytest.raises(CannotSimulate, match="without v0 above 0"):

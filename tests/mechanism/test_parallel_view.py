@@ -28,7 +28,7 @@ def recorded(path: Path) -> dict[str, list]:
 def test_the_lines_are_closed_loops(name):
     robot = find(name)
     x = np.random.default_rng(0).uniform(robot.chain.lower, robot.chain.upper, (4, robot.chain.r))
-    q = robot.known.place(x).q[:, robot.chain.actuated]
+    q = robot.mechanism.place(x).q[:, robot.chain.actuated]
     *legs, outline = picture(robot).strips(q)
     assert len(legs) == len(robot.chain.legs) and outline.shape == (4, len(legs) + 1, 3)
     for k, leg in enumerate(legs):
@@ -40,7 +40,7 @@ def test_the_lines_are_closed_loops(name):
 def fitted(tmp_path_factory) -> Path:
     """The folder of a fit of 20 poses of a five-bar linkage of another geometry, 5 of them unseen."""
     here, robot, rng = tmp_path_factory.mktemp("view"), find("fivebar"), np.random.default_rng(0)
-    parameters = loop_parameters(robot.known)
+    parameters = loop_parameters(robot.mechanism)
     true = closed(changed(robot.chain, parameters, 1e-3 * rng.normal(size=len(parameters))))
     x = 0.8 * rng.uniform(robot.chain.lower, robot.chain.upper, (20, 2))
     q = true.place(x).q[:, robot.chain.actuated] + 1e-5 * rng.normal(size=(20, 2))
@@ -71,7 +71,7 @@ def test_a_fit_shows_its_poses_and_errors(fitted, tmp_path):
 def test_motions_and_torques_are_shown_under_the_names_of_actuators_and_rows(fitted, tmp_path):
     folder = tmp_path / "id"
     find("dualv").write(folder)
-    q = np.tile(find("dualv").known.home.q[:, find("dualv").chain.actuated], (3, 1))
+    q = np.tile(find("dualv").mechanism.home.q[:, find("dualv").chain.actuated], (3, 1))
     t = [[0.0], [0.02], [0.04]]
     (folder / "dynamics.json").write_text('{"kind": "platform", "unit": "N m"}')
     head = [f"{what}{k + 1}" for what in ("measured_", "predicted_") for k in range(3)] + ["q1", "q2", "q3", "q4"]

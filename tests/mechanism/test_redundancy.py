@@ -22,7 +22,7 @@ RATE = 1000.0
 @pytest.fixture(scope="module")
 def dualv():
     """Return the robot, its model with a payload, the true values, and runs without and with the payload."""
-    known = find("dualv").known
+    known = find("dualv").mechanism
     model = make_parallel_model(known, ["Fv Fc"], v0=0.05, payloads=["5"])
     values = np.concatenate([model.known_parameters(), [{"Fv": 0.05, "Fc": 0.3}[one.name[:2]] for one in model.terms]])
     for name, value in PAYLOAD.items():
@@ -44,7 +44,7 @@ def run(model, values, carried, preload=10.0):
 
 def test_torques_are_shared_out_and_overconstraint_does_no_work():
     """τ = (Jᵀ)⁺ w + N c: the forces come back, c comes back, whatever c; without preload no torques are smaller."""
-    known = find("dualv").known
+    known = find("dualv").mechanism
     motion = along(known, *reference(0.3))
     rng = np.random.default_rng(2)
     forces, c = rng.normal(size=(len(motion.v), 3)), rng.normal(size=(len(motion.v), 1))
@@ -114,7 +114,7 @@ def test_what_cannot_be_simulated_is_said(dualv):
 @pytest.mark.parametrize("name", ["fivebar", "stewart"])
 def test_platforms_that_move_beside_their_coordinates_are_simulated(name):
     """The five-bar's platform turns as its loop says: held torques meet those of the model as 1 / rate."""
-    known = find(name).known
+    known = find(name).mechanism
     model = make_parallel_model(known, ["Ia Fv Fc"], v0=0.05, passive="Fv")
     drives = {"Ia": 0.02, "Fv": 0.2, "Fc": 0.3}
     values = np.concatenate([model.known_parameters(), [drives[one.name[:2]] for one in model.terms]])
@@ -133,7 +133,7 @@ def test_platforms_that_move_beside_their_coordinates_are_simulated(name):
 
 def test_slopes_for_the_design_are_derivatives():
     """Of Σ weights · W by x, v, a, against differences of the whole sum."""
-    known = find("dualv").known
+    known = find("dualv").mechanism
     model = make_parallel_model(known, ["Fv Fc"], v0=0.5)
     plan, rng = PlatformRegressor(model, np.arange(model.p)), np.random.default_rng(4)
     state = [0.5 * rng.uniform(known.robot.lower, known.robot.upper, (4, 3)), *rng.normal(size=(2, 4, 3))]

@@ -28,7 +28,7 @@ def folder(tmp_path_factory):
     The torques are those that the motion needs, by the model: a simulation's kernel would be compiled for 14 s.
     """
     path = tmp_path_factory.mktemp("dualv")
-    known = find("dualv").known
+    known = find("dualv").mechanism
     model = replace(make_parallel_model(known, ["Fv Fc"], v0=0.05, payloads=["5"]), preload=(10.0,))
     values = np.concatenate([model.known_parameters(), np.tile([0.05, 0.3], 4)])
     values[model.names.index("M5")] = 5.37
@@ -145,7 +145,7 @@ def test_a_motion_after_an_identification_adds_its_information_under_both_loads(
     found = api.design_excitation("dualv", settings, after=tmp_path / "id")
     names, covariance = read_covariance(tmp_path / "id")
     density = json.loads((tmp_path / "id" / "metrics.json").read_text())["error_density"]
-    model = make_parallel_model(find("dualv").known, ["Fv Fc off"], v0=0.01, payloads=["5"])
+    model = make_parallel_model(find("dualv").mechanism, ["Fv Fc off"], v0=0.01, payloads=["5"])
     kept = [model.names.index(name if name in model.names else name[:-1]) for name in names]
     _, q, v, a = found.sampled(500.0)
     total = np.linalg.inv(covariance)
@@ -186,7 +186,7 @@ def test_the_api_identifies_and_plans_as_the_commands_do(folder, tmp_path):
     assert judged.verdict.level == "pass" and judged.estimate is not None
     metrics = json.loads((judged.save(tmp_path / "api", plots=False) / "metrics.json").read_text())
     assert metrics == judged.to_dict() and list(metrics["validation"]) == ["other.csv"]
-    still = model.robot.known.home.q[:, robot.known.robot.actuated]
+    still = model.robot.mechanism.home.q[:, robot.mechanism.robot.actuated]
     assert np.abs(judged.torques(still, 0 * still, 0 * still)).max() < 1.0
     assert api.plan_motion(fitted.robot, folder / "way.csv", model=judged).duration > 0.1
     assert "robot.xml (loops closed)" in api.export(judged, tmp_path / "exported")[0]

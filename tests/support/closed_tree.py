@@ -25,7 +25,7 @@ class ClosedTree:
 
     def __init__(self, known: ClosedRobot, parameters: np.ndarray):
         robot, rows = known.robot, list(np.reshape(parameters, (-1, 10)))
-        self.known, self.model, tips, taken = known, pin.Model(), [], np.zeros(10)
+        self.mechanism, self.model, tips, taken = known, pin.Model(), [], np.zeros(10)
         self.model.gravity = pin.Motion(np.array(robot.gravity), np.zeros(3))
         for leg in robot.legs:
             bodies, parent = bodies_of(leg.chain), 0

@@ -59,4 +59,4 @@ def fitted(known: ClosedRobot, seed: int = 0) -> ParallelMechanism:
     x = rng.uniform(robot.lower, robot.upper, (60, robot.r))
     q = known.place(x).q[:, robot.actuated]
     found = fit_loops(known, q + 2e-4 * rng.normal(size=q.shape), x)
-    return ParallelMechanism(found.known, find(robot.name).source, LoopCovariance.fitted(found))
+    return ParallelMechanism(found.mechanism, find(robot.name).source, LoopCovariance.fitted(found))

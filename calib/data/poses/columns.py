@@ -7,10 +7,11 @@ from typing import NoReturn
 
 import numpy as np
 
+from calib.controllers.table import as_described
 from calib.data.csv_table import Table
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.measurements import KINDS
-from calib.data.schema import AS_DESCRIBED, BOUNDS, Column
+from calib.data.schema import BOUNDS, Column
 from calib.errors import MeasurementError, one_of, suggestion
 
 SUFFIXES = ("", "_meas", "_measured")
@@ -31,13 +32,15 @@ SIGMA_ROTATION = Column(
 DISTANCE = Column(("distance",), "length", "distance", BOUNDS.max_length, "mm", positive="a distance must be above 0")
 SIGMA_DISTANCE = Column(("sigma_distance",), "length", "sigma", positive=SIGMA.positive)
 BASE = Column(("base_x", "base_y", "base_z", "base_qx", "base_qy", "base_qz", "base_qw"))
-LATE, TIME = Column(("late_x", "late_y", "late_z"), "speed", "late"), Column(("time",), "time", "time")
+LATE = Column(("late_x", "late_y", "late_z"), "speed", "late")
+TIME = Column(("time",), "time", "time")
 LABELS = ("distance", "pair", "bar", "socket", "plane", "tool")
 UNIT_GROUPS = ("joints", "position", "orientation", "distance", "sigma", "sigma_rotation")
 _FAMILIES = (POSITION, QUATERNION, MATRIX, TURNS, SIGMA, SIGMA_ROTATION, SIGMA_DISTANCE, BASE, LATE)
 OURS = (*(name for column in _FAMILIES for name in column.names), *LABELS)
 LABEL_OF = {"distance": "pair", "bar": "bar", "sockets": "socket", "plane": "plane"}
 _TARGET = re.compile(r"(sigma_)?[xyz]\d+")
+_NUMBERED_JOINT = re.compile(r"q\d+")
 
 
 @dataclass(frozen=True)
@@ -60,45 +63,52 @@ class Sheet:
 
     def find(self, name: str) -> str:
         """Return the file's name of the toolkit's column `name`; "" if the file has no such column."""
-        theirs = self.options.columns.get(name, name)
-        return theirs if theirs in self.table else ""
+        heading = self.options.columns.get(name, name)
+        return heading if heading in self.table else ""
 
     def unit(self, column: str, family: str) -> str:
         """Return the unit of a column as stated in the header or the options; "" if neither states it."""
-        return self.table.units[self.table.index(column)] or self._stated(column, family)
+        return self.table.units[self.table.index(column)] or self._unit_of_options(column, family)
 
-    def _stated(self, column: str, family: str) -> str:
+    def _unit_of_options(self, column: str, family: str) -> str:
         units = self.options.units
-        ours = next((name for name, theirs in self.options.columns.items() if theirs == column), column)
-        return units.get(ours, units.get(column, units.get(family, "")))
+        names = [name for name, heading in self.options.columns.items() if heading == column]
+        for name in (*names[:1], column, family):
+            if name in units:
+                return units[name]
+        return ""
 
     def numbers(self, names: Sequence[str], column: Column, gaps: bool = False) -> np.ndarray:
         """Return columns (m, k) in SI, checked against the bounds of `column`; a gap is NaN."""
-        family, dimension = column.family, column.dimension
-        values = [self.table.numbers(name, dimension, self._stated(name, family), gaps) for name in names]
+        values = []
+        for name in names:
+            unit = self._unit_of_options(name, column.family)
+            values.append(self.table.numbers(name, column.dimension, unit, gaps))
         return column.check(np.stack(values, axis=1), self.table, names)
 
     def joints(self, joints: Sequence[str]) -> tuple[np.ndarray, tuple[str, ...]]:
         """Return joint values (m, n) [rad or m] and the file's names of their columns."""
         names = self.find_joints(joints)
         q = self.numbers(names, Column(tuple(joints), "joint", "joints"))
-        name = self.options.controller
-        return AS_DESCRIBED.one()(name, q) if name else q, names
+        if self.options.controller:
+            q = as_described(self.options.controller, q)
+        return q, names
 
     def check_names(self, joints: Sequence[str]) -> None:
         """Refuse options that name a column unknown to both the toolkit and the file."""
-        ours = (*OURS, *joints, *(f"q{i + 1}" for i in range(len(joints))))
-        for name, theirs in self.options.columns.items():
-            if name not in ours and not _TARGET.fullmatch(name):
-                message = f"the options map a column '{name}', which this toolkit does not know{suggestion(name, ours)}"
-                self.fail(f"{message}; known are {', '.join(ours)}", theirs)
-            self.table.index(theirs)
+        names = (*OURS, *joints, *(f"q{i + 1}" for i in range(len(joints))))
+        for name, heading in self.options.columns.items():
+            if name not in names and not _TARGET.fullmatch(name):
+                near = suggestion(name, names)
+                message = f"the options map a column '{name}', which this toolkit does not know{near}"
+                self.fail(f"{message}; known are {', '.join(names)}", heading)
+            self.table.index(heading)
         for name in (*self.options.groups, *self.options.where):
             self.table.index(name)
         for name, unit in self.options.units.items():
-            if name not in (*ours, *UNIT_GROUPS, *self.table.header) and not _TARGET.fullmatch(name):
+            if name not in (*names, *UNIT_GROUPS, *self.table.header) and not _TARGET.fullmatch(name):
                 message = f"the options state unit {unit} for '{name}', which is not a column"
-                self.fail(message + suggestion(name, (*ours, *UNIT_GROUPS)), name)
+                self.fail(message + suggestion(name, (*names, *UNIT_GROUPS)), name)
 
     def find_joints(self, joints: Sequence[str]) -> tuple[str, ...]:
         """Return the file's names of the joint columns in the robot's order.
@@ -109,19 +119,30 @@ class Sheet:
         numbered = tuple(f"q{i + 1}" for i in range(n))
         mapped = [mapping.get(joint) or mapping.get(q) for joint, q in zip(joints, numbered)]
         for form in (tuple(joints), tuple(f"q_{joint}" for joint in joints), numbered):
-            found = tuple(theirs or (name if name in table else "") for name, theirs in zip(form, mapped))
-            if all(found):
-                extra = [name for name in table.header if re.fullmatch(r"q\d+", name) and name not in found]
-                if extra and all(re.fullmatch(r"q\d+", name) for name in found):
-                    self.fail(f"the robot has only {n} joints: is this the right robot (chain)?", extra[0])
-                return found
+            columns: list[str] = []
+            missing: list[str] = []
+            for name, heading in zip(form, mapped):
+                if heading or name in table:
+                    columns.append(heading or name)
+                else:
+                    missing.append(name)
+            if not missing:
+                self._refuse_more_joints(columns, n)
+                return tuple(columns)
             if any(name in table for name in form):
-                missing = next(name for name, there in zip(form, found) if not there)
-                have = ", ".join(name for name in found if name)
-                near = suggestion(missing, table.header)
-                self.fail(f"missing{near}: the robot has {n} joints, the header has only {have}", missing)
+                near = suggestion(missing[0], table.header)
+                message = f"missing{near}: the robot has {n} joints, the header has only {', '.join(columns)}"
+                self.fail(message, missing[0])
         message = f"no joint columns: expected q1 to q{n}, or {', '.join(joints)}; found {', '.join(table.header)}"
         self.fail(f"{message}. Map them in the options' [columns]")
+
+    def _refuse_more_joints(self, columns: Sequence[str], n: int) -> None:
+        """Refuse a table that has more numbered joint columns than the robot has joints."""
+        if not all(_NUMBERED_JOINT.fullmatch(name) for name in columns):
+            return
+        for name in self.table.header:
+            if _NUMBERED_JOINT.fullmatch(name) and name not in columns:
+                self.fail(f"the robot has only {n} joints: is this the right robot (chain)?", name)
 
     def family(self, names: Sequence[str], mark: str = "") -> tuple[str, ...]:
         """Return the file's names of a family of columns (plain, or with a suffix); () if all are absent.
@@ -131,37 +152,47 @@ class Sheet:
         Raises:
             MeasurementError: where one is missing, or the file has them under several of these names.
         """
-        ours = [name + mark for name in names]
-        if any(name in self.options.columns for name in ours):
-            return tuple(self._mapped(name, ours) for name in ours)
-        forms = [tuple(name + suffix for name in ours) for suffix in self.suffixes]
-        if complete := self.one_of([form for form in forms if all(name in self.table for name in form)], ours):
-            return complete
-        for form in forms:
-            missing = [name for name in form if name not in self.table]
-            if len(missing) < len(form):
-                near = suggestion(missing[0], self.table.header)
-                self.fail(f"missing{near}: {', '.join(form)} go together", missing[0])
+        marked = [name + mark for name in names]
+        if any(name in self.options.columns for name in marked):
+            return tuple(self._mapped(name, marked) for name in marked)
+        complete: list[tuple[str, ...]] = []
+        partial: list[tuple[str, ...]] = []
+        for suffix in self.suffixes:
+            form = tuple(name + suffix for name in marked)
+            count = sum(name in self.table for name in form)
+            if count == len(form):
+                complete.append(form)
+            elif count:
+                partial.append(form)
+        if complete:
+            return self.only_family(complete, marked)
+        if partial:
+            missing = [name for name in partial[0] if name not in self.table]
+            near = suggestion(missing[0], self.table.header)
+            self.fail(f"missing{near}: {', '.join(partial[0])} go together", missing[0])
         return ()
 
-    def one_of(self, families: Sequence[tuple[str, ...]], ours: Sequence[str]) -> tuple[str, ...]:
+    def only_family(self, families: Sequence[tuple[str, ...]], names: Sequence[str]) -> tuple[str, ...]:
         """Return the only family of columns found in the file, () if none was found; refuse two."""
         if len(families) > 1:
             first, second = (", ".join(family) for family in families[:2])
-            one = ", ".join(f'{name} = "{theirs}"' for name, theirs in zip(ours, families[-1]))
+            mapping = ", ".join(f'{name} = "{heading}"' for name, heading in zip(names, families[-1]))
             message = f"the header has {first} and {second}; map the columns to be read in the options"
-            self.fail(f"{message}: [columns] {one}", families[0][0])
+            self.fail(f"{message}: [columns] {mapping}", families[0][0])
         return families[0] if families else ()
 
     def _mapped(self, name: str, together: Sequence[str]) -> str:
         """Return the file's name of column `name` of the family `together`, mapped only in part by the options."""
         if name in self.options.columns:
             return self.options.columns[name]
-        found = [name + suffix for suffix in self.suffixes if name + suffix in self.table]
-        if len(found) == 1:
-            return found[0]
-        what = " and ".join(found) + " could be it" if found else f"missing{suggestion(name, self.table.header)}"
-        self.fail(f"{what}: {', '.join(together)} belong together; map this one in [columns], too", name)
+        candidates = [name + suffix for suffix in self.suffixes if name + suffix in self.table]
+        if len(candidates) == 1:
+            return candidates[0]
+        if candidates:
+            fault = " and ".join(candidates) + " could be it"
+        else:
+            fault = f"missing{suggestion(name, self.table.header)}"
+        self.fail(f"{fault}: {', '.join(together)} belong together; map this one in [columns], too", name)
 
 
 @dataclass(frozen=True)
@@ -211,21 +242,24 @@ def find_layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
             triples, and the options name none.
     """
     sheet.check_names(joints)
-    found = _layout(sheet, joints)
-    numbers = (*found.joints, *(name for names in found.positions for name in names), *found.orientation)
-    if twice := sorted({name for name in numbers if numbers.count(name) > 1}):
-        message = "is read as two different columns: correct [columns] in the options"
-        sheet.fail(message, twice[0])
-    if found.kind == "pose":
-        _check_one_source(sheet, found.positions[0], found.orientation)
-    for name, theirs in sheet.options.columns.items():
-        if theirs not in found.used:
+    layout = _layout(sheet, joints)
+    numbers = list(layout.joints)
+    for names in layout.positions:
+        numbers += names
+    numbers += layout.orientation
+    doubled = sorted({name for name in numbers if numbers.count(name) > 1})
+    if doubled:
+        sheet.fail("is read as two different columns: correct [columns] in the options", doubled[0])
+    if layout.kind == "pose":
+        _check_one_source(sheet, layout.positions[0], layout.orientation)
+    for name, heading in sheet.options.columns.items():
+        if heading not in layout.used:
             sheet.fail(
-                f"is mapped to '{name}' by the options, but not read in a file of kind '{found.kind}': remove it "
+                f"is mapped to '{name}' by the options, but not read in a file of kind '{layout.kind}': remove it "
                 "from [columns], or state another kind",
-                theirs,
+                heading,
             )
-    return found
+    return layout
 
 
 def _layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
@@ -236,11 +270,14 @@ def _layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
     positions, sigmas, notes = _find_targets(sheet)
     if not positions:
         sheet.table.index("x")
-    tool, base = sheet.find("tool"), sheet.family(BASE.names)
-    late = (*moving, *TIME.names) if (moving := sheet.family(LATE.names)) else ()
-    found = Layout(kind, columns, positions, sigmas, tool=tool, base=base, late=late, notes=notes)
+    tool = sheet.find("tool")
+    base = sheet.family(BASE.names)
+    late = sheet.family(LATE.names)
+    if late:
+        late = (*late, *TIME.names)
+    layout = Layout(kind, columns, positions, sigmas, tool=tool, base=base, late=late, notes=notes)
     if kind == "position":
-        return found
+        return layout
     orientation = _find_orientation(sheet, columns)
     if not orientation:
         sheet.fail("kind 'pose' needs qx qy qz qw, r11 to r33, or rx ry rz; the header has none of them")
@@ -250,7 +287,7 @@ def _layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
         meaning = f" as {sheet.options.euler}" if len(orientation) == 3 else ""
         notes = (*notes, f"the orientation is read from {', '.join(orientation)}{meaning}")
     rotation = sheet.family(SIGMA_ROTATION.names)
-    return replace(found, orientation=orientation, sigma_rotation=rotation, notes=notes)
+    return replace(layout, orientation=orientation, sigma_rotation=rotation, notes=notes)
 
 
 def _check_one_source(sheet: Sheet, position: Sequence[str], orientation: Sequence[str]) -> None:
@@ -258,32 +295,38 @@ def _check_one_source(sheet: Sheet, position: Sequence[str], orientation: Sequen
 
     Measured is what is named so, or what the options map though the file has the plain names, too.
     """
-    plain = {4: QUATERNION.names, 9: MATRIX.names}.get(len(orientation))
-    names = plain or tuple(re.sub(f"({'|'.join(SUFFIXES[1:])})$", "", name) for name in orientation)
-    families = ((POSITION.names, position), (names, orientation))
-    for (names, plain), (others, measured) in (families, families[::-1]):
-        if plain != names or any(name in sheet.options.columns for name in names) or measured == others:
+    rotation_names = {4: QUATERNION.names, 9: MATRIX.names}.get(len(orientation))
+    if rotation_names is None:
+        suffix = re.compile(f"({'|'.join(SUFFIXES[1:])})$")
+        rotation_names = tuple(suffix.sub("", name) for name in orientation)
+    families = ((POSITION.names, position), (rotation_names, orientation))
+    for (names, columns), (partner_names, partner) in (families, families[::-1]):
+        is_mapped = any(name in sheet.options.columns for name in names)
+        if columns != names or is_mapped or partner == partner_names:
             continue
-        if measured[0].endswith(SUFFIXES[1:]) or all(name in sheet.table for name in others):
-            mapped = ", ".join(f'{name} = "{name}"' for name in names)
-            alone = "" if names == POSITION.names else ', or read the positions alone (kind = "position")'
+        if partner[0].endswith(SUFFIXES[1:]) or all(name in sheet.table for name in partner_names):
+            mapping = ", ".join(f'{name} = "{name}"' for name in names)
+            advice = "" if names == POSITION.names else ', or read the positions alone (kind = "position")'
             sheet.fail(
-                f"the header has {', '.join(names)} next to {', '.join(measured)}: were the former measured or "
-                f"commanded? If measured, map them in the options ([columns] {mapped}){alone}",
+                f"the header has {', '.join(names)} next to {', '.join(partner)}: were the former measured or "
+                f"commanded? If measured, map them in the options ([columns] {mapping}){advice}",
                 names[0],
             )
 
 
 def _grouped_layout(sheet: Sheet, kind: str, joints: tuple[str, ...]) -> Layout:
     label = LABEL_OF[kind]
-    measured = (label, "distance") if kind in ("distance", "bar") else (label,)
-    for name in measured:
-        sheet.table.index(sheet.options.columns.get(name, name))
-    own = sheet.find(label)
-    fixture = tuple(name for name in ("tool_position",) if kind == "sockets" and name in sheet.table)
-    group = (*(name for name in sheet.options.groups or fixture if name != own), own)
-    distance = [sheet.find(name) for name in ("distance", "sigma_distance") if len(measured) > 1]
-    return Layout(kind, joints, distance=tuple(filter(None, distance)), tool=sheet.find("tool"), group=group)
+    sheet.table.index(sheet.options.columns.get(label, label))
+    distance: tuple[str, ...] = ()
+    if kind in ("distance", "bar"):
+        sheet.table.index(sheet.options.columns.get("distance", "distance"))
+        distance = tuple(filter(None, (sheet.find("distance"), sheet.find("sigma_distance"))))
+    groups = sheet.options.groups
+    if not groups and kind == "sockets" and "tool_position" in sheet.table:
+        groups = ("tool_position",)
+    label_column = sheet.find(label)
+    group = (*(name for name in groups if name != label_column), label_column)
+    return Layout(kind, joints, distance=distance, tool=sheet.find("tool"), group=group)
 
 
 def _find_orientation(sheet: Sheet, joints: Sequence[str]) -> tuple[str, ...]:
@@ -292,15 +335,15 @@ def _find_orientation(sheet: Sheet, joints: Sequence[str]) -> tuple[str, ...]:
     Raises:
         MeasurementError: for three angles whose meaning the options do not state.
     """
-    found = sheet.family(QUATERNION.names) or sheet.family(MATRIX.names) or _angles(sheet, joints)
-    if len(found) == 3 and not sheet.options.euler:
+    columns = sheet.family(QUATERNION.names) or sheet.family(MATRIX.names) or _angles(sheet, joints)
+    if len(columns) == 3 and not sheet.options.euler:
         sheet.fail(
-            f"{', '.join(found)} look like an orientation. State their meaning in the options: euler = 'vector' "
+            f"{', '.join(columns)} look like an orientation. State their meaning in the options: euler = 'vector' "
             "(rotation vector, as in Universal Robots), 'xyz fixed' (roll, pitch, yaw), 'zyx moving' (KUKA's A, "
             "B, C) ...; or ignore them by kind = 'position'",
-            found[0],
+            columns[0],
         )
-    return found
+    return columns
 
 
 def _angles(sheet: Sheet, joints: Sequence[str]) -> tuple[str, ...]:
@@ -308,14 +351,21 @@ def _angles(sheet: Sheet, joints: Sequence[str]) -> tuple[str, ...]:
 
     Columns named by one small letter (a, b, c) are anything, unless the options state what angles mean.
     """
-    first, options = ANGLES[0], sheet.options
-    if any(name in options.columns for name in first):
-        return sheet.family(first)
-    any_name = (name for name in sheet.table.header if name not in joints)
-    known = {name.lower(): name for name in any_name if options.euler or len(name) > 1 or name.isupper()}
-    forms = [[name + suffix for name in names] for names in ANGLES for suffix in SUFFIXES]
-    complete = [tuple(known[name] for name in form) for form in forms if all(name in known for name in form)]
-    return sheet.one_of(complete, first)
+    standard_names = ANGLES[0]
+    if any(name in sheet.options.columns for name in standard_names):
+        return sheet.family(standard_names)
+    headings: dict[str, str] = {}
+    for name in sheet.table.header:
+        may_be_angle = sheet.options.euler or len(name) > 1 or name.isupper()
+        if name not in joints and may_be_angle:
+            headings[name.lower()] = name
+    complete: list[tuple[str, ...]] = []
+    for names in ANGLES:
+        for suffix in SUFFIXES:
+            form = [name + suffix for name in names]
+            if all(name in headings for name in form):
+                complete.append(tuple(headings[name] for name in form))
+    return sheet.only_family(complete, standard_names)
 
 
 def _find_kind(sheet: Sheet, joints: Sequence[str]) -> str:
@@ -327,8 +377,8 @@ def _find_kind(sheet: Sheet, joints: Sequence[str]) -> str:
     if _find_targets(sheet)[0]:
         kinds.append("pose" if _find_orientation(sheet, joints) else "position")
     if len(kinds) > 1:
-        several = ", ".join(kinds)
-        sheet.fail(f"the header allows the kinds {several}; state one in the options (kind = '{kinds[0]}')")
+        choices = ", ".join(kinds)
+        sheet.fail(f"the header allows the kinds {choices}; state one in the options (kind = '{kinds[0]}')")
     if not kinds:
         needed = "x y z (position), with qx qy qz qw (pose), distance with pair or bar, socket, or plane"
         message = f"no measurements found: expected columns {needed}; the header has {', '.join(sheet.table.header)}"
@@ -342,9 +392,9 @@ def _find_targets(sheet: Sheet) -> tuple[tuple, tuple, tuple[str, ...]]:
     marks = sorted({int(name[1:]) for name in all_names if re.fullmatch(r"[xyz]\d+", name)})
     plain = sheet.family(POSITION.names)
     chosen = [""] if plain else [str(mark) for mark in marks]
+    common_sigma = sheet.family(SIGMA.names)
     positions = tuple(sheet.family(POSITION.names, mark) for mark in chosen)
-    common = sheet.family(SIGMA.names)
-    sigmas = tuple(sheet.family(SIGMA.names, mark) or common for mark in chosen)
+    sigmas = tuple(sheet.family(SIGMA.names, mark) or common_sigma for mark in chosen)
     notes = ()
     if plain and plain[0] != "x":
         notes = (f"the position is read from {', '.join(plain)}",)

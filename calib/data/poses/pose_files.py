@@ -28,7 +28,7 @@ between series. Both measurements are noisy, and the base's orientation noise ac
 Rows that belong together: sockets, planes, pairs and bars.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -64,20 +64,21 @@ from calib.data.poses.measurements import (
     Positions,
     Sockets,
 )
+from calib.data.poses.robodk import FORMS
 from calib.data.schema import Joints, refuse
-from calib.extensions import Point, merged
-
-POSE_FORMS: Point[Mapping[str, Any]] = Point(
-    "pose_forms", "files of poses that are no standard table: whether a header is of that form, and its reader"
-)
 
 
 def read_groups(sheet: Sheet, layout: Layout, q: np.ndarray) -> GroupedMeasurements:
     """Return grouped measurements from the rows of a table, with joint values q (m, n)."""
     table, options = sheet.table, sheet.options
     names, group = labels(table, layout.group)
-    tool_names, tool = labels(table, (layout.tool,)) if layout.tool else ((options.tool,), np.zeros(len(q), dtype=int))
+    tool_names, tool = (options.tool,), np.zeros(len(q), dtype=int)
+    if layout.tool:
+        tool_names, tool = labels(table, (layout.tool,))
+    notes = ()
     single = [name for name, size in zip(names, np.bincount(group)) if size == 1]
+    if single:
+        notes = (f"{layout.kind} {', '.join(single[:5])}: a group of one row determines nothing",)
     common: dict[str, Any] = {
         "group": group,
         "group_names": names,
@@ -85,16 +86,20 @@ def read_groups(sheet: Sheet, layout: Layout, q: np.ndarray) -> GroupedMeasureme
         "tool_names": tool_names,
         "file": table.file,
         "rows": table.rows,
-        "notes": (f"{layout.kind} {', '.join(single[:5])}: a group of one row determines nothing",) if single else (),
+        "notes": notes,
     }
-    stated = None if options.sigma.position is None else np.tile(options.sigma.position, (len(q), 1))
+    position_sigma = None
+    sigma_along = None
+    if options.sigma.position is not None:
+        position_sigma = np.tile(options.sigma.position, (len(q), 1))
+        sigma_along = position_sigma[:, 0]
     if layout.kind == Sockets.kind:
-        return Sockets(q, layout.joints, sigma=stated, links=_links(sheet, layout, group), **common)
-    along = None if stated is None else stated[:, 0]
+        return Sockets(q, layout.joints, sigma=position_sigma, links=_links(sheet, layout, group), **common)
     if layout.kind == Planes.kind:
-        return Planes(q, layout.joints, sigma=along, **common)
+        return Planes(q, layout.joints, sigma=sigma_along, **common)
     distance, sigma = _read_distance(sheet, layout)
-    sigma = along if sigma is None else sigma
+    if sigma is None:
+        sigma = sigma_along
     if layout.kind == Bars.kind:
         return Bars(q, layout.joints, distance, sigma=sigma, **common)
     _check_pairs(table, layout, group, names, distance)
@@ -107,19 +112,24 @@ def labels(table: Table, columns: Sequence[str]) -> tuple[tuple[str, ...], np.nd
     empty = (texts == "") | (texts == "nan")
     refuse(table, empty, columns, lambda row, k: "found an empty cell where a label is needed")
     joined = ["/".join(parts) for parts in texts]
-    place = {name: i for i, name in enumerate(dict.fromkeys(joined))}
-    return tuple(place), np.array([place[name] for name in joined])
+    index: dict[str, int] = {}
+    for label in joined:
+        index.setdefault(label, len(index))
+    return tuple(index), np.array([index[label] for label in joined])
 
 
 def _read_distance(sheet: Sheet, layout: Layout) -> tuple[np.ndarray, np.ndarray | None]:
     """Return distances (m,) and their sigmas (m,) [m], None where not stated."""
-    value = sheet.numbers(layout.distance[:1], DISTANCE)[:, 0]
-    stated = sheet.options.sigma
+    distance = sheet.numbers(layout.distance[:1], DISTANCE)[:, 0]
+    options = sheet.options.sigma
+    if len(layout.distance) == 1 and options.distance is None:
+        return distance, None
     if len(layout.distance) == 1:
-        return value, None if stated.distance is None else np.full(len(value), stated.distance)
+        return distance, np.full(len(distance), options.distance)
     sigma = sheet.numbers(layout.distance[1:], replace(SIGMA_DISTANCE, positive=""))
-    sigma = np.where(sigma < 0.0, sigma, np.maximum(sigma, stated.floor))
-    return value, SIGMA_DISTANCE.check(sigma, sheet.table, layout.distance[1:])[:, 0]
+    sigma = np.where(sigma < 0.0, sigma, np.maximum(sigma, options.floor))
+    sigma = SIGMA_DISTANCE.check(sigma, sheet.table, layout.distance[1:])
+    return distance, sigma[:, 0]
 
 
 def _check_pairs(table: Table, layout: Layout, group: np.ndarray, names: Sequence[str], distance: np.ndarray) -> None:
@@ -144,12 +154,14 @@ def _links(sheet: Sheet, layout: Layout, group: np.ndarray) -> tuple[tuple[int, 
     texts = [table.texts(name) for name in layout.group]
     fixtures: dict[tuple[str, ...], dict[str, int]] = {}
     for parts, number in zip(zip(*texts), group):
-        fixtures.setdefault(parts[:-1], {})[parts[-1]] = int(number)
+        fixture, socket = parts[:-1], parts[-1]
+        fixtures.setdefault(fixture, {})[socket] = int(number)
     links = []
-    for place, sockets in fixtures.items():
+    for fixture, sockets in fixtures.items():
         if len(sockets) > 2 and not options.socket_pairs:
+            name = "/".join(fixture) or "the fixture"
             sheet.fail(
-                f"{'/'.join(place) or 'the fixture'} has {len(sockets)} sockets ({', '.join(sockets)}): state which of "
+                f"{name} has {len(sockets)} sockets ({', '.join(sockets)}): state which of "
                 "them are socket_distance apart (socket_pairs = [['0', '1']] in the options)",
                 layout.group[-1],
             )
@@ -158,8 +170,8 @@ def _links(sheet: Sheet, layout: Layout, group: np.ndarray) -> tuple[tuple[int, 
                 links.append((sockets[a], sockets[b], options.socket_distance))
     if not links:
         expected = ", ".join(f"{a} and {b}" for a, b in options.socket_pairs) or "two sockets"
-        found = ", ".join(dict.fromkeys(texts[-1]))
-        message = f"no fixture position has {expected}, needed for socket_distance; found {found}"
+        sockets = ", ".join(dict.fromkeys(texts[-1]))
+        message = f"no fixture position has {expected}, needed for socket_distance; found {sockets}"
         sheet.fail(message, layout.group[-1])
     return tuple(links)
 
@@ -179,21 +191,24 @@ def relative_to_base(block: Positions, position: np.ndarray, quaternion: np.ndar
     """
     base = Rotation.from_quat(quaternion)
     lever = block.position - position
-    turn = base.inv().as_matrix()
+    R_base_instrument = base.inv().as_matrix()
     changes: dict[str, np.ndarray] = {"position": base.inv().apply(lever)}
     if block.late is not None:
-        changes["late"] = np.einsum("mij,mkj->mki", turn, block.late)
-    stated = block.sigma_rotation if isinstance(block, Poses) else None
+        changes["late"] = np.einsum("mij,mkj->mki", R_base_instrument, block.late)
+    sigma_rotation = None
     if isinstance(block, Poses):
-        changes["quaternion"] = (base.inv() * Rotation.from_quat(block.quaternion)).as_quat(canonical=True)
-    if stated is not None:
-        changes["sigma_rotation"] = _turned(turn, 2.0 * _diagonal(stated))
+        sigma_rotation = block.sigma_rotation
+        rotation = base.inv() * Rotation.from_quat(block.quaternion)
+        changes["quaternion"] = rotation.as_quat(canonical=True)
+    if sigma_rotation is not None:
+        changes["sigma_rotation"] = _rotated_sigma(R_base_instrument, 2.0 * _diagonal(sigma_rotation))
     if block.sigma is not None:
         covariance = 2.0 * _diagonal(block.sigma)
-        if stated is not None:
-            cross = np.swapaxes(np.cross(lever[:, None], np.eye(3)), 1, 2)  # [l]×, its columns l × e
-            covariance = covariance + cross @ _diagonal(stated) @ np.swapaxes(cross, 1, 2)
-        changes["sigma"] = _turned(turn, covariance)
+        if sigma_rotation is not None:
+            # [l]×, its columns l × e
+            cross = np.swapaxes(np.cross(lever[:, None], np.eye(3)), 1, 2)
+            covariance = covariance + cross @ _diagonal(sigma_rotation) @ np.swapaxes(cross, 1, 2)
+        changes["sigma"] = _rotated_sigma(R_base_instrument, covariance)
     note = "positions are relative to the base frame measured with each row; its noise is assumed equal to the target's"
     return replace(block, notes=(*block.notes, note), **changes)
 
@@ -202,9 +217,9 @@ def _diagonal(sigma: np.ndarray) -> np.ndarray:
     return np.einsum("mi,ij->mij", sigma**2, np.eye(3))
 
 
-def _turned(turn: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+def _rotated_sigma(rotation: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Return the standard deviations (m, 3) of covariances (m, 3, 3) along rotated axes."""
-    return np.sqrt(np.einsum("mij,mjk,mik->mi", turn, covariance, turn))
+    return np.sqrt(np.einsum("mij,mjk,mik->mi", rotation, covariance, rotation))
 
 
 def read_measurements(
@@ -222,26 +237,39 @@ def read_measurements(
     Raises:
         MeasurementError: for whatever cannot be what it claims to be, with row and column.
     """
-    robot, options = Joints.of(joints), options or FileOptions()
-    table, path, notes = (source, source.file, ()) if isinstance(source, Table) else (None, source, ())
-    forms = merged(POSE_FORMS)
-    header = () if options.format or table is not None else read_header(path)[0]
-    form = options.format or next((name for name, (known, _) in forms.items() if known(header)), "csv")
-    if form in forms:
-        reader: Callable[..., tuple[Table, FileOptions, tuple[str, ...]]] = forms[form][1]
+    robot = Joints.of(joints)
+    options = options or FileOptions()
+    table = source if isinstance(source, Table) else None
+    path = source.file if isinstance(source, Table) else source
+    notes: tuple[str, ...] = ()
+    form = options.format
+    if not form:
+        header = read_header(path)[0] if table is None else ()
+        matching = [name for name, (matches, _) in FORMS.items() if matches(header)]
+        form = matching[0] if matching else "csv"
+    if form in FORMS:
+        reader: Callable[..., tuple[Table, FileOptions, tuple[str, ...]]] = FORMS[form][1]
         table, options, notes = reader(path, len(robot.names), options)
     table = table or read_table(path)
-    if table.notes:  # names that were understood need no map
-        maps = {ours: theirs for ours, theirs in options.columns.items() if theirs in table or ours not in table}
-        options = replace(options, columns=maps)
+    # Names that the reader of the form has understood need no map.
+    if table.notes:
+        mapped = options.columns.items()
+        columns = {name: heading for name, heading in mapped if heading in table or name not in table}
+        options = replace(options, columns=columns)
     sheet = _select_rows(Sheet(table, options))
     layout = find_layout(sheet, robot.names)
-    numbers = [name for name in sheet.table.header if name in layout.used.difference(layout.group, [layout.tool])]
-    several = (*layout.positions, *layout.sigmas) if len(layout.positions) > 1 else ()
-    sheet.table.check(numbers, set().union(*several))
+    number_columns = layout.used.difference(layout.group, [layout.tool])
+    # Where a file has several targets, one that was not seen is a gap.
+    columns_with_gaps: set[str] = set()
+    if len(layout.positions) > 1:
+        columns_with_gaps.update(*layout.positions, *layout.sigmas)
+    sheet.table.check([name for name in sheet.table.header if name in number_columns], columns_with_gaps)
     q, _ = sheet.joints(robot.names)
     notes = (*sheet.table.notes, *notes, *layout.notes, *plausible.check_joints(q, sheet, layout.joints, robot))
-    block = (_read_targets if layout.positions else read_groups)(sheet, layout, q)
+    if layout.positions:
+        block: PoseMeasurements = _read_targets(sheet, layout, q)
+    else:
+        block = read_groups(sheet, layout, q)
     ignored = tuple(name for name in sheet.table.header if name not in layout.used)
     station = options.station or Path(path).stem
     return [replace(block, station=station, ignored=ignored, notes=(*notes, *block.notes))]
@@ -252,64 +280,70 @@ def joint_columns(path: str | Path) -> tuple[str, ...]:
 
     A caller compares them with the chains of a URDF, to find the chain that was measured.
     """
-    known = {name + suffix for name in OURS for suffix in SUFFIXES}
+    toolkit_names = {name + suffix for name in OURS for suffix in SUFFIXES}
     names, units = read_header(path)
-    return tuple(
-        name.removeprefix("q_")
-        for name, unit in zip(names, units)
-        if name not in known and not (name[:1] in "xyz" and name[1:].isdigit()) and unit not in ("s", "C", "°C")
-    )
+    columns = []
+    for name, unit in zip(names, units):
+        is_target = name[:1] in "xyz" and name[1:].isdigit()
+        if name not in toolkit_names and not is_target and unit not in ("s", "C", "°C"):
+            columns.append(name.removeprefix("q_"))
+    return tuple(columns)
 
 
 def _select_rows(sheet: Sheet) -> Sheet:
     """Return the sheet with the rows selected by the option ``where``."""
-    table, keep = sheet.table, np.ones(len(sheet.table), dtype=bool)
+    table = sheet.table
+    keep = np.ones(len(table), dtype=bool)
     for name, values in sheet.options.where.items():
         texts = table.texts(name)
         keep &= np.isin(texts, list(values))
         if not keep.any():
-            found = ", ".join(list(dict.fromkeys(texts))[:10])
-            sheet.fail(f"no row is selected by where = {', '.join(values)}; found {found}", name)
+            examples = ", ".join(list(dict.fromkeys(texts))[:10])
+            sheet.fail(f"no row is selected by where = {', '.join(values)}; found {examples}", name)
     return sheet if keep.all() else replace(sheet, table=table.where(keep))
 
 
 def _read_targets(sheet: Sheet, layout: Layout, q: np.ndarray) -> Positions:
     """Return positions or poses, one row per target seen, in the file's order."""
-    table, several = sheet.table, len(layout.positions) > 1
-    position = np.stack([_position(sheet, names, several) for names in layout.positions], axis=1)
-    seen = np.asarray(~np.isnan(position).any(axis=2))
-    index, target = np.nonzero(seen)
-    if not len(index):
+    table = sheet.table
+    several = len(layout.positions) > 1
+    position = np.stack([_position(sheet, columns, several) for columns in layout.positions], axis=1)
+    visible = np.asarray(~np.isnan(position).any(axis=2))
+    row, target = np.nonzero(visible)
+    if not len(row):
         sheet.fail("no target was seen in any row", layout.positions[0][0])
+
     names, tool = (sheet.options.tool,), target
     if several:
         names = tuple(f"{sheet.options.tool} {k + 1}" for k in range(len(layout.positions)))
     elif layout.tool:
         names, tool = labels(table, (layout.tool,))
-    sigma = _sigma(sheet, layout, seen)
-    unseen = len(seen) - np.sum(seen, axis=0)
+    sigma = _sigma(sheet, layout, visible)
+    notes = []
+    hidden_counts = len(visible) - np.sum(visible, axis=0)
+    for columns, count in zip(layout.positions, hidden_counts):
+        if count:
+            notes.append(f"{', '.join(columns)}: not seen in {count} of {len(visible)} rows")
     common: dict[str, Any] = {
-        "sigma": None if sigma is None else sigma[index, target],
+        "sigma": None if sigma is None else sigma[row, target],
         "tool": tool,
         "tool_names": names,
         "file": table.file,
-        "rows": table.rows[index],
-        "late": _late(sheet, layout, index),
-        "notes": tuple(
-            f"{', '.join(names)}: not seen in {count} of {len(seen)} rows"
-            for names, count in zip(layout.positions, unseen)
-            if count
-        ),
+        "rows": table.rows[row],
+        "late": _late(sheet, layout, row),
+        "notes": tuple(notes),
     }
-    block = Positions(q[index], layout.joints, position[index, target], **common)
+    block = Positions(q[row], layout.joints, position[row, target], **common)
     if layout.kind == Poses.kind:
-        turns, about = plausible.orientation(sheet, layout.orientation), _sigma_rotation(sheet, layout)
-        euler = sheet.options.euler if len(layout.orientation) == 3 else ""
-        block = Poses(q[index], layout.joints, block.position, turns, sigma_rotation=about, euler=euler, **common)
+        quaternion = plausible.orientation(sheet, layout.orientation)
+        common["sigma_rotation"] = _sigma_rotation(sheet, layout)
+        common["euler"] = sheet.options.euler if len(layout.orientation) == 3 else ""
+        block = Poses(q[row], layout.joints, block.position, quaternion, **common)
     if not layout.base:
         return block
-    base = sheet.numbers(layout.base[:3], POSITION)
-    return relative_to_base(block, base[index], plausible.orientation(sheet, layout.base[3:])[index])
+    base_position = sheet.numbers(layout.base[:3], POSITION)
+    base_quaternion = plausible.orientation(sheet, layout.base[3:])
+    return relative_to_base(block, base_position[row], base_quaternion[row])
 
 
 def _position(sheet: Sheet, names: Sequence[str], gaps: bool) -> np.ndarray:
@@ -321,18 +355,20 @@ def _position(sheet: Sheet, names: Sequence[str], gaps: bool) -> np.ndarray:
     return position
 
 
-def _sigma(sheet: Sheet, layout: Layout, seen: np.ndarray) -> np.ndarray | None:
+def _sigma(sheet: Sheet, layout: Layout, visible: np.ndarray) -> np.ndarray | None:
     """Return sigmas (m, targets, 3) [m] from the columns, else from the options, else None."""
-    stated = sheet.options.sigma
+    options = sheet.options.sigma
+    if not layout.sigmas and options.position is None:
+        return None
     if not layout.sigmas:
-        return None if stated.position is None else np.tile(stated.position, (*seen.shape, 1))
+        return np.tile(options.position, (*visible.shape, 1))
     stack = []
     for k, names in enumerate(layout.sigmas):
-        there = seen[:, k : k + 1]
-        sigma = sheet.numbers(names, replace(SIGMA, positive=""), gaps=not there.all())
-        sigma = np.where(sigma < 0.0, sigma, np.maximum(sigma, stated.floor))
-        SIGMA.check(np.where(there, sigma, np.nan), sheet.table, names)
-        refuse(sheet.table, np.isnan(sigma) & there, names, lambda row, k: "is empty where a target was seen")
+        is_seen = visible[:, k : k + 1]
+        sigma = sheet.numbers(names, replace(SIGMA, positive=""), gaps=not is_seen.all())
+        sigma = np.where(sigma < 0.0, sigma, np.maximum(sigma, options.floor))
+        SIGMA.check(np.where(is_seen, sigma, np.nan), sheet.table, names)
+        refuse(sheet.table, np.isnan(sigma) & is_seen, names, lambda row, k: "is empty where a target was seen")
         stack.append(sigma)
     return np.stack(stack, axis=1)
 
@@ -341,12 +377,13 @@ def _late(sheet: Sheet, layout: Layout, index: np.ndarray) -> np.ndarray | None:
     """Return how the positions of rows change with a clock's offset and drift (m, 2, 3); None where not stated."""
     if not layout.late:
         return None
-    velocity, t = sheet.numbers(layout.late[:3], LATE)[index], sheet.numbers(layout.late[3:], TIME)[index]
+    velocity = sheet.numbers(layout.late[:3], LATE)[index]
+    t = sheet.numbers(layout.late[3:], TIME)[index]
     return np.stack([velocity, (t - t.mean()) * velocity], axis=1)
 
 
 def _sigma_rotation(sheet: Sheet, layout: Layout) -> np.ndarray | None:
     if layout.sigma_rotation:
         return sheet.numbers(layout.sigma_rotation, SIGMA_ROTATION)
-    stated = sheet.options.sigma.orientation
-    return None if stated is None else np.tile(stated, (len(sheet.table), 1))
+    sigma = sheet.options.sigma.orientation
+    return None if sigma is None else np.tile(sigma, (len(sheet.table), 1))

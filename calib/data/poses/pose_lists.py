@@ -58,7 +58,13 @@ from calib.errors import MeasurementError, listing
 from calib.records import frozen, shaped
 from calib.units import ANGLES, JOINT, LENGTHS
 
-MAX_JOINT_DIFFERENCE = 0.02  # read-back and commanded joints of one pose differ by less [rad or m]; our choice
+SUFFIXES = ("", "_target")
+# Read-back and commanded joints of one pose differ by less [rad or m] (our choice).
+MAX_JOINT_DIFFERENCE = 0.02
+# Share of the rows that most rows are (our choice).
+HALF = 0.5
+# Added to the cost of a reversed joint, so that of two equal ones the unreversed is taken.
+REVERSED_COST = 1e-9
 
 
 def write_poses(path: str | Path, q: ArrayLike, joint_names: Sequence[str], kinds: Sequence[str] | None = None) -> Path:
@@ -74,28 +80,39 @@ def write_poses(path: str | Path, q: ArrayLike, joint_names: Sequence[str], kind
 
 def joint_columns(names: Sequence[str], kinds: Sequence[str]) -> tuple[list[str], np.ndarray]:
     """Return headers of joints' columns for people, ``joint1 [deg]`` or ``[mm]``, and the factors (n,) from SI."""
-    units = [JOINT["prismatic" if kind == "prismatic" else "revolute"] for kind in kinds]
-    return [f"{name} [{unit}]" for name, (_, unit) in zip(names, units)], np.array([factor for factor, _ in units])
+    headers = []
+    factors = []
+    for name, kind in zip(names, kinds):
+        factor, unit = JOINT["prismatic" if kind == "prismatic" else "revolute"]
+        headers.append(f"{name} [{unit}]")
+        factors.append(factor)
+    return headers, np.array(factors)
 
 
 def filled_in(path: Path, joints: int) -> bool:
     """Return whether the user has entered measurements into a list of planned poses."""
-    lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()[1:]
-    return any(cell.strip() for line in lines for cell in re.split("[,;\t]", line)[joints:])
+    lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
+    for line in lines[1:]:
+        cells = re.split("[,;\t]", line)
+        if any(cell.strip() for cell in cells[joints:]):
+            return True
+    return False
 
 
 def read_poses(
-    given: str | Path | ArrayLike | PoseMeasurements, joints: Joints | Sequence[str], options: FileOptions | None = None
+    source: str | Path | ArrayLike | PoseMeasurements,
+    joints: Joints | Sequence[str],
+    options: FileOptions | None = None,
 ) -> np.ndarray:
     """Return joint values (m, n) [rad or m] in the order of `joints`, from a CSV file, measurements or an array.
 
     Columns and checks of a file are those of measurements.
     """
     robot = Joints.of(joints)
-    if not isinstance(given, str | Path):
-        q = given.q if isinstance(given, PoseMeasurements) else given
+    if not isinstance(source, str | Path):
+        q = source.q if isinstance(source, PoseMeasurements) else source
         return shaped(q, (None, len(robot.names)), "joint values")
-    sheet = Sheet(read_table(given), options or FileOptions())
+    sheet = Sheet(read_table(source), options or FileOptions())
     sheet.check_names(robot.names)
     q, columns = sheet.joints(robot.names)
     if len(q) > 1:
@@ -109,10 +126,12 @@ def check_planned(q: np.ndarray, sheet: Sheet, columns: Sequence[str], robot: Jo
     return plausible.check_joints(q if moves else q[:1], sheet, columns, robot)
 
 
-def check_against(plan: ArrayLike, measured: PoseMeasurements, near: float = MAX_JOINT_DIFFERENCE) -> tuple[str, ...]:
+def check_against(
+    plan: ArrayLike, measured: PoseMeasurements, max_difference: float = MAX_JOINT_DIFFERENCE
+) -> tuple[str, ...]:
     """Return notes on differences between measured joint values and planned poses (m, n) [rad or m].
 
-    A planned and a measured pose are the same if no joint differs by more than `near`.
+    A planned and a measured pose are the same if no joint differs by more than `max_difference`.
 
     Returns:
         Notes: rows that nobody planned.
@@ -123,20 +142,28 @@ def check_against(plan: ArrayLike, measured: PoseMeasurements, near: float = MAX
     """
     plan = shaped(plan, (None, measured.q.shape[1]), "plan")
     q, rows = _distinct(measured)
-    if (matched := _matched(plan, q, near)).mean() < 0.5:
-        raise _explain(plan, q, rows, measured, near)
-    strange = rows[~matched]
-    return (f"{len(strange)} rows were not planned: {listing(strange, 10)}",) if len(strange) else ()
+    is_planned = _has_match(plan, q, max_difference)
+    if is_planned.mean() < HALF:
+        raise _explain(plan, q, rows, measured, max_difference)
+    unplanned = rows[~is_planned]
+    if not len(unplanned):
+        return ()
+    return (f"{len(unplanned)} rows were not planned: {listing(unplanned, 10)}",)
 
 
 def unmeasured(
-    plan: ArrayLike, measured: Sequence[PoseMeasurements], near: float = MAX_JOINT_DIFFERENCE
+    plan: ArrayLike, measured: Sequence[PoseMeasurements], max_difference: float = MAX_JOINT_DIFFERENCE
 ) -> tuple[str, ...]:
     """Return a note on the planned poses (m, n) [rad or m] that are in none of the blocks; empty if all are."""
-    found = [_matched(block.q, np.asarray(plan), near) for block in measured]
-    remain = np.flatnonzero(~np.any(found, axis=0)) + 1 if found else ()
-    words = f"{len(remain)} of {len(np.asarray(plan))} planned poses remain to be measured: {listing(remain, 10)}"
-    return (f"{words} (in a further file, then calib next again)",) if len(remain) else ()
+    if not measured:
+        return ()
+    plan = np.asarray(plan)
+    is_measured = [_has_match(block.q, plan, max_difference) for block in measured]
+    remaining = np.flatnonzero(~np.any(is_measured, axis=0)) + 1
+    if not len(remaining):
+        return ()
+    note = f"{len(remaining)} of {len(plan)} planned poses remain to be measured: {listing(remaining, 10)}"
+    return (f"{note} (in a further file, then calib next again)",)
 
 
 def _distinct(measured: PoseMeasurements) -> tuple[np.ndarray, np.ndarray]:
@@ -145,35 +172,39 @@ def _distinct(measured: PoseMeasurements) -> tuple[np.ndarray, np.ndarray]:
     return measured.q[first], rows
 
 
-def _matched(these: np.ndarray, those: np.ndarray, near: float) -> np.ndarray:
-    """Return the mask of rows of `those` with a row of `these` within `near` (largest joint difference)."""
-    distance, _ = KDTree(these).query(those, p=math.inf)
-    return distance <= near
+def _has_match(candidates: np.ndarray, q: np.ndarray, max_difference: float) -> np.ndarray:
+    """Return the mask of rows of `q` with a row of `candidates` within `max_difference` (largest of the joints)."""
+    distance, _ = KDTree(candidates).query(q, p=math.inf)
+    return distance <= max_difference
 
 
 def _explain(
-    plan: np.ndarray, q: np.ndarray, rows: np.ndarray, measured: PoseMeasurements, near: float
+    plan: np.ndarray, q: np.ndarray, rows: np.ndarray, measured: PoseMeasurements, max_difference: float
 ) -> MeasurementError:
     names = measured.joint_names
-    for factor, what in ((1.0, ""), (math.pi / 180, "degrees"), (180 / math.pi, "radians converted from degrees")):
+    units = ((1.0, ""), (math.pi / 180, "degrees"), (180 / math.pi, "radians converted from degrees"))
+    for factor, unit in units:
         order, sign = _best_order(plan, q * factor)
-        if _matched(plan, q[:, order] * sign * factor, near).mean() < 0.5:
+        if _has_match(plan, q[:, order] * sign * factor, max_difference).mean() < HALF:
             continue
-        causes = [f"the values are {what}"] if what else []
-        moved = [j for j in range(len(names)) if order[j] != j]
-        if moved:
-            pairs = ", ".join(f"{names[order[j]]} contains joint {j + 1}" for j in moved)
+        causes = []
+        if unit:
+            causes.append(f"the values are {unit}")
+        swapped = [j for j in range(len(names)) if order[j] != j]
+        if swapped:
+            pairs = ", ".join(f"{names[order[j]]} contains joint {j + 1}" for j in swapped)
             causes.append(f"columns are swapped ({pairs})")
         if (sign < 0).any():
-            turned = ", ".join(names[order[j]] for j in np.flatnonzero(sign < 0))
-            causes.append(f"the sign is reversed ({turned})")
+            reversed_names = ", ".join(names[order[j]] for j in np.flatnonzero(sign < 0))
+            causes.append(f"the sign is reversed ({reversed_names})")
         message = f"the measured joints agree with the plan if {' and '.join(causes)}"
-        column = names[order[moved[0]]] if moved else names[0]
+        column = names[order[swapped[0]]] if swapped else names[0]
         return MeasurementError(f"{message}; correct the header or the options", measured.file, None, column)
-    distance, index = (np.atleast_1d(found) for found in KDTree(plan).query(q, p=math.inf))
+    distance, index = KDTree(plan).query(q, p=math.inf)
+    distance, index = np.atleast_1d(distance), np.atleast_1d(index)
     worst = int(np.argmax(distance))
     joint = int(np.argmax(np.abs(q[worst] - plan[index[worst]])))
-    count = int((distance <= near).sum())
+    count = int((distance <= max_difference).sum())
     message = f"only {count} of {len(q)} rows are planned poses; the nearest one differs by {distance[worst]:.3g}"
     advice = "is it the right plan? If other poses were measured on purpose, set plan = false under [poses]"
     return MeasurementError(f"{message}: {advice} in session.toml", measured.file, int(rows[worst]), names[joint])
@@ -191,13 +222,11 @@ def _best_order(plan: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray
         planned = KDTree(plan[:, j : j + 1])
         for k in range(n):
             for s, sign in enumerate((1.0, -1.0)):
-                taken = planned.query(sign * q[:, k : k + 1])[0]
-                missed = KDTree(sign * q[:, k : k + 1]).query(plan[:, j : j + 1])[0]
-                cost[s, j, k] = np.minimum(taken, 1.0).mean() + np.minimum(missed, 1.0).mean() + 1e-9 * s
+                to_plan = planned.query(sign * q[:, k : k + 1])[0]
+                from_plan = KDTree(sign * q[:, k : k + 1]).query(plan[:, j : j + 1])[0]
+                mean_distance = np.minimum(to_plan, 1.0).mean() + np.minimum(from_plan, 1.0).mean()
+                cost[s, j, k] = mean_distance + REVERSED_COST * s
     return assigned(cost)
-
-
-SUFFIXES = ("", "_target")
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,17 +255,18 @@ class Targets:
 
     def __post_init__(self) -> None:
         for name in ("q", "position", "rotation"):
-            if (value := getattr(self, name)) is not None:
+            value = getattr(self, name)
+            if value is not None:
                 object.__setattr__(self, name, frozen(value))
 
     @staticmethod
-    def of(given: Targets | np.ndarray) -> Targets:
+    def of(targets: Targets | np.ndarray) -> Targets:
         """Return targets in memory: poses (m, 4, 4) [m], or joint values (m, n) [rad or m]."""
-        if isinstance(given, Targets):
-            return given
-        if given.ndim == 3:
-            return Targets(None, given[:, :3, 3], given[:, :3, :3], file="the array")
-        return Targets(given, file="the array")
+        if isinstance(targets, Targets):
+            return targets
+        if targets.ndim == 3:
+            return Targets(None, targets[:, :3, 3], targets[:, :3, :3], file="the array")
+        return Targets(targets, file="the array")
 
     def __len__(self) -> int:
         return len(self.q if self.q is not None else self.position)  # type: ignore[arg-type]  # one of them is there
@@ -252,30 +282,46 @@ def read_targets(path: str | Path, joints: Joints | Sequence[str]) -> Targets:
     Raises:
         MeasurementError: for whatever cannot be what it claims to be, with row and column.
     """
-    sheet, robot = Sheet(read_table(path), suffixes=SUFFIXES), Joints.of(joints)
+    sheet = Sheet(read_table(path), suffixes=SUFFIXES)
+    robot = Joints.of(joints)
     table, joints = sheet.table, robot.names
-    forms = (*joints, *(f"q_{name}" for name in joints), *(f"q{k + 1}" for k in range(len(joints))))
-    position, turned = sheet.family(POSITION.names), sheet.family(QUATERNION.names) or sheet.family(MATRIX.names)
-    q, columns, notes = None, (), ()
-    if any(name in table for name in forms):
-        q, columns = sheet.joints(joints)
-        # limits count where most rows (our choice) are outside: it is the file then, not the row
-        outside = plausible.outside(q, robot.lower, robot.upper).any(axis=1).mean() > 0.5
-        notes = check_planned(q, sheet, columns, robot if outside else replace(robot, lower=None, upper=None))
-    if not columns and not position and not turned:
+    joint_forms = (*joints, *(f"q_{name}" for name in joints), *(f"q{k + 1}" for k in range(len(joints))))
+    position_columns = sheet.family(POSITION.names)
+    rotation_columns = sheet.family(QUATERNION.names) or sheet.family(MATRIX.names)
+    q, joint_headings, notes = None, (), ()
+    if any(name in table for name in joint_forms):
+        q, joint_headings = sheet.joints(joints)
+        # Limits count where most rows are outside of them: it is the file then, not the row.
+        outside_share = plausible.outside(q, robot.lower, robot.upper).any(axis=1).mean()
+        if outside_share <= HALF:
+            robot = replace(robot, lower=None, upper=None)
+        notes = check_planned(q, sheet, joint_headings, robot)
+    if not joint_headings and not position_columns and not rotation_columns:
         needed = f"joints ({', '.join(joints)}, or q1 to q{len(joints)}), or x y z with or without qx qy qz qw"
         sheet.fail(f"no targets found: expected {needed}; found {', '.join(table.header)}")
-    if turned and not position:
-        sheet.fail(f"has {turned[0]} but no x y z: a target needs a position")
-    used = {*columns, *position, *turned}
-    units = [table.units[table.index(name)] for name in columns]
+    if rotation_columns and not position_columns:
+        sheet.fail(f"has {rotation_columns[0]} but no x y z: a target needs a position")
+
+    position = None
+    if position_columns:
+        position = sheet.numbers(position_columns, POSITION)
+    rotation = None
+    if rotation_columns:
+        rotation = Rotation.from_quat(plausible.orientation(sheet, rotation_columns)).as_matrix()
+    columns = []
+    factors = []
+    for name in joint_headings:
+        unit = table.units[table.index(name)]
+        columns.append(f"{name} [{unit}]" if unit else name)
+        factors.append((ANGLES | LENGTHS)[unit.lower()] if unit else 1.0)
+    read_columns = {*joint_headings, *position_columns, *rotation_columns}
     return Targets(
-        q,
-        sheet.numbers(position, POSITION) if position else None,
-        Rotation.from_quat(plausible.orientation(sheet, turned)).as_matrix() if turned else None,
-        tuple(f"{name} [{unit}]" if unit else name for name, unit in zip(columns, units)),
-        tuple((ANGLES | LENGTHS)[unit.lower()] if unit else 1.0 for unit in units),
-        tuple(name for name in table.header if name not in used),
-        notes,
-        table.file,
+        q=q,
+        position=position,
+        rotation=rotation,
+        columns=tuple(columns),
+        factors=tuple(factors),
+        ignored=tuple(name for name in table.header if name not in read_columns),
+        notes=notes,
+        file=table.file,
     )

@@ -37,8 +37,11 @@ from calib.data.schema import Joints
 from calib.errors import MeasurementError, refuse_data, refused_as, require
 from calib.records import read_only
 
-MAX_MEMBERS, MAX_BYTES = 1000, 8_000_000_000  # of an archive, and of a member (our choices)
-TOGETHER = 1 << 16  # rows read at a time
+# Largest number of members of an archive, and size of a member [B] (our choices).
+MAX_MEMBERS = 1000
+MAX_BYTES = 8_000_000_000
+# Rows read at a time.
+CHUNK = 1 << 16
 
 
 def read_archive(path: Path, joints: Joints | None, options: RecordingOptions, ends: Ends = (None, None)) -> Recording:
@@ -50,15 +53,16 @@ def read_archive(path: Path, joints: Joints | None, options: RecordingOptions, e
 def read_archived_positions(path: Path, joints: Joints, options: RecordingOptions) -> tuple[np.ndarray, np.ndarray]:
     """Return the stamps (N,) [s] and reference positions (N, n) of an archive: q_ref, or q without it."""
     with _opened(path) as archive:
-        found = find_names(tuple(archive.members), options, path)
-        ours = "q_ref" if "q_ref" in found else "q"
-        if ours not in found:
+        names = find_names(tuple(archive.members), options, path)
+        series = "q_ref" if "q_ref" in names else "q"
+        if series not in names:
             archive.fail(f"a reference needs t and q_ref (or q); found: {', '.join(archive.members)}")
-        q = archive.read(found[ours])
+        q = archive.read(names[series])
         if q.ndim != 2:
-            archive.fail(f"has shape {q.shape}, expected (samples, joints)", found[ours])
-        order = joint_order(_names(archive), joints, q.shape[1], path)[0]
-        return _stamps(archive, found, options, len(q)), _arrange(q, order, options.factor(ours))
+            archive.fail(f"has shape {q.shape}, expected (samples, joints)", names[series])
+        order = joint_order(_joint_names(archive), joints, q.shape[1], path)[0]
+        t = _stamps(archive, names, options, len(q))
+        return t, _arrange(q, order, options.factor(series))
 
 
 @contextmanager
@@ -92,11 +96,11 @@ class _Archive:
 
     def header(self, name: str) -> tuple[IO[bytes], tuple[int, ...], bool, np.dtype]:
         """Return a member's stream after its header, its shape, whether its order is Fortran's, and its type."""
-        member, kinds = self.members[name], (ValueError, TypeError, KeyError, SyntaxError, tokenize.TokenError)
+        member = self.members[name]
         stream = self.file.open(member)
-        with refused_as(
-            MeasurementError, (*kinds, RecursionError, OverflowError), "not a NumPy array ({})", self.path, None, name
-        ):
+        # What numpy's reader of headers raises, and Python's parser in it.
+        errors = (ValueError, TypeError, KeyError, SyntaxError, tokenize.TokenError, RecursionError, OverflowError)
+        with refused_as(MeasurementError, errors, "not a NumPy array ({})", self.path, None, name):
             version = npy.read_magic(stream)
             read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
             shape, fortran, dtype = read(stream)
@@ -119,17 +123,22 @@ class _Archive:
         with stream:
             if dtype.kind not in kinds:
                 self.fail(f"contains {dtype}, expected {'texts' if 'U' in kinds else 'numbers'}", name)
-            kind, step = dtype if exact else np.dtype(float), TOGETHER
+            result_type = dtype if exact else np.dtype(float)
             if rows is None or fortran or not shape:
-                values = np.frombuffer(stream.read(), dtype, prod(shape)).reshape(shape, order="F" if fortran else "C")
-                return (values if rows is None or not shape else values[rows]).astype(kind, copy=False)
-            rows = rows[: np.searchsorted(rows, shape[0])]  # a member of another length is refused later
-            result, size = np.empty((len(rows), *shape[1:]), kind), prod(shape[1:]) * dtype.itemsize
-            for start in range(0, shape[0], step):
-                count = min(step, shape[0] - start)
-                some = np.frombuffer(stream.read(count * size), dtype).reshape(count, *shape[1:])
-                own = slice(*np.searchsorted(rows, (start, start + step)))
-                result[own] = some[rows[own] - start]
+                values = np.frombuffer(stream.read(), dtype, prod(shape))
+                values = values.reshape(shape, order="F" if fortran else "C")
+                if rows is not None and shape:
+                    values = values[rows]
+                return values.astype(result_type, copy=False)
+            # A member of another length is refused later.
+            rows = rows[: np.searchsorted(rows, shape[0])]
+            result = np.empty((len(rows), *shape[1:]), result_type)
+            row_size = prod(shape[1:]) * dtype.itemsize
+            for start in range(0, shape[0], CHUNK):
+                count = min(CHUNK, shape[0] - start)
+                chunk = np.frombuffer(stream.read(count * row_size), dtype).reshape(count, *shape[1:])
+                in_chunk = slice(*np.searchsorted(rows, (start, start + CHUNK)))
+                result[in_chunk] = chunk[rows[in_chunk] - start]
         return result
 
     def few(self, name: str, count: int) -> np.ndarray | None:
@@ -146,41 +155,50 @@ class _Archive:
 def _recording(archive: _Archive, joints: Joints | None, options: RecordingOptions, ends: Ends) -> Recording:
     count, path = len(archive.file.infolist()), archive.path
     require(count <= MAX_MEMBERS, f"has {count} members: is this a recording?", MeasurementError, path)
-    found = one_effort(find_names(tuple(archive.members), options, path), options, tuple(archive.members), path)
-    stream, shape, _, _ = archive.header(found["q"])
+    members = tuple(archive.members)
+    names = one_effort(find_names(members, options, path), options, members, path)
+    stream, shape, _, _ = archive.header(names["q"])
     stream.close()
-    t = _stamps(archive, found, options, (shape or (0,))[0])
+    sample_count = shape[0] if shape else 0
+    t = _stamps(archive, names, options, sample_count)
     rows, notes = _used(archive, t, options, ends)
-    q = archive.read(found["q"], rows)
+    q = archive.read(names["q"], rows)
     if q.ndim != 2:
-        archive.fail(f"has shape {q.shape}, expected (samples, joints)", found["q"])
-    kind = "current" if "current" in found else "torque"
-    order, names = joint_order(_names(archive), joints, q.shape[1], path)
+        archive.fail(f"has shape {q.shape}, expected (samples, joints)", names["q"])
+    kind = "current" if "current" in names else "torque"
+    order, joint_names = joint_order(_joint_names(archive), joints, q.shape[1], path)
     series = {}
-    for ours, theirs in found.items():
-        if ours in ("t", "q"):
+    for name, member in names.items():
+        if name in ("t", "q"):
             continue
-        values = archive.read(theirs, rows)
+        values = archive.read(member, rows)
         if values.shape != q.shape:
-            archive.fail(f"has shape {values.shape}, {found['q']} has {q.shape} (samples, joints)", theirs)
-        series["effort" if ours == kind else ours] = _arrange(values, order, options.factor(ours))
+            archive.fail(f"has shape {values.shape}, {names['q']} has {q.shape} (samples, joints)", member)
+        series["effort" if name == kind else name] = _arrange(values, order, options.factor(name))
+
     gain = archive.few("drive_gain", q.shape[1])
-    if gain is not None and (gain == 0.0).any():
-        archive.fail("has a gain of zero: the current would cause no torque", "drive_gain")
-    variance = f"variance_{found.get(kind, '')}"
-    used = (*found.values(), *KEYS_BESIDE_SERIES, *RATES, "periods", variance)
-    unused = [name for name in archive.members if name not in used]
-    noise = _variance(archive, variance, q.shape, rows)
+    if gain is not None:
+        if (gain == 0.0).any():
+            archive.fail("has a gain of zero: the current would cause no torque", "drive_gain")
+        gain = gain[order]
+    variance_member = f"variance_{names.get(kind, '')}"
+    variance = _variance(archive, variance_member, q.shape, rows)
+    if variance is not None:
+        variance = variance[order] * options.factor(kind) ** 2
+    read_members = (*names.values(), *KEYS_BESIDE_SERIES, *RATES, "periods", variance_member)
+    unused = [member for member in archive.members if member not in read_members]
+    if unused:
+        notes = [*notes, f"not read: {', '.join(sorted(unused))}"]
     return Recording(
         t[rows],
         _arrange(q, order, options.factor("q")),
         kind=kind,
-        joint_names=names,
-        drive_gain=None if gain is None else gain[order],
-        effort_variance=None if noise is None else noise[order] * options.factor(kind) ** 2,
+        joint_names=joint_names,
+        drive_gain=gain,
+        effort_variance=variance,
         file=str(path),
         rows=rows + 1,
-        notes=(*notes, *([f"not read: {', '.join(sorted(unused))}"] if unused else [])),
+        notes=tuple(notes),
         **series,
     )
 
@@ -200,28 +218,39 @@ def _variance(archive: _Archive, name: str, shape: tuple[int, ...], rows: np.nda
     return np.asarray(values.mean(axis=0) / periods[0])
 
 
-def _stamps(archive: _Archive, found: Mapping[str, str], options: RecordingOptions, count: int) -> np.ndarray:
+def _stamps(archive: _Archive, names: Mapping[str, str], options: RecordingOptions, count: int) -> np.ndarray:
     """Return the time (N,) [s] of all samples since the first, from stamps or from a stated rate."""
-    if "t" not in found:
-        stated = next((name for name in RATES if name in archive.members), "")
-        own = archive.few(stated, 1) if not options.rate else None
-        rate = options.rate or (0.0 if own is None else float(own[0]))
+    if "t" not in names:
+        rate = options.rate or _rate(archive)
         if not rate > 0:
             expected = f"{', '.join(SYNONYMS['t'])}, or {', '.join(RATES)}"
             archive.fail(f"has neither stamps nor a rate ({expected}); found: {', '.join(archive.members)}")
         return np.arange(count) / rate
-    t = archive.read(found["t"], exact=True, kinds="fiu").ravel()
+    t = archive.read(names["t"], exact=True, kinds="fiu").ravel()
     if len(t) != count:
-        archive.fail(f"has {len(t)} stamps, q has {count} samples", found["t"])
-    return (t - t[0] if len(t) else t).astype(float) * options.factor("t")
+        archive.fail(f"has {len(t)} stamps, q has {count} samples", names["t"])
+    if len(t):
+        t = t - t[0]
+    return t.astype(float) * options.factor("t")
+
+
+def _rate(archive: _Archive) -> float:
+    """Return the sampling rate that the archive states [Hz]; 0 if it states none."""
+    for name in RATES:
+        rate = archive.few(name, 1)
+        if rate is not None:
+            return float(rate[0])
+    return 0.0
 
 
 def _used(archive: _Archive, t: np.ndarray, options: RecordingOptions, ends: Ends) -> tuple[np.ndarray, list[str]]:
     """Return the rows to read (of the cut, else of the file's use_range, else of all), and notes."""
-    stated = archive.few("use_range", 2) if options.use_range and ends == (None, None) else None
-    if stated is None:
+    use_range = None
+    if options.use_range and ends == (None, None):
+        use_range = archive.few("use_range", 2)
+    if use_range is None:
         return rows_used(t, ends, options.samples, archive.path)
-    first, end = (int(value) for value in np.clip(stated, -1, len(t) + 1))
+    first, end = (int(value) for value in np.clip(use_range, -1, len(t) + 1))
     if not 0 <= first < end <= len(t):
         archive.fail(f"is {first} to {end}, the file has {len(t)} samples", "use_range")
     rows, notes = rows_in_pieces(t, first, end, options.samples)
@@ -230,15 +259,22 @@ def _used(archive: _Archive, t: np.ndarray, options: RecordingOptions, ends: End
     return rows, notes
 
 
-def _names(archive: _Archive) -> list[str]:
+def _joint_names(archive: _Archive) -> list[str]:
     """Return the joints' names; an empty list if the archive states none."""
     if "joint_names" not in archive.members:
         return []
-    values = archive.read("joint_names", exact=True, kinds="US").ravel()
-    return [name.decode("utf-8", "replace") if isinstance(name, bytes) else str(name) for name in values.tolist()]
+    names = []
+    for name in archive.read("joint_names", exact=True, kinds="US").ravel().tolist():
+        if isinstance(name, bytes):
+            name = name.decode("utf-8", "replace")
+        names.append(str(name))
+    return names
 
 
 def _arrange(values: np.ndarray, order: list[int], factor: float) -> np.ndarray:
     """Return the columns in `order`, in SI; copied only if they change."""
-    values = values if order == list(range(values.shape[1])) else values[:, order]
-    return read_only(values if factor == 1.0 else values * factor)
+    if order != list(range(values.shape[1])):
+        values = values[:, order]
+    if factor != 1.0:
+        values = values * factor
+    return read_only(values)

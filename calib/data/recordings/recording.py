@@ -17,9 +17,15 @@ from calib.records import frozen
 
 KINDS = ("torque", "current")
 SERIES = ("q", "v", "effort", "tau_link", "tau_motor", "q_link", "q_ref", "tau_ff")
-LATE = ("effort", "tau_link", "tau_motor")  # what may come late: they have a path of their own to the log
+# Series that may come late: they have a path of their own to the log.
+LATE = ("effort", "tau_link", "tau_motor")
 Ends = tuple[float | None, float | None]
-PIECES = 20  # of a recording of which not all is used (our choice)
+# Pieces of a recording of which not all is used (our choice).
+PIECES = 20
+# A recording longer than the largest number of samples by no more than this is used whole.
+MAX_EXCESS = 1.25
+# Tolerance of a cut [s].
+TOLERANCE = 1e-9
 _CUT = re.compile(r"^(?P<file>.+)@(?P<start>[^@:/\\]*):(?P<stop>[^@:/\\]*)$")
 
 
@@ -73,17 +79,18 @@ class Recording:
         for name in SERIES:
             value = getattr(self, name)
             if value is not None:
-                object.__setattr__(self, name, settled(value))
-                if getattr(self, name).shape != shape:
-                    found = getattr(self, name).shape
-                    refuse_data(self.file, f"{name} has shape {found}, expected {shape} (samples, joints)")
+                value = settled(value)
+                object.__setattr__(self, name, value)
+                if value.shape != shape:
+                    refuse_data(self.file, f"{name} has shape {value.shape}, expected {shape} (samples, joints)")
         object.__setattr__(self, "t", settled(self.t))
         object.__setattr__(self, "joint_names", tuple(self.joint_names))
         rows = np.arange(1, shape[0] + 1) if self.rows is None else self.rows
         object.__setattr__(self, "rows", frozen(rows, int))
         for name in ("drive_gain", "effort_variance"):
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, frozen(getattr(self, name)))
+            value = getattr(self, name)
+            if value is not None:
+                object.__setattr__(self, name, frozen(value))
 
     @staticmethod
     def of(
@@ -93,7 +100,7 @@ class Recording:
         *,
         kind: str = "torque",
         joint_names: Sequence[str] = (),
-        **more: Any,
+        **fields: Any,
     ) -> Recording:
         """Return a recording from arrays.
 
@@ -101,13 +108,14 @@ class Recording:
             t: (N,) stamps [s]; q: (N, n) positions [rad or m]; tau: (N, n) torques [N m or N], or currents [A].
             kind: what `tau` is, ``torque`` or ``current``.
             joint_names: n names; q1 to qn by default.
-            more: other fields: ``v``, ``tau_link``, ``q_ref`` ...
+            fields: other fields: ``v``, ``tau_link``, ``q_ref`` ...
 
         Raises:
             MeasurementError: for inconsistent shapes.
         """
         q = np.asarray(q, dtype=float)
-        return Recording(np.asarray(t), q, np.asarray(tau), kind, named(joint_names, q.shape[1]), **more)
+        names = named(joint_names, q.shape[1])
+        return Recording(np.asarray(t), q, np.asarray(tau), kind, names, **fields)
 
     def __len__(self) -> int:
         return len(self.t)
@@ -132,22 +140,27 @@ class Recording:
 
     def take(self, index: slice | np.ndarray) -> Recording:
         """Return the recording of the samples at `index`, a slice or a mask (N,), with their times and row numbers."""
-        picked = {name: None if (value := getattr(self, name)) is None else value[index] for name in SERIES}
-        return replace(self, t=self.t[index], rows=self.rows[index], **picked)
+        series: dict[str, Any] = {}
+        for name in SERIES:
+            values = getattr(self, name)
+            series[name] = None if values is None else values[index]
+        return replace(self, t=self.t[index], rows=self.rows[index], **series)
 
 
-def rows_in_pieces(t: np.ndarray, first: int, stop: int, most: int | None) -> tuple[np.ndarray, list[str]]:
-    """Return the rows to use of a recording's rows `first` to `stop`, and notes: all, or at most `most` in pieces.
+def rows_in_pieces(t: np.ndarray, first: int, stop: int, max_samples: int | None) -> tuple[np.ndarray, list[str]]:
+    """Return the rows to use of a recording's rows `first` to `stop`, and notes: all, or `max_samples` in pieces.
 
     A piece lies at a random place in each of `PIECES` equal parts: the whole time takes part, and no period of the
     motion meets the same phase each time. Up to a quarter more rows are used whole; so are all rows where the stamps
     t (N,) of pieces run backwards, which is refused later: only the whole tells where to cut.
     """
     count = stop - first
-    if most is None or count <= 1.25 * most:
+    if max_samples is None or count <= MAX_EXCESS * max_samples:
         return np.arange(first, stop), []
-    edges, length = np.linspace(first, stop, PIECES + 1).astype(int), most // PIECES
-    starts = edges[:-1] + np.random.default_rng(0).integers(np.diff(edges) - length + 1)
+    length = max_samples // PIECES
+    edges = np.linspace(first, stop, PIECES + 1).astype(int)
+    free_rows = np.diff(edges) - length
+    starts = edges[:-1] + np.random.default_rng(0).integers(free_rows + 1)
     rows = (starts[:, None] + np.arange(length)).ravel()
     if (np.diff(t[rows]) < 0).any():
         return np.arange(first, stop), []
@@ -158,24 +171,31 @@ def rows_in_pieces(t: np.ndarray, first: int, stop: int, most: int | None) -> tu
     return rows, [note]
 
 
-def rows_used(t: np.ndarray, ends: Ends, most: int | None, file: str | Path) -> tuple[np.ndarray, list[str]]:
-    """Return the rows of a file with stamps `t` (N,) [s] that a cut leaves, at most `most` in pieces, and notes."""
-    ordered = np.maximum.accumulate(np.nan_to_num(t, nan=-np.inf))  # time that runs back is refused later
-    cut = slice(0, len(t)) if ends == (None, None) else rows_of_cut(ordered, *ends, file)
-    return rows_in_pieces(t, cut.start, cut.stop, most)
+def rows_used(t: np.ndarray, ends: Ends, max_samples: int | None, file: str | Path) -> tuple[np.ndarray, list[str]]:
+    """Return the rows of a file with stamps `t` (N,) [s] that a cut leaves, `max_samples` in pieces, and notes."""
+    cut = slice(0, len(t))
+    if ends != (None, None):
+        # Time that runs back is refused later.
+        ordered = np.maximum.accumulate(np.nan_to_num(t, nan=-np.inf))
+        cut = rows_of_cut(ordered, *ends, file)
+    return rows_in_pieces(t, cut.start, cut.stop, max_samples)
 
 
-def in_pieces(recording: Recording, most: int | None) -> Recording:
-    """Return a recording of at most `most` samples: itself, or pieces spread over it (`rows_in_pieces`)."""
-    rows, notes = rows_in_pieces(recording.t, 0, len(recording), most)
-    return replace(recording.take(rows), notes=(*recording.notes, *notes)) if notes else recording
+def in_pieces(recording: Recording, max_samples: int | None) -> Recording:
+    """Return a recording of at most `max_samples` samples: itself, or pieces spread over it (`rows_in_pieces`)."""
+    rows, notes = rows_in_pieces(recording.t, 0, len(recording), max_samples)
+    if not notes:
+        return recording
+    return replace(recording.take(rows), notes=(*recording.notes, *notes))
 
 
 def settled(values: np.ndarray) -> np.ndarray:
     """Return `values` itself if it is a read-only float array, else a frozen copy (logs are large)."""
-    owner = values.base if isinstance(values, np.ndarray) and values.base is not None else values
-    fixed = isinstance(owner, np.ndarray) and not owner.flags.writeable and values.dtype == float
-    return values if fixed else frozen(values)
+    owner = values
+    if isinstance(values, np.ndarray) and values.base is not None:
+        owner = values.base
+    is_fixed = isinstance(owner, np.ndarray) and not owner.flags.writeable and values.dtype == float
+    return values if is_fixed else frozen(values)
 
 
 def earlier(recording: Recording, lag: float) -> Recording:
@@ -189,24 +209,32 @@ def earlier(recording: Recording, lag: float) -> Recording:
     if not lag:
         return recording
     t = recording.t + lag
-    inside = (t >= recording.t[0]) & (t <= recording.t[-1]) if len(t) else np.zeros(0, bool)
-    if not inside.any():
+    covered = np.zeros(0, bool)
+    if len(t):
+        covered = (t >= recording.t[0]) & (t <= recording.t[-1])
+    if not covered.any():
         refuse_data(recording.file, f"a lag of {lag:g} s leaves no sample of a recording of {recording.duration:.3g} s")
-    moved = {
-        name: np.column_stack([np.interp(t, recording.t, own) for own in value.T])
-        for name in LATE
-        if (value := getattr(recording, name)) is not None
-    }
+    shifted: dict[str, Any] = {}
+    for name in LATE:
+        values = getattr(recording, name)
+        if values is not None:
+            columns = [np.interp(t, recording.t, column) for column in values.T]
+            shifted[name] = np.column_stack(columns)
     notes = (*recording.notes, f"torques are shifted {1e3 * lag:g} ms earlier, as the option lag states")
-    return replace(recording, notes=notes, **moved).take(inside)
+    return replace(recording, notes=notes, **shifted).take(covered)
 
 
 def rows_of_cut(t: np.ndarray, start: float | None, stop: float | None, file: str | Path) -> slice:
     """Return the slice of samples with start ≤ t < stop (tolerance 1 ns); refuse a cut without samples."""
-    first = 0 if start is None else int(np.searchsorted(t, start - 1e-9))
-    end = len(t) if stop is None else int(np.searchsorted(t, stop - 1e-9))
+    first, end = 0, len(t)
+    low = high = ""
+    if start is not None:
+        first = int(np.searchsorted(t, start - TOLERANCE))
+        low = f"{start:g}"
+    if stop is not None:
+        end = int(np.searchsorted(t, stop - TOLERANCE))
+        high = f"{stop:g}"
     if first >= end:
-        low, high = "" if start is None else f"{start:g}", "" if stop is None else f"{stop:g}"
         last = f"{t[-1]:.4g} s" if len(t) else "nothing"
         refuse_data(file, f"the cut @{low}:{high} leaves no sample; the recording ends at {last}")
     return slice(first, end)
@@ -225,8 +253,8 @@ def parse_cut(text: str) -> tuple[str, float | None, float | None]:
         return text, None, None
     ends: list[float | None] = []
     for part in (match["start"], match["stop"]):
-        words = f"{text}: '{part}' is not a time in seconds; to use a part of a recording, write log.npz@0:9.4"
-        with refused_as(UsageError, ValueError, words):
+        message = f"{text}: '{part}' is not a time in seconds; to use a part of a recording, write log.npz@0:9.4"
+        with refused_as(UsageError, ValueError, message):
             ends.append(float(part) if part.strip() else None)
     start, stop = ends
     if start is not None and start < 0.0:
@@ -238,4 +266,6 @@ def parse_cut(text: str) -> tuple[str, float | None, float | None]:
 
 def named(names: Sequence[str], n: int) -> tuple[str, ...]:
     """Return `names`, or q1 … qn if empty."""
-    return tuple(names) if len(names) else tuple(f"q{j + 1}" for j in range(n))
+    if len(names):
+        return tuple(names)
+    return tuple(f"q{j + 1}" for j in range(n))

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from calib.controllers.table import as_described, motors_as_described
 from calib.data.csv_table import Table, read_table
 from calib.data.recordings.archives import read_archive
 from calib.data.recordings.checks import check_recording
@@ -28,49 +29,58 @@ from calib.data.recordings.recording_options import (
     plain_stems,
     stem_of,
 )
-from calib.data.schema import AS_DESCRIBED, MOTORS_AS_DESCRIBED, Joints
+from calib.data.schema import Joints
 from calib.errors import MeasurementError, refuse_data, suggestion
-from calib.extensions import Point
 from calib.files import check_regular
-
-READ_BAG: "Point[Reader]" = Point("read_bag", "a ROS bag's recording")
 
 
 def read_log(path: Path, joints: Joints | None, options: RecordingOptions, ends: Ends = (None, None)) -> Recording:
     """Return the recording in a CSV table from ends[0] to ends[1] [s]; only shapes are checked; about 20 MB/s."""
     table = _numbered_brackets(read_table(path, doubles=True))
-    found = _find(table, options, joints.names if joints else ())
-    chosen = one_effort({ours: ours for ours in found}, options, table.header, path)
-    found = {ours: found[theirs] for ours, theirs in chosen.items()}
-    n = len(found["q"])
-    for ours, columns in found.items():
-        if ours != "t" and len(columns) != n:
-            refuse_data(path, f"{len(columns)} columns of {ours} ({', '.join(_called(table, columns))}) for {n} of q")
-        check_units(ours, [table.units[place] for place in columns], joints, path)
-    t = _stamps(table, found, options)
-    used, spread = rows_used(t, ends, options.samples, path)
-    table = table.where(used)
-    taken = {place for columns in found.values() for place in columns}
-    table.check(names := _called(table, sorted(taken)), names)
-    kind = "current" if "current" in found else "torque"
-    series: dict[str, Any] = {
-        "effort" if ours == kind else ours: np.column_stack([_values(table, c, ours, options) for c in columns])
-        for ours, columns in found.items()
-        if ours not in ("t", "q")
-    }
-    unused = [name for place, name in enumerate(table.header) if place not in taken]
-    notes = [*table.notes, *spread, *([f"not read: {', '.join(unused)}"] if unused else [])]
-    for ours, columns in found.items():
+    columns_of = _find_columns(table, options, joints.names if joints else ())
+    renamed = one_effort({name: name for name in columns_of}, options, table.header, path)
+    columns_of = {name: columns_of[file_name] for name, file_name in renamed.items()}
+    n = len(columns_of["q"])
+    for name, columns in columns_of.items():
+        if name != "t" and len(columns) != n:
+            headings = ", ".join(_headings(table, columns))
+            refuse_data(path, f"{len(columns)} columns of {name} ({headings}) for {n} of q")
+        check_units(name, [table.units[column] for column in columns], joints, path)
+
+    t = _stamps(table, columns_of, options)
+    rows, notes = rows_used(t, ends, options.samples, path)
+    table = table.where(rows)
+    read_columns: set[int] = set()
+    for columns in columns_of.values():
+        read_columns.update(columns)
+    headings = _headings(table, sorted(read_columns))
+    table.check(headings, headings)
+
+    kind = "current" if "current" in columns_of else "torque"
+    series: dict[str, np.ndarray] = {}
+    for name, columns in columns_of.items():
+        if name != "t":
+            values = [_values(table, column, name, options) for column in columns]
+            series["effort" if name == kind else name] = np.column_stack(values)
+
+    unused = [heading for column, heading in enumerate(table.header) if column not in read_columns]
+    notes = [*table.notes, *notes]
+    if unused:
+        notes.append(f"not read: {', '.join(unused)}")
+    for name, columns in columns_of.items():
         if stem_of(table.header[columns[0]])[0].startswith(MEASURED):
-            notes.append(f"{ours} is read from {', '.join(_called(table, columns))}")
-        if len(units := dict.fromkeys(table.units[place] or "no unit" for place in columns)) > 1:
-            notes.append(f"the columns of {ours} have different units ({', '.join(units)}): is this intended?")
-    names = joints.names if joints is not None and len(joints.names) == n else _joint_names(table, found["q"])
+            notes.append(f"{name} is read from {', '.join(_headings(table, columns))}")
+        units = dict.fromkeys(table.units[column] or "no unit" for column in columns)
+        if len(units) > 1:
+            notes.append(f"the columns of {name} have different units ({', '.join(units)}): is this intended?")
+    if joints is not None and len(joints.names) == n:
+        joint_names: Sequence[str] = joints.names
+    else:
+        joint_names = _joint_names(table, columns_of["q"])
     return Recording(
-        t[used],
-        np.column_stack([_values(table, place, "q", options) for place in found["q"]]),
+        t[rows],
         kind=kind,
-        joint_names=named(names, n),
+        joint_names=named(joint_names, n),
         file=str(path),
         rows=table.rows,
         notes=tuple(notes),
@@ -81,44 +91,58 @@ def read_log(path: Path, joints: Joints | None, options: RecordingOptions, ends:
 def read_positions(path: Path, joints: Joints, options: RecordingOptions) -> tuple[np.ndarray, np.ndarray]:
     """Return the stamps (N,) [s] and reference positions (N, n) of a table: q_ref, or q without it."""
     table = _numbered_brackets(read_table(path, doubles=True))
-    here = replace(options, names={key: name for key, name in options.names.items() if key in ("t", "q", "q_ref")})
-    found = _find(table, here, joints.names)
-    ours = "q_ref" if "q_ref" in found else "q"
-    if ours not in found:
+    names = {key: name for key, name in options.names.items() if key in ("t", "q", "q_ref")}
+    columns_of = _find_columns(table, replace(options, names=names), joints.names)
+    name = "q_ref" if "q_ref" in columns_of else "q"
+    if name not in columns_of:
         expected = ", ".join((*SYNONYMS["q_ref"], *SYNONYMS["q"]))
         message = f"has no reference positions ({expected}, with the joints' numbers or names)"
         refuse_data(path, f"{message}; found: {', '.join(table.header)}")
-    q = np.column_stack([_values(table, place, ours, options) for place in found[ours]])
-    return _stamps(table, found, options), q
+    q = np.column_stack([_values(table, column, name, options) for column in columns_of[name]])
+    return _stamps(table, columns_of, options), q
 
 
 def _numbered_brackets(table: Table) -> Table:
     """Return the table with headings like ``q[1]`` (joint number in brackets) renamed to ``q1``."""
-    if not any(unit.isdigit() for unit in table.units):
-        return table
-    header = tuple(name + unit if unit.isdigit() else name for name, unit in zip(table.header, table.units))
-    units = tuple("" if unit.isdigit() else unit for unit in table.units)
-    return Table(table.file, header, units, table.cells, table.rows, table.notes)
+    header = []
+    units = []
+    for name, unit in zip(table.header, table.units):
+        has_number = unit.isdigit()
+        header.append(name + unit if has_number else name)
+        units.append("" if has_number else unit)
+    return replace(table, header=tuple(header), units=tuple(units))
 
 
-def _find(table: Table, options: RecordingOptions, joints: Sequence[str]) -> dict[str, list[int]]:
+def _find_columns(table: Table, options: RecordingOptions, joints: Sequence[str]) -> dict[str, list[int]]:
     """Return the column indices of each series, in the robot's order, by the toolkit's name."""
-    found = {}
-    for ours, synonyms in SYNONYMS.items():
-        stems = (options.names[ours],) if ours in options.names else synonyms
-        ways = (_alone,) if ours == "t" else (partial(_of_joints, joints=joints), _numbered)
-        if places := next((places for stem in stems for way in ways if (places := way(table, stem))), None):
-            found[ours] = places
-        elif ours in options.names:
-            message = f"no column begins with '{options.names[ours]}'{suggestion(options.names[ours], table.header)}"
+    columns_of: dict[str, list[int]] = {}
+    for name, synonyms in SYNONYMS.items():
+        stems = (options.names[name],) if name in options.names else synonyms
+        columns = _stamp_column(table, stems) if name == "t" else _joint_columns(table, stems, joints)
+        if columns:
+            columns_of[name] = columns
+        elif name in options.names:
+            message = f"no column begins with '{options.names[name]}'{suggestion(options.names[name], table.header)}"
             table.fail(f"{message}; found: {', '.join(table.header)}")
-    return found
+    return columns_of
 
 
-def _alone(table: Table, stem: str) -> list[int]:
-    """Return the index of the one column with this name; [] if absent."""
-    header = [name.lower() for name in table.header]
-    return [header.index(stem.lower())] if stem.lower() in header else []
+def _stamp_column(table: Table, names: Sequence[str]) -> list[int]:
+    """Return the index of the column with the first of these names that the table has; [] if it has none."""
+    header = [heading.lower() for heading in table.header]
+    for name in names:
+        if name.lower() in header:
+            return [header.index(name.lower())]
+    return []
+
+
+def _joint_columns(table: Table, stems: Sequence[str], joints: Sequence[str]) -> list[int]:
+    """Return the indices of the columns of the first quantity that the table has for all joints; [] if it has none."""
+    for stem in stems:
+        columns = _of_joints(table, stem, joints) or _numbered(table, stem)
+        if columns:
+            return columns
+    return []
 
 
 def _of_joints(table: Table, stem: str, joints: Sequence[str]) -> list[int]:
@@ -133,37 +157,38 @@ def _of_joints(table: Table, stem: str, joints: Sequence[str]) -> list[int]:
 
 def _numbered(table: Table, stem: str) -> list[int]:
     """Return the indices of the numbered columns of one quantity; [] unless numbered from 0 or 1 without gaps."""
-    found: dict[str, list[tuple[int, int]]] = {}
-    for place, name in enumerate(table.header):
-        own, number = stem_of(name)
+    numbered: dict[str, list[tuple[int, int]]] = {}
+    for column, name in enumerate(table.header):
+        column_stem, number = stem_of(name)
         if number is not None:
-            found.setdefault(own, []).append((number, place))
-    places = sorted(found.get(plain_stems(tuple(found)).get(stem_of(stem)[0], ""), []))
-    numbers = [number for number, _ in places]
+            numbered.setdefault(column_stem, []).append((number, column))
+    plain_stem = stem_of(stem)[0]
+    full_stem = plain_stems(tuple(numbered)).get(plain_stem, "")
+    pairs = sorted(numbered.get(full_stem, []))
+    numbers = [number for number, _ in pairs]
     if not numbers or numbers[0] > 1 or numbers != list(range(numbers[0], numbers[0] + len(numbers))):
         return []
-    return [place for _, place in places]
+    return [column for _, column in pairs]
 
 
-def _called(table: Table, places: Sequence[int]) -> list[str]:
-    return [table.header[place] for place in places]
+def _headings(table: Table, columns: Sequence[int]) -> list[str]:
+    return [table.header[column] for column in columns]
 
 
-def _joint_names(table: Table, places: Sequence[int]) -> list[str]:
-    names = [name.split("_", 1)[-1] for name in _called(table, places)]
+def _joint_names(table: Table, columns: Sequence[int]) -> list[str]:
+    names = [name.split("_", 1)[-1] for name in _headings(table, columns)]
     return names if len(set(names)) == len(names) and all(names) else []
 
 
-def _values(table: Table, place: int, ours: str, options: RecordingOptions) -> np.ndarray:
+def _values(table: Table, column: int, series: str, options: RecordingOptions) -> np.ndarray:
     """Return a column in SI; NaN is kept and refused later, if it is within the cut."""
-    return table.numbers(table.header[place], None, gaps=True) * table.factor(
-        place, SCALES[ours], options.units.get(ours, "")
-    )
+    factor = table.factor(column, SCALES[series], options.units.get(series, ""))
+    return table.numbers(table.header[column], None, gaps=True) * factor
 
 
-def _stamps(table: Table, found: dict[str, list[int]], options: RecordingOptions) -> np.ndarray:
-    if "t" in found:
-        t = _values(table, found["t"][0], "t", options)
+def _stamps(table: Table, columns_of: dict[str, list[int]], options: RecordingOptions) -> np.ndarray:
+    if "t" in columns_of:
+        t = _values(table, columns_of["t"][0], "t", options)
         return t - t[0]
     if options.rate:
         return np.arange(len(table)) / options.rate
@@ -191,7 +216,8 @@ def read_recording(
     options = options or RecordingOptions()
     for name, unit in options.units.items():
         check_units(name, [unit] * len(joints.names if joints else ()), joints, file)
-    recording = _described(_reader(Path(file), (start, stop))(Path(file), joints, options), options.controller)
+    reader = _reader(Path(file), (start, stop))
+    recording = _described(reader(Path(file), joints, options), options.controller)
     if (start, stop) != (None, None):
         recording = recording.cut(start, stop)
     recording = in_pieces(recording, options.samples)
@@ -208,13 +234,17 @@ def _described(recording: Recording, controller: str) -> Recording:
     """Return a recording of the description's joints from one of joints as a controller shows them."""
     if not controller:
         return recording
-    parts = {
-        AS_DESCRIBED: ("q", "v", "q_link", "q_ref"),
-        MOTORS_AS_DESCRIBED: ("effort", "tau_link", "tau_motor", "tau_ff"),
+    series_of = {
+        as_described: ("q", "v", "q_link", "q_ref"),
+        motors_as_described: ("effort", "tau_link", "tau_motor", "tau_ff"),
     }
-    series = {name: (how, getattr(recording, name)) for how, names in parts.items() for name in names}
-    changed = {name: how.one()(controller, own) for name, (how, own) in series.items() if own is not None}
-    return replace(recording, **changed)
+    changes: dict[str, Any] = {}
+    for conversion, names in series_of.items():
+        for name in names:
+            values = getattr(recording, name)
+            if values is not None:
+                changes[name] = conversion(controller, values)
+    return replace(recording, **changes)
 
 
 def _reader(path: Path, ends: Ends) -> Reader:
@@ -223,7 +253,9 @@ def _reader(path: Path, ends: Ends) -> Reader:
         if path.exists():
             check_regular(path)
         if path.is_dir() or path.suffix in (".bag", ".mcap", ".db3"):
-            return READ_BAG.one()
+            from calib.data.recordings.bags import read_bag
+
+            return read_bag
         with open(path, "rb") as file:
             head = file.read(1 << 16)
     except OSError as error:
@@ -234,8 +266,8 @@ def _reader(path: Path, ends: Ends) -> Reader:
     if head and path.suffix == ".npz":
         refuse_data(path, "is not a NumPy archive despite its name: was it written by np.savez?")
     if not head or b"\0" in head:
-        found = "is empty" if not head else "is neither a NumPy archive, a bag nor text"
-        refuse_data(path, f"{found}: expected .npz, .csv, .mcap, .bag or a ROS 2 bag's folder")
+        fault = "is neither a NumPy archive, a bag nor text" if head else "is empty"
+        refuse_data(path, f"{fault}: expected .npz, .csv, .mcap, .bag or a ROS 2 bag's folder")
     if len(head) == 1 << 16 and b"\n" not in head:
         refuse_data(path, "has a first line of more than 64 kB: not a table")
     return partial(read_log, ends=ends)

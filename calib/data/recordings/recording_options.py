@@ -64,7 +64,8 @@ SYNONYMS: Mapping[str, tuple[str, ...]] = {
 }
 MEASURED = ("actual", "measured", "state", "robot")
 _NUMBER = re.compile(r"\d+(?!.*\d)")
-MAX_LAG = 1.0  # largest lag that is believed [s] (our choice)
+# Largest lag that is believed [s] (our choice).
+MAX_LAG = 1.0
 RATES = ("frequency", "rate", "sample_rate", "fs")
 KEYS_BESIDE_SERIES = ("joint_names", "drive_gain", "use_range")
 SCALES = {
@@ -83,15 +84,19 @@ SCALES = {
 
 def _ours(names: Any) -> Any:
     """Return `names` unchanged; refuse names of series that this toolkit does not know."""
-    for name in names if isinstance(names, Mapping) else ():
-        words = f"'{name}' is not a known name{suggestion(name, SYNONYMS)}; known are {', '.join(SYNONYMS)}"
-        require(name in SYNONYMS, words, ValueError)
+    if not isinstance(names, Mapping):
+        return names
+    for name in names:
+        message = f"'{name}' is not a known name{suggestion(name, SYNONYMS)}; known are {', '.join(SYNONYMS)}"
+        require(name in SYNONYMS, message, ValueError)
     return names
 
 
 def _known(units: Any) -> Any:
     """Return `units` unchanged; refuse a unit that does not suit its series."""
-    for name, unit in _ours(units).items() if isinstance(units, Mapping) else ():
+    if not isinstance(units, Mapping):
+        return units
+    for name, unit in _ours(units).items():
         if unit and (not isinstance(unit, str) or unit.lower() not in SCALES[name]):
             raise ValueError(f"unit {shown(unit)} of {name} is unknown; expected one of {', '.join(SCALES[name])}")
     return units
@@ -155,88 +160,117 @@ def check_units(name: str, units: Sequence[str], joints: Joints | None, path: st
 
 def stem_of(name: str) -> tuple[str, int | None]:
     """Return the quantity that a column's name states, in lower case, and its last number: (q, 1) for ``J1 q``."""
-    number = _NUMBER.search(name)
-    rest = f"{name[: number.start()]} {name[number.end() :]}" if number else name
-    words = [word for word in re.split(r"[\W_]+", rest.lower()) if word not in ("", "joint", "j")]
-    return "_".join(words), int(number[0]) if number else None
+    match = _NUMBER.search(name)
+    number = None
+    if match:
+        number = int(match[0])
+        name = f"{name[: match.start()]} {name[match.end() :]}"
+    parts = [part for part in re.split(r"[\W_]+", name.lower()) if part not in ("", "joint", "j")]
+    return "_".join(parts), number
 
 
 def plain_stems(stems: Sequence[str]) -> dict[str, str]:
     """Return a map from each stem, and from its form without leading words of `MEASURED` if unique, to it."""
     short: dict[str, list[str]] = {}
     for stem in stems:
-        words = stem.split("_")
-        while len(words) > 1 and words[0] in MEASURED:
-            words = words[1:]
-            short.setdefault("_".join(words), []).append(stem)
-    return {name: own[0] for name, own in short.items() if len(own) == 1} | {stem: stem for stem in stems}
+        parts = stem.split("_")
+        while len(parts) > 1 and parts[0] in MEASURED:
+            parts = parts[1:]
+            short.setdefault("_".join(parts), []).append(stem)
+    result = {name: full_stems[0] for name, full_stems in short.items() if len(full_stems) == 1}
+    return result | {stem: stem for stem in stems}
 
 
 def find_names(members: tuple[str, ...], options: RecordingOptions, path: Path) -> dict[str, str]:
     """Return the file's name of each series in it, by the toolkit's name."""
-    plain = {stem: member for member in reversed(members) if not (named := stem_of(member))[1] for stem in [named[0]]}
-    plain = {name: plain[stem] for name, stem in plain_stems(tuple(plain)).items()}
-    found = {}
-    for ours, synonyms in SYNONYMS.items():
-        if ours in options.names:
-            if options.names[ours] not in members:
-                message = f"has no '{options.names[ours]}'{suggestion(options.names[ours], members)}"
+    members_by_stem: dict[str, str] = {}
+    for member in members:
+        stem, number = stem_of(member)
+        if not number:
+            members_by_stem.setdefault(stem, member)
+    for name, stem in plain_stems(tuple(members_by_stem)).items():
+        members_by_stem[name] = members_by_stem[stem]
+    names = {}
+    for series, synonyms in SYNONYMS.items():
+        if series in options.names:
+            member = options.names[series]
+            if member not in members:
+                message = f"has no '{member}'{suggestion(member, members)}"
                 refuse_data(path, f"{message}; found: {', '.join(members)}")
-            found[ours] = options.names[ours]
-        elif name := next((plain[own] for synonym in synonyms if (own := stem_of(synonym)[0]) in plain), ""):
-            found[ours] = name
-    return found
+            names[series] = member
+            continue
+        for synonym in synonyms:
+            stem = stem_of(synonym)[0]
+            if stem in members_by_stem:
+                names[series] = members_by_stem[stem]
+                break
+    return names
 
 
 def one_effort(
-    found: dict[str, str], options: RecordingOptions, members: tuple[str, ...], path: Path
+    names: dict[str, str], options: RecordingOptions, members: tuple[str, ...], path: Path
 ) -> dict[str, str]:
-    """Return `found` with either ``torque`` or ``current``; without both, ``tau_link`` becomes the torque."""
-    if "q" not in found:
+    """Return `names` with either ``torque`` or ``current``; without both, ``tau_link`` becomes the torque."""
+    if "q" not in names:
         expected = ", ".join(SYNONYMS["q"])
         message = f"has no joint positions ({expected}); found: {', '.join(members)}"
-        refuse_data(path, message + _cure(found, members))
-    kinds = [kind for kind in ("torque", "current") if kind in found]
+        refuse_data(path, message + _advice(names, members))
+    kinds = [kind for kind in ("torque", "current") if kind in names]
     if not kinds and options.sensors:
-        kinds = _two_torques(found, options, members, path)
-    if not kinds and "tau_link" in found:
-        found["torque"] = found.pop("tau_link")
+        kinds = _two_torques(names, options, members, path)
+    if not kinds and "tau_link" in names:
+        names["torque"] = names.pop("tau_link")
         kinds = ["torque"]
     if not kinds:
         expected = ", ".join((*SYNONYMS["torque"], *SYNONYMS["current"]))
         message = f"has no torques and no currents ({expected}); found: {', '.join(members)}"
-        refuse_data(path, message + _cure(found, members))
+        refuse_data(path, message + _advice(names, members))
     kind = options.kind or kinds[0]
-    if kind not in found:  # the options say that what is called a torque is a current
-        found[kind] = found.pop(kinds[0])
-    return {ours: theirs for ours, theirs in found.items() if ours not in ("torque", "current") or ours == kind}
+    # The options may say that what the file calls a torque is a current.
+    if kind not in names:
+        names[kind] = names.pop(kinds[0])
+    unused = {"torque", "current"} - {kind}
+    return {series: name for series, name in names.items() if series not in unused}
 
 
-def _cure(found: Mapping[str, str], members: Sequence[str]) -> str:
+def _advice(names: Mapping[str, str], members: Sequence[str]) -> str:
     """Return advice to name the missing series in the options, with likely columns (by a shared word)."""
-    stems = [stem for member in members for stem in [stem_of(member)[0]] if stem not in (*found.values(), "")]
-    several = [stem for stem in stems if stems.count(stem) > 1] or stems or ["..."]
+    stems = []
+    for member in members:
+        stem = stem_of(member)[0]
+        if stem and stem not in names.values():
+            stems.append(stem)
     likely = {}
-    for ours in ("q", "torque", "current"):
-        words = {word for synonym in SYNONYMS[ours] for word in synonym.split("_")} - {"joint", *MEASURED}
-        if ours not in found and (own := next((stem for stem in stems if words & set(stem.split("_"))), "")):
-            likely[ours] = own
-    likely = likely or {"q": several[0], "torque": several[-1]}
-    names = ", ".join(f'{ours} = "{stem}"' for ours, stem in likely.items())
-    return f". State their names in the options, as in [recording] names = {{ {names} }}"
+    for series in ("q", "torque", "current"):
+        if series in names:
+            continue
+        series_words: set[str] = set()
+        for synonym in SYNONYMS[series]:
+            series_words.update(synonym.split("_"))
+        series_words -= {"joint", *MEASURED}
+        for stem in stems:
+            if series_words & set(stem.split("_")):
+                likely[series] = stem
+                break
+    if not likely:
+        repeated = [stem for stem in stems if stems.count(stem) > 1]
+        candidates = repeated or stems or ["..."]
+        likely = {"q": candidates[0], "torque": candidates[-1]}
+    example = ", ".join(f'{series} = "{stem}"' for series, stem in likely.items())
+    return f". State their names in the options, as in [recording] names = {{ {example} }}"
 
 
-def _two_torques(found: dict[str, str], options: RecordingOptions, members: tuple[str, ...], path: Path) -> list[str]:
-    """Add the motors' torque to `found` as the effort (the sensors' torque if only that is needed)."""
-    own = "tau_motor" if "tau_motor" in found else "tau_link"
-    if "tau_link" not in found or (options.motors and own == "tau_link"):
-        what = "two torques, of motors and of sensors" if options.motors else "torques of sensors"
-        message = f"rows '{options.rows}' need {what} behind the gear"
-        wanted_names = f"{', '.join(SYNONYMS['tau_motor'])}; {', '.join(SYNONYMS['tau_link'])}"
-        refuse_data(path, f"{message} ({wanted_names}); found: {', '.join(members)}")
-    found["torque"] = found[own]
-    if own == "tau_motor":
-        del found[own]
+def _two_torques(names: dict[str, str], options: RecordingOptions, members: tuple[str, ...], path: Path) -> list[str]:
+    """Add the motors' torque to `names` as the effort (the sensors' torque if only that is needed)."""
+    series = "tau_motor" if "tau_motor" in names else "tau_link"
+    if "tau_link" not in names or (options.motors and series == "tau_link"):
+        torques = "two torques, of motors and of sensors" if options.motors else "torques of sensors"
+        message = f"rows '{options.rows}' need {torques} behind the gear"
+        expected = f"{', '.join(SYNONYMS['tau_motor'])}; {', '.join(SYNONYMS['tau_link'])}"
+        refuse_data(path, f"{message} ({expected}); found: {', '.join(members)}")
+    names["torque"] = names[series]
+    if series == "tau_motor":
+        del names[series]
     return ["torque"]
 
 
@@ -245,8 +279,10 @@ def joint_order(names: list[str], joints: Joints | None, n: int, path: str | Pat
     if names and len(names) != n:
         refuse_data(path, f"joint_names has {len(names)} names for {n} columns")
     if joints is None or not names:
-        known = joints.names if joints is not None and len(joints.names) == n else names
-        return list(range(n)), named(known, n)
+        column_names: Sequence[str] = names
+        if joints is not None and len(joints.names) == n:
+            column_names = joints.names
+        return list(range(n)), named(column_names, n)
     missing = [name for name in joints.names if name not in names]
     if missing:
         message = f"has no joint '{missing[0]}'{suggestion(missing[0], names)}; found: {', '.join(names)}"

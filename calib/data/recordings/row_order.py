@@ -12,7 +12,8 @@ import numpy as np
 
 from calib.data.recordings.recording import Recording
 
-MAX_BACK = 5  # median steps by which a stamp may be earlier than one before it, to be put in order (our choice)
+# Median steps by which a stamp may be earlier than one before it, to be put in order (our choice).
+MAX_BACK = 5
 
 
 def in_order(recording: Recording) -> Recording:
@@ -26,11 +27,14 @@ def in_order(recording: Recording) -> Recording:
     if not 0.0 < back.max() <= MAX_BACK * _usual_step(t):
         return recording
     order = np.concatenate([part.start + np.argsort(t[part], kind="stable") for part in parts])
-    largest = f"{int((back > 0.0).sum())} stamps are up to {1e3 * back.max():.3g} ms earlier than one before them"
-    if _way(recording.q[order]) < _way(recording.q):
-        ordered, note = recording.take(order), f"{largest}: the rows are sorted by their stamps"
+    count = int((back > 0.0).sum())
+    remark = f"{count} stamps are up to {1e3 * back.max():.3g} ms earlier than one before them"
+    if _path_length(recording.q[order]) < _path_length(recording.q):
+        ordered = recording.take(order)
+        note = f"{remark}: the rows are sorted by their stamps"
     else:
-        ordered, note = replace(recording, t=t[order]), f"{largest}: the rows are in order, their stamps are sorted"
+        ordered = replace(recording, t=t[order])
+        note = f"{remark}: the rows are in order, their stamps are sorted"
     return replace(ordered, notes=(*recording.notes, note))
 
 
@@ -44,8 +48,9 @@ def _usual_step(t: np.ndarray) -> float:
     return float(np.median(np.abs(np.diff(t))))
 
 
-def _way(q: np.ndarray) -> float:
-    """Return the length of the way through positions (N, n), each joint's in units of its travel."""
+def _path_length(q: np.ndarray) -> float:
+    """Return the length of the path through positions (N, n), each joint's in units of its travel."""
     travel = np.ptp(q, axis=0)
     moves = travel > 0.0
-    return float((np.abs(np.diff(q[:, moves], axis=0)) / travel[moves]).sum())
+    steps = np.abs(np.diff(q[:, moves], axis=0))
+    return float((steps / travel[moves]).sum())

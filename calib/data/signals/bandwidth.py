@@ -16,9 +16,26 @@ from calib.data.signals.resampling import Resampled
 from calib.errors import refuse_data
 from calib.records import frozen
 
-SHARE = 0.95  # of the acceleration power that is the motion
-LOWEST = 2.0  # [Hz]; friction turns faster than slow trajectories do
-USABLE = 0.8  # of the Nyquist frequency
+# Share of the acceleration power that is the motion.
+SHARE = 0.95
+# Lowest f_dyn [Hz]; friction turns faster than slow trajectories do.
+LOWEST = 2.0
+# Largest f_dyn [Hz]; rigid industrial robots reach 10 to 20 (Gautier); above that, joints bend.
+MAX_CUTOFF = 20.0
+# Usable share of the Nyquist frequency.
+USABLE = 0.8
+# Length of the spectra's windows [s].
+WINDOW_LENGTH = 4.0
+# Share of the acceleration's rms from which on noise in it is too much.
+MAX_NOISE = 0.05
+# Joints slower than this share of the fastest one do not determine the bandwidth.
+MIN_SPEED_SHARE = 0.05
+# A joint this many times above the median of all is taken to vibrate.
+MAX_SPREAD = 3.0
+# A power that rises this far again above the motion is a resonance, not a gap between two lines.
+MIN_RISE = 30.0
+# A power that stands this far above the floor is seen.
+MIN_ABOVE_FLOOR = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,29 +71,35 @@ def propose_cutoffs(sampled: Resampled, dynamics: float | None = None) -> Cutoff
     Args:
         dynamics: f_dyn if known [Hz] (the bandwidth of the position loop); else estimated from the data.
     """
-    from scipy.signal import welch  # slow to load
+    # Slow to load.
+    from scipy.signal import welch
 
-    window_length = 4.0  # length of the spectra's windows [s]
     parts = segments(sampled.segment)
-    size = min(max(own.stop - own.start for own in parts), max(64, int(window_length * sampled.rate)))
-    long = [sampled.series["q"][own] for own in parts if own.stop - own.start >= size]
-    spectra = [welch(q, sampled.rate, "hann", size, size - size // 2, detrend="linear", axis=0) for q in long]
-    f, power = spectra[0][0], np.average([one for _, one in spectra], axis=0, weights=[len(q) for q in long])
+    longest = max(rows.stop - rows.start for rows in parts)
+    size = min(longest, max(64, int(WINDOW_LENGTH * sampled.rate)))
+    blocks = [sampled.series["q"][rows] for rows in parts if rows.stop - rows.start >= size]
+    spectra = []
+    for q in blocks:
+        f, spectrum = welch(q, sampled.rate, "hann", size, size - size // 2, detrend="linear", axis=0)
+        spectra.append(spectrum)
+    power = np.average(spectra, axis=0, weights=[len(q) for q in blocks])
     floor = np.median(power[int(0.6 * len(f)) : int(0.9 * len(f))], axis=0)
-    active = _active(np.concatenate([np.diff(q, axis=0) for q in long]))
-    read = [_joint_dynamics(f, power[:, j], floor[j]) if active[j] else (0.0, np.nan) for j in range(len(active))]
-    dynamics, reason = _choose(np.array([joint for joint, _ in read]), dynamics)
-    reasons = [reason]
-    reasons += [
-        f"joint {j + 1}: a peak at {peak:.3g} Hz (resonance, or noise of the loop) is ignored"
-        for j, (_, peak) in enumerate(read)
-        if np.isfinite(peak)
-    ]
-    position, why = _position_cutoff(f, power, floor, active, dynamics, sampled.rate)
+    active = _active(np.concatenate([np.diff(q, axis=0) for q in blocks]))
+
+    joint_dynamics = np.zeros(len(active))
+    peak_notes = []
+    for j in np.flatnonzero(active):
+        joint_dynamics[j], peak = _joint_dynamics(f, power[:, j], floor[j])
+        if np.isfinite(peak):
+            peak_notes.append(f"joint {j + 1}: a peak at {peak:.3g} Hz (resonance, or noise of the loop) is ignored")
+    dynamics, dynamics_reason = _choose(joint_dynamics, dynamics)
+    position, position_reason = _position_cutoff(f, power, floor, active, dynamics, sampled.rate)
     factor = factor_for(sampled.rate, min(2 * dynamics, USABLE * sampled.rate / 2))
     band = USABLE * sampled.rate / (2 * factor)
-    reasons += [why, f"f_p = {band:.3g} Hz (2 f_dyn, rounded to a whole decimation factor n_d = {factor})"]
-    return Cutoffs(dynamics, position, band, factor, frozen(np.sqrt(floor * sampled.rate / 2)), tuple(reasons))
+    band_reason = f"f_p = {band:.3g} Hz (2 f_dyn, rounded to a whole decimation factor n_d = {factor})"
+    noise = np.sqrt(floor * sampled.rate / 2)
+    reasons = (dynamics_reason, *peak_notes, position_reason, band_reason)
+    return Cutoffs(dynamics, position, band, factor, frozen(noise), reasons)
 
 
 def check_cutoff(cutoff: float, rate: float, file: str = "") -> None:
@@ -97,64 +120,60 @@ def _position_cutoff(
     White noise of density S_0 becomes an acceleration of variance (2π)⁴ S_0 f_q⁵/5.
     """
     band = f <= 2 * dynamics
-    signal = (f[:, None] ** 4 * np.maximum(power - floor, 0))[band].sum(axis=0) * (f[1] - f[0])
-    max_noise = 0.05  # of the acceleration's rms: noise in it that is too much
-    quiet = (5 * max_noise**2 * signal / np.maximum(floor, 1e-300)) ** 0.2
-    quiet = float(np.median(quiet[active])) if active.any() else np.inf
-    most = USABLE * rate / 2
-    if most <= min(5 * dynamics, quiet):
-        return most, f"f_q = {most:.3g} Hz, {USABLE:g} of the Nyquist frequency; 5 f_dyn would be {5 * dynamics:.3g} Hz"
+    density = (f[:, None] ** 4 * np.maximum(power - floor, 0))[band]
+    signal = density.sum(axis=0) * (f[1] - f[0])
+    quiet = np.inf
+    if active.any():
+        quiet_by_joint = (5 * MAX_NOISE**2 * signal / np.maximum(floor, 1e-300)) ** 0.2
+        quiet = float(np.median(quiet_by_joint[active]))
+    highest = USABLE * rate / 2
+    if highest <= min(5 * dynamics, quiet):
+        reason = f"{USABLE:g} of the Nyquist frequency; 5 f_dyn would be {5 * dynamics:.3g} Hz"
+        return highest, f"f_q = {highest:.3g} Hz, {reason}"
     if quiet >= 5 * dynamics:
         return 5 * dynamics, f"f_q = {5 * dynamics:.3g} Hz (5 f_dyn)"
-    lower = min(max(quiet, 2 * dynamics), most)
-    return (lower, f"f_q = {lower:.3g} Hz: at 5 f_dyn = {5 * dynamics:.3g} Hz noise exceeds 5 % of the acceleration")
+    lower = min(max(quiet, 2 * dynamics), highest)
+    reason = f"at 5 f_dyn = {5 * dynamics:.3g} Hz noise exceeds 5 % of the acceleration"
+    return lower, f"f_q = {lower:.3g} Hz: {reason}"
 
 
-def _active(steps: np.ndarray, min_speed_share: float = 0.05) -> np.ndarray:
-    """Return the mask (n,) of joints that move fast enough to determine the bandwidth, given their steps (N, n).
-
-    `min_speed_share`: slower joints, relative to the fastest one, are not used.
-    """
+def _active(steps: np.ndarray) -> np.ndarray:
+    """Return the mask (n,) of joints that move fast enough to determine the bandwidth, given their steps (N, n)."""
     speed = np.quantile(np.abs(steps), 0.95, axis=0)
-    return speed > min_speed_share * speed.max()
+    return speed > MIN_SPEED_SHARE * speed.max()
 
 
-def _choose(per_joint: np.ndarray, stated: float | None, max_cutoff: float = 20.0) -> tuple[float, str]:
-    """Return f_dyn of the robot [Hz] and the reason.
-
-    `max_cutoff`: [Hz]; rigid industrial robots reach 10 to 20 (Gautier); above that, joints bend.
-    """
-    if stated is not None:
-        return stated, f"f_dyn = {stated:.3g} Hz as stated"
+def _choose(per_joint: np.ndarray, dynamics: float | None) -> tuple[float, str]:
+    """Return f_dyn of the robot [Hz] and the reason: the one in the options, else by those of the joints (n,)."""
+    if dynamics is not None:
+        return dynamics, f"f_dyn = {dynamics:.3g} Hz as stated"
     fastest = int(np.argmax(per_joint))
-    top, middle = float(per_joint[fastest]), float(np.median(per_joint[per_joint > 0])) if per_joint.any() else 0.0
-    max_spread = 3.0  # a joint this many times above the median of all is taken to vibrate
-    found = min(top, max_spread * middle)
-    if found < LOWEST:
-        where = f"ends at {found:.2g} Hz" if found else "hardly exceeds the noise"
-        return LOWEST, f"f_dyn = {LOWEST:g} Hz: the motion {where}; friction is faster"
-    if found > max_cutoff:
-        why = f"joint {fastest + 1} moves at {top:.3g} Hz, where no robot is rigid"
-        return max_cutoff, f"f_dyn = {max_cutoff:g} Hz: {why}"
-    if found < top:
-        why = f"{max_spread:g} times the median: joint {fastest + 1}'s {top:.3g} Hz is an outlier"
-        return found, f"f_dyn = {found:.3g} Hz, {why}"
-    return found, f"f_dyn = {found:.3g} Hz: 95 % of the acceleration power of joint {fastest + 1} lies below"
+    top = float(per_joint[fastest])
+    middle = 0.0
+    if per_joint.any():
+        middle = float(np.median(per_joint[per_joint > 0]))
+    frequency = min(top, MAX_SPREAD * middle)
+    if frequency < LOWEST:
+        extent = f"ends at {frequency:.2g} Hz" if frequency else "hardly exceeds the noise"
+        return LOWEST, f"f_dyn = {LOWEST:g} Hz: the motion {extent}; friction is faster"
+    if frequency > MAX_CUTOFF:
+        reason = f"joint {fastest + 1} moves at {top:.3g} Hz, where no robot is rigid"
+        return MAX_CUTOFF, f"f_dyn = {MAX_CUTOFF:g} Hz: {reason}"
+    if frequency < top:
+        reason = f"{MAX_SPREAD:g} times the median: joint {fastest + 1}'s {top:.3g} Hz is an outlier"
+        return frequency, f"f_dyn = {frequency:.3g} Hz, {reason}"
+    return frequency, f"f_dyn = {frequency:.3g} Hz: 95 % of the acceleration power of joint {fastest + 1} lies below"
 
 
-def _joint_dynamics(f: np.ndarray, power: np.ndarray, floor: float, min_rise: float = 30.0) -> tuple[float, float]:
-    """Return the highest frequency of one joint's motion, and that of a resonance above it or NaN [Hz].
-
-    `min_rise`: a power that rises this far again above the motion is a resonance, not a gap between two lines.
-    """
+def _joint_dynamics(f: np.ndarray, power: np.ndarray, floor: float) -> tuple[float, float]:
+    """Return the highest frequency of one joint's motion, and that of a resonance above it or NaN [Hz]."""
     smooth = uniform_filter1d(power, 5, mode="nearest")
-    min_above_floor = 10.0  # a power that stands this far above the floor is seen
-    peak = int(np.argmax(f**2 * np.maximum(smooth - min_above_floor * floor, 0)))
-    sunk = smooth[peak:] < min_above_floor * floor
+    peak = int(np.argmax(f**2 * np.maximum(smooth - MIN_ABOVE_FLOOR * floor, 0)))
+    sunk = smooth[peak:] < MIN_ABOVE_FLOOR * floor
     top = peak + (int(np.argmax(sunk)) if sunk.any() else len(sunk) - 1)
     acceleration = f**4 * smooth
     lowest = np.minimum.accumulate(acceleration[peak : top + 1])
-    risen = acceleration[peak : top + 1] > min_rise * lowest
+    risen = acceleration[peak : top + 1] > MIN_RISE * lowest
     resonance = np.nan
     if risen.any():
         first = peak + int(np.argmax(risen))

@@ -19,8 +19,22 @@ from calib.errors import MeasurementError, require
 from calib.records import frozen
 
 KINDS = ("chebyshev", "kaiser")
-SHARE = 0.8  # of the new Nyquist frequency that is kept
-KAISER = 0.1102 * (60.0 - 8.7)  # beta of a window whose stop band is 60 dB down (Kaiser 1974)
+# Share of the new Nyquist frequency that is kept.
+SHARE = 0.8
+# Beta of a window whose stop band is 60 dB down (Kaiser 1974).
+KAISER = 0.1102 * (60.0 - 8.7)
+# Of one pass of the Chebyshev filter: its order and ripple [dB], and the share of its impulse response that is cut.
+CHEBYSHEV_ORDER = 8
+RIPPLE = 0.05
+CUT_SHARE = 1e-4
+# Order of the Butterworth filter, run forwards and backwards (Gautier's choice; the studies' too).
+ORDER = 4
+# Samples at a time: they stay in the processor's cache.
+CHUNK = 4096
+# Central differences of half-width w are exact for polynomials of degree 2w: coefficients of x(k+i) - x(k-i) for the
+# slope, of x(k+i) + x(k-i) - 2 x(k) for the curvature (Fornberg 1988, table 1).
+SLOPE = {1: (1 / 2,), 2: (2 / 3, -1 / 12), 3: (3 / 4, -3 / 20, 1 / 60), 4: (4 / 5, -1 / 5, 4 / 105, -1 / 280)}
+CURVATURE = {1: (1.0,), 2: (4 / 3, -1 / 12), 3: (3 / 2, -3 / 20, 1 / 90), 4: (8 / 5, -1 / 5, 8 / 315, -1 / 560)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,12 +70,12 @@ def design_decimator(rate: float, factor: int, kind: str = "kaiser") -> Decimato
     Raises:
         CalibError: for a factor below 1 or a kind that is none.
     """
-    words = f"decimation by {factor} with a '{kind}' filter: expected at least 1, and {' or '.join(KINDS)}"
-    require(factor >= 1 and kind in KINDS, words)
+    message = f"decimation by {factor} with a '{kind}' filter: expected at least 1, and {' or '.join(KINDS)}"
+    require(factor >= 1 and kind in KINDS, message)
     band = SHARE * rate / (2 * factor)
     if factor == 1:
         return Decimator(1, frozen([1.0]), rate, band)
-    taps = np.asarray(_chebyshev(factor) if kind == "chebyshev" else _kaiser(factor), dtype=float)
+    taps = _chebyshev(factor) if kind == "chebyshev" else _kaiser(factor)
     return Decimator(factor, frozen(taps / taps.sum()), rate, band)
 
 
@@ -72,8 +86,9 @@ def factor_for(rate: float, band: float) -> int:
 
 def kept(segment: np.ndarray, decimator: Decimator) -> np.ndarray:
     """Return the indices (M,) of the samples that `decimate` keeps, given rising segment numbers (N,)."""
-    h, r = decimator.reach, decimator.factor
-    return np.concatenate([np.arange(own.start + h, own.stop - h, r) for own in segments(segment)])
+    reach, factor = decimator.reach, decimator.factor
+    parts = [np.arange(rows.start + reach, rows.stop - reach, factor) for rows in segments(segment)]
+    return np.concatenate(parts)
 
 
 def segments(segment: np.ndarray) -> list[slice]:
@@ -84,16 +99,18 @@ def segments(segment: np.ndarray) -> list[slice]:
 
 def longest(segment: np.ndarray) -> slice:
     """Return the slice of the longest segment, given rising segment numbers (N,)."""
-    return max(segments(segment), key=lambda own: own.stop - own.start)
+    return max(segments(segment), key=lambda rows: rows.stop - rows.start)
 
 
 def decimate(values: np.ndarray, decimator: Decimator, segment: np.ndarray | None = None) -> np.ndarray:
     """Return `values` (N, ...) filtered and decimated to the samples `kept` (M, ...), segment by segment."""
     values = np.asarray(values, dtype=float)
-    segment = np.zeros(len(values), dtype=int) if segment is None else segment
+    if segment is None:
+        segment = np.zeros(len(values), dtype=int)
     parts = [np.empty((0, *values.shape[1:]))]
-    for own in segments(segment):
-        parts += [np.moveaxis(part, -1, 0) for part in decimate_blocks([np.moveaxis(values[own], 0, -1)], decimator)]
+    for rows in segments(segment):
+        block = np.moveaxis(values[rows], 0, -1)
+        parts += [np.moveaxis(part, -1, 0) for part in decimate_blocks([block], decimator)]
     return np.concatenate(parts)
 
 
@@ -108,9 +125,10 @@ def spread(values: np.ndarray, decimator: Decimator, length: int) -> np.ndarray:
     weights = np.zeros(phases * r)
     weights[: len(taps)] = taps
     result = np.zeros((count + phases, r, *values.shape[1:]))
-    shape = (1, r, *(1 for _ in values.shape[1:]))
+    shape = (1, r) + (1,) * (values.ndim - 1)
     for phase in range(phases):
-        result[phase : phase + count] += weights[phase * r : (phase + 1) * r].reshape(shape) * values[:, None]
+        phase_weights = weights[phase * r : (phase + 1) * r].reshape(shape)
+        result[phase : phase + count] += phase_weights * values[:, None]
     return result.reshape(-1, *values.shape[1:])[:length]
 
 
@@ -123,12 +141,16 @@ def decimate_blocks(blocks: Iterable[np.ndarray], decimator: Decimator) -> Itera
     if r == 1 and len(taps) == 1:
         yield from blocks
         return
-    rest = None
+    pending = None
     for block in blocks:
-        rest = block if rest is None or not rest.shape[-1] else np.concatenate([rest, block], axis=-1)
-        if (count := (rest.shape[-1] - len(taps)) // r + 1) > 0:
-            yield _windows(rest, taps, r, count)
-            rest = rest[..., count * r :]
+        if pending is None or not pending.shape[-1]:
+            pending = block
+        else:
+            pending = np.concatenate([pending, block], axis=-1)
+        count = (pending.shape[-1] - len(taps)) // r + 1
+        if count > 0:
+            yield _windows(pending, taps, r, count)
+            pending = pending[..., count * r :]
 
 
 def _windows(values: np.ndarray, taps: np.ndarray, r: int, count: int) -> np.ndarray:
@@ -151,38 +173,30 @@ def _windows(values: np.ndarray, taps: np.ndarray, r: int, count: int) -> np.nda
 
 
 def _kaiser(factor: int) -> np.ndarray:
-    place = np.arange(18 * factor + 1) - 9 * factor
-    return np.sinc(place / factor) * np.kaiser(len(place), KAISER)
+    sample = np.arange(18 * factor + 1) - 9 * factor
+    return np.sinc(sample / factor) * np.kaiser(len(sample), KAISER)
 
 
-def _chebyshev(factor: int, ripple: float = 0.05) -> np.ndarray:
-    # ripple: of one pass of the Chebyshev filter [dB]
-    from scipy.signal import cheby1, sosfreqz  # slow to load
+def _chebyshev(factor: int) -> np.ndarray:
+    # Slow to load.
+    from scipy.signal import cheby1, sosfreqz
 
-    sos = cheby1(8, ripple, SHARE / factor, output="sos")
+    sos = cheby1(CHEBYSHEV_ORDER, RIPPLE, SHARE / factor, output="sos")
     size = 1 << int(np.ceil(np.log2(400 * factor)))
     _, response = sosfreqz(sos, np.linspace(0, np.pi, size // 2 + 1))
-    even = np.fft.irfft(np.abs(response) ** 2, size)
-    half = even[: size // 2]
-    left = np.cumsum(np.abs(half)[::-1])[::-1]
-    reach = int(np.argmax(left < 1e-4 * np.abs(half).sum()))
+    impulse_response = np.fft.irfft(np.abs(response) ** 2, size)
+    half = impulse_response[: size // 2]
+    remaining = np.cumsum(np.abs(half)[::-1])[::-1]
+    reach = int(np.argmax(remaining < CUT_SHARE * np.abs(half).sum()))
     return np.concatenate([half[reach:0:-1], half[: reach + 1]])
 
 
 def too_short(motion_length: int, decimator: Decimator) -> MeasurementError:
     """Return the error about a motion that is shorter than the filter's window."""
-    need = len(decimator.taps) / decimator.rate
-    message = (
-        f"decimation by {decimator.factor} needs {need:.3g} s without a gap, found {motion_length / decimator.rate:.3g}"
-    )
-    return MeasurementError(message + " s: raise the band, or record longer")
-
-
-ORDER = 4  # of the Butterworth filter, run forwards and backwards (Gautier's choice; the studies' too)
-# Central differences of half-width w are exact for polynomials of degree 2w: coefficients of x(k+i) - x(k-i) for the
-# slope, of x(k+i) + x(k-i) - 2 x(k) for the curvature (Fornberg 1988, table 1)
-SLOPE = {1: (1 / 2,), 2: (2 / 3, -1 / 12), 3: (3 / 4, -3 / 20, 1 / 60), 4: (4 / 5, -1 / 5, 4 / 105, -1 / 280)}
-CURVATURE = {1: (1.0,), 2: (4 / 3, -1 / 12), 3: (3 / 2, -3 / 20, 1 / 90), 4: (8 / 5, -1 / 5, 8 / 315, -1 / 560)}
+    needed = len(decimator.taps) / decimator.rate
+    duration = motion_length / decimator.rate
+    message = f"decimation by {decimator.factor} needs {needed:.3g} s without a gap, found {duration:.3g} s"
+    return MeasurementError(f"{message}: raise the band, or record longer")
 
 
 def low_pass(values: np.ndarray, rate: float, cutoff: float, order: int = ORDER) -> np.ndarray:
@@ -201,10 +215,12 @@ def low_pass(values: np.ndarray, rate: float, cutoff: float, order: int = ORDER)
     if not 0 < cutoff < rate / 2:
         message = f"a cut-off of {cutoff:g} Hz is not between 0 and the Nyquist frequency {rate / 2:g} Hz: lower it"
         raise MeasurementError(message + " below 0.8 of that, or sample faster")
-    from scipy.signal import butter, sosfiltfilt  # slow to load
+    # Slow to load.
+    from scipy.signal import butter, sosfiltfilt
 
+    sos = butter(order, 2.0 * cutoff / rate, output="sos")
     pad = min(len(values) - 1, int(3 * rate / cutoff) + 1)
-    return sosfiltfilt(butter(order, 2.0 * cutoff / rate, output="sos"), values, axis=0, padlen=pad)
+    return sosfiltfilt(sos, values, axis=0, padlen=pad)
 
 
 def border(rate: float, cutoff: float) -> int:
@@ -232,16 +248,16 @@ def curvature(values: np.ndarray, rate: float, width: int = 4) -> np.ndarray:
 
 def _differences(values: np.ndarray, coefficients: tuple[float, ...], scale: float, sign: float) -> np.ndarray:
     width, n = len(coefficients), len(values)
-    out = np.full_like(values, np.nan, dtype=float)
-    chunk = 4096  # samples at a time: they stay in the processor's cache
-    for start in range(width, n - width, chunk):
-        stop = min(start + chunk, n - width)
-        inner, middle = out[start:stop], values[start:stop]
-        inner[:] = 0.0
+    result = np.full_like(values, np.nan, dtype=float)
+    for start in range(width, n - width, CHUNK):
+        stop = min(start + CHUNK, n - width)
+        derivative, middle = result[start:stop], values[start:stop]
+        derivative[:] = 0.0
         for i, c in enumerate(coefficients, start=1):
-            ahead, behind = values[start + i : stop + i], values[start - i : stop - i]
+            ahead = values[start + i : stop + i]
+            behind = values[start - i : stop - i]
             if sign < 0:
-                inner += (scale * c) * (ahead - behind)
+                derivative += (scale * c) * (ahead - behind)
             else:
-                inner += (scale * c) * ((ahead - middle) - (middle - behind))
-    return out
+                derivative += (scale * c) * ((ahead - middle) - (middle - behind))
+    return result

@@ -7,9 +7,8 @@ recorded (on the even grid): the parallel decimation filters them, and every col
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -29,10 +28,33 @@ from calib.errors import MeasurementError, UsageError, refuse_data, refused_as, 
 from calib.files import check_regular
 from calib.records import frozen, read_only
 
-# of a joint's peak speed: below it stands, for friction (the TX40's own thresholds are this share)
+# Share of a joint's peak speed below which it stands, for friction (the TX40's own thresholds are this share).
 STANDSTILL_SHARE = 0.01
-FASTER = 5.0  # f_v of f_q at most (our choice)
-CREEP = 1e-3  # no joint moves below this [rad/s or m/s]
+# Largest ratio of f_v to f_q (our choice).
+MAX_CUTOFF_RATIO = 5.0
+# No joint moves below this speed [rad/s or m/s].
+CREEP = 1e-3
+# Share of the accelerations' rms that noise may have at the velocities' cut-off (our choice).
+MAX_NOISE = 0.1
+# Least number of samples of a reference.
+MIN_REFERENCE_SAMPLES = 10
+
+# Fields of a motion with one entry per sample.
+ROWS = (
+    "t",
+    "q",
+    "v",
+    "a",
+    "effort",
+    "weight",
+    "segment",
+    "tau_link",
+    "tau_motor",
+    "q_link",
+    "q_ref",
+    "tau_ff",
+    "v_measured",
+)
 
 
 @strict
@@ -135,12 +157,17 @@ class Motion:
 
     def part(self, rows: slice) -> "Motion":
         """Return the motion of a slice of its samples."""
-        return replace(self, **{name: value[rows] for name in ROWS if (value := getattr(self, name)) is not None})
+        series: dict[str, Any] = {}
+        for name in ROWS:
+            values = getattr(self, name)
+            if values is not None:
+                series[name] = values[rows]
+        return replace(self, **series)
 
     def in_band(self, values: np.ndarray) -> np.ndarray:
         """Return `values` (N, ...) low-passed to the identification band, at the full rate, segment by segment."""
         cutoff = min(self.band, USABLE * self.rate / 2)
-        parts = [filtering.low_pass(values[own], self.rate, cutoff) for own in filtering.segments(self.segment)]
+        parts = [filtering.low_pass(values[rows], self.rate, cutoff) for rows in filtering.segments(self.segment)]
         return np.concatenate(parts)
 
     def standstill(self, slow: float | Sequence[float] = STANDSTILL_SHARE) -> np.ndarray:
@@ -154,25 +181,8 @@ class Motion:
 
         σ_v² = σ_q² (2/f_s) ∫ (2πf)² |H(f)|⁴ df with |H|² of the two passes, about σ_q² (2/f_s) (2π)² f_q³/3.
         """
-        at = self.velocity_cutoff if cutoff is None else cutoff
-        return self.cutoffs.noise * 2 * np.pi * np.sqrt(2 * at**3 / (3 * self.rate))
-
-
-ROWS = (
-    "t",
-    "q",
-    "v",
-    "a",
-    "effort",
-    "weight",
-    "segment",
-    "tau_link",
-    "tau_motor",
-    "q_link",
-    "q_ref",
-    "tau_ff",
-    "v_measured",
-)
+        velocity_cutoff = self.velocity_cutoff if cutoff is None else cutoff
+        return self.cutoffs.noise * 2 * np.pi * np.sqrt(2 * velocity_cutoff**3 / (3 * self.rate))
 
 
 def make_motion(
@@ -192,35 +202,53 @@ def make_motion(
         UsageError: for a list of cut-offs of another length than the joints.
     """
     options = options or FilterOptions()
-    sampled = resample(recording, options.clock, options.gap) if sampled is None else sampled
-    cutoffs = propose_cutoffs(sampled, options.dynamics) if cutoffs is None else cutoffs
+    if sampled is None:
+        sampled = resample(recording, options.clock, options.gap)
+    if cutoffs is None:
+        cutoffs = propose_cutoffs(sampled, options.dynamics)
     cutoff = _per_joint(cutoffs.position if options.cutoff is None else options.cutoff, recording)
-    faster = None if options.velocity_cutoff is None else _per_joint(options.velocity_cutoff, recording)
-    for value in (*cutoff, *(() if faster is None else faster)):
-        check_cutoff(float(value), sampled.rate, recording.file)
+    _check_cutoffs(cutoff, sampled.rate, recording.file)
+    velocity_cutoff = None
+    if options.velocity_cutoff is not None:
+        velocity_cutoff = _per_joint(options.velocity_cutoff, recording)
+        _check_cutoffs(velocity_cutoff, sampled.rate, recording.file)
     decimator = _decimator(cutoffs, options, sampled, recording.file)
-    q, mask = _smooth(sampled, cutoff, options.order), _inside(sampled, cutoff, options, recording.file)
+
+    q = _smooth(sampled, cutoff, options.order)
+    mask = _unaffected(sampled, cutoff, options, recording.file)
     a = _differences(filtering.curvature, q, sampled, options.width)
-    if faster is None:
-        faster = cutoff if options.cutoff is not None else _velocity_cutoff(cutoffs, cutoff, a[mask], sampled.rate)
-    less = q if np.array_equal(faster, cutoff) else _smooth(sampled, faster, options.order)
-    v = _differences(filtering.slope, less, sampled, options.width)
-    while options.band is None and decimator.factor > 1 and not len(filtering.kept(sampled.segment[mask], decimator)):
-        # whose window fits
+    if velocity_cutoff is None:
+        velocity_cutoff = cutoff
+        if options.cutoff is None:
+            velocity_cutoff = _velocity_cutoff(cutoffs, cutoff, a[mask], sampled.rate)
+    q_for_velocity = q
+    if not np.array_equal(velocity_cutoff, cutoff):
+        q_for_velocity = _smooth(sampled, velocity_cutoff, options.order)
+    v = _differences(filtering.slope, q_for_velocity, sampled, options.width)
+
+    # Unless the band is stated, a filter is taken whose window fits.
+    segment = sampled.segment[mask]
+    while options.band is None and decimator.factor > 1 and not len(filtering.kept(segment, decimator)):
         decimator = filtering.design_decimator(sampled.rate, decimator.factor // 2, options.decimator)
-    if not len(filtering.kept(sampled.segment[mask], decimator)):
+    if not len(filtering.kept(segment, decimator)):
         raise filtering.too_short(int(mask.sum()), decimator)
-    inside = _span(mask)
-    others = {name: read_only(value[inside]) for name, value in sampled.series.items() if name not in ("q", "v")}
-    v_measured = read_only(sampled.series["v"][inside]) if "v" in sampled.series else None
+
+    rows = _span(mask)
+    series: dict[str, np.ndarray] = {}
+    for name, values in sampled.series.items():
+        if name != "q":
+            series["v_measured" if name == "v" else name] = read_only(values[rows])
     return Motion(
-        *(read_only(values[inside]) for values in (sampled.t, q, v, a)),
-        weight=read_only(sampled.weight[inside]),
-        segment=frozen(sampled.segment[inside], int),
+        t=read_only(sampled.t[rows]),
+        q=read_only(q[rows]),
+        v=read_only(v[rows]),
+        a=read_only(a[rows]),
+        weight=read_only(sampled.weight[rows]),
+        segment=frozen(sampled.segment[rows], int),
         rate=sampled.rate,
         band=decimator.band,
         cutoff=frozen(cutoff),
-        velocity_cutoff=frozen(faster),
+        velocity_cutoff=frozen(velocity_cutoff),
         decimator=decimator,
         kind=recording.kind,
         joint_names=recording.joint_names,
@@ -230,11 +258,15 @@ def make_motion(
         notes=(*recording.notes, *sampled.report.lines(), *_reasons(cutoffs, options)),
         drive_gain=recording.drive_gain,
         effort_variance=recording.effort_variance,
-        v_measured=v_measured,
         jumps=recording.jumps,
         faults=recording.faults,
-        **others,
+        **series,
     )
+
+
+def _check_cutoffs(cutoffs: np.ndarray, rate: float, file: str) -> None:
+    for cutoff in cutoffs:
+        check_cutoff(float(cutoff), rate, file)
 
 
 def with_reference(motion: Motion, path: Path, joints: Joints, options: RecordingOptions) -> Motion:
@@ -248,11 +280,14 @@ def with_reference(motion: Motion, path: Path, joints: Joints, options: Recordin
     with refused_as(MeasurementError, OSError, "cannot be read: {}", path):
         check_regular(path)
         with open(path, "rb") as file:
-            read = read_archived_positions if file.read(2) == b"PK" else read_positions
-    t, q = read(path, joints, options)
+            is_archive = file.read(2) == b"PK"
+    if is_archive:
+        t, q = read_archived_positions(path, joints, options)
+    else:
+        t, q = read_positions(path, joints, options)
     if q.shape[1:] != (motion.n,):
         refuse_data(path, f"has {q.shape[1]} joints, the recording has {motion.n}")
-    if len(t) < 10 or not np.isfinite(q).all() or not (np.diff(t) > 0.0).all():
+    if len(t) < MIN_REFERENCE_SAMPLES or not np.isfinite(q).all() or not (np.diff(t) > 0.0).all():
         refuse_data(path, "a reference needs ten samples or more, finite numbers and increasing stamps")
     slack = 1.5 * float(np.median(np.diff(t)))
     if motion.t[0] < t[0] - slack or motion.t[-1] > t[-1] + slack:
@@ -261,7 +296,8 @@ def with_reference(motion: Motion, path: Path, joints: Joints, options: Recordin
             f"used from {motion.t[0]:.6g} s to {motion.t[-1]:.6g} s: times count from each file's first sample"
         )
         refuse_data(path, message)
-    return replace(motion, q_ref=frozen(CubicSpline(t, q)(np.clip(motion.t, t[0], t[-1]))))
+    q_ref = CubicSpline(t, q)(np.clip(motion.t, t[0], t[-1]))
+    return replace(motion, q_ref=frozen(q_ref))
 
 
 def moving(motion: Motion, slow: float | Sequence[float] = STANDSTILL_SHARE) -> np.ndarray:
@@ -273,47 +309,58 @@ def moving(motion: Motion, slow: float | Sequence[float] = STANDSTILL_SHARE) -> 
 
 
 def _velocity_cutoff(cutoffs: Cutoffs, cutoff: np.ndarray, a: np.ndarray, rate: float) -> np.ndarray:
-    """Return f_v (n,) [Hz], at which noise reaches `max_noise` of the accelerations (N, n); between f_q and 5 f_q."""
-    share = cutoffs.acceleration_noise(cutoff, rate) / np.maximum(np.sqrt(np.mean(a**2, axis=0)), 1e-12)
-    # noise in the accelerations that velocities of the same cut-off can bear, of their rms (our choice)
-    max_noise = 0.1
-    wider = (max_noise / np.maximum(share, 1e-12)) ** 0.4  # the noise grows with f_q^2.5
-    return np.maximum(np.minimum(cutoff * np.clip(wider, 1.0, FASTER), 0.5 * USABLE * rate), cutoff)
+    """Return f_v (n,) [Hz], at which noise reaches `MAX_NOISE` of the accelerations (N, n); between f_q and 5 f_q."""
+    rms = np.sqrt(np.mean(a**2, axis=0))
+    noise_share = cutoffs.acceleration_noise(cutoff, rate) / np.maximum(rms, 1e-12)
+    # The noise grows with f_q^2.5.
+    ratio = (MAX_NOISE / np.maximum(noise_share, 1e-12)) ** 0.4
+    velocity_cutoff = cutoff * np.clip(ratio, 1.0, MAX_CUTOFF_RATIO)
+    return np.maximum(np.minimum(velocity_cutoff, 0.5 * USABLE * rate), cutoff)
 
 
 def _smooth(sampled: Resampled, cutoff: np.ndarray, order: int) -> np.ndarray:
     """Return the positions (N, n) low-passed at each joint's cut-off (n,) [Hz], segment by segment."""
-    result = np.array(sampled.series["q"], order="F")  # by joints, as all that follows reads them
-    for own, (j, f) in product(filtering.segments(sampled.segment), enumerate(cutoff)):
-        result[own, j] = filtering.low_pass(result[own, j], sampled.rate, float(f), order)
+    # By joints, as all that follows reads them.
+    result = np.array(sampled.series["q"], order="F")
+    for rows in filtering.segments(sampled.segment):
+        for j, f in enumerate(cutoff):
+            result[rows, j] = filtering.low_pass(result[rows, j], sampled.rate, float(f), order)
     return result
 
 
 def _differences(
-    of: Callable[[np.ndarray, float, int], np.ndarray], q: np.ndarray, sampled: Resampled, width: int
+    derivative: Callable[[np.ndarray, float, int], np.ndarray], q: np.ndarray, sampled: Resampled, width: int
 ) -> np.ndarray:
     """Return first or second derivatives (N, n) of q (N, n), segment by segment."""
-    return np.concatenate([of(q[own], sampled.rate, width) for own in filtering.segments(sampled.segment)])
+    parts = [derivative(q[rows], sampled.rate, width) for rows in filtering.segments(sampled.segment)]
+    return np.concatenate(parts)
 
 
-def _inside(sampled: Resampled, cutoff: np.ndarray, options: FilterOptions, file: str) -> np.ndarray:
+def _unaffected(sampled: Resampled, cutoff: np.ndarray, options: FilterOptions, file: str) -> np.ndarray:
     """Return the mask (N,) of samples that the filters' ends do not affect; refuse a motion without such samples."""
-    inside = np.zeros(len(sampled.t), dtype=bool)
-    edge = filtering.border(sampled.rate, float(cutoff.min()))
-    edge = edge if options.borders is None else int(np.ceil(options.borders * sampled.rate))
-    edge = max(edge, options.width)
-    for own in filtering.segments(sampled.segment):
-        inside[own.start + edge : max(own.start + edge, own.stop - edge)] = True
-    if not inside.any():
-        why = "the filters' ends" if options.borders is None else f"borders = {options.borders:g}"
-        message = f"no part without a gap is longer than {2 * edge / sampled.rate:.3g} s, the part removed by {why}"
+    if options.borders is None:
+        border = filtering.border(sampled.rate, float(cutoff.min()))
+        reason = "the filters' ends"
+    else:
+        border = int(np.ceil(options.borders * sampled.rate))
+        reason = f"borders = {options.borders:g}"
+    border = max(border, options.width)
+    mask = np.zeros(len(sampled.t), dtype=bool)
+    for rows in filtering.segments(sampled.segment):
+        first = rows.start + border
+        mask[first : max(first, rows.stop - border)] = True
+    if not mask.any():
+        message = (
+            f"no part without a gap is longer than {2 * border / sampled.rate:.3g} s, the part removed by {reason}"
+        )
         refuse_data(file, f"{message}: record longer, or lower the borders")
-    return inside
+    return mask
 
 
 def _span(mask: np.ndarray) -> np.ndarray | slice:
     """Return a mask (N,), or a slice if its samples are contiguous (slices copy nothing)."""
-    first, stop = int(np.argmax(mask)), len(mask) - int(np.argmax(mask[::-1]))
+    first = int(np.argmax(mask))
+    stop = len(mask) - int(np.argmax(mask[::-1]))
     return slice(first, stop) if mask[first:stop].all() else mask
 
 
@@ -321,9 +368,10 @@ def _decimator(cutoffs: Cutoffs, options: FilterOptions, sampled: Resampled, fil
     rate = sampled.rate
     if options.band is None:
         return filtering.design_decimator(rate, cutoffs.factor, options.decimator)
-    words = f"an identification band of {options.band:g} Hz is not below the Nyquist frequency {rate / 2:g} Hz"
-    require(options.band < rate / 2, words, MeasurementError, file)
-    if (factor := filtering.factor_for(rate, options.band)) > len(sampled.t):
+    message = f"an identification band of {options.band:g} Hz is not below the Nyquist frequency {rate / 2:g} Hz"
+    require(options.band < rate / 2, message, MeasurementError, file)
+    factor = filtering.factor_for(rate, options.band)
+    if factor > len(sampled.t):
         message = f"a band of {options.band:g} Hz keeps one of {factor} samples; there are only {len(sampled.t)}"
         refuse_data(file, f"{message}: raise the band, or leave it out")
     return filtering.design_decimator(rate, factor, options.decimator)
@@ -338,9 +386,12 @@ def _per_joint(cutoff: float | tuple[float, ...], recording: Recording) -> np.nd
 
 def _reasons(cutoffs: Cutoffs, options: FilterOptions) -> tuple[str, ...]:
     """Return sentences on where the cut-offs come from."""
-    stated = {name: value for name in ("cutoff", "band") if (value := getattr(options, name)) is not None}
-    lines = [
-        f"{name} = {' '.join(f'{one:.4g}' for one in np.atleast_1d(value))} Hz, stated, or that of the training motion"
-        for name, value in stated.items()
-    ]
-    return (*lines, *cutoffs.reasons) if len(stated) < 2 else tuple(lines)
+    lines = []
+    for name, option in (("cutoff", options.cutoff), ("band", options.band)):
+        if option is not None:
+            frequencies = " ".join(f"{frequency:.4g}" for frequency in np.atleast_1d(option))
+            lines.append(f"{name} = {frequencies} Hz, stated, or that of the training motion")
+    # Both are stated: none was chosen from the data.
+    if len(lines) == 2:
+        return tuple(lines)
+    return (*lines, *cutoffs.reasons)

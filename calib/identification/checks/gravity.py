@@ -28,20 +28,37 @@ from calib.identification.checks.recording_sizes import common_factor
 from calib.identification.prior import rods
 from calib.robot.chain import Chain
 
-STANDARD_GRAVITY = 9.81  # [m/s²], where the stated one is zero
+STANDARD_GRAVITY = 9.81
+"""Gravity where the stated one is zero [m/s²]."""
+MAX_LEFT = 0.8
+"""Residual with another hypothesis over that with gravity as stated, from which on it is reported.
+
+0.95 and more on the real recordings at hand (our choice).
+"""
+MAX_WORSE = 1.02
+"""The same for joints whose torques lack what is expected: no worse."""
+MIN_ANGLE = np.radians(10.0)
+"""Angle between both directions: a robot on a floor that slopes by less is not mounted otherwise [rad]."""
+RIVAL = 1.1
+"""Residual with the opposite direction over the best one's, up to which both explain the torques."""
+MAX_FACTOR = 0.15
+"""Gravity torque over the expected, with 2 sigmas, up to which a joint's torque holds none."""
+MIN_SHARE = 0.2
+"""Expected gravity torque in units of the largest joint's, from which something is said of a joint."""
+MIN_CORRELATED = 0.1
+"""Share of a joint's expected gravity torque that motion and friction do not explain as well, at least."""
+MIN_SIGMAS = 5.0
+"""Sigmas of the inertias' size relative to rods, from which on it is known."""
+MASSES = [6, 7, 8, 9]
+"""Standard parameters of a body that gravity acts on."""
+ROUNDS = 4
+"""Rounds of weighing joints by their residuals."""
+DIRECTIONS = 60
+"""Directions of a half sphere that are tried first: some 20 degrees apart."""
+
+
 # residual with another hypothesis over that with gravity as stated, from which on it is reported; 0.95 and more on the
 # real recordings at hand (our choice)
-MAX_LEFT = 0.8
-MAX_WORSE = 1.02  # the same for joints whose torques lack what is expected: no worse
-MIN_ANGLE = np.radians(10.0)  # between both directions: a robot on a floor that slopes by less is not mounted otherwise
-RIVAL = 1.1  # residual with the opposite direction over the best one's, up to which both explain the torques
-MAX_FACTOR = 0.15  # gravity torque over the expected, with 2 sigmas, up to which a joint's torque holds none
-MIN_SHARE = 0.2  # of the largest joint's expected gravity torque, below which nothing is said of a joint
-MIN_CORRELATED = 0.1  # of a joint's expected gravity torque that motion and friction do not explain as well
-MIN_SIGMAS = 5.0  # of the inertias' size relative to rods, from which on it is known
-MASSES = [6, 7, 8, 9]  # of a body's standard parameters, those that gravity acts on
-ROUNDS = 4  # of weighing joints by their residuals
-DIRECTIONS = 60  # of a half sphere that are tried first: some 20 degrees apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,56 +106,73 @@ def gravity_of(motions: Sequence[MotionSamples], chain: Chain, newtons: bool = T
     """
     sums = _Sums(motions)
     stated = np.array(motions[0].bodies.gravity)
-    before = sums.left(stated)
-    turned = _another_direction(sums, stated, before)
-    gravity, after = (stated, before) if turned is None else (turned, sums.left(turned))
+    before = sums.unexplained(stated)
+    direction = _another_direction(sums, stated, before)
+    gravity, after = stated, before
+    if direction is not None:
+        gravity, after = direction, sums.unexplained(direction)
     factors, sigmas, outweighed = _gravity_factors(motions, chain, gravity, newtons)
     ambiguous = False
-    if turned is not None and _mean(sums.left(-gravity) / after) < RIVAL:
-        # masses are positive: the expected torques' sign decides between both
-        ambiguous = not np.isfinite(factors).any()
-        if not ambiguous and np.nanmedian(factors) < 0.0:
-            turned, gravity, after, factors = -turned, -gravity, sums.left(-gravity), -factors
-    # and the whole torque varies less than gravity's alone would
+    if direction is not None:
+        opposite = sums.unexplained(-gravity)
+        if _mean(opposite / after) < RIVAL:
+            # Masses are positive: the expected torques' sign decides between both.
+            ambiguous = not np.isfinite(factors).any()
+            if not ambiguous and np.nanmedian(factors) < 0.0:
+                direction, gravity, after, factors = -direction, -gravity, opposite, -factors
+    # Outweighed: the whole torque varies less than gravity's alone would.
     certain = np.isfinite(factors) & (np.abs(factors) + 2.0 * sigmas < MAX_FACTOR) & outweighed
     absent = _without_gravity(sums, gravity, after, np.flatnonzero(certain).tolist())
-    return GravityHypotheses(stated, before, turned, after, ambiguous, absent, factors, sigmas)
+    return GravityHypotheses(stated, before, direction, after, ambiguous, absent, factors, sigmas)
 
 
 def _another_direction(sums: "_Sums", stated: np.ndarray, before: np.ndarray) -> np.ndarray | None:
     """Return the gravity vector (3,) of the stated one's magnitude that explains the torques instead; None if it does.
 
-    `before`: (n,) unexplained shares with the stated vector.
+    Args:
+        sums: products of the motions.
+        stated: (3,) gravity vector.
+        before: (n,) unexplained shares with it.
     """
     bound = sums.bound()
     if _mean(bound / before) > MAX_LEFT:
         return None
-    axis = _best_direction(sums, float(np.linalg.norm(stated)) or STANDARD_GRAVITY, bound)
-    best = min((axis, -axis), key=lambda gravity: _mean(sums.left(gravity)))
-    left = sums.left(best)
-    none = sums.left(np.zeros(3))
-    helps = _mean(left / before) < MAX_LEFT and _mean(left / none) < MAX_LEFT
+    magnitude = float(np.linalg.norm(stated)) or STANDARD_GRAVITY
+    axis = _best_direction(sums, magnitude, bound)
+    best = min((axis, -axis), key=lambda gravity: _mean(sums.unexplained(gravity)))
+    with_best = sums.unexplained(best)
+    with_none = sums.unexplained(np.zeros(3))
+    helps = _mean(with_best / before) < MAX_LEFT and _mean(with_best / with_none) < MAX_LEFT
     return best if helps and _angle(best, stated) > MIN_ANGLE else None
 
 
 def _without_gravity(
-    sums: "_Sums", gravity: np.ndarray, left: np.ndarray, candidates: Sequence[int]
+    sums: "_Sums", gravity: np.ndarray, unexplained: np.ndarray, candidates: Sequence[int]
 ) -> tuple[int, ...]:
     """Return the joints whose torques hold no gravity: those that are better explained without.
 
-    Of `candidates`, whose torques lack what is expected of the robot's masses, it is enough that they are explained
-    as well. `left`: (n,) unexplained shares with gravity at all joints.
+    Args:
+        sums: products of the motions.
+        gravity: (3,) gravity vector.
+        unexplained: (n,) unexplained shares with gravity at all joints.
+        candidates: joints whose torques lack what is expected of the robot's masses: it is enough that they are
+            explained as well.
     """
-    absent, now = list(candidates), left
-    if absent:
-        now = sums.left(gravity, absent)
-        absent, now = (absent, now) if _mean(now / left) < MAX_WORSE else ([], left)
+    absent: list[int] = []
+    if candidates:
+        without = sums.unexplained(gravity, candidates)
+        if _mean(without / unexplained) < MAX_WORSE:
+            absent, unexplained = list(candidates), without
     while len(absent) < sums.n:
-        tried = {joint: sums.left(gravity, [*absent, joint]) for joint in range(sums.n) if joint not in absent}
-        joint = min(tried, key=lambda each: _mean(tried[each]))
-        if _mean(tried[joint] / now) > MAX_LEFT:
+        shares = {}
+        for joint in range(sums.n):
+            if joint not in absent:
+                shares[joint] = sums.unexplained(gravity, [*absent, joint])
+        best = min(shares, key=lambda joint: _mean(shares[joint]))
+        if _mean(shares[best] / unexplained) > MAX_LEFT:
             break
-        absent, now = [*absent, joint], tried[joint]
+        absent.append(best)
+        unexplained = shares[best]
     return tuple(sorted(absent))
 
 
@@ -147,34 +181,38 @@ class _Sums:
 
     def __init__(self, motions: Sequence[MotionSamples]) -> None:
         """Sum the products WᵀW of all motions, joint by joint."""
-        self.n, self.bodies = motions[0].q.shape[1], motions[0].bodies.count
+        self.n = motions[0].q.shape[1]
+        self.bodies = motions[0].bodies.count
         self.squares = np.sum([_products(motion) for motion in motions], axis=0)
         self.heavy = slice(10 * self.bodies, 22 * self.bodies)
         self.power = np.maximum(self.squares[:, -1, -1], 1e-300)
 
-    def left(self, gravity: np.ndarray, without: Collection[int] = ()) -> np.ndarray:
+    def unexplained(self, gravity: np.ndarray, without: Collection[int] = ()) -> np.ndarray:
         """Return the unexplained share (n,) of the joints' rms torques under a gravity vector (3,).
 
-        `without`: joints, from 0, whose torques hold none.
+        Args:
+            gravity: in the base frame.
+            without: joints, from 0, whose torques hold none.
         """
         squares = np.array(self.squares)
         for joint in without:
             squares[joint, self.heavy] = 0.0
             squares[joint, :, self.heavy] = 0.0
-        return self._left(self._under(gravity), squares)
+        return self._unexplained(self._under(gravity), squares)
 
     def bound(self) -> np.ndarray:
-        """Return the share (n,) that is left where each axis of the base has masses of its own."""
-        return self._left(np.eye(self.squares.shape[1]), self.squares)
+        """Return the unexplained share (n,) where each axis of the base has masses of its own."""
+        return self._unexplained(np.eye(self.squares.shape[1]), self.squares)
 
-    def cost(self, left: np.ndarray) -> Callable[[np.ndarray], float]:
-        """Return a function from a gravity vector (3,) to the sum of squares, joints weighed by shares (n,) left."""
-        whole = np.tensordot(1.0 / (left**2 * self.power), self.squares, 1)
+    def cost(self, unexplained: np.ndarray) -> Callable[[np.ndarray], float]:
+        """Return a function from a gravity vector (3,) to the sum of squares, joints weighed by unexplained shares."""
+        weight = 1.0 / (unexplained**2 * self.power)
+        total = np.tensordot(weight, self.squares, 1)
 
         def squares(gravity: np.ndarray) -> float:
             change = self._under(gravity)
-            own = change.T @ whole @ change
-            return float(own[-1, -1] - own[-1, :-1] @ _solved(own))
+            square = change.T @ total @ change
+            return float(square[-1, -1] - square[-1, :-1] @ _solved(square))
 
         return squares
 
@@ -182,18 +220,22 @@ class _Sums:
         """Return the matrix (k, p + 1) from the columns of bodies under a gravity vector (3,) to all columns."""
         inertial = np.eye(10 * self.bodies)
         masses = inertial.reshape(self.bodies, 10, -1)[:, MASSES].reshape(4 * self.bodies, -1)
-        mixed = np.vstack([inertial, *(component * masses for component in gravity)])
-        rest = np.eye(4 * self.n + 1)
-        return np.block([[mixed, np.zeros((len(mixed), len(rest)))], [np.zeros((len(rest), mixed.shape[1])), rest]])
+        heavy = [component * masses for component in gravity]
+        bodies = np.vstack([inertial, *heavy])
+        drives = np.eye(4 * self.n + 1)
+        beside_bodies = np.zeros((len(bodies), len(drives)))
+        beside_drives = np.zeros((len(drives), bodies.shape[1]))
+        return np.block([[bodies, beside_bodies], [beside_drives, drives]])
 
-    def _left(self, change: np.ndarray, squares: np.ndarray) -> np.ndarray:
+    def _unexplained(self, change: np.ndarray, squares: np.ndarray) -> np.ndarray:
         """Return the unexplained shares (n,) of products by joint, their columns changed by a matrix (k, p + 1)."""
-        left = self.power
+        residual = self.power
         for _ in range(ROUNDS):
-            whole = np.tensordot(1.0 / np.maximum(left, 1e-12 * self.power), squares, 1)
-            values = change @ np.append(_solved(change.T @ whole @ change), -1.0)
-            left = np.maximum((squares @ values) @ values, 0.0)
-        return np.sqrt(np.maximum(left / self.power, 1e-12))
+            weight = 1.0 / np.maximum(residual, 1e-12 * self.power)
+            total = np.tensordot(weight, squares, 1)
+            values = change @ np.append(_solved(change.T @ total @ change), -1.0)
+            residual = np.maximum((squares @ values) @ values, 0.0)
+        return np.sqrt(np.maximum(residual / self.power, 1e-12))
 
 
 def _products(motion: MotionSamples) -> np.ndarray:
@@ -205,17 +247,15 @@ def _products(motion: MotionSamples) -> np.ndarray:
 def _columns(motion: MotionSamples) -> np.ndarray:
     """Return the columns (m, n, 10 B + 3 · 4 B + 4 n + 1): bodies without gravity, in x, y, z, drives, and torque."""
     m, n = motion.q.shape
-    still = np.zeros_like(motion.v)
-    parts = [_flat(regressor(motion.bodies.with_gravity(np.zeros(3)), motion.q, motion.v, motion.a))]
+    zero = np.zeros_like(motion.v)
+    weightless = motion.bodies.with_gravity(np.zeros(3))
+    columns = [regressor(weightless, motion.q, motion.v, motion.a).reshape(m, n, -1)]
     for axis in np.eye(3):
-        heavy = regressor(motion.bodies.with_gravity(axis), motion.q, still, still)
-        parts.append(heavy.reshape(m, n, -1, 10)[..., MASSES].reshape(m, n, -1))
+        at_rest = regressor(motion.bodies.with_gravity(axis), motion.q, zero, zero)
+        heavy = at_rest.reshape(m, n, -1, 10)[..., MASSES]
+        columns.append(heavy.reshape(m, n, -1))
     torque = motion.torque - motion.torque.mean(axis=0)
-    return np.concatenate([*parts, motion.drives, torque[:, :, None]], axis=2)
-
-
-def _flat(columns: np.ndarray) -> np.ndarray:
-    return columns.reshape(*columns.shape[:2], -1)
+    return np.concatenate([*columns, motion.drives, torque[:, :, None]], axis=2)
 
 
 def _solved(square: np.ndarray) -> np.ndarray:
@@ -232,40 +272,47 @@ def _mean(ratios: np.ndarray) -> float:
     return float(np.exp(np.mean(np.log(ratios))))
 
 
-def _angle(one_vector: np.ndarray, other_vector: np.ndarray) -> float:
+def _angle(first: np.ndarray, second: np.ndarray) -> float:
     """Return the angle between two vectors (3,) [rad]; a right one where one of them is zero."""
-    size = float(np.linalg.norm(one_vector) * np.linalg.norm(other_vector))
-    return float(np.arccos(np.clip(one_vector @ other_vector / size, -1.0, 1.0))) if size > 0.0 else 0.5 * np.pi
+    size = float(np.linalg.norm(first) * np.linalg.norm(second))
+    if not size > 0.0:
+        return 0.5 * np.pi
+    return float(np.arccos(np.clip(first @ second / size, -1.0, 1.0)))
 
 
-def _best_direction(sums: _Sums, size: float, left: np.ndarray) -> np.ndarray:
-    """Return the gravity vector (3,) of a size [m/s²] that leaves least unexplained, of both signs either.
+def _best_direction(sums: _Sums, magnitude: float, unexplained: np.ndarray) -> np.ndarray:
+    """Return the gravity vector (3,) of a magnitude [m/s²] that leaves least unexplained, of both signs either.
 
     Joints are weighed by what masses of their own for each axis leave of them (n,), then by what the direction leaves.
     """
-    cost = sums.cost(left)
-    first = min(size * _half_sphere(DIRECTIONS), key=cost)
-    near = min((first, -first), key=cost)
+    cost = sums.cost(unexplained)
+    axis = min(magnitude * _half_sphere(DIRECTIONS), key=cost)
+    best = min((axis, -axis), key=cost)
     for _ in range(2):
-        near = _refined(cost, near)
-        cost = sums.cost(sums.left(near))
-    return near
+        best = _refined(cost, best)
+        cost = sums.cost(sums.unexplained(best))
+    return best
 
 
-def _refined(cost: Callable[[np.ndarray], float], first: np.ndarray) -> np.ndarray:
-    """Return the vector (3,) of least cost near `first`, of the same size."""
-    from scipy.optimize import minimize  # slow to load
+def _refined(cost: Callable[[np.ndarray], float], start: np.ndarray) -> np.ndarray:
+    """Return the vector (3,) of least cost near `start`, of the same size."""
+    # Imported here because it is slow to load.
+    from scipy.optimize import minimize
 
-    size = float(np.linalg.norm(first))
-    across = np.linalg.svd(first[None])[2][1:]
+    size = float(np.linalg.norm(start))
+    across = np.linalg.svd(start[None])[2][1:]
 
     def turned(amounts: np.ndarray) -> np.ndarray:
-        vector = first + size * amounts @ across
+        vector = start + size * amounts @ across
         return np.asarray(size * vector / np.linalg.norm(vector))
 
+    def turned_cost(amounts: np.ndarray) -> float:
+        return cost(turned(amounts))
+
     corners = [[0.0, 0.0], [0.1, 0.0], [0.0, 0.1]]
-    options = {"initial_simplex": corners, "xatol": 1e-4, "fatol": 1e-4 * cost(first), "maxfev": 80}
-    return turned(minimize(lambda amounts: cost(turned(amounts)), np.zeros(2), method="Nelder-Mead", options=options).x)
+    options = {"initial_simplex": corners, "xatol": 1e-4, "fatol": 1e-4 * cost(start), "maxfev": 80}
+    solution = minimize(turned_cost, np.zeros(2), method="Nelder-Mead", options=options)
+    return turned(solution.x)
 
 
 def _half_sphere(count: int) -> np.ndarray:
@@ -287,34 +334,42 @@ def _gravity_factors(
     and that of its drive. NaN where no gravity torque is expected, or motion and friction look like it.
     """
     n = chain.n
-    own_masses = chain.inertias is not None and bool(chain.inertias[:, 9].any())
-    rod_like = rods(chain, IdentificationModel(motions[0].bodies, ()))
-    reference = standard_parameters(chain) if own_masses else np.asarray(rod_like).ravel()
-    scale = 1.0 if own_masses and newtons else _inertia_factor(motions, reference)
     factors, sigmas = np.full(n, np.nan), np.full(n, np.nan)
+    has_masses = chain.inertias is not None and bool(chain.inertias[:, 9].any())
+    if has_masses:
+        reference = standard_parameters(chain)
+    else:
+        reference = np.asarray(rods(chain, IdentificationModel(motions[0].bodies, ()))).ravel()
+    scale = 1.0
+    if not (has_masses and newtons):
+        scale = _inertia_factor(motions, reference)
     if not np.isfinite(scale):
         return factors, sigmas, np.zeros(n, dtype=bool)
-    expected, moved = [], []
+
+    of_gravity, of_motion = [], []
     for motion in motions:
-        still = np.zeros_like(motion.v)
-        free, heavy = motion.bodies.with_gravity(np.zeros(3)), motion.bodies.with_gravity(gravity)
-        moved.append(inverse_dynamics(free, reference, motion.q, motion.v, motion.a))
-        expected.append(inverse_dynamics(heavy, reference, motion.q, still, still))
-    weight, inertia = np.concatenate(expected), np.concatenate(moved)
+        zero = np.zeros_like(motion.v)
+        weightless = motion.bodies.with_gravity(np.zeros(3))
+        heavy = motion.bodies.with_gravity(gravity)
+        of_motion.append(inverse_dynamics(weightless, reference, motion.q, motion.v, motion.a))
+        of_gravity.append(inverse_dynamics(heavy, reference, motion.q, zero, zero))
+    expected, inertia = np.concatenate(of_gravity), np.concatenate(of_motion)
     torque = np.concatenate([motion.torque for motion in motions])
     drives = np.concatenate([drive_columns(motion.v, motion.a) for motion in motions])
-    size = weight.std(axis=0)
-    least = MIN_SHARE * max(float(size.max()), 1e-9)
-    for joint in np.flatnonzero(size > least):
-        spanned = basis(np.column_stack([inertia[:, joint], drives[:, joint]]))
-        part, seen = (x - spanned @ (spanned.T @ x) for x in (weight[:, joint], torque[:, joint]))
-        if np.sqrt(np.mean(part**2)) < MIN_CORRELATED * size[joint]:
+    size = expected.std(axis=0)
+    min_size = MIN_SHARE * max(float(size.max()), 1e-9)
+    for joint in np.flatnonzero(size > min_size):
+        free = basis(np.column_stack([inertia[:, joint], drives[:, joint]]))
+        expected_part = expected[:, joint] - free @ (free.T @ expected[:, joint])
+        torque_part = torque[:, joint] - free @ (free.T @ torque[:, joint])
+        if np.sqrt(np.mean(expected_part**2)) < MIN_CORRELATED * size[joint]:
             continue
-        power = float(part @ part)
-        factor = float(part @ seen) / power
-        rest = seen - factor * part
+        power = float(expected_part @ expected_part)
+        factor = float(expected_part @ torque_part) / power
+        residual = torque_part - factor * expected_part
+        mean_square = float(residual @ residual) / len(residual)
         factors[joint] = factor / scale
-        sigmas[joint] = np.sqrt(inflation(rest) * float(rest @ rest) / len(rest) / power) / scale
+        sigmas[joint] = np.sqrt(inflation(residual) * mean_square / power) / scale
     return factors, sigmas, abs(scale) * size > torque.std(axis=0)
 
 

@@ -20,11 +20,33 @@ from calib.robot.chain import Chain
 from trajectories.errors import BadInput
 from trajectories.recall import Recalled, find_periods, sliding_products
 
-EDGE_TIME = 0.25  # kept before and after the motion [s], for the filters' borders
-STEP = 0.01  # of the coarse grid [s] (this and all below: our choice)
-SPEEDS = (0.1, 0.2, 0.25, 0.5, 2.0)  # rehearsal factors that are tried to explain another motion
-UNITS = (1.0, np.pi / 180, 180 / np.pi)  # factors on recorded positions that are tried
-CREEP = 0.05  # speed over which the sign of Coulomb friction is smoothed [rad/s or m/s]
+EDGE_TIME = 0.25
+"""Time before and after the motion that is kept for the filters' borders [s]."""
+STEP = 0.01
+"""Step of the coarse grid [s] (this and all below: our choice)."""
+SPEEDS = (0.1, 0.2, 0.25, 0.5, 2.0)
+"""Rehearsal factors that are tried to explain another motion."""
+UNITS = (1.0, np.pi / 180, 180 / np.pi)
+"""Factors on recorded positions that are tried."""
+CREEP = 0.05
+"""Speed over which the sign of Coulomb friction is smoothed [rad/s or m/s]."""
+MAX_GAP = 60.0
+"""Gap between samples that the coarse grid bridges [s]; a log may go on after weeks."""
+MIN_LIKENESS = 0.9
+"""Share of the motion's variance that a recorded period has to explain."""
+MIN_TORQUE = 0.03
+"""Rigid-body torque, in units of the torque limit, from which a joint says something of its masses."""
+DEFAULT_LIMIT = 100.0
+"""Torque limit of a joint that states none [N m or N]."""
+MIN_SIGN_CORRELATION = 0.8
+"""Partial correlation with the torque of the nominal masses from which its sign counts."""
+HALF_WIDTH = 10
+"""Half width of the window for derivatives, in steps of the coarse grid."""
+SEGMENT_EDGE = 0.3
+"""Time omitted at both ends of a segment, so that shifted torques are still recorded ones [s]."""
+TORQUE_WINDOW = 0.02
+"""Window of a moving average of the torques [s]: else a shift between samples smooths, and seems to help."""
+
 Pair = tuple[np.ndarray, np.ndarray]
 """Recorded positions (N, n), and one period of a motion (P, n)."""
 
@@ -64,105 +86,122 @@ def locate(recording: Recording, motion: DesignedMotion) -> LocatedMotion | None
     """Return the repetitions of a designed motion in a recording; None if it contains none."""
     grid, q = _on_grid(recording)
     reference = _one_period(motion)
-    found = _found(q, reference)
-    if found is None:
+    recalled = _recalled(q, reference)
+    if recalled is None:
         return None
-    start, stop = grid[found.start], grid[min(found.rows.stop, len(grid) - 1)]
-    played = q[found.rows] - np.tile(reference, (found.periods, 1))[: len(q[found.rows])]
-    tracking = np.sqrt(np.mean(played**2, axis=0))
+    start = float(grid[recalled.start])
+    stop = float(grid[min(recalled.rows.stop, len(grid) - 1)])
+    recorded = q[recalled.rows]
+    designed = np.tile(reference, (recalled.periods, 1))[: len(recorded)]
+    tracking = np.sqrt(np.mean((recorded - designed) ** 2, axis=0))
+    relative = tracking / np.maximum(np.std(reference, axis=0), 1e-9)
     return LocatedMotion(
-        start=max(float(recording.t[0]), float(start) - EDGE_TIME),
-        stop=min(float(recording.t[-1]), float(stop) + EDGE_TIME),
-        began=float(start) + STEP * found.lag,
-        periods=found.periods,
-        tracking=tuple(map(float, tracking)),
-        likeness=min(found.likeness),
-        loosest=int(np.argmax(tracking / np.maximum(np.std(reference, axis=0), 1e-9))),
+        start=max(float(recording.t[0]), start - EDGE_TIME),
+        stop=min(float(recording.t[-1]), stop + EDGE_TIME),
+        began=start + STEP * recalled.lag,
+        periods=recalled.periods,
+        tracking=tuple(tracking.tolist()),
+        likeness=min(recalled.likeness),
+        loosest=int(np.argmax(relative)),
     )
 
 
-def another_motion(recording: Recording, motion: DesignedMotion, others: Mapping[str, DesignedMotion]) -> Change | None:
+def another_motion(
+    recording: Recording, motion: DesignedMotion, alternatives: Mapping[str, DesignedMotion]
+) -> Change | None:
     """Return the change of the designed motion that explains a recording, e.g. other units; None if no tested one does.
 
     Args:
         recording: of n joints.
         motion: the one that was to be played; it is tried at other `SPEEDS`, in other `UNITS`, with its columns swapped
             and reversed, and with joints that count from the one before them.
-        others: designed motions by name, one of which may have been played instead.
+        alternatives: designed motions by name, one of which may have been played instead.
     """
-    q, reference = _on_grid(recording)[1], _one_period(motion)
+    _, q = _on_grid(recording)
+    reference = _one_period(motion)
+    n = q.shape[1]
 
-    def instead(other: DesignedMotion, speed: float = 1.0) -> Callable[[Pair], Pair]:
-        return lambda data: (data[0], _one_period(other, speed))
+    def with_motion(replacement: DesignedMotion, speed: float = 1.0) -> Callable[[Pair], Pair]:
+        return lambda data: (data[0], _one_period(replacement, speed))
 
-    def altered(matrix: np.ndarray) -> Callable[[Pair], Pair]:
+    def with_columns(matrix: np.ndarray) -> Callable[[Pair], Pair]:
         return lambda data: (data[0] @ matrix.T, data[1])
 
-    table = [Change("motion-exchanged", instead(other), values={"motion": name}) for name, other in others.items()]
-    table += [Change("motion-rehearsed", instead(motion, speed), values={"speed": speed}) for speed in SPEEDS]
+    changes = []
+    for name, alternative in alternatives.items():
+        changes.append(Change("motion-exchanged", with_motion(alternative), values={"motion": name}))
+    changes += [Change("motion-rehearsed", with_motion(motion, speed), values={"speed": speed}) for speed in SPEEDS]
     if len(q) >= len(reference):
         order, sign = _best_order(q, reference)
-        moved = sign[:, None] * np.eye(len(order))[order]
-        values = {"order": order.tolist(), "sign": sign.tolist()}
-        table += [Change("motion-altered", altered(unit * moved), values={"unit": unit, **values}) for unit in UNITS]
-    table += [
-        Change("motion-coupled", altered(coupling(len(q[0]), j, k, way)), (j, k), {"way": "+-"[way < 0.0]})
-        for j, k, way in couplings(len(q[0]))
-    ]
-    found = best_changes((q, reference), table, _unlike)
-    return found and found.changes[0]
+        permutation = sign[:, None] * np.eye(n)[order]
+        for unit in UNITS:
+            values = {"unit": unit, "order": order.tolist(), "sign": sign.tolist()}
+            changes.append(Change("motion-altered", with_columns(unit * permutation), values=values))
+    for joint, motor, direction in couplings(n):
+        matrix = coupling(n, joint, motor, direction)
+        sign_text = "-" if direction < 0.0 else "+"
+        changes.append(Change("motion-coupled", with_columns(matrix), (joint, motor), {"way": sign_text}))
+    explanation = best_changes((q, reference), changes, _unlike)
+    return explanation and explanation.changes[0]
 
 
 def _on_grid(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """Return the times of the coarse grid (N,) and the positions at them (N, n)."""
     grid = _coarse(recording.t)
     return grid, _sampled(recording.t, recording.q, grid)
 
 
-def _coarse(t: np.ndarray, max_gap: float = 60.0) -> np.ndarray:
-    """Return a time grid with spacing `STEP` [s] over sample times (N,); longer gaps are cut to `max_gap`.
-
-    `max_gap`: between samples that the grid bridges [s]; a log may go on after weeks.
-    """
-    last = np.flatnonzero(np.diff(t) > max_gap)
-    spans = zip(t[np.append(0, last + 1)], np.append(t[last] + max_gap, t[-1]))
-    return np.concatenate([np.arange(start, stop, STEP) for start, stop in spans])
+def _coarse(t: np.ndarray) -> np.ndarray:
+    """Return a time grid with spacing `STEP` [s] over sample times (N,); longer gaps are cut to `MAX_GAP`."""
+    before_gap = np.flatnonzero(np.diff(t) > MAX_GAP)
+    starts = t[np.append(0, before_gap + 1)]
+    stops = np.append(t[before_gap] + MAX_GAP, t[-1])
+    return np.concatenate([np.arange(start, stop, STEP) for start, stop in zip(starts, stops)])
 
 
 def _sampled(t: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """Return values (N, n) at times (N,), interpolated at the times of a grid."""
     return np.column_stack([np.interp(grid, t, column) for column in values.T])
 
 
 def _one_period(motion: DesignedMotion, speed: float = 1.0) -> np.ndarray:
     """Return the positions (P, n) of one period of a motion, sampled about every `STEP`, at `speed` times its speed."""
     count = round(motion.period / speed / STEP)
-    return motion.orders(np.arange(count) * motion.period / count)[0]
+    q, _, _ = motion.orders(np.arange(count) * motion.period / count)
+    return q
 
 
-def _found(q: np.ndarray, reference: np.ndarray, min_likeness: float = 0.9) -> Recalled | None:
-    # min_likeness: share of the motion's variance a recorded period has to explain
+def _recalled(q: np.ndarray, reference: np.ndarray) -> Recalled | None:
+    """Return the periods of a motion (P, n) in positions (N, n); None if these contain none."""
     try:
-        return find_periods(q, reference, likeness=min_likeness)
+        return find_periods(q, reference, likeness=MIN_LIKENESS)
     except BadInput:
         return None
 
 
 def _unlike(data: Pair) -> np.ndarray:
     """Return the share (1,) of a motion's variance that the worst recorded period leaves unexplained; 1 if none is."""
-    found = _found(*data)
-    return np.array([1.0 if found is None else max(1.0 - min(found.likeness), 1e-9)])
+    q, reference = data
+    recalled = _recalled(q, reference)
+    if recalled is None:
+        return np.array([1.0])
+    return np.array([max(1.0 - min(recalled.likeness), 1e-9)])
 
 
 def _best_order(q: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return for each joint the recorded column (n,) and its sign (n,) that correlate best with the designed motion."""
     n = reference.shape[1]
     likeness = np.zeros((2, n, n))
+    window = np.ones(len(reference))
     for j in range(n):
-        r = reference[:, j] - reference[:, j].mean()
+        designed = reference[:, j] - reference[:, j].mean()
+        size = max(np.linalg.norm(designed), 1e-12)
         for k in range(n):
-            x = q[:, k] - q[:, k].mean()
-            crossed = sliding_products(x, r) / max(np.linalg.norm(r), 1e-12)
-            power = np.sqrt(np.maximum(sliding_products(x**2, np.ones(len(r))), 1e-12))
-            likeness[0, j, k], likeness[1, j, k] = (crossed / power).max(), (-crossed / power).max()
+            recorded = q[:, k] - q[:, k].mean()
+            product = sliding_products(recorded, designed) / size
+            power = np.sqrt(np.maximum(sliding_products(recorded**2, window), 1e-12))
+            likeness[0, j, k] = (product / power).max()
+            likeness[1, j, k] = (-product / power).max()
     return assigned(-likeness)
 
 
@@ -177,11 +216,12 @@ def share_of_nominal(
     """Return the ratios (n,) of recorded torques to those of the nominal masses, with the drives estimated as well.
 
     Least squares of τ_j on [τ_nominal,j, a_j, v_j, tanh(v_j / v0), 1] on the coarse grid: without the rotor's inertia
-    (a_j) it is taken for mass. A joint counts where its rigid-body torque is more than `min_torque` of its limit and
-    the partial correlation of both torques is above `min_sign_correlation`.
+    (a_j) it is taken for mass. A joint counts where its rigid-body torque is more than `MIN_TORQUE` of its limit and
+    the partial correlation of both torques is above `MIN_SIGN_CORRELATION`.
 
     Args:
-        t: (N,) [s]; q, effort: (N, n).
+        t: (N,) [s].
+        q, effort: (N, n).
         chain: the arm with its nominal masses.
         gravity: [m/s²], where it is not the robot's own.
         static: compare torques of gravity alone, the others left free like the drives'.
@@ -190,45 +230,53 @@ def share_of_nominal(
         (n,) factors on τ_nominal: 1 for right masses, below 0 for a reversed sign; NaN for joints that do not count.
     """
     grid = _coarse(t)
-    torque, place = _smooth(_sampled(t, effort, grid)), _sampled(t, q, grid)
-    q, v, a = (_smooth(place, order) for order in range(3))
-    bodies, parameters = bodies_under(chain, gravity), standard_parameters(chain)
+    torque = _smooth(_sampled(t, effort, grid))
+    positions = _sampled(t, q, grid)
+    q, v, a = _smooth(positions, 0), _smooth(positions, 1), _smooth(positions, 2)
+    bodies = bodies_under(chain, gravity)
+    parameters = standard_parameters(chain)
     rigid = inverse_dynamics(bodies, parameters, q, v, a)
-    other = None
+    of_motion = None
     if static:
-        still = inverse_dynamics(bodies, parameters, q, np.zeros_like(v), np.zeros_like(a))
-        rigid, other = still, rigid - still
+        of_gravity = inverse_dynamics(bodies, parameters, q, np.zeros_like(v), np.zeros_like(a))
+        of_motion = rigid - of_gravity
+        rigid = of_gravity
     limit = np.array([joint.effort for joint in chain.joints])
-    min_torque = 0.03  # of the torque limit: rigid-body torques smaller than this say nothing
-    default_limit = 100.0  # torque limit of a joint that states none [N m or N]
-    heavy = rigid.std(axis=0) > min_torque * np.where(np.isfinite(limit), limit, default_limit)
+    limit = np.where(np.isfinite(limit), limit, DEFAULT_LIMIT)
+    heavy = rigid.std(axis=0) > MIN_TORQUE * limit
     share = np.full(chain.n, np.nan)
-    # partial correlation with the torque of the nominal masses from which on its sign counts
-    min_sign_correlation = 0.8
     for j in np.flatnonzero(heavy):
-        drive = drive_columns(v[:, j], a[:, j])
-        free = drive if other is None else np.column_stack([drive, other[:, j]])
-        own, seen = (x - free @ np.linalg.lstsq(free, x, rcond=None)[0] for x in (rigid[:, j], torque[:, j]))
-        common, power = own @ seen, own @ own
-        if abs(common) / max(np.sqrt(power * (seen @ seen)), 1e-12) > min_sign_correlation:
+        free = drive_columns(v[:, j], a[:, j])
+        if of_motion is not None:
+            free = np.column_stack([free, of_motion[:, j]])
+        nominal = _without(free, rigid[:, j])
+        recorded = _without(free, torque[:, j])
+        common, power = nominal @ recorded, nominal @ nominal
+        size = max(np.sqrt(power * (recorded @ recorded)), 1e-12)
+        if abs(common) / size > MIN_SIGN_CORRELATION:
             share[j] = common / max(power, 1e-12)
     return share
+
+
+def _without(columns: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return what the least-squares combination of columns (N, k) leaves of values (N,)."""
+    return values - columns @ np.linalg.lstsq(columns, values, rcond=None)[0]
 
 
 def bodies_under(chain: Chain, gravity: Sequence[float] | None) -> Bodies:
     """Return the chain's bodies with gravity set to the given vector [m/s²]; None keeps the chain's gravity."""
     bodies = bodies_of(chain)
-    return bodies if gravity is None else bodies.with_gravity(np.asarray(gravity, dtype=float))
+    if gravity is None:
+        return bodies
+    return bodies.with_gravity(np.asarray(gravity, dtype=float))
 
 
-def _smooth(values: np.ndarray, order: int = 0, half_width: int = 10) -> np.ndarray:
-    """Return values (N, n) of the coarse grid, or their derivatives, smoothed by cubics over a moving window.
+def _smooth(values: np.ndarray, order: int = 0) -> np.ndarray:
+    """Return values (N, n) of the coarse grid, or their derivatives, smoothed by cubics over a moving window."""
+    # Imported here because it is slow to load.
+    from scipy.signal import savgol_filter
 
-    `half_width`: half width of the window for derivatives, in steps of the coarse grid.
-    """
-    from scipy.signal import savgol_filter  # slow to load
-
-    size = 2 * min(half_width, (len(values) - 1) // 2) + 1
+    size = 2 * min(HALF_WIDTH, (len(values) - 1) // 2) + 1
     return np.asarray(savgol_filter(values, size, min(3, size - 1), order, STEP, axis=0))
 
 
@@ -264,35 +312,35 @@ class MotionSamples:
     @cached_property
     def at_rest(self) -> np.ndarray:
         """Regressor of the bodies at rest (N, n, 10 B): gravity alone."""
-        still = np.zeros_like(self.v)
-        return regressor(self.bodies, self.q, still, still).reshape(*self.q.shape, -1)
+        zero = np.zeros_like(self.v)
+        return regressor(self.bodies, self.q, zero, zero).reshape(*self.q.shape, -1)
 
     @cached_property
     def drives(self) -> np.ndarray:
         """Regressor of the drives (N, n, 4 n): Ia, Fv, Fc and off of each joint."""
         m, n = self.q.shape
-        found, joints = np.zeros((m, n, n, 4)), np.arange(n)
-        found[:, joints, joints] = drive_columns(self.v, self.a)
-        return found.reshape(m, n, -1)
+        joints = np.arange(n)
+        columns = np.zeros((m, n, n, 4))
+        columns[:, joints, joints] = drive_columns(self.v, self.a)
+        return columns.reshape(m, n, -1)
 
 
 def take_samples(case: Case, bodies: Bodies, count: int) -> MotionSamples | None:
     """Return about `count` samples of a recording of motor torques; None if too few are usable."""
-    from scipy.ndimage import uniform_filter1d  # slow to load
+    # Imported here because it is slow to load.
+    from scipy.ndimage import uniform_filter1d
 
-    motion, n = case.motion, case.motion.n
-    # left out at both ends of a segment [s], so that shifted torques are still recorded ones (our choice)
-    edge_time = 0.3
-    edge = int(edge_time * motion.rate)
-    inner = np.concatenate([np.arange(a + edge, b - edge) for a, b in segments(motion.segment)])
-    if len(inner) < 20 * n or case.target.shape[1] != n:
+    motion = case.motion
+    edge = int(SEGMENT_EDGE * motion.rate)
+    inner = np.concatenate([np.arange(start + edge, stop - edge) for start, stop in segments(motion.segment)])
+    if len(inner) < 20 * motion.n or case.target.shape[1] != motion.n:
         return None
     index = inner[:: max(1, len(inner) // count)]
-    # window of a moving average of the torques [s]: else a shift between samples smooths, and seems to help
-    window = 0.02
-    size = 2 * max(1, round(window * motion.rate) // 2) + 1  # odd
-    effort = uniform_filter1d(np.array(case.target), size, axis=0, mode="nearest")
-    q, v, a = (np.ascontiguousarray(x[index]) for x in (motion.q, motion.v, motion.a))
+    window = 2 * max(1, round(TORQUE_WINDOW * motion.rate) // 2) + 1
+    effort = uniform_filter1d(np.array(case.target), window, axis=0, mode="nearest")
+    q = np.ascontiguousarray(motion.q[index])
+    v = np.ascontiguousarray(motion.v[index])
+    a = np.ascontiguousarray(motion.a[index])
     return MotionSamples(index, q, v, a, effort, motion.v, bodies)
 
 
@@ -309,9 +357,10 @@ def basis(columns: np.ndarray) -> np.ndarray:
 def spanning(square: np.ndarray) -> np.ndarray:
     """Return the matrix (p, k) that turns columns W into an orthonormal basis of their space, from WᵀW (p, p)."""
     size = np.sqrt(np.diag(square))
-    used = np.flatnonzero(size > 1e-9 * size.max())
-    values, vectors = np.linalg.eigh(square[np.ix_(used, used)] / (size[used, None] * size[used]))
-    kept = values > 1e-9 * values[-1]
-    result = np.zeros((len(size), int(kept.sum())))
-    result[used] = vectors[:, kept] / np.sqrt(values[kept]) / size[used, None]
+    nonzero = np.flatnonzero(size > 1e-9 * size.max())
+    nonzero_size = size[nonzero]
+    values, vectors = np.linalg.eigh(square[np.ix_(nonzero, nonzero)] / (nonzero_size[:, None] * nonzero_size))
+    independent = values > 1e-9 * values[-1]
+    result = np.zeros((len(size), int(independent.sum())))
+    result[nonzero] = vectors[:, independent] / np.sqrt(values[independent]) / nonzero_size[:, None]
     return result

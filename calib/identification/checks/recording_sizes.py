@@ -39,6 +39,38 @@ from calib.identification.prior import rods
 from calib.identification.rows import Case, segments
 from calib.robot.chain import Chain
 
+MAX_LAG_SAMPLES, MAX_SAMPLES = 1500, 500
+"""Samples on which a lag is estimated, and everything else."""
+FOLLOWS = 0.9
+"""Correlation from which on measured velocities, integrated, are the positions."""
+MIN_JOINTS = 3
+"""Joints of the shortest arm whose clock is checked (our choice)."""
+MIN_FACTOR_SIGMAS = 5.0
+"""Sigmas from which on a factor of the inertias or masses is identified."""
+ROUNDS = 3
+"""Rounds of weighing joints by their residuals."""
+MAX_LEFT = 0.8
+"""Share of a joint's residual that a reversed sign may leave.
+
+Sound recordings at hand keep 0.91 and more, and 0.84 by couplings (our choice, as the next two).
+"""
+MAX_LEFT_COUPLED = 0.7
+"""The same of a coupling."""
+MAX_LEFT_EXCHANGED = 0.6
+"""The same of an exchange."""
+MAX_LEFT_RECORDED = 0.5
+"""Largest share of their torques' variance that joints to exchange leave as recorded."""
+MIN_EXCHANGED_SPEED = 0.3
+"""Rms speed in units of the fastest joint's: one that hardly moves may have any column."""
+SPIKE_SHARE = 0.01
+"""Share of the samples that may be spikes."""
+DATE_ERROR = 0.01
+"""Share of a joint's travel by which errors of dates move its positions."""
+MIN_TRAVEL = 0.05
+"""Travel below which a joint says nothing of its velocity's size [rad or m]."""
+INDEPENDENT_ERRORS = 6
+"""Independent errors in what velocities leave of the positions: those with a dead zone drift for long."""
+
 
 @dataclass(frozen=True)
 class ClockRatio:
@@ -60,81 +92,92 @@ def clock_ratio(samples: MotionSamples, chain: Chain) -> ClockRatio | None:
     gravity beside any torque of motion; drives free in both. Where the description has masses, the ratio to theirs
     counts if it is nearer to 1.
     """
-    min_joints = 3  # of the shortest arm that is looked at (our choice)
-    if chain.n < min_joints:
+    if chain.n < MIN_JOINTS:
         return None
-    wholes = [np.asarray(rods(chain, IdentificationModel(bodies_of(chain), ()))).ravel()]
+    robots = [np.asarray(rods(chain, IdentificationModel(bodies_of(chain), ()))).ravel()]
     if chain.inertias is not None and chain.inertias[:, 9].any():
-        wholes.append(standard_parameters(chain))
-    found = [one for whole in wholes if (one := _ratio_to(whole, samples)) is not None]
-    return min(found, key=lambda one: abs(np.log(one.ratio)), default=None)
+        robots.append(standard_parameters(chain))
+    ratios = []
+    for robot in robots:
+        ratio = _ratio_to(robot, samples)
+        if ratio is not None:
+            ratios.append(ratio)
+    return min(ratios, key=lambda ratio: abs(np.log(ratio.ratio)), default=None)
 
 
-def _ratio_to(whole: np.ndarray, samples: MotionSamples) -> ClockRatio | None:
+def _ratio_to(robot: np.ndarray, samples: MotionSamples) -> ClockRatio | None:
     """Return the ratio of inertias to masses over that of bodies (10 B,); None where it is not identified."""
-    still, moving = samples.at_rest, samples.inertial - samples.at_rest
-    inertia, own = common_factor(samples.torque, moving @ whole, np.concatenate([still, samples.drives], axis=2))
-    mass, other = common_factor(samples.torque, still @ whole, np.concatenate([moving, samples.drives], axis=2))
-    min_factor_sigmas = 5.0  # sigmas from which on a factor is told
-    if inertia < min_factor_sigmas * own or mass < min_factor_sigmas * other:
+    of_gravity = samples.at_rest
+    of_motion = samples.inertial - of_gravity
+    beside_motion = np.concatenate([of_gravity, samples.drives], axis=2)
+    beside_gravity = np.concatenate([of_motion, samples.drives], axis=2)
+    inertia, inertia_sigma = common_factor(samples.torque, of_motion @ robot, beside_motion)
+    mass, mass_sigma = common_factor(samples.torque, of_gravity @ robot, beside_gravity)
+    if inertia < MIN_FACTOR_SIGMAS * inertia_sigma or mass < MIN_FACTOR_SIGMAS * mass_sigma:
         return None
-    return ClockRatio(inertia / mass, float(np.hypot(own / inertia, other / mass)))
+    return ClockRatio(inertia / mass, float(np.hypot(inertia_sigma / inertia, mass_sigma / mass)))
 
 
-def common_factor(torque: np.ndarray, common: np.ndarray, free: np.ndarray, rounds: int = 3) -> tuple[float, float]:
-    """Return α of torques τ (m, n) = α common + free x and its sigma, each joint weighted by its residual.
-
-    `rounds`: of weighing joints by what is left of them.
-    """
+def common_factor(torque: np.ndarray, common: np.ndarray, free: np.ndarray) -> tuple[float, float]:
+    """Return α of torques τ (m, n) = α common + free x and its sigma, each joint weighted by its residual."""
     m, n = torque.shape
-    weight, left, own = np.ones(n), torque, common
+    min_deviation = 1e-9 * max(float(torque.std()), 1e-300)
+    weight = np.ones(n)
+    residual, part = torque, common
     alpha = power = 0.0
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         scale = np.repeat(weight, m)
-        rows = free.transpose(1, 0, 2).reshape(m * n, -1) * scale[:, None]
-        spanned = basis(rows)
-        seen, part = (x - spanned @ (spanned.T @ x) for x in (torque.T.ravel() * scale, common.T.ravel() * scale))
-        power = float(part @ part)
+        free_basis = basis(free.transpose(1, 0, 2).reshape(m * n, -1) * scale[:, None])
+        torque_part = _without(free_basis, torque.T.ravel() * scale)
+        common_part = _without(free_basis, common.T.ravel() * scale)
+        power = float(common_part @ common_part)
         if not power > 0.0:
             return 0.0, np.inf
-        alpha = float(part @ seen) / power
-        left, own = ((x / scale).reshape(n, m) for x in (seen - alpha * part, part))
-        weight = 1.0 / np.maximum(left.std(axis=1), 1e-9 * max(float(torque.std()), 1e-300))
-    spread = [inflation(each) for each in left]
-    return alpha, float(np.sqrt(np.sum(weight[:, None] ** 2 * own**2 * np.array(spread)[:, None]))) / power
+        alpha = float(common_part @ torque_part) / power
+        residual = ((torque_part - alpha * common_part) / scale).reshape(n, m)
+        part = (common_part / scale).reshape(n, m)
+        weight = 1.0 / np.maximum(residual.std(axis=1), min_deviation)
+    spread = np.array([inflation(joint_residual) for joint_residual in residual])
+    variance = np.sum(weight[:, None] ** 2 * part**2 * spread[:, None])
+    return alpha, float(np.sqrt(variance)) / power
+
+
+def _without(orthonormal: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return values (N,) without their projection onto an orthonormal basis (N, k)."""
+    return values - orthonormal @ (orthonormal.T @ values)
 
 
 def wrong_joints(samples: MotionSamples) -> Explanation | None:
     """Return the joints with reversed or exchanged torques, or coupled positions; None if all joints are right.
 
     One model of all joints is fitted to each: bodies and offsets of any size, Ia, Fv and Fc of every drive not
-    negative, since no drive brakes backwards. The robot's own masses need not be known. What is left are shares of the
+    negative, since no drive brakes backwards. The robot's own masses need not be known. Residuals are shares of the
     joints' torques.
     """
     n = samples.q.shape[1]
-    shares = cache(_shares)
+    unexplained_shares = cache(_unexplained_function)
 
-    def mixed(matrix: np.ndarray) -> Callable[[tuple], tuple]:
+    def with_torques(matrix: np.ndarray) -> Callable[[tuple], tuple]:
         return lambda data: (data[0], matrix @ data[1])
 
-    def counted(matrix: np.ndarray) -> Callable[[tuple], tuple]:
+    def with_positions(matrix: np.ndarray) -> Callable[[tuple], tuple]:
         return lambda data: (_changed(data[0], matrix), data[1])
 
-    # shares that may be left: sound recordings at hand are left 0.91 and more, and 0.84 by couplings (our choice)
-    max_left, max_left_coupled, max_left_exchanged = 0.8, 0.7, 0.6
-    table = [Change("torque-sign", mixed(reversal(n, j)), (j,), max_left=max_left) for j in range(n)]
-    table += [
-        Change("torques-exchanged", mixed(exchange(n, *pair)), pair, max_left=max_left_exchanged)
-        for pair in combinations(range(n), 2)
-    ]
-    table += [
-        Change("axis-coupled", counted(coupling(n, j, k, way)), (j, k), {"way": "+-"[way < 0.0]}, max_left_coupled)
-        for j, k, way in couplings(n)
-    ]
-    return best_changes((samples, np.eye(n)), table, lambda data: shares(data[0])(data[1]), max_changes=n)
+    changes = []
+    for joint in range(n):
+        reversed_sign = with_torques(reversal(n, joint))
+        changes.append(Change("torque-sign", reversed_sign, (joint,), max_left=MAX_LEFT))
+    for pair in combinations(range(n), 2):
+        exchanged = with_torques(exchange(n, *pair))
+        changes.append(Change("torques-exchanged", exchanged, pair, max_left=MAX_LEFT_EXCHANGED))
+    for joint, motor, direction in couplings(n):
+        coupled = with_positions(coupling(n, joint, motor, direction))
+        values = {"way": "-" if direction < 0.0 else "+"}
+        changes.append(Change("axis-coupled", coupled, (joint, motor), values, MAX_LEFT_COUPLED))
+    return best_changes((samples, np.eye(n)), changes, lambda data: unexplained_shares(data[0])(data[1]), max_changes=n)
 
 
-def _shares(samples: MotionSamples) -> Callable[[np.ndarray], np.ndarray]:
+def _unexplained_function(samples: MotionSamples) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function from torques by joint to the unexplained share of each one's variance (n,).
 
     Its argument (n, n) mixes the recorded columns: the identity, with signs reversed or rows exchanged.
@@ -142,79 +185,87 @@ def _shares(samples: MotionSamples) -> Callable[[np.ndarray], np.ndarray]:
     m, n = samples.q.shape
     scale = 1.0 / np.maximum(samples.torque.std(axis=0), 1e-12)
 
-    def rows(columns: np.ndarray) -> np.ndarray:
+    def weighted_rows(columns: np.ndarray) -> np.ndarray:
         return (columns * scale[:, None]).transpose(1, 0, 2).reshape(n * m, -1)
 
+    # Bodies and offsets are free, the drives' other parameters not negative.
     drives = samples.drives.reshape(m, n, n, 4)
-    free = rows(np.concatenate([samples.inertial, drives[..., 3]], axis=2))
+    free = weighted_rows(np.concatenate([samples.inertial, drives[..., 3]], axis=2))
     free = free @ spanning(free.T @ free)
-    positive = rows(drives[..., :3].reshape(m, n, -1))
+    positive = weighted_rows(drives[..., :3].reshape(m, n, -1))
     positive /= np.maximum(np.abs(positive).max(axis=0), 1e-12)
     positive -= free @ (free.T @ positive)
-    across, triangle = np.linalg.qr(positive)
+    orthonormal, triangle = np.linalg.qr(positive)
 
-    def left(mixing: np.ndarray) -> np.ndarray:
+    def unexplained(mixing: np.ndarray) -> np.ndarray:
         torque = (scale * (samples.torque @ mixing.T)).T.ravel()
         power = torque.reshape(n, m).var(axis=1)
         torque = torque - free @ (free.T @ torque)
-        residual = torque - positive @ nnls(triangle, across.T @ torque)[0]
-        return np.maximum((residual.reshape(n, m) ** 2).mean(axis=1) / np.maximum(power, 1e-300), 1e-9)
+        values, _ = nnls(triangle, orthonormal.T @ torque)
+        residual = torque - positive @ values
+        mean_square = (residual.reshape(n, m) ** 2).mean(axis=1)
+        return np.maximum(mean_square / np.maximum(power, 1e-300), 1e-9)
 
-    return left
+    return unexplained
 
 
 def rearranged(samples: MotionSamples, chain: Chain) -> Explanation | None:
     """Return the exchange of two joints or the zero offset of one joint that best explains the torques, or None.
 
-    The torques are those of the robot's own masses, and what is left of each joint's is a share of its variance.
+    The torques are those of the robot's own masses, and residuals are shares of the variance of each joint's torque.
     """
-    n, masses = chain.n, standard_parameters(chain)
+    n = chain.n
+    masses = standard_parameters(chain)
     samples = replace(samples, index=np.arange(len(samples.index)), effort=samples.torque)
 
-    def exchanged(pair: tuple[int, int]) -> Callable[[MotionSamples], MotionSamples]:
-        return lambda data: replace(_changed(data, exchange(n, *pair)), effort=data.effort @ exchange(n, *pair))
+    def with_exchange(pair: tuple[int, int]) -> Callable[[MotionSamples], MotionSamples]:
+        matrix = exchange(n, *pair)
+        return lambda data: replace(_changed(data, matrix), effort=data.effort @ matrix)
 
-    def turned(joint: int, angle: float) -> Callable[[MotionSamples], MotionSamples]:
-        return lambda data: replace(data, q=data.q + angle * np.eye(n)[joint])
+    def with_zero(joint: int, angle: float) -> Callable[[MotionSamples], MotionSamples]:
+        offset = angle * np.eye(n)[joint]
+        return lambda data: replace(data, q=data.q + offset)
 
     speed = samples.v.std(axis=0)
-    max_left = 0.5  # largest share of their torques' variance that is left as recorded
-    min_exchanged_speed = 0.3  # rms, of the fastest joint's: one that hardly moves may have any column
-    moves = np.flatnonzero((speed > min_exchanged_speed * speed.max()) & (_left(samples, masses) < max_left)).tolist()
-    turning = [j for j, joint in enumerate(chain.joints) if joint.kind != "prismatic"]
-    table = [Change("columns-exchanged", exchanged(pair), pair) for pair in combinations(moves, 2)]
-    table += [
-        Change("zero-elsewhere", turned(j, angle), (j,), {"angle": angle})
-        for j in turning
-        for angle in (0.5 * np.pi, np.pi, -0.5 * np.pi)
-    ]
-    return best_changes(samples, table, lambda changed: _left(changed, masses))
+    moves = speed > MIN_EXCHANGED_SPEED * speed.max()
+    unexplained = _unexplained_by_masses(samples, masses) < MAX_LEFT_RECORDED
+    pairs = combinations(np.flatnonzero(moves & unexplained).tolist(), 2)
+    changes = [Change("columns-exchanged", with_exchange(pair), pair) for pair in pairs]
+    for number, joint in enumerate(chain.joints):
+        if joint.kind == "prismatic":
+            continue
+        for angle in (0.5 * np.pi, np.pi, -0.5 * np.pi):
+            turned = with_zero(number, angle)
+            changes.append(Change("zero-elsewhere", turned, (number,), {"angle": angle}))
+    return best_changes(samples, changes, lambda changed: _unexplained_by_masses(changed, masses))
 
 
 def _changed(samples: MotionSamples, matrix: np.ndarray) -> MotionSamples:
     """Return samples with the joints' positions, velocities and accelerations multiplied by a matrix (n, n)."""
-    q, v, a = (np.ascontiguousarray(x @ matrix.T) for x in (samples.q, samples.v, samples.a))
+    q = np.ascontiguousarray(samples.q @ matrix.T)
+    v = np.ascontiguousarray(samples.v @ matrix.T)
+    a = np.ascontiguousarray(samples.a @ matrix.T)
     return replace(samples, q=q, v=v, a=a)
 
 
-def _left(samples: MotionSamples, masses: np.ndarray) -> np.ndarray:
+def _unexplained_by_masses(samples: MotionSamples, masses: np.ndarray) -> np.ndarray:
     """Return the unexplained share of each joint's torque variance (n,).
 
     Each torque is that of gravity and that of motion, by the robot's masses, each times a factor, its own drive and
     those of the joints beside it: wrists are coupled by their gears, which an exchange would seem to explain.
     """
-    still = inverse_dynamics(samples.bodies, masses, samples.q, np.zeros_like(samples.v), np.zeros_like(samples.a))
-    moving = inverse_dynamics(samples.bodies, masses, samples.q, samples.v, samples.a) - still
-    drives, shares = drive_columns(samples.v, samples.a), []
-    for joint, torque in enumerate((samples.torque - samples.torque.mean(axis=0)).T):
-        beside = drives[:, max(joint - 1, 0) : joint + 2].reshape(len(torque), -1)
-        spanned = basis(np.column_stack([still[:, joint], moving[:, joint], beside]))
-        shares.append(1.0 - ((torque @ spanned) ** 2).sum() / max(float(torque @ torque), 1e-300))
+    q, v, a = samples.q, samples.v, samples.a
+    of_gravity = inverse_dynamics(samples.bodies, masses, q, np.zeros_like(v), np.zeros_like(a))
+    of_motion = inverse_dynamics(samples.bodies, masses, q, v, a) - of_gravity
+    drives = drive_columns(v, a)
+    centred = samples.torque - samples.torque.mean(axis=0)
+    shares = []
+    for joint, torque in enumerate(centred.T):
+        neighbours = drives[:, max(joint - 1, 0) : joint + 2].reshape(len(torque), -1)
+        orthonormal = basis(np.column_stack([of_gravity[:, joint], of_motion[:, joint], neighbours]))
+        explained = ((torque @ orthonormal) ** 2).sum()
+        shares.append(1.0 - explained / max(float(torque @ torque), 1e-300))
     return np.maximum(shares, 1e-9)
-
-
-MAX_LAG_SAMPLES, MAX_SAMPLES = 1500, 500  # samples on which a lag is looked for, and all else
-FOLLOWS = 0.9  # correlation from which on measured velocities, integrated, are the positions
 
 
 @dataclass(frozen=True)
@@ -262,33 +313,53 @@ def compare_sizes(
         gravity: in the base frame [m/s²], where it is not the robot's own.
         newtons: whether the torques are in N m; those of currents without known gains compare with no masses.
     """
-    n, motion = chain.n, case.motion
-    nothing = np.full(n, np.nan)
-    known = newtons and case.target.shape[1] == n
-    known = known and chain.inertias is not None and bool(np.any(chain.inertias[:, 9] > 0.0))
-    masses = share_of_nominal(motion.t, motion.q, case.target, chain, gravity, static=True) if known else nothing
-    limits = nothing
-    spike_share = 0.01  # share of the samples that may be spikes
-    if newtons and case.target.shape[1] == n:
+    motion = case.motion
+    unknown = np.full(chain.n, np.nan)
+    of_motors = newtons and case.target.shape[1] == chain.n
+    has_masses = chain.inertias is not None and bool(np.any(chain.inertias[:, 9] > 0.0))
+
+    masses, limits = unknown, unknown
+    if of_motors and has_masses:
+        masses = share_of_nominal(motion.t, motion.q, case.target, chain, gravity, static=True)
+    if of_motors:
         limit = np.array([joint.effort for joint in chain.joints])
-        usual = np.quantile(np.abs(case.target), 1.0 - spike_share, axis=0)
-        limits = np.where(np.isfinite(limit) & (limit > 0.0), usual / np.where(limit > 0.0, limit, 1.0), np.nan)
-    speed, v = (nothing, nothing, nothing), motion.v_measured
-    if v is not None:
-        speed = _speed_ratio(motion.t, motion.q, v, motion.segment)
-    counted = motion.sampling.clock.kind == "counted"
+        torque = np.quantile(np.abs(case.target), 1.0 - SPIKE_SHARE, axis=0)
+        share = torque / np.where(limit > 0.0, limit, 1.0)
+        limits = np.where(np.isfinite(limit) & (limit > 0.0), share, np.nan)
+    speed, speed_sigma, follows = unknown, unknown, unknown
+    if motion.v_measured is not None:
+        speed, speed_sigma, follows = _speed_ratio(motion.t, motion.q, motion.v_measured, motion.segment)
+
     bodies = bodies_under(chain, gravity)
-    many, few = (take_samples(case, bodies, count) for count in (MAX_LAG_SAMPLES, MAX_SAMPLES))
-    lag = None if many is None else lag_of(many, motion.rate)
-    clock = clock_ratio(few, chain) if newtons and few is not None else None
-    other = rearranged(few, chain) if known and few is not None else None
-    return RecordingSizes(case.name, masses, limits, *speed, counted, motion.rate, lag, clock, other, motion.jumps)
+    lag_samples = take_samples(case, bodies, MAX_LAG_SAMPLES)
+    samples = take_samples(case, bodies, MAX_SAMPLES)
+    lag, clock, other = None, None, None
+    if lag_samples is not None:
+        lag = lag_of(lag_samples, motion.rate)
+    if newtons and samples is not None:
+        clock = clock_ratio(samples, chain)
+    if of_motors and has_masses and samples is not None:
+        other = rearranged(samples, chain)
+    return RecordingSizes(
+        name=case.name,
+        masses=masses,
+        limits=limits,
+        speed=speed,
+        speed_sigma=speed_sigma,
+        follows=follows,
+        counted=motion.sampling.clock.kind == "counted",
+        rate=motion.rate,
+        lag=lag,
+        clock=clock,
+        other=other,
+        jumps=motion.jumps,
+    )
 
 
 def signs_of(case: Case, chain: Chain, gravity: Sequence[float] | None = None) -> Explanation | None:
     """Return the joints of a recording with reversed torques or coupled positions; None if it is too short."""
-    few = take_samples(case, bodies_under(chain, gravity), MAX_SAMPLES)
-    return None if few is None else wrong_joints(few)
+    samples = take_samples(case, bodies_under(chain, gravity), MAX_SAMPLES)
+    return None if samples is None else wrong_joints(samples)
 
 
 def _speed_ratio(
@@ -300,21 +371,23 @@ def _speed_ratio(
     since nobody knows the speed in a gap. Of a short motion little is left beside its trend, while an error of the
     dates moves the whole travel. NaN for joints that hardly travel, and the ratio where velocities do not follow.
     """
-    own, seen = np.array(q), np.empty_like(q)
-    for a, b in segments(segment):
-        step = np.diff(t[a:b])[:, None]
-        seen[a:b] = np.concatenate([0.0 * v[a : a + 1], np.cumsum((v[a + 1 : b] + v[a : b - 1]) / 2 * step, axis=0)])
-        trend = np.column_stack([np.ones(b - a), t[a:b] - t[a:b].mean()])
-        for x in (own, seen):
-            x[a:b] -= trend @ np.linalg.lstsq(trend, x[a:b], rcond=None)[0]
-    power = np.maximum((own**2).sum(axis=0), 1e-300)
-    ratio = (own * seen).sum(axis=0) / power
-    date_error = 0.01  # share of a joint's travel by which errors of dates move its positions
-    dated = date_error * np.ptp(q, axis=0) / np.maximum(np.ptp(own, axis=0), 1e-300)
-    min_travel = 0.05  # a joint that travels less says nothing of its velocity's size [rad or m]
-    travels = np.ptp(q, axis=0) > min_travel
-    follows = np.where(travels, ratio * np.sqrt(power / np.maximum((seen**2).sum(axis=0), 1e-300)), np.nan)
-    # independent errors in what velocities leave of the positions: those with a dead zone drift for long
-    independent_errors = 6
-    sigma = np.hypot(np.sqrt(((seen - ratio * own) ** 2).sum(axis=0) / power / independent_errors), dated)
+    position = np.array(q)
+    integral = np.empty_like(q)
+    for start, stop in segments(segment):
+        part = slice(start, stop)
+        step = np.diff(t[part])[:, None]
+        mean_velocity = (v[start + 1 : stop] + v[start : stop - 1]) / 2
+        integral[part] = np.concatenate([0.0 * v[start : start + 1], np.cumsum(mean_velocity * step, axis=0)])
+        trend = np.column_stack([np.ones(stop - start), t[part] - t[part].mean()])
+        position[part] -= trend @ np.linalg.lstsq(trend, position[part], rcond=None)[0]
+        integral[part] -= trend @ np.linalg.lstsq(trend, integral[part], rcond=None)[0]
+    power = np.maximum((position**2).sum(axis=0), 1e-300)
+    integral_power = np.maximum((integral**2).sum(axis=0), 1e-300)
+    ratio = (position * integral).sum(axis=0) / power
+    travel = np.ptp(q, axis=0)
+    travels = travel > MIN_TRAVEL
+    follows = np.where(travels, ratio * np.sqrt(power / integral_power), np.nan)
+    by_dates = DATE_ERROR * travel / np.maximum(np.ptp(position, axis=0), 1e-300)
+    by_noise = np.sqrt(((integral - ratio * position) ** 2).sum(axis=0) / power / INDEPENDENT_ERRORS)
+    sigma = np.hypot(by_noise, by_dates)
     return np.where(travels & (follows > FOLLOWS), ratio, np.nan), sigma, follows

@@ -16,10 +16,38 @@ import numpy as np
 
 from calib.identification.checks.recorded_motion import CREEP, MotionSamples, spanning
 
-LAGS = 0.25  # largest lag that is tried [s], in steps of
+LAGS = 0.25
+"""Largest lag that is tried [s]."""
 STEP = 0.005
-MIN_LAG, MIN_LAG_SIGMAS = 0.015, 3.5  # smallest lag that is reported [s], and in sigmas
-ALONE, OTHERS = 0.2, 3.0  # share by which a lag of its own helps a joint, and times as much as any other joint's
+"""Step of the lags that are tried [s]."""
+SHIFTS = np.arange(-LAGS, LAGS + STEP / 2, STEP)
+"""Lags that are tried [s]."""
+RECORDED = len(SHIFTS) // 2
+"""Index of no lag."""
+MIN_LAG = 0.015
+"""Smallest lag that is reported [s]."""
+MIN_LAG_SIGMAS = 3.5
+"""Smallest lag that is reported, in sigmas."""
+MIN_GAIN = 1.05
+"""Residual without the lag over residual with it, at least: of another robot any lag may be the best."""
+MAX_UNEXPLAINED = 0.4
+"""Share of the joints' torques that a model may leave unexplained: one that leaves more identifies no lag."""
+ALONE = 0.2
+"""Share by which a lag of its own helps a joint, at least."""
+OTHERS = 3.0
+"""Times as much as any other joint's that it helps, at least."""
+MAX_LAG_DIFFERENCE = 0.5
+"""Share of a joint's lag by which those of both halves of the recording may differ from it."""
+MIN_TIME = 2.0
+"""Time with samples below which no lag is estimated: bodies make up for it [s]."""
+ROUNDS = 4
+"""Rounds of weighing joints by their residuals."""
+LAG_SIGMA = 0.005
+"""Sigma that a friction of another form brings [s]: real recordings as they are show lags of 4 ms rms."""
+MAX_SWEEPS = 30
+"""Sweeps over the joints' separate lags, at most."""
+FREE_TIME = 0.03
+"""Time by which friction may turn over early or late by itself [s]."""
 
 
 @dataclass(frozen=True)
@@ -47,11 +75,9 @@ class Lag:
     @property
     def certain(self) -> bool:
         """Whether the lag of all torques is significant and large enough to report."""
-        least = max(MIN_LAG, MIN_LAG_SIGMAS * self.sigma)
-        # and what is left without it over what is left with it: of another robot any lag may be the best
-        min_gain = 1.05
-        max_left = 0.4  # share of the joints' torques that may be left: a model that leaves more knows no lag
-        return least < abs(self.seconds) < LAGS - STEP and self.factor > min_gain and self.after < max_left
+        min_lag = max(MIN_LAG, MIN_LAG_SIGMAS * self.sigma)
+        significant = min_lag < abs(self.seconds) < LAGS - STEP
+        return significant and self.factor > MIN_GAIN and self.after < MAX_UNEXPLAINED
 
 
 def lag_of(samples: MotionSamples, rate: float) -> Lag | None:
@@ -61,35 +87,34 @@ def lag_of(samples: MotionSamples, rate: float) -> Lag | None:
         samples: of the recording.
         rate: of its motion [Hz].
     """
-    m = len(samples.index)
-    min_time = 2.0  # time with samples below which no lag is estimated: bodies make up for it [s]
-    if m * float(np.median(np.diff(samples.index))) < min_time * rate:
+    count = len(samples.index)
+    if count * float(np.median(np.diff(samples.index))) < MIN_TIME * rate:
         return None
-    rows = _rows(samples, rate)
-    parts = [_Rows.of(rows[0][:, half], rows[1][:, :, half]) for half in (slice(0, m // 2), slice(m // 2, m))]
-    sums = (getattr(parts[0], name) + getattr(parts[1], name) for name in ("square", "cross", "power"))
-    whole, *halves = (_lag_in(each) for each in (_Rows(*rows, *sums), *parts))
-    apart = abs(halves[0].seconds - halves[1].seconds) / 2.0
-    return replace(whole, sigma=float(np.hypot(whole.sigma, apart)), joint=_alone(whole, halves))
+    columns, torque = _rows(samples, rate)
+    middle = count // 2
+    first = _Rows.of(columns[:, :middle], torque[:, :, :middle])
+    second = _Rows.of(columns[:, middle:], torque[:, :, middle:])
+    total = _Rows(columns, torque, first.square + second.square, first.cross + second.cross, first.power + second.power)
+    lag = _lag_in(total)
+    half_lags = [_lag_in(first), _lag_in(second)]
+    difference = abs(half_lags[0].seconds - half_lags[1].seconds) / 2.0
+    return replace(lag, sigma=float(np.hypot(lag.sigma, difference)), joint=_single_joint(lag, half_lags))
 
 
-def _alone(whole: Lag, halves: Sequence[Lag], max_lag_difference: float = 0.5) -> int | None:
-    """Return the one joint whose lag differs from the common lag in both halves of the recording; None without one.
-
-    `max_lag_difference`: share of that lag by which those of both halves may differ from it.
-    """
-    j, more = int(whole.gains.argmax()), np.sort(whole.gains) - 1.0
-    late = whole.own[j] - whole.seconds
-    if abs(late) < MIN_LAG or abs(whole.own[j]) > LAGS - 1.5 * STEP or len(more) < 2:
+def _single_joint(lag: Lag, half_lags: Sequence[Lag]) -> int | None:
+    """Return the one joint whose lag differs from the common lag in both halves of the recording; None without one."""
+    joint = int(lag.gains.argmax())
+    gains = np.sort(lag.gains) - 1.0
+    late = lag.own[joint] - lag.seconds
+    if abs(late) < MIN_LAG or abs(lag.own[joint]) > LAGS - 1.5 * STEP or len(gains) < 2:
         return None
-    if more[-1] < max(ALONE, OTHERS * more[-2]):
+    if gains[-1] < max(ALONE, OTHERS * gains[-2]):
         return None
-    return (
-        j if all(abs(half.own[j] - half.seconds - late) < max_lag_difference * abs(late) for half in halves) else None
-    )
-
-
-SHIFTS = np.arange(-LAGS, LAGS + STEP / 2, STEP)
+    for half in half_lags:
+        half_late = half.own[joint] - half.seconds
+        if not abs(half_late - late) < MAX_LAG_DIFFERENCE * abs(late):
+            return None
+    return joint
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,116 +142,127 @@ class _Rows:
 
 def _rows(samples: MotionSamples, rate: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the columns (n, m, p) of all joints, and their torques (n, S, m) at the lags `SHIFTS`."""
-    places, times = samples.index + SHIFTS[:, None] * rate, np.arange(len(samples.effort))
-    torque = np.stack([np.interp(places, times, own) for own in samples.effort.T])
+    shifted = samples.index + SHIFTS[:, None] * rate
+    times = np.arange(len(samples.effort))
+    torque = np.stack([np.interp(shifted, times, effort) for effort in samples.effort.T])
     columns = np.concatenate([samples.inertial, samples.drives, *_turning(samples, rate)], axis=2)
     return np.ascontiguousarray(columns.transpose(1, 0, 2)), torque
 
 
-def _lag_in(rows: _Rows, rounds: int = 4, lag_sigma: float = 0.005) -> Lag:
-    """Return the least-squares lag of the rows, with its sigma from the spread between joints.
-
-    `rounds`: of weighing joints by what is left of them.
-
-    `lag_sigma`: sigma that a friction of another form brings [s]: real recordings as they are show lags of 4 ms rms.
-    """
-    n, torque = len(rows.torque), rows.torque
-    recorded = np.full(n, len(SHIFTS) // 2)
-    fit = _Fit(rows, 1.0 / np.maximum(torque[:, recorded[0]].std(axis=1), 1e-12))
-    for _ in range(rounds):
-        left = fit.left(np.full(n, fit.common.argmin()))
-        fit = _Fit(rows, fit.weight / np.maximum(left.std(axis=1), 1e-12))
-    at = int(fit.common.argmin())
-    common, alone = np.full(n, at), fit.own(np.full(n, at))
-    spread = torque[:, recorded[0]].std(axis=1)
-
-    def share(places: np.ndarray) -> float:
-        return float(np.sqrt(np.mean((fit.left(places).std(axis=1) / fit.weight / np.maximum(spread, 1e-12)) ** 2)))
-
+def _lag_in(rows: _Rows) -> Lag:
+    """Return the least-squares lag of the rows, with its sigma from the spread between joints."""
+    n = len(rows.torque)
+    spread = rows.torque[:, RECORDED].std(axis=1)
+    fit = _Fit(rows, 1.0 / np.maximum(spread, 1e-12))
+    for _ in range(ROUNDS):
+        residual = fit.residual(np.full(n, fit.common.argmin()))
+        fit = _Fit(rows, fit.weight / np.maximum(residual.std(axis=1), 1e-12))
+    best = int(fit.common.argmin())
+    separate = fit.separate_lags(np.full(n, best))
     return Lag(
-        seconds=float(SHIFTS[at] + STEP * _least(fit.common, at)),
-        sigma=float(np.hypot(fit.sigma(at), lag_sigma)),
-        before=share(recorded),
-        after=share(common),
-        factor=float(np.sqrt(fit.common[recorded[0]] / max(fit.common[at], 1e-300))),
-        own=SHIFTS[alone],
-        gains=np.array([fit.gain(alone, j, at) for j in range(n)]),
+        seconds=float(SHIFTS[best] + STEP * _parabola_minimum(fit.common, best)),
+        sigma=float(np.hypot(fit.sigma(best), LAG_SIGMA)),
+        before=fit.unexplained_share(np.full(n, RECORDED), spread),
+        after=fit.unexplained_share(np.full(n, best), spread),
+        factor=float(np.sqrt(fit.common[RECORDED] / max(fit.common[best], 1e-300))),
+        own=SHIFTS[separate],
+        gains=np.array([fit.gain(separate, joint, best) for joint in range(n)]),
         joint=None,
     )
 
 
 class _Fit:
-    """Least squares of the joints' torques at any lags: projections at every lag are computed once."""
+    """Least squares of the joints' torques at any lags: projections at every lag are computed once.
+
+    Attributes:
+        rows: columns and torques.
+        weight: (n,) of the joints.
+        spanning: (p, k) from the columns to an orthonormal basis of their space.
+        parts: (n, shifts, k) projections of the weighted torques onto the basis.
+        power: (n, shifts) squares of the weighted torques.
+        common: (shifts,) squared residual where all joints have the same lag.
+    """
 
     def __init__(self, rows: _Rows, weight: np.ndarray) -> None:
         """Project torques, weighted (n,), onto the columns of all joints."""
-        self.rows, self.weight = rows, weight
-        weights = weight**2
-        self.spanning = spanning(np.tensordot(weights, rows.square, 1))
-        self.parts = np.matmul(rows.cross.transpose(0, 2, 1), self.spanning) * weights[:, None, None]  # (n, shifts, k)
-        self.power = rows.power * weights[:, None]
-        self.common = self.power.sum(axis=0) - (self.parts.sum(axis=0) ** 2).sum(axis=1)
-        """(shifts,) squared residual where all joints have the same lag."""
+        self.rows = rows
+        self.weight = weight
+        squares = weight**2
+        self.spanning = spanning(np.tensordot(squares, rows.square, 1))
+        self.parts = np.matmul(rows.cross.transpose(0, 2, 1), self.spanning) * squares[:, None, None]
+        self.power = rows.power * squares[:, None]
+        explained = (self.parts.sum(axis=0) ** 2).sum(axis=1)
+        self.common = self.power.sum(axis=0) - explained
 
-    def left(self, places: np.ndarray) -> np.ndarray:
-        """Return the residuals (n, m) of the weighted torques at the joints' lags (n,)."""
-        joints = np.arange(len(places))
-        return self._unexplained(self.rows.torque[joints, places], self.parts[joints, places].sum(axis=0))
+    def residual(self, lags: np.ndarray) -> np.ndarray:
+        """Return the residuals (n, m) of the weighted torques at the joints' lags (n,), indices of `SHIFTS`."""
+        joints = np.arange(len(lags))
+        return self._unexplained(self.rows.torque[joints, lags], self.parts[joints, lags].sum(axis=0))
 
     def _unexplained(self, torque: np.ndarray, parts: np.ndarray) -> np.ndarray:
         """Return torques (n, m) without their projections (k,), weighted."""
         return self.weight[:, None] * (torque - self.rows.columns @ (self.spanning @ parts))
 
-    def along(self, places: np.ndarray, joint: int) -> np.ndarray:
+    def unexplained_share(self, lags: np.ndarray, spread: np.ndarray) -> float:
+        """Return the rms share of the torques, each in units of its `spread` (n,), that is unexplained at some lags."""
+        deviation = self.residual(lags).std(axis=1) / self.weight
+        return float(np.sqrt(np.mean((deviation / np.maximum(spread, 1e-12)) ** 2)))
+
+    def along(self, lags: np.ndarray, joint: int) -> np.ndarray:
         """Return the squared residual of all joints (shifts,) over one joint's lag; the other lags (n,) stay fixed."""
-        others = np.flatnonzero(np.arange(len(places)) != joint)
-        fixed = self.parts[others, places[others]].sum(axis=0)
-        explained = ((fixed + self.parts[joint]) ** 2).sum(axis=1)
-        return np.asarray(self.power[others, places[others]].sum() + self.power[joint] - explained)
+        fixed = np.flatnonzero(np.arange(len(lags)) != joint)
+        fixed_part = self.parts[fixed, lags[fixed]].sum(axis=0)
+        explained = ((fixed_part + self.parts[joint]) ** 2).sum(axis=1)
+        return np.asarray(self.power[fixed, lags[fixed]].sum() + self.power[joint] - explained)
 
-    def own(self, places: np.ndarray) -> np.ndarray:
+    def separate_lags(self, start: np.ndarray) -> np.ndarray:
         """Return the separate least-squares lags of the joints (n,), starting from the given ones."""
-        places = places.copy()
-        max_sweeps = 30  # over the joints' own lags
-        for _ in range(max_sweeps):
-            before = places.copy()
-            for joint in range(len(places)):
-                places[joint] = self.along(places, joint).argmin()
-            if (places == before).all():
+        lags = start.copy()
+        for _ in range(MAX_SWEEPS):
+            before = lags.copy()
+            for joint in range(len(lags)):
+                lags[joint] = self.along(lags, joint).argmin()
+            if (lags == before).all():
                 break
-        return places
+        return lags
 
-    def gain(self, places: np.ndarray, joint: int, common: int) -> float:
-        """Return the ratio of a joint's residuals at the common lag and at its own lag; `places` (n,): all lags."""
-        along, own = self.along(places, joint), float((self.left(places)[joint] ** 2).sum())
-        return float(np.sqrt(1.0 + max(along[common] - along[places[joint]], 0.0) / max(own, 1e-300)))
+    def gain(self, lags: np.ndarray, joint: int, common: int) -> float:
+        """Return the ratio of a joint's residuals at the common lag and at its separate lag; `lags` (n,): all lags."""
+        along = self.along(lags, joint)
+        square = float((self.residual(lags)[joint] ** 2).sum())
+        increase = max(along[common] - along[lags[joint]], 0.0)
+        return float(np.sqrt(1.0 + increase / max(square, 1e-300)))
 
-    def sigma(self, at: int) -> float:
-        """Return the sigma of the common lag at index `at` [s], each joint counted as one independent sample."""
-        inner = int(np.clip(at, 1, len(SHIFTS) - 2))
-        torque, parts = ((x[:, inner + 1] - x[:, inner - 1]) / (2.0 * STEP) for x in (self.rows.torque, self.parts))
-        slope = self._unexplained(torque, parts.sum(axis=0))
-        votes, power = (self.left(np.full(len(slope), inner)) * slope).sum(axis=1), float((slope**2).sum())
-        few = len(votes) / max(len(votes) - 1, 1)
-        return float(np.sqrt(few * ((votes - votes.mean()) ** 2).sum()) / max(power, 1e-300))
-
-
-def _turning(samples: MotionSamples, rate: float, free_time: float = 0.03) -> list[np.ndarray]:
-    """Return two friction regressors (m, n, n) whose sign changes `free_time` too early, and too late.
-
-    `free_time`: by which friction may turn over early or late by itself [s].
-    """
-    n, times = samples.q.shape[1], np.arange(len(samples.velocity))
-    found = []
-    for early in (-free_time, free_time):
-        v = np.stack([np.interp(samples.index + early * rate, times, own) for own in samples.velocity.T], axis=1)
-        found.append(np.tanh(v / CREEP)[:, :, None] * np.eye(n))
-    return found
+    def sigma(self, lag: int) -> float:
+        """Return the sigma of a common lag [s], an index of `SHIFTS`; each joint counts as one independent sample."""
+        inner = int(np.clip(lag, 1, len(SHIFTS) - 2))
+        torque, parts = self.rows.torque, self.parts
+        torque_slope = (torque[:, inner + 1] - torque[:, inner - 1]) / (2.0 * STEP)
+        parts_slope = (parts[:, inner + 1] - parts[:, inner - 1]) / (2.0 * STEP)
+        slope = self._unexplained(torque_slope, parts_slope.sum(axis=0))
+        votes = (self.residual(np.full(len(slope), inner)) * slope).sum(axis=1)
+        power = float((slope**2).sum())
+        correction = len(votes) / max(len(votes) - 1, 1)
+        return float(np.sqrt(correction * ((votes - votes.mean()) ** 2).sum()) / max(power, 1e-300))
 
 
-def _least(left: np.ndarray, at: int) -> float:
-    """Return the minimum of a parabola through three points about index `at`, as an offset in indices."""
-    if not 0 < at < len(left) - 1:
+def _turning(samples: MotionSamples, rate: float) -> list[np.ndarray]:
+    """Return two friction regressors (m, n, n) whose sign changes `FREE_TIME` too early, and too late."""
+    times = np.arange(len(samples.velocity))
+    regressors = []
+    for early in (-FREE_TIME, FREE_TIME):
+        shifted = samples.index + early * rate
+        v = np.stack([np.interp(shifted, times, velocity) for velocity in samples.velocity.T], axis=1)
+        regressors.append(np.tanh(v / CREEP)[:, :, None] * np.eye(v.shape[1]))
+    return regressors
+
+
+def _parabola_minimum(values: np.ndarray, index: int) -> float:
+    """Return the minimum of a parabola through three points about an index, as an offset in indices."""
+    if not 0 < index < len(values) - 1:
         return 0.0
-    bend = left[at - 1] - 2.0 * left[at] + left[at + 1]
-    return 0.5 * float(left[at - 1] - left[at + 1]) / float(bend) if bend > 0.0 else 0.0
+    before, middle, after = values[index - 1 : index + 2]
+    bend = before - 2.0 * middle + after
+    if not bend > 0.0:
+        return 0.0
+    return 0.5 * float(before - after) / float(bend)

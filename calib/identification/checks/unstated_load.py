@@ -14,20 +14,37 @@ import numpy as np
 from calib.estimation.whiteness import inflation
 from calib.identification.checks.recorded_motion import MotionSamples, basis
 
-MAX_LEFT = 0.8  # rms residual with the load over that without (geometric mean over the joints; all below: our choice)
-MAX_BEYOND = 1.15  # rms residual with the load over that with masses of their own in each recording
+MAX_LEFT = 0.8
+"""Rms residual with the load over that without (geometric mean over the joints; all below: our choice)."""
+MAX_BEYOND = 1.15
+"""Rms residual with the load over that with masses of their own in each recording."""
+MAX_SCALED = 0.93
+"""Rms residual with the load over that with other gains of the joints' torques.
+
+0.59 to 0.88 for real loads of a UR10e (16 pairs of recordings), 0.99 and more where one recording's torques were scaled
+instead.
+"""
+MIN_SIGMAS = 10.0
+"""Mass of a load in sigmas, at least."""
+MAX_REACH = 1.0
+"""Distance of the load's centre of mass from the last joint, at most [m]."""
+MIN_FACTOR = 0.1
+"""Factor between torques of one joint in two recordings, at least."""
+RANK = 1e-10
+"""Eigenvalue of WᵀW with columns of unit norm, below which a direction is not identified."""
+MAX_UNIDENTIFIED = 1e-3
+"""Share of the mass that may be in such directions."""
+ROUNDS = 4
+"""Rounds of weighing joints by their residuals."""
+BODY = 10
+"""Standard parameters of a body."""
+MASS = 9
+"""Index of the mass in them."""
+FIRST_MOMENT = slice(6, 9)
+
+
 # rms residual with the load over that with other gains of the joints' torques: 0.59 to 0.88 for real loads of a UR10e
 # (16 pairs of recordings), 0.99 and more where one recording's torques were scaled instead
-MAX_SCALED = 0.93
-MIN_SIGMAS = 10.0  # of the mass
-MAX_REACH = 1.0  # of the load's centre of mass from the last joint [m]
-MIN_FACTOR = 0.1  # between torques of one joint in two recordings
-RANK = 1e-10  # of WᵀW with columns of unit norm, below which a direction is not identified
-MAX_UNTOLD = 1e-3  # of the mass, that may be in such directions
-ROUNDS = 4  # of weighing joints by their residuals
-BODY = 10  # standard parameters of a body
-MASS = 9  # index of the mass in them
-FIRST_MOMENT = slice(6, 9)
 
 
 @dataclass(frozen=True)
@@ -55,23 +72,26 @@ def unstated_load(samples: Mapping[str, MotionSamples]) -> UnstatedLoad | None:
         return None
     names = list(samples)
     rows = [_rows(motion) for motion in samples.values()]
-    nobody = _fit(rows, None)
-    apart = [residual for part in rows for residual in _fit([part], None).residuals]
+    unloaded = _fit(rows, None)
+    separate = []
+    for part in rows:
+        separate += _fit([part], None).residuals
     loaded = [_fit(rows, index) for index in range(len(rows))]
-    best = min(range(len(rows)), key=lambda index: _size(loaded[index].residuals))
-    # of two recordings either one explains the other's load by a negative one
+    sizes = [_size(fit.residuals) for fit in loaded]
+    best = int(np.argmin(sizes))
     if len(rows) == 2 and loaded[best].values[MASS] < 0.0:
+        # Of two recordings either one explains the other's load by a negative one.
         best = 1 - best
     fit = loaded[best]
-    before, after = _size(nobody.residuals), _size(fit.residuals)
-    mass, sigma = float(fit.values[MASS]), fit.sigma
+    before, after = _size(unloaded.residuals), sizes[best]
+    mass = float(fit.values[MASS])
     reach = float(np.linalg.norm(fit.values[FIRST_MOMENT])) / max(abs(mass), 1e-12)
-    explained = after < MAX_LEFT * before and after < MAX_BEYOND * _size(apart)
+    explained = after < MAX_LEFT * before and after < MAX_BEYOND * _size(separate)
     explained = explained and after < MAX_SCALED * _size(_scaled(rows, best))
-    if not explained or mass < MIN_SIGMAS * sigma or reach > MAX_REACH:
+    if not explained or mass < MIN_SIGMAS * fit.sigma or reach > MAX_REACH:
         return None
-    size = _size([part[:, :, -1] for part in rows])
-    return UnstatedLoad(names[best], mass, sigma, reach, before / size, after / size)
+    torque = _size([part[:, :, -1] for part in rows])
+    return UnstatedLoad(names[best], mass, fit.sigma, reach, before / torque, after / torque)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,45 +118,48 @@ def _rows(motion: MotionSamples) -> np.ndarray:
 def _fit(rows: Sequence[np.ndarray], loaded: int | None) -> _Fit:
     """Return the fit of recordings with the same bodies, and a load on the last one of recording `loaded`."""
     n, size = rows[0].shape[1], rows[0].shape[2] - 1
-    last = slice(size - n - BODY, size - n)
-    parts = []
+    last_body = slice(size - n - BODY, size - n)
+    matrices, targets = [], []
     for index, part in enumerate(rows):
-        load = part[:, :, last] * (index == loaded)
-        parts.append(np.concatenate([part[:, :, :-1], load], axis=2))
-    residuals = [part[:, :, -1] for part in rows]
+        load = part[:, :, last_body] * (index == loaded)
+        matrices.append(np.concatenate([part[:, :, :-1], load], axis=2))
+        targets.append(part[:, :, -1])
+    residuals = targets
     bodies, values, sigma = np.zeros(size), np.zeros(BODY), np.inf
     for _ in range(ROUNDS):
         weight = 1.0 / np.maximum(_mean_squares(residuals), 1e-300)
-        square = sum(np.einsum("mjp,j,mjq->pq", part, weight, part, optimize=True) for part in parts)
-        product = sum(
-            np.einsum("mjp,j,mj->p", part, weight, own[:, :, -1], optimize=True) for part, own in zip(parts, rows)
-        )
-        inverse = _inverse(np.asarray(square))
-        solution = inverse @ np.asarray(product)
-        residuals = [own[:, :, -1] - part @ solution for part, own in zip(parts, rows)]
+        square = np.zeros((size + BODY, size + BODY))
+        product = np.zeros(size + BODY)
+        for matrix, target in zip(matrices, targets):
+            square = square + np.einsum("mjp,j,mjq->pq", matrix, weight, matrix, optimize=True)
+            product = product + np.einsum("mjp,j,mj->p", matrix, weight, target, optimize=True)
+        inverse = _inverse(square)
+        solution = inverse @ product
+        residuals = [target - matrix @ solution for matrix, target in zip(matrices, targets)]
         bodies, values = solution[:-BODY], solution[-BODY:]
-        sigma = float(np.sqrt(inverse[MASS - BODY, MASS - BODY]))
-        # 1 where the rows tell the mass by itself, less where only sums with others
-        told = float(inverse[MASS - BODY] @ np.asarray(square)[:, MASS - BODY])
-        sigma = sigma if told > 1.0 - MAX_UNTOLD else np.inf
+        # 1 where the rows identify the mass by itself, less where only sums with others.
+        identified = float(inverse[MASS - BODY] @ square[:, MASS - BODY])
+        sigma = np.inf
+        if identified > 1.0 - MAX_UNIDENTIFIED:
+            sigma = float(np.sqrt(inverse[MASS - BODY, MASS - BODY]))
     spread = [inflation(residual) for part in residuals for residual in part.T]
     return _Fit(residuals, bodies, values, sigma * float(np.sqrt(max(spread))))
 
 
-def _scaled(rows: Sequence[np.ndarray], scaled: int) -> list[np.ndarray]:
+def _scaled(rows: Sequence[np.ndarray], recording: int) -> list[np.ndarray]:
     """Return the residuals where the joints' torques of one recording are too large by factors, and none is loaded."""
-    part = rows[scaled]
+    before, part, after = rows[:recording], rows[recording], rows[recording + 1 :]
     torque = part[:, :, -1]
-    fit = _fit([*rows[:scaled], *rows[scaled + 1 :]], None)
+    fit = _fit([*before, *after], None)
     residuals = []
     for _ in range(ROUNDS):
         expected = part[:, :, :-1] @ fit.bodies
         factor = np.sum(expected * torque, axis=0) / np.maximum(np.sum(expected**2, axis=0), 1e-300)
         changed = np.array(part)
         changed[:, :, -1] /= np.where(np.abs(factor) > MIN_FACTOR, factor, 1.0)
-        fit = _fit([*rows[:scaled], changed, *rows[scaled + 1 :]], None)
+        fit = _fit([*before, changed, *after], None)
         residuals = list(fit.residuals)
-        residuals[scaled] = torque - factor * (part[:, :, :-1] @ fit.bodies)
+        residuals[recording] = torque - factor * (part[:, :, :-1] @ fit.bodies)
     return residuals
 
 
@@ -144,8 +167,8 @@ def _inverse(square: np.ndarray) -> np.ndarray:
     """Return the pseudo-inverse (p, p) of WᵀW, columns scaled to unit norm."""
     size = np.sqrt(np.diag(square))
     scale = np.where(size > 1e-9 * size.max(), size, np.inf)
-    both = np.outer(scale, scale)
-    return np.asarray(np.linalg.pinv(square / both, rcond=RANK, hermitian=True) / both)
+    scales = np.outer(scale, scale)
+    return np.asarray(np.linalg.pinv(square / scales, rcond=RANK, hermitian=True) / scales)
 
 
 def _mean_squares(residuals: Sequence[np.ndarray]) -> np.ndarray:

@@ -47,17 +47,22 @@ class Reference:
 
     def sampled(self, ahead: np.ndarray | None) -> np.ndarray:
         """Return position, velocity, feedforward torque `ahead` (N, n) and acceleration as one array (4, N, n)."""
-        torque = np.zeros_like(self.q) if ahead is None else shaped(ahead, self.q.shape, "torque ahead")
+        if ahead is None:
+            torque = np.zeros_like(self.q)
+        else:
+            torque = shaped(ahead, self.q.shape, "torque ahead")
         return np.array([self.q, self.v, torque, self.a])
 
     def at(self, tick: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return q, v, a (M, n) at control periods `tick` (M,), interpolated by cubic splines between integers."""
-        whole = tick.astype(int)
-        if np.all(tick == whole):
-            return self.q[whole], self.v[whole], self.a[whole]
+        index = tick.astype(int)
+        if np.all(tick == index):
+            return self.q[index], self.v[index], self.a[index]
         from scipy.interpolate import CubicSpline
 
-        q, v, a = (CubicSpline(np.arange(len(self.t)), x)(tick) for x in (self.q, self.v, self.a))
+        q = CubicSpline(np.arange(len(self.t)), self.q)(tick)
+        v = CubicSpline(np.arange(len(self.t)), self.v)(tick)
+        a = CubicSpline(np.arange(len(self.t)), self.a)(tick)
         return q, v, a
 
 
@@ -127,7 +132,9 @@ def stated_controller(loop: LoopSettings, n: int) -> Controller:
         UsageError: where the length of a list is not the number of joints.
     """
     if loop.controller == "cascade":
-        first, second, third = (loop.per_joint(key, n) for key in ("position", "velocity", "reset"))
+        first = loop.per_joint("position", n)
+        second = loop.per_joint("velocity", n)
+        third = loop.per_joint("reset", n)
         return completed(cascade(first, second, third, share=loop.share), loop, n)
     return completed(pd(loop.per_joint("kp", n), loop.per_joint("kd", n), ki=loop.per_joint("ki", n)), loop, n)
 
@@ -179,8 +186,8 @@ def identify_controller(
     tau = low_pass(tau, rate, band)
     edge = border(rate, band)
     basis = np.linalg.qr(_instruments(reference, len(error), rate, band)[edge:-edge])[0]
-    found = [_joint(error[edge:-edge, j], tau[edge:-edge, j], basis, orders) for j in range(error.shape[1])]
-    gains = np.array([_read(past, errors, rate, band, integral) for past, errors in found])
+    fits = [_joint(error[edge:-edge, j], tau[edge:-edge, j], basis, orders) for j in range(error.shape[1])]
+    gains = np.array([_read(past, errors, rate, band, integral) for past, errors in fits])
     controller = pd(gains[:, 0], gains[:, 1], ki=gains[:, 2])
     explained = [_explained(error[:, j], tau[:, j], gains[j], rate, band) for j in range(len(gains))]
     return IdentifiedController(controller, frozen(explained))
@@ -221,12 +228,12 @@ def _joint(
     na, nb = orders
     first = max(orders)
     count = len(error)
-    own = basis[first:]
+    rows = basis[first:]
     columns = [tau[first - i : count - i] for i in range(1, na + 1)]
     columns += [error[first - i : count - i] for i in range(nb + 1)]
-    matrix = np.column_stack([own @ (own.T @ np.column_stack(columns)), np.ones(count - first)])
+    matrix = np.column_stack([rows @ (rows.T @ np.column_stack(columns)), np.ones(count - first)])
     size = np.linalg.norm(matrix, axis=0)
-    values = np.linalg.lstsq(matrix / size, own @ (own.T @ tau[first:]), rcond=None)[0] / size
+    values = np.linalg.lstsq(matrix / size, rows @ (rows.T @ tau[first:]), rcond=None)[0] / size
     return values[:na], values[na:-1]
 
 
@@ -245,7 +252,8 @@ def _read(past: np.ndarray, errors: np.ndarray, rate: float, band: float, integr
 
 def _explained(error: np.ndarray, tau: np.ndarray, gains: np.ndarray, rate: float, band: float) -> float:
     """Return the share of the low-passed torque explained by the gains (n,) [%]."""
-    own = gains[0] * error + gains[1] * np.gradient(error, 1.0 / rate) + gains[2] * np.cumsum(error) / rate
+    feedback = gains[0] * error + gains[1] * np.gradient(error, 1.0 / rate) + gains[2] * np.cumsum(error) / rate
     edge = border(rate, band)
-    rest, whole = (x[edge:-edge] - x[edge:-edge].mean() for x in (tau - own, tau))
-    return float(100.0 * (1.0 - np.linalg.norm(rest) / np.linalg.norm(whole)))
+    residual = (tau - feedback)[edge:-edge] - (tau - feedback)[edge:-edge].mean()
+    torque = tau[edge:-edge] - tau[edge:-edge].mean()
+    return float(100.0 * (1.0 - np.linalg.norm(residual) / np.linalg.norm(torque)))

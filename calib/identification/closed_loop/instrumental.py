@@ -152,7 +152,10 @@ class Instrumental:
         # the torques' share that is unsure makes e_s = q_ref - q_s unsure, too
         unsure = np.sqrt(np.einsum("gij,jk,gik->g", simulated, estimate.covariance, simulated) / sizes)
         # rows of the motors
-        unsure = unsure[-len(self.stray) :] if len(unsure) >= len(self.stray) else unsure.max()
+        if len(unsure) >= len(self.stray):
+            unsure = unsure[-len(self.stray) :]
+        else:
+            unsure = unsure.max()
         away = np.abs(np.log(np.maximum(np.nan_to_num(self.stray, nan=1.0), 1e-3)))
         return np.flatnonzero(away > np.log(MAX_GAIN_RATIO) + 5.0 * unsure)
 
@@ -183,12 +186,12 @@ class Instrumental:
 
         Zero where nothing binds, and for didim; see `instrumental_variables.by_free_instruments`.
         """
-        held = self.constrained
+        constrained = self.constrained
         values = self.fit.estimate.values
-        if held is None or not len(held.normals) or not self.estimator.measured:
+        if constrained is None or not len(constrained.normals) or not self.estimator.measured:
             return np.zeros(len(values))
-        other = instrumental_variables.by_free_instruments(self.problem, self.std, values, held.normals)
-        return np.abs(other - values) / np.maximum(held.free.estimate.sigma, 1e-300)
+        free_estimate = instrumental_variables.by_free_instruments(self.problem, self.std, values, constrained.normals)
+        return np.abs(free_estimate - values) / np.maximum(constrained.free.estimate.sigma, 1e-300)
 
     @property
     def valid(self) -> bool:
@@ -263,13 +266,13 @@ def identify_instrumental(
     # of the last step, and how often it was halved afterwards
     start, returns = plant, 0
     for _ in range(limit):
-        found = _estimate_round(task, runs, std, tau)
-        task = task.after(found)
-        rounds.append(Round(_change(before, found.fit), found.fit.estimate.residual_std, retreats))
-        if before is not None and retreats == 0 and instrumental_variables.settled(before, found.fit):
-            return _result(task, found, ordinary, task.plant(plant, found), rounds, std, runs)
+        estimate = _estimate_round(task, runs, std, tau)
+        task = task.after(estimate)
+        rounds.append(Round(_change(before, estimate.fit), estimate.fit.estimate.residual_std, retreats))
+        if before is not None and retreats == 0 and instrumental_variables.settled(before, estimate.fit):
+            return _result(task, estimate, ordinary, task.plant(plant, estimate), rounds, std, runs)
         try:
-            task, found, end, runs, retreats = _simulate_new(task, found, plant, std, tau)
+            task, estimate, end, runs, retreats = _simulate_new(task, estimate, plant, std, tau)
             start, plant, returns = plant, end, 0
         except CannotSimulate:
             # the last step led to a loop that is hardly stable, whose motion tells nothing: take a smaller one
@@ -278,13 +281,15 @@ def identify_instrumental(
                 raise
             plant, runs = _nearer(start, plant, cases)
             retreats = returns
-        before = found.fit
-        std = found.fit.group_std
-        tau = found.tau
-    kind = Diverged if len(rounds) > 2 and rounds[-1].change > rounds[1].change else NotConverged
+        before = estimate.fit
+        std = estimate.fit.group_std
+        tau = estimate.tau
+    kind = NotConverged
+    if len(rounds) > 2 and rounds[-1].change > rounds[1].change:
+        kind = Diverged
     raise kind(
         f"instruments from simulation: parameters still change by {100 * rounds[-1].change:.3g} % after {limit} "
-        f"iterations; estimate fewer (essential ones), or check the controller's gains{_if_weak(task, found, std)}",
+        f"iterations; estimate fewer (essential ones), or check the controller's gains{_if_weak(task, estimate, std)}",
         before,
     )
 
@@ -320,17 +325,17 @@ class _Fixed:
     constraints: Constraints | None
     friction: _Friction
 
-    def after(self, found: _Found) -> _Fixed:
+    def after(self, estimate: _Found) -> _Fixed:
         """Return the settings of the next iteration, which starts from the postures whose constraints are binding."""
-        if self.constraints is None or found.bound is None:
+        if self.constraints is None or estimate.bound is None:
             return self
-        return replace(self, constraints=replace(self.constraints, likely=found.bound.tight))
+        return replace(self, constraints=replace(self.constraints, likely=estimate.bound.tight))
 
-    def plant(self, old: Plant, found: _Found) -> Plant:
+    def plant(self, old: Plant, estimate: _Found) -> Plant:
         """Return the simulated robot with an estimate; without motor torques, its motor inertias J are unchanged."""
-        own = found.fit.estimate.values
+        estimated = estimate.fit.estimate.values
         b = self.base.b
-        values = np.concatenate([self.base.to_standard(own[:b]), own[b:]])
+        values = np.concatenate([self.base.to_standard(estimated[:b]), estimated[b:]])
         regular = old.parameters[len(values) :] * (not self.model.torque_rows.driven)
         return old.with_parameters(np.concatenate([values, regular]))
 
@@ -350,10 +355,13 @@ class _Found:
 def _estimate_round(task: _Fixed, runs: Runs, std: np.ndarray, tau: float) -> _Found:
     """Return the estimate with instruments from simulated runs; `tau` is the variance inflation of the last round."""
     columns = task.base.kept
-    moved = [simulated_case(case, run, loop) for (case, loop), run in runs]
-    simulated = [task.friction.added(observe(task.model, columns, case, task.decimator), case).matrix for case in moved]
+    simulated_cases = [simulated_case(case, run, loop) for (case, loop), run in runs]
+    simulated = [
+        task.friction.added(observe(task.model, columns, case, task.decimator), case).matrix for case in simulated_cases
+    ]
     observed = [
-        _with_signs(task, columns, *one) for one in zip(task.observed, simulated, (c for c, _ in task.cases), moved)
+        _with_signs(task, columns, *arguments)
+        for arguments in zip(task.observed, simulated, (c for c, _ in task.cases), simulated_cases)
     ]
     problem = _stack(observed, simulated, task.estimator.measured)
     fit, bound = _held_fit(task, problem, std, tau)
@@ -361,7 +369,7 @@ def _estimate_round(task: _Fixed, runs: Runs, std: np.ndarray, tau: float) -> _F
 
 
 def _with_signs(
-    task: _Fixed, columns: np.ndarray, rows: ObservationRows, simulated: np.ndarray, case: Case, moved: Case
+    task: _Fixed, columns: np.ndarray, rows: ObservationRows, simulated: np.ndarray, case: Case, simulated_case: Case
 ) -> ObservationRows:
     """Return the rows with columns of Coulomb signs replaced where velocity noise exceeds their smoothing.
 
@@ -374,14 +382,15 @@ def _with_signs(
         return rows
     motion = case.motion
     band = 0.5 * case.motion.band
-    measured, expected = (slope(low_pass(one.motion.q, motion.rate, band), motion.rate) for one in (case, moved))
+    measured = slope(low_pass(case.motion.q, motion.rate, band), motion.rate)
+    expected = slope(low_pass(simulated_case.motion.q, motion.rate, band), motion.rate)
     away = np.sqrt(np.nanmean((measured - expected) ** 2, axis=0))
     followed = away <= MAX_FOLLOWING * motion.velocity_noise(band)
     if not followed.all():
-        speed = np.where(followed | np.isnan(measured), moved.motion.v, measured)
-        seen = observe(task.model, columns[signs], replace(case, motion=replace(motion, v=speed)), task.decimator)
+        speed = np.where(followed | np.isnan(measured), simulated_case.motion.v, measured)
+        sign_rows = observe(task.model, columns[signs], replace(case, motion=replace(motion, v=speed)), task.decimator)
         simulated = simulated.copy()
-        simulated[:, :, drowned] = seen.matrix
+        simulated[:, :, drowned] = sign_rows.matrix
     return replace(rows, matrix=np.where(drowned, simulated, rows.matrix))
 
 
@@ -396,28 +405,40 @@ def sign_noise(model: Any, motion: Motion) -> np.ndarray:
 def _drowned_signs(model: IdentificationModel, columns: np.ndarray, case: Case) -> np.ndarray:
     """Return the mask (p,) of Coulomb columns of joints whose velocity noise exceeds the sign's smoothing."""
     noise = sign_noise(model, case.motion)
-    found = np.zeros(len(columns), dtype=bool)
-    for place, k in enumerate(columns - model.inertial):
+    drowned = np.zeros(len(columns), dtype=bool)
+    for position, k in enumerate(columns - model.inertial):
         if k < 0 or model.columns[k].shape != "sign":
             continue
-        one = model.columns[k]
-        speeds = [float(np.hypot.reduce([weight * noise[j] for j, weight in motion])) for _, motion in one.acts]
-        found[place] = max(speeds) > one.settings[0]
-    return found
+        term = model.columns[k]
+        speeds = [float(np.hypot.reduce([weight * noise[j] for j, weight in motion])) for _, motion in term.acts]
+        drowned[position] = max(speeds) > term.settings[0]
+    return drowned
 
 
 def _result(
-    task: _Fixed, found: _Found, ordinary: LinearFit, plant: Plant, rounds: Sequence[Round], std: np.ndarray, runs: Runs
+    task: _Fixed,
+    estimate: _Found,
+    ordinary: LinearFit,
+    plant: Plant,
+    rounds: Sequence[Round],
+    std: np.ndarray,
+    runs: Runs,
 ) -> Instrumental:
     """Return the result of the last iteration: σ with the variance inflation of its residuals, and the tests."""
-    problem = found.problem if task.estimator.measured else _stack(found.observed, found.simulated)
-    fit, bound = _held_fit(task, problem, std, found.tau)
-    verdict = instrumental_variables.exogeneity(problem, std, found.tau)
+    if task.estimator.measured:
+        problem = estimate.problem
+    else:
+        problem = _stack(estimate.observed, estimate.simulated)
+    fit, bound = _held_fit(task, problem, std, estimate.tau)
+    verdict = instrumental_variables.exogeneity(problem, std, estimate.tau)
     strength = instrumental_variables.strength(problem, std)
-    rows = zip((case for (case, _), _ in runs), found.observed, found.simulated)
+    rows = zip((case for (case, _), _ in runs), estimate.observed, estimate.simulated)
     if not task.estimator.measured:
-        moved = (simulated_case(case, run, loop) for (case, loop), run in runs)
-        rows = ((case, replace(own, matrix=z), z) for case, own, z in zip(moved, found.observed, found.simulated))
+        simulated_cases = (simulated_case(case, run, loop) for (case, loop), run in runs)
+        rows = (
+            (case, replace(rows_, matrix=z), z)
+            for case, rows_, z in zip(simulated_cases, estimate.observed, estimate.simulated)
+        )
     return Instrumental(
         fit,
         ordinary,
@@ -426,7 +447,7 @@ def _result(
         strength,
         verdict,
         frozen(std),
-        found.tau,
+        estimate.tau,
         _distance(runs),
         _stray(runs),
         bound,
@@ -443,7 +464,7 @@ def _regular(model: IdentificationModel, terms: Sequence[DriveTerm], loop: Loop,
             inertia = loop.controller.kd**2 / (2.0 * loop.controller.kp)
         if not np.all(np.isfinite(inertia)) or not np.all(inertia > 0.0):
             raise UsageError("kd² / (2 kp) of these gains is no inertia above 0; give the inertia (n,) [kg m²]")
-    extra = tuple(replace(one, name=f"regular {one.name}") for one in standard(["Ia"] * model.n))
+    extra = tuple(replace(motor, name=f"regular {motor.name}") for motor in standard(["Ia"] * model.n))
     values = np.concatenate([np.zeros(model.p + len(terms)), inertia])
     return plant_of(model, values, (*terms, *extra))
 
@@ -461,7 +482,7 @@ def _runs(plant: Plant, cases: Sequence[tuple[Case, Loop]]) -> Runs:
 
 
 def _simulate_new(
-    task: _Fixed, found: _Found, old: Plant, std: np.ndarray, tau: float
+    task: _Fixed, estimate: _Found, old: Plant, std: np.ndarray, tau: float
 ) -> tuple[_Fixed, _Found, Plant, Runs, int]:
     """Return the simulations with the new parameters or, if these fail, with smaller steps from the old ones.
 
@@ -469,25 +490,25 @@ def _simulate_new(
     """
     retreats = 0
     while retreats < MAX_RETREATS:
-        tried = _between(old, task.plant(old, found), 0.5**retreats)
+        candidate = _between(old, task.plant(old, estimate), 0.5**retreats)
         try:
-            return task, found, tried, _runs(tried, task.cases), retreats
+            return task, estimate, candidate, _runs(candidate, task.cases), retreats
         except CalibError as error:
             problem = error
-        if task.constraints and found.bound and found.bound.postures:
+        if task.constraints and estimate.bound and estimate.bound.postures:
             bound = task.constraints.raised()
         else:
             bound = None
         if bound is not None:
             further = replace(task, constraints=bound)
             with suppress(NotConverged):
-                fit, held = _held_fit(further, found.problem, std, tau)
+                fit, binding = _held_fit(further, estimate.problem, std, tau)
                 task = further
-                found = replace(found, fit=fit, bound=held)
+                estimate = replace(estimate, fit=fit, bound=binding)
                 continue
         retreats += 1
-    words = f"neither the estimate nor smaller steps can be simulated: {problem}{_if_weak(task, found, std)}"
-    raise CannotSimulate(words, task.plant(old, found))
+    message = f"neither the estimate nor smaller steps can be simulated: {problem}{_if_weak(task, estimate, std)}"
+    raise CannotSimulate(message, task.plant(old, estimate))
 
 
 def _between(start: Plant, end: Plant, share: float) -> Plant:
@@ -503,22 +524,22 @@ def _nearer(start: Plant, end: Plant, cases: Sequence[tuple[Case, Loop]]) -> tup
     """
     problem: CalibError | None = None
     for halvings in range(1, MAX_RETREATS + 1):
-        tried = _between(start, end, 0.5**halvings)
+        candidate = _between(start, end, 0.5**halvings)
         try:
-            return tried, _runs(tried, cases)
+            return candidate, _runs(candidate, cases)
         except CalibError as error:
             problem = error
     raise CannotSimulate(f"no robot on the way to the estimate can be simulated: {problem}", start)
 
 
-def _if_weak(task: _Fixed, found: _Found, std: np.ndarray) -> str:
+def _if_weak(task: _Fixed, estimate: _Found, std: np.ndarray) -> str:
     """Return what weak instruments add to the message of a failure; "" for strong ones."""
     if not task.estimator.measured:
         return ""
-    strength = instrumental_variables.strength(found.problem, std)
-    words = f". The instruments are weak (Cragg-Donald {strength.cragg_donald:.2g}, sound above 10)"
+    strength = instrumental_variables.strength(estimate.problem, std)
+    note = f". The instruments are weak (Cragg-Donald {strength.cragg_donald:.2g}, sound above 10)"
     if strength.weak:
-        return f"{words}: record faster motion, or positions with less noise"
+        return f"{note}: record faster motion, or positions with less noise"
     return ""
 
 
@@ -530,10 +551,16 @@ def _stack(observed: Sequence[ObservationRows], simulated: Sequence[np.ndarray],
     for rows, z in zip(observed, simulated, strict=True):
         for row in range(count):
             # no copy of all
-            used = slice(None) if rows.present[:, row].all() else rows.present[:, row]
-            own = z[used, row]
-            w = rows.matrix[used, row] if measured else np.zeros_like(own)
-            problem = instrumental_variables.instrument(own, w, rows.target[used, row], row, before=problem)
+            if rows.present[:, row].all():
+                in_use = slice(None)
+            else:
+                in_use = rows.present[:, row]
+            instruments = z[in_use, row]
+            if measured:
+                w = rows.matrix[in_use, row]
+            else:
+                w = np.zeros_like(instruments)
+            problem = instrumental_variables.instrument(instruments, w, rows.target[in_use, row], row, before=problem)
     return problem
 
 
@@ -552,18 +579,21 @@ def _inflation(observed: Sequence[ObservationRows], fit: LinearFit) -> float:
 def _held_fit(task: _Fixed, problem: Instruments, std: np.ndarray, tau: float) -> tuple[LinearFit, Held | None]:
     """Return the estimate of an iteration, with the constraints if any are set."""
     fit = task.estimator.fit(problem, std, tau)
-    own = task.estimator
+    estimator = task.estimator
     if task.constraints is None:
         return fit, None
-    data = problem.least_squares() if own.measured else _simulated(problem)
-    return hold(fit, own.triangle(problem, std), data, std, task.constraints, stated=not own.measured)
+    if estimator.measured:
+        data = problem.least_squares()
+    else:
+        data = _simulated(problem)
+    return hold(fit, estimator.triangle(problem, std), data, std, task.constraints, stated_noise=not estimator.measured)
 
 
-def _change(before: LinearFit | None, now: LinearFit) -> float:
+def _change(before: LinearFit | None, after: LinearFit) -> float:
     if before is None:
         return float("inf")
-    size = np.maximum(np.abs(before.estimate.values), 8.0 * now.estimate.sigma)
-    return float(np.max(np.abs(now.estimate.values - before.estimate.values) / np.maximum(size, 1e-300)))
+    size = np.maximum(np.abs(before.estimate.values), 8.0 * after.estimate.sigma)
+    return float(np.max(np.abs(after.estimate.values - before.estimate.values) / np.maximum(size, 1e-300)))
 
 
 def _distance(runs: Runs) -> np.ndarray:
@@ -581,16 +611,17 @@ def _stray(runs: Runs) -> np.ndarray:
     pairs = []
     for (case, loop), run in runs:
         motion = case.motion
-        used = simulated_samples(case, run.t, loop)
-        asked = loop.reference.at(np.arange(len(run.t)) * loop.every)[0]
-        asked, moved = (low_passed(x, motion)[used] for x in (asked, run.q))
-        pairs.append((asked - motion.q, asked - moved))
-    found, expected = (np.concatenate(x) for x in zip(*pairs))
+        samples = simulated_samples(case, run.t, loop)
+        reference = loop.reference.at(np.arange(len(run.t)) * loop.every)[0]
+        reference = low_passed(reference, motion)[samples]
+        position = low_passed(run.q, motion)[samples]
+        pairs.append((reference - motion.q, reference - position))
+    measured, expected = (np.concatenate(x) for x in zip(*pairs))
     size = np.maximum(np.sum(expected**2, axis=0), 1e-300)
-    slope = np.sum(found * expected, axis=0) / size
-    rest = found - slope * expected
-    rows = [inflation(rest[:, j]) for j in range(rest.shape[1])]
-    sigma = np.sqrt(np.array(rows) * np.mean(rest**2, axis=0) / size)
+    slope = np.sum(measured * expected, axis=0) / size
+    residual = measured - slope * expected
+    rows = [inflation(residual[:, j]) for j in range(residual.shape[1])]
+    sigma = np.sqrt(np.array(rows) * np.mean(residual**2, axis=0) / size)
     return frozen(np.where(5.0 * sigma < np.abs(slope) * np.log(MAX_GAIN_RATIO), slope, np.nan))
 
 

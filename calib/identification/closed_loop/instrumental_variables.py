@@ -83,7 +83,9 @@ class Instruments:
             fit: the result of `iv`.
         """
         p = len(self.names)
-        sigma = np.ones(self.data.groups) if std is None else std
+        sigma = std
+        if std is None:
+            sigma = np.ones(self.data.groups)
         squares = self.data.residual_squares(np.concatenate([np.zeros(p), fit.estimate.values]))
         factor = np.zeros((1, p + 1, p + 1))
         factor[0, :p] = projected(self, sigma)[:p]
@@ -113,8 +115,13 @@ def instrument(
     matrix = shaped(matrix, (None, None), "observation matrix W")
     instruments = shaped(instruments, matrix.shape, "instruments Z")
     if before is None:
-        own = tuple(names) if names is not None else tuple(f"x{k + 1}" for k in range(matrix.shape[1]))
-        before = unseen(own, units if units is not None else ("",) * len(own), int(np.max(group, initial=0)) + 1)
+        if names is not None:
+            column_names = tuple(names)
+        else:
+            column_names = tuple(f"x{k + 1}" for k in range(matrix.shape[1]))
+        before = unseen(
+            column_names, units if units is not None else ("",) * len(column_names), int(np.max(group, initial=0)) + 1
+        )
     return replace(before, data=absorb(before.data, np.hstack([instruments, matrix]), target, group))
 
 
@@ -146,27 +153,27 @@ def iv(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1
     factor = combine(problem.data, sigma)
     values, inverse, _ = solve_triangle(_projected(factor, problem.names), problem.names)
     squares = problem.data.residual_squares(np.concatenate([np.zeros(p), values]))
-    left = problem.data.rows - inflation * p * problem.data.rows / problem.data.rows.sum()
+    degrees = problem.data.rows - inflation * p * problem.data.rows / problem.data.rows.sum()
     dof = int(problem.data.rows.sum() / inflation) - p
     require(dof > 0, "fewer independent rows than parameters; record longer motion", Unidentifiable, problem.names)
-    residual_std = float(np.sqrt(np.sum(squares / sigma**2) / left.sum()))
+    residual_std = float(np.sqrt(np.sum(squares / sigma**2) / degrees.sum()))
     covariance = inflation * residual_std**2 * inverse @ inverse.T
     units = problem.data.units[p:]
     estimate = Estimate(problem.names, units, values, covariance, residual_std, dof)
-    return LinearFit(estimate, np.sqrt(squares / left), *condition_numbers(factor[:, p : 2 * p]))
+    return LinearFit(estimate, np.sqrt(squares / degrees), *condition_numbers(factor[:, p : 2 * p]))
 
 
-def settled(before: LinearFit, now: LinearFit, change: float = 0.025, residual: float = 0.025) -> bool:
+def settled(before: LinearFit, after: LinearFit, change: float = 0.025, residual: float = 0.025) -> bool:
     """Return whether the outer loop (simulate, estimate) has converged in parameters and residual.
 
     |Δx_j| < change · |x_j| for every parameter and |Δ‖ρ‖| < residual · ‖ρ‖ (Janot, Vandanjon & Gautier 2014; both
     usually 1 … 5 %). A parameter that moves by less than a fifth of its standard deviation rests as well (our choice:
     one near zero never meets a relative rule).
     """
-    moved = np.abs(now.estimate.values - before.estimate.values)
-    allowed = np.maximum(change * np.abs(before.estimate.values), 0.2 * now.estimate.sigma)
-    sizes = before.estimate.residual_std, now.estimate.residual_std
-    return bool(np.all(moved <= allowed) and abs(sizes[1] - sizes[0]) <= residual * sizes[0])
+    change_ = np.abs(after.estimate.values - before.estimate.values)
+    allowed = np.maximum(change * np.abs(before.estimate.values), 0.2 * after.estimate.sigma)
+    sizes = before.estimate.residual_std, after.estimate.residual_std
+    return bool(np.all(change_ <= allowed) and abs(sizes[1] - sizes[0]) <= residual * sizes[0])
 
 
 def strength(problem: Instruments, std: np.ndarray | None = None) -> InstrumentStrength:
@@ -184,9 +191,9 @@ def strength(problem: Instruments, std: np.ndarray | None = None) -> InstrumentS
     basis = np.linalg.qr(factor[: 2 * p, p : 2 * p] / norms)[0]
     correlations = np.clip(np.linalg.svd(basis[:p], compute_uv=False), 0.0, 1.0)
     cross = (factor[:p, :p] / np.linalg.norm(factor[:p, :p], axis=0)).T @ (explained / norms)
-    least = correlations[-1] ** 2
+    minimum = correlations[-1] ** 2
     with np.errstate(divide="ignore", invalid="ignore"):
-        donald = float((rows - p) / p * np.divide(least, 1.0 - least))
+        donald = float((rows - p) / p * np.divide(minimum, 1.0 - minimum))
     return InstrumentStrength(
         problem.names,
         correlations,
@@ -211,20 +218,23 @@ def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: f
     p = len(problem.names)
     rows = problem.data.rows.sum() / inflation
     factor = combine(problem.data, std)
-    whole = factor[:, p : 2 * p]
-    norms = np.linalg.norm(whole, axis=0)
-    require_rank(whole / np.where(norms > 0.0, norms, 1.0), problem.names)
+    instrument_rows = factor[:, p : 2 * p]
+    norms = np.linalg.norm(instrument_rows, axis=0)
+    require_rank(instrument_rows / np.where(norms > 0.0, norms, 1.0), problem.names)
     part = np.vstack([np.zeros((p, p)), factor[p:, p : 2 * p]])
     size = np.linalg.norm(part, axis=0) > 1e-8 * norms
-    columns = np.hstack([whole, part[:, size]])
+    columns = np.hstack([instrument_rows, part[:, size]])
     split = split_columns(columns, [np.arange(p)], 1e-8)
     k = split.rank - p
     dof = int(rows) - p - k
     require(k > 0 and dof > 0, "nothing to test: the instruments equal the columns, or there are too few rows")
     target = factor[:, -1]
-    first = _rss(whole, target)
+    first = _rss(instrument_rows, target)
     second = _rss(columns[:, split.kept], target)
-    f = (first - second) / k / (second / (rows - p - k)) / inflation if second > 0.0 else np.inf
+    if second > 0.0:
+        f = (first - second) / k / (second / (rows - p - k)) / inflation
+    else:
+        f = np.inf
     return ExogeneityTest(float(f), (k, dof), float(fdtrc(k, dof, f)))
 
 
@@ -237,7 +247,9 @@ def projected(problem: Instruments, std: np.ndarray | None = None) -> np.ndarray
     return _projected(combine(problem.data, std), problem.names)
 
 
-def by_free_instruments(problem: Instruments, std: np.ndarray, held: np.ndarray, normals: np.ndarray) -> np.ndarray:
+def by_free_instruments(
+    problem: Instruments, std: np.ndarray, constrained: np.ndarray, normals: np.ndarray
+) -> np.ndarray:
     """Return x (p,) with A x = A `held` from the instruments of what A leaves free alone, Z_Uᵀ Ω⁻¹ (y - W x) = 0.
 
     Janot's slides on the TX40 state the criterion ½ ‖P_Z (y - W x)‖² (`projected`), in which all instruments count, but
@@ -257,8 +269,8 @@ def by_free_instruments(problem: Instruments, std: np.ndarray, held: np.ndarray,
     free = null_space(normals / norms) / norms[:, None]
     z = factor[:p, :p] @ free
     w = factor[:p, p : 2 * p] @ free
-    rest = factor[:p, -1] - factor[:p, p : 2 * p] @ held
-    return np.asarray(held + free @ np.linalg.solve(z.T @ w, z.T @ rest))
+    residual = factor[:p, -1] - factor[:p, p : 2 * p] @ constrained
+    return np.asarray(constrained + free @ np.linalg.solve(z.T @ w, z.T @ residual))
 
 
 def _projected(factor: np.ndarray, names: Sequence[str]) -> np.ndarray:
@@ -279,9 +291,9 @@ def _projected(factor: np.ndarray, names: Sequence[str]) -> np.ndarray:
     return retriangulate(factor[:p, p:])
 
 
-def _shea(explained: np.ndarray, whole: np.ndarray) -> np.ndarray:
+def _shea(explained: np.ndarray, total: np.ndarray) -> np.ndarray:
     """Return diag((WᵀW)⁻¹) / diag((WᵀP_Z W)⁻¹) (Shea 1997 in the form of Godfrey 1999)."""
-    variances = [np.sum(np.linalg.pinv(part) ** 2, axis=1) for part in (whole, explained)]
+    variances = [np.sum(np.linalg.pinv(part) ** 2, axis=1) for part in (total, explained)]
     return variances[0] / variances[1]
 
 

@@ -98,18 +98,20 @@ def close_loops(
     # the longest part of each recording tells
     for part in ordered:
         if part.name not in shifts and loop.timing != "stated":
-            shifts[part.name], said = _shift(part, loop, partial(_fed_forward, controller, loop, cad, model))
-            notes += said
-    design = loop.per_joint("design", model.n) if loop.design else None
+            shifts[part.name], note = _shift(part, loop, partial(_fed_forward, controller, loop, cad, model))
+            notes += note
+    design = None
+    if loop.design:
+        design = loop.per_joint("design", model.n)
     pairs = []
     for part in stretches:
         reference, every = _make_reference(part.motion, loop.rate, shifts.get(part.name, 0.0))
-        own = _fed_forward(controller, loop, cad, model, part.motion, reference, every)
+        feed_forward = _fed_forward(controller, loop, cad, model, part.motion, reference, every)
         if loop.reference_velocity == "difference":
             # by half a period
-            late = np.diff(reference.q, axis=0) / reference.period
-            reference = replace(reference, v=np.vstack([reference.v[:1], late]))
-        pairs.append((take(part, _inside(part.motion)), Loop(own, reference, every, design)))
+            rates = np.diff(reference.q, axis=0) / reference.period
+            reference = replace(reference, v=np.vstack([reference.v[:1], rates]))
+        pairs.append((take(part, _inside(part.motion)), Loop(feed_forward, reference, every, design)))
     return ClosedLoops(tuple(pairs), controller, identified, notes)
 
 
@@ -139,19 +141,21 @@ def _check_reference(motion: Motion) -> None:
         check_no_copy(motion, low_passed(np.asarray(motion.q_ref), motion))
 
 
-def _compare(motion: Motion, asked: np.ndarray, joint: int, max_difference: float = 0.3) -> None:
+def _compare(motion: Motion, reference: np.ndarray, joint: int, max_difference: float = 0.3) -> None:
     """Raise an error for a joint that does not follow its reference `asked` (N,), naming a likely unit error.
 
     `max_difference`: largest deviation, over a joint's motion, from its own reference (our choice).
     """
     q = motion.q[:, joint]
     spread = np.std(q)
-    size = np.std(asked)
-    away = float(np.sqrt(np.mean((q - asked) ** 2)) / spread)
+    size = np.std(reference)
+    away = float(np.sqrt(np.mean((q - reference) ** 2)) / spread)
     if away < max_difference:
         return
     name = f"{motion.joint_names[joint]} (joint {joint + 1})"
-    alike = abs(float(np.corrcoef(q, asked)[0, 1])) > 0.95 if size > 0.0 else False
+    alike = False
+    if size > 0.0:
+        alike = abs(float(np.corrcoef(q, reference)[0, 1])) > 0.95
     if alike and abs(size / spread / DEGREES - 1.0) < 0.1:
         refuse_data(
             motion.file,
@@ -162,7 +166,7 @@ def _compare(motion: Motion, asked: np.ndarray, joint: int, max_difference: floa
         motion.file,
         f"{name} deviates from its reference by {away:.2g} times its travel (rms); the reference "
         + (
-            f"is {size / spread:.3g} times as large, {np.mean(asked - q):.2g} rad (or m) above it on average"
+            f"is {size / spread:.3g} times as large, {np.mean(reference - q):.2g} rad (or m) above it on average"
             if alike
             else "is not correlated with it"
         )
@@ -191,25 +195,25 @@ def _shift(part: Case, loop: LoopSettings, fed_forward: Callable[..., Controller
         return 0.0, ()
     reference, every = _make_reference(motion, loop.rate)
     band = min(loop.band, 0.5 * float(motion.cutoff.min()), 0.2 * motion.rate)
-    found = reference_shift(part, reference, every, fed_forward(motion, reference, every), band)
-    shown = f"{1e3 * abs(found.seconds):.3g} ± {1e3 * found.sigma:.2g} ms"
+    shift = reference_shift(part, reference, every, fed_forward(motion, reference, every), band)
+    text = f"{1e3 * abs(shift.seconds):.3g} ± {1e3 * shift.sigma:.2g} ms"
     if estimated:
-        begin = (motion.located or 0.0) + found.seconds
+        begin = (motion.located or 0.0) + shift.seconds
         where = "" if motion.located is None else f"the designed motion begins at {begin:.5f} s, "
-        way = "later" if found.seconds > 0.0 else "earlier"
-        return found.seconds, (
-            f"{part.name}: {where}the reference was moved {shown} {way}; the controller explains "
-            f"{100 * (1 - found.left):.3g} % of the torques, one σ of time changes them by {100 * found.effect:.2g} %",
+        direction = "later" if shift.seconds > 0.0 else "earlier"
+        return shift.seconds, (
+            f"{part.name}: {where}the reference was moved {text} {direction}; the controller explains "
+            f"{100 * (1 - shift.left):.3g} % of the torques, one σ of time changes them by {100 * shift.effect:.2g} %",
         )
     # [s], and shares of the torques (our choice)
     min_shift, min_gain, max_left = 1.5e-3, 2.0, 0.5
-    late = abs(found.seconds) > max(5.0 * found.sigma, min_shift)
-    if late and found.left < max_left and found.before > min_gain * found.left:
+    significant = abs(shift.seconds) > max(5.0 * shift.sigma, min_shift)
+    if significant and shift.left < max_left and shift.before > min_gain * shift.left:
         refuse_data(
             motion.file,
-            f"its reference (q_ref) is {'late' if found.seconds < 0.0 else 'early'} by {shown}: so "
-            f"moved, the controller of [loop] explains {100 * (1 - found.left):.3g} % of the torques, as logged "
-            f"{100 * (1 - min(found.before, 1.0)):.2g} %. Set [loop] timing = 'estimated' to move it; or correct kd "
+            f"its reference (q_ref) is {'late' if shift.seconds < 0.0 else 'early'} by {text}: so "
+            f"moved, the controller of [loop] explains {100 * (1 - shift.left):.3g} % of the torques, as logged "
+            f"{100 * (1 - min(shift.before, 1.0)):.2g} %. Set [loop] timing = 'estimated' to move it; or correct kd "
             "and share, which may look like this; timing = 'stated' takes it as it is",
         )
     return 0.0, ()
@@ -233,10 +237,10 @@ def _make_reference(
     cutoff = min(cutoff_factor * float(motion.cutoff.max()), USABLE * motion.rate / 2)
     smooth = low_pass(np.asarray(motion.q_ref), motion.rate, cutoff)
     spline = CubicSpline(np.arange(len(smooth)), smooth)
-    place = np.arange(int((len(smooth) - 1) * every + 1e-9) + 1) / every
-    asked = np.clip(place - shift * motion.rate, 0.0, len(smooth) - 1.0)
-    q, v, a = (spline(asked, order) * motion.rate**order for order in range(3))
-    return Reference(motion.t[0] + place / motion.rate, q, v, a), every
+    indices = np.arange(int((len(smooth) - 1) * every + 1e-9) + 1) / every
+    times = np.clip(indices - shift * motion.rate, 0.0, len(smooth) - 1.0)
+    q, v, a = (spline(times, order) * motion.rate**order for order in range(3))
+    return Reference(motion.t[0] + indices / motion.rate, q, v, a), every
 
 
 def periods_per_sample(motion: Motion, rate: float | None = None) -> float:
@@ -284,22 +288,29 @@ def _controller(loop: LoopSettings, case: Case) -> tuple[Controller, IdentifiedC
 
     def identified(shift: float) -> IdentifiedController:
         reference, _ = _make_reference(motion, loop.rate, shift)
-        orders = (1, 2) if loop.integral else (0, 1)
+        if loop.integral:
+            orders = (1, 2)
+        else:
+            orders = (0, 1)
         return identify_controller(reference, motion.q, tau, motion.rate, band, orders, loop.integral)
 
-    found = identified(_best_shift(identified) if motion.located is not None or loop.timing == "estimated" else 0.0)
-    kp = found.controller.kp
-    kd = found.controller.kd
+    identified_controller = identified(
+        _best_shift(identified) if motion.located is not None or loop.timing == "estimated" else 0.0
+    )
+    kp = identified_controller.controller.kp
+    kd = identified_controller.controller.kd
     bad = np.flatnonzero((kp <= 0.0) | (kd <= 0.0))
-    shown = ", ".join(f"{x:.4g}/{y:.3g} ({share:.0f} %)" for x, y, share in zip(kp, kd, found.explained))
+    gains = ", ".join(
+        f"{x:.4g}/{y:.3g} ({share:.0f} %)" for x, y, share in zip(kp, kd, identified_controller.explained)
+    )
     if len(bad):
         raise NotConverged(
-            f"{case.name}: the log does not identify the controller of joint {bad[0] + 1} (kp/kd by joint: {shown}); "
+            f"{case.name}: the log does not identify the controller of joint {bad[0] + 1} (kp/kd by joint: {gains}); "
             "state the gains, or lower [loop] band",
-            found,
+            identified_controller,
         )
-    note = f"controller identified from {case.name} up to {band:.3g} Hz, kp/kd (explained torque): {shown}"
-    return completed(found.controller, loop, n), found, (note,)
+    note = f"controller identified from {case.name} up to {band:.3g} Hz, kp/kd (explained torque): {gains}"
+    return completed(identified_controller.controller, loop, n), identified_controller, (note,)
 
 
 def _best_shift(identified: Callable[[float], IdentifiedController]) -> float:
@@ -307,8 +318,8 @@ def _best_shift(identified: Callable[[float], IdentifiedController]) -> float:
     # within 0.03 s of where positions match best (our choice)
     middle, step = 0.0, 0.01
     while step > 1e-6:
-        near = middle + step * np.arange(-3, 4)
-        middle = max(near, key=lambda shift: float(np.mean(identified(shift).explained)))
+        candidates = middle + step * np.arange(-3, 4)
+        middle = max(candidates, key=lambda shift: float(np.mean(identified(shift).explained)))
         step = step / 3.0
     return float(middle)
 
@@ -353,8 +364,9 @@ def followed(q: np.ndarray, motion: Motion, index: np.ndarray) -> tuple[np.ndarr
         q: (N, n, ...) of the whole simulation.
         index: (M,) samples to return.
     """
-    own, less = (low_passed(q, motion, at) for at in (motion.cutoff, motion.velocity_cutoff))
-    return own[index], slope(less, motion.rate)[index], curvature(own, motion.rate)[index]
+    positions = low_passed(q, motion, motion.cutoff)
+    less = low_passed(q, motion, motion.velocity_cutoff)
+    return positions[index], slope(less, motion.rate)[index], curvature(positions, motion.rate)[index]
 
 
 def simulated_samples(case: Case, t: np.ndarray, loop: Loop) -> np.ndarray:
@@ -380,6 +392,6 @@ def low_passed(q: np.ndarray, motion: Motion, cutoff: np.ndarray | None = None) 
     result = np.empty_like(q)
     cutoffs = motion.cutoff if cutoff is None else cutoff
     for f in np.unique(cutoffs):
-        own = cutoffs == f
-        result[:, own] = low_pass(q[:, own], motion.rate, float(f))
+        joints = cutoffs == f
+        result[:, joints] = low_pass(q[:, joints], motion.rate, float(f))
     return result

@@ -33,20 +33,24 @@ class LoopEstimate(MethodEstimate):
 
     def testable(self) -> tuple[Triangles, np.ndarray, np.ndarray]:
         """Return R factors on which least squares gives this estimate, with std and inflation (g,), for tests."""
-        own = self.instrumental
-        if own is None:
+        identification = self.instrumental
+        if identification is None:
             return super().testable()
-        return own.problem.testable(own.fit, own.std), np.ones(1), np.array([own.inflation])
+        return (
+            identification.problem.testable(identification.fit, identification.std),
+            np.ones(1),
+            np.array([identification.inflation]),
+        )
 
 
 def attempted_in_loop(
     method: str, problem: IdentificationProblem, loops: ClosedLoops, run: Callable[[], MethodEstimate]
 ) -> LoopEstimate:
     """Return the result of `run` on a problem with its loops and computing time; a failure is returned as a status."""
-    found = attempted(method, problem, run)
-    if isinstance(found, LoopEstimate):
-        return found
-    return LoopEstimate(**vars(found), loops=loops)
+    estimate = attempted(method, problem, run)
+    if isinstance(estimate, LoopEstimate):
+        return estimate
+    return LoopEstimate(**vars(estimate), loops=loops)
 
 
 @dataclass(frozen=True)
@@ -74,9 +78,9 @@ class _Simulated(Method):
         plain = WLS.estimate(problem)
         if not plain.found:
             return replace(plain, method=self.name)
-        richer = [one for one in problem.terms[problem.base.b :] if one is not None]
-        found = self.beside(problem, plain, richer)
-        return replace(found, seconds=plain.seconds + found.seconds)
+        richer = [term for term in problem.terms[problem.base.b :] if term is not None]
+        estimate = self.beside(problem, plain, richer)
+        return replace(estimate, seconds=plain.seconds + estimate.seconds)
 
     def beside(
         self, problem: IdentificationProblem, plain: MethodEstimate, terms: Sequence[DriveTerm] = ()
@@ -87,10 +91,12 @@ class _Simulated(Method):
         if loop is None or not simulable(model):
             raise UsageError("instruments from simulation need a [loop], and a robot that can be simulated")
         loops = close_loops(model, problem.cases, problem.decimator, loop, problem.cad)
-        inertia = loop.per_joint("inertia", model.n) if loop.inertia else None
+        inertia = None
+        if loop.inertia:
+            inertia = loop.per_joint("inertia", model.n)
 
         def estimate() -> LoopEstimate:
-            found = identify_instrumental(
+            identification = identify_instrumental(
                 model,
                 problem.base,
                 loops.pairs,
@@ -104,15 +110,15 @@ class _Simulated(Method):
             result = replace(
                 plain,
                 method=self.name,
-                solution=found.fit,
-                std=found.std,
-                iterations=len(found.rounds),
-                simulations=len(loops.pairs) * sum(1 + one.retreats for one in found.rounds),
+                solution=identification.fit,
+                std=identification.std,
+                iterations=len(identification.rounds),
+                simulations=len(loops.pairs) * sum(1 + round_.retreats for round_ in identification.rounds),
                 beforehand=None,
-                held=found.constrained,
-                instruments=found.rows,
+                held=identification.constrained,
+                instruments=identification.rows,
             )
-            return LoopEstimate(**{**vars(result), "loops": loops, "instrumental": found})
+            return LoopEstimate(**{**vars(result), "loops": loops, "instrumental": identification})
 
         return attempted_in_loop(self.name, problem, loops, estimate)
 
@@ -132,17 +138,23 @@ DIDIM = _Simulated(
     description="least squares on the simulated motion alone (the slides' CLIE)",
     source="Gautier, Janot & Vandanjon 2013",
 )
-PC_IV, PC_DIDIM = (
-    replace(
-        one,
-        name=f"pc-{one.name}",
-        assumes=one.assumes + CONSISTENT,
-        instruments=one.name,
-        takes_constraints=True,
-        description=one.name + CONSTRAINED,
-        source=source,
-    )
-    for one, source in ((IV, "Janot & Wensing 2021"), (DIDIM, "Leboutet et al. 2021"))
+PC_IV = replace(
+    IV,
+    name=f"pc-{IV.name}",
+    assumes=IV.assumes + CONSISTENT,
+    instruments=IV.name,
+    takes_constraints=True,
+    description=IV.name + CONSTRAINED,
+    source="Janot & Wensing 2021",
+)
+PC_DIDIM = replace(
+    DIDIM,
+    name=f"pc-{DIDIM.name}",
+    assumes=DIDIM.assumes + CONSISTENT,
+    instruments=DIDIM.name,
+    takes_constraints=True,
+    description=DIDIM.name + CONSTRAINED,
+    source="Leboutet et al. 2021",
 )
 METHODS = (IV, DIDIM, PC_IV, PC_DIDIM)
 
@@ -161,12 +173,12 @@ class LoopTest:
     loops: ClosedLoops | None = None
     failure: str = ""
 
-    def findings(self, taken: bool) -> list[Finding]:
+    def findings(self, is_estimate: bool) -> list[Finding]:
         """Return the findings for a user of this estimate, or (`taken` False) of a least-squares one."""
         if self.found is None or self.loops is None:
             return [finding("loop-test-failed", why=self.failure)]
         noticed = [*_weakness(self.found), *(_distance(self.found) or _gains(self.found) or _torques(self.found))]
-        return noticed + (_blurred(self.found, self.loops) if taken else _biased(self.found))
+        return noticed + (_blurred(self.found, self.loops) if is_estimate else _biased(self.found))
 
 
 def compare_with_loop(problem: IdentificationProblem, estimate: MethodEstimate) -> LoopTest:
@@ -174,78 +186,93 @@ def compare_with_loop(problem: IdentificationProblem, estimate: MethodEstimate) 
 
     An estimate that came from them is the comparison itself; beside another method's, their failure is reported.
     """
-    found = estimate if isinstance(estimate, LoopEstimate) and estimate.instrumental is not None else None
-    if found is None:
+    loop_estimate = None
+    if isinstance(estimate, LoopEstimate) and estimate.instrumental is not None:
+        loop_estimate = estimate
+    if loop_estimate is None:
         try:
-            found = IV.beside(problem, estimate)
+            loop_estimate = IV.beside(problem, estimate)
         except CalibError as error:
             return LoopTest(failure=str(error))
-    return LoopTest(found.instrumental, found.loops, "" if found.found else str(found.failure))
+    return LoopTest(
+        loop_estimate.instrumental, loop_estimate.loops, "" if loop_estimate.found else str(loop_estimate.failure)
+    )
 
 
-def _weakness(found: Instrumental) -> list[Finding]:
-    strength = found.strength
+def _weakness(identification: Instrumental) -> list[Finding]:
+    strength = identification.strength
     if not strength.weak:
         return []
-    least = np.argsort(strength.partial_r2)[:5]
-    names = [f"{strength.names[k]} ({100 * strength.partial_r2[k]:.2g} %)" for k in least]
+    weakest = np.argsort(strength.partial_r2)[:5]
+    names = [f"{strength.names[k]} ({100 * strength.partial_r2[k]:.2g} %)" for k in weakest]
     return [finding("weak-instruments", donald=strength.cragg_donald, names=names)]
 
 
-def _distance(found: Instrumental) -> list[Finding]:
+def _distance(identification: Instrumental) -> list[Finding]:
     # [%] of a joint's motion by which the simulated robot may miss the recorded one (our choice)
     max_miss = 10.0
-    joints = [f"{x:.3g} % at joint {j + 1}" for j, x in enumerate(found.distance) if not x < max_miss]
+    joints = [f"{x:.3g} % at joint {j + 1}" for j, x in enumerate(identification.distance) if not x < max_miss]
     if joints:
         return [finding("loop-not-followed", joints=joints)]
     return []
 
 
-def _gains(found: Instrumental) -> list[Finding]:
+def _gains(identification: Instrumental) -> list[Finding]:
     """Return the finding on joints whose given gains differ from the gains in the recording."""
-    joints = [f"{found.stray[j]:.2g} times at joint {j + 1}" for j in found.off]
-    return [finding("loop-gains-off", joints=joints)] if joints else []
+    joints = [f"{identification.stray[j]:.2g} times at joint {j + 1}" for j in identification.off]
+    if joints:
+        return [finding("loop-gains-off", joints=joints)]
+    return []
 
 
-def _torques(found: Instrumental) -> list[Finding]:
+def _torques(identification: Instrumental) -> list[Finding]:
     """Return the finding on torque rows that the simulated motion does not explain, though the measured one does."""
-    case = found.rows[0][0]
-    direct = found.direct
-    own = found.own
+    case = identification.rows[0][0]
+    direct = identification.direct
+    iv_torques = identification.own
     labels = case.torque_rows.numbered(case.motion.n)
-    rows = [f"{direct[k]:.3g} % for {own[k]:.3g} % at joint {labels[k]}" for k in found.unexplained]
-    return [finding("loop-unexplained", rows=rows)] if rows else []
+    rows = [f"{direct[k]:.3g} % for {iv_torques[k]:.3g} % at joint {labels[k]}" for k in identification.unexplained]
+    if rows:
+        return [finding("loop-unexplained", rows=rows)]
+    return []
 
 
-def _biased(found: Instrumental) -> list[Finding]:
+def _biased(identification: Instrumental) -> list[Finding]:
     """Return the finding on a bias of least squares; none if the bias is small or the simulated loop fits poorly."""
     # standard deviations of a shift that is worth a word (our choice)
-    shift = found.shift
+    shift = identification.shift
     min_shift = 1.0
-    if not found.verdict.biased() or not found.valid or not found.explains or shift.max() < min_shift:
+    if (
+        not identification.verdict.biased()
+        or not identification.valid
+        or not identification.explains
+        or shift.max() < min_shift
+    ):
         return []
-    names = [f"{found.names[k]} by {shift[k]:.2g} σ" for k in np.argsort(-shift)[:5]]
-    return [finding("least-squares-biased", p=found.verdict.p, names=names)]
+    names = [f"{identification.names[k]} by {shift[k]:.2g} σ" for k in np.argsort(-shift)[:5]]
+    return [finding("least-squares-biased", p=identification.verdict.p, names=names)]
 
 
-def _blurred(found: Instrumental, loops: ClosedLoops) -> list[Finding]:
+def _blurred(identification: Instrumental, loops: ClosedLoops) -> list[Finding]:
     """Return the finding on joints whose Coulomb sign is mainly velocity noise, which instruments cannot correct."""
-    if not found.estimator.measured:
+    if not identification.estimator.measured:
         return []
     # widths of the sign (our choice)
-    noise = sign_noise(found.plant, loops.pairs[0][0].motion)
+    noise = sign_noise(identification.plant, loops.pairs[0][0].motion)
     max_blur = 3.0
-    signs = [one for one in found.plant.terms if one.shape == "sign"]
-    blurred = {one.name: noise[one.acts[0][0]] / one.settings[-1] for one in signs}
+    signs = [term for term in identification.plant.terms if term.shape == "sign"]
+    blurred = {sign.name: noise[sign.acts[0][0]] / sign.settings[-1] for sign in signs}
     joints = [f"{size:.2g} at {name}" for name, size in blurred.items() if size > max_blur]
-    return [finding("noisy-signs", joints=joints)] if joints else []
+    if joints:
+        return [finding("noisy-signs", joints=joints)]
+    return []
 
 
 # of both together, by which a parameter differs surely (our choice)
 SIGMAS = 5.0
 
 
-def disagreement(problem: IdentificationProblem, found: MethodEstimate, test: LoopTest) -> LoopDisagreement | None:
+def disagreement(problem: IdentificationProblem, estimate: MethodEstimate, test: LoopTest) -> LoopDisagreement | None:
     """Return the disagreement of an output-error estimate with the recorded torques; None if both agree.
 
     Args:
@@ -253,57 +280,66 @@ def disagreement(problem: IdentificationProblem, found: MethodEstimate, test: Lo
         found: the estimate.
         test: result of instruments; least squares replaces it if absent.
     """
-    if not (found.found and found.alone and isinstance(found, LoopEstimate)):
+    if not (estimate.found and estimate.alone and isinstance(estimate, LoopEstimate)):
         return None
-    own = found.estimate
+    own_estimate = estimate.estimate
     instruments = test.found
     # times the torque that instruments leave unexplained (our choice)
     max_beside_instruments = 1.2
     # the same beside least squares, of which it is the least that there is (our choice)
     max_beside_wls = 2.0
-    if instruments is not None and instruments.valid and len(instruments.names) == len(own.values):
+    if instruments is not None and instruments.valid and len(instruments.names) == len(own_estimate.values):
         name = instruments.estimator.name
-        other = instruments.fit.estimate
+        iv_estimate = instruments.fit.estimate
         limit = max_beside_instruments
-        left, beside = (instruments.simulated_error(x.values) for x in (own, other))
+        own_errors = instruments.simulated_error(own_estimate.values)
+        beside = instruments.simulated_error(iv_estimate.values)
     else:
         plain = WLS.estimate(problem)
         if not plain.found:
             return None
         name = "wls"
-        other = plain.estimate
+        iv_estimate = plain.estimate
         limit = max_beside_wls
-        left, beside = (problem.pooled.relative_errors(x.values) for x in (own, other))
-    away = np.abs(own.values - other.values) / np.maximum(np.hypot(own.sigma, other.sigma), 1e-300)
+        own_errors = problem.pooled.relative_errors(own_estimate.values)
+        beside = problem.pooled.relative_errors(iv_estimate.values)
+    away = np.abs(own_estimate.values - iv_estimate.values) / np.maximum(
+        np.hypot(own_estimate.sigma, iv_estimate.sigma), 1e-300
+    )
     worst = int(np.argmax(away))
-    if away[worst] < SIGMAS or not np.any(left > limit * beside):
+    if away[worst] < SIGMAS or not np.any(own_errors > limit * beside):
         return None
     return LoopDisagreement(
-        found.method,
+        estimate.method,
         name,
-        other.names[worst],
+        iv_estimate.names[worst],
         float(away[worst]),
-        tuple(left.tolist()),
+        tuple(own_errors.tolist()),
         tuple(beside.tolist()),
-        _factors(problem, own.values, other.values),
+        _factors(problem, own_estimate.values, iv_estimate.values),
     )
 
 
-def _factors(problem: IdentificationProblem, own: np.ndarray, other: np.ndarray) -> tuple[float, ...]:
+def _factors(problem: IdentificationProblem, estimate: np.ndarray, reference: np.ndarray) -> tuple[float, ...]:
     """Return for each torque row the ratio (regression slope) of the torques of two estimates."""
     factors = problem.pooled.factors[:, :, :-1]
-    mine = factors @ own
-    theirs = factors @ other
-    return tuple(map(float, np.sum(mine * theirs, axis=1) / np.maximum(np.sum(theirs**2, axis=1), 1e-300)))
+    own_values = factors @ estimate
+    reference_values = factors @ reference
+    return tuple(
+        map(
+            float,
+            np.sum(own_values * reference_values, axis=1) / np.maximum(np.sum(reference_values**2, axis=1), 1e-300),
+        )
+    )
 
 
 def loop_results(problem: IdentificationProblem, estimate: MethodEstimate) -> LoopResults:
     """Return the results of an estimate's loop test, in the form that is stored and printed."""
     test = compare_with_loop(problem, estimate)
-    taken = isinstance(estimate, LoopEstimate) and estimate.instrumental is not None
+    is_estimate = isinstance(estimate, LoopEstimate) and estimate.instrumental is not None
     return LoopResults(
-        _metrics(test, not taken),
-        tuple(test.findings(taken)),
+        _metrics(test, not is_estimate),
+        tuple(test.findings(is_estimate)),
         () if test.found is None else _table(test.found),
         test.loops and test.loops.controller,
         disagreement(problem, estimate, test),
@@ -312,43 +348,43 @@ def loop_results(problem: IdentificationProblem, estimate: MethodEstimate) -> Lo
 
 def _metrics(test: LoopTest, beside: bool) -> LoopMetrics:
     """Return the metrics of a test by simulation."""
-    found = test.found
+    identification = test.found
     loops = test.loops
     notes = () if loops is None else loops.notes
-    if found is None or loops is None:
+    if identification is None or loops is None:
         return LoopMetrics(test.failure, notes, valid=False, explains=False)
     identified = loops.identified
-    strength = found.strength
-    apart = found.apart
-    if apart.any():
+    strength = identification.strength
+    distance = identification.apart
+    if distance.any():
         notes += (
             f"with the instruments of unbound parameters alone (Janot's slides) the estimate is at most "
-            f"{apart.max():.2g} σ away, at {found.names[int(np.argmax(apart))]}",
+            f"{distance.max():.2g} σ away, at {identification.names[int(np.argmax(distance))]}",
         )
     return LoopMetrics(
         "",
         notes,
-        found.estimator.name,
+        identification.estimator.name,
         beside,
-        len(found.rounds),
-        found.verdict,
-        float(found.shift.max()),
+        len(identification.rounds),
+        identification.verdict,
+        float(identification.shift.max()),
         strength.cragg_donald,
         strength.weak,
         float(strength.partial_r2.min()),
-        found.distance,
-        found.direct,
-        found.stray,
-        found.valid,
-        found.explains,
+        identification.distance,
+        identification.direct,
+        identification.stray,
+        identification.valid,
+        identification.explains,
         loops.controller,
         identified and identified.explained,
     )
 
 
-def _table(found: Instrumental) -> tuple[tuple[Any, ...], ...]:
+def _table(identification: Instrumental) -> tuple[tuple[Any, ...], ...]:
     """Return the rows of both estimates of the standard model, one for each parameter."""
-    estimate = found.fit.estimate
-    columns = (estimate.values, estimate.sigma, found.ordinary.estimate.values, found.shift)
-    explained = 100.0 * found.strength.partial_r2
-    return tuple(zip(estimate.names, estimate.units, *(one.tolist() for one in (*columns, explained))))
+    estimate = identification.fit.estimate
+    columns = (estimate.values, estimate.sigma, identification.ordinary.estimate.values, identification.shift)
+    explained = 100.0 * identification.strength.partial_r2
+    return tuple(zip(estimate.names, estimate.units, *(column.tolist() for column in (*columns, explained))))

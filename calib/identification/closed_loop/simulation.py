@@ -40,9 +40,9 @@ LOWER = "these gains cannot stabilise this robot at this rate; lower kp and kd (
 def added_inertia(terms: Iterable[DriveTerm], values: np.ndarray, n: int) -> np.ndarray:
     """Return the constant inertia (n, n) that acceleration terms add to that of the bodies: diag(Ia) and couplings."""
     result = np.zeros((n, n))
-    for one, value in zip(terms, values, strict=True):
-        if one.shape == "acceleration":
-            for row, motion in one.acts:
+    for term, value in zip(terms, values, strict=True):
+        if term.shape == "acceleration":
+            for row, motion in term.acts:
                 for joint, weight in motion:
                     result[row, joint] += weight * value
     return result
@@ -66,10 +66,10 @@ class Plant:
     def __post_init__(self) -> None:
         size = self.inertial + len(self.terms)
         object.__setattr__(self, "parameters", frozen(shaped(self.parameters, (size,), "parameters of the plant")))
-        for one in self.terms:
-            if any(x <= 0.0 for name, x in zip(one.form.settings, one.settings) if name in ("v0", "rest")):
+        for term in self.terms:
+            if any(x <= 0.0 for name, x in zip(term.form.settings, term.settings) if name in ("v0", "rest")):
                 raise CalibError(
-                    f"term '{one.name}': sign(v) without smoothing cannot be simulated; give v0, about 0.01 rad/s"
+                    f"term '{term.name}': sign(v) without smoothing cannot be simulated; give v0, about 0.01 rad/s"
                 )
 
     @property
@@ -83,8 +83,8 @@ class Plant:
 
     def carrying(self, carried: Collection[str]) -> Plant:
         """Return the robot model with these payloads alone."""
-        there = IdentificationModel(self.bodies).carried_columns(carried)
-        return self.with_parameters(self.parameters * np.append(there, np.ones(len(self.terms))))
+        carried_columns = IdentificationModel(self.bodies).carried_columns(carried)
+        return self.with_parameters(self.parameters * np.append(carried_columns, np.ones(len(self.terms))))
 
     def run(self, controller: Controller, reference: Reference, sensing: Sensing | None = None) -> SimulatedRun:
         """Return the simulated motion of the robot that follows a reference; see `simulate`."""
@@ -183,12 +183,15 @@ def simulate(
     if sensing.push_band is not None:
         drawn["push"] = _coloured(drawn["push"], 2.0 * np.pi * sensing.push_band * reference.period)
     if push is not None:
-        own = shaped(push, reference.q.shape, "push")
-        drawn["push"] = np.ascontiguousarray(own + drawn["push"] if len(drawn["push"]) else own)
+        push_ = shaped(push, reference.q.shape, "push")
+        drawn["push"] = np.ascontiguousarray(push_ + drawn["push"] if len(drawn["push"]) else push_)
     q, v = (np.array(x, dtype=float) for x in (start if start is not None else (reference.q[0], reference.v[0])))
     tick = sample_ticks(count, sensing.every)
     out = np.empty((5, len(tick), n))
-    model = np.empty((0, 0)) if controller.model is None else body_rows(plant.bodies, controller.model)
+    if controller.model is None:
+        model = np.empty((0, 0))
+    else:
+        model = body_rows(plant.bodies, controller.model)
     status, reached = loop_kernels.closed_loop(
         *packed(plant),
         model,
@@ -207,9 +210,14 @@ def simulate(
     )
     if status != loop_kernels.FINE:
         raise failure(status, reached * reference.period)
-    heard = drawn["sigma_tau"][tick.astype(int)] if len(drawn["sigma_tau"]) else 0.0
-    whole = np.all(tick == tick.astype(int))
-    t = reference.t[tick.astype(int)] if whole else reference.t[0] + tick * reference.period
+    heard = 0.0
+    if len(drawn["sigma_tau"]):
+        heard = drawn["sigma_tau"][tick.astype(int)]
+    on_ticks = np.all(tick == tick.astype(int))
+    if on_ticks:
+        t = reference.t[tick.astype(int)]
+    else:
+        t = reference.t[0] + tick * reference.period
     motion = [frozen(x) for x in out]
     return SimulatedRun(t, motion[0], motion[1], motion[2], motion[3], frozen(out[4] + heard), motion[4])
 
@@ -271,15 +279,17 @@ def layout_of(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
     entries: list[tuple[int, int, int]] = []
     shares: list[float] = []
     owners: list[int] = []
-    for k, one in enumerate(plant.terms):
-        for row, motion in one.acts:
-            if one.shape not in LINEAR:
+    for k, term in enumerate(plant.terms):
+        for row, motion in term.acts:
+            if term.shape not in LINEAR:
                 owners.append(first + k)
                 continue
-            seen = ((2 * n, 1.0),) if one.shape == "one" else motion
-            start = n if one.shape == "velocity" else 0
-            entries += [(row, start + place, first + k) for place, _ in seen]
-            shares += [weight for _, weight in seen]
+            motion_entries = motion
+            if term.shape == "one":
+                motion_entries = ((2 * n, 1.0),)
+            start = n if term.shape == "velocity" else 0
+            entries += [(row, start + offset, first + k) for offset, _ in motion_entries]
+            shares += [weight for _, weight in motion_entries]
     return order, np.array(entries, dtype=np.int64).reshape(-1, 3), np.array(shares), np.array(owners, dtype=np.int64)
 
 
@@ -302,7 +312,10 @@ def body_rows(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:
     result[-1, :3] = -bodies.gravity
     turns = [upright_turn(axis)[:3, :3] for axis in bodies.axes]
     for i, parent in enumerate(bodies.parents):
-        before = np.eye(3) if parent < 0 else turns[parent].T
+        if parent < 0:
+            before = np.eye(3)
+        else:
+            before = turns[parent].T
         result[i, :9] = (before @ bodies.placements[i, :3, :3] @ turns[i]).ravel()
         result[i, 9:12] = before @ bodies.placements[i, :3, 3]
         result[i, 12:22] = parameters[10 * i : 10 * i + 10][bodies.order[i]]
@@ -319,23 +332,23 @@ def _drives(terms: Sequence[DriveTerm], values: np.ndarray, n: int, ramp: float 
 
     linear = np.zeros((n, 2 * n + 1))
     acts = []
-    for one, value in zip(terms, values, strict=True):
-        for row, motion in one.acts:
-            if one.shape == "one":
+    for term, value in zip(terms, values, strict=True):
+        for row, motion in term.acts:
+            if term.shape == "one":
                 linear[row, 2 * n] += value
                 continue
             weights = np.zeros(n)
             for joint, weight in motion:
                 weights[joint] += weight
-            if one.shape not in LINEAR:
-                if one.shape == "dead":
-                    settings = [*one.settings, ramp * one.settings[0]]
+            if term.shape not in LINEAR:
+                if term.shape == "dead":
+                    settings = [*term.settings, ramp * term.settings[0]]
                 else:
-                    settings = [*one.settings]
-                code = getattr(shape_kernels, one.shape.upper())
+                    settings = [*term.settings]
+                code = getattr(shape_kernels, term.shape.upper())
                 acts.append((row, code, value, [*settings, *[0.0] * (7 - len(settings))], weights))
             else:
-                first = 0 if one.shape == "acceleration" else n
+                first = 0 if term.shape == "acceleration" else n
                 linear[row, first : first + n] += value * weights
     return linear, acts
 
@@ -344,15 +357,15 @@ def failure(status: int, time: float, where: str | None = None) -> NotConverged:
     """Return the error for a failure status at `time` [s], or at `where`."""
     from calib.identification.closed_loop import loop_kernels
 
-    place = f"at {time:.4g} s " if where is None else where
+    location = f"at {time:.4g} s " if where is None else where
     if status == loop_kernels.SINGULAR:
         return CannotSimulate(
-            f"{place}the inertia matrix is not positive definite: these parameters are not physically "
+            f"{location}the inertia matrix is not positive definite: these parameters are not physically "
             "consistent; use a physically consistent estimate, or start from regular inertia"
         )
     if status == loop_kernels.STIFF:
         return CannotSimulate(
-            f"{place}friction at rest is too stiff: integrating a control period takes more than "
+            f"{location}friction at rest is too stiff: integrating a control period takes more than "
             f"{loop_kernels.MAX_STEPS} steps; "
             "smooth the sign over a larger velocity, or give the joint its motor inertia"
         )
@@ -366,7 +379,7 @@ def feed_forward(believed: Plant, reference: Reference) -> np.ndarray:
     block = 4096
     parts = [slice(k, k + block) for k in range(0, len(reference.t), block)]
     states = ((reference.q[part], reference.v[part], reference.a[part]) for part in parts)
-    return np.concatenate([model.torque(believed.parameters, *each) for each in states])
+    return np.concatenate([model.torque(believed.parameters, *state) for state in states])
 
 
 def tracking_error(

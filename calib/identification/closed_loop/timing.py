@@ -71,7 +71,8 @@ def reference_shift(
             raise NotConverged(f"{case.name}: no shift of the reference in time explains the torques: check [loop]")
     tau = np.mean([inflation(column) for column in residual.T])
     sigma = float(np.sqrt(tau / max(information, 1e-300)))
-    torque, rise = (law.torque(law.t, order)[law.rows] for order in (0, 1))
+    torque = law.torque(law.t, 0)[law.rows]
+    rise = law.torque(law.t, 1)[law.rows]
     effect = float(sigma * np.sqrt(np.mean(rise.var(axis=0) / np.maximum(torque.var(axis=0), 1e-300))))
     return ReferenceShift(shift, sigma, *law.left(shift), effect)
 
@@ -84,34 +85,42 @@ class _Law:
         n = case.motion.n
         self.controller = controller
         self.t = np.arange(len(case.motion)) / rate
-        place = np.arange(len(self.t)) * every
-        parts = (reference.at(place)[0], case.motion.q, cast(np.ndarray, motor_torques(case)))
+        ticks = np.arange(len(self.t)) * every
+        parts = (reference.at(ticks)[0], case.motion.q, cast(np.ndarray, motor_torques(case)))
         self.asked, self.measured, self.torque = (CubicSpline(self.t, low_pass(x, rate, band)) for x in parts)
         self.ahead = np.zeros((len(self.t), n))
         if controller.ahead is not None:
-            ahead = CubicSpline(np.arange(len(controller.ahead)), controller.ahead)(place)
+            ahead = CubicSpline(np.arange(len(controller.ahead)), controller.ahead)(ticks)
             self.ahead = low_pass(ahead, rate, band)
         edge = border(rate, band)
         # saturated ones follow no law
         free = (np.abs(parts[2]) < 0.98 * controller.limit).all(axis=1)
-        inside = (np.arange(len(self.t)) >= edge) & (np.arange(len(self.t)) < len(self.t) - edge)
-        self.rows = np.flatnonzero(inside & free)
+        is_inside = (np.arange(len(self.t)) >= edge) & (np.arange(len(self.t)) < len(self.t) - edge)
+        self.rows = np.flatnonzero(is_inside & free)
         self.late = controller.delay * reference.period
-        lag = 0.0 if controller.cutoff is None else 1.0 / (2 * np.pi * controller.cutoff)
+        if controller.cutoff is None:
+            lag = 0.0
+        else:
+            lag = 1.0 / (2 * np.pi * controller.cutoff)
         # the measured speed is a backward difference
         self.speed_late = self.late + 0.5 * reference.period + lag
 
     def linearised(self, shift: float) -> tuple[np.ndarray, np.ndarray]:
         """Return residual torques (M, n), without their means, and the law's derivative with respect to the shift."""
-        own = self.controller
-        now = self.t - self.late
-        asked = [self.asked(np.clip(now - shift, self.t[0], self.t[-1]), order) for order in range(3)]
-        error = asked[0] - self.measured(now)
-        speed = own.share * asked[1] - self.measured(self.t - self.speed_late, 1)
+        controller = self.controller
+        instants = self.t - self.late
+        reference = [self.asked(np.clip(instants - shift, self.t[0], self.t[-1]), order) for order in range(3)]
+        error = reference[0] - self.measured(instants)
+        speed = controller.share * reference[1] - self.measured(self.t - self.speed_late, 1)
         sums = np.cumsum(error, axis=0) * (self.t[1] - self.t[0])
-        law = own.kp * error + own.kd * speed + own.ki * sums + self.ahead
-        slopes = -(own.kp * asked[1] + own.kd * own.share * asked[2] + own.ki * asked[0])
-        residual, slopes = ((x[self.rows]) for x in (self.torque(self.t) - law, slopes))
+        law = controller.kp * error + controller.kd * speed + controller.ki * sums + self.ahead
+        slopes = -(
+            controller.kp * reference[1]
+            + controller.kd * controller.share * reference[2]
+            + controller.ki * reference[0]
+        )
+        residual = (self.torque(self.t) - law)[self.rows]
+        slopes = slopes[self.rows]
         return residual - residual.mean(axis=0), slopes - slopes.mean(axis=0)
 
     def left(self, shift: float) -> tuple[float, float]:
@@ -120,28 +129,32 @@ class _Law:
         Of torques and residuals counts what goes with the reference, shifted or not, and its derivatives, joint by
         joint: noise of positions, which goes through the law, hides no delay (our choice).
         """
-        times = [np.clip(self.t[self.rows] - own, self.t[0], self.t[-1]) for own in (shift, 0.0)]
-        moved = np.array([self.asked(own, order) for own in times for order in range(3)])
-        moved = (moved - moved.mean(axis=1, keepdims=True)) / np.maximum(moved.std(axis=1, keepdims=True), 1e-300)
-        along = np.linalg.qr(moved.transpose(2, 1, 0))[0].transpose(0, 2, 1)
+        times = [np.clip(self.t[self.rows] - instants_, self.t[0], self.t[-1]) for instants_ in (shift, 0.0)]
+        reference = np.array([self.asked(time, order) for time in times for order in range(3)])
+        reference = (reference - reference.mean(axis=1, keepdims=True)) / np.maximum(
+            reference.std(axis=1, keepdims=True), 1e-300
+        )
+        along = np.linalg.qr(reference.transpose(2, 1, 0))[0].transpose(0, 2, 1)
         torque, *residuals = (
             np.sum((along @ x.T[:, :, None]) ** 2, axis=(1, 2))
             for x in (self.torque(self.t[self.rows]), self.linearised(shift)[0], self.linearised(0.0)[0])
         )
-        late, stated = (float(np.sqrt(np.mean(one / np.maximum(torque, 1e-300)))) for one in residuals)
-        return late, stated
+        late_share, stated_share = (
+            float(np.sqrt(np.mean(residual / np.maximum(torque, 1e-300)))) for residual in residuals
+        )
+        return late_share, stated_share
 
 
-def _by_positions(asked: CubicSpline, measured: CubicSpline, t: np.ndarray) -> float:
+def _by_positions(reference: CubicSpline, measured: CubicSpline, t: np.ndarray) -> float:
     """Return the shift [s] of the reference at which it is nearest to the measured positions, at times t (M,)."""
     shift = 0.0
-    low = float(asked.x[0])
-    high = float(asked.x[-1])
+    low = float(reference.x[0])
+    high = float(reference.x[-1])
     for _ in range(30):
-        rest = measured(t) - asked(np.clip(t - shift, low, high))
-        slopes = -asked(np.clip(t - shift, low, high), 1)
+        residual = measured(t) - reference(np.clip(t - shift, low, high))
+        slopes = -reference(np.clip(t - shift, low, high), 1)
         size = np.maximum(measured(t).var(axis=0), 1e-300)
-        step = float(np.sum(rest * slopes / size) / max(np.sum(slopes**2 / size), 1e-300))
+        step = float(np.sum(residual * slopes / size) / max(np.sum(slopes**2 / size), 1e-300))
         shift = float(np.clip(shift + step, -MAX_SHIFT, MAX_SHIFT))
         if abs(step) < 1e-9:
             break
@@ -153,10 +166,12 @@ def motor_torques(case: Case) -> np.ndarray | None:
     if case.torque_rows.with_motors:
         return case.target[:, -case.motion.n :]
     projected = case.torque_rows.projection is not None and case.motion.kind == "torque"
-    return np.asarray(case.motion.effort) if projected else None
+    if projected:
+        return np.asarray(case.motion.effort)
+    return None
 
 
-def check_no_copy(motion: Motion, asked: np.ndarray) -> None:
+def check_no_copy(motion: Motion, reference_: np.ndarray) -> None:
     """Refuse a reference that is the measured motion itself, perhaps shifted in time, rounded or low-passed.
 
     Where the motion has died away the positions hold noise alone: a reference that holds it, too, comes from them.
@@ -174,27 +189,28 @@ def check_no_copy(motion: Motion, asked: np.ndarray) -> None:
     rows = t[edge:-edge]
     if len(rows) < 10 or not moves.any():
         return
-    measured, reference = (CubicSpline(t, x[:, moves]) for x in (motion.q, asked))
+    measured = CubicSpline(t, motion.q[:, moves])
+    reference = CubicSpline(t, reference_[:, moves])
     shift = _by_positions(reference, measured, rows)
-    rest = measured(rows) - reference(np.clip(rows - shift, t[0], t[-1]))
+    residual = measured(rows) - reference(np.clip(rows - shift, t[0], t[-1]))
     # of the positions' noise in the band; no commanded motion has that of the encoders
     share = 0.01
     noise = (motion.cutoffs.noise * np.sqrt(2.0 * motion.cutoff / motion.rate))[moves]
-    exact = np.sqrt(np.mean(rest**2, axis=0)) < np.maximum(share * noise, 1e-7 * measured(rows).std(axis=0))
-    shares = _noise_shares(motion, measured(rows), rest, np.flatnonzero(moves))
+    exact = np.sqrt(np.mean(residual**2, axis=0)) < np.maximum(share * noise, 1e-7 * measured(rows).std(axis=0))
+    shares = _noise_shares(motion, measured(rows), residual, np.flatnonzero(moves))
     # of the noise's power in the distance from a copy; from a commanded motion it is all (our choice)
     max_share = 0.1
     if exact.all() or (len(shares) and np.median(shares) < max_share):
-        late = f", {1e3 * -shift:.4g} ms later" if abs(shift) > 1e-5 else ""
+        note = f", {1e3 * -shift:.4g} ms later" if abs(shift) > 1e-5 else ""
         refuse_data(
             motion.file,
-            f"its reference (q_ref) is the measured positions{late}: instruments from it hold the noise that they are "
+            f"its reference (q_ref) is the measured positions{note}: instruments from it hold the noise that they are "
             "to avoid. Log what was commanded (UR: target_q, Franka: q_d), or give the folder of the designed motion "
             "(--excitation)",
         )
 
 
-def _noise_shares(motion: Motion, measured: np.ndarray, rest: np.ndarray, joints: np.ndarray) -> np.ndarray:
+def _noise_shares(motion: Motion, measured: np.ndarray, residual: np.ndarray, joints: np.ndarray) -> np.ndarray:
     """Return the noise's power in `rest` over that in the `measured` positions (N, k), of joints with noise alone.
 
     In the lowest octave in which the positions' spectrum is at the floor of their noise, below f_q.
@@ -205,7 +221,7 @@ def _noise_shares(motion: Motion, measured: np.ndarray, rest: np.ndarray, joints
     # windows of 4 s
     size = min(len(measured), max(64, int(4.0 * motion.rate)))
     f, power = welch(measured, motion.rate, "hann", size, detrend="linear", axis=0)
-    left = welch(rest, motion.rate, "hann", size, detrend="linear", axis=0)[1]
+    spectrum = welch(residual, motion.rate, "hann", size, detrend="linear", axis=0)[1]
     floor = 2.0 * motion.cutoffs.noise[joints] ** 2 / motion.rate
     # times the floor that are still noise; frequencies that make a spectrum (our choice)
     above, min_bins = 4.0, 8
@@ -214,5 +230,5 @@ def _noise_shares(motion: Motion, measured: np.ndarray, rest: np.ndarray, joints
         quiet = (power[:, column] < above * floor[column]) & (f > 0.0) & (f < 0.8 * motion.cutoff[joint])
         octave = quiet & (f <= 2.0 * f[np.argmax(quiet)])
         if octave.sum() >= min_bins:
-            result.append(left[octave, column].sum() / power[octave, column].sum())
+            result.append(spectrum[octave, column].sum() / power[octave, column].sum())
     return np.array(result)

@@ -65,15 +65,15 @@ class BodyCone(Frozen):
         root = np.diag([unit_length, unit_length, unit_length, 1.0])
         # of the unknowns' pseudo-inertia
         block = pseudo_inertia.to_standard(root @ pseudo_inertia.UNITS @ root).T
-        made = unit[:base, None] / size * self.transform @ block_diag(*[block] * count, np.eye(len(self.positive)))
-        made = np.asarray(
-            block_diag(made, np.eye(p - base))
+        columns = unit[:base, None] / size * self.transform @ block_diag(*[block] * count, np.eye(len(self.positive)))
+        columns = np.asarray(
+            block_diag(columns, np.eye(p - base))
         )  # b of bodies and terms, and of columns that are none of theirs
-        bodies = pseudo_inertia.unknown_bodies(count, made.shape[1] - 10 * count)
+        bodies = pseudo_inertia.unknown_bodies(count, columns.shape[1] - 10 * count)
         # of a body in those units: keeps finite what the data do not tell
         max_trace = 1e4
         rows = [-np.einsum("irrj->ij", bodies) / max_trace]
-        rows.append(np.eye(made.shape[1])[10 * count : 10 * count + len(self.positive)][self.positive])
+        rows.append(np.eye(columns.shape[1])[10 * count : 10 * count + len(self.positive)][self.positive])
         low = np.isfinite(lower)
         high = np.isfinite(upper)
         sides = np.vstack([matrix[low], -matrix[high]]) / unit * size
@@ -81,21 +81,21 @@ class BodyCone(Frozen):
         edges = np.concatenate([lower[low], -upper[high]]) / lengths[:, 0]
         sides = sides / lengths
         offset = np.concatenate([np.repeat([1.0, 0.0], [count, int(self.positive.sum())]), -edges])
-        found = minimise(R @ made, z, np.vstack([*rows, sides @ made]), offset, bodies)
-        b = made @ found.values
+        solution = minimise(R @ columns, z, np.vstack([*rows, sides @ columns]), offset, bodies)
+        b = columns @ solution.values
         # the gradient's part that the cone balances
-        held = (R.T @ (R @ b - z) - sides.T @ found.rows[len(offset) - len(edges) :])[:base]
+        gradient = (R.T @ (R @ b - z) - sides.T @ solution.rows[len(offset) - len(edges) :])[:base]
         # of the gradient, from which on the cone holds the optimum
         min_multiplier = 1e-6
-        if np.abs(held).max() < min_multiplier * max(float(np.abs(R.T @ z).max()), 1e-300):
+        if np.abs(gradient).max() < min_multiplier * max(float(np.abs(R.T @ z).max()), 1e-300):
             return None
         normal = np.zeros(p)
-        normal[:base] = held
-        eigenvalues = np.linalg.eigvalsh(bodies @ found.values)
+        normal[:base] = gradient
+        eigenvalues = np.linalg.eigvalsh(bodies @ solution.values)
         # of a body's largest moment in those units, below which it counts as on the border
         max_on_border = 1e-4
         border = eigenvalues[:, 0] < max_on_border * np.maximum(eigenvalues[:, -1], max_on_border)
-        labels = tuple(label for label, near in zip(self.labels, border) if near)
+        labels = tuple(label for label, touches in zip(self.labels, border) if touches)
         return _Plane(normal * unit / size, float(normal @ b), labels)
 
 
@@ -103,5 +103,5 @@ def cone_of(model: RegressorModel, base: Base) -> BodyCone:
     """Return the cone of consistent base parameters of a model."""
     labels = tuple(name.removeprefix("XX") for name in model.names[: model.inertial : 10])
     return BodyCone(
-        np.asarray(base.transform), labels, np.array([one.nonnegative for one in model.columns], dtype=bool)
+        np.asarray(base.transform), labels, np.array([column.nonnegative for column in model.columns], dtype=bool)
     )

@@ -66,16 +66,16 @@ def contradicting(matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> t
     limit = np.concatenate([-lower[low], upper[high]])
     size = np.maximum(np.linalg.norm(rows, axis=1), 1e-300)
     count, p = rows.shape
-    found = linprog(
+    program = linprog(
         np.concatenate([np.zeros(p), np.ones(count)]),
         np.hstack([rows / size[:, None], -np.eye(count)]),
         limit / size,
         bounds=[(None, None)] * p + [(0.0, None)] * count,
     )
-    if found.fun <= 1e-9 * max(1.0, float(np.abs(limit / size).max(initial=0.0))):
+    if program.fun <= 1e-9 * max(1.0, float(np.abs(limit / size).max(initial=0.0))):
         return ()
     places = np.concatenate([np.flatnonzero(low), np.flatnonzero(high)])
-    return tuple(sorted({int(places[k]) for k in np.flatnonzero(found.ineqlin.marginals < -1e-9)}))
+    return tuple(sorted({int(places[k]) for k in np.flatnonzero(program.ineqlin.marginals < -1e-9)}))
 
 
 def restricted(covariance: np.ndarray, factor: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -156,20 +156,20 @@ def within(
     if (lower > upper).any():
         worst = int(np.argmax(lower - upper))
         raise CalibError(f"bounds: lower {lower[worst]:g} is above upper {upper[worst]:g} in row {worst}")
-    same = lower == upper
-    low = np.isfinite(lower) & ~same
-    high = np.isfinite(upper) & ~same
+    equal = lower == upper
+    low = np.isfinite(lower) & ~equal
+    high = np.isfinite(upper) & ~equal
     rows = np.vstack([matrix[low], -matrix[high]])
     edges = np.concatenate([lower[low], -upper[high]])
-    planes = _Planes(factor, rows, edges, matrix[same], lower[same])
+    planes = _Planes(factor, rows, edges, matrix[equal], lower[equal])
     matrices = matrices or Definite(np.zeros((0, 1, 1, p)), 1.0)
-    found = planes.optimum(np.zeros(len(rows), dtype=bool))
-    if (found.slack[: len(rows)] < 0.0).any():
-        found = planes.bounded()
-    sizes, normals = matrices.least_eigenvalues(found.values)
+    solution = planes.optimum(np.zeros(len(rows), dtype=bool))
+    if (solution.slack[: len(rows)] < 0.0).any():
+        solution = planes.bounded()
+    sizes, normals = matrices.least_eigenvalues(solution.values)
     if not matrices.satisfied(sizes):
         return planes.definite(matrices)
-    return _widened(found, len(rows), normals, sizes)
+    return _widened(solution, len(rows), normals, sizes)
 
 
 class _Planes:
@@ -178,7 +178,7 @@ class _Planes:
     Columns of R and rows of A and E of unit norm, ‖z‖ = 1: `upper`, `target`, `scaled` and `edges` in b / `unit`.
     """
 
-    def __init__(self, factor: np.ndarray, rows: np.ndarray, sides: np.ndarray, equal: np.ndarray, held: np.ndarray):
+    def __init__(self, factor: np.ndarray, rows: np.ndarray, sides: np.ndarray, equal: np.ndarray, fixed: np.ndarray):
         p = len(factor) - 1
         norms = np.linalg.norm(factor[:p, :p], axis=0)
         self.upper = factor[:p, :p] / np.where(norms > 0.0, norms, 1.0)
@@ -187,7 +187,7 @@ class _Planes:
         self.unit = self.length / norms
         self.target = factor[:p, p] / self.length
         self.normals = np.vstack([rows, equal])
-        self.sides = np.concatenate([sides, held])
+        self.sides = np.concatenate([sides, fixed])
         self.count = len(rows)
         sizes = np.linalg.norm(self.normals * self.unit, axis=1)
         self.sizes = np.where(sizes > 0.0, sizes, 1.0)
@@ -203,13 +203,13 @@ class _Planes:
         `max_contradiction`: of an equality, by which the best point may miss it.
         """
         scaled = self.scaled[self.count :]
-        wanted = self.edges[self.count :]
+        edges = self.edges[self.count :]
         if not len(scaled):
             return
         acts = scaled.any(axis=1)
         require(acts.all(), f"equality {int(np.argmin(acts)) + 1} has only zero coefficients")
-        origin, _, rank, _ = np.linalg.lstsq(scaled, wanted, rcond=1e-10)
-        away = np.abs(scaled @ origin - wanted) / np.maximum(np.abs(wanted), max(float(np.abs(origin).max()), 1e-300))
+        origin, _, rank, _ = np.linalg.lstsq(scaled, edges, rcond=1e-10)
+        away = np.abs(scaled @ origin - edges) / np.maximum(np.abs(edges), max(float(np.abs(origin).max()), 1e-300))
         require(away.max() <= max_contradiction, "equalities contradict each other: no point satisfies all of them")
         require(rank < len(self.free), f"equalities fix all {rank} parameters: nothing remains to be estimated")
 
@@ -224,8 +224,8 @@ class _Planes:
             values = from_free(self.factor, self.free, normals, sides)
             # bounds on single parameters
             for row in np.flatnonzero(np.count_nonzero(normals, axis=1) == 1):
-                place = int(np.flatnonzero(normals[row])[0])
-                values[place] = sides[row] / normals[row, place]
+                column = int(np.flatnonzero(normals[row])[0])
+                values[column] = sides[row] / normals[row, column]
             slope = self.upper.T @ (self.upper @ (values / self.unit) - self.target)
             multipliers[binding] = np.linalg.lstsq(self.scaled[binding].T, slope)[0]
         slack = np.where(binding, 0.0, self.normals @ values - self.sides)
@@ -238,13 +238,13 @@ class _Planes:
         """
         c = self.count
         p = len(self.free)
-        found = self.definite(Definite(np.zeros((0, 1, 1, p)), 1.0))
-        exact = self.optimum(found.binding[:c])
-        away = np.linalg.norm(self.upper @ ((exact.values - found.values) / self.unit))
+        solution = self.definite(Definite(np.zeros((0, 1, 1, p)), 1.0))
+        exact = self.optimum(solution.binding[:c])
+        away = np.linalg.norm(self.upper @ ((exact.values - solution.values) / self.unit))
         # of ‖z‖, by which the optimum on the constraints that bind may be off the solver's
         max_move = 1e-3
         good = (exact.slack >= 0.0).all() and (exact.multipliers[:c] >= 0.0).all() and away <= max_move
-        return exact if good else found
+        return exact if good else solution
 
     def definite(self, matrices: Definite) -> Constrained:
         """Return the optimum under inequalities and matrices by cone programs.
@@ -256,7 +256,10 @@ class _Planes:
         rows = self.scaled
         edges = self.edges
         small = Definite(matrices.matrices * self.unit, matrices.least)
-        used = np.zeros(0, dtype=int) if matrices.likely is None else matrices.likely
+        if matrices.likely is None:
+            active = np.zeros(0, dtype=int)
+        else:
+            active = matrices.likely
         # of the scaled problem, multipliers of matrices above which bind
         min_multiplier = 1e-6
         # matrices that enter at once, the most indefinite (our choice)
@@ -264,10 +267,10 @@ class _Planes:
         # rounds in which what does not bind may go: rounding could let it come back
         max_drops = 30
         for rounds in count():
-            if not len(used):
-                used = np.argsort(small.least_eigenvalues(self.free / self.unit)[0])[:max_entering]
+            if not len(active):
+                active = np.argsort(small.least_eigenvalues(self.free / self.unit)[0])[:max_entering]
             goal = self.upper, self.target, rows[:c], -edges[:c]
-            solved = minimise(*goal, small.matrices[used], small.least, rows[c:], edges[c:])
+            solved = minimise(*goal, small.matrices[active], small.least, rows[c:], edges[c:])
             b = solved.values
             mu = solved.rows
             pushes = solved.matrices
@@ -275,27 +278,27 @@ class _Planes:
             sizes, normals = small.least_eigenvalues(b)
             traces = np.einsum("kii->k", pushes)
             bind = traces > min_multiplier
-            left = sizes.copy()
-            left[used] = 0.0
-            if small.satisfied(left):
+            margins = sizes.copy()
+            margins[active] = 0.0
+            if small.satisfied(margins):
                 break
-            worst = np.argsort(left)[:max_entering]
-            used = np.union1d(used[bind] if rounds < max_drops else used, worst[left[worst] < 0.0])
-        held_by = np.einsum("kij,kijp->kp", pushes[bind], small.matrices[used[bind]])
-        normals[used[bind]] = held_by / traces[bind, None]
+            worst = np.argsort(margins)[:max_entering]
+            active = np.union1d(active[bind] if rounds < max_drops else active, worst[margins[worst] < 0.0])
+        held_by = np.einsum("kij,kijp->kp", pushes[bind], small.matrices[active[bind]])
+        normals[active[bind]] = held_by / traces[bind, None]
         force = np.zeros(len(small.matrices))
-        force[used[bind]] = traces[bind]
+        force[active[bind]] = traces[bind]
         slack = np.maximum(rows[:c] @ b - edges[:c], 0.0)
-        whole = np.vstack([rows[:c], normals, rows[c:]])
+        all_rows = np.vstack([rows[:c], normals, rows[c:]])
         binding = np.concatenate([mu > slack, force > 0.0, np.ones(len(rates), dtype=bool)])
         scales = np.concatenate([self.sizes[:c], np.ones(len(force)), self.sizes[c:]])
-        apart = np.concatenate([slack, np.where(force > 0.0, np.maximum(sizes, 0.0), sizes), np.zeros(len(rates))])
+        gaps = np.concatenate([slack, np.where(force > 0.0, np.maximum(sizes, 0.0), sizes), np.zeros(len(rates))])
         return _frozen(
             b * self.unit,
             np.concatenate([mu, force, rates]) * self.length**2 / scales,
-            apart * scales,
+            gaps * scales,
             binding,
-            whole * scales[:, None] / self.unit,
+            all_rows * scales[:, None] / self.unit,
         )
 
 
@@ -304,13 +307,13 @@ def _frozen(*parts: np.ndarray) -> Constrained:
     return Constrained(frozen(values), frozen(multipliers), frozen(slack), frozen(binding, bool), frozen(normals))
 
 
-def _widened(found: Constrained, place: int, normals: np.ndarray, slack: np.ndarray) -> Constrained:
+def _widened(solution: Constrained, position: int, normals: np.ndarray, slack: np.ndarray) -> Constrained:
     """Return the optimum with further, inactive inequalities inserted at `place`."""
     zero = np.zeros(len(slack))
     return _frozen(
-        found.values,
-        np.insert(found.multipliers, place, zero),
-        np.insert(found.slack, place, slack),
-        np.insert(found.binding, place, zero > 0.0),
-        np.insert(found.normals, place, normals, axis=0),
+        solution.values,
+        np.insert(solution.multipliers, position, zero),
+        np.insert(solution.slack, position, slack),
+        np.insert(solution.binding, position, zero > 0.0),
+        np.insert(solution.normals, position, normals, axis=0),
     )

@@ -91,13 +91,13 @@ class Curved:
     def _compare(self, u: np.ndarray, slope: np.ndarray) -> None:
         differences = np.ravel(_differences(lambda x: np.array([self.h(x)]), u))
         size = _sizes(u)
-        stated = slope * size
-        found = differences * size
+        analytic = slope * size
+        numeric = differences * size
         # of the derivative; of the largest one, what differences lose
         max_error, max_rounding = 1e-4, 1e-6
-        allowed = max_error * np.maximum(np.abs(stated), np.abs(found)) + max_rounding * np.abs(found).max()
-        worst = int(np.argmax(np.abs(stated - found) - allowed))
-        if abs(stated[worst] - found[worst]) > allowed[worst]:
+        allowed = max_error * np.maximum(np.abs(analytic), np.abs(numeric)) + max_rounding * np.abs(numeric).max()
+        worst = int(np.argmax(np.abs(analytic - numeric) - allowed))
+        if abs(analytic[worst] - numeric[worst]) > allowed[worst]:
             self._refuse(
                 f"its derivative by {self.arguments[worst]} is stated as {slope[worst]:.6g}, but differences of h give "
                 f"{differences[worst]:.6g}, at {self._at(u)}; correct 'slope', in the order of h's arguments"
@@ -106,8 +106,8 @@ class Curved:
     def _at(self, u: np.ndarray) -> str:
         return ", ".join(f"{name} = {x:.4g}" for name, x in zip(self.arguments, u))
 
-    def _refuse(self, words: str) -> None:
-        refuse_option(f"[constraints] curved '{self.name}'", words)
+    def _refuse(self, message: str) -> None:
+        refuse_option(f"[constraints] curved '{self.name}'", message)
 
 
 def _sizes(u: np.ndarray) -> np.ndarray:
@@ -121,7 +121,7 @@ def _differences(function: Callable[[np.ndarray], np.ndarray], u: np.ndarray) ->
     return np.transpose([(function(u + step) - function(u - step)) / (2.0 * step.sum()) for step in steps])
 
 
-def make_curved(asked: CurvedConstraint, row: Callable[[Mapping[str, float]], np.ndarray]) -> Curved:
+def make_curved(constraint: CurvedConstraint, row: Callable[[Mapping[str, float]], np.ndarray]) -> Curved:
     """Return a constraint from its formula, or from a Python function and its derivatives.
 
     Args:
@@ -130,17 +130,20 @@ def make_curved(asked: CurvedConstraint, row: Callable[[Mapping[str, float]], np
     Raises:
         UsageError: for a formula of anything but names, numbers, + - * / ** and a few functions.
     """
-    h = asked.h
-    names = tuple(signature(h).parameters) if callable(h) else ()
-    name = asked.name or (f"h({', '.join(names)}) >= 0" if callable(h) else h)
-    place = f"[constraints] curved '{name}'"
-    if callable(h) == (asked.slope is None):
-        refuse_option(place, "'slope' states the derivatives of a function; a formula has its own")
-    if callable(h) and asked.slope is not None:
-        function = _called(h, place, 1)
-        slope = _called(asked.slope, place, len(names))
+    h = constraint.h
+    if callable(h):
+        names = tuple(signature(h).parameters)
+    else:
+        names = ()
+    name = constraint.name or (f"h({', '.join(names)}) >= 0" if callable(h) else h)
+    location = f"[constraints] curved '{name}'"
+    if callable(h) == (constraint.slope is None):
+        refuse_option(location, "'slope' states the derivatives of a function; a formula has its own")
+    if callable(h) and constraint.slope is not None:
+        function = _called(h, location, 1)
+        slope = _called(constraint.slope, location, len(names))
         return Curved(name, names, _rows(names, row), lambda u: float(function(u)[0]), slope, True)
-    tree, names = _parsed(str(h), place)
+    tree, names = _parsed(str(h), location)
 
     def value(u: np.ndarray) -> Any:
         return evaluated(tree, _KNOWN | dict(zip(names, u)), _OPERATIONS)
@@ -148,18 +151,18 @@ def make_curved(asked: CurvedConstraint, row: Callable[[Mapping[str, float]], np
     # by complex steps, without rounding (Squire & Trapp 1998)
     def derivatives(u: np.ndarray) -> np.ndarray:
         step = 1e-30
-        return np.array([np.imag(value(u + 1j * step * one)) / step for one in np.eye(len(u))])
+        return np.array([np.imag(value(u + 1j * step * direction)) / step for direction in np.eye(len(u))])
 
     return Curved(name, names, _rows(names, row), value, derivatives, False)
 
 
-def _called(function: Callable[..., Any], place: str, count: int) -> Callable[[np.ndarray], np.ndarray]:
+def _called(function: Callable[..., Any], location: str, count: int) -> Callable[[np.ndarray], np.ndarray]:
     def call(u: np.ndarray) -> np.ndarray:
-        found = np.ravel(np.asarray(function(*map(float, u)), dtype=float))
-        if len(found) != count:
-            words = f"returns {len(found)} numbers, expected {count}"
-            refuse_option(place, f"'{getattr(function, '__name__', 'function')}' {words}")
-        return found
+        values = np.ravel(np.asarray(function(*map(float, u)), dtype=float))
+        if len(values) != count:
+            message = f"returns {len(values)} numbers, expected {count}"
+            refuse_option(location, f"'{getattr(function, '__name__', 'function')}' {message}")
+        return values
 
     return call
 
@@ -168,29 +171,29 @@ def _rows(names: Sequence[str], row: Callable[[Mapping[str, float]], np.ndarray]
     return np.array([row({name: 1.0}) for name in names])
 
 
-def _parsed(text: str, place: str) -> tuple[ast.expr, tuple[str, ...]]:
+def _parsed(text: str, location: str) -> tuple[ast.expr, tuple[str, ...]]:
     """Return the tree of h from a formula ``h``, ``left >= right`` or ``left <= right``, and its names."""
     try:
         require(len(text) <= MAX_FORMULA, "too long", ValueError)
         tree = ast.parse(text.strip(), mode="eval").body
-        used = [one.id for one in ast.walk(tree) if isinstance(one, ast.Name)]
-        names = tuple(dict.fromkeys(name for name in used if name not in _KNOWN))
+        identifiers = [node.id for node in ast.walk(tree) if isinstance(node, ast.Name)]
+        names = tuple(dict.fromkeys(name for name in identifiers if name not in _KNOWN))
     except (SyntaxError, ValueError, RecursionError, MemoryError):
-        refuse_option(place, f"is not a formula of at most {MAX_FORMULA} characters: 'XX2 * ZZ2 >= XZ2**2'")
+        refuse_option(location, f"is not a formula of at most {MAX_FORMULA} characters: 'XX2 * ZZ2 >= XZ2**2'")
     if isinstance(tree, ast.Compare) and len(tree.ops) == 1 and isinstance(tree.ops[0], (ast.GtE, ast.LtE)):
         ends = (tree.left, tree.comparators[0])
-        more, less = ends if isinstance(tree.ops[0], ast.GtE) else ends[::-1]
-        tree = ast.BinOp(more, ast.Sub(), less)
+        larger, less = ends if isinstance(tree.ops[0], ast.GtE) else ends[::-1]
+        tree = ast.BinOp(larger, ast.Sub(), less)
     try:
         with np.errstate(all="ignore"):
             evaluated(tree, _KNOWN | dict.fromkeys(names, 1.0), _OPERATIONS)
     except ArithmeticError:
         pass
     except ValueError as wrong:
-        known = f"parameters' names, numbers, + - * / **, {' '.join(_KNOWN)}, and one >= or <="
-        refuse_option(place, f"expected {known}; found '{wrong}'")
+        allowed = f"parameters' names, numbers, + - * / **, {' '.join(_KNOWN)}, and one >= or <="
+        refuse_option(location, f"expected {allowed}; found '{wrong}'")
     if not names:
-        refuse_option(place, "names no parameter")
+        refuse_option(location, "names no parameter")
     return tree, names
 
 
@@ -224,50 +227,54 @@ def tangents(
     unit = length / np.linalg.norm(factor[:p, :p], axis=0)
     b = np.asarray(start)
     multipliers = np.zeros(m)
-    normals = np.array([one.normal(b) for one in curved])
+    normals = np.array([constraint.normal(b) for constraint in curved])
     size = np.linalg.norm(normals * unit, axis=1)
     size = np.where(size > 0.0, size, 1.0)
     # of the violation's price, below which it is at its least
     min_gain = 1e-6
 
     def merit(x: np.ndarray) -> float:
-        rest = (factor[:p, :p] @ x - factor[:p, p]) / length
-        violated = np.maximum(-np.array([one.value(x) for one in curved]) / size, 0.0)
-        return float(0.5 * rest @ rest + price * violated.sum() + 0.5 * violated @ violated)
+        residual = (factor[:p, :p] @ x - factor[:p, p]) / length
+        violated = np.maximum(-np.array([constraint.value(x) for constraint in curved]) / size, 0.0)
+        return float(0.5 * residual @ residual + price * violated.sum() + 0.5 * violated @ violated)
 
     for _ in range(MAX_ROUNDS):
-        normals = np.array([one.normal(b) for one in curved])
-        heights = np.array([one.value(b) for one in curved])
-        bend = -np.sum([mu / each * one.curvature(b) for mu, each, one in zip(multipliers, size, curved)], axis=0)
+        normals = np.array([constraint.normal(b) for constraint in curved])
+        heights = np.array([constraint.value(b) for constraint in curved])
+        bend = -np.sum(
+            [mu / length_ * constraint.curvature(b) for mu, length_, constraint in zip(multipliers, size, curved)],
+            axis=0,
+        )
         planes = np.hstack([normals / size[:, None], np.eye(m)])
         rows = np.vstack([planes, np.eye(p + m)[p:]])
-        found = solve(
+        solution = solve(
             _elastic(factor, b, bend, unit, price * np.full(m, length)),
             rows,
             np.append((normals @ b - heights) / size, np.zeros(m)),
         )
-        multipliers = found.multipliers[:m]
-        moved = found.values[:p] - b
-        slack = found.values[p:]
+        multipliers = solution.multipliers[:m]
+        step = solution.values[:p] - b
+        slack = solution.values[p:]
         satisfied = bool((slack < SETTLED).all())
-        if satisfied and np.linalg.norm(factor[:p, :p] @ moved) < SETTLED * length:
+        if satisfied and np.linalg.norm(factor[:p, :p] @ step) < SETTLED * length:
             return normals, normals @ b - heights
-        share = _share(merit, b, moved)
-        now = merit(b)
-        b = b + share * moved
-        if not satisfied and price >= MAX_PRICE and now - merit(b) < min_gain * now:
+        share = _share(merit, b, step)
+        merit_now = merit(b)
+        b = b + share * step
+        if not satisfied and price >= MAX_PRICE and merit_now - merit(b) < min_gain * merit_now:
             break
-        price = price if satisfied else min(10.0 * price, MAX_PRICE)
-    left = "; ".join(f"h of '{one.name}' = {one.value(b):.3g}" for one in curved)
-    raise NotConverged(f"the nearest found has {left}", b)
+        if not satisfied:
+            price = min(10.0 * price, MAX_PRICE)
+    heights_text = "; ".join(f"h of '{constraint.name}' = {constraint.value(b):.3g}" for constraint in curved)
+    raise NotConverged(f"the nearest found has {heights_text}", b)
 
 
-def _share(merit: Callable[[np.ndarray], float], b: np.ndarray, moved: np.ndarray) -> float:
+def _share(merit: Callable[[np.ndarray], float], b: np.ndarray, step: np.ndarray) -> float:
     """Return the share of a step, halved until the merit does not rise."""
     share = 1.0
-    now = merit(b)
+    merit_now = merit(b)
     max_halvings = 30
-    while not merit(b + share * moved) <= now + 1e-12 * abs(now) and share > 0.5**max_halvings:
+    while not merit(b + share * step) <= merit_now + 1e-12 * abs(merit_now) and share > 0.5**max_halvings:
         share *= 0.5
     return share
 

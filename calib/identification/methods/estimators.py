@@ -55,16 +55,19 @@ def tls(
     if abs(direction[p]) <= 1e-10 * np.abs(direction).max():
         raise Unidentifiable("no combination of the columns explains y: the columns depend on each other", data.names)
     values = -direction[:p] / direction[p]
-    variance = singular**2 / (count - p) if count > p else np.nan
+    if count > p:
+        variance = singular**2 / (count - p)
+    else:
+        variance = np.nan
     if not np.isfinite(variance):
         raise Unidentifiable(f"{count} rows for {p} parameters: no residual is left to check them", data.names)
-    more = np.zeros((0, p))
+    prior_rows = np.zeros((0, p))
     independent = count
     if inflation is not None:
         scale = np.sqrt(inflation - 1.0) / (1.0 if std is None else std)
-        more = (data.factors[:, :, :p] * np.broadcast_to(scale, (data.groups,))[:, None, None]).reshape(-1, p)
+        prior_rows = (data.factors[:, :, :p] * np.broadcast_to(scale, (data.groups,))[:, None, None]).reshape(-1, p)
         independent = int(np.sum(data.rows / inflation))
-    covariance = _covariance(factor[:p, :p], noise, values, variance, count, data.names, more)
+    covariance = _covariance(factor[:p, :p], noise, values, variance, count, data.names, prior_rows)
     estimate = Estimate(data.names, data.units, values, covariance, float(np.sqrt(variance)), max(independent - p, 1))
     group_std = np.sqrt(data.residual_squares(values) / np.maximum(data.rows * (1.0 - p / count), 1e-300))
     return LinearFit(estimate, group_std, *condition_numbers(factor[:p, :p]))
@@ -107,21 +110,21 @@ def _covariance(
     variance: float,
     rows: int,
     names: tuple[str, ...],
-    more: np.ndarray,
+    prior_rows: np.ndarray,
 ) -> np.ndarray:
     """Return V (p, p) of `tls`, computed on columns of unit norm; `more` (k, p): rows √(τ - 1) W."""
     norms = np.linalg.norm(upper, axis=0)
     scaled = upper / norms
-    own = variance * (noise[:-1] / norms) ** 2
+    column_noise = variance * (noise[:-1] / norms) ** 2
     x = values * norms
-    gram = scaled.T @ scaled - rows * np.diag(own)
+    gram = scaled.T @ scaled - rows * np.diag(column_noise)
     eigenvalues = np.linalg.eigvalsh(gram)
     if eigenvalues[0] <= 0.0:
         raise Unidentifiable("some columns contain only noise; filter, or excite more", names, eigenvalues)
     inverse = np.linalg.inv(gram)
-    total = variance * noise[-1] ** 2 + own @ x**2
-    middle = np.diag(own) * total - np.outer(own * x, own * x)
-    extra = (more / norms) @ inverse
+    total = variance * noise[-1] ** 2 + column_noise @ x**2
+    middle = np.diag(column_noise) * total - np.outer(column_noise * x, column_noise * x)
+    extra = (prior_rows / norms) @ inverse
     return (inverse * total + rows * inverse @ middle @ inverse + total * extra.T @ extra) / np.outer(norms, norms)
 
 
@@ -176,12 +179,15 @@ class _ConstrainedLeastSquares(Method):
         std, tau = weighed(problem)
         pooled = problem.pooled
         free = self.free.solve(problem, std, tau)
-        weights = std if self.free.weighted else np.ones(len(std))
+        if self.free.weighted:
+            weights = std
+        else:
+            weights = np.ones(len(std))
         factor = combine(pooled, weights)
         if self.free is IRLS:
             factor = _reweighted(problem, tau, lambda triangle: constraints.solve(triangle).values).factor
-        fit, held = hold(free, factor, pooled, weights, constraints, stated=self.free.weighted)
-        return MethodEstimate(self.name, EstimateStatus.FOUND, fit, pooled, std, tau, self.free.weighted, held=held)
+        fit, binding = hold(free, factor, pooled, weights, constraints, stated_noise=self.free.weighted)
+        return MethodEstimate(self.name, EstimateStatus.FOUND, fit, pooled, std, tau, self.free.weighted, held=binding)
 
 
 def _reweighted(
@@ -219,16 +225,31 @@ TLS = LeastSquares(
     source="Golub & Van Loan 1980; Van Huffel & Vandewalle 1991",
     tunes=("ratio of the columns' noise to the torques'",),
 )
-PC_OLS, PC_WLS, PC_IRLS = (
-    _ConstrainedLeastSquares(
-        f"pc-{one.name}",
-        one.assumes + CONSISTENT,
-        one,
-        tunes=one.tunes,
-        version=one.version,
-        description=one.name + CONSTRAINED,
-        source="Sousa & Cortesão 2014; Wensing et al. 2018",
-    )
-    for one in (OLS, WLS, IRLS)
+PC_OLS = _ConstrainedLeastSquares(
+    f"pc-{OLS.name}",
+    OLS.assumes + CONSISTENT,
+    OLS,
+    tunes=OLS.tunes,
+    version=OLS.version,
+    description=OLS.name + CONSTRAINED,
+    source="Sousa & Cortesão 2014; Wensing et al. 2018",
+)
+PC_WLS = _ConstrainedLeastSquares(
+    f"pc-{WLS.name}",
+    WLS.assumes + CONSISTENT,
+    WLS,
+    tunes=WLS.tunes,
+    version=WLS.version,
+    description=WLS.name + CONSTRAINED,
+    source="Sousa & Cortesão 2014; Wensing et al. 2018",
+)
+PC_IRLS = _ConstrainedLeastSquares(
+    f"pc-{IRLS.name}",
+    IRLS.assumes + CONSISTENT,
+    IRLS,
+    tunes=IRLS.tunes,
+    version=IRLS.version,
+    description=IRLS.name + CONSTRAINED,
+    source="Sousa & Cortesão 2014; Wensing et al. 2018",
 )
 METHODS = (IRLS, TLS, PC_OLS, PC_WLS, PC_IRLS)

@@ -92,12 +92,12 @@ class IdentificationProblem:
     @property
     def nonnegative(self) -> np.ndarray:
         """Columns that must not be negative (p,) bool: inertia and friction of drives."""
-        return np.array([one is not None and one.nonnegative for one in self.terms], dtype=bool)
+        return np.array([term is not None and term.nonnegative for term in self.terms], dtype=bool)
 
     @property
     def exact(self) -> np.ndarray:
         """Mask (p,) of columns that have no noise from measured positions: constants and signs."""
-        return np.array([one is not None and one.form.exact for one in self.terms], dtype=bool)
+        return np.array([term is not None and term.form.exact for term in self.terms], dtype=bool)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,6 +141,7 @@ class MethodEstimate:
 
     @property
     def found(self) -> bool:
+        """Whether there is a solution."""
         return self.status is EstimateStatus.FOUND
 
     @property
@@ -156,32 +157,36 @@ class MethodEstimate:
 
     @property
     def estimate(self) -> Estimate:
+        """Values with covariance.
+
+        Raises:
+            Unidentifiable, NotConverged: where there are none.
+        """
         return self.fit.estimate
 
     def testable(self) -> tuple[Triangles, np.ndarray, np.ndarray]:
         """Return R factors on which least squares gives this estimate, with std and inflation (g,), for tests."""
         if self.alone:
-            return _standing_for(self.estimate), np.ones(1), np.ones(1)
+            return _equivalent_triangle(self.estimate), np.ones(1), np.ones(1)
         if self.beforehand is None:
             return self.pooled, self.std, self.inflation
-        known = retriangulate(np.pad(self.beforehand, ((0, 0), (0, 1))))  # one more group of rows
-        data = replace(
-            self.pooled,
-            factors=frozen(np.concatenate([self.pooled.factors, known[None]])),
-            rows=frozen([*self.pooled.rows, len(self.beforehand)], int),
-        )
+        # The prior is one more group of rows.
+        prior_factor = retriangulate(np.pad(self.beforehand, ((0, 0), (0, 1))))
+        factors = np.concatenate([self.pooled.factors, prior_factor[None]])
+        counts = [*self.pooled.rows, len(self.beforehand)]
+        data = replace(self.pooled, factors=frozen(factors), rows=frozen(counts, int))
         return data, np.append(self.std, 1.0), np.append(self.inflation, 1.0)
 
 
-def _standing_for(estimate: Estimate) -> Triangles:
+def _equivalent_triangle(estimate: Estimate) -> Triangles:
     """Return the R factor of one group, whose least-squares solution is an estimate with its covariance."""
     p = len(estimate.values)
+    freedom = max(estimate.dof, 1)
     factor = np.zeros((1, p + 1, p + 1))
     factor[0, :p] = retriangulate(whitened(estimate.values, estimate.covariance))[:p]
-    factor[0, p, p] = np.sqrt(max(estimate.dof, 1))
-    return replace(
-        empty(estimate.names, estimate.units, 1), factors=frozen(factor), rows=frozen([max(estimate.dof, 1) + p], int)
-    )
+    factor[0, p, p] = np.sqrt(freedom)
+    no_rows = empty(estimate.names, estimate.units, 1)
+    return replace(no_rows, factors=frozen(factor), rows=frozen([freedom + p], int))
 
 
 @dataclass(frozen=True)
@@ -231,18 +236,23 @@ class Method(ABC):
         return rows.motors_alone or (self.takes_models and (simulable or not self.needs_simulation))
 
     def __str__(self) -> str:
-        needs = "; needs the loop" if self.needs_controller else "; needs simulation" if self.needs_simulation else ""
-        tuned = f"; tuned: {', '.join(self.tunes)}" if self.tunes else ""
-        return f"{self.name:14} {self.description} ({self.source}){needs}{tuned}"
+        text = f"{self.name:14} {self.description} ({self.source})"
+        if self.needs_controller:
+            text += "; needs the loop"
+        elif self.needs_simulation:
+            text += "; needs simulation"
+        if self.tunes:
+            text += f"; tuned: {', '.join(self.tunes)}"
+        return text
 
 
 def attempted(method: str, problem: IdentificationProblem, run: Callable[[], MethodEstimate]) -> MethodEstimate:
     """Return the result of `run` with its computing time; an error of the estimation becomes a status."""
     began = time.perf_counter()
     try:
-        found = run()
+        estimate = run()
     except (Unidentifiable, NotConverged) as error:
-        status = next(own for kind, own in _STATUS if isinstance(error, kind))
-        nothing = np.full(problem.pooled.groups, np.nan)
-        found = MethodEstimate(method, status, None, problem.pooled, nothing, nothing, failure=error)
-    return replace(found, seconds=time.perf_counter() - began)
+        status = next(status for kind, status in _STATUS if isinstance(error, kind))
+        unknown = np.full(problem.pooled.groups, np.nan)
+        estimate = MethodEstimate(method, status, None, problem.pooled, unknown, unknown, failure=error)
+    return replace(estimate, seconds=time.perf_counter() - began)

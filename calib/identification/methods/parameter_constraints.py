@@ -75,11 +75,12 @@ class Constraints(Frozen):
         if self.cone is not None or self.curved:
             return self.touched(factor).solve(factor, free)
         p = len(factor) - 1
-        free = np.linalg.solve(factor[:p, :p], factor[:p, p]) if free is None else free
+        if free is None:
+            free = np.linalg.solve(factor[:p, :p], factor[:p, p])
         postures = f"M(q) positive definite in {len(self.inertia)} postures"
         with _unsatisfied(f"no estimate satisfies {self} with {postures}: remove bounds, or record other motion"):
-            wanted = _definite(self.inertia, free, self.least, self.likely)
-            return within(factor, self.matrix, self.lower, self.upper, wanted)
+            definite = _definite(self.inertia, free, self.least, self.likely)
+            return within(factor, self.matrix, self.lower, self.upper, definite)
 
     def __str__(self) -> str:
         return "; ".join(self.names) or "them"
@@ -108,12 +109,12 @@ class Constraints(Frozen):
             plane = self.cone.touching(factor, self.matrix, self.lower, self.upper)
         if plane is None:
             return replace(self, cone=None)
-        named = f"bodies that can exist ({', '.join(plane.bodies) or 'all'} on the border)"
+        label = f"bodies that can exist ({', '.join(plane.bodies) or 'all'} on the border)"
         return replace(
             self,
             cone=None,
-            plane=named,
-            names=(*self.names, named),
+            plane=label,
+            names=(*self.names, label),
             matrix=np.vstack([self.matrix, plane.normal]),
             lower=np.append(self.lower, plane.bound),
             upper=np.append(self.upper, np.inf),
@@ -121,15 +122,15 @@ class Constraints(Frozen):
 
     def _flattened(self, factor: np.ndarray) -> Constraints:
         """Return the constraints with the curved ones replaced by their tangent planes at the optimum."""
-        others = replace(self, curved=())
+        linear = replace(self, curved=())
         m = len(self.curved)
-        start = others.solve(factor).values
+        start = linear.solve(factor).values
         free = np.append(np.linalg.solve(factor[:-1, :-1], factor[:-1, -1]), np.zeros(m))
 
         def solve(triangle: np.ndarray, rows: np.ndarray, lower: np.ndarray) -> Constrained:
             wider = np.pad(self.matrix, ((0, 0), (0, m)))
             return replace(
-                others,
+                linear,
                 names=("",) * len(rows) + self.names,
                 matrix=np.vstack([rows, wider]),
                 lower=np.append(lower, self.lower),
@@ -137,11 +138,11 @@ class Constraints(Frozen):
                 inertia=np.pad(self.inertia, ((0, 0), (0, 0), (0, 0), (0, m))),
             ).solve(triangle, free)
 
-        names = tuple(one.name for one in self.curved)
-        with _unsatisfied(f"no estimate satisfies {'; '.join(names)} beside {others}: remove one of them"):
+        names = tuple(constraint.name for constraint in self.curved)
+        with _unsatisfied(f"no estimate satisfies {'; '.join(names)} beside {linear}: remove one of them"):
             normals, bounds = tangents(self.curved, factor, start, solve)
         return replace(
-            others,
+            linear,
             tangents=names,
             names=(*self.names, *names),
             matrix=np.vstack([self.matrix, normals]),
@@ -151,12 +152,12 @@ class Constraints(Frozen):
 
 
 @contextmanager
-def _unsatisfied(words: str) -> Iterator[None]:
+def _unsatisfied(message: str) -> Iterator[None]:
     """Put `words` in front of the message of a `NotConverged` that is raised inside."""
     try:
         yield
     except NotConverged as error:
-        raise NotConverged(f"[constraints]: {words} ({error})", error.last) from error
+        raise NotConverged(f"[constraints]: {message} ({error})", error.last) from error
 
 
 def make_constraints(
@@ -175,32 +176,38 @@ def make_constraints(
     Raises:
         UsageError: for an unknown name, a bound without effect on the torques, or contradicting bounds.
     """
-    asked: list[tuple[str, Mapping[str, float], float, float]]
-    asked = [(name, {name: 1.0}, *bounds) for name, bounds in settings.bounds.items()]
-    for number, one in enumerate(settings.sum, 1):
-        place, (low, high) = f"[[constraints.sum]] number {number}", one.limits
-        named = one.name or " + ".join(f"{weight:g} {name}" for name, weight in one.weights.items())
-        twice = one.equal is not None and (one.least, one.most) != (None, None)
-        require(not twice, f"{place}: 'equal' excludes 'least' and 'most'", UsageError)
+    requests: list[tuple[str, Mapping[str, float], float, float]]
+    requests = [(name, {name: 1.0}, *bounds) for name, bounds in settings.bounds.items()]
+    for number, sum_ in enumerate(settings.sum, 1):
+        location, (low, high) = f"[[constraints.sum]] number {number}", sum_.limits
+        label = sum_.name or " + ".join(f"{weight:g} {name}" for name, weight in sum_.weights.items())
+        twice = sum_.equal is not None and (sum_.least, sum_.most) != (None, None)
+        require(not twice, f"{location}: 'equal' excludes 'least' and 'most'", UsageError)
         if low > high or not (np.isfinite(low) or np.isfinite(high)):
-            refuse_option(f"{place} ({named})", "expected equal, or least <= most")
-        asked.append((named, one.weights, low, high))
+            refuse_option(f"{location} ({label})", "expected equal, or least <= most")
+        requests.append((label, sum_.weights, low, high))
     if settings.signs:
-        signed = [name for name, one in zip(names, terms) if one is not None and one.nonnegative]
-        asked += [(name, {name: 1.0}, 0.0, np.inf) for name in signed if name not in settings.bounds]
-    words = [_words(named, low, high) for named, _, low, high in asked]
-    matrix = np.reshape([_row(weights, base, names) for _, weights, _, _ in asked], (-1, len(names)))
-    low, high = (np.array([one[k] for one in asked], dtype=float) for k in (2, 3))
-    against = contradicting(matrix, low, high) if len(matrix) else ()
+        signed = [name for name, term in zip(names, terms) if term is not None and term.nonnegative]
+        requests += [(name, {name: 1.0}, 0.0, np.inf) for name in signed if name not in settings.bounds]
+    descriptions = [_words(label, low, high) for label, _, low, high in requests]
+    matrix = np.reshape([_row(weights, base, names) for _, weights, _, _ in requests], (-1, len(names)))
+    low = np.array([sum_[2] for sum_ in requests], dtype=float)
+    high = np.array([sum_[3] for sum_ in requests], dtype=float)
+    if len(matrix):
+        against = contradicting(matrix, low, high)
+    else:
+        against = ()
     if against:
-        named = "; ".join(words[k] for k in against)
+        label = "; ".join(descriptions[k] for k in against)
         refuse_option(
-            "[constraints] contradict each other", f"{named}: no estimate satisfies them together; remove one of them"
+            "[constraints] contradict each other", f"{label}: no estimate satisfies them together; remove one of them"
         )
-    cone = cone_of(model, base) if settings.bodies and model.inertial else None
+    cone = None
+    if settings.bodies and model.inertial:
+        cone = cone_of(model, base)
     inertia = _inertia(settings if cone is None else replace(settings, inertia=0), model, base, len(names))
-    curved = tuple(make_curved(one, lambda weights: _row(weights, base, names)) for one in settings.curved)
-    return Constraints(tuple(words), matrix, low, high, inertia, cone, curved=curved)
+    curved = tuple(make_curved(sum_, lambda weights: _row(weights, base, names)) for sum_ in settings.curved)
+    return Constraints(tuple(descriptions), matrix, low, high, inertia, cone, curved=curved)
 
 
 def constraints_of(problem: IdentificationProblem) -> Constraints:
@@ -215,7 +222,7 @@ def constraints_of(problem: IdentificationProblem) -> Constraints:
 
 
 def hold(
-    fit: LinearFit, factor: np.ndarray, data: Triangles, std: np.ndarray, constraints: Constraints, stated: bool
+    fit: LinearFit, factor: np.ndarray, data: Triangles, std: np.ndarray, constraints: Constraints, stated_noise: bool
 ) -> tuple[LinearFit, Held]:
     """Return a constrained fit, whose covariance treats active constraints as equalities, and these constraints.
 
@@ -224,36 +231,40 @@ def hold(
         factor: (p + 1, p + 1) triangle [R z; 0 ρ] that it minimises.
         data: triangles of the rows whose residuals give the noise, one group per torque row.
         std: (g,) of the groups.
-        stated: whether the covariance takes `std` as the noise; otherwise σ² of the residuals, of the constrained
+        stated_noise: whether the covariance takes `std` as the noise; otherwise σ² of the residuals, of the constrained
             estimate.
     """
     free = fit.estimate
     constraints = constraints.touched(factor)
-    found = constraints.solve(factor)
-    normals = found.normals[found.binding]
-    before, after = (data.residual_squares(values) for values in (free.values, found.values))
-    dof = free.dof + int(np.linalg.matrix_rank(normals)) if len(normals) else free.dof
+    solution = constraints.solve(factor)
+    normals = solution.normals[solution.binding]
+    before = data.residual_squares(free.values)
+    after = data.residual_squares(solution.values)
+    if len(normals):
+        dof = free.dof + int(np.linalg.matrix_rank(normals))
+    else:
+        dof = free.dof
     ratio = float(np.sum(after / std**2) / dof / max(np.sum(before / std**2) / free.dof, 1e-300))
-    covariance = restricted(np.asarray(free.covariance), factor, normals) * (1.0 if stated else ratio)
+    covariance = restricted(np.asarray(free.covariance), factor, normals) * (1.0 if stated_noise else ratio)
     estimate = replace(
-        free, values=found.values, covariance=covariance, residual_std=free.residual_std * np.sqrt(ratio), dof=dof
+        free, values=solution.values, covariance=covariance, residual_std=free.residual_std * np.sqrt(ratio), dof=dof
     )
     group = fit.group_std * np.sqrt(after / np.where(before > 0.0, before, np.inf))
-    held = replace(fit, estimate=estimate, group_std=np.where(before > 0.0, group, fit.group_std))
-    return held, _binding(constraints, found, fit)
+    held_fit = replace(fit, estimate=estimate, group_std=np.where(before > 0.0, group, fit.group_std))
+    return held_fit, _binding(constraints, solution, fit)
 
 
-def _binding(constraints: Constraints, found: Constrained, free: LinearFit) -> Held:
+def _binding(constraints: Constraints, solution: Constrained, free: LinearFit) -> Held:
     """Return the binding constraints of a solution, by its multipliers in the order of `within`."""
-    same = constraints.lower == constraints.upper
-    low = np.flatnonzero(np.isfinite(constraints.lower) & ~same)
-    high = np.flatnonzero(np.isfinite(constraints.upper) & ~same)
+    equal = constraints.lower == constraints.upper
+    low = np.flatnonzero(np.isfinite(constraints.lower) & ~equal)
+    high = np.flatnonzero(np.isfinite(constraints.upper) & ~equal)
     postures = len(constraints.inertia)
-    places = np.concatenate([low, high, np.full(postures, -1), np.flatnonzero(same)]).astype(int)
+    places = np.concatenate([low, high, np.full(postures, -1), np.flatnonzero(equal)]).astype(int)
     upper = np.zeros(len(places), bool)
     upper[len(low) : len(low) + len(high)] = True
     binding = []
-    for k in np.flatnonzero(found.binding & (places >= 0)):
+    for k in np.flatnonzero(solution.binding & (places >= 0)):
         row = constraints.matrix[places[k]]
         bound = (constraints.upper if upper[k] else constraints.lower)[places[k]]
         name = constraints.names[places[k]]
@@ -264,16 +275,16 @@ def _binding(constraints: Constraints, found: Constrained, free: LinearFit) -> H
         binding.append(
             Binding(
                 name,
-                float(found.multipliers[k]),
+                float(solution.multipliers[k]),
                 float(row @ free.estimate.values - origin),
                 float(np.sqrt(max(row @ free.estimate.covariance @ row, 0.0))),
                 float(bound - origin),
-                bool(same[places[k]]),
+                bool(equal[places[k]]),
             )
         )
-    tight = frozen(np.flatnonzero(found.binding[places < 0]), int)
+    tight = frozen(np.flatnonzero(solution.binding[places < 0]), int)
     findings = tuple(_findings(constraints, binding, len(tight)))
-    return Held(constraints.names, tuple(binding), tight, free, found.normals[found.binding], findings)
+    return Held(constraints.names, tuple(binding), tight, free, solution.normals[solution.binding], findings)
 
 
 def _findings(constraints: Constraints, binding: Sequence[Binding], postures: int) -> Iterator[Finding]:
@@ -318,13 +329,13 @@ def _row(weights: Mapping[str, float], base: Base, names: Sequence[str]) -> np.n
             standard[base.standard.index(name)] += weight
         else:
             similar = suggestion(name, (*names, *base.standard))
-            words = f"'{name}' is not a parameter of this model{similar}; its parameters: {', '.join(names)}"
-            refuse_option("[constraints]", words)
+            message = f"'{name}' is not a parameter of this model{similar}; its parameters: {', '.join(names)}"
+            refuse_option("[constraints]", message)
     # T of the kept columns is the identity
-    own = standard[base.kept]
-    if np.abs(base.transform.T @ own - standard).max() > 1e-6 * max(np.abs(standard).max(), 1e-300):
+    row_ = standard[base.kept]
+    if np.abs(base.transform.T @ row_ - standard).max() > 1e-6 * max(np.abs(standard).max(), 1e-300):
         refuse_option("[constraints]", _without_effect(weights, base))
-    row[: base.b] += own
+    row[: base.b] += row_
     require(row.any(), f"[constraints]: the weights of {', '.join(weights)} sum to zero", UsageError)
     return row
 
@@ -347,12 +358,12 @@ def _inertia(settings: ConstraintSettings, model: RegressorModel, base: Base, p:
     q = bases.random_samples(model, settings.inertia).q
     count, n = q.shape
     still = np.zeros_like(q)
-    rest = model.regressor(q, still, still)[:, :, base.kept]
+    regressor = model.regressor(q, still, still)[:, :, base.kept]
     tensor = np.zeros((count, n, n, p))
     for j in range(n):
         moving = still.copy()
         moving[:, j] = 1.0
-        tensor[:, :, j, : base.b] = model.regressor(q, still, moving)[:, :, base.kept] - rest
+        tensor[:, :, j, : base.b] = model.regressor(q, still, moving)[:, :, base.kept] - regressor
     return 0.5 * (tensor + tensor.transpose(0, 2, 1, 3))
 
 

@@ -58,8 +58,8 @@ def weigh(size: np.ndarray, joints: np.ndarray, gated: bool = True) -> np.ndarra
     """
     result = np.zeros(len(size))
     for n in np.unique(joints[joints > 0]):
-        own = joints == n
-        result[own] = _weights(size[own], int(n), gated)
+        rows = joints == n
+        result[rows] = _weights(size[rows], int(n), gated)
     return result
 
 
@@ -163,13 +163,16 @@ def stack(
     """Return samples checked for shape and finiteness, without a copy; see `Samples`."""
     matrix = shaped(matrix, (None, None, None), "observation matrices W")
     target = shaped(target, matrix.shape[:2], "target y")
-    present = np.ones(target.shape, dtype=bool) if present is None else np.asarray(present, dtype=bool)
+    if present is None:
+        present = np.ones(target.shape, dtype=bool)
+    else:
+        present = np.asarray(present, dtype=bool)
     if present.shape != target.shape:
         raise CalibError(f"rows present: expected an array of shape {target.shape}, found {present.shape}")
-    named = empty([f"x{k + 1}" for k in range(matrix.shape[2])] if names is None else names, units)
-    if named.parameters != matrix.shape[2]:
-        raise CalibError(f"{named.parameters} names for {matrix.shape[2]} columns")
-    return Samples(named.names, named.units, matrix, target, present)
+    names_ = empty([f"x{k + 1}" for k in range(matrix.shape[2])] if names is None else names, units)
+    if names_.parameters != matrix.shape[2]:
+        raise CalibError(f"{names_.parameters} names for {matrix.shape[2]} columns")
+    return Samples(names_.names, names_.units, matrix, target, present)
 
 
 def irls(data: Samples, inflation: float = 1.0, solve: Callable[[np.ndarray], np.ndarray] | None = None) -> SampleFit:
@@ -186,17 +189,20 @@ def irls(data: Samples, inflation: float = 1.0, solve: Callable[[np.ndarray], np
             constraints; the covariance ignores these.
     """
     start = row_irls(data)
-    left = np.sqrt(_share_left(data, start.group_std))
+    shares = np.sqrt(_share_left(data, start.group_std))
     covariance = np.diag(start.group_std**2)
     values = start.estimate.values
     for _ in range(ROUNDS):
-        residual = np.where(data.present, data.target - data.matrix @ values, 0.0) / left
+        residual = np.where(data.present, data.target - data.matrix @ values, 0.0) / shares
         size = _sizes(residual, covariance, data.present)
         weights = weigh(size, data.joints)
         covariance = _scatter(data, residual, weights * _consistent(data), weights)
         factor = _factor(data, covariance, weights)
         last = values
-        values = solve_triangle(factor, data.names)[0] if solve is None else solve(factor)
+        if solve is None:
+            values = solve_triangle(factor, data.names)[0]
+        else:
+            values = solve(factor)
         if np.sum((factor[:-1, :-1] @ (values - last)) ** 2) <= 1e-8 * len(values):
             return _pack(data, values, covariance, size, weights, factor, inflation)
     raise NotConverged("the weights of the samples do not converge", values)
@@ -243,33 +249,33 @@ def _pack(
 
 def _sizes(residual: np.ndarray, noise: np.ndarray, present: np.ndarray) -> np.ndarray:
     """Return Mahalanobis sizes (e_kᵀ S⁻¹ e_k)^½ (N,) of residuals (N, n), over the rows present."""
-    patterns, which = _roots(noise, present)
+    patterns, pattern = _roots(noise, present)
     result = np.empty(len(residual))
     for k, root in enumerate(patterns):
-        own = which == k
-        result[own] = np.linalg.norm(residual[own] @ root.T, axis=1)
+        rows = pattern == k
+        result[rows] = np.linalg.norm(residual[rows] @ root.T, axis=1)
     return result
 
 
 def _roots(noise: np.ndarray, present: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return L⁻¹ (k, n, n) for every pattern of rows present, zero for absent ones, and each sample's pattern (N,)."""
-    patterns, which = np.unique(present, axis=0, return_inverse=True)
+    patterns, pattern_index = np.unique(present, axis=0, return_inverse=True)
     roots = np.zeros((len(patterns), *noise.shape))
     for k, pattern in enumerate(patterns):
         block = np.ix_(pattern, pattern)
         lower = np.linalg.cholesky(noise[block])
         roots[k][block] = scipy.linalg.solve_triangular(lower, np.eye(len(lower)), lower=True)
-    return roots, which.reshape(-1)
+    return roots, pattern_index.reshape(-1)
 
 
 def _factor(data: Samples, noise: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Return the R factor of the whitened and weighted [W y], a chunk of samples at a time."""
-    roots, which = _roots(noise, data.present)
+    roots, pattern = _roots(noise, data.present)
     p = len(data.names)
     total = empty(data.names)
     for start in range(0, len(data.target), CHUNK):
         part = slice(start, start + CHUNK)
-        root = roots[which[part]] * np.sqrt(weights[part])[:, None, None]
+        root = roots[pattern[part]] * np.sqrt(weights[part])[:, None, None]
         target = np.einsum("kij,kj->ki", root, data.target[part])
         total = absorb(total, (root @ data.matrix[part]).reshape(-1, p), target.reshape(-1))
     return total.factors[0]
@@ -290,21 +296,21 @@ def _triangles(data: Samples, weights: np.ndarray) -> Triangles:
 
 def _spreads(data: Samples, residual: np.ndarray) -> np.ndarray:
     """Return the robust standard deviation of each joint's residuals (n,), always positive."""
-    std = np.array([robust.spread(column[used]) for column, used in zip(residual.T, data.present.T)])
+    std = np.array([robust.spread(column[in_use]) for column, in_use in zip(residual.T, data.present.T)])
     return np.maximum(std, 1e-9 * max(std.max(initial=0.0), 1e-300))
 
 
 def _share_left(data: Samples, std: np.ndarray) -> np.ndarray:
     """Return 1 - h_j / r_j (n,), the share of joint j's noise variance that remains in its residuals."""
     triangles = _triangles(data, np.ones(data.target.shape))
-    taken = leverage(triangles, std, solve_triangle(combine(triangles, std), data.names)[1])
-    return np.maximum(1.0 - taken / np.maximum(triangles.rows, 1), 1e-3)
+    leverages = leverage(triangles, std, solve_triangle(combine(triangles, std), data.names)[1])
+    return np.maximum(1.0 - leverages / np.maximum(triangles.rows, 1), 1e-3)
 
 
 def _consistent(data: Samples) -> np.ndarray:
     """Return the factor (N,) that makes the weighted covariance consistent for normal residuals."""
-    each = [consistency(n) if n else 0.0 for n in range(data.target.shape[1] + 1)]
-    return np.array(each)[data.joints]
+    factors = [consistency(n) if n else 0.0 for n in range(data.target.shape[1] + 1)]
+    return np.array(factors)[data.joints]
 
 
 def _scatter(data: Samples, residual: np.ndarray, scaled: np.ndarray, weights: np.ndarray) -> np.ndarray:

@@ -56,10 +56,10 @@ class _GeneralisedTLS(Method):
         values = np.linalg.solve(gram, upper.T @ factor[:p, p])
         meat = np.outer(noise @ values, noise @ values) / max(float(problem.pooled.rows.sum()), 1.0)
         for part in states.parts:
-            used = states.present[part.own]
-            white = np.where(used[:, :, None], states.matrix[part.own] / std[:, None], 0.0) / norms
-            left = np.where(used, states.target[part.own] / std, 0.0) - white @ values
-            meat += scatter(white, left)
+            in_use = states.present[part.own]
+            white = np.where(in_use[:, :, None], states.matrix[part.own] / std[:, None], 0.0) / norms
+            residual = np.where(in_use, states.target[part.own] / std, 0.0) - white @ values
+            meat += scatter(white, residual)
         bread = np.linalg.inv(gram) / norms[:, None]
         estimate = replace(plain.estimate, values=values / norms, covariance=bread @ meat @ bread.T, residual_std=1.0)
         group = np.sqrt(problem.pooled.residual_squares(estimate.values) / problem.pooled.rows)
@@ -79,8 +79,8 @@ def column_noise(states: NoisyStates, std: np.ndarray) -> np.ndarray:
             for direction in (np.sqrt(np.maximum(sizes, 0.0)) * axes).T:
                 error = np.zeros((len(part.q), 3, states.model.n))
                 error[:, :, joint] = direction
-                moved = (scale * changed(states, part, error)).reshape(-1, p)
-                total += moved.T @ moved
+                change = (scale * changed(states, part, error)).reshape(-1, p)
+                total += change.T @ change
     return total
 
 
@@ -105,10 +105,10 @@ class _SetMembership(Method):
         std, tau = weighed(problem)
         plain = wls(problem.pooled, std)
         data = samples_of(problem)
-        left = np.where(data.present, data.target - data.matrix @ plain.estimate.values, 0.0)
-        bound = np.maximum(np.abs(left).max(axis=0), 1e-9 * std)
+        residual = np.where(data.present, data.target - data.matrix @ plain.estimate.values, 0.0)
+        bound = np.maximum(np.abs(residual).max(axis=0), 1e-9 * std)
         rows = (data.matrix / bound[:, None])[data.present]
-        ends = (left / bound)[data.present]
+        ends = (residual / bound)[data.present]
         lower, upper, count = intervals(rows, ends)
         values = plain.estimate.values + 0.5 * (lower + upper)
         covariance = np.diag((upper - lower) ** 2 / 12.0)
@@ -137,24 +137,24 @@ def intervals(rows: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarra
     # x = goals u, with |u| <= 2 √r wherever all rows are within the bound
     goals = np.linalg.inv(upper)
     goals = np.vstack([goals, -goals]) / np.tile(np.linalg.norm(goals, axis=1), 2)[:, None]
-    used = np.argsort(-np.abs(ends))[: 2 * p]
+    active = np.argsort(-np.abs(ends))[: 2 * p]
     ahead = np.arange(2 * p)
-    found = np.zeros((2 * p, p))
+    optima = np.zeros((2 * p, p))
     # of u; of the bound, by which rounding may miss it
     reach = 2.0 * np.sqrt(count)
     max_violation = 1e-6
     rounds = 0
     while len(ahead) and rounds < ROUNDS:
-        system = np.vstack([q[used], -q[used]])
-        limit = np.concatenate([1.0 + ends[used], 1.0 - ends[used]])
+        system = np.vstack([q[active], -q[active]])
+        limit = np.concatenate([1.0 + ends[active], 1.0 - ends[active]])
         for k in ahead:
-            found[k] = linprog(goals[k], system, limit, bounds=[(-reach, reach)] * p, method="highs-ds").x
-        violated = np.abs(q @ found[ahead].T - ends[:, None])
-        left = violated.max(axis=0) > 1.0 + max_violation
-        used = np.union1d(used, np.argmax(violated[:, left], axis=0))
-        ahead = ahead[left]
+            optima[k] = linprog(goals[k], system, limit, bounds=[(-reach, reach)] * p, method="highs-ds").x
+        violated = np.abs(q @ optima[ahead].T - ends[:, None])
+        open_ = violated.max(axis=0) > 1.0 + max_violation
+        active = np.union1d(active, np.argmax(violated[:, open_], axis=0))
+        ahead = ahead[open_]
         rounds = rounds + 1
-    best = np.einsum("kp,kp->k", np.tile(np.linalg.inv(upper), (2, 1)), found)
+    best = np.einsum("kp,kp->k", np.tile(np.linalg.inv(upper), (2, 1)), optima)
     return best[:p], best[p:], rounds
 
 

@@ -72,7 +72,10 @@ class _KalmanFilter(Method):
         for case in problem.cases:
             for first, last in segments(case.motion.segment):
                 state = _pass(state, case, slice(first, last), noise)
-        innovation = float(np.mean(state.sizes)) if state.sizes else np.inf
+        if state.sizes:
+            innovation = float(np.mean(state.sizes))
+        else:
+            innovation = np.inf
         # times the stated mean square: innovations of a filter that has lost the robot
         max_innovation = 30.0
         if not np.isfinite(innovation) or innovation > max_innovation:
@@ -140,13 +143,13 @@ def _steps(case: Case, part: slice, max_step: float = 2.5e-3) -> Iterator[tuple[
     # as the positions were: the same band on both sides
     q = motion.q[part]
     tau = low_passed(case.target[part], motion)
-    whole = np.concatenate([np.zeros((1, motion.n)), np.cumsum(0.5 * (tau[1:] + tau[:-1]), axis=0)])
+    cumulated = np.concatenate([np.zeros((1, motion.n)), np.cumsum(0.5 * (tau[1:] + tau[:-1]), axis=0)])
     steps = max(1, int(np.ceil(thin / (motion.rate * max_step) - 1e-6)))
-    place = np.arange(len(q), dtype=float)
+    indices = np.arange(len(q), dtype=float)
     for k in range(thin, len(q), thin):
         ends = np.linspace(k - thin, k, steps + 1)
-        near = slice(k - thin, k + 1)
-        sums = np.column_stack([np.interp(ends, place[near], own) for own in whole[near].T])
+        window = slice(k - thin, k + 1)
+        sums = np.column_stack([np.interp(ends, indices[window], joint_sum) for joint_sum in cumulated[window].T])
         yield q[k], np.diff(sums, axis=0) * (steps / thin)
 
 
@@ -164,20 +167,20 @@ def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
         return before
     columns = before.robot.columns
     p = len(before.mean)
-    made = stepper(before.robot.at(before.mean, case), columns)
-    there = before.robot.carried(case)
-    seen = np.maximum(motion.cutoffs.noise / np.sqrt(thin), 1e-9 * np.ptp(motion.q, axis=0).max())
+    robot_stepper = stepper(before.robot.at(before.mean, case), columns)
+    carried = before.robot.carried(case)
+    position_noise = np.maximum(motion.cutoffs.noise / np.sqrt(thin), 1e-9 * np.ptp(motion.q, axis=0).max())
     period = thin / motion.rate
     torque = noise * np.sqrt(1.0 / thin)
     moving = np.maximum(motion.velocity_noise(), 1e-3 * np.abs(motion.v).max(axis=0))
     first = np.concatenate([motion.q[part.start], motion.v[part.start], before.mean])
-    belief = believe(first, np.concatenate([seen, moving, np.ones(p)]), before.kind)
+    belief = believe(first, np.concatenate([position_noise, moving, np.ones(p)]), before.kind)
     belief = replace(belief, spread=_joined(belief, before.covariance, 2 * n))
-    full = _Stepping(made, before.kind, n, len(before.robot.plant.parameters), columns, there)
+    full = _Stepping(robot_stepper, before.kind, n, len(before.robot.plant.parameters), columns, carried)
     sizes = []
     for q, tau in _steps(case, part):
         belief = full.step(belief, np.ascontiguousarray(tau), period / len(tau), torque)
-        belief, size = corrected(belief, q, n, seen)
+        belief, size = corrected(belief, q, n, position_noise)
         require(np.isfinite(size), "the filter's estimate is no longer finite", Diverged, belief.mean)
         sizes.append(size / n)
     settled = sizes[len(sizes) // 4 :]
@@ -193,7 +196,10 @@ def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
 def _joined(belief: Belief, parameters: np.ndarray, first: int) -> np.ndarray:
     """Return a belief's spread (covariance or root) with its parameter block replaced by that of a covariance."""
     spread = np.array(belief.spread)
-    spread[first:, first:] = np.linalg.cholesky(parameters) if belief.root else parameters
+    if belief.root:
+        spread[first:, first:] = np.linalg.cholesky(parameters)
+    else:
+        spread[first:, first:] = parameters
     return spread
 
 
@@ -220,9 +226,9 @@ class _Stepping:
             values = self._values(before.mean[None])[0]
             slopes = np.eye(len(mean))
             gain = np.eye(n)
-            for own in tau:
-                made = self.made.linearised(values, mean[:n], mean[n : 2 * n], own, period, len(self.columns))
-                mean[:n], mean[n : 2 * n], gain, part = made
+            for torques in tau:
+                outcome = self.made.linearised(values, mean[:n], mean[n : 2 * n], torques, period, len(self.columns))
+                mean[:n], mean[n : 2 * n], gain, part = outcome
                 part[:, 2 * n :] *= self.there
                 slopes[: 2 * n] = part[:, : 2 * n] @ slopes[: 2 * n]
                 slopes[: 2 * n, 2 * n :] += part[:, 2 * n :]
@@ -236,8 +242,8 @@ class _Stepping:
             v = spread[:, n : 2 * n]
             gain = np.eye(n)
             try:
-                for own in tau:
-                    q, v, gain = self.made.points(values, q, v, own, period)
+                for torques in tau:
+                    q, v, gain = self.made.points(values, q, v, torques, period)
             except CalibError as error:
                 failure = error
                 continue

@@ -54,7 +54,9 @@ class Belief:
 
     @property
     def covariance(self) -> np.ndarray:
-        return self.spread @ self.spread.T if self.root else self.spread
+        if self.root:
+            return self.spread @ self.spread.T
+        return self.spread
 
     @property
     def deviations(self) -> np.ndarray:
@@ -107,12 +109,12 @@ def linearly_predicted(before: Belief, mean: np.ndarray, slopes: np.ndarray, noi
     return Belief(mean, slopes @ before.spread @ slopes.T + noise @ noise.T, False)
 
 
-def corrected(before: Belief, seen: np.ndarray, rows: int, std: np.ndarray) -> tuple[Belief, float]:
+def corrected(before: Belief, measured: np.ndarray, rows: int, std: np.ndarray) -> tuple[Belief, float]:
     """Return the belief corrected by a measurement of its first `rows` components, and the innovation's size.
 
     The size is eᵀ (H P Hᵀ + R)⁻¹ e, on average `rows` where the filter knows its noise.
     """
-    innovation = seen - before.mean[:rows]
+    innovation = measured - before.mean[:rows]
     size = len(before.mean)
     if before.root:
         array = np.zeros((rows + size, rows + size))
@@ -124,13 +126,13 @@ def corrected(before: Belief, seen: np.ndarray, rows: int, std: np.ndarray) -> t
         after = Belief(before.mean + lower[rows:, :rows] @ white, lower[rows:, rows:], True)
         return after, float(white @ white)
     cross = before.spread[:, :rows]
-    own = cross[:rows] + np.diag(std**2)
-    gain = np.linalg.solve(own, cross.T).T
-    kept = np.eye(size)
-    kept[:, :rows] -= gain
-    spread = kept @ before.spread @ kept.T + (gain * std**2) @ gain.T
+    innovation_covariance = cross[:rows] + np.diag(std**2)
+    gain = np.linalg.solve(innovation_covariance, cross.T).T
+    remainder = np.eye(size)
+    remainder[:, :rows] -= gain
+    spread = remainder @ before.spread @ remainder.T + (gain * std**2) @ gain.T
     after = Belief(before.mean + gain @ innovation, 0.5 * (spread + spread.T), False)
-    return after, float(innovation @ np.linalg.solve(own, innovation))
+    return after, float(innovation @ np.linalg.solve(innovation_covariance, innovation))
 
 
 def _gamma(kind: Filter, size: int) -> float:

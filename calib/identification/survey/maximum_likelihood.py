@@ -68,9 +68,9 @@ class _MaximumLikelihood(Method):
         tolerance = 0.01
         for count in range(1, max_steps + 1):
             noise = _torque_noise(task, values, noise, (min_noise * std) ** 2)
-            found = _step(task, values, noise)
-            steps.append(float(np.max(np.abs(found.values - values) / found.sigma)))
-            values = found.values
+            round_ = _step(task, values, noise)
+            steps.append(float(np.max(np.abs(round_.values - values) / round_.sigma)))
+            values = round_.values
             if not np.all(np.isfinite(values)) or (count > 5 and steps[-1] > 10.0 * steps[0]):
                 raise Diverged("maximum likelihood diverged: too much position noise for a linear model", values)
             if steps[-1] < tolerance:
@@ -83,7 +83,7 @@ class _MaximumLikelihood(Method):
         return MethodEstimate(
             self.name,
             EstimateStatus.FOUND,
-            _packed(problem, found, noise),
+            _packed(problem, round_, noise),
             problem.pooled,
             np.sqrt(noise),
             residual_inflation(problem.rows, values),
@@ -128,17 +128,19 @@ class NoisyStates:
 def noisy_states(problem: IdentificationProblem, model: IdentificationModel) -> NoisyStates:
     """Return all samples of a problem, with the covariance of the noise in q, v and a."""
     samples, (model, columns) = samples_of(problem), with_friction(problem, model)
-    smooth = np.array([one is None or one.form.slopes for one in problem.terms], dtype=bool)
+    smooth = np.array([term is None or term.form.slopes for term in problem.terms], dtype=bool)
     parts = []
     first = 0
     for case in problem.cases:
         motion = case.motion
         index = kept(motion.segment, problem.decimator)
-        there = np.append(model.carried_columns(case.carried), np.ones(model.p - model.inertial))
+        carried = np.append(model.carried_columns(case.carried), np.ones(model.p - model.inertial))
         noise = noise_of_states(motion, problem.decimator)
         part = slice(first, first + len(index))
-        q, v, a = (x[index] for x in (motion.q, motion.v, motion.a))
-        parts.append(_Recording(part, q, v, a, noise, case.carried, there[columns]))
+        q = motion.q[index]
+        v = motion.v[index]
+        a = motion.a[index]
+        parts.append(_Recording(part, q, v, a, noise, case.carried, carried[columns]))
         first += len(index)
     return NoisyStates(model, columns, smooth, samples.matrix, samples.target, samples.present, tuple(parts))
 
@@ -149,32 +151,35 @@ def noise_of_states(motion: Motion, decimator: Decimator) -> np.ndarray:
     From the impulse response of low-pass, differences and decimation; the noise's level is that of the log's spectrum.
     """
     result = np.empty((motion.n, 3, 3))
-    both = np.stack([motion.cutoff, motion.velocity_cutoff], axis=1)
-    for cutoff, faster in np.unique(both, axis=0):
+    cutoffs = np.stack([motion.cutoff, motion.velocity_cutoff], axis=1)
+    for cutoff, faster in np.unique(cutoffs, axis=0):
         reach = int(np.ceil(6.0 * motion.rate / cutoff)) + decimator.reach + 16
         impulse = np.zeros(2 * reach + 1)
         impulse[reach] = 1.0
-        q, less = (low_pass(impulse, motion.rate, float(f)) for f in (cutoff, faster))
+        q = low_pass(impulse, motion.rate, float(cutoff))
+        less = low_pass(impulse, motion.rate, float(faster))
         states = np.stack([q, slope(less, motion.rate), curvature(q, motion.rate)])
-        response = np.array([np.convolve(one, decimator.taps) for one in np.nan_to_num(states)])
-        result[np.all(both == (cutoff, faster), axis=1)] = response @ response.T
+        response = np.array([np.convolve(state, decimator.taps) for state in np.nan_to_num(states)])
+        result[np.all(cutoffs == (cutoff, faster), axis=1)] = response @ response.T
     return result * (motion.cutoffs.noise**2)[:, None, None]
 
 
 def _slopes(task: NoisyStates, part: _Recording, values: np.ndarray) -> np.ndarray:
     """Return B (M, n, 3, n), the Jacobian of W β with respect to q, v and a of each joint."""
-    used = task.smooth & (part.present > 0.0)
-    order = np.argsort(task.columns[used])
-    columns = task.columns[used][order]
-    own = values[used][order]
+    differentiable = task.smooth & (part.present > 0.0)
+    order = np.argsort(task.columns[differentiable])
+    columns = task.columns[differentiable][order]
+    column_values = values[differentiable][order]
     n = task.model.n
     out = np.empty((len(part.q), n, 3, n))
     for start in range(0, len(part.q), BLOCK):
         block = slice(start, start + BLOCK)
-        q, v, a = (np.ascontiguousarray(x[block]) for x in (part.q, part.v, part.a))
+        q = np.ascontiguousarray(part.q[block])
+        v = np.ascontiguousarray(part.v[block])
+        a = np.ascontiguousarray(part.a[block])
         for row in range(n):
             weights = np.zeros((len(q), n, len(columns)))
-            weights[:, row] = own
+            weights[:, row] = column_values
             gradient = task.model.regressor_gradient(q, v, a, weights, columns)
             out[block, row] = np.stack(gradient, axis=1)
     return out
@@ -188,25 +193,25 @@ def _residuals(task: NoisyStates, part: _Recording, values: np.ndarray) -> tuple
     return residual, spread, np.einsum("mrkj,mkjs->mrs", by_state, spread)
 
 
-def _inverse(other: np.ndarray, noise: np.ndarray, used: np.ndarray) -> np.ndarray:
+def _inverse(position_part: np.ndarray, noise: np.ndarray, in_use: np.ndarray) -> np.ndarray:
     """Return the inverse (M, n, n) of S = Σ_τ + other for the rows in use (M, n); zero for other rows."""
-    both = used[:, :, None] & used[:, None, :]
-    return np.where(both, np.linalg.inv(np.where(both, other + np.diag(noise), np.eye(len(noise)))), 0.0)
+    pairs = in_use[:, :, None] & in_use[:, None, :]
+    return np.where(pairs, np.linalg.inv(np.where(pairs, position_part + np.diag(noise), np.eye(len(noise)))), 0.0)
 
 
-def _torque_noise(task: NoisyStates, values: np.ndarray, noise: np.ndarray, least: np.ndarray) -> np.ndarray:
+def _torque_noise(task: NoisyStates, values: np.ndarray, noise: np.ndarray, minimum: np.ndarray) -> np.ndarray:
     """Return the maximum likelihood torque noise Σ_τ (n,) for fixed parameters and position noise."""
     parts = [_residuals(task, part, values) for part in task.parts]
-    residual, other = (np.concatenate(x) for x in zip(*((r, more) for r, _, more in parts)))
+    residual, position_part = (np.concatenate(x) for x in zip(*((r, position_share) for r, _, position_share in parts)))
     # of the residuals, after the fit
-    left = max(1.0 - len(values) / task.present.sum(), 0.1)
-    seen = task.present.any(axis=0)
+    share = max(1.0 - len(values) / task.present.sum(), 0.1)
+    observed = task.present.any(axis=0)
     for _ in range(50):
-        inverse = _inverse(other, noise, task.present)
-        score = np.sum(np.einsum("mij,mj->mi", inverse, residual) ** 2, axis=0) / left
+        inverse = _inverse(position_part, noise, task.present)
+        score = np.sum(np.einsum("mij,mj->mi", inverse, residual) ** 2, axis=0) / share
         ratio = np.clip(score / np.maximum(np.einsum("mii->i", inverse), 1e-300), 0.1, 10.0)
         before = noise
-        noise = np.where(seen, np.maximum(noise * ratio, least), noise)
+        noise = np.where(observed, np.maximum(noise * ratio, minimum), noise)
         if np.max(np.abs(noise / before - 1.0)) < 1e-3:
             break
     return noise
@@ -224,7 +229,7 @@ class _Round:
     @property
     def sigma(self) -> np.ndarray:
         """Standard deviations (p,) for white residuals."""
-        return np.sqrt(sum(np.sum((own @ self.bread.T) ** 2, axis=(0, 1)) for own in self.white))
+        return np.sqrt(sum(np.sum((white @ self.bread.T) ** 2, axis=(0, 1)) for white in self.white))
 
 
 def _step(task: NoisyStates, values: np.ndarray, noise: np.ndarray) -> _Round:
@@ -233,21 +238,21 @@ def _step(task: NoisyStates, values: np.ndarray, noise: np.ndarray) -> _Round:
     cross = np.zeros((p, p))
     score = np.zeros(p)
     white = []
-    left = []
+    white_residuals = []
     for part in task.parts:
-        residual, spread, other = _residuals(task, part, values)
-        used = task.present[part.own]
-        inverse = _inverse(other, noise, used)
+        residual, spread, position_part = _residuals(task, part, values)
+        in_use = task.present[part.own]
+        inverse = _inverse(position_part, noise, in_use)
         error = np.einsum("mkjr,mrs,ms->mkj", spread, inverse, residual)
-        rows = np.where(used[:, :, None], task.matrix[part.own] + changed(task, part, error), 0.0)
-        root = np.linalg.cholesky(np.where(used[:, :, None], inverse, np.eye(len(noise)))).transpose(0, 2, 1)
+        rows = np.where(in_use[:, :, None], task.matrix[part.own] + changed(task, part, error), 0.0)
+        root = np.linalg.cholesky(np.where(in_use[:, :, None], inverse, np.eye(len(noise)))).transpose(0, 2, 1)
         white.append(root @ rows)
-        left.append((root @ residual[:, :, None])[:, :, 0])
+        white_residuals.append((root @ residual[:, :, None])[:, :, 0])
         cross += np.einsum("mip,miq->pq", inverse @ rows, task.matrix[part.own], optimize=True)
-        score += np.einsum("mip,mi->p", white[-1], left[-1])
+        score += np.einsum("mip,mi->p", white[-1], white_residuals[-1])
     size = np.sqrt(np.abs(np.diag(cross)))
     bread = np.linalg.inv(cross / np.outer(size, size)) / np.outer(size, size)
-    return _Round(values + bread @ score, bread, tuple(white), tuple(left))
+    return _Round(values + bread @ score, bread, tuple(white), tuple(white_residuals))
 
 
 def changed(task: NoisyStates, part: _Recording, error: np.ndarray) -> np.ndarray:
@@ -258,21 +263,25 @@ def changed(task: NoisyStates, part: _Recording, error: np.ndarray) -> np.ndarra
         block = slice(start, start + BLOCK)
         state = np.stack([part.q[block], part.v[block], part.a[block]])
         shifted = state + error[block].transpose(1, 0, 2)
-        load = None if task.smooth.all() else np.zeros_like(state[0])
-        before, after = (task.model.regressor(x[0], x[1], x[2], load, part.carried) for x in (state, shifted))
+        if task.smooth.all():
+            load = None
+        else:
+            load = np.zeros_like(state[0])
+        before = task.model.regressor(state[0], state[1], state[2], load, part.carried)
+        after = task.model.regressor(shifted[0], shifted[1], shifted[2], load, part.carried)
         out[block][:, :, smooth] = (after - before)[:, :, task.columns[smooth]]
     return out
 
 
-def _packed(problem: IdentificationProblem, found: _Round, noise: np.ndarray) -> LinearFit:
+def _packed(problem: IdentificationProblem, round_: _Round, noise: np.ndarray) -> LinearFit:
     """Return the fit of the last round; its covariance allows for residuals correlated in time."""
     plain = wls(problem.pooled, np.sqrt(noise))
-    p = len(found.values)
+    p = len(round_.values)
     rows = int(problem.pooled.rows.sum())
-    meat = sum(scatter(own, left) for own, left in zip(found.white, found.residual))
-    covariance = rows / (rows - p) * found.bread @ meat @ found.bread.T
-    estimate = replace(plain.estimate, values=found.values, covariance=covariance, residual_std=1.0)
-    return LinearFit(estimate, np.sqrt(noise), *condition_numbers(np.concatenate(found.white).reshape(-1, p)))
+    meat = sum(scatter(white, residual) for white, residual in zip(round_.white, round_.residual))
+    covariance = rows / (rows - p) * round_.bread @ meat @ round_.bread.T
+    estimate = replace(plain.estimate, values=round_.values, covariance=covariance, residual_std=1.0)
+    return LinearFit(estimate, np.sqrt(noise), *condition_numbers(np.concatenate(round_.white).reshape(-1, p)))
 
 
 ML = _MaximumLikelihood(

@@ -46,8 +46,8 @@ def adaline(data: Samples, start: np.ndarray, rate: float = 1.0, steps: int = ST
     with np.errstate(over="ignore", invalid="ignore"):
         for k in np.concatenate([rng.permutation(len(target)) for _ in range(rounds)])[:steps]:
             slope = (target[k] - matrix[k] @ x) @ matrix[k]
-            moved = matrix[k] @ slope
-            size = moved @ moved
+            change = matrix[k] @ slope
+            size = change @ change
             if size:
                 x += rate * (slope @ slope) / size * slope
     return x
@@ -120,14 +120,17 @@ class _Network(Method):
         pooled = problem.pooled
         std, tau = weighed(problem)
         fit = ols(pooled, tau)
-        start = np.zeros(pooled.parameters) if problem.start is None else problem.start
+        if problem.start is None:
+            start = np.zeros(pooled.parameters)
+        else:
+            start = problem.start
         values, count = self.trained(problem, start)
         require(
             np.isfinite(values).all(), f"the network diverges: take a smaller rate than {self.rate:g}", NotConverged
         )
-        found = _off(fit, values, np.sqrt(pooled.residual_squares(values) / pooled.rows))
+        trained_fit = _off(fit, values, np.sqrt(pooled.residual_squares(values) / pooled.rows))
         return MethodEstimate(
-            self.name, EstimateStatus.FOUND, found, pooled, std, tau, False, iterations=count, alone=True
+            self.name, EstimateStatus.FOUND, trained_fit, pooled, std, tau, False, iterations=count, alone=True
         )
 
     def trained(self, problem: IdentificationProblem, start: np.ndarray) -> tuple[np.ndarray, int]:

@@ -97,9 +97,9 @@ class _OutputError(Method):
         # of weighing joints by what the last estimate leaves
         rounds = 3
         for _ in range(rounds):
-            found = task.solved(values, std)
-            values = found.state
-            count = count + found.iterations
+            solution = task.solved(values, std)
+            values = solution.state
+            count = count + solution.iterations
             residual, slopes = task.linearised(values)
             before = std
             std = task.spread(residual, len(values))
@@ -107,8 +107,8 @@ class _OutputError(Method):
                 break
         fit = _packed(task, plain, values, residual, slopes, std)
         step = np.linalg.norm(_gradient(residual / std, slopes / std[:, None]))
-        if not found.status.good and step > 0.5:
-            raise NotConverged(f"{self.name}: {found.status.value} ({step:.2g} standard deviations from rest)", fit)
+        if not solution.status.good and step > 0.5:
+            raise NotConverged(f"{self.name}: {solution.status.value} ({step:.2g} standard deviations from rest)", fit)
         return replace(
             plain,
             method=self.name,
@@ -177,37 +177,46 @@ class _Comparison:
             run = self.robot.sensitivities(values, case, controller, loop.reference, loop.every, relative)
             index = simulated_samples(case, run.t, loop)
             motion = case.motion
-            parts = [self._sensed(plant, case, run, index)] if self.rows.sensed else []
+            if self.rows.sensed:
+                parts = [self._sensed(plant, case, run, index)]
+            else:
+                parts = []
             if not self.torques:
-                moved, slope = (low_passed(x, motion)[index] for x in (run.q, run.by_q))
-                parts.append((motion.q - moved, slope))
+                position = low_passed(run.q, motion)[index]
+                slope = low_passed(run.by_q, motion)[index]
+                parts.append((motion.q - position, slope))
             elif self.rows.projection is not None:
                 torques = np.dstack([run.torque, run.by_torque])[index]
-                seen = self.rows.observe(torques, [BODIES] * torques.shape[2], motion.q, motion.v)
-                parts.append((case.target - seen[:, :, 0], seen[:, :, 1:]))
+                observed = self.rows.observe(torques, [BODIES] * torques.shape[2], motion.q, motion.v)
+                parts.append((case.target - observed[:, :, 0], observed[:, :, 1:]))
             elif self.rows.with_motors:
                 parts.append((case.target[:, -motion.n :] - run.torque[index], run.by_torque[index]))
-            rest, slope = (np.concatenate(one, axis=1) for one in zip(*parts))
-            known = case.present[:, np.arange(rest.shape[1]) % min(motion.n, case.present.shape[1])]
-            used = thinned(known, motion.segment, self.problem.decimator)
-            rest, slope = (decimate(x, self.problem.decimator, motion.segment) for x in (rest, slope))
-            residuals.append(np.where(used, rest, 0.0))
-            slopes.append(np.where(used[:, :, None], slope, 0.0))
+            residual, slope = (np.concatenate(blocks, axis=1) for blocks in zip(*parts))
+            present = case.present[:, np.arange(residual.shape[1]) % min(motion.n, case.present.shape[1])]
+            in_use = thinned(present, motion.segment, self.problem.decimator)
+            residual = decimate(residual, self.problem.decimator, motion.segment)
+            slope = decimate(slope, self.problem.decimator, motion.segment)
+            residuals.append(np.where(in_use, residual, 0.0))
+            slopes.append(np.where(in_use[:, :, None], slope, 0.0))
         return np.concatenate(residuals), np.concatenate(slopes)
 
     def _sensed(self, plant: Plant, case: Case, run: Sensitivities, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return residuals (N, n) of the sensors' torques [N m or N], and the Jacobian (N, n, p) of simulated ones."""
         link = IdentificationModel(plant.bodies, plant.terms, LINK)
-        seen = [*range(plant.inertial), *(plant.inertial + k for k, x in enumerate(plant.terms) if x in link.columns)]
-        place = np.full(len(plant.parameters), -1)
-        place[seen] = np.arange(len(seen))
-        own = place[self.robot.columns]
-        values = plant.parameters[seen]
-        moved, slopes = (followed(x, case.motion, index) for x in (run.q, run.by_q))
-        regressor = link.regressor(*moved, None, case.carried)
-        jacobian = np.where(own >= 0, regressor[:, :, own], 0.0)
+        link_columns = [
+            *range(plant.inertial),
+            *(plant.inertial + k for k, x in enumerate(plant.terms) if x in link.columns),
+        ]
+        position = np.full(len(plant.parameters), -1)
+        position[link_columns] = np.arange(len(link_columns))
+        columns = position[self.robot.columns]
+        values = plant.parameters[link_columns]
+        states = followed(run.q, case.motion, index)
+        slopes = followed(run.by_q, case.motion, index)
+        regressor = link.regressor(*states, None, case.carried)
+        jacobian = np.where(columns >= 0, regressor[:, :, columns], 0.0)
         for row in np.eye(case.motion.n, dtype=bool):
-            for by, slope in zip(link.torque_gradient(*moved, values, np.tile(row, (len(index), 1)) * 1.0), slopes):
+            for by, slope in zip(link.torque_gradient(*states, values, np.tile(row, (len(index), 1)) * 1.0), slopes):
                 jacobian[:, row] += np.einsum("kj,kjc->kc", by, slope)[:, None]
         return case.target[:, : case.motion.n] - regressor @ values, jacobian
 
@@ -252,7 +261,7 @@ class _Comparison:
         n = self.problem.cases[0].motion.n
         # of torques and of positions: other units
         kinds = [std[k : k + n] for k in range(0, len(std), n)]
-        return np.concatenate([np.maximum(one, 1e-6 * max(float(one.max()), 1e-300)) for one in kinds])
+        return np.concatenate([np.maximum(kind, 1e-6 * max(float(kind.max()), 1e-300)) for kind in kinds])
 
 
 def _gradient(residual: np.ndarray, slopes: np.ndarray) -> np.ndarray:
@@ -275,23 +284,25 @@ def _packed(
         Unidentifiable: where the simulated motion does not distinguish parameters.
     """
     white = slopes / std[:, None]
-    left = residual / std
+    white_residual = residual / std
     p = len(values)
     rows = int(np.sum(residual != 0.0))
-    own = len(plain.pooled.names)
+    count_ = len(plain.pooled.names)
     plant = task.robot.plant
-    names = (*plain.pooled.names, *(plant.terms[k - plant.inertial].name for k in task.robot.columns[own:]))
+    names = (*plain.pooled.names, *(plant.terms[k - plant.inertial].name for k in task.robot.columns[count_:]))
     flat = white.reshape(-1, p)
     size = np.linalg.norm(flat, axis=0)
     factor = np.asarray(np.linalg.qr(flat / np.where(size > 0.0, size, 1.0), mode="r"))
     require_rank(factor, names, "the simulated motion does not distinguish them")
     inverse = scipy.linalg.solve_triangular(factor, np.eye(p)) / size[:, None]
     bread = inverse @ inverse.T
-    covariance = rows / max(rows - p, 1) * bread @ scatter(white, left) @ bread
+    covariance = rows / max(rows - p, 1) * bread @ scatter(white, white_residual) @ bread
     rounds = 5
     for _ in range(rounds):
-        covariance = bread @ scatter(white, left, covariance) @ bread
-    estimate = replace(plain.estimate, values=values[:own], covariance=covariance[:own, :own], residual_std=1.0)
+        covariance = bread @ scatter(white, white_residual, covariance) @ bread
+    estimate = replace(
+        plain.estimate, values=values[:count_], covariance=covariance[:count_, :count_], residual_std=1.0
+    )
     return LinearFit(estimate, std, *condition_numbers(flat))
 
 

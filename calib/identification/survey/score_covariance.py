@@ -28,16 +28,19 @@ def scatter(white: np.ndarray, residual: np.ndarray, covariance: np.ndarray | No
     result = np.zeros((p, p))
     # at least, of the residuals' autocorrelation
     min_lags = 12
-    root = np.zeros((p, 0)) if covariance is None else np.linalg.cholesky(covariance)
+    if covariance is None:
+        root = np.zeros((p, 0))
+    else:
+        root = np.linalg.cholesky(covariance)
     for row in range(white.shape[1]):
         values = white[:, row]
-        own = np.column_stack([residual[:, row], values @ root])
-        variance = float(np.sum(own**2) / count)
+        row_residuals = np.column_stack([residual[:, row], values @ root])
+        variance = float(np.sum(row_residuals**2) / count)
         if variance == 0.0 or count < 4 * min_lags:
             result += variance * values.T @ values
             continue
-        lags = int(min(count // 4, max(min_lags, 15 * inflation(own))))
-        rho = autocorrelation(own, lags) * (1.0 - np.arange(1, lags + 1) / (lags + 1.0))
+        lags = int(min(count // 4, max(min_lags, 15 * inflation(row_residuals))))
+        rho = autocorrelation(row_residuals, lags) * (1.0 - np.arange(1, lags + 1) / (lags + 1.0))
         kernel = np.zeros(size)
         kernel[0], kernel[1 : lags + 1], kernel[size - lags :] = 1.0, rho, rho[::-1]
         gain = np.fft.rfft(kernel).real

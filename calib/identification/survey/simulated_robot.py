@@ -75,9 +75,11 @@ def simulate_tangents(
     from calib.identification.closed_loop import loop_kernels
     from calib.identification.survey import tangent_kernels
 
-    for one in plant.terms:
-        words = f"term '{one.name}' ({one.shape}): no derivatives of friction that hangs on past motion or on torques"
-        require(one.form.slopes, f"{words}; iv and didim take it")
+    for term in plant.terms:
+        message = (
+            f"term '{term.name}' ({term.shape}): no derivatives of friction that hangs on past motion or on torques"
+        )
+        require(term.form.slopes, f"{message}; iv and didim take it")
     n = plant.bodies.n
     count = len(reference.t)
     c = len(columns)
@@ -86,7 +88,10 @@ def simulate_tangents(
     tick = sample_ticks(count, every)
     out = np.empty((3, len(tick), n))
     slopes = np.empty((3, len(tick), n, c))
-    model = np.empty((0, 0)) if controller.model is None else body_rows(plant.bodies, controller.model)
+    if controller.model is None:
+        model = np.empty((0, 0))
+    else:
+        model = body_rows(plant.bodies, controller.model)
     if relative is None:
         scale = np.zeros((n, c))
     else:
@@ -134,11 +139,11 @@ def simulate_differences(
         return np.array([run.q, run.v, run.torque])
 
     values = np.array(plant.parameters)
-    here = moved(values)
+    nominal = moved(values)
     shifts = np.eye(len(values))[columns] * steps[:, None]
-    slopes = np.stack([(moved(values + shift) - here) / step for shift, step in zip(shifts, steps)], axis=-1)
+    slopes = np.stack([(moved(values + shift) - nominal) / step for shift, step in zip(shifts, steps)], axis=-1)
     tick = sample_ticks(len(reference.t), every)
-    return Sensitivities(reference.t[0] + tick * reference.period, *map(frozen, (*here, *slopes)))
+    return Sensitivities(reference.t[0] + tick * reference.period, *map(frozen, (*nominal, *slopes)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,7 +226,9 @@ class BelievedRobot:
         parameters = np.zeros(len(self.plant.parameters))
         parameters[self.columns] = values
         plant = self.plant.with_parameters(parameters)
-        return plant if case is None else plant.carrying(case.carried)
+        if case is None:
+            return plant
+        return plant.carrying(case.carried)
 
     def sensitivities(
         self,
@@ -236,9 +243,11 @@ class BelievedRobot:
         plant = self.at(values, case)
         if self.steps is not None:
             return simulate_differences(plant, controller, reference, self.columns, self.steps, every)
-        found = simulate_tangents(plant, controller, reference, self.columns, every, relative)
-        there = self.carried(case)
-        return replace(found, **{name: vars(found)[name] * there for name in ("by_q", "by_v", "by_torque")})
+        sensitivities = simulate_tangents(plant, controller, reference, self.columns, every, relative)
+        carried = self.carried(case)
+        return replace(
+            sensitivities, **{name: vars(sensitivities)[name] * carried for name in ("by_q", "by_v", "by_torque")}
+        )
 
     def carried(self, case: Case) -> np.ndarray:
         """Return a factor (p,) per parameter of a serial arm: 0 for payloads not attached in a case, otherwise 1."""
@@ -253,8 +262,8 @@ def serial_arm(problem: IdentificationProblem, method: Method) -> Identification
     """
     model = problem.model
     if not isinstance(model, IdentificationModel) or not method.takes(model.torque_rows):
-        words = f"needs a serial arm with motor torques, not rows '{model.torque_rows.name}'"
-        raise UsageError(f"method '{method.name}' {words}; otherwise take wls or tls")
+        message = f"needs a serial arm with motor torques, not rows '{model.torque_rows.name}'"
+        raise UsageError(f"method '{method.name}' {message}; otherwise take wls or tls")
     return model
 
 
@@ -278,10 +287,10 @@ def believed_robot(problem: IdentificationProblem, method: Method, steps: np.nda
     terms = model.columns
     size = model.p
     if not model.torque_rows.with_motors:
-        widths = {one.acts[0][0]: one.settings[-1] for one in terms if one.shape == "sign"}
+        widths = {term.acts[0][0]: term.settings[-1] for term in terms if term.shape == "sign"}
         width = [widths.get(joint, V0) for joint in range(model.n)]
         motors = standard(["Ia Fvm Fcm offm"] * model.n, width, model.prismatic.tolist())
-        terms = (*terms, *(replace(one, name=f"motor {one.name}") for one in motors))
+        terms = (*terms, *(replace(motor, name=f"motor {motor.name}") for motor in motors))
         columns = np.append(columns, np.arange(size, size + len(motors)))
     with refused_as(CannotSimulate, CalibError, "{}"):
         plant = Plant(model.bodies, terms, np.zeros(model.inertial + len(terms)))
@@ -290,7 +299,7 @@ def believed_robot(problem: IdentificationProblem, method: Method, steps: np.nda
 
 def with_friction(problem: IdentificationProblem, model: IdentificationModel) -> tuple[IdentificationModel, np.ndarray]:
     """Return a problem's model with all friction terms, and the index (p,) of each parameter in it."""
-    extra = [one for one in problem.terms[problem.base.b :] if one is not None]
+    extra = [term for term in problem.terms[problem.base.b :] if term is not None]
     model = model.with_terms(*extra)
     return model, np.array([*problem.base.kept, *range(model.p - len(extra), model.p)], dtype=int)
 
@@ -311,16 +320,18 @@ def start_of(
     if problem.start is not None:
         return np.array(problem.start, dtype=float)
     model: Any = problem.model
-    own = problem.base.b
+    base_count = problem.base.b
     standard = np.zeros(model.p)
     serial = isinstance(model, IdentificationModel)
-    motors = {one.joint: k for k, one in enumerate(model.columns, model.inertial) if one.shape == "acceleration"}
-    for joint, own_inertia in zip(range(model.n) if serial else model.known.robot.actuated, inertia):
+    motors = {
+        column.joint: k for k, column in enumerate(model.columns, model.inertial) if column.shape == "acceleration"
+    }
+    for joint, own_inertia in zip(range(model.n) if serial else model.mechanism.robot.actuated, inertia):
         if joint in motors:
             standard[motors[joint]] = own_inertia
-    regular = np.append(problem.base.transform @ standard, np.zeros(len(plain) - own))
+    regular = np.append(problem.base.transform @ standard, np.zeros(len(plain) - base_count))
     if serial and not np.any(standard):
-        regular = np.append(problem.base.transform @ _hubs(model, inertia), np.zeros(len(plain) - own))
+        regular = np.append(problem.base.transform @ _hubs(model, inertia), np.zeros(len(plain) - base_count))
     failure: CalibError | None = None
     for share in SHARES:
         values = share * plain + (1.0 - share) * regular
@@ -338,6 +349,9 @@ def _hubs(model: IdentificationModel, inertia: np.ndarray) -> np.ndarray:
     result = np.zeros(model.p)
     for i, (coordinate, axis) in enumerate(zip(model.bodies.coordinates, model.bodies.axes)):
         if coordinate >= 0:
-            place = 9 if model.prismatic[coordinate] else (0, 3, 5)[int(axis)]
-            result[10 * i + place] = inertia[coordinate]
+            if model.prismatic[coordinate]:
+                entry = 9
+            else:
+                entry = (0, 3, 5)[int(axis)]
+            result[10 * i + entry] = inertia[coordinate]
     return result

@@ -48,67 +48,67 @@ from calib.identification.closed_loop.loop_kernels import (
 
 
 @njit(**OPTIONS)
-def _outward(tree, body, v, a, work, own, more):
+def _outward(tree, body, v, a, work, bodies_own, extended):
     """Write accelerations, ψ̇ and ψ̈, and each body's inertia, wrench, P and L; `work` is that of `dynamics`."""
     count = tree.shape[0]
     for i in range(count):
         for r in range(10):
-            own[i, r] = work[i, 36 + r]
+            bodies_own[i, r] = work[i, 36 + r]
     for i in range(count):
         p = tree[i, 0]
         if p < count:
             for r in range(10):
-                own[p, r] -= work[i, 36 + r]
+                bodies_own[p, r] -= work[i, 36 + r]
     for r in range(36):
-        more[count, r] = 0.0
-    more[count, 3], more[count, 4], more[count, 5] = body[count, 0], body[count, 1], body[count, 2]
+        extended[count, r] = 0.0
+    extended[count, 3], extended[count, 4], extended[count, 5] = body[count, 0], body[count, 1], body[count, 2]
     for i in range(count):
         p, c = tree[i, 0], tree[i, 2]
         rate, change = (v[c], a[c]) if c >= 0 else (0.0, 0.0)
-        w, n, b, a_p = three(work, p, 12), three(work, p, 15), three(more, p, 0), three(more, p, 3)
+        w, n, b, a_p = three(work, p, 12), three(work, p, 15), three(extended, p, 0), three(extended, p, 3)
         u, s = three(work, i, 24), three(work, i, 27)
         e, f = twist_cross(w, n, u, s)
         (first, second), (third, fourth) = twist_cross(b, a_p, u, s), twist_cross(w, n, e, f)
-        write(more, i, 6, e)
-        write(more, i, 9, f)
-        write(more, i, 12, add(first, third))
-        write(more, i, 15, add(second, fourth))
-        write(more, i, 0, add(b, add(scaled(rate, e), scaled(change, u))))
-        write(more, i, 3, add(a_p, add(scaled(rate, f), scaled(change, s))))
+        write(extended, i, 6, e)
+        write(extended, i, 9, f)
+        write(extended, i, 12, add(first, third))
+        write(extended, i, 15, add(second, fourth))
+        write(extended, i, 0, add(b, add(scaled(rate, e), scaled(change, u))))
+        write(extended, i, 3, add(a_p, add(scaled(rate, f), scaled(change, s))))
         w, n = three(work, i, 12), three(work, i, 15)
-        J = own[i, 0], own[i, 1], own[i, 2], own[i, 3], own[i, 4], own[i, 5]
-        h = three(own, i, 6)
-        moment, force, linear = wrench((J, h, own[i, 9]), w, n, three(more, i, 0), three(more, i, 3))
-        write(more, i, 18, moment)
-        write(more, i, 21, force)
+        J = bodies_own[i, 0], bodies_own[i, 1], bodies_own[i, 2], bodies_own[i, 3], bodies_own[i, 4], bodies_own[i, 5]
+        h = three(bodies_own, i, 6)
+        moment, force, linear = wrench((J, h, bodies_own[i, 9]), w, n, three(extended, i, 0), three(extended, i, 3))
+        write(extended, i, 18, moment)
+        write(extended, i, 21, force)
         half, along = 0.5 * (J[0] + J[3] + J[5]), dot(h, n)
         # P = -[ω] Σ - [h][ν], [h][ν] = ν hᵀ - (h·ν) 1; Σ has the off-diagonals of -J; its columns one by one
         sigma = (half - J[0], -J[1], -J[2]), (-J[1], half - J[3], -J[4]), (-J[2], -J[4], half - J[5])
         for k in range(3):
             turning = cross(sigma[k], w)
             for r in range(3):
-                more[i, 24 + 3 * r + k] = turning[r] - n[r] * h[k] + (along if r == k else 0.0)
-        write(more, i, 33, linear)
+                extended[i, 24 + 3 * r + k] = turning[r] - n[r] * h[k] + (along if r == k else 0.0)
+        write(extended, i, 33, linear)
 
 
 @njit(**OPTIONS)
-def _slopes(tree, work, more, by_q, by_v):
+def _slopes(tree, work, extended, by_q, by_v):
     """Add the bodies' part of K and D (n, n), summing composite quantities from the tips to the base."""
     count = tree.shape[0]
     for i in range(count - 1, -1, -1):
         p, c = tree[i, 0], tree[i, 2]
         if c >= 0:
-            u, s, inertia, linear = three(work, i, 24), three(work, i, 27), inertia_of(work, i), three(more, i, 33)
+            u, s, inertia, linear = three(work, i, 24), three(work, i, 27), inertia_of(work, i), three(extended, i, 33)
             y, g = momentum(inertia, u, s)
-            x = add(turned_back(more, i, u, 24), cross(linear, s))
-            e, f = three(more, i, 6), three(more, i, 9)
-            once, twice = momentum(inertia, e, f), momentum(inertia, three(more, i, 12), three(more, i, 15))
-            moment, force = three(more, i, 18), three(more, i, 21)
+            x = add(turned_back(extended, i, u, 24), cross(linear, s))
+            e, f = three(extended, i, 6), three(extended, i, 9)
+            once, twice = momentum(inertia, e, f), momentum(inertia, three(extended, i, 12), three(extended, i, 15))
+            moment, force = three(extended, i, 18), three(extended, i, 21)
             # by q: 2 B ψ̇ + I ψ̈ + S ×* f
-            q0 = add(add(scaled(2.0, turned(more, i, e, 24)), twice[0]), add(cross(u, moment), cross(s, force)))
+            q0 = add(add(scaled(2.0, turned(extended, i, e, 24)), twice[0]), add(cross(u, moment), cross(s, force)))
             q1 = add(add(scaled(2.0, cross(e, linear)), twice[1]), cross(u, force))
             # by v: 2 B S + 2 I ψ̇
-            v0 = scaled(2.0, add(turned(more, i, u, 24), once[0]))
+            v0 = scaled(2.0, add(turned(extended, i, u, 24), once[0]))
             v1 = scaled(2.0, add(cross(u, linear), once[1]))
             by_q[c, c] += dot(u, q0) + dot(s, q1)
             by_v[c, c] += dot(u, v0) + dot(s, v1)
@@ -116,32 +116,32 @@ def _slopes(tree, work, more, by_q, by_v):
             while k < count:
                 d = tree[k, 2]
                 if d >= 0:
-                    a, b, e, f = three(work, k, 24), three(work, k, 27), three(more, k, 6), three(more, k, 9)
+                    a, b, e, f = three(work, k, 24), three(work, k, 27), three(extended, k, 6), three(extended, k, 9)
                     by_q[d, c] += dot(a, q0) + dot(b, q1)
                     by_v[d, c] += dot(a, v0) + dot(b, v1)
                     by_v[c, d] += 2.0 * (dot(x, a) + dot(y, e) + dot(g, f))
-                    by_q[c, d] += 2.0 * dot(x, e) + dot(y, three(more, k, 12)) + dot(g, three(more, k, 15))
+                    by_q[c, d] += 2.0 * dot(x, e) + dot(y, three(extended, k, 12)) + dot(g, three(extended, k, 15))
                 k = tree[k, 0]
         if p < count:
             for r in range(18, 36):
-                more[p, r] += more[i, r]
+                extended[p, r] += extended[i, r]
 
 
 @njit(**OPTIONS)
-def _columns(tree, order, find, work, more, out):
+def _columns(tree, order, find, work, extended, out):
     """Add the derivatives Y (n, c) with respect to the bodies' parameters that have a column."""
     count = tree.shape[0]
     for i in range(count):
-        wanted = False
+        has_column = False
         for k in range(10):
-            wanted = wanted or find[10 * i + order[i, k]] >= 0
-        if not wanted:
+            has_column = has_column or find[10 * i + order[i, k]] >= 0
+        if not has_column:
             continue
         x, g = three(work, i, 9), three(work, i, 12)
-        w, b = turned_back(work, i, g), three(more, i, 0)
+        w, b = turned_back(work, i, g), three(extended, i, 0)
         # acceleration of the body's origin: spatial, moved there, and ω × ν
         moving = add(three(work, i, 15), cross(g, x))
-        a = turned_back(work, i, add(add(three(more, i, 3), cross(b, x)), cross(g, moving)))
+        a = turned_back(work, i, add(add(three(extended, i, 3), cross(b, x)), cross(g, moving)))
         b, j = turned_back(work, i, b), i
         while j < count:
             d = tree[j, 2]
@@ -173,8 +173,8 @@ def _linearise(
     v,
     a,
     work,
-    own,
-    more,
+    bodies_own,
+    extended,
     by_q,
     by_v,
     out,
@@ -186,10 +186,10 @@ def _linearise(
     for j in range(n):
         for k in range(n):
             by_v[j, k] = linear[j, n + k]
-    _outward(tree, body, v, a, work, own, more)
+    _outward(tree, body, v, a, work, bodies_own, extended)
     if find.shape[0]:
-        _columns(tree, order, find, work, more, out)
-    _slopes(tree, work, more, by_q, by_v)
+        _columns(tree, order, find, work, extended, out)
+    _slopes(tree, work, extended, by_q, by_v)
     for t in range(kinds.shape[0]):
         row = kinds[t, 0]
         value, place, rate = act(kinds[t, 1], acts, t, memory, q, v)
@@ -214,9 +214,9 @@ def _solve(matrix, by_q, by_v, columns, dq, dv, dtau, out):
         for m in range(c):
             out[j, m] = dtau[j, m] - columns[j, m]
         for k in range(n):
-            one, other = by_q[j, k], by_v[j, k]
+            by_q_jk, by_v_jk = by_q[j, k], by_v[j, k]
             for m in range(c):
-                out[j, m] -= one * dq[k, m] + other * dv[k, m]
+                out[j, m] -= by_q_jk * dq[k, m] + by_v_jk * dv[k, m]
         for k in range(j):
             low = matrix[j, k]
             for m in range(c):
@@ -237,7 +237,7 @@ def _advance_tangent(
 ):
     """Advance q, v (n,) and δq, δv (n, c) by one period as `loop_kernels.advance` does; `slopes[0]` is not used."""
     tree, body, linear, kinds, acts = plant
-    own, more, by_q, by_v, columns, at, rate, dat, drate = rooms
+    bodies_own, extended, by_q, by_v, columns, at, rate, dat, drate = rooms
     n, c = dq.shape
     if not accelerate(tree, body, linear, kinds, acts, memory, loads, q, v, tau, work, matrix, slopes[0]):
         return SINGULAR
@@ -270,7 +270,7 @@ def _advance_tangent(
                 state = (at, rate, tau, work, matrix, slopes[stage])
                 if not accelerate(tree, body, linear, kinds, acts, memory, loads, *state):
                     return SINGULAR
-            where = (at, rate, slopes[stage], work, own, more, by_q, by_v, columns)
+            where = (at, rate, slopes[stage], work, bodies_own, extended, by_q, by_v, columns)
             _linearise(tree, body, linear, kinds, acts, *layout, memory, *where)  # pyright: ignore[reportCallIssue]
             _solve(matrix, by_q, by_v, columns, dat, drate, dtau, dslopes[stage])
         for j in range(n):
@@ -278,18 +278,28 @@ def _advance_tangent(
             q[j] += span * (v[j] + span / 6.0 * (first + inner))
             v[j] += span / 6.0 * (first + 2.0 * inner + last)
             for m in range(c):
-                one, middle, other = dslopes[0, j, m], dslopes[1, j, m] + dslopes[2, j, m], dslopes[3, j, m]
-                dq[j, m] += span * (dv[j, m] + span / 6.0 * (one + middle))
-                dv[j, m] += span / 6.0 * (one + 2.0 * middle + other)
+                by_q_jk, middle, by_v_jk = dslopes[0, j, m], dslopes[1, j, m] + dslopes[2, j, m], dslopes[3, j, m]
+                dq[j, m] += span * (dv[j, m] + span / 6.0 * (by_q_jk + middle))
+                dv[j, m] += span / 6.0 * (by_q_jk + 2.0 * middle + by_v_jk)
     return FINE
 
 
 @njit(**OPTIONS)
 def _workspace(bodies, n, c):
     """Return the work arrays of `_advance_tangent`."""
-    own, more = np.empty((bodies, 10)), np.empty((bodies + 1, 36))
+    bodies_own, extended = np.empty((bodies, 10)), np.empty((bodies + 1, 36))
     square, wide = (np.empty((n, n)), np.empty((n, n))), np.empty((n, c))
-    return own, more, square[0], square[1], wide, np.empty(n), np.empty(n), np.empty((n, c)), np.empty((n, c))
+    return (
+        bodies_own,
+        extended,
+        square[0],
+        square[1],
+        wide,
+        np.empty(n),
+        np.empty(n),
+        np.empty((n, c)),
+        np.empty((n, c)),
+    )
 
 
 @njit(**OPTIONS)
@@ -345,7 +355,7 @@ def _command_tangent(
     rooms,
 ):
     """Write the derivatives (n, c) of the command before saturation; feedback (n,) is its feedback part."""
-    own, more, by_q, by_v, columns, at, _, dat, _ = rooms
+    bodies_own, extended, by_q, by_v, columns, at, _, dat, _ = rooms
     tree, linear = plant[0], plant[2]
     n = len(dwish)
     for j in range(n):
@@ -356,7 +366,7 @@ def _command_tangent(
         dynamics(tree, model, linear, read, speed, work, matrix, wish)
         bare = np.zeros_like(linear)
         order, entries, shares, owners, find = layout
-        where = (read, speed, at, work, own, more, by_q, by_v, columns)
+        where = (read, speed, at, work, bodies_own, extended, by_q, by_v, columns)
         none = (np.zeros((0, 2), dtype=np.int64), np.zeros((0, 8 + n)))
         _linearise(tree, model, bare, none[0], none[1], order, entries, shares, owners, empty, np.zeros((0, 2)), *where)
         dat[:] = 0.0

@@ -14,10 +14,10 @@ from calib.data.csv_table import read_table
 from calib.dynamics.base import expressions
 from calib.identification.gains import GainRecord
 from calib.identification.model_file import MODEL, read_dynamics, to_table
-from calib.identification.possible import information
+from calib.identification.physical_consistency import information
 from calib.identification.prediction import Dynamics
 from calib.identification.rows import Case
-from calib.identification.torque_errors import TorqueErrorModel, TorqueIntervals, read_uncertainty
+from calib.identification.uncertainty.torque_errors import TorqueErrorModel, TorqueIntervals, read_uncertainty
 from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.identify import Assessment, IdentificationOutcome, ModelFindings
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs

@@ -23,7 +23,12 @@ import numpy as np
 
 from calib import files
 from calib.folders import write_covariance
-from calib.identification.geometry_uncertainty import NOTHING, TILTS, GeometryComparison, GeometryUncertainty
+from calib.identification.uncertainty.geometry_uncertainty import (
+    NOTHING,
+    TILTS,
+    GeometryComparison,
+    GeometryUncertainty,
+)
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.records import Number
 

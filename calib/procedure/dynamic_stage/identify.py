@@ -13,13 +13,13 @@ import numpy as np
 
 from calib.data.signals.persistency import ExcitationReport, repeats, report_excitation
 from calib.errors import Finding, finding
-from calib.identification import geometry_uncertainty, torque_errors
 from calib.identification.friction.passivity import driven
 from calib.identification.identify import Identification, identify
 from calib.identification.loop import Controller, LoopDisagreement, Replay
-from calib.identification.possible.solve import Contradiction, contradiction
+from calib.identification.physical_consistency.solve import Contradiction, contradiction
 from calib.identification.prediction import Dynamics, Score, predict, score
 from calib.identification.rows import Case
+from calib.identification.uncertainty import geometry_uncertainty, torque_errors
 from calib.procedure.dynamic_stage import plain, plausibility
 from calib.procedure.dynamic_stage import verdict as judging
 from calib.procedure.dynamic_stage.hypotheses import gravity_hypotheses

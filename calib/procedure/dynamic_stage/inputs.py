@@ -17,11 +17,11 @@ from calib.data.signals.filtering import SHARE
 from calib.data.signals.motion import FilterOptions, Motion, make_motion, with_reference
 from calib.data.signals.resampling import Resampled, resample
 from calib.errors import MeasurementError, NoPosture, UsageError, refuse_data, refused_as, suggestion
-from calib.extensions import Point
 from calib.identification.checks.recorded_motion import DesignedMotion, locate
 from calib.identification.friction.friction_ladder import NAMES
 from calib.identification.gains import DriveGains
 from calib.identification.identify_options import FileSettings, IdentifyOptions
+from calib.identification.link_motion import with_link_motion
 from calib.identification.registry import METHODS
 from calib.identification.rows import Case, case_names, make_case
 from calib.identification.settings import IdentificationSettings
@@ -33,10 +33,6 @@ from calib.robot.chain import Chain
 from calib.robot.description import remarks
 from calib.robot.library import load_calibrated, resolve
 from calib.units import TORQUE
-
-LINK_MOTION: Point[Callable[[Any, Case, IdentificationSettings], Case]] = Point(
-    "link_motion", "a case with its links' motion, moved by joint corrections"
-)
 
 LOST = 0.05  # of a recording may fall to the windows of the parallel decimation (our choice)
 QUIET = 0.02  # noise of the accelerations that is no matter, of their rms (our choice)
@@ -213,8 +209,8 @@ def _read_case(path: str, name: str, motion: Motion, options: IdentifyOptions, f
         case = make_case(
             name, motion, options.settings.torque_rows, gains=found.for_motion(motion, own), carried=own.payload
         )
-    for moved in LINK_MOTION.all() if getattr(robot, "corrections", None) is not None else ():
-        case = moved(robot, case, options.settings)
+    if getattr(robot, "corrections", None) is not None:
+        case = with_link_motion(robot, case, options.settings)
     return case
 
 

@@ -14,7 +14,7 @@ from calib.errors import Finding, finding
 from calib.identification.checks.recording_sizes import FOLLOWS, ClockRatio, RecordingSizes, compare_sizes, signs_of
 from calib.identification.checks.torque_lag import Lag
 from calib.identification.loop import LoopDisagreement
-from calib.identification.possible.solve import Contradiction
+from calib.identification.physical_consistency.solve import Contradiction
 from calib.identification.rows import Case
 from calib.procedure.dynamic_stage.hypotheses import gravity_findings, gravity_hypotheses, load_findings
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs

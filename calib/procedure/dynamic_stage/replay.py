@@ -68,7 +68,10 @@ def replay(
     robot, left_out = _robot(dynamics, case)
     reference, every = _reference(take(case, part), rate)
     robot, added = _possible(robot, reference)
-    control = _default(robot, reference) if controller is None else replace(controller, ahead=None)
+    if controller is None:
+        control = _default(robot, reference)
+    else:
+        control = replace(controller, ahead=None)
     sampled = np.arange(part.stop - part.start)
 
     def controlled(torque: np.ndarray) -> np.ndarray:
@@ -79,12 +82,12 @@ def replay(
     ahead: dict[str, np.ndarray | None] = {FEEDBACK: None}
     if chain.inertias is not None:
         values = np.zeros(model.inertial)
-        own = standard_parameters(chain)
-        values[: len(own)] = own
+        parameters = standard_parameters(chain)
+        values[: len(parameters)] = parameters
         ahead[CAD] = feed_forward(Plant(model.bodies, (), values), reference)
     ahead |= {IDENTIFIED: controlled(predicted), FLOOR: measured}
     push = feed_forward(robot, reference) - measured
-    rms = {name: tracking_error(robot, control, reference, one, push) for name, one in ahead.items()}
+    rms = {name: tracking_error(robot, control, reference, push_, push) for name, push_ in ahead.items()}
     seconds = float(motion.t[part.stop - 1] - motion.t[part.start])
     return Replay(case.name, seconds, control, controller is not None, left_out, added, rms)
 
@@ -102,12 +105,12 @@ def _robot(dynamics: Dynamics, case: Case) -> tuple[Plant, tuple[str, ...]]:
     """Return the model as a robot with the case's payloads, and the names of terms that cannot be simulated."""
     model = dynamics.model
     bodies = model.inertial
-    simulated = [one.form.of_velocity or one.shape == "acceleration" for one in model.columns]
-    kept = np.flatnonzero(simulated)
-    terms = tuple(replace(model.columns[k], side="motor") for k in kept)
+    simulated = [column.form.of_velocity or column.shape == "acceleration" for column in model.columns]
+    columns = np.flatnonzero(simulated)
+    terms = tuple(replace(model.columns[k], side="motor") for k in columns)
     values = dynamics.values[:bodies] * model.carried_columns(case.carried)
-    left_out = tuple(one.name for one, there in zip(model.columns, simulated) if not there)
-    return Plant(model.bodies, terms, np.concatenate([values, dynamics.values[bodies:][kept]])), left_out
+    left_out = tuple(column.name for column, is_simulated in zip(model.columns, simulated) if not is_simulated)
+    return Plant(model.bodies, terms, np.concatenate([values, dynamics.values[bodies:][columns]])), left_out
 
 
 def _reference(part: Case, rate: float | None) -> tuple[Reference, float]:
@@ -115,9 +118,9 @@ def _reference(part: Case, rate: float | None) -> tuple[Reference, float]:
     motion = part.motion
     every = periods_per_sample(motion, rate)
     samples = np.arange(len(motion))
-    place = np.arange(int((len(motion) - 1) * every + 1e-9) + 1) / every
-    series = [CubicSpline(samples, x)(place) for x in (motion.q, motion.v, motion.a)]
-    return Reference(place / motion.rate, *series), every
+    indices = np.arange(int((len(motion) - 1) * every + 1e-9) + 1) / every
+    series = [CubicSpline(samples, x)(indices) for x in (motion.q, motion.v, motion.a)]
+    return Reference(indices / motion.rate, *series), every
 
 
 def _possible(robot: Plant, reference: Reference, min_eigenvalue: float = 0.05) -> tuple[Plant, np.ndarray]:
@@ -133,24 +136,24 @@ def _possible(robot: Plant, reference: Reference, min_eigenvalue: float = 0.05) 
     # [kg m² or kg] least inertia of a joint
     min_inertia = 1e-3
     size = np.maximum(np.abs(np.einsum("kii->i", inertia)) / len(inertia), min_inertia)
-    least = float(np.linalg.eigvalsh(inertia / np.sqrt(np.outer(size, size)))[:, 0].min())
-    added = max(0.0, min_eigenvalue - least) * size
-    softer = tuple(_softer(one, value, size, reference) for one, value in zip(robot.terms, robot.parameters[first:]))
+    minimum = float(np.linalg.eigvalsh(inertia / np.sqrt(np.outer(size, size)))[:, 0].min())
+    added = max(0.0, min_eigenvalue - minimum) * size
+    softer = tuple(_softer(term, value, size, reference) for term, value in zip(robot.terms, robot.parameters[first:]))
     robot = replace(robot, terms=softer)
     if not added.any():
         return robot, added
-    extra = tuple(replace(one, name=f"added {one.name}") for one in standard(["Ia"] * bodies.n))
+    extra = tuple(replace(column, name=f"added {column.name}") for column in standard(["Ia"] * bodies.n))
     return Plant(bodies, (*robot.terms, *extra), np.concatenate([robot.parameters, added])), added
 
 
-def _softer(one: DriveTerm, value: float, size: np.ndarray, reference: Reference) -> DriveTerm:
+def _softer(term: DriveTerm, value: float, size: np.ndarray, reference: Reference) -> DriveTerm:
     """Return a drive term whose sign function is smooth enough to integrate at this control period."""
-    if "v0" not in one.form.settings:
-        return one
+    if "v0" not in term.form.settings:
+        return term
     # of a sign, in Fc h / inertia: Runge and Kutta's bound in 64 steps at `min_eigenvalue` is 0.11
     min_smoothing = 0.25
-    least = min_smoothing * abs(value) * reference.period / size[one.acts[0][0]]
-    return replace(one, settings=(*one.settings[:-1], max(one.settings[-1], least)))
+    minimum = min_smoothing * abs(value) * reference.period / size[term.acts[0][0]]
+    return replace(term, settings=(*term.settings[:-1], max(term.settings[-1], minimum)))
 
 
 def _default(robot: Plant, reference: Reference) -> Controller:
@@ -178,8 +181,11 @@ def track(
     try:
         if loop is None or loop.controller != "identify":
             controller = loop and stated_controller(loop, chain.n)
-        rate = None if controller is None or loop is None else loop.rate
+        if controller is None or loop is None:
+            rate = None
+        else:
+            rate = loop.rate
         replays = (replay(chain, dynamics, case, predictions[case.name], controller, rate) for case in chosen)
-        return {one.name: replace(one, unseen=bool(inputs.unseen)) for one in replays}, ""
+        return {replay.name: replace(replay, unseen=bool(inputs.unseen)) for replay in replays}, ""
     except CalibError as error:
         return {}, str(error)

@@ -17,7 +17,7 @@ from calib.errors import Finding, finding
 from calib.identification.identify import Identification
 from calib.identification.prediction import Score
 from calib.identification.rows import Case
-from calib.identification.torque_errors import COVERED, TorqueIntervals
+from calib.identification.uncertainty.torque_errors import COVERED, TorqueIntervals
 from calib.procedure.findings import Verdict, limit, lines_of, sentence, settle
 from calib.robot.chain import Chain
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.config import Tables
+from calib.dynamics.load_cases import LoadCases
 from calib.errors import UsageError
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.excitation.excited_model import ExcitedModel
@@ -52,9 +53,13 @@ class DesignCondition:
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
-INSTANTS = 1000  # over the period, at which condition numbers are reported
 Progress = Callable[[str], None]
 Search = Callable[..., SearchResult]
+
+# over the period, at which condition numbers are reported
+INSTANTS = 1000
+# index evaluations of the search for the ends of a front of trade-offs
+END_EVALUATIONS = 300
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,101 +139,123 @@ def excite(
 
     Ctrl-C ends the search; the best motion found so far is verified and returned.
     """
-    given = read_inputs(robot, settings, model, limits, base, tip, options, after)
+    inputs = read_inputs(robot, settings, model, limits, base, tip, options, after)
     try:
-        return search_motion(given, settings, map, progress)
+        return search_motion(inputs, settings, map, progress)
     except NothingFeasible as error:
         raise located(error) from error
 
 
+def _silent(stage: str) -> None:
+    """Show no progress."""
+
+
 def search_motion(
-    given: ExcitationInputs, settings: ExcitationSettings, map: Callable = map, progress: Progress | None = None
+    inputs: ExcitationInputs, settings: ExcitationSettings, map: Callable = map, progress: Progress | None = None
 ) -> Designed:
     """Search for an exciting motion of an arm, or of the platform's coordinates of a parallel robot."""
-    say = progress or (lambda words: None)
-    check_start(settings.start, given.chain, given.limits)
-    problem, checked, notes = _excitation_problem(given, settings)
-    condition = _condition_objective(given, settings)
-    goals = read_goals(settings, given, condition)
-    report = lambda done, total, what: say(f"{what} ({done} of {total})")  # noqa: E731
+    show = progress or _silent
+
+    def report(done: int, total: int, stage: str) -> None:
+        show(f"{stage} ({done} of {total})")
+
+    def problem_of_period(period: float) -> ExcitationProblem:
+        problem, _, _ = _excitation_problem(inputs, replace(settings, period=period, shortest=None))
+        return problem
+
+    check_start(settings.start, inputs.chain, inputs.limits)
+    problem, checked, notes = _excitation_problem(inputs, settings)
+    condition = _condition_objective(inputs, settings)
+    goals = read_goals(settings, inputs, condition)
     search = partial(
         design, evaluations=settings.evaluations, method=settings.solver, seed=settings.seed, map=map, report=report
     )
-    found, problem = _searched(problem, goals, settings.starts, search, say)
-    say("verifying")
-    found, problem = _whole(found, problem, settings.rate)
+    motion, problem = _searched(problem, goals, settings.starts, search, show)
+
+    show("verifying")
+    motion, problem = _with_whole_samples(motion, problem, settings.rate)
     with finishing():
-        found, proof = ensured(problem, found, checked)
+        motion, proof = ensured(problem, motion, checked)
     front = None
-    if settings.front and not found.interrupted:
-        with suppress(KeyboardInterrupt):  # the motion is there: what comes besides may be cut short
-            front = _front(problem, given, found, goals, settings.front, settings.evaluations, report)
-            front, found, proof = _nearest_goals(front, problem, goals, given, (found, proof), checked)
+    if settings.front and not motion.interrupted:
+        # the motion exists: what follows may be cut short
+        with suppress(KeyboardInterrupt):
+            front = _front(problem, inputs, motion, goals, settings.front, settings.evaluations, report)
+            front, motion, proof = _nearest_goals(front, problem, goals, inputs, (motion, proof), checked)
     with finishing():
-        played = play(problem.family, found, given, settings)
-        condition_found = _condition_of(given, problem.family, found, settings.repeat)
-        values = _reached(problem, goals, found, given)
+        playback = play(problem.family, motion, inputs, settings)
+        condition_numbers = _condition_of(inputs, problem.family, motion, settings.repeat)
+        values = _reached(problem, goals, motion, inputs)
     outlook, predicted = None, ()
     with suppress(KeyboardInterrupt):
-        say("predicting sigmas of other periods")
-        of_period = lambda period: _excitation_problem(given, replace(settings, period=period, shortest=None))[0]  # noqa: E731
-        outlook, predicted = foretell(given, settings, problem, found, of_period)
-    cut = ("interrupted before any motion met the goals",) if goals and not problem.goals else ()
-    cut += missed(goals, values, given)
-    reached = tuple((*split_goal(goal.words), goal.share, goal.stated(value)) for goal, value in zip(goals, values))
+        show("predicting sigmas of other periods")
+        outlook, predicted = foretell(inputs, settings, problem, motion, problem_of_period)
+
+    goal_notes: tuple[str, ...] = ()
+    if goals and not problem.goals:
+        goal_notes = ("interrupted before any motion met the goals",)
+    goal_notes += missed(goals, values, inputs)
+    reached = []
+    for goal, value in zip(goals, values):
+        name, number = split_goal(goal.words)
+        reached.append((name, number, goal.share, goal.stated(value)))
     return Designed(
-        given,
-        settings,
-        problem,
-        found,
-        proof,
-        condition_found,
-        reached,
-        front,
-        played,
-        (*given.limits.notes, *given.model.notes, *notes, *given.columns.notes, *cut, *played.notes),
-        outlook,
-        predicted,
+        inputs=inputs,
+        settings=settings,
+        problem=problem,
+        found=motion,
+        proof=proof,
+        condition=condition_numbers,
+        goals=tuple(reached),
+        front=front,
+        playback=playback,
+        notes=(*inputs.limits.notes, *inputs.model.notes, *notes, *inputs.columns.notes, *goal_notes, *playback.notes),
+        outlook=outlook,
+        predicted=predicted,
     )
 
 
 def _reached(
-    problem: ExcitationProblem, goals: list[AttainmentGoal], found: SearchResult, given: ExcitationInputs
+    problem: ExcitationProblem, goals: Sequence[AttainmentGoal], found: SearchResult, inputs: ExcitationInputs
 ) -> tuple[float, ...]:
     """Return the goals' values of a motion at `INSTANTS`, with the model's own Coulomb sign."""
     if not goals:
         return ()
     motion = dense_motion(problem.family, found.x, _instants(problem.family, found), found.factor)
-    denser = []  # as the condition's: information of earlier motions counts per sample
+    # as the condition's: information of earlier motions counts per sample
+    scaled_goals = []
     for goal in goals:
-        if isinstance(one := goal.objective, Excitation) and one.existing is not None:
-            goal = replace(goal, objective=replace(one, existing=one.existing * (INSTANTS / problem.samples)))
-        denser.append(goal)
-    Y = given.model.exact.regressor(motion.q, motion.v, motion.a)
-    return tuple(exact_values(replace(problem, goals=tuple(denser)), motion, Y).tolist())
+        objective = goal.objective
+        if isinstance(objective, Excitation) and objective.existing is not None:
+            existing = objective.existing * (INSTANTS / problem.samples)
+            goal = replace(goal, objective=replace(objective, existing=existing))
+        scaled_goals.append(goal)
+    Y = inputs.model.exact.regressor(motion.q, motion.v, motion.a)
+    values = exact_values(replace(problem, goals=tuple(scaled_goals)), motion, Y)
+    return tuple(values.tolist())
 
 
-def _instants(family: Family, found: SearchResult) -> np.ndarray:
-    return family.period * found.factor / INSTANTS * np.arange(INSTANTS)
+def _instants(family: Family, motion: SearchResult) -> np.ndarray:
+    return family.period * motion.factor / INSTANTS * np.arange(INSTANTS)
 
 
 def _excitation_problem(
-    given: ExcitationInputs, settings: ExcitationSettings
+    inputs: ExcitationInputs, settings: ExcitationSettings
 ) -> tuple[ExcitationProblem, tuple[MotionConstraint, ...], tuple[str, ...]]:
     """Return the optimisation problem (condition numbers, limits), the constraints to verify, and notes."""
-    search, checked, notes = _constraints(given.model, given.limits)
-    condition, smooth = _condition_objective(given, settings), given.model.smooth
-    objectives = objectives_of(settings, condition, given)
-    family, coarse = _family(given, settings)
+    constraints, checked, notes = _constraints(inputs.model, inputs.limits)
+    condition = _condition_objective(inputs, settings)
+    objectives = objectives_of(settings, condition, inputs)
+    family, coarse = _family(inputs, settings)
     shortest = settings.shortest or settings.period
     if shortest > settings.period:
         raise UsageError(f"--shortest {shortest:g} s: expected at most the period, {settings.period:g} s")
     problem = ExcitationProblem(
         family,
-        smooth.regressor,
-        smooth.regressor_gradient,
+        inputs.model.smooth.regressor,
+        inputs.model.smooth.regressor_gradient,
         objectives,
-        search,
+        constraints,
         samples=settings.samples,
         stretch=(shortest / settings.period, 1.0),
         coarse=coarse,
@@ -236,80 +263,100 @@ def _excitation_problem(
     return problem, checked, notes
 
 
-def _whole(found: SearchResult, problem: ExcitationProblem, rate: float) -> tuple[SearchResult, ExcitationProblem]:
+def _with_whole_samples(
+    motion: SearchResult, problem: ExcitationProblem, rate: float
+) -> tuple[SearchResult, ExcitationProblem]:
     """Return (motion, problem), both with the period rounded to whole controller samples."""
     if not problem.free_period:
-        return found, problem
-    whole = problem.family.period * rate
-    factor = np.ceil(found.factor * whole - 1e-6) / whole
-    return replace(found, factor=factor), replace(problem, stretch=(factor, factor))
+        return motion, problem
+    samples = problem.family.period * rate
+    factor = np.ceil(motion.factor * samples - 1e-6) / samples
+    return replace(motion, factor=factor), replace(problem, stretch=(factor, factor))
 
 
-def _condition_objective(given: ExcitationInputs, settings: ExcitationSettings) -> Excitation:
+def _condition_objective(inputs: ExcitationInputs, settings: ExcitationSettings) -> Excitation:
     """Return the objective: condition number of the identifiable columns, including earlier motions."""
-    known = None if given.prior is None else given.prior.per_sample(settings.samples, settings.repeat * settings.period)
-    return Excitation("cond", sigmas=given.columns.sigmas, existing=known, columns=given.columns.aimed)
+    existing = None
+    if inputs.prior is not None:
+        existing = inputs.prior.per_sample(settings.samples, settings.repeat * settings.period)
+    columns = inputs.columns
+    return Excitation("cond", sigmas=columns.sigmas, existing=existing, columns=columns.aimed)
 
 
 def _searched(
-    problem: ExcitationProblem, goals: list[AttainmentGoal], starts: int, search: Search, say: Progress
+    problem: ExcitationProblem, goals: Sequence[AttainmentGoal], starts: int, search: Search, show: Progress
 ) -> tuple[SearchResult, ExcitationProblem]:
-    """Return the motion found and the problem solved; a first search sets the goals of the condition numbers."""
-    if not goals or any(isinstance(one.objective, Excitation) for one in goals):
+    """Return the motion and the problem solved; a first search sets the goals of the condition numbers."""
+    has_condition_goal = any(isinstance(goal.objective, Excitation) for goal in goals)
+    if not goals or has_condition_goal:
         problem = replace(problem, goals=tuple(goals))
         return search(problem, starts=starts), problem
     first = search(problem, starts=starts)
     if first.interrupted:
         return first, problem
-    proposed = [AttainmentGoal(one, float(value)) for (one, _), value in zip(problem.objectives, first.values)]
-    plain, problem = problem, replace(problem, goals=(*goals, *proposed))
-    say("goal attainment")
+    proposed = []
+    for (objective, _), value in zip(problem.objectives, first.values):
+        proposed.append(AttainmentGoal(objective, float(value)))
+    attainment = replace(problem, goals=(*goals, *proposed))
+    show("goal attainment")
     try:
-        found = search(problem, starts=max(1, starts // 3), guesses=(first.x,))
+        motion = search(attainment, starts=max(1, starts // 3), guesses=(first.x,))
     except KeyboardInterrupt:
-        return replace(first, interrupted=True), plain
-    spent, seconds = first.evaluations + found.evaluations, first.seconds + found.seconds
-    return replace(found, evaluations=spent, seconds=seconds), problem
+        return replace(first, interrupted=True), problem
+    evaluations = first.evaluations + motion.evaluations
+    seconds = first.seconds + motion.seconds
+    return replace(motion, evaluations=evaluations, seconds=seconds), attainment
 
 
-def _condition_of(given: ExcitationInputs, family: Family, found: SearchResult, repeat: int = 1) -> DesignCondition:
+def _condition_of(inputs: ExcitationInputs, family: Family, found: SearchResult, repeat: int = 1) -> DesignCondition:
     """Return the condition numbers at `INSTANTS` samples over the period, without smoothing of Coulomb friction.
 
     With motions before they are those of all motions together; ``alone`` and ``before`` say what each has by itself.
     """
-    motion, columns = dense_motion(family, found.x, _instants(family, found), found.factor), given.columns
-    Y = given.model.exact.regressor(motion.q, motion.v, motion.a)
-    alone = condition_numbers(Y, columns.sigmas, columns=columns.aimed)
-    if given.prior is None:
-        return DesignCondition(**alone)
-    known = given.prior.per_sample(INSTANTS, repeat * family.period * found.factor)
-    both = condition_numbers(Y, columns.sigmas, known, columns.aimed)
-    before = condition_numbers(0.0 * Y, None, known, columns.aimed)
-    named = {
-        f"{key}_{when}": value if np.isfinite(value) else None  # by itself it need not determine all columns
-        for when, one in (("alone", alone), ("before", before))
-        for key, value in one.items()
-    }
-    return DesignCondition(both["raw"], both["normalised"], **named)
+    columns = inputs.columns
+    motion = dense_motion(family, found.x, _instants(family, found), found.factor)
+    Y = inputs.model.exact.regressor(motion.q, motion.v, motion.a)
+    this_motion = condition_numbers(Y, columns.sigmas, columns=columns.aimed)
+    if inputs.prior is None:
+        return DesignCondition(**this_motion)
+    existing = inputs.prior.per_sample(INSTANTS, repeat * family.period * found.factor)
+    together = condition_numbers(Y, columns.sigmas, existing, columns.aimed)
+    earlier = condition_numbers(0.0 * Y, None, existing, columns.aimed)
+    return DesignCondition(
+        together["raw"],
+        together["normalised"],
+        raw_alone=_finite(this_motion["raw"]),
+        normalised_alone=_finite(this_motion["normalised"]),
+        raw_before=_finite(earlier["raw"]),
+        normalised_before=_finite(earlier["normalised"]),
+    )
 
 
-def _family(given: ExcitationInputs, settings: ExcitationSettings) -> tuple[Family, Family | None]:
+def _finite(condition: float) -> float | None:
+    """Return a condition number; None where a motion by itself does not determine all columns."""
+    if np.isfinite(condition):
+        return condition
+    return None
+
+
+def _family(inputs: ExcitationInputs, settings: ExcitationSettings) -> tuple[Family, Family | None]:
     """Return the family of motions, and for the first search stage a family of fewer harmonics or None."""
-    fixed = {j: value for j, value in given.locked.items() if value is not None}
-    resonance, most = given.limits.resonance, settings.harmonics
-    if most is None:
-        most = HARMONICS if resonance is None else round(0.99 * settings.period * resonance / (2 * np.pi) - 0.5)
-        most = max(2, min(most, HARMONICS))
-    counts = np.full(given.chain.n, most)
-    counts[list(given.locked)] = 0 if settings.family == "fourier" else 1
+    fixed = {j: value for j, value in inputs.locked.items() if value is not None}
+    resonance, harmonics = inputs.limits.resonance, settings.harmonics
+    if harmonics is None:
+        harmonics = HARMONICS
+        if resonance is not None:
+            harmonics = round(0.99 * settings.period * resonance / (2 * np.pi) - 0.5)
+        harmonics = max(2, min(harmonics, HARMONICS))
+    counts = np.full(inputs.chain.n, harmonics)
+    locked = list(inputs.locked)
     if settings.family == "fourier":
-        full, few = (
-            fourier_family(
-                np.minimum(counts, top).tolist(), settings.period, held=fixed, resonance=resonance, rate=settings.rate
-            )
-            for top in (most, COARSE)
-        )
-        return full, few if most > COARSE else None
+        counts[locked] = 0
+        fourier = partial(fourier_family, held=fixed, resonance=resonance, rate=settings.rate)
+        family = fourier(np.minimum(counts, harmonics).tolist(), settings.period)
+        coarse = fourier(np.minimum(counts, COARSE).tolist(), settings.period)
+        return family, coarse if harmonics > COARSE else None
+    counts[locked] = 1
     if settings.family == "bspline":
         return bspline_family(counts.tolist(), settings.period, held=fixed, rate=settings.rate), None
     raise UsageError(f"family '{settings.family}' is unknown; use fourier or bspline")
@@ -323,54 +370,59 @@ def _constraints(
         return limits.constraints, limits.constraints, ()
     margin, notes = limits.margin, ()
     if margin is None:
-        margin = 0.0 if dynamics.friction else GUARD
-        notes = () if dynamics.friction else (f"{GUARD:.0%} of the torque limits are reserved for friction",)
-    torque = [
-        TorqueLimit(
-            one.regressor,
-            one.regressor_gradient,
+        margin = 0.0
+        if not dynamics.friction:
+            margin = GUARD
+            notes = (f"{GUARD:.0%} of the torque limits are reserved for friction",)
+
+    def torque_limit(model: LoadCases) -> TorqueLimit:
+        return TorqueLimit(
+            model.regressor,
+            model.regressor_gradient,
             dynamics.values,
-            one.of_rows(limits.torque),
+            model.of_rows(limits.torque),
             dynamics.covariance,
             limits.deviations,
             margin,
-            one.torque_gradient,
-            rows=one.row_names,
+            model.torque_gradient,
+            rows=model.row_names,
         )
-        for one in (dynamics.smooth, dynamics.exact)
-    ]
-    return (*limits.constraints, torque[0]), (*limits.constraints, torque[1]), notes
+
+    search = (*limits.constraints, torque_limit(dynamics.smooth))
+    checked = (*limits.constraints, torque_limit(dynamics.exact))
+    return search, checked, notes
 
 
 def _nearest_goals(
     front: Front,
     problem: ExcitationProblem,
-    goals: list[AttainmentGoal],
-    given: ExcitationInputs,
+    goals: Sequence[AttainmentGoal],
+    inputs: ExcitationInputs,
     designed: tuple[SearchResult, Verification],
     checked: tuple[MotionConstraint, ...],
 ) -> tuple[Front, SearchResult, Verification]:
     """Return the front, and of its motions and the designed one that which comes nearest to the goals, verified."""
 
-    def missed(run: SearchResult) -> float:
-        return merit(problem, np.array(_reached(problem, goals, run, given)))
+    def distance(motion: SearchResult) -> float:
+        return merit(problem, np.array(_reached(problem, goals, motion, inputs)))
 
+    motion, proof = designed
     if not goals:
-        return front, *designed
-    best = int(np.argmin([missed(run) for run in front.found]))
-    moved = replace(designed[0], x=front.found[best].x, factor=front.found[best].factor)
+        return front, motion, proof
+    index = int(np.argmin([distance(candidate) for candidate in front.found]))
+    nearest = replace(motion, x=front.found[index].x, factor=front.found[index].factor)
     with suppress(NothingFeasible):
-        moved, proof = ensured(problem, moved, checked)
-        if missed(moved) < missed(designed[0]):
-            return replace(front, designed=best), moved, proof
-    return front, *designed
+        nearest, nearest_proof = ensured(problem, nearest, checked)
+        if distance(nearest) < distance(motion):
+            return replace(front, designed=index), nearest, nearest_proof
+    return front, motion, proof
 
 
 def _front(
     problem: ExcitationProblem,
-    given: ExcitationInputs,
-    found: SearchResult,
-    goals: list[AttainmentGoal],
+    inputs: ExcitationInputs,
+    motion: SearchResult,
+    goals: Sequence[AttainmentGoal],
     count: int,
     evaluations: int,
     report: Callable[[int, int, str], None],
@@ -379,10 +431,11 @@ def _front(
 
     Against it stands the condition number among the goals; default the normalised one, or the aim.
     """
-    slack = next((one.objective for one in goals if isinstance(one.objective, TorqueSlack)), None)
-    slack = slack or torque_slack(wrist(given.chain.n), given, "front")
-    stated = (one.objective for one in goals if isinstance(one.objective, Excitation))
-    bare, index = replace(problem, goals=()), next(stated, problem.objectives[-1][0])
-    ends = proposed_goals(bare, [index, slack], starts=1, evaluations=300, guesses=(found.x,))
-    known = [run for _, run in ends]
-    return sweep(problem, index, slack, count, known, found, evaluations=evaluations, report=report)
+    slacks = [goal.objective for goal in goals if isinstance(goal.objective, TorqueSlack)]
+    slack = slacks[0] if slacks else torque_slack(wrist(inputs.chain.n), inputs, "front")
+    conditions = [goal.objective for goal in goals if isinstance(goal.objective, Excitation)]
+    condition = conditions[0] if conditions else problem.objectives[-1][0]
+    without_goals = replace(problem, goals=())
+    ends = proposed_goals(without_goals, [condition, slack], starts=1, evaluations=END_EVALUATIONS, guesses=(motion.x,))
+    runs = [run for _, run in ends]
+    return sweep(problem, condition, slack, count, runs, motion, evaluations=evaluations, report=report)

@@ -22,8 +22,14 @@ from calib.identification.settings import IdentificationSettings, make_model
 from calib.procedure.excitation.limits import MotionLimits, check_bodies
 from calib.robot.chain import Chain
 
-MANY_POSTURES, MAX_UNHELD = 400, 0.5  # postures; share of them that the torque limits need not hold (our choice)
-SMOOTH = 0.05  # [rad/s or m/s] of the Coulomb sign while searching; the figures reported have the model's own
+# postures in which gravity is held against the torque limits
+MANY_POSTURES = 400
+# share of these postures that the torque limits need not hold (our choice)
+MAX_UNHELD = 0.5
+# [rad/s or m/s] of the Coulomb sign while searching; the figures reported have the model's own
+SMOOTH = 0.05
+# inertial parameters of a body
+BODY_PARAMETERS = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,35 +81,46 @@ def read_model(
         return _identified(chain, folder, loads, nominal)
     notes = []
     if options is not None and not _designable(options.torque_rows):
-        notes = [f"designed for motor torques: a motion cannot be designed for rows = '{options.torque_rows.name}'"]
+        notes.append(f"designed for motor torques: a motion cannot be designed for rows = '{options.torque_rows.name}'")
         options = replace(options, torque_rows=MOTOR, sets=())
+    payloads: list[str] = []
     if options is None:
         linear = [joint.kind == "prismatic" for joint in chain.joints]
-        model = IdentificationModel(bodies_of(chain), drives.standard([sets or MOTOR.drives] * chain.n, V0, linear))
+        terms = drives.standard([sets or MOTOR.drives] * chain.n, V0, linear)
+        model = IdentificationModel(bodies_of(chain), terms)
     else:
+        payloads = [*options.payloads]
         model = make_model(chain, options)
-    model, left = _differentiable(model)
-    cases = loads_of(loads, [] if options is None else [*options.payloads], with_payloads=True)
+    model, derivative_notes = _differentiable(model)
+    cases = loads_of(loads, payloads, with_payloads=True)
     if options is not None and options.friction not in ("auto", "standard"):
         notes.append(f"designed for standard friction: the step '{options.friction}' has its terms from recordings")
     if chain.inertias is None and np.isfinite(limits.torque).any():
-        sizes = ", ".join(f"{x:g}" for x in dict.fromkeys(limits.torque.tolist()))
+        sizes = ", ".join(f"{size:g}" for size in dict.fromkeys(limits.torque.tolist()))
         notes.append(f"NOT checked: torques (limits {sizes}), since the robot has no masses; name a model (--model)")
-    known = {} if limits.friction is None else dict(zip(("velocity", "sign"), limits.friction))
-    values, notes = None, notes + left
+    notes += derivative_notes
+
+    values = None
+    friction: dict[str, np.ndarray] = {}
+    if limits.friction is not None:
+        friction = dict(zip(("velocity", "sign"), limits.friction))
     if chain.inertias is not None:
         check_bodies(chain, limits.torque)
-        side = "motor" if model.torque_rows.with_motors else "link"  # where all friction counts, as the limits do
-        drive_values = [
-            known[one.shape][one.acts[0][0]] if one.shape in known and one.side == side else 0.0
-            for one in model.columns
-        ]
-        payloads, said = stated_payloads(options)
-        values = np.concatenate([standard_parameters(chain), *payloads, drive_values])
-        notes += said
-        if not known:
+        # all friction counts where the torque limits do
+        side = "motor" if model.torque_rows.with_motors else "link"
+        drive_values = []
+        for term in model.columns:
+            value = 0.0
+            if term.shape in friction and term.side == side:
+                joint = term.acts[0][0]
+                value = friction[term.shape][joint]
+            drive_values.append(value)
+        payload_values, payload_notes = stated_payloads(options)
+        values = np.concatenate([standard_parameters(chain), *payload_values, drive_values])
+        notes += payload_notes
+        if not friction:
             notes.append("friction is unknown (no model, no [friction]): torques are predicted without it")
-    return excited_model(model, cases, values, bool(known), notes, nominal)
+    return excited_model(model, cases, values, bool(friction), notes, nominal)
 
 
 def check_held(model: ExcitedModel, limits: MotionLimits) -> None:
@@ -111,17 +128,21 @@ def check_held(model: ExcitedModel, limits: MotionLimits) -> None:
     if model.values is None:
         return
     exact, box = model.exact, limits.positions
-    low, high = np.maximum(box.lower, -np.pi), np.minimum(box.upper, np.pi)
+    low = np.maximum(box.lower, -np.pi)
+    high = np.minimum(box.upper, np.pi)
     q = low + (high - low) * np.random.default_rng(0).random((MANY_POSTURES, len(low)))
-    torques, held = exact.regressor(q, 0.0 * q, 0.0 * q) @ model.values, exact.of_rows(limits.torque)
-    beyond = float(np.mean((np.abs(torques) > held).any(axis=1)))
+    torques = exact.regressor(q, 0.0 * q, 0.0 * q) @ model.values
+    held = exact.of_rows(limits.torque)
+    unheld = float(np.mean((np.abs(torques) > held).any(axis=1)))
+    if unheld <= MAX_UNHELD:
+        return
     posture, row = np.unravel_index(np.argmax(np.abs(torques) / held), torques.shape)
-    words = (
-        f"gravity is beyond the torque limits in {beyond:.0%} of the postures: at {exact.row_names[row]} "
+    values = ", ".join(f"{value:.2f}" for value in q[posture])
+    raise UsageError(
+        f"gravity is beyond the torque limits in {unheld:.0%} of the postures: at {exact.row_names[row]} "
         f"{abs(torques[posture, row]):.4g}, limit {held[row]:.4g} N m (or N), in the posture "
-        f"{', '.join(f'{x:.2f}' for x in q[posture])} rad (or m); take a lighter payload, or correct masses or limits"
+        f"{values} rad (or m); take a lighter payload, or correct masses or limits"
     )
-    require(beyond <= MAX_UNHELD, words, UsageError)
 
 
 def _designable(rows: TorqueRows) -> bool:
@@ -131,36 +152,45 @@ def _designable(rows: TorqueRows) -> bool:
 
 def stated_payloads(options: IdentificationSettings | None) -> tuple[list[tuple[float, ...]], list[str]]:
     """Return the ten parameters of each payload, and notes on assumptions about the payloads."""
-    result, notes = [], []
-    for label, load in ({} if options is None else options.payloads).items():
+    parameters: list[tuple[float, ...]] = []
+    notes: list[str] = []
+    if options is None:
+        return parameters, notes
+    for label, load in options.payloads.items():
         if load.mass is None:
             notes.append(f"NOT checked: torques with payload '{label}', whose mass is not stated")
         elif load.com is None:
             notes.append(f"payload '{label}': no com is stated; torques are predicted with its mass at the tip")
-        result.append(replace(load, com=load.com or (0.0, 0.0, 0.0)).parameters or (0.0,) * 10)
-    return result, notes
+        at_tip = replace(load, com=load.com or (0.0, 0.0, 0.0))
+        parameters.append(at_tip.parameters or (0.0,) * BODY_PARAMETERS)
+    return parameters, notes
 
 
-def loads_of(texts: Sequence[str], known: Sequence[str], with_payloads: bool) -> Loads:
-    """Return the payload labels of each run; by default none, then each known one alone if `with_payloads`."""
+def loads_of(texts: Sequence[str], payloads: Sequence[str], with_payloads: bool) -> Loads:
+    """Return the payload labels of each run; by default none, then each payload alone if `with_payloads`."""
     if not texts:
-        return ((), *((label,) for label in known)) if with_payloads and known else (None,)
-    result = []
+        if with_payloads and payloads:
+            return ((), *((label,) for label in payloads))
+        return (None,)
+    runs = []
     for text in texts:
         labels = () if text == "none" else tuple(part.strip() for part in text.split("+"))
         for label in labels:
             where = f"load '{text}': payload"
-            require(known, f"{where} '{label}' is not known: options or model have no payloads", UsageError)
-            one_of(label, known, where, UsageError)
-        result.append(labels)
-    return tuple(result)
+            require(payloads, f"{where} '{label}' is not known: options or model have no payloads", UsageError)
+            one_of(label, payloads, where, UsageError)
+        runs.append(labels)
+    return tuple(runs)
 
 
 def _differentiable(model: IdentificationModel) -> tuple[IdentificationModel, list[str]]:
     """Return the model without drive terms that have no derivatives, and a note that names them."""
-    left = [one.name for one in model.columns if not one.form.slopes]
-    notes = [f"the design does not include friction terms without derivatives: {', '.join(left)}"] if left else []
-    return replace(model, terms=tuple(one for one in model.columns if one.form.slopes)), notes
+    differentiable = tuple(term for term in model.columns if term.form.slopes)
+    omitted = [term.name for term in model.columns if not term.form.slopes]
+    notes = []
+    if omitted:
+        notes.append(f"the design does not include friction terms without derivatives: {', '.join(omitted)}")
+    return replace(model, terms=differentiable), notes
 
 
 def _identified(chain: Chain, folder: Path, texts: Sequence[str], nominal: Chain | None) -> ExcitedModel:
@@ -168,27 +198,31 @@ def _identified(chain: Chain, folder: Path, texts: Sequence[str], nominal: Chain
     refuse_currents(folder, "an excitation within torque limits")
     refuse_other_arm(folder, chain)
     table = read_table(folder)
-    words = f"{folder}/dynamics.json does not fit robot '{chain.name}' ({{}}); identify again"
-    with refused_as(UsageError, (KeyError, TypeError, ValueError, IndexError), words):
-        found = from_table(chain, table)
-    words = f"{folder}: rows 'drive' contain no information on the bodies; give an identification of motor torques"
-    require(found.model.torque_rows.has_bodies, words, UsageError)
-    loads = loads_of(texts, table.get("payloads", ()), with_payloads=False)
-    run = {label for carried in loads for label in carried or ()}
-    values = dict(zip(found.model.names, found.values))
-    carried = [label for label in table.get("payloads", ()) if label in run]
-    bodies = bodies_with(chain, found.model.bodies.gravity, carried)
-    rows = found.model.torque_rows if _designable(found.model.torque_rows) else MOTOR
-    model, notes = _differentiable(IdentificationModel(bodies, found.model.columns, rows))
-    parameters = np.array([values[name] for name in model.names])
+    unfit = f"{folder}/dynamics.json does not fit robot '{chain.name}' ({{}}); identify again"
+    with refused_as(UsageError, (KeyError, TypeError, ValueError, IndexError), unfit):
+        identified = from_table(chain, table)
+    torque_rows = identified.model.torque_rows
+    without_bodies = f"{folder}: rows 'drive' contain no information on the bodies"
+    require(torque_rows.has_bodies, f"{without_bodies}; give an identification of motor torques", UsageError)
+    if not _designable(torque_rows):
+        torque_rows = MOTOR
+
+    payloads = table.get("payloads", ())
+    loads = loads_of(texts, payloads, with_payloads=False)
+    run_labels = {label for run in loads for label in run or ()}
+    bodies = bodies_with(chain, identified.model.bodies.gravity, [label for label in payloads if label in run_labels])
+    model, notes = _differentiable(IdentificationModel(bodies, identified.model.columns, torque_rows))
+    value_of = dict(zip(identified.model.names, identified.values))
+    parameters = np.array([value_of[name] for name in model.names])
     if not np.isfinite(parameters).all():
         name = model.names[int(np.argmin(np.isfinite(parameters)))]
         raise UsageError(f"{folder}: parameter {name} of the model is not finite")
-    made = excited_model(model, loads, parameters, any(one.shape == "sign" for one in model.columns), notes, nominal)
-    covariance = covariance_of(folder / COVARIANCE, made.exact)
+    friction = any(term.shape == "sign" for term in model.columns)
+    excited = excited_model(model, loads, parameters, friction, notes, nominal)
+    covariance = covariance_of(folder / COVARIANCE, excited.exact)
     if covariance is None:
         notes.append(f"{folder}/covariance.csv has other columns than the design: no torque margin for uncertainty")
-    return replace(made, covariance=covariance, notes=tuple(notes))
+    return replace(excited, covariance=covariance, notes=tuple(notes))
 
 
 def bodies_with(chain: Chain, gravity: np.ndarray, payloads: Sequence[str]) -> Bodies:
@@ -201,8 +235,13 @@ def bodies_with(chain: Chain, gravity: np.ndarray, payloads: Sequence[str]) -> B
 
 def moved_to(chain: Chain, model: IdentificationModel) -> IdentificationModel:
     """Return a model, payloads included, on another geometry of its arm."""
-    payloads = [label for label, c in zip(model.bodies.labels, model.bodies.coordinates) if c < 0]
-    return replace(model, bodies=bodies_with(chain, model.bodies.gravity, payloads))
+    return replace(model, bodies=bodies_with(chain, model.bodies.gravity, _payloads(model)))
+
+
+def _payloads(model: IdentificationModel) -> list[str]:
+    """Return the labels of the payloads of a model, whose bodies move with no joint's coordinate."""
+    bodies = zip(model.bodies.labels, model.bodies.coordinates)
+    return [label for label, coordinate in bodies if coordinate < 0]
 
 
 def excited_model(
@@ -221,24 +260,41 @@ def excited_model(
         friction: whether friction is among the values.
         nominal: the arm that base columns are chosen on, as by the identification; None: the model's own.
     """
-    smoothed = (
-        replace(one, settings=(max(SMOOTH, one.settings[0]),)) if one.shape == "sign" else one for one in model.terms
-    )
-    smooth = replace(model, terms=tuple(smoothed))
-    there = None if nominal is None else moved_to(nominal, model)
-    found = base_parameters.find(model, loads=loads, nominal=there)
-    chosen = None if values is None else found.transform @ values
-    own = {model.names[k].removeprefix(name) for k in found.kept for name in STANDARD}
-    lost = [label for label, c in zip(model.bodies.labels, model.bodies.coordinates) if c < 0 and label not in own]
+    smooth_terms = []
+    for term in model.terms:
+        if term.shape == "sign":
+            term = replace(term, settings=(max(SMOOTH, term.settings[0]),))
+        smooth_terms.append(term)
+    smooth = replace(model, terms=tuple(smooth_terms))
+    nominal_model = None
+    if nominal is not None:
+        nominal_model = moved_to(nominal, model)
+    base = base_parameters.find(model, loads=loads, nominal=nominal_model)
+    base_values = None
+    if values is not None:
+        base_values = base.transform @ values
+    # a body without a parameter of its own among the base columns cannot be identified
+    identifiable = {model.names[k].removeprefix(name) for k in base.kept for name in STANDARD}
+    lost = [label for label in _payloads(model) if label not in identifiable]
     if lost:
         notes = (*notes, f"payload {', '.join(lost)}: not identifiable from these loads; run others, too: --load none")
     return ExcitedModel(
-        LoadCases(smooth, found, loads), LoadCases(model, found, loads), chosen, None, friction, tuple(notes)
+        smooth=LoadCases(smooth, base, loads),
+        exact=LoadCases(model, base, loads),
+        values=base_values,
+        covariance=None,
+        friction=friction,
+        notes=tuple(notes),
     )
 
 
 def covariance_of(path: Path, model: LoadCases) -> np.ndarray | None:
     """Return the covariance of a model's columns; None if the file has other columns."""
-    known, covariance = read_covariance(path) if path.is_file() else ((), np.empty((0, 0)))
-    index = places(model.names, known, model.model.names)
-    return None if index is None else covariance[np.ix_(index, index)]
+    names: Sequence[str] = ()
+    covariance = np.empty((0, 0))
+    if path.is_file():
+        names, covariance = read_covariance(path)
+    index = places(model.names, names, model.model.names)
+    if index is None:
+        return None
+    return covariance[np.ix_(index, index)]

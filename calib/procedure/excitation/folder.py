@@ -24,30 +24,27 @@ from calib.robot import description
 from calib.robot.chain import Chain
 from calib.robot.tables import dumps
 from calib.units import headings, motion_units
+from trajectories.design.pareto import Front
 from trajectories.design.verify import dense_motion
 from trajectories.messages import joint_trajectory, to_json, to_yaml
 from trajectories.setpoints import Setpoints
 from trajectories.timing.time_scaling import ACTIVE
 
+# files that identify the folder of an earlier run
 DESIGN = (METRICS, coefficients.SAMPLES, coefficients.NAME)
 PLAN = (METRICS, coefficients.PLANNED, "trajectory.yaml", "trajectory.json")
-"""Files that identify the folder of an earlier run."""
+FRONT = "front.csv"
+APPROACH = "approach.csv"
 REHEARSAL = "rehearsal.csv"
 FIGURES = tuple(f"plot_{name}.png" for name in ("motion", "path", "history", "front", "profile", "outlook"))
-ALL = (
-    *DESIGN,
-    *PLAN[1:],
-    coefficients.ARM,
-    coefficients.RUN,
-    prediction.NAME,
-    "front.csv",
-    "approach.csv",
-    REHEARSAL,
-    *FIGURES,
-)
-"""Files of an earlier run that a new one replaces."""
-KINDS = ("position", "velocity", "acceleration", "torque")  # of limits, as `motion_units` has them
-MESSAGES = 100.0  # points per second of the ROS message, whose controllers interpolate (our choice)
+# files of an earlier run that a new one replaces
+ALL = (*DESIGN, *PLAN[1:], coefficients.ARM, coefficients.RUN, prediction.NAME, FRONT, APPROACH, REHEARSAL, *FIGURES)
+# of limits, as `motion_units` has them
+KINDS = ("position", "velocity", "acceleration", "torque")
+# points per second of the ROS message, whose controllers interpolate (our choice)
+MESSAGES = 100.0
+# degree of splines, where a family does not state it
+DEFAULT_DEGREE = 5
 
 
 def check_design_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
@@ -68,10 +65,10 @@ def write_design(designed: Designed, out: Path, draw: Callable[[Designed, Path],
     """
 
     def write(folder: Path) -> None:
-        period, played = one_period(designed), designed.playback
+        settings, family, playback = designed.settings, designed.family, designed.playback
         chain, bounds = designed.inputs.chain, designed.inputs.limits.bounds
+        period = one_period(designed)
         _write_setpoints(period, bounds, folder / coefficients.SAMPLES)
-        settings, family = designed.settings, designed.family
         motion = Periodic(
             chain.joint_names,
             tuple(joint.kind for joint in chain.joints),
@@ -80,25 +77,32 @@ def write_design(designed: Designed, out: Path, draw: Callable[[Designed, Path],
             settings.repeat,
             settings.family,
             tuple(family.coefficients(designed.found.x)),
-            getattr(family, "degree", 5),
+            getattr(family, "degree", DEFAULT_DEGREE),
         )
-        files.write(folder / coefficients.NAME, dumps(coefficients.table(motion, chain.name, bounds.lines())))
-        if played.approach is not None or played.repeat > 1:
-            _write_setpoints(played.run, bounds, folder / coefficients.RUN)
+        table = coefficients.table(motion, chain.name, bounds.lines())
+        files.write(folder / coefficients.NAME, dumps(table))
+        if playback.approach is not None or playback.repeat > 1:
+            _write_setpoints(playback.run, bounds, folder / coefficients.RUN)
         _write_arm(chain, designed.inputs.source, folder)
-        _write_besides(played, bounds, folder)
-        _write_messages(played.run, bounds, folder, max(1, round(period.rate / MESSAGES)))
+        _write_approach_and_rehearsal(playback, bounds, folder)
+        _write_messages(playback.run, bounds, folder, max(1, round(period.rate / MESSAGES)))
         if draw is not None:
             draw(designed, folder)
         if designed.front is not None and len(designed.front.values):
-            front = designed.front
-            rows = [[*map(float, row), bool(front.best[k]), k == front.designed] for k, row in enumerate(front.values)]
-            files.write_table(folder / "front.csv", [*front.names, "not dominated", "designed"], rows)
+            _write_front(designed.front, folder)
         if designed.outlook is not None:
             prediction.write(designed.predicted, folder)
         files.write_json(folder / METRICS, design_metrics(designed))
 
     return write_staged(out, ALL, write)
+
+
+def _write_front(front: Front, folder: Path) -> None:
+    """Write the trade-offs, one row per motion."""
+    rows = []
+    for k, values in enumerate(front.values):
+        rows.append([*map(float, values), bool(front.best[k]), k == front.designed])
+    files.write_table(folder / FRONT, [*front.names, "not dominated", "designed"], rows)
 
 
 def write_plan(planned: Planned, out: Path, draw: Callable[[Planned, Path], None] | None = None) -> Path:
@@ -112,7 +116,7 @@ def write_plan(planned: Planned, out: Path, draw: Callable[[Planned, Path], None
         _write_setpoints(planned.track, planned.bounds, folder / coefficients.PLANNED)
         _write_arm(planned.chain, planned.source, folder)
         _write_messages(planned.track, planned.bounds, folder)
-        _write_besides(planned, planned.bounds, folder)
+        _write_approach_and_rehearsal(planned, planned.bounds, folder)
         if draw is not None:
             draw(planned, folder)
         files.write_json(folder / METRICS, plan_metrics(planned))
@@ -128,23 +132,30 @@ def _write_arm(chain: Chain, source: str, folder: Path) -> None:
 def _write_setpoints(track: Setpoints, bounds: MotionBounds, path: Path) -> Path:
     """Write t, q, v, a and, if known, tau, one row per controller sample; comments state the limits."""
     bounds.check(track)
-    parts = {"q": track.q, "v": track.v, "a": track.a} | ({} if track.tau is None else {"tau": track.tau})
-    header = ["t [s]", *(name for letter in parts for name in headings(letter, bounds.joints))]
-    return files.write_numbers(path, header, np.column_stack([track.times, *parts.values()]), notes=bounds.lines())
+    columns = {"q": track.q, "v": track.v, "a": track.a}
+    if track.tau is not None:
+        columns["tau"] = track.tau
+    header = ["t [s]"]
+    for letter in columns:
+        header += headings(letter, bounds.joints)
+    table = np.column_stack([track.times, *columns.values()])
+    return files.write_numbers(path, header, table, notes=bounds.lines())
 
 
-def _write_besides(played: Playback | Planned, bounds: MotionBounds, folder: Path) -> None:
+def _write_approach_and_rehearsal(motion: Playback | Planned, bounds: MotionBounds, folder: Path) -> None:
     """Write ``approach.csv`` and ``rehearsal.csv`` if the motion has an approach and a rehearsal."""
-    for name, track in (("approach.csv", played.approach), (REHEARSAL, played.rehearsal)):
-        if track is not None:
-            _write_setpoints(track, bounds, folder / name)
+    if motion.approach is not None:
+        _write_setpoints(motion.approach, bounds, folder / APPROACH)
+    if motion.rehearsal is not None:
+        _write_setpoints(motion.rehearsal, bounds, folder / REHEARSAL)
 
 
 def _write_messages(track: Setpoints, bounds: MotionBounds, folder: Path, every: int = 1) -> None:
     """Write ``trajectory.json`` and ``trajectory.yaml`` (trajectory_msgs/JointTrajectory), every `every`-th sample."""
     bounds.check(track)
     message = joint_trajectory(track, [joint.name for joint in bounds.joints], every)
-    files.write(folder / "trajectory.json", to_json(message))  # which has no place for remarks
+    # JSON has no remarks
+    files.write(folder / "trajectory.json", to_json(message))
     files.write(folder / "trajectory.yaml", files.remarks(bounds.lines()) + to_yaml(message))
 
 
@@ -158,91 +169,122 @@ def one_period(designed: Designed, rate: float | None = None) -> Setpoints:
 
 def design_metrics(designed: Designed) -> dict[str, Any]:
     """Return the content of ``metrics.json`` of a designed motion."""
-    found, given, settings, family = designed.found, designed.inputs, designed.settings, designed.family
-    played = designed.playback
+    motion, inputs, settings = designed.found, designed.inputs, designed.settings
+    family, playback, proof = designed.family, designed.playback, designed.proof
+    margins = {}
+    for name, margin in proof.worst.items():
+        margins[name] = plain(margin) | {"at": margin.label}
+    goals = {}
+    for name, goal, weight, value in designed.goals:
+        goals[name] = {"goal": goal, "weight": weight, "reached": value}
+    existing = None
+    if inputs.prior is not None:
+        existing = {"names": inputs.prior.names, "seconds": inputs.prior.seconds}
+    setting = {
+        "robot": inputs.chain.name,
+        "family": settings.family,
+        "period": designed.period,
+        "harmonics": getattr(family, "harmonics", getattr(family, "counts", ())),
+        "columns": inputs.columns.aimed_names,
+        "samples": designed.problem.samples,
+        "samples_reported": INSTANTS,
+        "instants_verified": proof.instants,
+        "rate": settings.rate,
+        "interrupted": motion.interrupted,
+        "held": designed.locked,
+    }
+    seconds = {
+        "repeat": playback.repeat,
+        "seconds": playback.run.duration,
+        "approach": _seconds(playback.approach),
+        "rehearsal": _seconds(playback.rehearsal),
+    }
     return plain(
         {
             "condition_number": designed.condition.table(),
-            "objective": found.merit,
-            "feasible": designed.proof.feasible,
-            "margins": {name: plain(one) | {"at": one.label} for name, one in designed.proof.worst.items()},
-            "seconds": found.seconds,
-            "evaluations": found.evaluations,
-            "feasible_evaluations": found.feasible,
-            "history": found.history,
-            "goals": {name: {"goal": goal, "weight": w, "reached": value} for name, goal, w, value in designed.goals},
-            "setting": {
-                "robot": given.chain.name,
-                "family": settings.family,
-                "period": designed.period,
-                "harmonics": getattr(family, "harmonics", getattr(family, "counts", ())),
-                "columns": given.columns.aimed_names,
-                "samples": designed.problem.samples,
-                "samples_reported": INSTANTS,
-                "instants_verified": designed.proof.instants,
-                "rate": settings.rate,
-                "interrupted": found.interrupted,
-                "held": designed.locked,
-            },
-            "existing": None if given.prior is None else {"names": given.prior.names, "seconds": given.prior.seconds},
-            "playback": {
-                "repeat": played.repeat,
-                "seconds": played.run.duration,
-                "approach": _seconds(played.approach),
-                "rehearsal": _seconds(played.rehearsal),
-            },
+            "objective": motion.merit,
+            "feasible": proof.feasible,
+            "margins": margins,
+            "seconds": motion.seconds,
+            "evaluations": motion.evaluations,
+            "feasible_evaluations": motion.feasible,
+            "history": motion.history,
+            "goals": goals,
+            "setting": setting,
+            "existing": existing,
+            "playback": seconds,
             "prediction": designed.outlook,
-            "limits": given.limits.bounds.lines(),
+            "limits": inputs.limits.bounds.lines(),
             "notes": designed.notes,
         }
     )
 
 
 def _seconds(track: Setpoints | None) -> float | None:
-    return None if track is None else track.duration
+    if track is None:
+        return None
+    return track.duration
 
 
-def _pair(raw: float | None, normalised: float | None) -> str:
-    return "no finite one" if raw is None or normalised is None else f"{raw:.4g} raw, {normalised:.4g} normalised"
+def _condition_text(raw: float | None, normalised: float | None) -> str:
+    if raw is None or normalised is None:
+        return "no finite one"
+    return f"{raw:.4g} raw, {normalised:.4g} normalised"
 
 
 def design_lines(designed: Designed) -> list[str]:
     """Return the lines that `calib excite` prints: condition number, goals, margins, limits, notes."""
-    found, cond = designed.found, designed.condition
-    columns, prior = len(designed.inputs.columns.aimed_names), designed.inputs.prior
-    together = (
-        []
-        if prior is None
-        else [
-            f"together with {', '.join(prior.names)}, "
-            f"which alone has {_pair(cond.raw_before, cond.normalised_before)}; "
-            f"this motion alone has {_pair(cond.raw_alone, cond.normalised_alone)}"
-        ]
+    motion, condition, proof, playback = designed.found, designed.condition, designed.proof, designed.playback
+    column_count = len(designed.inputs.columns.aimed_names)
+    prior = designed.inputs.prior
+    lines = []
+    if motion.interrupted:
+        lines.append("interrupted: this is the best motion so far")
+    lines.append(
+        f"condition number of {column_count} columns: {condition.raw:.4g} raw, {condition.normalised:.4g} normalised "
+        f"({designed.settings.family}, period {designed.period:g} s)"
     )
-    result = [
-        *(["interrupted: this is the best motion so far"] if found.interrupted else []),
-        f"condition number of {columns} columns: {cond.raw:.4g} raw, {cond.normalised:.4g} normalised "
-        f"({designed.settings.family}, period {designed.period:g} s)",
-        *together,
-        *(f"goal {name}: {value:.4g} (asked: {goal:.4g})" for name, goal, _, value in designed.goals),
-        f"{found.evaluations} evaluations, {found.feasible:.0%} of them feasible, {found.seconds:.1f} s",
-        f"all limits are respected, at {designed.proof.instants} instants and between them; smallest margins: "
-        + "; ".join(
-            f"{name} {one.margin:.3g} {one.unit} ({one.label}, {one.time:.2f} s)"
-            for name, one in designed.proof.worst.items()
-        ),
-    ]
-    played = designed.playback
-    parts = ["the approach"] if played.approach is not None else []
-    parts.append(counted(played.repeat, "period"))
-    result.append(f"to run: {' and '.join(parts)}, {played.run.duration:.1f} s")
-    result += [] if designed.outlook is None else prediction.lines(designed.outlook, designed.predicted)
-    return [*result, *designed.inputs.limits.bounds.lines(), *(f"note: {note}" for note in designed.notes)]
+    if prior is not None:
+        before = _condition_text(condition.raw_before, condition.normalised_before)
+        this_motion = _condition_text(condition.raw_alone, condition.normalised_alone)
+        lines.append(
+            f"together with {', '.join(prior.names)}, which alone has {before}; this motion alone has {this_motion}"
+        )
+    for name, goal, _, value in designed.goals:
+        lines.append(f"goal {name}: {value:.4g} (asked: {goal:.4g})")
+    lines.append(f"{motion.evaluations} evaluations, {motion.feasible:.0%} of them feasible, {motion.seconds:.1f} s")
+    margins = []
+    for name, margin in proof.worst.items():
+        margins.append(f"{name} {margin.margin:.3g} {margin.unit} ({margin.label}, {margin.time:.2f} s)")
+    lines.append(
+        f"all limits are respected, at {proof.instants} instants and between them; smallest margins: "
+        + "; ".join(margins)
+    )
+    parts = [counted(playback.repeat, "period")]
+    if playback.approach is not None:
+        parts.insert(0, "the approach")
+    lines.append(f"to run: {' and '.join(parts)}, {playback.run.duration:.1f} s")
+    if designed.outlook is not None:
+        lines += prediction.lines(designed.outlook, designed.predicted)
+    lines += designed.inputs.limits.bounds.lines()
+    return [*lines, *(f"note: {note}" for note in designed.notes)]
 
 
 def plan_metrics(planned: Planned) -> dict[str, Any]:
     """Return the content of ``metrics.json`` of a planned motion."""
-    shaped, deviation = planned.shaped, planned.deviation
+    timings, shaped = planned.timings, planned.shaped
+    line_deviation = None
+    if planned.deviation is not None:
+        line_deviation = dict(zip(("position", "orientation"), planned.deviation.tolist()))
+    shortened = None
+    if shaped is not None:
+        shortened = {
+            "before": shaped.before,
+            "after": shaped.after,
+            "evaluations": shaped.evaluations,
+            "refused": shaped.refused,
+            "parameters": shaped.phi,
+        }
     return plain(
         {
             "feasible": True,
@@ -250,23 +292,15 @@ def plan_metrics(planned: Planned) -> dict[str, Any]:
             "margins": _margins(planned),
             "active_share": planned.active_share,
             "active_within": ACTIVE,
-            "iterations": sum(one.iterations for one in planned.timings),
-            "tightened": max(one.tightened for one in planned.timings),
-            "history": [one.history for one in planned.timings],
-            "segments": [one.duration for one in planned.timings],
+            "iterations": sum(timing.iterations for timing in timings),
+            "tightened": max(timing.tightened for timing in timings),
+            "history": [timing.history for timing in timings],
+            "segments": [timing.duration for timing in timings],
             "rate": planned.track.rate,
             "samples": len(planned.track),
             "samples_verified": _verified(planned),
-            "line_deviation": None if deviation is None else dict(zip(("position", "orientation"), deviation.tolist())),
-            "shortened": None
-            if shaped is None
-            else {
-                "before": shaped.before,
-                "after": shaped.after,
-                "evaluations": shaped.evaluations,
-                "refused": shaped.refused,
-                "parameters": shaped.phi,
-            },
+            "line_deviation": line_deviation,
+            "shortened": shortened,
             "torque_sigma": planned.sigma,
             "torque_limits": planned.limits.torque,
             "approach": _seconds(planned.approach),
@@ -278,22 +312,23 @@ def plan_metrics(planned: Planned) -> dict[str, Any]:
 
 def plan_lines(planned: Planned) -> list[str]:
     """Return the lines that `calib plan` prints: duration, margins, limits, notes."""
-    words = [
+    lines = [
         f"{planned.track.duration:.3f} s at {planned.track.rate:g} Hz; closer than {ACTIVE:.0%} to a limit for "
         f"{planned.active_share:.1%} of the time; all limits are respected at "
         f"{_verified(planned)} instants",
         "smallest margins:",
     ]
-    for name, one in _margins(planned).items():
-        words.append(f"  {name:12} {one.margin:.4g} {one.unit} ({one.at})")
+    for name, smallest in _margins(planned).items():
+        lines.append(f"  {name:12} {smallest.margin:.4g} {smallest.unit} ({smallest.at})")
     if planned.sigma is not None:
-        free = ", ".join(f"{x:.3g}" for x in planned.sigma)
-        words.append(f"torque limits are reduced for the model's uncertainty; one sigma of each joint: {free} N m")
+        sigmas = ", ".join(f"{sigma:.3g}" for sigma in planned.sigma)
+        lines.append(f"torque limits are reduced for the model's uncertainty; one sigma of each joint: {sigmas} N m")
     if planned.shaped is not None:
-        words.append(f"path shape optimised: {planned.shaped.before:.3f} s before, {planned.shaped.after:.3f} s after")
+        lines.append(f"path shape optimised: {planned.shaped.before:.3f} s before, {planned.shaped.after:.3f} s after")
     if planned.deviation is not None:
-        words.append(f"largest deviation of the tool from its straight lines: {1e6 * planned.deviation[0]:.2g} µm")
-    return [*words, *planned.bounds.lines(), *(f"note: {note}" for note in planned.notes)]
+        lines.append(f"largest deviation of the tool from its straight lines: {1e6 * planned.deviation[0]:.2g} µm")
+    lines += planned.bounds.lines()
+    return [*lines, *(f"note: {note}" for note in planned.notes)]
 
 
 @dataclass(frozen=True)
@@ -308,19 +343,28 @@ class _PlanMargin:
 
 
 def _verified(planned: Planned) -> int:
-    return sum(len(one.sampled.s) for one in planned.timings)
+    return sum(len(timing.sampled.s) for timing in planned.timings)
 
 
 def _margins(planned: Planned) -> dict[str, _PlanMargin]:
     """Return the smallest margin to each limit, by name."""
-    used = {name: np.concatenate([one.used[name] for one in planned.timings]) for name in planned.timings[0].used}
-    left = {name: 1.0 - shares.max(axis=0) for name, shares in used.items()}  # shares of the limits
     result = {}
-    for name, joints in (({} if planned.margins is None else {"position": planned.margins}) | left).items():
-        j = int(np.argmin(joints))
-        joint, size = planned.chain.joints[j], planned.upper - planned.lower
-        share = joints[j] / size[j] if name == "position" else joints[j]
-        margin = joints[j] if name == "position" else joints[j] * getattr(planned.limits, name)[j]
-        unit = motion_units([joint.kind])[KINDS.index(name)]
-        result[name] = _PlanMargin(float(margin), unit, joint.name, float(share), joints.tolist())
+    if planned.margins is not None:
+        j = int(np.argmin(planned.margins))
+        size = planned.upper - planned.lower
+        result["position"] = _margin(planned, "position", planned.margins, planned.margins[j] / size[j], 1.0)
+    for name in planned.timings[0].used:
+        used = np.concatenate([timing.used[name] for timing in planned.timings])
+        # as shares of the limits
+        margins = 1.0 - used.max(axis=0)
+        j = int(np.argmin(margins))
+        result[name] = _margin(planned, name, margins, margins[j], getattr(planned.limits, name)[j])
     return result
+
+
+def _margin(planned: Planned, name: str, margins: np.ndarray, share: float, unit_size: float) -> _PlanMargin:
+    """Return the smallest of the margins (n,) of joints to a limit; `unit_size`: what a margin of 1 is."""
+    j = int(np.argmin(margins))
+    joint = planned.chain.joints[j]
+    unit = motion_units([joint.kind])[KINDS.index(name)]
+    return _PlanMargin(float(margins[j] * unit_size), unit, joint.name, float(share), margins.tolist())

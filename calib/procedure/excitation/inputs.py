@@ -1,19 +1,19 @@
 """Inputs of an excitation: model to identify, limits, locked joints, columns, and earlier motions to include."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 
 from calib.config import Tables
 from calib.dynamics.base import columns_at_rest, standard_name
 from calib.errors import UsageError, one_of, refused_as, require
-from calib.extensions import Point
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.excitation.excited_model import ExcitedModel, check_held, read_model
+from calib.procedure.excitation.geometry_spread import geometry_spread
 from calib.procedure.excitation.limits import MotionLimits, read_motion_limits
 from calib.procedure.excitation.prior_motions import GeometrySpread, PriorMotions, designed_orders, read_prior
 from calib.procedure.excitation.settings import ExcitationSettings
@@ -21,10 +21,6 @@ from calib.procedure.kinematic_stage.inputs import load_rigid
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
 from trajectories.constraints import BoxLimit
-
-GEOMETRY_SPREAD: Point[Callable[..., Any]] = Point(
-    "geometry_spread", "see `calib.procedure.excitation.prior_motions.GeometrySpread`"
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,8 +125,7 @@ def read_inputs(
     check_held(dynamics, known)
     noise = None if known.noise is None or after is not None else known.noise[dynamics.exact.joint_of_row]
     locked = _read_locked(settings.lock, chain, known.positions)
-    spreads = [find(robot, source, chain, dynamics, after) for find in GEOMETRY_SPREAD.all()]
-    spread = next(iter(spreads), None)
+    spread = geometry_spread(robot, source, chain, dynamics, after)
     prior = read_prior(settings.existing, dynamics, chain, after, noise, spread)
     columns = selected_columns(identifiable(dynamics, chain, locked, prior, noise), dynamics, settings, model)
     return ExcitationInputs(chain, known, dynamics, locked, columns, prior, spread, found.source or str(source))

@@ -29,7 +29,7 @@ waypoints keeps what is stated only. Besides, per joint or ``all``::
     resonance = "5 Hz"               # the smallest resonance: all frequencies of the motion stay below
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -56,11 +56,30 @@ from trajectories.setpoints import Setpoints
 # [rad or m, s, N m or N] a number above is no limit of a joint; direct drives of fast robots reach 1300 (our choice)
 MAX = {"velocity": 100.0, "acceleration": 3000.0, "torque": 1e5, "effort": 1e5}
 EXAMPLES = {"velocity": '[velocity] all = "90 deg/s"', "acceleration": "[acceleration] all = 5.0"}
-MAX_EXCESS = 0.01  # of a limit, by which a written sample may be beyond it: rounding to whole samples
-DEFAULT_NOISE = 0.01  # of the torque limits: what no parameter explains, where nothing is stated (our choice)
-DEFAULT_RISE = 2.0  # [1/s] default acceleration limit over the speed limit: full speed in half a second (our choice)
+# of a limit, by which a written sample may exceed it: rounding to whole samples
+MAX_EXCESS = 0.01
+# of the torque limits: error that no parameter explains, where nothing is stated (our choice)
+DEFAULT_NOISE = 0.01
+# [1/s] default acceleration limit over the speed limit: full speed in half a second (our choice)
+DEFAULT_RISE = 2.0
 DEFAULT_ORIGIN = f"default, {DEFAULT_RISE:g}/s times the speed limit, since none is stated"
+# standard deviations of the predicted torque that are kept from its limit by default (our choice)
+DEFAULT_DEVIATIONS = 2.0
 PLACE = "in the limits file (--limits, or [dynamics] limits in session.toml)"
+# keys of [torque] that are no joint's
+MARGINS = ("margin", "deviations")
+# tables of the limits file by the name of the constraint
+STATED_IN = {
+    "position": "[joints]",
+    "velocity": "[velocity]",
+    "acceleration": "[acceleration]",
+    "jerk": "[jerk]",
+    "torque": "[torque] (a joint's, or margin)",
+    "workspace": "[target] (height, axis_distance) and [[point]]",
+    "clearance": "[collision] (margin, radius, floor) and [[obstacle]]",
+}
+# constraints of pose selection that `trajectories.places.Workspace` keeps
+OF_WORKSPACE = ("height", "distance from the axis")
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,38 +106,56 @@ class MotionBounds:
     place: str = f"{PLACE}, such as {{}}"
 
     def __post_init__(self) -> None:
-        sizes = {"effort": self.torque, "velocity": self.velocity, "acceleration": self.acceleration}
-        for what, kinds in (("velocity", ("velocity",)), ("acceleration", ("acceleration", "effort"))):
-            free = np.all([sizes[kind] > MAX[kind] for kind in kinds], axis=0)
-            if not free.any():
-                continue
-            names = self._named(joint for joint, one in zip(self.joints, free) if one)
-            written = [words for joint, one in zip(self.joints, free) if one for words in joint.unstated]
-            written += [f"{kind} {x:g}" for kind in kinds for x in sizes[kind][free] if np.isfinite(x)]
-            wrong = [words for words in dict.fromkeys(written) if words.split()[0] in kinds]
-            found = f" ({', '.join(wrong)} is no limit)" if wrong else ""
-            speed = what == "velocity"
-            other = "" if speed else "; efforts count where masses are known or a model is named (--model)"
-            raise UsageError(
-                f"{self.robot}: no limit for the {'speed' if speed else what} of {names}{found}; without it no motion "
-                f"is written; state it {self.place.format(EXAMPLES[what])}{other}"
-            )
+        self._require("velocity", {"velocity": self.velocity}, "speed", "")
+        self._require(
+            "acceleration",
+            {"acceleration": self.acceleration, "effort": self.torque},
+            "acceleration",
+            "; efforts count where masses are known or a model is named (--model)",
+        )
 
-    def _named(self, joints: Iterable[Joint]) -> str:
-        names = [joint.name for joint in joints]
-        return "all joints" if len(names) == len(self.joints) else ", ".join(names)
+    def _require(self, example: str, limits: Mapping[str, np.ndarray], quantity: str, hint: str) -> None:
+        """Raise an error if a joint has none of the limits: naming the joints, and what to state."""
+        unlimited = np.all([sizes > MAX[kind] for kind, sizes in limits.items()], axis=0)
+        if not unlimited.any():
+            return
+        joints = [joint for joint, is_unlimited in zip(self.joints, unlimited) if is_unlimited]
+        # numbers that are stated, and too large for a limit
+        numbers: list[str] = []
+        for joint in joints:
+            numbers += joint.unstated
+        for kind, sizes in limits.items():
+            numbers += [f"{kind} {size:g}" for size in sizes[unlimited] if np.isfinite(size)]
+        wrong = [number for number in dict.fromkeys(numbers) if number.split()[0] in limits]
+        remark = f" ({', '.join(wrong)} is no limit)" if wrong else ""
+        raise UsageError(
+            f"{self.robot}: no limit for the {quantity} of {self._named(joints)}{remark}; without it no motion "
+            f"is written; state it {self.place.format(EXAMPLES[example])}{hint}"
+        )
+
+    def _named(self, joints: Sequence[Joint]) -> str:
+        """Return the joints' names."""
+        if len(joints) == len(self.joints):
+            return "all joints"
+        return ", ".join(joint.name for joint in joints)
 
     def lines(self) -> list[str]:
         """Return the limits as text lines for file headers: velocity, acceleration, torque."""
-        result = []
-        for order, kind in enumerate(("velocity", "acceleration", "torque"), 1):
-            by_size: dict[str, list[Joint]] = {}
-            for joint, size in zip(self.joints, getattr(self, kind)):
-                words = f"{size:.4g} {motion_units([joint.kind])[order]}" if size <= MAX[kind] else "none"
-                by_size.setdefault(words, []).append(joint)
-            sizes = "; ".join(f"{words} {self._named(joints)}" for words, joints in by_size.items())
-            result.append(f"{kind} limits: " + ("none" if [*by_size] == ["none"] else f"{sizes} ({self.origin[kind]})"))
-        return result
+        lines = []
+        limits = {"velocity": self.velocity, "acceleration": self.acceleration, "torque": self.torque}
+        for order, (kind, sizes) in enumerate(limits.items(), 1):
+            joints_by_size: dict[str, list[Joint]] = {}
+            for joint, size in zip(self.joints, sizes):
+                text = "none"
+                if size <= MAX[kind]:
+                    text = f"{size:.4g} {motion_units([joint.kind])[order]}"
+                joints_by_size.setdefault(text, []).append(joint)
+            if [*joints_by_size] == ["none"]:
+                lines.append(f"{kind} limits: none")
+                continue
+            parts = [f"{text} {self._named(joints)}" for text, joints in joints_by_size.items()]
+            lines.append(f"{kind} limits: {'; '.join(parts)} ({self.origin[kind]})")
+        return lines
 
     def check(self, track: Setpoints) -> None:
         """Raise an error if a track exceeds its limits of speed or acceleration, or those of any real joint.
@@ -128,27 +165,18 @@ class MotionBounds:
         Raises:
             UsageError: naming the joint.
         """
-        for kind, values in (("velocity", track.v), ("acceleration", track.a)):
-            peak, limit = np.abs(values).max(axis=0), np.minimum(getattr(self, kind), MAX[kind])
-            j = int(np.argmax(peak / limit))
-            if not peak[j] <= (1.0 + MAX_EXCESS) * limit[j]:
-                raise UsageError(
-                    f"{self.robot}: the {kind} of {self.joints[j].name} reaches {peak[j]:.4g} in this motion, above "
-                    f"{limit[j]:.4g}, so the motion is not written; state a limit {self.place.format(EXAMPLES[kind])}"
-                )
+        self._check("velocity", np.abs(track.v).max(axis=0), self.velocity)
+        self._check("acceleration", np.abs(track.a).max(axis=0), self.acceleration)
 
-
-MARGINS = ("margin", "deviations")  # keys of [torque] that are no joint's
-STATED_IN = {
-    "position": "[joints]",
-    "velocity": "[velocity]",
-    "acceleration": "[acceleration]",
-    "jerk": "[jerk]",
-    "torque": "[torque] (a joint's, or margin)",
-    "workspace": "[target] (height, axis_distance) and [[point]]",
-    "clearance": "[collision] (margin, radius, floor) and [[obstacle]]",
-}
-"""Tables of the limits file by the name of the constraint."""
+    def _check(self, kind: str, peak: np.ndarray, limit: np.ndarray) -> None:
+        """Raise an error if a joint's largest speed or acceleration (n,) exceeds its limit."""
+        limit = np.minimum(limit, MAX[kind])
+        j = int(np.argmax(peak / limit))
+        if not peak[j] <= (1.0 + MAX_EXCESS) * limit[j]:
+            raise UsageError(
+                f"{self.robot}: the {kind} of {self.joints[j].name} reaches {peak[j]:.4g} in this motion, above "
+                f"{limit[j]:.4g}, so the motion is not written; state a limit {self.place.format(EXAMPLES[kind])}"
+            )
 
 
 @strict
@@ -221,14 +249,19 @@ class MotionLimits:
     @property
     def positions(self) -> BoxLimit:
         """The joint position limits; infinite: not limited."""
-        free = np.full(len(self.torque), np.inf)
-        boxes = (one for one in self.constraints if isinstance(one, BoxLimit) and one.order == 0)
-        return next(boxes, BoxLimit(0, -free, free))
+        for constraint in self.constraints:
+            if isinstance(constraint, BoxLimit) and constraint.order == 0:
+                return constraint
+        unlimited = np.full(len(self.torque), np.inf)
+        return BoxLimit(0, -unlimited, unlimited)
 
     def narrowed(self, ranges: Sequence[tuple[np.ndarray, np.ndarray]]) -> "MotionLimits":
         """Return the limits with those of a motion: least and largest q, v and a (n,), of joints that move."""
-        free = (np.where(low < high, [low, high], [[-np.inf], [np.inf]]) for low, high in ranges)
-        return replace(self, constraints=(*self.constraints, *(BoxLimit(k, *both) for k, both in enumerate(free))))
+        boxes = []
+        for order, (low, high) in enumerate(ranges):
+            lower, upper = np.where(low < high, [low, high], [[-np.inf], [np.inf]])
+            boxes.append(BoxLimit(order, lower, upper))
+        return replace(self, constraints=(*self.constraints, *boxes))
 
     def broken(self, motion: SampledMotion) -> Iterator[tuple[MotionConstraint, str, int]]:
         """Yield (constraint, message, index of the worst of N states) for each violated constraint on positions."""
@@ -236,22 +269,24 @@ class MotionLimits:
             if isinstance(limit, BoxLimit):
                 continue
             values = limit.values(motion)
-            k, column = (int(i) for i in np.unravel_index(np.argmax(values), values.shape))
-            if values[k, column] > 0:
-                words = f"{limit.name} ({limit.labels[column]}) is violated by {values[k, column]:.3g} {limit.unit}"
-                yield limit, words, k
+            state, column = (int(index) for index in np.unravel_index(np.argmax(values), values.shape))
+            excess = values[state, column]
+            if excess > 0:
+                message = f"{limit.name} ({limit.labels[column]}) is violated by {excess:.3g} {limit.unit}"
+                yield limit, message, state
 
 
 def read_motion_limits(
-    given: Tables | None, chain: Chain, source: Path | None = None, given_way: bool = False, predicted: bool = False
+    tables: Tables | None, chain: Chain, source: Path | None = None, stated_path: bool = False, predicted: bool = False
 ) -> MotionLimits:
     """Return the limits of a motion from the limits file and the robot; defaults are those of pose selection.
 
     Args:
-        given: the file, or its tables; None for the robot's own limits and the defaults alone.
+        tables: the file, or its tables; None for the robot's own limits and the defaults alone.
+        chain: the arm.
         source: the robot's file, for its collision shapes.
-        given_way: the motion goes where its user says: what is not stated is not kept, since capsules and a floor that
-            we think of should not forbid a way that somebody knows.
+        stated_path: the motion goes where its user says: what is not stated is not kept, since capsules and a floor
+            that we think of should not forbid a path that somebody knows.
         predicted: torques are, by an identified model, so that their limits count; so they do where the chain's masses
             are known.
 
@@ -259,25 +294,32 @@ def read_motion_limits(
         UsageError: for an unknown key or a value that a key cannot have, and where nothing limits speeds, or
             accelerations and torques (`MotionBounds`).
     """
-    stated, where = read(LimitsFile, *tables_of(given, chain, source, "limits"))
-    torque_table = stated.torque
+    stated, where = read(LimitsFile, *tables_of(tables, chain, source, "limits"))
     without = ()
-    if given_way:
+    if stated_path:
         without = ("joint-margin", "floor") if stated.collision or stated.obstacle else DEFAULTS
-    found = limits_of(stated, targets_of(chain), source, where, without, seen=False)
-    speeds, efforts = (np.array([getattr(j, key) for j in chain.joints]) for key in ("velocity", "effort"))
+    pose_limits = limits_of(stated, targets_of(chain), source, where, without, seen=False)
+
+    speeds = np.array([joint.velocity for joint in chain.joints])
+    efforts = np.array([joint.effort for joint in chain.joints])
     velocity = _per_joint(stated.velocity, f"{where}: velocity", chain, speeds, ("angular speed", "speed"))
     acceleration = _per_joint(stated.acceleration, f"{where}: acceleration", chain)
     jerk = _per_joint(stated.jerk, f"{where}: jerk", chain)
-    amounts = {key: value for key, value in torque_table.items() if key not in MARGINS}
-    torque = _per_joint(amounts, f"{where}: torque", chain, efforts, ("torque", "force"))
-    counted = torque if predicted or chain.inertias is not None else np.full(chain.n, np.inf)
-    sizes = velocity, acceleration, counted
-    bounds = _bounds(chain, str(source or chain.name), stated, where, sizes, default=not given_way)
-    margin = number(torque_table["margin"], f"{where}: torque.margin") if "margin" in torque_table else None
+    joint_torques = {key: value for key, value in stated.torque.items() if key not in MARGINS}
+    torque = _per_joint(joint_torques, f"{where}: torque", chain, efforts, ("torque", "force"))
+    # without masses no torque is predicted that a limit could hold against
+    counted_torque = torque
+    if not predicted and chain.inertias is None:
+        counted_torque = np.full(chain.n, np.inf)
+    sizes = velocity, acceleration, counted_torque
+    bounds = _bounds(chain, str(source or chain.name), stated, where, sizes, default=not stated_path)
+
+    margin = None
+    if "margin" in stated.torque:
+        margin = number(stated.torque["margin"], f"{where}: torque.margin")
     if margin is not None and not 0.0 <= margin < 1.0:
         raise UsageError(f"{where}: torque.margin: expected a share of the limit, from 0 to below 1, found {margin:g}")
-    deviations = number(torque_table.get("deviations", 2.0), f"{where}: torque.deviations")
+    deviations = number(stated.torque.get("deviations", DEFAULT_DEVIATIONS), f"{where}: torque.deviations")
     if not 0.0 <= deviations < np.inf:
         raise UsageError(f"{where}: torque.deviations: expected 0 or more, found {deviations:g}")
     noise = None
@@ -285,32 +327,35 @@ def read_motion_limits(
         noise = _per_joint(stated.noise, f"{where}: noise", chain, None, ("torque", "force"))
         noise = np.where(np.isfinite(noise), noise, DEFAULT_NOISE * torque)
         require((noise > 0.0).all(), f"{where}: noise: expected standard deviations above 0", UsageError)
+
     points = _points(stated.point, chain, where)
     friction = _friction(stated.friction, chain, where)
     linear = [joint.kind == "prismatic" for joint in chain.joints]
-    boxes = box_limits(found.lower, found.upper, velocity, bounds.acceleration, jerk, linear=linear)
-    constraints: list[MotionConstraint] = [*boxes]
-    constraints += _places(stated, found, points)
-    notes = list(found.notes)
-    if found.collision is None:
+    boxes = box_limits(pose_limits.lower, pose_limits.upper, velocity, bounds.acceleration, jerk, linear=linear)
+    constraints: list[MotionConstraint] = [*boxes, *_position_constraints(stated, pose_limits, points)]
+    notes = list(pose_limits.notes)
+    collision = pose_limits.collision
+    if collision is None:
         notes.append(
             "collisions and floor are NOT checked: state [collision], with floor = … at least, in a limits file"
         )
     else:
-        names = tuple(f"{one} - {two}" for one, two in found.collision.pairs)
-        constraints.append(Clearance(found.collision.distances, found.collision.gradients, names, found.clearance))
-        sets = (("kept", found.checked), ("NOT checked", found.unchecked))
-        notes += [f"{words}: {', '.join(names)}" for words, names in sets if names]
+        pairs = tuple(f"{link} - {obstacle}" for link, obstacle in collision.pairs)
+        constraints.append(Clearance(collision.distances, collision.gradients, pairs, pose_limits.clearance))
+        if pose_limits.checked:
+            notes.append(f"kept: {', '.join(pose_limits.checked)}")
+        if pose_limits.unchecked:
+            notes.append(f"NOT checked: {', '.join(pose_limits.unchecked)}")
     return MotionLimits(
-        tuple(constraints),
-        bounds,
-        torque,
-        margin,
-        deviations,
-        friction,
-        stated.frequency.resonance,
-        tuple(notes),
-        noise,
+        constraints=tuple(constraints),
+        bounds=bounds,
+        torque=torque,
+        margin=margin,
+        deviations=deviations,
+        friction=friction,
+        resonance=stated.frequency.resonance,
+        notes=tuple(notes),
+        noise=noise,
     )
 
 
@@ -328,7 +373,10 @@ def check_bodies(chain: Chain, torque: np.ndarray) -> None:
     Raises:
         UsageError: naming them.
     """
-    if np.isfinite(torque).any() and (wrong := impossible_bodies(chain)):
+    if not np.isfinite(torque).any():
+        return
+    wrong = impossible_bodies(chain)
+    if wrong:
         raise UsageError(
             f"robot '{chain.name}': {'; '.join(wrong)}: torques predicted with them are wrong; correct the "
             "masses in the robot's file, or name an identified model (--model)"
@@ -344,13 +392,15 @@ def _bounds(
         sizes: (n,) largest velocities, accelerations, torques.
     """
     velocity, acceleration, torque = sizes
-    tables = {"velocity": stated.velocity, "torque": stated.torque}
-    origin = {kind: f"robot description, {path}" if table else "robot description" for kind, table in tables.items()}
-    origin["acceleration"] = path
-    free = (acceleration > MAX["acceleration"]) & (torque > MAX["torque"])
-    if default and free.any():
-        origin["acceleration"] = DEFAULT_ORIGIN if np.isinf(acceleration).all() else f"{path}, or {DEFAULT_ORIGIN}"
-        acceleration = np.where(free, DEFAULT_RISE * velocity, acceleration)
+    origin = {"acceleration": path}
+    for kind, table in (("velocity", stated.velocity), ("torque", stated.torque)):
+        origin[kind] = f"robot description, {path}" if table else "robot description"
+    unlimited = (acceleration > MAX["acceleration"]) & (torque > MAX["torque"])
+    if default and unlimited.any():
+        origin["acceleration"] = f"{path}, or {DEFAULT_ORIGIN}"
+        if np.isinf(acceleration).all():
+            origin["acceleration"] = DEFAULT_ORIGIN
+        acceleration = np.where(unlimited, DEFAULT_RISE * velocity, acceleration)
     return MotionBounds(robot, chain.joints, velocity, acceleration, torque, origin)
 
 
@@ -363,22 +413,31 @@ class Points:
     places: np.ndarray
 
     def __call__(self, q: np.ndarray) -> np.ndarray:
-        return self._places(q, sweep(self.chain, q).poses())
+        return self._positions(q, sweep(self.chain, q).poses())
 
     def product(self, q: np.ndarray, G: np.ndarray) -> np.ndarray:
         """Return the gradient (N, n) of Σ G · points with respect to q."""
-        walked = sweep(self.chain, q)
-        points, result = self._places(q, walked.poses()), np.zeros(q.shape)
+        kinematics = sweep(self.chain, q)
+        points = self._positions(q, kinematics.poses())
+        gradient = np.zeros(q.shape)
         for k, joint in enumerate(self.joints):
-            behind = int(self.chain.moving[joint - 1]) + 1 if joint else None
-            slope = joint_jacobian(self.chain, walked, np.ascontiguousarray(points[:, k].T), behind)
-            result += np.einsum("min,mi->mn", slope[:, :3], G[:, k])
-        return result
+            element = None
+            if joint:
+                element = int(self.chain.moving[joint - 1]) + 1
+            point = np.ascontiguousarray(points[:, k].T)
+            jacobian = joint_jacobian(self.chain, kinematics, point, element)
+            gradient += np.einsum("min,mi->mn", jacobian[:, :3], G[:, k])
+        return gradient
 
-    def _places(self, q: np.ndarray, tip: np.ndarray) -> np.ndarray:
-        frames = joint_frames(self.chain, q) if any(self.joints) else tip[None]
-        carriers = [frames[j - 1] if j else tip for j in self.joints]
-        return np.stack([f[:, :3, :3] @ p + f[:, :3, 3] for f, p in zip(carriers, self.places)], axis=1)
+    def _positions(self, q: np.ndarray, tip: np.ndarray) -> np.ndarray:
+        frames = tip[None]
+        if any(self.joints):
+            frames = joint_frames(self.chain, q)
+        points = []
+        for joint, position in zip(self.joints, self.places):
+            frame = frames[joint - 1] if joint else tip
+            points.append(frame[:, :3, :3] @ position + frame[:, :3, 3])
+        return np.stack(points, axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -403,20 +462,22 @@ class _PoseLimit:
         return result
 
 
-def _places(stated: LimitsFile, found: Limits, points: Points) -> list[MotionConstraint]:
+def _position_constraints(stated: LimitsFile, pose_limits: Limits, points: Points) -> list[MotionConstraint]:
     """Return the constraints: workspace of the tip and of named points, and all other constraints of poses."""
-    radius, (lowest, highest) = stated.target.axis_distance, stated.target.heights
-    result: list[MotionConstraint] = []
+    constraints: list[MotionConstraint] = []
+    radius = stated.target.axis_distance
+    lowest, highest = stated.target.heights
     if radius is not None or lowest is not None:
-        names = ("tool", *(one.name for one in stated.point))
-        result.append(Workspace(points, points.product, names, radius, lowest, highest))
-    others = [one for one in found.constraints if one.name not in ("height", "distance from the axis")]
-    still = np.zeros((1, len(found.lower)))
-    for one in others:
-        k = np.asarray(one.function(still)).shape[1]
-        labels = tuple(f"{one.name} {j + 1}" for j in range(k))
-        result.append(_PoseLimit(one, one.name, labels, np.ones(k), np.arange(k)))
-    return result
+        names = ("tool", *(point.name for point in stated.point))
+        constraints.append(Workspace(points, points.product, names, radius, lowest, highest))
+    posture = np.zeros((1, len(pose_limits.lower)))
+    for constraint in pose_limits.constraints:
+        if constraint.name in OF_WORKSPACE:
+            continue
+        count = np.asarray(constraint.function(posture)).shape[1]
+        labels = tuple(f"{constraint.name} {j + 1}" for j in range(count))
+        constraints.append(_PoseLimit(constraint, constraint.name, labels, np.ones(count), np.arange(count)))
+    return constraints
 
 
 def _per_joint(
@@ -431,12 +492,21 @@ def _per_joint(
     Args:
         quantities: of a revolute joint's limit, and of a prismatic one's.
     """
-    numbered = {f"q{j + 1}": j for j in range(chain.n)} | {name: j for j, name in enumerate(chain.joint_names)}
-    check_keys(stated, ("all", "share", *(MARGINS if where.endswith("torque") else ()), *numbered), where)
-    bounds = np.full(chain.n, np.inf) if default is None else default.copy()
-    for name in [name for name in stated if name != "share"]:
-        for j in range(chain.n) if name == "all" else [numbered[name]]:
-            value = number(stated[name], f"{where}.{name}", quantities[chain.joints[j].kind != "revolute"])
+    index = {f"q{j + 1}": j for j in range(chain.n)}
+    index |= {name: j for j, name in enumerate(chain.joint_names)}
+    further_keys = MARGINS if where.endswith("torque") else ()
+    check_keys(stated, ("all", "share", *further_keys, *index), where)
+    bounds = np.full(chain.n, np.inf)
+    if default is not None:
+        bounds = default.copy()
+    for name, written in stated.items():
+        if name == "share":
+            continue
+        joints = range(chain.n) if name == "all" else [index[name]]
+        for j in joints:
+            quantity = quantities[chain.joints[j].kind != "revolute"]
+            value = number(written, f"{where}.{name}", quantity)
+            # a file narrows the robot's own limits only
             bounds[j] = value if default is None else min(value, bounds[j])
     share = number(stated.get("share", 1.0), f"{where}.share")
     if not 0 < share <= 1:
@@ -445,18 +515,20 @@ def _per_joint(
 
 
 def _points(stated: Sequence[PointTable], chain: Chain, where: str) -> Points:
-    for k, one in enumerate(stated, 1):
-        if one.joint > chain.n:
+    for k, point in enumerate(stated, 1):
+        if point.joint > chain.n:
             raise UsageError(f"{where}: [[point]] number {k}.joint: expected a joint from 1 to {chain.n} (0: the tip)")
-    return Points(chain, (0, *(one.joint for one in stated)), np.array([(0.0, 0.0, 0.0), *(one.xyz for one in stated)]))
+    joints = (0, *(point.joint for point in stated))
+    positions = [(0.0, 0.0, 0.0), *(point.xyz for point in stated)]
+    return Points(chain, joints, np.array(positions))
 
 
 def _friction(stated: FrictionTable | None, chain: Chain, where: str) -> np.ndarray | None:
     if stated is None:
         return None
     result = []
-    for key in ("Fv", "Fc"):
-        values = getattr(stated, key) or (0.0,) * chain.n
+    for key, coefficients in (("Fv", stated.Fv), ("Fc", stated.Fc)):
+        values = coefficients or (0.0,) * chain.n
         if len(values) not in (1, chain.n):
             raise UsageError(f"{where}: friction.{key}: {len(values)} values for {chain.n} joints")
         result.append(np.broadcast_to(np.array(values), (chain.n,)))

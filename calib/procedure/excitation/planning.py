@@ -31,7 +31,7 @@ from calib.geometry.installation import Installation
 from calib.geometry.inverse import Goal
 from calib.identification.model_file import read_dynamics, refuse_currents, refuse_other_arm
 from calib.identification.prediction import Dynamics
-from calib.identification.torque_errors import Uncertainty, read_uncertainty
+from calib.identification.uncertainty.torque_errors import Uncertainty, read_uncertainty
 from calib.procedure.excitation.limits import MotionBounds, MotionLimits, check_bodies, read_motion_limits
 from calib.procedure.excitation.playback import approach_to
 from calib.procedure.excitation.settings import DEFAULT_PLAN, DRIVES, PlanSettings
@@ -50,12 +50,20 @@ from trajectories.timing.profile import track
 from trajectories.timing.shape import Shaped, shorten
 from trajectories.timing.time_scaling import Timing, time_optimal
 
-MAX_TRIES = 40  # random configurations from which a waypoint is sought (our choice)
-MAX_ERROR = 1e-6  # [m and rad] that may be left
+Progress = Callable[[str], None]
+
+# random configurations from which a waypoint is sought (our choice)
+MAX_TRIES = 40
+# [m and rad] largest distance of the tool from a waypoint
+MAX_ERROR = 1e-6
+# grid of the outer loop
+COARSE_GRID = 150
+# points of a path at which workspace and clearance are checked
+CHECKED_POINTS = 500
 
 
 def read_waypoints(
-    given: Path | Targets | np.ndarray,
+    waypoints: Path | Targets | np.ndarray,
     chain: Chain,
     lower: np.ndarray,
     upper: np.ndarray,
@@ -64,7 +72,7 @@ def read_waypoints(
     """Return waypoints as joint values (m, n) [rad or m], from a file or from arrays.
 
     Args:
-        given: the file; or in memory joint values (m, n) [rad or m], poses (m, 4, 4) [m], or targets.
+        waypoints: the file; or in memory joint values (m, n) [rad or m], poses (m, 4, 4) [m], or targets.
         chain: whose tip stands at the places, the best geometry there is.
         lower, upper: (n,) joint limits to stay within.
         start: (n,) where the robot stands: the first place is reached near it; else near the middle of the limits.
@@ -72,50 +80,61 @@ def read_waypoints(
     Raises:
         UsageError: for a waypoint out of reach, with its number and the distance.
     """
-    if not isinstance(given, Path):
-        targets = Targets.of(given)
-    elif {"x", "x_target"} & set(read_header(given)[0]):
-        targets = read_targets(given, Joints(chain.joint_names, joint_kinds(chain)))
+    if not isinstance(waypoints, Path):
+        targets = Targets.of(waypoints)
     else:
-        targets = Targets.of(read_poses(given, Joints(chain.joint_names, joint_kinds(chain))))
+        joints = Joints(chain.joint_names, joint_kinds(chain))
+        header = read_header(waypoints)[0]
+        if {"x", "x_target"} & set(header):
+            targets = read_targets(waypoints, joints)
+        else:
+            targets = Targets.of(read_poses(waypoints, joints))
     if targets.position is None and targets.q is not None:
         return read_poses(targets.q, chain.joint_names)
-    goal = Goal(Installation(chain), 3 if targets.rotation is None else 6, lower, upper)
-    places = pose(targets.rotation, targets.position)
-    low, high = (np.where(np.isfinite(x), x, s * np.pi) for x, s in ((lower, -1.0), (upper, 1.0)))
-    here = np.asarray(start, dtype=float) if start is not None else (low + high) / 2
-    others = np.random.default_rng(0).uniform(low, high, (MAX_TRIES, chain.n))
-    found = []
+
+    dof = 3 if targets.rotation is None else 6
+    goal = Goal(Installation(chain), dof, lower, upper)
+    target_poses = pose(targets.rotation, targets.position)
+    low = np.where(np.isfinite(lower), lower, -np.pi)
+    high = np.where(np.isfinite(upper), upper, np.pi)
+    configurations = np.random.default_rng(0).uniform(low, high, (MAX_TRIES, chain.n))
+    # each waypoint is reached from the configuration before it, unless its own is stated
+    q = (low + high) / 2
+    if start is not None:
+        q = np.asarray(start, dtype=float)
+    result = []
     for k in range(len(targets)):
-        near = here if targets.q is None else np.array(targets.q[k])
-        here = _reached(goal, places[k : k + 1], near, others, targets, k)
-        found.append(here)
-    return np.array(found)
+        near = q if targets.q is None else np.array(targets.q[k])
+        q = _reached(goal, target_poses[k : k + 1], near, configurations, targets, k)
+        result.append(q)
+    return np.array(result)
 
 
 def _reached(
-    goal: Goal, target: np.ndarray, near: np.ndarray, others: np.ndarray, targets: Targets, k: int
+    goal: Goal, target: np.ndarray, near: np.ndarray, configurations: np.ndarray, targets: Targets, k: int
 ) -> np.ndarray:
     """Return joint values (n,) at a target (1, 4, 4), solved from the present pose or else by many tries."""
-    q = inverse.nearest(goal, target, near[None], inverse.reach(goal, target, near[None]))
-    left = inverse.differences(goal, q, target)
-    if np.abs(left).max() <= MAX_ERROR:
+    present = near[None]
+    q = inverse.nearest(goal, target, present, inverse.reach(goal, target, present))
+    if np.abs(inverse.differences(goal, q, target)).max() <= MAX_ERROR:
         return q[0]
-    many = np.repeat(target, len(others), axis=0)
-    tried = inverse.reach(goal, many, others)
-    left = inverse.differences(goal, tried, many)
-    met = np.abs(left).max(axis=1) <= MAX_ERROR
-    if not met.any():
-        best = left[np.argmin(np.linalg.norm(left, axis=1))]
-        turn = f" and {np.degrees(np.linalg.norm(best[3:])):.3g} deg" if goal.dof == 6 else ""
+    repeated_target = np.repeat(target, len(configurations), axis=0)
+    tries = inverse.reach(goal, repeated_target, configurations)
+    differences = inverse.differences(goal, tries, repeated_target)
+    reached = np.abs(differences).max(axis=1) <= MAX_ERROR
+    if not reached.any():
+        nearest = differences[np.argmin(np.linalg.norm(differences, axis=1))]
+        angle = ""
+        if goal.dof == 6:
+            angle = f" and {np.degrees(np.linalg.norm(nearest[3:])):.3g} deg"
         raise UsageError(
-            f"{targets.file}: waypoint {k + 1} is out of reach: the nearest of {len(others)} tries is "
-            f"{1e3 * np.linalg.norm(best[:3]):.3g} mm{turn} off, within the joint limits. Are x y z those of the tip "
-            "in the robot's base frame, in metres?"
+            f"{targets.file}: waypoint {k + 1} is out of reach: the nearest of {len(configurations)} tries is "
+            f"{1e3 * np.linalg.norm(nearest[:3]):.3g} mm{angle} off, within the joint limits. Are x y z those of the "
+            "tip in the robot's base frame, in metres?"
         )
-    distance = np.where(met, np.abs(tried - near).max(axis=1), np.inf)
-    chosen = tried[np.argmin(distance)][None]
-    return inverse.nearest(goal, target, near[None], chosen)[0]
+    distance = np.where(reached, np.abs(tries - near).max(axis=1), np.inf)
+    closest = tries[np.argmin(distance)][None]
+    return inverse.nearest(goal, target, present, closest)[0]
 
 
 PerJoint = Annotated[tuple[float, ...], Expect("a list of numbers, one per joint")]
@@ -127,10 +146,6 @@ class _DrivesFile:
     """The file of ``calib plan --drives``: [drives] with any of Ia, Fv, Fc, off per joint (SI, joint side)."""
 
     drives: Mapping[str, PerJoint] = field(default_factory=dict)
-
-
-COARSE_GRID = 150  # grid of the outer loop
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,8 +187,13 @@ class Planned:
     @property
     def active_share(self) -> float:
         """Share of the time during which the motion is close to a limit."""
-        seconds = [one.duration for one in self.timings]
-        return float(np.average([one.active_share for one in self.timings], weights=seconds))
+        seconds = [timing.duration for timing in self.timings]
+        shares = [timing.active_share for timing in self.timings]
+        return float(np.average(shares, weights=seconds))
+
+
+def _silent(stage: str) -> None:
+    """Show no progress."""
 
 
 def plan(
@@ -201,147 +221,183 @@ def plan(
     Raises:
         UsageError: for waypoints that cannot be reached, and limits that cannot be kept.
     """
-    say = progress or (lambda words: None)
-    words = "--shorten cannot be combined with --line: straight lines leave no path to change; leave one out"
-    require(not (settings.shorten and settings.lines), words, UsageError)
+    show = progress or _silent
+    if settings.shorten and settings.lines:
+        raise UsageError(
+            "--shorten cannot be combined with --line: straight lines leave no path to change; leave one out"
+        )
     if settings.payloads and model is None:
         raise UsageError(f"payloads {', '.join(settings.payloads)}: need an identified model; name it (--model)")
-    found, source = load_rigid(robot, waypoints if isinstance(waypoints, Path) else None, base, tip)
-    chain = found.chain
-    known = read_motion_limits(limits, chain, source, given_way=True, predicted=model is not None)
-    law, notes, uncertain = _law(chain, model, settings.payloads, drives, known)
-    lower, upper, free = known.positions.lower, known.positions.upper, 1.0 - (known.margin or 0.0)
-    bounds = TimingLimits(known.bounds.velocity, known.bounds.acceleration, known.bounds.torque * free)
+    waypoint_file = waypoints if isinstance(waypoints, Path) else None
+    calibrated, source = load_rigid(robot, waypoint_file, base, tip)
+    chain = calibrated.chain
+    motion_limits = read_motion_limits(limits, chain, source, stated_path=True, predicted=model is not None)
+    dynamics, notes, uncertainty = _dynamics(chain, model, settings.payloads, drives, motion_limits)
+    lower, upper = motion_limits.positions.lower, motion_limits.positions.upper
+    bounds = motion_limits.bounds
+    torque_share = 1.0 - (motion_limits.margin or 0.0)
+    timing_limits = TimingLimits(bounds.velocity, bounds.acceleration, bounds.torque * torque_share)
+    # an identified model has the best geometry
     arm = chain if model is None else read_dynamics(model)[0]
     points = read_waypoints(waypoints, arm, lower, upper, settings.start)
-    say("the path")
+
+    show("the path")
     paths, deviation = _paths(arm, points, settings.lines)
     for path in paths:
         check_within(path, lower, upper, points)
     shaped = None
     if settings.shorten:
-        timer = partial(_duration, limits=bounds, law=law, lower=lower, upper=upper, known=known)
-        report = lambda done, best: say(f"shaping the path: {best:.4f} s after {done} timings")  # noqa: E731
-        shaped = shorten(points, timer, settings.shorten, settings.stray, report)
+
+        def duration(path: JointPath) -> float:
+            check_within(path, lower, upper)
+            _check_constraints(path, motion_limits)
+            return time_optimal(path, timing_limits, dynamics, grid=COARSE_GRID).duration
+
+        def report(timing_count: int, best: float) -> None:
+            show(f"shaping the path: {best:.4f} s after {timing_count} timings")
+
+        shaped = shorten(points, duration, settings.shorten, settings.stray, report)
         paths = [shaped.path]
     margins = np.min([check_within(path, lower, upper) for path in paths], axis=0)
     for path in paths:
-        _check_places(path, known)
-    say("timing")
-    timed = partial(time_optimal, law=law, rate=settings.rate)
-    timings, sigma = tuple(timed(path, bounds) for path in paths), None
-    if uncertain is not None and known.deviations > 0:
-        sigma = np.max([uncertain.sigma(one.sampled) for one in timings], axis=0)
-        bounds = _guarded(bounds, known.deviations * sigma, chain)
-        timings = tuple(timed(path, bounds) for path in paths)
-    torque = None if law is None else law.torque
-    motion = joined([track(one.path, one.profile, settings.rate, torque) for one in timings])
-    known.bounds.check(motion)
-    lead, remarks = approach_to(settings.start, motion.q[0], settings.rate, known, chain)
+        _check_constraints(path, motion_limits)
+
+    show("timing")
+    timed = partial(time_optimal, law=dynamics, rate=settings.rate)
+    timings = tuple(timed(path, timing_limits) for path in paths)
+    sigma = None
+    if uncertainty is not None and motion_limits.deviations > 0:
+        # timed anew with margins for the uncertainty of the torques along the first timing
+        sigma = np.max([uncertainty.sigma(timing.sampled) for timing in timings], axis=0)
+        timing_limits = _guarded(timing_limits, motion_limits.deviations * sigma, chain)
+        timings = tuple(timed(path, timing_limits) for path in paths)
+    torque = None if dynamics is None else dynamics.torque
+    motion = joined([track(timing.path, timing.profile, settings.rate, torque) for timing in timings])
+    bounds.check(motion)
+    approach, approach_notes = approach_to(settings.start, motion.q[0], settings.rate, motion_limits, chain)
+    rehearsal = None
+    if settings.slower != 1:
+        rehearsal = slowed(motion, settings.slower)
     return Planned(
-        chain,
-        known.bounds,
-        bounds,
-        lower,
-        upper,
-        timings,
-        motion,
-        (*known.notes, *notes, *remarks),
-        margins,
-        deviation,
-        shaped,
-        lead,
-        slowed(motion, settings.slower) if settings.slower != 1 else None,
-        sigma,
-        found.source or str(source),
+        chain=chain,
+        bounds=bounds,
+        limits=timing_limits,
+        lower=lower,
+        upper=upper,
+        timings=timings,
+        track=motion,
+        notes=(*motion_limits.notes, *notes, *approach_notes),
+        margins=margins,
+        deviation=deviation,
+        shaped=shaped,
+        approach=approach,
+        rehearsal=rehearsal,
+        sigma=sigma,
+        source=calibrated.source or str(source),
     )
 
 
-def _read_drives(given: Tables | None, chain: Chain) -> dict[str, np.ndarray]:
+def _read_drives(tables: Tables | None, chain: Chain) -> dict[str, np.ndarray]:
     """Read drive parameters (n,) from TOML: ``[drives]`` with Ia, Fv, Fc, off as needed (SI, joint side)."""
-    stated, where = read(_DrivesFile, given, "drives")
-    check_keys(stated.drives, DRIVES, f"{where}: drives")
-    return {key: np.array(numbers(value, chain.n, f"{where}: drives.{key}")) for key, value in stated.drives.items()}
+    content, where = read(_DrivesFile, tables, "drives")
+    check_keys(content.drives, DRIVES, f"{where}: drives")
+    drives = {}
+    for key, values in content.drives.items():
+        drives[key] = np.array(numbers(values, chain.n, f"{where}: drives.{key}"))
+    return drives
 
 
-def _check_places(path: JointPath, known: MotionLimits) -> None:
-    """Raise an error if one of 500 points of a path violates the workspace or clearance of the limits file.
+def _check_constraints(path: JointPath, limits: MotionLimits) -> None:
+    """Raise an error if a point of a path violates the workspace or clearance of the limits file.
 
     Raises:
         UsageError: with the violated constraint, the place, and the excess.
     """
-    s = np.linspace(0, path.length, 500)
-    still = np.zeros((len(s), path.n))
-    for _, words, k in known.broken(SampledMotion(s, path(s), still, still, still)):
-        raise UsageError(f"{words}, after {s[k] / path.length:.0%} of the path; move or add waypoints")
+    s = np.linspace(0, path.length, CHECKED_POINTS)
+    rest = np.zeros((len(s), path.n))
+    for _, violation, k in limits.broken(SampledMotion(s, path(s), rest, rest, rest)):
+        raise UsageError(f"{violation}, after {s[k] / path.length:.0%} of the path; move or add waypoints")
 
 
-def _law(
-    chain: Chain, folder: Path | None, payloads: Sequence[str], drives: Tables | None, known: MotionLimits
+def _dynamics(
+    chain: Chain, folder: Path | None, payloads: Sequence[str], tables: Tables | None, limits: MotionLimits
 ) -> tuple[PathDynamics | None, tuple[str, ...], Uncertainty | None]:
-    """Return the dynamics: identified model, or the robot's inertias and given drives; None without both."""
+    """Return the dynamics: identified model, or the robot's inertias and stated drives; None without both."""
     if folder is not None:
-        require(drives is None, "model and drives both state drive parameters; leave one of them out", UsageError)
-        law, unsure = _identified(chain, folder, payloads)
-        return law, () if unsure else ("the model states no covariance: torques have no margin for it",), unsure
+        require(tables is None, "model and drives both state drive parameters; leave one of them out", UsageError)
+        dynamics, uncertainty = _identified(chain, folder, payloads)
+        notes: tuple[str, ...] = ()
+        if not uncertainty:
+            notes = ("the model states no covariance: torques have no margin for it",)
+        return dynamics, notes, uncertainty
     with refused_as(UsageError, RobotError, "{}"):
-        stated = _read_drives(drives, chain)
-        if known.friction is not None and not stated:
-            stated = {"Fv": known.friction[0], "Fc": known.friction[1]}
+        drives = _read_drives(tables, chain)
+        if limits.friction is not None and not drives:
+            drives = {"Fv": limits.friction[0], "Fc": limits.friction[1]}
         if chain.inertias is None:
             return None, (), None
-        check_bodies(chain, known.torque)
-        values = np.column_stack([stated.get(key, np.zeros(chain.n)) for key in DRIVES])
+        check_bodies(chain, limits.torque)
+        drive_values = np.column_stack([drives.get(key, np.zeros(chain.n)) for key in DRIVES])
     linear = [joint.kind == "prismatic" for joint in chain.joints]
-    model = IdentificationModel(bodies_of(chain), standard([" ".join(DRIVES)] * chain.n, linear=linear))
-    missing = [what for what, key in (("motor inertia", "Ia"), ("friction", "Fc")) if key not in stated]
+    terms = standard([" ".join(DRIVES)] * chain.n, linear=linear)
+    values = np.concatenate([standard_parameters(chain), drive_values.ravel()])
+    dynamics = of_standard(IdentificationModel(bodies_of(chain), terms), values)
+    missing = []
+    if "Ia" not in drives:
+        missing.append("motor inertia")
+    if "Fc" not in drives:
+        missing.append("friction")
+    if not missing:
+        return dynamics, (), None
     note = f"{' and '.join(missing)} unknown (no model, no drives): planned without; the real robot needs more torque"
-    law = of_standard(model, np.concatenate([standard_parameters(chain), values.ravel()]))
-    return law, (note,) if missing else (), None
+    return dynamics, (note,), None
 
 
 def _identified(chain: Chain, folder: Path, payloads: Sequence[str]) -> tuple[PathDynamics, Uncertainty | None]:
-    """Return the dynamics of an identified model with the given payloads, and its uncertainty or None."""
+    """Return the dynamics of an identified model with the payloads, and its uncertainty or None."""
     refuse_currents(folder, "a motion plan")
     refuse_other_arm(folder, chain)
-    dynamics = read_dynamics(folder)[1]
+    _, dynamics = read_dynamics(folder)
     model = dynamics.model
-    if model.torque_rows.projection is not None:  # of power, say: its parameters predict the motors' torques as well
+    if model.torque_rows.projection is not None:
+        # of power, say: its parameters predict the motors' torques as well
         model = replace(model, torque_rows=MOTOR)
-    known = [label for label, coordinate in zip(model.bodies.labels, model.bodies.coordinates) if coordinate < 0]
-    if unknown := sorted(set(payloads) - set(known)):
-        raise UsageError(f"{folder}: no payload '{unknown[0]}' was identified; it has {', '.join(known) or 'none'}")
+    bodies = zip(model.bodies.labels, model.bodies.coordinates)
+    identified = [label for label, coordinate in bodies if coordinate < 0]
+    unknown = sorted(set(payloads) - set(identified))
+    if unknown:
+        raise UsageError(
+            f"{folder}: no payload '{unknown[0]}' was identified; it has {', '.join(identified) or 'none'}"
+        )
     if not model.torque_rows.has_bodies:
-        return of_standard(model, dynamics.values), None  # which says why that cannot be
+        # `of_standard` says why that cannot be
+        return of_standard(model, dynamics.values), None
     values = np.array(dynamics.values)
     values[: model.inertial] *= model.carried_columns(payloads)
     return of_standard(model, values), read_uncertainty(folder, Dynamics(model, values), payloads)
 
 
-def _guarded(bounds: TimingLimits, margin: np.ndarray, chain: Chain) -> TimingLimits:
+def _guarded(limits: TimingLimits, margin: np.ndarray, chain: Chain) -> TimingLimits:
     """Return the limits with each torque limit reduced by a margin (n,)."""
-    if (margin >= bounds.torque).any():
-        j = int(np.argmax(margin / bounds.torque))
+    if (margin >= limits.torque).any():
+        j = int(np.argmax(margin / limits.torque))
         raise UsageError(
             f"{chain.joint_names[j]}: the margin for torque uncertainty, {margin[j]:.3g}, reaches the torque limit, "
-            f"{bounds.torque[j]:.3g}; identify with a richer motion, or lower torque.deviations in the limits file"
+            f"{limits.torque[j]:.3g}; identify with a richer motion, or lower torque.deviations in the limits file"
         )
-    return replace(bounds, torque=bounds.torque - margin)
+    return replace(limits, torque=limits.torque - margin)
 
 
-def _paths(chain: Chain, points: np.ndarray, lines: bool) -> tuple[list[JointPath], np.ndarray | None]:
-    if not lines:
+def _paths(chain: Chain, points: np.ndarray, straight: bool) -> tuple[list[JointPath], np.ndarray | None]:
+    """Return the paths through waypoints (m, n): one spline, or lines of the tool with their deviation (2,)."""
+    if not straight:
         return [spline(points)], None
-    start, found = checked(points)[0], []
+    start = checked(points)[0]
+    tool_lines = []
     for goal in forward(chain, points[1:]):
-        found.append(line(partial(forward, chain), partial(tip_jacobian, chain), start, goal))
-        start = found[-1].path(np.array([found[-1].path.length]))[0]
-    return [one.path for one in found], np.max([one.deviation for one in found], axis=0)
-
-
-def _duration(
-    path: JointPath, limits: TimingLimits, law: PathDynamics | None, lower, upper, known: MotionLimits
-) -> float:
-    check_within(path, lower, upper)
-    _check_places(path, known)
-    return time_optimal(path, limits, law, grid=COARSE_GRID).duration
+        tool_line = line(partial(forward, chain), partial(tip_jacobian, chain), start, goal)
+        tool_lines.append(tool_line)
+        end = np.array([tool_line.path.length])
+        start = tool_line.path(end)[0]
+    deviation = np.max([tool_line.deviation for tool_line in tool_lines], axis=0)
+    return [tool_line.path for tool_line in tool_lines], deviation

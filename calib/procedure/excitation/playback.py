@@ -23,8 +23,14 @@ from trajectories.design.verify import dense_motion
 from trajectories.places import Clearance
 from trajectories.setpoints import Setpoints, joined, slowed
 
-APPROACH_RISE, APPROACH_JERK = (DEFAULT_RISE, 20.0)  # over its speed, where none is stated
-MAX_APPROACH_SPEED = 1.0  # [rad/s or m/s] an approach is no faster than this (our choice)
+# [1/s, 1/s^2] acceleration and jerk of an approach over its speed, where none is stated
+APPROACH_RISE = DEFAULT_RISE
+APPROACH_JERK = 20.0
+# [rad/s or m/s] an approach is no faster than this (our choice)
+MAX_APPROACH_SPEED = 1.0
+# samples of an approach at which constraints are checked
+CHECKED_SAMPLES = 500
+# samples whose torques are predicted at once, for memory
 BLOCK_ROWS = 4000
 
 
@@ -46,31 +52,38 @@ class Playback:
     notes: tuple[str, ...]
 
 
-def play(family: Family, found: SearchResult, given: ExcitationInputs, settings: ExcitationSettings) -> Playback:
+def play(family: Family, found: SearchResult, inputs: ExcitationInputs, settings: ExcitationSettings) -> Playback:
     """Return the setpoints of a designed motion: approach, periods and rehearsal, as set."""
-    model, limits, chain = given.model, given.limits, given.chain
+    model, limits, chain = inputs.model, inputs.limits, inputs.chain
+    # a period holds a whole number of the controller's samples
     period = family.period * found.factor
-    count = round(period * settings.rate)  # a period holds a whole number of the controller's samples
+    count = round(period * settings.rate)
     motion = dense_motion(family, found.x, np.arange(count + 1) * (period / count), found.factor)
     once = _with_torque(Setpoints(settings.rate, motion.q, motion.v, motion.a), model)
-    lead, notes = approach_to(settings.start, once.q[0], settings.rate, limits, chain)
-    lead = None if lead is None else _with_torque(lead, model)
-    ahead = [] if lead is None else [lead]
-    slow = _with_torque(slowed(joined([*ahead, once]), settings.slower), model) if settings.slower > 1 else None
-    for name, track in (("approach", lead), ("rehearsal", slow)):
+    approach, notes = approach_to(settings.start, once.q[0], settings.rate, limits, chain)
+    before: list[Setpoints] = []
+    if approach is not None:
+        approach = _with_torque(approach, model)
+        before = [approach]
+    rehearsal = None
+    if settings.slower > 1:
+        rehearsal = _with_torque(slowed(joined([*before, once]), settings.slower), model)
+    for name, track in (("approach", approach), ("rehearsal", rehearsal)):
         notes = (*notes, *_torques(name, track, limits, chain))
-    return Playback(joined([*ahead, once.repeated(settings.repeat)]), lead, slow, settings.repeat, notes)
+    run = joined([*before, once.repeated(settings.repeat)])
+    return Playback(run, approach, rehearsal, settings.repeat, notes)
 
 
 def _with_torque(track: Setpoints, dynamics: ExcitedModel) -> Setpoints:
     """Return the track with predicted torques, largest over the loads; unchanged if parameters are unknown."""
     if dynamics.values is None:
         return track
-    parts, model = [], dynamics.exact
+    torques = []
     for begin in range(0, len(track), BLOCK_ROWS):
-        part = (np.ascontiguousarray(x[begin : begin + BLOCK_ROWS]) for x in (track.q, track.v, track.a))
-        parts.append(model.largest_torques(dynamics.values, *part))
-    return replace(track, tau=np.concatenate(parts))
+        rows = slice(begin, begin + BLOCK_ROWS)
+        q, v, a = (np.ascontiguousarray(values[rows]) for values in (track.q, track.v, track.a))
+        torques.append(dynamics.exact.largest_torques(dynamics.values, q, v, a))
+    return replace(track, tau=np.concatenate(torques))
 
 
 def _torques(name: str, track: Setpoints | None, limits: MotionLimits, chain: Chain) -> tuple[str, ...]:
@@ -85,48 +98,56 @@ def _torques(name: str, track: Setpoints | None, limits: MotionLimits, chain: Ch
 
 
 def approach_to(
-    start: Sequence[float] | None, goal: np.ndarray, rate: float, known: MotionLimits, chain: Chain
+    start: Sequence[float] | None, goal: np.ndarray, rate: float, limits: MotionLimits, chain: Chain
 ) -> tuple[Setpoints | None, tuple[str, ...]]:
     """Return setpoints of a straight approach in joint space to the start of a motion, and notes on violated limits.
 
     Velocity, acceleration and jerk come from the limits file, else from the robot and our own choice.
 
     Args:
-        start: (n,) where the robot stands [rad or m]; None: no approach; goal: (n,).
+        start: (n,) where the robot stands [rad or m]; None: no approach.
+        goal: (n,) where the motion starts.
+        rate: of the controller [Hz].
+        limits: of the motion.
+        chain: the arm.
 
     Raises:
         UsageError: for a start beyond the joint limits, or an approach that violates a clearance.
     """
-    here = check_start(start, chain, known)
-    if here is None:
+    start_q = check_start(start, chain, limits)
+    if start_q is None:
         return None, ()
-    boxes = {one.order: one for one in known.constraints if isinstance(one, BoxLimit)}
-    sizes = {order: box.upper for order, box in boxes.items()}
-    free = np.full(chain.n, np.inf)
-    velocity = np.minimum(sizes.get(1, free), MAX_APPROACH_SPEED)
-    acceleration, jerk = (
-        np.where(np.isfinite(sizes.get(order, free)), sizes.get(order, free), factor * velocity)
-        for order, factor in ((2, APPROACH_RISE), (3, APPROACH_JERK))
-    )
-    found = straight_approach(here, goal, velocity, acceleration, jerk, rate)
-    rows = evenly(len(found), 500)
-    parts = (found.times, found.q, found.v, found.a, np.zeros(found.q.shape))
+    unlimited = np.full(chain.n, np.inf)
+    boxes = [constraint for constraint in limits.constraints if isinstance(constraint, BoxLimit)]
+    upper = {box.order: box.upper for box in boxes}
+    velocity = np.minimum(upper.get(1, unlimited), MAX_APPROACH_SPEED)
+    acceleration = upper.get(2, unlimited)
+    acceleration = np.where(np.isfinite(acceleration), acceleration, APPROACH_RISE * velocity)
+    jerk = upper.get(3, unlimited)
+    jerk = np.where(np.isfinite(jerk), jerk, APPROACH_JERK * velocity)
+    approach = straight_approach(start_q, goal, velocity, acceleration, jerk, rate)
+
+    rows = evenly(len(approach), CHECKED_SAMPLES)
+    # no constraint on positions needs the jerk
+    jerk = np.zeros(approach.q.shape)
+    columns = (approach.times, approach.q, approach.v, approach.a, jerk)
     notes = []
-    for limit, broken, k in known.broken(SampledMotion(*(x[rows] for x in parts))):
-        words = f"on the straight approach, {broken} at t = {found.times[rows[k]]:.3g} s"
+    for limit, violation, k in limits.broken(SampledMotion(*(column[rows] for column in columns))):
+        message = f"on the straight approach, {violation} at t = {approach.times[rows[k]]:.3g} s"
         if isinstance(limit, Clearance):
-            raise UsageError(f"{words}: move the robot to another pose first, or jog it to the start")
-        notes.append(f"{words}: watch the approach, or start from another pose")
-    return found, tuple(notes)
+            raise UsageError(f"{message}: move the robot to another pose first, or jog it to the start")
+        notes.append(f"{message}: watch the approach, or start from another pose")
+    return approach, tuple(notes)
 
 
-def check_start(start: Sequence[float] | None, chain: Chain, known: MotionLimits) -> np.ndarray | None:
+def check_start(start: Sequence[float] | None, chain: Chain, limits: MotionLimits) -> np.ndarray | None:
     """Return the start as an array (n,); raise an error for a wrong number of values or a violated joint limit."""
     if start is None:
         return None
-    limits, here = known.positions, np.asarray(start, dtype=float)
-    require(here.shape == (chain.n,), f"start: expected {chain.n} joint values, found {here.size}", UsageError)
-    for name, value, lower, upper in zip(chain.joint_names, here, limits.lower, limits.upper):
+    q = np.asarray(start, dtype=float)
+    require(q.shape == (chain.n,), f"start: expected {chain.n} joint values, found {q.size}", UsageError)
+    box = limits.positions
+    for name, value, lower, upper in zip(chain.joint_names, q, box.lower, box.upper):
         if not lower <= value <= upper:
             raise UsageError(f"start: {name} at {value:g} is beyond its limits {lower:.4g} to {upper:.4g}")
-    return here
+    return q

@@ -6,7 +6,8 @@ rows per joint leaves the base parameters with the covariance
     C = (R · mean over the period of Σ_j Y_jᵀ Y_j / σ_j²)⁻¹,
 
 and a torque on other motion with the variance Y C Yᵀ. On a calibrated robot an error g of the geometry, the same in all
-logs, adds to both (`calib.identification.geometry_uncertainty`): the parameters err by S g = -C Σ Yᵀ (∂Y/∂g φ) g / σ²,
+logs, adds to both (`calib.identification.uncertainty.geometry_uncertainty`): the parameters err by S g = -C Σ Yᵀ
+(∂Y/∂g φ) g / σ²,
 with earlier motions C (C_before⁻¹ S_before g - …), and torques by Y S g + (∂Y/∂g φ) g. A design minimises the part of
 the torques' errors alone. R counts the rows that `calib identify` keeps: twice the band
 that its own rules read from the accelerations. What is not known before a log is σ_j: noise, and friction that no term
@@ -40,10 +41,17 @@ from trajectories.design.search import STAGES, SearchResult, one_start
 from trajectories.design.verify import dense_motion
 
 NAME = "prediction.csv"
-OUTLOOK_EVALUATIONS = 240  # for a motion of another period, which is only looked at (our choice)
+# of the search for a motion of another period, which only informs the user (our choice)
+OUTLOOK_EVALUATIONS = 240
+# [s] of the motions that are predicted besides
 PERIODS = (5.0, 10.0, 20.0, 40.0)
-PERIOD_SAMPLES = 500  # over a period
-TASK_STATES = 400  # states of the typical task: anywhere within the joint limits, up to half of the speed limits
+# samples of a period at which rows are computed
+PERIOD_SAMPLES = 500
+# states of the typical task: anywhere within the joint limits, up to half of the speed limits
+TASK_STATES = 400
+# parameters named as those that a motion improves most
+NAMED_GAINS = 3
+WRITTEN_BY_EXCITE = "give the folder that calib excite wrote"
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +59,8 @@ class MotionPrediction:
     """σ predicted for a log of a motion.
 
     Attributes:
-        seconds: of motion; rows_per_joint: independent ones.
+        seconds: of motion.
+        rows_per_joint: independent ones.
         torque_sigma: (n,) rms of the predicted torque's sigma over the typical task [N m or N].
         torque_sigma_share: the same, rms over the joints, as a share of the torque limits.
     """
@@ -105,62 +114,101 @@ class MotionOutlook:
 
 
 def foretell(
-    given: ExcitationInputs,
+    inputs: ExcitationInputs,
     settings: ExcitationSettings,
     problem: ExcitationProblem,
-    found: SearchResult,
+    motion: SearchResult,
     problem_of: Callable[[float], ExcitationProblem],
 ) -> tuple[MotionOutlook | None, Sequence[PredictedSigma]]:
     """Return the predicted sigmas of torques and parameters; None if a joint has no torque limit.
 
     Args:
-        given, settings, problem, found: the robot, what was asked for, what was solved, and the motion.
+        inputs: the robot, its limits and model.
+        settings: of the design.
+        problem: that was solved.
+        motion: that solves it.
         problem_of: a period [s] -> the problem with it.
     """
-    limits, noise = given.limits.torque, given.limits.noise
+    limits, noise = inputs.limits.torque, inputs.limits.noise
     if not np.isfinite(limits).all():
         return None, ()
     if noise is None:
-        noise = (DEFAULT_NOISE if settings.noise is None else settings.noise) * limits
-    share = float(np.sqrt(np.mean((noise / limits) ** 2)))
-    task = task_of(given, settings.seed)
-    predict = partial(_prediction, given, noise, task)
-    own, spread = predict(problem.family, found.x, found.factor, settings.repeat)
-    others, evaluations = [], min(OUTLOOK_EVALUATIONS, settings.evaluations // 4)
-    own_period = problem.family.period * found.factor
-    for period in PERIODS if settings.outlook and evaluations and not found.interrupted else ():
-        if period >= own_period - 1e-9:
-            others.append(predict(problem.family, found.x, found.factor, period / own_period)[0])
+        share = DEFAULT_NOISE if settings.noise is None else settings.noise
+        noise = share * limits
+    noise_share = float(np.sqrt(np.mean((noise / limits) ** 2)))
+    task = task_of(inputs, settings.seed)
+    predict = partial(_prediction, inputs, noise, task)
+    prediction, root, shifts = predict(problem.family, motion.x, motion.factor, settings.repeat)
+
+    by_period = []
+    evaluations = min(OUTLOOK_EVALUATIONS, settings.evaluations // 4)
+    periods: Sequence[float] = ()
+    if settings.outlook and evaluations and not motion.interrupted:
+        periods = PERIODS
+    designed_period = problem.family.period * motion.factor
+    for period in periods:
+        # a longer log repeats the motion, a shorter one needs another motion
+        if period >= designed_period - 1e-9:
+            repeated, _, _ = predict(problem.family, motion.x, motion.factor, period / designed_period)
+            by_period.append(repeated)
             continue
-        shorter = _shortened(problem, found, problem_of, period, evaluations)
-        others += [] if shorter is None else [predict(shorter[0], shorter[1].x, shorter[1].factor, 1.0)[0]]
-    model, kept = given.model, given.columns.kept
-    values = np.full(len(model.exact.names), np.nan) if model.values is None else model.values
-    before, earlier = (None, None), [None] * len(values[kept])
-    if given.errors_known:
-        before, earlier = known_sigmas(given, task)
-    parts = given.columns.names, np.array(model.exact.units)[kept].tolist(), values[kept].tolist(), earlier
-    sigmas = (np.linalg.norm(part, axis=1).tolist() for part in (np.hstack(spread), spread[1]))
+        shorter = _shortened(problem, motion, problem_of, period, evaluations)
+        if shorter is not None:
+            family, search = shorter
+            shortened, _, _ = predict(family, search.x, search.factor, 1.0)
+            by_period.append(shortened)
+
+    outlook = MotionOutlook(noise_share, noise, prediction, tuple(by_period))
+    sigmas_before: Sequence[float | None] = [None] * len(inputs.columns.names)
+    if inputs.errors_known:
+        (torque_sigma, share_before), sigmas_before = known_sigmas(inputs, task)
+        outlook = replace(outlook, before=share_before, torque_sigma_before=torque_sigma)
+    return outlook, _parameter_rows(inputs, root, shifts, sigmas_before)
+
+
+def _parameter_rows(
+    inputs: ExcitationInputs, root: np.ndarray, shifts: np.ndarray, sigmas_before: Sequence[float | None]
+) -> list[PredictedSigma]:
+    """Return the rows of ``prediction.csv``.
+
+    Args:
+        inputs: the robot and its model.
+        root, shifts: see `_prediction`.
+        sigmas_before: (c,) stated by the identification that the motion adds to.
+    """
+    model, columns = inputs.model, inputs.columns.kept
+    values = np.full(len(model.exact.names), np.nan)
+    if model.values is not None:
+        values = model.values
+    units = np.array(model.exact.units)[columns].tolist()
+    sigmas = np.linalg.norm(np.hstack([root, shifts]), axis=1).tolist()
+    geometry_sigmas = np.linalg.norm(shifts, axis=1).tolist()
     rows = []
-    for name, unit, value, sigma_before, sigma, geometry in zip(*parts, *sigmas):
-        known = np.isfinite(value) and value != 0.0
-        known_rsd = 100.0 * sigma / abs(value) if known else None
-        part = None if given.geometry is None else geometry
-        rows.append(PredictedSigma(name, unit, value if known else None, sigma, known_rsd, sigma_before, part))
-    return MotionOutlook(share, noise, own, tuple(others), before[1], before[0]), rows
+    for k, value in enumerate(values[columns].tolist()):
+        stated_value = rsd = sigma_geometry = None
+        if np.isfinite(value) and value != 0.0:
+            stated_value = value
+            rsd = 100.0 * sigmas[k] / abs(value)
+        if inputs.geometry is not None:
+            sigma_geometry = geometry_sigmas[k]
+        name = inputs.columns.names[k]
+        rows.append(PredictedSigma(name, units[k], stated_value, sigmas[k], rsd, sigmas_before[k], sigma_geometry))
+    return rows
 
 
-def known_sigmas(given: ExcitationInputs, task: Task) -> tuple[tuple[np.ndarray, float], list[float]]:
+def known_sigmas(inputs: ExcitationInputs, task: Task) -> tuple[tuple[np.ndarray, float], list[float]]:
     """Return the σ of torques on a task (see `_torque_sigma`), and of the parameters, that an identification states."""
-    parts = _root(_known(given)), _shifts_before(given)
-    return _torque_sigma(given, task, *parts), np.linalg.norm(np.hstack(parts), axis=1).tolist()
+    root = _root(_information_root(inputs))
+    shifts = _shifts_before(inputs)
+    sigmas = np.linalg.norm(np.hstack([root, shifts]), axis=1)
+    return _torque_sigma(inputs, task, root, shifts), sigmas.tolist()
 
 
-def _known(given: ExcitationInputs) -> np.ndarray:
+def _information_root(inputs: ExcitationInputs) -> np.ndarray:
     """Return a root (c, c) of the information matrix of earlier motions, for the columns of the design."""
-    assert given.prior is not None
-    kept = given.columns.kept
-    values, V = np.linalg.eigh(given.prior.information[kept][:, kept])
+    assert inputs.prior is not None
+    columns = inputs.columns.kept
+    values, V = np.linalg.eigh(inputs.prior.information[columns][:, columns])
     return np.sqrt(np.maximum(values, 0.0))[:, None] * V.T
 
 
@@ -171,76 +219,96 @@ def _root(W: np.ndarray) -> np.ndarray:
     return (vt.T / np.maximum(s, 1e-12 * s[0])) / scale[:, None]
 
 
-def _felt(given: ExcitationInputs, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+def _geometry_torques(inputs: ExcitationInputs, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
     """Return the torques' changes (N, rows, r) by the principal errors of the geometry; r = 0 for an exact one."""
-    if given.geometry is None or given.model.values is None:
-        return np.zeros((len(q), len(given.model.exact.joint_of_row), 0))
-    return given.geometry.felt(given.model.values, q, v, a)
+    if inputs.geometry is None or inputs.model.values is None:
+        return np.zeros((len(q), len(inputs.model.exact.joint_of_row), 0))
+    return inputs.geometry.felt(inputs.model.values, q, v, a)
 
 
-def _shifts_before(given: ExcitationInputs) -> np.ndarray:
+def _shifts_before(inputs: ExcitationInputs) -> np.ndarray:
     """Return what the principal errors of the geometry did to the parameters (c, r) of an earlier identification."""
-    return (
-        np.zeros((len(given.columns.names), 0)) if given.geometry is None else given.geometry.before[given.columns.kept]
-    )
+    if inputs.geometry is None:
+        return np.zeros((len(inputs.columns.names), 0))
+    return inputs.geometry.before[inputs.columns.kept]
 
 
 def _torque_sigma(
-    given: ExcitationInputs, task: Task, root: np.ndarray, shifts: np.ndarray
+    inputs: ExcitationInputs, task: Task, root: np.ndarray, shifts: np.ndarray
 ) -> tuple[np.ndarray, float]:
     """Return the σ of each joint's predicted torque (n,), largest over the loads, and the rms of σ / torque limit.
 
     Args:
-        root: (c, c) of the parameters' covariance; shifts: (c, r) of the parameters by the geometry's errors.
+        inputs: the robot and its model.
+        task: the states.
+        root: (c, c) of the parameters' covariance.
+        shifts: (c, r) of the parameters by the geometry's errors.
     """
-    errors = np.concatenate([task.regressors @ root, task.regressors @ shifts + task.felt], axis=2)
+    by_torque_errors = task.regressors @ root
+    by_geometry = task.regressors @ shifts + task.felt
+    errors = np.concatenate([by_torque_errors, by_geometry], axis=2)
     squares = np.mean(np.sum(errors**2, axis=2), axis=0)
-    torque = np.sqrt(squares[given.model.exact.limited].max(axis=0))
-    return torque, float(np.sqrt(np.mean((torque / given.limits.torque) ** 2)))
+    torque = np.sqrt(squares[inputs.model.exact.limited].max(axis=0))
+    return torque, float(np.sqrt(np.mean((torque / inputs.limits.torque) ** 2)))
 
 
-def task_states(given: ExcitationInputs, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def task_states(inputs: ExcitationInputs, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return q, v, a (TASK_STATES, n) of a typical task."""
-    box, rng, n = given.limits.positions, np.random.default_rng([seed, 3]), given.chain.n
-    low, high = np.where(np.isfinite(box.lower), box.lower, -np.pi), np.where(np.isfinite(box.upper), box.upper, np.pi)
-    speeds = np.array([joint.velocity for joint in given.chain.joints])
-    fast = 0.5 * np.where(np.isfinite(speeds), speeds, 1.0)
-    q, v, a = low + (high - low) * rng.random((TASK_STATES, n)), *(2.0 * rng.random((2, TASK_STATES, n)) - 1.0)
-    for j, value in given.locked.items():
-        q[:, j], v[:, j], a[:, j] = 0.0 if value is None else value, 0.0, 0.0
-    return q, fast * v, DEFAULT_RISE * fast * a
+    n = inputs.chain.n
+    box = inputs.limits.positions
+    low = np.where(np.isfinite(box.lower), box.lower, -np.pi)
+    high = np.where(np.isfinite(box.upper), box.upper, np.pi)
+    speeds = np.array([joint.velocity for joint in inputs.chain.joints])
+    half_speed = 0.5 * np.where(np.isfinite(speeds), speeds, 1.0)
+    stream = np.random.default_rng([seed, 3])
+    q = low + (high - low) * stream.random((TASK_STATES, n))
+    v, a = 2.0 * stream.random((2, TASK_STATES, n)) - 1.0
+    for j, value in inputs.locked.items():
+        q[:, j] = 0.0 if value is None else value
+        v[:, j] = 0.0
+        a[:, j] = 0.0
+    return q, half_speed * v, DEFAULT_RISE * half_speed * a
 
 
-def task_of(given: ExcitationInputs, seed: int) -> Task:
+def task_of(inputs: ExcitationInputs, seed: int) -> Task:
     """Return the typical task of `task_states`."""
-    states = task_states(given, seed)
-    return Task(given.model.exact.regressor(*states)[:, :, given.columns.kept], _felt(given, *states))
+    states = task_states(inputs, seed)
+    regressors = inputs.model.exact.regressor(*states)[:, :, inputs.columns.kept]
+    return Task(regressors, _geometry_torques(inputs, *states))
 
 
 def _prediction(
-    given: ExcitationInputs, noise: np.ndarray, task: Task, family: Family, x: np.ndarray, factor: float, repeat: float
-) -> tuple[MotionPrediction, tuple[np.ndarray, np.ndarray]]:
+    inputs: ExcitationInputs, noise: np.ndarray, task: Task, family: Family, x: np.ndarray, factor: float, repeat: float
+) -> tuple[MotionPrediction, np.ndarray, np.ndarray]:
     """Return the prediction for `repeat` periods of a motion, and the two parts of the parameters' errors.
 
     They are a root (c, c) of the covariance by the torques' errors, and the shifts (c, r) by the geometry's errors.
     """
+    exact, columns = inputs.model.exact, inputs.columns.kept
     period = family.period * factor
     motion = dense_motion(family, x, period / PERIOD_SAMPLES * np.arange(PERIOD_SAMPLES), factor)
-    rows, sigmas = 2.0 * _band(motion, period) * period * repeat, given.columns.sigmas
-    if sigmas is None or not given.errors_known:
-        own = noise[given.model.exact.joint_of_row]
-        sigmas = own if sigmas is None else np.where(np.isinf(sigmas), np.inf, own)
-        weight, earlier = rows / PERIOD_SAMPLES, np.zeros((0, task.regressors.shape[2]))
+    rows = 2.0 * _band(motion, period) * period * repeat
+
+    # rows are weighted by the stated density of the torques' errors, else by the noise of each independent row
+    sigmas = inputs.columns.sigmas
+    if sigmas is not None and inputs.errors_known:
+        weight = period * repeat / PERIOD_SAMPLES
+        earlier = _information_root(inputs)
     else:
-        weight, earlier = period * repeat / PERIOD_SAMPLES, _known(given)
-    kept, factors = given.columns.kept, np.sqrt(weight) / sigmas[:, None]
-    Y = (given.model.exact.regressor(motion.q, motion.v, motion.a)[:, :, kept] * factors).reshape(
-        -1, len(task.regressors[0, 0])
-    )
-    felt = (_felt(given, motion.q, motion.v, motion.a) * factors).reshape(len(Y), -1)
+        row_noise = noise[exact.joint_of_row]
+        sigmas = row_noise if sigmas is None else np.where(np.isinf(sigmas), np.inf, row_noise)
+        weight = rows / PERIOD_SAMPLES
+        earlier = np.zeros((0, task.regressors.shape[2]))
+    factors = np.sqrt(weight) / sigmas[:, None]
+    Y = exact.regressor(motion.q, motion.v, motion.a)[:, :, columns] * factors
+    Y = Y.reshape(-1, len(task.regressors[0, 0]))
+    geometry_torques = _geometry_torques(inputs, motion.q, motion.v, motion.a) * factors
+    geometry_torques = geometry_torques.reshape(len(Y), -1)
     root = _root(np.concatenate([Y, earlier]))
-    shifts = root @ (root.T @ (earlier.T @ (earlier @ _shifts_before(given)) - Y.T @ felt))
-    return MotionPrediction(period * repeat, rows, *_torque_sigma(given, task, root, shifts)), (root, shifts)
+    information_shifts = earlier.T @ (earlier @ _shifts_before(inputs)) - Y.T @ geometry_torques
+    shifts = root @ (root.T @ information_shifts)
+    torque_sigma, share = _torque_sigma(inputs, task, root, shifts)
+    return MotionPrediction(period * repeat, rows, torque_sigma, share), root, shifts
 
 
 def _band(motion: SampledMotion, period: float) -> float:
@@ -253,23 +321,25 @@ def _band(motion: SampledMotion, period: float) -> float:
 
 def _shortened(
     problem: ExcitationProblem,
-    found: SearchResult,
+    motion: SearchResult,
     problem_of: Callable[[float], ExcitationProblem],
     period: float,
     evaluations: int,
 ) -> tuple[Family, SearchResult] | None:
     """Return a motion of a shorter period, or None; the search starts from the same path, scaled to keep its speeds."""
     try:
-        other = replace(problem_of(period), stretch=(1.0, 1.0))
+        shorter = replace(problem_of(period), stretch=(1.0, 1.0))
     except ValueError:  # as many harmonics of a short period are beyond the resonance, or it is no whole sample
         return None
-    basis, full = other.basis(), problem.family.period * found.factor
-    path = problem.family.basis(basis.times * problem.family.period / period).motion(found.x).q
+    basis = shorter.basis()
+    designed_period = problem.family.period * motion.factor
+    path = problem.family.basis(basis.times * problem.family.period / period).motion(motion.x).q
     middle = path.mean(axis=0)
-    run = one_start(
-        other, evaluations, "slsqp", 0, basis.nearest(middle + period / full * (path - middle)), STAGES[1:3]
-    )
-    return (other.family, run) if isinstance(run, SearchResult) else None
+    start = basis.nearest(middle + period / designed_period * (path - middle))
+    result = one_start(shorter, evaluations, "slsqp", 0, start, STAGES[1:3])
+    if isinstance(result, SearchResult):
+        return shorter.family, result
+    return None
 
 
 def write(rows: Sequence[PredictedSigma], folder: Path) -> Path:
@@ -278,24 +348,26 @@ def write(rows: Sequence[PredictedSigma], folder: Path) -> Path:
     return files.write_table(folder / NAME, header, rows)
 
 
-def lines(one: MotionOutlook, predicted: Sequence[PredictedSigma] = ()) -> list[str]:
+def lines(outlook: MotionOutlook, predicted: Sequence[PredictedSigma] = ()) -> list[str]:
     """Return the predicted σ of torques as text, for this motion and for motions of other lengths.
 
     After an identification, the three parameters whose σ the motion lowers most follow.
     """
-    others = ", ".join(f"{100 * each.torque_sigma_share:.2g} % from {each.seconds:g} s" for each in one.by_period)
+    by_period = ""
+    if outlook.by_period:
+        parts = [f"{100 * motion.torque_sigma_share:.2g} % from {motion.seconds:g} s" for motion in outlook.by_period]
+        by_period = f" ({', '.join(parts)})"
     head = "predicted σ of torques, typical task: "
-    own = f"{100 * one.own.torque_sigma_share:.2g} % of the limits from {one.own.seconds:g} s"
-    others = f" ({others})" if others else ""
-    if one.before is None:
-        return [f"{head}{own}{others}, if the torque residual is {100 * one.noise_share:.2g} %"]
-    gains = sorted(
-        (row for row in predicted if row.sigma_before), key=lambda row: row.sigma / (row.sigma_before or np.inf)
-    )[:3]
+    designed = f"{100 * outlook.own.torque_sigma_share:.2g} % of the limits from {outlook.own.seconds:g} s"
+    if outlook.before is None:
+        noise = f"{100 * outlook.noise_share:.2g} %"
+        return [f"{head}{designed}{by_period}, if the torque residual is {noise}"]
+    rows = [row for row in predicted if row.sigma_before]
+    rows.sort(key=lambda row: row.sigma / (row.sigma_before or np.inf))
+    gains = [f"{row.name} from ± {row.sigma_before:.3g} to ± {row.sigma:.3g} {row.unit}" for row in rows[:NAMED_GAINS]]
     return [
-        f"{head}{100 * one.before:.2g} % so far, with this motion {own}{others}",
-        "most improved: "
-        + "; ".join(f"{row.name} from ± {row.sigma_before:.3g} to ± {row.sigma:.3g} {row.unit}" for row in gains),
+        f"{head}{100 * outlook.before:.2g} % so far, with this motion {designed}{by_period}",
+        "most improved: " + "; ".join(gains),
     ]
 
 
@@ -316,19 +388,21 @@ def compared_with_identification(folder: Path, outcome: IdentificationOutcome) -
         UsageError: if the folder contains no prediction, or one of other parameters.
     """
     check_folder(folder)
-    outlook = read_json(folder / METRICS, "give the folder that calib excite wrote", _Predicted).prediction
-    with refused_as(UsageError, ValueError, "{}; give the folder that calib excite wrote"):
+    outlook = read_json(folder / METRICS, WRITTEN_BY_EXCITE, _Predicted).prediction
+    with refused_as(UsageError, ValueError, f"{{}}; {WRITTEN_BY_EXCITE}"):
         predicted = {row.name: row.sigma for row in read_rows(PredictedSigma, folder / NAME)}
     limits = np.array([joint.effort for joint in outcome.inputs.chain.joints])
-    rms = next(iter(outcome.fit.values())).filtered.rms[-len(limits) :]  # the motors' rows come last
-    known = len(rms) == len(limits) and np.isfinite(rms / limits).all()
-    known &= outlook.before is None  # else the errors were known
-    residual = float(np.sqrt(np.mean((rms / limits) ** 2))) if known else None
+    # the motors' rows come last
+    rms = next(iter(outcome.fit.values())).filtered.rms[-len(limits) :]
+    residual = None
+    # after an identification the errors were known, not assumed
+    if outlook.before is None and len(rms) == len(limits) and np.isfinite(rms / limits).all():
+        residual = float(np.sqrt(np.mean((rms / limits) ** 2)))
     estimate = outcome.found.fitted.estimate if outcome.carried is None else outcome.carried
-    stated = dict(zip(outcome.found.names, estimate.sigma.tolist()))
-    found = sigma_ratio(predicted, stated, residual=residual, assumed=outlook.noise_share)
-    if found is None:
+    identified = dict(zip(outcome.found.names, estimate.sigma.tolist()))
+    ratio = sigma_ratio(predicted, identified, residual=residual, assumed=outlook.noise_share)
+    if ratio is None:
         raise UsageError(
-            f"{folder} contains none of the {len(stated)} identified parameters: it belongs to another robot"
+            f"{folder} contains none of the {len(identified)} identified parameters: it belongs to another robot"
         )
-    return sentence(found)
+    return sentence(ratio)

@@ -18,6 +18,15 @@ from calib.procedure.excitation import coefficients
 from calib.procedure.excitation.excited_model import ExcitedModel, covariance_of
 from calib.robot.chain import Chain
 
+# of a parameter that a constraint holds: its sigma as a share of its value, and at least
+CONSTRAINED_SHARE = 1e-6
+SMALLEST_SIGMA = 1e-12
+# added to the correlation matrix, so that it can be inverted
+REGULARISATION = 1e-9
+# of a designed motion: samples per period, and rate [Hz], at least
+MIN_SAMPLES = 1000
+MIN_RATE = 50
+
 
 class GeometrySpread(Protocol):
     """Principal errors of a calibrated geometry, g_1 … g_r: √λ_i u_i of its covariance Σ λ_i u_i u_iᵀ."""
@@ -74,66 +83,80 @@ def read_prior(
     """
     if not paths and after is None:
         return None
-    total, seconds, sigmas = np.zeros((len(model.exact.names),) * 2), 0.0, None
-    names, trained = [], ()
+    column_count = len(model.exact.names)
+    total = np.zeros((column_count, column_count))
+    sigmas = None
+    names: list[str] = []
+    identified: tuple[str, ...] = ()
     if after is not None:
-        total, sigmas = _known(after, model, geometry)
-        names, trained = ["what is identified"], tuple(IdentificationFolder(after).metrics().identification)
+        total, sigmas = _identified_information(after, model, geometry)
+        names.append("what is identified")
+        identified = tuple(IdentificationFolder(after).metrics().identification)
+    row_sigmas = noise if sigmas is None else sigmas
+    seconds = 0.0
     for text in paths:
-        if Path(text).name in trained:
+        if Path(text).name in identified:
             raise UsageError(f"existing {text}: {after} was identified from this recording; leave it out")
-        designed = (Path(text) / coefficients.NAME).exists()
-        q, v, a, rate = designed_orders(Path(text), chain) if designed else _recorded(text, chain)
-        total += information(model.exact, q, v, a, noise if sigmas is None else sigmas) / rate
+        if (Path(text) / coefficients.NAME).exists():
+            q, v, a, rate = designed_orders(Path(text), chain)
+        else:
+            q, v, a, rate = _recorded(text, chain)
+        total += information(model.exact, q, v, a, row_sigmas) / rate
         seconds += len(q) / rate
     return PriorMotions((*names, *paths), seconds, total, sigmas)
 
 
-def _known(folder: Path, model: ExcitedModel, geometry: GeometrySpread | None) -> tuple[np.ndarray, np.ndarray]:
+def _identified_information(
+    folder: Path, model: ExcitedModel, geometry: GeometrySpread | None
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the information (b, b) of an identification, and the square root of its torque error density (rows,).
 
     Args:
         geometry: where it is given, its part is not in the information.
     """
-    metrics, path = IdentificationFolder(folder).metrics(), folder / COVARIANCE
-    density, rows = metrics.error_density, metrics.rows
-    path = path if geometry is None else folder / TORQUE_COVARIANCE
+    metrics = IdentificationFolder(folder).metrics()
+    density = metrics.error_density
+    path = folder / (COVARIANCE if geometry is None else TORQUE_COVARIANCE)
     covariance = covariance_of(path, model.exact)
     if density is None:
         raise UsageError(f"{folder}/metrics.json has no error_density of the torque rows; identify again")
     if len(density) != model.exact.model.rows:
         designed = model.exact.model.torque_rows.name
         raise UsageError(
-            f"{folder} states torque errors of {', '.join(rows)}, and a motion is designed for rows = '{designed}': "
-            f"identify again with rows = '{designed}', or name the folder as --model, without --after"
+            f"{folder} states torque errors of {', '.join(metrics.rows)}, "
+            f"and a motion is designed for rows = '{designed}': identify again with "
+            f"rows = '{designed}', or name the folder as --model, without --after"
         )
     if covariance is None:
         raise UsageError(
             f"{path} is missing or lacks columns of the design; if the model has payloads, state each run's load "
             "(--load none --load tool)"
         )
-    spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     # what a constraint holds has no spread and gains nothing: as if known to a millionth (our choice)
-    spread = np.where(spread > 0.0, spread, np.maximum(1e-6 * np.abs(cast(np.ndarray, model.values)), 1e-12))
-    unit = covariance / np.outer(spread, spread)
-    np.fill_diagonal(unit, 1.0 + 1e-9)
-    if not np.linalg.eigvalsh(unit)[0] > 0.0:
+    smallest = np.maximum(CONSTRAINED_SHARE * np.abs(cast(np.ndarray, model.values)), SMALLEST_SIGMA)
+    sigma = np.where(sigma > 0.0, sigma, smallest)
+    scale = np.outer(sigma, sigma)
+    correlation = covariance / scale
+    np.fill_diagonal(correlation, 1.0 + REGULARISATION)
+    if not np.linalg.eigvalsh(correlation)[0] > 0.0:
         raise UsageError(f"{path} is not positive definite, so it is damaged; identify again")
-    return np.linalg.inv(unit) / np.outer(spread, spread), np.tile(np.sqrt(density), len(model.exact.loads))
+    root_density = np.tile(np.sqrt(density), len(model.exact.loads))
+    return np.linalg.inv(correlation) / scale, root_density
 
 
 def designed_orders(folder: Path, chain: Chain) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Return q, v, a of all periods of a designed motion, sampled at 50 Hz or more, and the sampling rate [Hz]."""
-    found = coefficients.read(folder)
-    if found.joint_names != tuple(chain.joint_names):
+    motion = coefficients.read(folder)
+    if motion.joint_names != tuple(chain.joint_names):
         raise UsageError(
-            f"{folder}: the motion has joints {', '.join(found.joint_names)}; {chain.name} has "
+            f"{folder}: the motion has joints {', '.join(motion.joint_names)}; {chain.name} has "
             f"{', '.join(chain.joint_names)}"
         )
-    count = max(1000, round(50 * found.period))
-    q, v, a = found.orders(np.arange(count) * (found.period / count))
-    every = found.repeat
-    return np.tile(q, (every, 1)), np.tile(v, (every, 1)), np.tile(a, (every, 1)), count / found.period
+    count = max(MIN_SAMPLES, round(MIN_RATE * motion.period))
+    q, v, a = motion.orders(np.arange(count) * (motion.period / count))
+    periods = (motion.repeat, 1)
+    return np.tile(q, periods), np.tile(v, periods), np.tile(a, periods), count / motion.period
 
 
 def _recorded(text: str, chain: Chain) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:

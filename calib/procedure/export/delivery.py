@@ -21,7 +21,8 @@ parameters.json       names, units, values and covariances of geometry and dynam
                       with drives.csv) and by the identified model, at the samples of the ``torques_N.csv`` named there.
 README.txt            what each file is for, and the verdict on it.
 
-Masses are those of physically consistent bodies (`calib.identification.possible.solve`). What the torques do not
+Masses are those of physically consistent bodies (`calib.identification.physical_consistency.solve`). What the torques
+do not
 identify is regularised towards the masses of the robot's description: by the entropic (log-det) prior, which keeps off
 the border of the physically consistent; with ``--prior euclidean`` by its second order, which does not, so that a body
 may come out thin. A link to which others are fixed (flange, covers, sensors) is identified with them as one body: the
@@ -42,12 +43,13 @@ import numpy as np
 
 from calib import files
 from calib.errors import UsageError
-from calib.extensions import Point
 from calib.folders import OFFSETS, PARAMETERS, check_target, write_staged
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.export import geometry, identified
 from calib.procedure.export.geometry import results
 from calib.procedure.export.identified import ExportedPrediction, IdentifiedRobot
+from calib.procedure.export.joint_origins import joint_origins
+from calib.procedure.export.ur_kinematics import kinematics
 from calib.procedure.findings import Verdict, Verdicts
 from calib.procedure.kinematic_stage.folder import (
     CORRECTED_URDF,
@@ -64,13 +66,6 @@ from calib.robot.chain import Joint
 from calib.robot.description import impossible_bodies
 from calib.robot.formats import urdf_write
 from calib.robot.formats.urdf_tree import is_urdf, text, with_comment
-
-UR_KINEMATICS_YAML: Point[Callable[[CalibratedChain], tuple[str, str]]] = Point(
-    "ur_kinematics", "YAML for ur_description, and a remark"
-)
-JOINT_ORIGINS: Point[Callable[[str, str, str], str]] = Point(
-    "joint_origins", "YAML for tesseract of a nominal and a calibrated URDF"
-)
 
 README, UR_KINEMATICS, MJCF, DRIVES = "README.txt", "ur_kinematics.yaml", "robot.xml", "drives.csv"
 GEOMETRY, DYNAMICS = "geometry", "dynamics"
@@ -100,7 +95,7 @@ class Export:
         fit: folder of the fit; None: identified dynamics alone.
         identified: folder of the identification; None: geometry alone.
         prior: regularisation of masses that the torques do not identify, see
-            `calib.identification.possible.solve.PRIORS`.
+            `calib.identification.physical_consistency.solve.PRIORS`.
         remark: for the head of files that a robot or a simulation moves by.
     """
 
@@ -184,12 +179,9 @@ def _offsets(export: Export, path: Path) -> list[str]:
 
 
 def _ur_kinematics(export: Export, path: Path) -> list[str]:
-    notes = []
-    for kinematics in UR_KINEMATICS_YAML.all():
-        content, flange = kinematics(export.robot, FitFolder(export.fit or Path()).urdf)
-        files.write(path, _remarked(content.encode(), export.remark))
-        notes.append(f"{path.name}: for kinematics_params_file of ur_description" + (f"; {flange}" if flange else ""))
-    return notes
+    content, flange = kinematics(export.robot, FitFolder(export.fit or Path()).urdf)
+    files.write(path, _remarked(content.encode(), export.remark))
+    return [f"{path.name}: for kinematics_params_file of ur_description" + (f"; {flange}" if flange else "")]
 
 
 def _mjcf(export: Export, path: Path) -> list[str]:
@@ -216,8 +208,8 @@ def _drives(export: Export, path: Path) -> list[str]:
 
 def _joint_origins(export: Export, path: Path) -> list[str]:
     if export.urdf is not None:
-        for origins in JOINT_ORIGINS.all():
-            files.write(path, origins(text(export.urdf)[0], export.with_masses[0], str(export.urdf)))
+        origins = joint_origins(text(export.urdf)[0], export.with_masses[0], str(export.urdf))
+        files.write(path, origins)
     return []
 
 

@@ -15,9 +15,9 @@ from calib.dynamics.bodies import Bodies, bodies_of
 from calib.dynamics.drives import DriveTerm
 from calib.errors import RobotError, finding, listing
 from calib.identification.model_file import MODEL, refuse_currents
-from calib.identification.possible.information import Information
-from calib.identification.possible.information import read as read_information
-from calib.identification.possible.solve import PossibleBodies, find_possible
+from calib.identification.physical_consistency.information import Information
+from calib.identification.physical_consistency.information import read as read_information
+from calib.identification.physical_consistency.solve import PossibleBodies, find_possible
 from calib.identification.prediction import Dynamics
 from calib.procedure.dynamic_stage.folder import IdentificationFolder, read_torques
 from calib.procedure.export import geometry

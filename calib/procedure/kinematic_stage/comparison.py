@@ -2,29 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements, Positions
-from calib.extensions import Point
 from calib.geometry.accuracy import Errors, errors, pair_errors, statistics
 from calib.geometry.error_model import ErrorModel, outside
 from calib.geometry.fit import placed_on
 from calib.geometry.installation import Installation
 from calib.geometry.repeatability import ARMS, RepeatedPoses, repeated_poses
 from calib.geometry.weighing import Settings
+from calib.procedure.kinematic_stage.image_findings import reprojection
 from calib.procedure.kinematic_stage.inputs import Unseen, pose_count
 from calib.procedure.kinematic_stage.metrics import ComparedRows, IntervalCoverage
 
-REPROJECTION: Point[Callable[[Installation, Any], Any]] = Point("reprojection", "how far corners are off")
-
-# of unseen rows: the standard deviation that the fit expects of the calibrated arm's position error there, all axes
-# together; the radius within which 95 % of such errors are to be; 1 where a joint is outside the range learnt from
+# Columns of unseen rows: the standard deviation that the fit expects of the calibrated arm's position error there, all
+# axes together; the radius within which 95 % of such errors are to be; 1 where a joint is outside the range learnt from
 INTERVAL = ("sigma [mm]", "interval95 [mm]", "extrapolated")
-MARGIN = 3  # measured numbers per fitted parameter of a placement, below which errors prove nothing (our choice)
+# measured numbers per fitted parameter of a placement, below which errors prove nothing (our choice)
+MARGIN = 3
+# kind of a block -> what its position errors are, where it measures no position
+MEASURED = {"sockets": "socket scatter", "plane": "plane distance"}
+# kinds of blocks that have no position errors
+WITHOUT_POSITIONS = ("distance", "bar")
+# ISO 9283 requires so many poses and cycles; makers state an accuracy from so many poses
+ISO_POSES = 5
+ISO_CYCLES = 30
+USUAL_POSES = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +41,7 @@ class Intervals:
     Attributes:
         sigma: (m,) standard deviation of the tool position error, all axes together [m].
         radius: (m,) within which 95 % of such errors are to be [m].
-        size: (m,) the errors found [m].
+        size: (m,) the errors [m].
         beyond: (m,) whether a joint stands outside the training range.
         joints: names of those that do.
     """
@@ -107,55 +114,60 @@ class Comparison:
     @property
     def of_urdf(self) -> Comparison:
         """The comparison for the URDF alone: without joint corrections and without intervals (these include them)."""
-        return self if self.alone is None else replace(self, errors=(self.errors[0], self.alone), intervals=None)
+        if self.alone is None:
+            return self
+        return replace(self, errors=(self.errors[0], self.alone), intervals=None)
 
     def record(self, parameters: int = 0) -> ComparedRows:
         """Return the entry of ``metrics.json``; `parameters` is the number of parameters fitted to these rows."""
-        pairs = self.pairs if len(self.pairs[0]) else ()
+        pair_distances = {}
+        if len(self.pairs[0]):
+            pair_distances = {arm: statistics(sizes, 1e3) for arm, sizes in zip(ARMS, self.pairs)}
+        urdf_alone = None if self.alone is None else self.alone.summary()
+        plain = None if self.plain is None else self.plain.summary()
+        interval95 = None if self.intervals is None else self.intervals.record
         return ComparedRows(
             poses=self.poses,
             frames=self.frames,
             nominal=self.errors[0].summary(),
             calibrated=self.errors[1].summary(),
-            urdf_alone=None if self.alone is None else self.alone.summary(),
-            plain=None if self.plain is None else self.plain.summary(),
-            pair_distance_mm={arm: statistics(sizes, 1e3) for arm, sizes in zip(ARMS, pairs)},
+            urdf_alone=urdf_alone,
+            plain=plain,
+            pair_distance_mm=pair_distances,
             iso9283=self.repeated,
             unseen=self.proves,
             parameters=parameters,
-            interval95=None if self.intervals is None else self.intervals.record,
+            interval95=interval95,
             reprojection_px=dict(zip(ARMS, self.reprojection or ())),
             position_means=_position_means(self.blocks),
         )
 
 
-MEASURED = {"sockets": "socket scatter", "plane": "plane distance"}
-"""Kind of a block → what its position errors are, where it measures no position."""
-
-
 def _position_means(blocks: Sequence[PoseMeasurements]) -> str:
     """Return what the position errors of blocks are, in words."""
-    kinds = dict.fromkeys(block.kind for block in blocks if block.kind not in ("distance", "bar"))
-    return " or ".join(dict.fromkeys(MEASURED.get(kind, "position") for kind in kinds)) or "position"
+    kinds = [block.kind for block in blocks if block.kind not in WITHOUT_POSITIONS]
+    means = dict.fromkeys(MEASURED.get(kind, "position") for kind in kinds)
+    return " or ".join(means) or "position"
 
 
 def compare(
     cells: Sequence[Installation], blocks: Sequence[PoseMeasurements], frames: str, proves: bool = True, seed: int = 0
 ) -> Comparison:
     """Return the errors of the nominal arm, the calibrated arm and (if given) the URDF alone on the same rows."""
-    (one, two, *alone), both = [errors(cell, blocks) for cell in cells], (cells[0], cells[1])
-    first, second = (pair_errors(cell, blocks, seed=seed) for cell in both)
-    corners: Any = tuple(room(cell, blocks) for room in REPROJECTION.all() for cell in both)
+    nominal, calibrated, *urdf_alone = [errors(cell, blocks) for cell in cells]
+    arms = (cells[0], cells[1])
+    pairs_nominal, pairs_calibrated = (pair_errors(cell, blocks, seed=seed) for cell in arms)
+    corners: Any = tuple(reprojection(cell, blocks) for cell in arms)
     return Comparison(
-        tuple(blocks),
-        both,
-        (one, two),
-        (first, second),
-        pose_count(blocks),
-        frames,
-        proves,
-        alone=alone[0] if alone else None,
-        repeated=repeated_poses(both, blocks),
+        blocks=tuple(blocks),
+        cells=arms,
+        errors=(nominal, calibrated),
+        pairs=(pairs_nominal, pairs_calibrated),
+        poses=pose_count(blocks),
+        frames=frames,
+        proves=proves,
+        alone=urdf_alone[0] if urdf_alone else None,
+        repeated=repeated_poses(arms, blocks),
         reprojection=None if None in corners else corners or None,
     )
 
@@ -178,56 +190,81 @@ def compare_unseen(
         expected: what errors the fit expects; None without an error model.
         plain: the plain reference.
     """
-    block, settled, thin = unseen.block, True, None
+    block = unseen.block
+    settled = True
+    placed_by = None
     if unseen.own_frames:
-        placed = [placed_on(cell, block, settings) for cell in cells]
-        cells = [each.cell for each in placed]
-        settled = all(each.solution.status.good for each in placed[:2])
-        numbers, fitted = sum(piece.part.value.size for piece in placed[1].pieces), len(placed[1].free)
-        words = "base and tool placement refitted on these rows"
+        placements = [placed_on(cell, block, settings) for cell in cells]
+        cells = [placement.cell for placement in placements]
+        settled = all(placement.solution.status.good for placement in placements[:2])
+        calibrated = placements[1]
+        measured = sum(piece.part.value.size for piece in calibrated.pieces)
+        parameters = len(calibrated.free)
+        frames = "base and tool placement refitted on these rows"
         if not settled:
-            words = "base and tool placement did not converge on these rows"
-        elif numbers < MARGIN * fitted:
-            thin = numbers, fitted
-            words = f"base and tool placement: {fitted} parameters fitted to only {numbers} numbers of these rows"
+            frames = "base and tool placement did not converge on these rows"
+        elif measured < MARGIN * parameters:
+            placed_by = measured, parameters
+            frames = f"base and tool placement: {parameters} parameters fitted to only {measured} numbers of these rows"
     elif unseen.held_out:
-        words = "those of the fit"
+        frames = "those of the fit"
+    elif block.has_instrument:
+        frames = f"those of the fit, station '{block.station}'"
     else:
-        words = f"those of the fit, station '{block.station}'" if block.has_instrument else "tool of the fit"
-    found = compare(cells, [block], words, settled and thin is None and not unseen.seen, seed)
-    sizes, intervals = found.errors[1].position, None
+        frames = "tool of the fit"
+    proves = settled and placed_by is None and not unseen.seen
+    comparison = compare(cells, [block], frames, proves, seed)
+
+    intervals = None
+    sizes = comparison.errors[1].position
     if expected is not None and isinstance(block, Positions) and sizes is not None:
-        sigma, beyond = expected.sigma_on(cells[1], block, unseen.own_frames), outside(block.q, expected.learnt)
-        names = tuple(name for name, out in zip(block.joint_names, np.any(beyond, axis=0)) if out)
-        intervals = Intervals(sigma, expected.discrepancy.radius * sigma, sizes, np.any(beyond, axis=1), names)
-    shares = not (unseen.own_frames or unseen.held_out)
-    reference = None
+        sigma = expected.sigma_on(cells[1], block, unseen.own_frames)
+        outside_range = outside(block.q, expected.learnt)
+        joint_outside = np.any(outside_range, axis=0)
+        joints = tuple(name for name, is_outside in zip(block.joint_names, joint_outside) if is_outside)
+        radius = expected.discrepancy.radius * sigma
+        intervals = Intervals(sigma, radius, sizes, np.any(outside_range, axis=1), joints)
+
+    plain_errors = None
     if plain is not None and settled:
         if unseen.own_frames:
             plain = placed_on(plain, block, settings).cell
-        reference = errors(plain, [block])
-    return replace(found, settled=settled, placed_by=thin, intervals=intervals, shares_frames=shares, plain=reference)
-
-
-def interval_cells(found: Comparison) -> np.ndarray:
-    """Return the table cells (m, 3) of `INTERVAL` for all rows; NaN if the fit has no error model."""
-    if (each := found.intervals) is None:
-        return np.full((sum(map(len, found.blocks)), 3), np.nan)
-    return np.column_stack([1e3 * each.sigma, 1e3 * each.radius, each.beyond])
-
-
-def iso9283_sentence(
-    found: RepeatedPoses, arm: str, min_poses: int = 5, min_cycles: int = 30, usual_poses: int = 100
-) -> str:
-    """Return a sentence with repeatability RP and accuracy AP of repeated poses (ISO 9283); `arm`: what was fitted."""
-    least, most = found.cycles
-    cycles = f"{least}" if least == most else f"{least} to {most}"
-    nominal, calibrated = (found.accuracy_mm[arm]["mean"] for arm in ARMS)
-    words = (
-        f"ISO 9283 on {found.poses} poses repeated {cycles} times: RP {found.repeatability_mm['mean']:.3f} mm "
-        f"(at most {found.repeatability_mm['max']:.3f}), AP {nominal:.3f} mm nominal, {calibrated:.3f} mm {arm}"
+        plain_errors = errors(plain, [block])
+    return replace(
+        comparison,
+        settled=settled,
+        placed_by=placed_by,
+        intervals=intervals,
+        shares_frames=not (unseen.own_frames or unseen.held_out),
+        plain=plain_errors,
     )
-    few = [f"{min_poses} poses"] * (found.poses < min_poses) + [f"{min_cycles} cycles"] * (least < min_cycles)
-    words += f"; the norm requires {' and '.join(few)}" if few else ""
-    too_few = f"; too few poses to state an accuracy (makers use {usual_poses})"
-    return words + (too_few if found.poses < usual_poses else "")
+
+
+def interval_cells(comparison: Comparison) -> np.ndarray:
+    """Return the table cells (m, 3) of `INTERVAL` for all rows; NaN if the fit has no error model."""
+    intervals = comparison.intervals
+    if intervals is None:
+        row_count = sum(len(block) for block in comparison.blocks)
+        return np.full((row_count, 3), np.nan)
+    return np.column_stack([1e3 * intervals.sigma, 1e3 * intervals.radius, intervals.beyond])
+
+
+def iso9283_sentence(repeated: RepeatedPoses, arm: str) -> str:
+    """Return a sentence with repeatability RP and accuracy AP of repeated poses (ISO 9283); `arm`: what was fitted."""
+    fewest, largest = repeated.cycles
+    cycles = f"{fewest}" if fewest == largest else f"{fewest} to {largest}"
+    nominal, calibrated = (repeated.accuracy_mm[name]["mean"] for name in ARMS)
+    text = (
+        f"ISO 9283 on {repeated.poses} poses repeated {cycles} times: RP {repeated.repeatability_mm['mean']:.3f} mm "
+        f"(at most {repeated.repeatability_mm['max']:.3f}), AP {nominal:.3f} mm nominal, {calibrated:.3f} mm {arm}"
+    )
+    required = []
+    if repeated.poses < ISO_POSES:
+        required.append(f"{ISO_POSES} poses")
+    if fewest < ISO_CYCLES:
+        required.append(f"{ISO_CYCLES} cycles")
+    if required:
+        text += f"; the norm requires {' and '.join(required)}"
+    if repeated.poses < USUAL_POSES:
+        text += f"; too few poses to state an accuracy (makers use {USUAL_POSES})"
+    return text

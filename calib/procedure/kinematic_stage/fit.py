@@ -8,7 +8,6 @@ from typing import TypeVar
 from calib.data.poses.fit_options import FitOptions
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import Finding, NotConverged, finding
-from calib.extensions import Point
 from calib.geometry.accuracy import errors
 from calib.geometry.checks.joint_range import joint_range
 from calib.geometry.checks.row_changes import row_changes
@@ -25,6 +24,7 @@ from calib.geometry.weighing import GeometricFit, Settings, calibrated_chain
 from calib.procedure.findings import Verdict, level_of, sentence, settle
 from calib.procedure.kinematic_stage import plausibility
 from calib.procedure.kinematic_stage.comparison import Comparison
+from calib.procedure.kinematic_stage.image_findings import image_notes
 from calib.procedure.kinematic_stage.inputs import Inputs, plain_reference
 from calib.procedure.kinematic_stage.metrics import Findings, Outlier
 from calib.procedure.kinematic_stage.plausibility import gross_rows, misfit, named_outliers
@@ -33,11 +33,12 @@ from calib.procedure.kinematic_stage.validation import Arms, Assessment, assess
 from calib.procedure.measuring.prediction import SelectionPrediction, compared_with_fit
 from calib.robot.calibrated import CalibratedChain
 
-FIT_NOTES: Point[Callable[[GeometricFit], list[Finding]]] = Point("fit_notes", "findings on a fit")
-
 Progress = Callable[[str], None]
-MOVED = 3.0  # nominal errors fall by this factor when each file gets a station of its own: it was moved (our choice)
-HEEDS_ALL = ("none", "huber")  # losses that let a few gross rows draw a fit
+
+# nominal errors fall by this factor when each file gets a station of its own: the instrument was moved (our choice)
+MOVED = 3.0
+# losses that let a few gross rows draw a fit
+HEEDS_ALL = ("none", "huber")
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +50,8 @@ class Outcome:
         selection: the rungs, the chosen model, and the fits of the nominal and the calibrated arm.
         rigid: the best fit without joint corrections: the geometry that a URDF holds.
         outliers: rows of the fit that do not fit, worst first.
-        unclear: what is not identifiable from the poses.
-        findings: what the fit says of itself.
+        undetermined: parameters that are not identifiable from the poses.
+        findings: warnings and notes on the fit.
         assessment: both arms on fitted and on unseen rows, and the verdict.
         settings, options: how it was fitted and judged.
         expected: how far off the calibrated arm may be at any pose; None where no positions were measured.
@@ -60,7 +61,7 @@ class Outcome:
     selection: ModelSelection
     rigid: GeometricFit
     outliers: Sequence[Outlier]
-    unclear: tuple[Finding, ...]
+    undetermined: tuple[Finding, ...]
     findings: Findings
     assessment: Assessment
     settings: FitSettings = field(default_factory=FitSettings)
@@ -70,12 +71,13 @@ class Outcome:
     @property
     def robot(self) -> CalibratedChain:
         """Calibrated robot with covariance and corrections, for identification, excitation and export."""
-        found = calibrated_chain(self.selection.fit, self.rigid, self.inputs.nominal)
-        if found.corrections is not None and self.inputs.masses is not None:
-            reference = replace(found.deflection.reference or self.inputs.chain, inertias=self.inputs.masses)
-            bent = replace(found.deflection, reference=reference)
-            found = replace(found, corrections=replace(found.corrections, deflection=bent))
-        return replace(found, source=str(self.inputs.source))
+        robot = calibrated_chain(self.selection.fit, self.rigid, self.inputs.nominal)
+        if robot.corrections is not None and self.inputs.masses is not None:
+            # the corrections' gravity torques are those of the identified masses
+            reference = replace(robot.deflection.reference or self.inputs.chain, inertias=self.inputs.masses)
+            deflection = replace(robot.deflection, reference=reference)
+            robot = replace(robot, corrections=replace(robot.corrections, deflection=deflection))
+        return replace(robot, source=str(self.inputs.source))
 
     @cached_property
     def nominal_cell(self) -> Installation:
@@ -83,11 +85,12 @@ class Outcome:
 
         A fit of an earlier fit's robot compares with that robot; its nominal arm is placed anew.
         """
-        compared, nominal = self.selection.nominal.cell, self.inputs.nominal
+        nominal = self.inputs.nominal
         if nominal is self.inputs.chain:
-            return compared
-        loss = self.settings.loss or self.options.loss
-        settings = Settings(self.findings.loss or loss, self.options.loss_scale)
+            return self.selection.nominal.cell
+        settings = weighing_settings(self.options, self.settings)
+        if self.findings.loss:
+            settings = replace(settings, loss=self.findings.loss)
         return polish_frames(install(nominal, self.inputs.fit), self.inputs.fit, settings).cell
 
     @property
@@ -114,31 +117,43 @@ class Outcome:
 T = TypeVar("T", bound=Outcome)
 
 
+def weighing_settings(options: FitOptions, settings: FitSettings) -> Settings:
+    """Return the loss of the residuals: the one of the fit's settings, else that of the options file."""
+    return Settings(settings.loss or options.loss, options.loss_scale)
+
+
+def _silent(stage: str) -> None:
+    """Show no progress."""
+
+
 def run(
     inputs: Inputs,
     options: FitOptions | None = None,
-    wanted: FitSettings | None = None,
+    settings: FitSettings | None = None,
     progress: Progress | None = None,
-    selection: SelectionPrediction | None = None,
+    prediction: SelectionPrediction | None = None,
 ) -> Outcome:
     """Return the outcome of a fit: the chosen model, errors on all rows, and the verdict.
 
     Args:
         inputs: see `calib.procedure.kinematic_stage.inputs.gather`.
         options: the fit options file's content.
-        wanted: model, loss and folds of the ladder, tolerance, seed.
+        settings: model, loss and folds of the ladder, tolerance, seed.
         progress: called with a few words at each stage.
-        selection: what was predicted when the poses were chosen, to be held against what the fit states.
+        prediction: accuracy predicted when the poses were chosen, compared with the one that the fit states.
 
     Raises:
         NotConverged: where the chosen model's fit did not come to an end.
     """
-    options, wanted, say = options or FitOptions(), wanted or FitSettings(), progress or (lambda words: None)
-    settings = Settings(wanted.loss or options.loss, options.loss_scale)
-    asked, seed = wanted.model or options.model, wanted.seed
-    if selection is not None:
-        selection.check_robot(inputs.chain.joint_names)
-    say("estimating the placements of instrument and tool")
+    options = options or FitOptions()
+    settings = settings or FitSettings()
+    progress = progress or _silent
+    weighing = weighing_settings(options, settings)
+    model = settings.model or options.model
+    if prediction is not None:
+        prediction.check_robot(inputs.chain.joint_names)
+
+    progress("estimating the placements of instrument and tool")
     start = install(inputs.chain, inputs.fit, inputs.known)
     climb = partial(
         select_model,
@@ -146,91 +161,136 @@ def run(
         inputs.fit,
         fixed=fixed_parameters(start, options),
         prior=stated_prior(start, options),
-        folds=folds_by_name(wanted.folds, inputs.fit, seed),
-        seed=seed,
-        progress=lambda done, total, what: say(f"fitting: {what}"),
+        folds=folds_by_name(settings.folds, inputs.fit, settings.seed),
+        seed=settings.seed,
+        progress=lambda done, total, what: progress(f"fitting: {what}"),
     )
-    found = climb(asked, settings=settings)
-    reach = found.nominal.cell.reach
-    status = found.fit.solution.status
-    if not status.good:
-        odd = plausibility.findings(found.nominal.cell, found.fit, inputs.fit, None, reach)
-        why = [sentence(one) for one in settle(odd, options.accept) if level_of(one) == "fail"]
-        words = f"the fit of model '{found.chosen}' did not converge: {status.value}"
-        raise NotConverged("; ".join([words, *why]), found.fit)
-    changed = row_changes(found.rigid)
-    explained = bool(changed) and changed[-1].values["after"] < plausibility.FLOOR * reach
-    rigid_misfit = None if explained else misfit(found, reach)
-    if rigid_misfit and settings.loss in HEEDS_ALL:
-        robust = climb("geometry", settings=replace(settings, loss="cauchy"))
-        rigid_misfit = gross_rows(found, robust, reach) or rigid_misfit
-    say("comparing on unseen poses")
-    settings = replace(settings, loss=found.loss)
-    rigid = found.rigid_fit(inputs.fit, settings, inputs.bare)
-    named = named_outliers(found.fit)
-    notes = [
-        *changed,
-        *([rigid_misfit] if rigid_misfit else []),
-        *_moved_between(found.nominal.cell, inputs.fit, settings),
-        *diagnose(found.fit, with_changes=not changed),
-        *(note for notes in FIT_NOTES.all() for note in notes(found.fit)),
-    ]
-    if selection is not None and (ratio := compared_with_fit(selection, found.fit)) is not None:
-        notes.append(ratio)
-    held = joint_range(found.rigid, found.nominal.cell)
-    if found.chosen != "frames":  # else the arm is the nominal one everywhere
-        notes += plausibility.of_range(held, wanted.tolerance)
-    findings = replace(_found_of(inputs, found, named, notes, options.accept), joint_range=held)
-    say("estimating the expected errors")
-    expected = learn_errors(found, inputs.fit, seed)
-    findings = replace(findings, discrepancy=None if expected is None else expected.discrepancy)
-    plain = plain_reference(found.nominal.cell, inputs)
-    arms = Arms(found.nominal.cell, found.fit.cell, rigid.cell.chain, expected, plain)
-    result = assess(arms, inputs, findings, settings, replace(wanted, model=asked))
-    unclear = tuple(unidentified(found.fit))
-    return Outcome(inputs, found, rigid, named, unclear, findings, result, wanted, options, expected)
+    selection = climb(model, settings=weighing)
+    nominal = selection.nominal.cell
+    _check_convergence(selection, inputs, options)
+
+    # Row changes that explain the rigid misfit stand in its place.
+    changes = row_changes(selection.rigid)
+    explained = bool(changes) and changes[-1].values["after"] < plausibility.FLOOR * nominal.reach
+    rigid_misfit = None
+    if not explained:
+        rigid_misfit = misfit(selection, nominal.reach)
+    if rigid_misfit and weighing.loss in HEEDS_ALL:
+        robust = climb("geometry", settings=replace(weighing, loss="cauchy"))
+        rigid_misfit = gross_rows(selection, robust, nominal.reach) or rigid_misfit
+
+    progress("comparing on unseen poses")
+    weighing = replace(weighing, loss=selection.loss)
+    rigid = selection.rigid_fit(inputs.fit, weighing, inputs.bare)
+    outliers = named_outliers(selection.fit)
+    notes = list(changes)
+    if rigid_misfit:
+        notes.append(rigid_misfit)
+    notes += _moved_between(nominal, inputs.fit, weighing)
+    notes += diagnose(selection.fit, with_changes=not changes)
+    notes += image_notes(selection.fit)
+    if prediction is not None:
+        ratio = compared_with_fit(prediction, selection.fit)
+        if ratio is not None:
+            notes.append(ratio)
+    measured_range = joint_range(selection.rigid, nominal)
+    # with frames alone the arm is the nominal one everywhere
+    if selection.chosen != "frames":
+        notes += plausibility.of_range(measured_range, settings.tolerance)
+    findings = _findings(inputs, selection, outliers, notes, options.accept)
+    findings = replace(findings, joint_range=measured_range)
+
+    progress("estimating the expected errors")
+    expected = learn_errors(selection, inputs.fit, settings.seed)
+    if expected is not None:
+        findings = replace(findings, discrepancy=expected.discrepancy)
+    plain = plain_reference(nominal, inputs)
+    arms = Arms(nominal, selection.fit.cell, rigid.cell.chain, expected, plain)
+    assessment = assess(arms, inputs, findings, weighing, replace(settings, model=model))
+    return Outcome(
+        inputs=inputs,
+        selection=selection,
+        rigid=rigid,
+        outliers=outliers,
+        undetermined=tuple(unidentified(selection.fit)),
+        findings=findings,
+        assessment=assessment,
+        settings=settings,
+        options=options,
+        expected=expected,
+    )
+
+
+def _check_convergence(selection: ModelSelection, inputs: Inputs, options: FitOptions) -> None:
+    """Raise an error if the chosen model's fit did not converge, with the findings that may be the reason."""
+    status = selection.fit.solution.status
+    if status.good:
+        return
+    nominal = selection.nominal.cell
+    contradictions = plausibility.findings(nominal, selection.fit, inputs.fit, None, nominal.reach)
+    reasons = [sentence(reason) for reason in settle(contradictions, options.accept) if level_of(reason) == "fail"]
+    message = f"the fit of model '{selection.chosen}' did not converge: {status.value}"
+    raise NotConverged("; ".join([message, *reasons]), selection.fit)
 
 
 def assessed(outcome: T, inputs: Inputs) -> T:
     """Return the outcome with a new verdict from the validation rows of `inputs`; nothing is fitted."""
-    wanted, options, fits = outcome.settings, outcome.options, outcome.selection
-    settings = Settings(wanted.loss or options.loss, options.loss_scale)
-    plain = plain_reference(fits.nominal.cell, outcome.inputs)
-    arms = Arms(fits.nominal.cell, fits.fit.cell, outcome.rigid.cell.chain, outcome.expected, plain)
-    result = assess(arms, inputs, outcome.findings, settings, replace(wanted, model=wanted.model or options.model))
-    return replace(outcome, inputs=inputs, assessment=result)
+    settings, options, selection = outcome.settings, outcome.options, outcome.selection
+    nominal = selection.nominal.cell
+    plain = plain_reference(nominal, outcome.inputs)
+    arms = Arms(nominal, selection.fit.cell, outcome.rigid.cell.chain, outcome.expected, plain)
+    weighing = weighing_settings(options, settings)
+    settings = replace(settings, model=settings.model or options.model)
+    assessment = assess(arms, inputs, outcome.findings, weighing, settings)
+    return replace(outcome, inputs=inputs, assessment=assessment)
 
 
-def _found_of(
-    inputs: Inputs, found: ModelSelection, named: Sequence[Outlier], notes: Sequence[Finding], accepted: Sequence[str]
+def _findings(
+    inputs: Inputs,
+    selection: ModelSelection,
+    outliers: Sequence[Outlier],
+    notes: Sequence[Finding],
+    accepted: Sequence[str],
 ) -> Findings:
     """Return the findings of a fit that do not depend on validation rows; `notes` are findings on its residuals."""
-    reach = found.nominal.cell.reach
-    left = found.cross_validated
-    odd = plausibility.findings(found.nominal.cell, found.fit, inputs.fit, left, reach)
-    blind = [finding("transfer-by-regions", stations=found.folds.blind)] if found.folds.blind else []
+    nominal = selection.nominal.cell
+    cross_validated = selection.cross_validated
+    contradictions = plausibility.findings(nominal, selection.fit, inputs.fit, cross_validated, nominal.reach)
+    noticed = [*contradictions, *notes]
+    if selection.folds.blind:
+        noticed.append(finding("transfer-by-regions", stations=selection.folds.blind))
+    nominal_cross_validated = None
+    for rung in selection.rungs:
+        if rung.model == "frames":
+            nominal_cross_validated = rung.cross_validated
+            break
+    outlier_rows = {(outlier.file, outlier.row) for outlier in outliers}
+    row_count = sum(len(block) for block in inputs.fit)
     return Findings(
-        model=found.chosen,
-        loss=found.loss,
-        cross_validated=left,
-        nominal_cross_validated=found.nominal_step.cross_validated,
-        outlier_share=len({(each.file, each.row) for each in named}) / sum(len(block) for block in inputs.fit),
-        reach=reach,
-        noticed=settle([*odd, *notes, *blind], accepted),
-        blind=found.folds.blind,
-        rigid_cross_validated=found.rigid_cross_validated,
+        model=selection.chosen,
+        loss=selection.loss,
+        cross_validated=cross_validated,
+        nominal_cross_validated=nominal_cross_validated,
+        outlier_share=len(outlier_rows) / row_count,
+        reach=nominal.reach,
+        noticed=settle(noticed, accepted),
+        blind=selection.folds.blind,
+        rigid_cross_validated=selection.rigid_cross_validated,
     )
 
 
 def _moved_between(nominal: Installation, blocks: Sequence[PoseMeasurements], settings: Settings) -> list[Finding]:
     """Return a finding if separate stations explain the files far better than a common station."""
-    own = [block for block in blocks if block.has_instrument]
-    if len({block.file for block in own}) < 2 or len({block.station for block in own}) > 1:
+    blocks = [block for block in blocks if block.has_instrument]
+    files = {block.file for block in blocks}
+    stations = {block.station for block in blocks}
+    if len(files) < 2 or len(stations) > 1:
         return []
-    apart = [replace(block, station=f"{number}") for number, block in enumerate(own)]
-    before = errors(nominal, own).rms
-    placed = polish_frames(install(nominal.chain, apart, nominal.known), apart, settings).cell
-    after = errors(placed, apart).rms
+    separate = [replace(block, station=f"{number}") for number, block in enumerate(blocks)]
+    before = errors(nominal, blocks).rms
+    start = install(nominal.chain, separate, nominal.known)
+    placed = polish_frames(start, separate, settings).cell
+    after = errors(placed, separate).rms
     if before < MOVED * after:
         return []
-    return [finding("instrument-moved", before=before, after=after, files=len(own))]
+    return [finding("instrument-moved", before=before, after=after, files=len(blocks))]

@@ -35,7 +35,9 @@ from calib.robot.formats.urdf_tree import is_urdf
 T = TypeVar("T")
 URDF, CORRECTED_URDF = "robot.urdf", "robot_for_corrections.urdf"
 RESIDUALS = "residuals.csv"
-TERMS, FORMULA = "joint_corrections.csv", "joint_corrections.txt"  # the latter is shipped beside this module
+TERMS = "joint_corrections.csv"
+# how to apply these terms; shipped beside this module
+FORMULA = "joint_corrections.txt"
 FIGURES = (
     "position",
     "orientation",
@@ -47,6 +49,7 @@ FIGURES = (
     "parameters",
     "correlations",
 )
+# files of an earlier fit that a new one replaces
 OURS = (
     calibrated.ROBOT,
     URDF,
@@ -62,9 +65,9 @@ OURS = (
     METRICS,
     *(f"plot_{name}.png" for name in FIGURES),
 )
-"""Files of an earlier fit that a new one replaces."""
-
-IN_SESSION, VALIDATED = "4-fit", "5-validation"  # what these folders are called in a session
+# what these folders are called in a session
+IN_SESSION = "4-fit"
+VALIDATED = "5-validation"
 
 
 @dataclass(frozen=True)
@@ -93,18 +96,22 @@ class FitFolder:
         if metrics.findings is not None:
             return metrics.findings
         early = read_json(self.report, "fit again")["judged"]
-        return read_record(Findings, _of_today(early | {"notes": metrics.warnings}))
+        return read_record(Findings, _current_form(early | {"notes": metrics.warnings}))
 
     def arms(self, inputs: Inputs, settings: Settings) -> Arms:
         """Read the calibrated and the nominal arm; frames of the nominal arm are refitted to the fitted rows."""
-        found, cell, expected = self.findings(), installation.read(self.path), None
-        chosen = replace(settings, loss=found.loss or settings.loss)
-        if found.discrepancy is not None:
-            learnt = np.concatenate([block.q for block in inputs.fit])
-            expected = ErrorModel(cell, *tables.read_covariance(self.path, cell), learnt, found.discrepancy)
+        findings = self.findings()
+        calibrated_cell = installation.read(self.path)
+        expected = None
+        if findings.discrepancy is not None:
+            fitted_q = np.concatenate([block.q for block in inputs.fit])
+            free, covariance = tables.read_covariance(self.path, calibrated_cell)
+            expected = ErrorModel(calibrated_cell, free, covariance, fitted_q, findings.discrepancy)
         start = install(inputs.chain, inputs.fit, inputs.known)
-        nominal = polish_frames(start, inputs.fit, chosen).cell
-        return Arms(nominal, cell, calibrated.read(self.path).chain, expected, plain_reference(nominal, inputs))
+        weighing = replace(settings, loss=findings.loss or settings.loss)
+        nominal = polish_frames(start, inputs.fit, weighing).cell
+        rigid = calibrated.read(self.path).chain
+        return Arms(nominal, calibrated_cell, rigid, expected, plain_reference(nominal, inputs))
 
     def learnt_joints(self, joints: Sequence[Joint]) -> np.ndarray | None:
         """Read the joint values (m, n) [rad or m] of the fitted rows; None without a file of residuals."""
@@ -112,8 +119,11 @@ class FitFolder:
             return None
         names = [shielded(f"{joint.name} [{joint.unit}]") for joint in joints]
         with self.residuals.open(encoding="utf-8", newline="") as file:
-            rows = [[float(row[name]) for name in names] for row in csv.DictReader(file) if row["set"] == "fit"]
-        return np.array(rows).reshape(-1, len(names)) if rows else None
+            fitted = [row for row in csv.DictReader(file) if row["set"] == "fit"]
+        if not fitted:
+            return None
+        q = [[float(row[name]) for name in names] for row in fitted]
+        return np.array(q).reshape(-1, len(names))
 
 
 @dataclass(frozen=True)
@@ -127,12 +137,12 @@ class ValidationFolder:
     rows = InFolder("rows.json")  # errors of all rows, for figures
     report = InFolder(REPORT)  # data of the certificate
 
-    def write(self, found: Assessment, inputs: Inputs, rows: Sequence[Any]) -> ValidationMetrics:
+    def write(self, assessment: Assessment, inputs: Inputs, rows: Sequence[Any]) -> ValidationMetrics:
         """Write errors, rows and, last, the metrics; return the metrics."""
-        tables.write_errors(self.errors, inputs.chain, found.validation)
+        tables.write_errors(self.errors, inputs.chain, assessment.validation)
         files.write_json(self.rows, rows)
-        files.write_json(self.judged, found.record)
-        return found.record
+        files.write_json(self.judged, assessment.record)
+        return assessment.record
 
     def metrics(self) -> ValidationMetrics:
         """Read numbers and verdict; in schema 1, warnings of the fit are not included."""
@@ -144,20 +154,30 @@ def _read(kind: type[T], path: Path) -> T:
     if content.get("schema", 1) > SCHEMA:
         raise UsageError(f"{path}: schema {content['schema']} of a later version, this one reads up to {SCHEMA}")
     if content.get("findings"):
-        content["findings"] = _of_today(content["findings"])
+        content["findings"] = _current_form(content["findings"])
     with refused_as(UsageError, ValueError, f"{path} cannot be read ({{}}); fit again"):
         return read_record(kind, content | {"schema": content.get("schema", 1)})
 
 
-def _of_today(findings: dict[str, Any]) -> dict[str, Any]:
+def _current_form(findings: dict[str, Any]) -> dict[str, Any]:
     """Return findings of schema 1 or 2, which stored sentences, in the current form."""
     if "odd" not in findings and "notes" not in findings:
         return findings
-    levels = {"fail": "earlier-fail", "marginal": "earlier-misfit"}
-    said = [(one["words"], levels.get(one["level"], "earlier"), one["accepted"]) for one in findings.get("odd", ())]
-    said += [(findings["unexplained"], "earlier-misfit", False)] if findings.get("unexplained") else []
-    said += [(words, "earlier", False) for words in findings.get("notes", ()) if words != findings.get("unexplained")]
-    noticed = [{"code": code, "values": {"words": words}, "accepted": accepted} for words, code, accepted in said]
+    noticed = []
+
+    def add(sentence: str, code: str, accepted: bool) -> None:
+        noticed.append({"code": code, "values": {"words": sentence}, "accepted": accepted})
+
+    codes = {"fail": "earlier-fail", "marginal": "earlier-misfit"}
+    for contradiction in findings.get("odd", ()):
+        code = codes.get(contradiction["level"], "earlier")
+        add(contradiction["words"], code, contradiction["accepted"])
+    unexplained = findings.get("unexplained")
+    if unexplained:
+        add(unexplained, "earlier-misfit", False)
+    for note in findings.get("notes", ()):
+        if note != unexplained:
+            add(note, "earlier", False)
     return findings | {"noticed": noticed}
 
 
@@ -182,21 +202,22 @@ def write_folder(
 
 
 def _write_all(outcome: Outcome, folder: Path) -> None:
-    fit, chain = outcome.selection.fit, outcome.inputs.chain
-    robot, origin = outcome.robot, f"calibrated from {outcome.inputs.source}"
-    calibrated.write(folder, robot, installation.frame_tables(fit.cell), _record(outcome), origin)
+    fit, chain, source = outcome.selection.fit, outcome.inputs.chain, outcome.inputs.source
+    robot = outcome.robot
+    frames = installation.frame_tables(fit.cell)
+    calibrated.write(folder, robot, frames, _record(outcome), f"calibrated from {source}")
     urdfs = {URDF: robot.chain}
     if robot.corrections is not None:
         urdfs[CORRECTED_URDF] = robot.corrections.chain
         _write_corrections(robot.corrections, folder)
     for name, geometry in urdfs.items():
-        if is_urdf(outcome.inputs.source):
-            urdf_write.edit_file(outcome.inputs.source, folder / name, chain, geometry)
+        if is_urdf(source):
+            urdf_write.edit_file(source, folder / name, chain, geometry)
         else:
             files.write(folder / name, urdf_write.write_new(geometry))
-    table = tables.estimate_table(fit, outcome.selection.nominal.cell)
-    files.write_table(folder / ESTIMATE, tables.HEADER, table.rows())
-    folders.write_covariance(folder / COVARIANCE, table.names, table.covariance)
+    estimate = tables.estimate_table(fit, outcome.selection.nominal.cell)
+    files.write_table(folder / ESTIMATE, tables.HEADER, estimate.rows())
+    folders.write_covariance(folder / COVARIANCE, estimate.names, estimate.covariance)
     rows, header = tables.residuals(outcome)
     files.write_table(folder / RESIDUALS, header, rows)
     files.write_json(folder / METRICS, metrics(outcome))
@@ -204,16 +225,27 @@ def _write_all(outcome: Outcome, folder: Path) -> None:
 
 def metrics(outcome: Outcome) -> FitMetrics:
     """Return the content of ``metrics.json``."""
-    tolerance = outcome.settings.tolerance
+    tolerance_mm = None
+    if outcome.settings.tolerance is not None:
+        tolerance_mm = 1e3 * outcome.settings.tolerance
+    assessed = outcome.assessment.record
     return FitMetrics(
-        **vars(outcome.assessment.record),
+        validation=assessed.validation,
+        verdict=assessed.verdict,
+        reason=assessed.reason,
+        code=assessed.code,
+        advice=assessed.advice,
+        warnings=assessed.warnings,
+        noticed=assessed.noticed,
+        deliverables=assessed.deliverables,
+        deliverable=assessed.deliverable,
         fit=outcome.fit.record(outcome.selection.fit.identified),
         model=outcome.selection.chosen,
         ladder=outcome.selection.rungs,
         seed=outcome.settings.seed,
         status=outcome.selection.fit.solution.status.name.lower(),
-        tolerance_mm=None if tolerance is None else 1e3 * tolerance,
-        not_identifiable=tuple(lines_of(outcome.unclear)),
+        tolerance_mm=tolerance_mm,
+        not_identifiable=tuple(lines_of(outcome.undetermined)),
         outliers=tuple(outcome.outliers),
         findings=outcome.findings,
     )
@@ -221,27 +253,28 @@ def metrics(outcome: Outcome) -> FitMetrics:
 
 def _record(outcome: Outcome) -> dict[str, object]:
     """Return the provenance entries of robot.toml: files, model, seed, verdict and nominal frames."""
-    inputs = outcome.inputs
-    frames = installation.frame_tables(outcome.nominal_cell)
-    return {
-        **{f"nominal_{kind}": table for kind, table in frames.items()},
-        "files": [block.file for block in inputs.fit],
-        "model": outcome.selection.chosen,
-        "seed": outcome.settings.seed,
-        **({"verdict": f"{outcome.verdict.level}: {outcome.verdict.reason}"} if outcome.verdict.level else {}),
-        "covariance": COVARIANCE,
-    }
+    verdict = outcome.verdict
+    nominal_frames = installation.frame_tables(outcome.nominal_cell)
+    record: dict[str, object] = {f"nominal_{kind}": table for kind, table in nominal_frames.items()}
+    record["files"] = [block.file for block in outcome.inputs.fit]
+    record["model"] = outcome.selection.chosen
+    record["seed"] = outcome.settings.seed
+    if verdict.level:
+        record["verdict"] = f"{verdict.level}: {verdict.reason}"
+    record["covariance"] = COVARIANCE
+    return record
 
 
 def _write_corrections(corrections: CorrectedChain, folder: Path) -> None:
     """Write the table of joint corrections, which a URDF cannot contain, and a text on how to apply them."""
     chain, deflection = corrections.chain, corrections.deflection
-    units = dict(zip(chain.names, chain.units))
-    owners = {element.name: element.joint for element in chain.elements}
+    unit_of = dict(zip(chain.names, chain.units))
+    joint_of = {element.name: element.joint for element in chain.elements}
     rows = []
-    for term, value in zip(deflection.terms, np.asarray(deflection.coefficients)):
-        joint = owners[term.element]
-        target = term.element if joint is None else chain.joint_names[joint]
-        rows.append([target, units[term.element], term.basis, chain.joint_names[term.source], term.order, float(value)])
+    for term, coefficient in zip(deflection.terms, np.asarray(deflection.coefficients)):
+        joint = joint_of[term.element]
+        corrected = term.element if joint is None else chain.joint_names[joint]
+        source = chain.joint_names[term.source]
+        rows.append([corrected, unit_of[term.element], term.basis, source, term.order, float(coefficient)])
     files.write_table(folder / TERMS, ("corrected", "unit", "basis", "joint", "order", "coefficient"), rows)
     files.write(folder / FORMULA, Path(__file__).with_name(FORMULA).read_text(encoding="utf-8"))

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -30,14 +29,9 @@ from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.kinematics import gravity_torques
 from calib.robot.library import load, resolve
 
-IDENTIFIED_MASSES: Point[Callable[[str, Chain], np.ndarray]] = Point(
-    "identified_masses", "standard parameters (n, 10) in the folder of an identification"
-)
-IMAGE_FOLDERS: Point[Any] = Point("image_folders", "a module: `read_images` reads a folder of images as a block")
 PLANNED_POSES: Point[Callable[[Path, Chain, FileOptions], list[PoseMeasurements]]] = Point(
     "planned_poses", "points without joints, with those of planned poses"
 )
-CAMERA_GUESS: Point[Any] = Point("camera_guess", "a module: completes images' lenses, and takes images as poses")
 
 
 @dataclass(frozen=True)
@@ -82,12 +76,16 @@ class Inputs:
     @property
     def weighed(self) -> Chain:
         """The nominal arm with the masses that gravity torques are computed from."""
-        return self.chain if self.masses is None else replace(self.chain, inertias=self.masses)
+        if self.masses is None:
+            return self.chain
+        return replace(self.chain, inertias=self.masses)
 
     @property
     def known(self) -> Deflection:
         """Joint corrections of the robot from an earlier fit."""
-        return Deflection() if self.earlier is None else self.earlier.deflection
+        if self.earlier is None:
+            return Deflection()
+        return self.earlier.deflection
 
     @property
     def bare(self) -> Chain | None:
@@ -99,7 +97,9 @@ class Inputs:
     @property
     def nominal(self) -> Chain:
         """Nominal arm, before any calibration."""
-        return self.chain if self.earlier is None or self.earlier.nominal is None else self.earlier.nominal
+        if self.earlier is None or self.earlier.nominal is None:
+            return self.chain
+        return self.earlier.nominal
 
 
 def gather(
@@ -122,68 +122,85 @@ def gather(
         settings: stations, tools, rows to hold out, seed of their choice.
         base, tip: links of a URDF.
     """
-    options, settings = options or FitOptions(), settings or FitSettings()
+    options = options or FitOptions()
+    settings = settings or FitSettings()
     require(measured, "no measurement file given", UsageError)
-    files = [_path(each) for each in measured]
-    check_files(options, [*files, *map(_path, validate)])
+    paths = [_path(source) for source in measured]
+    check_files(options, [*paths, *map(_path, validate)])
     # the joints of a table tell where a URDF's arm ends; measurements in memory have no table
-    table = None if isinstance(measured[0], PoseMeasurements) else files[0]
-    chain, source = load_robot(robot, table, options, base, tip)
-    stored = source.suffix == ".toml"
-    earlier = robot if isinstance(robot, CalibratedChain) else calibrated.read(source) if stored else None
-    masses = IDENTIFIED_MASSES.one()(settings.masses, chain) if settings.masses else None
-    weighed = chain if masses is None else replace(chain, inertias=masses)
-    blocks = _named(
-        [(path, block) for path, each in zip(files, measured) for block in read_file(each, weighed, options)],
-        options,
-        settings.stations,
-        settings.tools,
-    )
+    table = None if isinstance(measured[0], PoseMeasurements) else paths[0]
+    chain, robot_file = load_robot(robot, table, options, base, tip)
+    if isinstance(robot, CalibratedChain):
+        earlier = robot
+    elif robot_file.suffix == ".toml":
+        earlier = calibrated.read(robot_file)
+    else:
+        earlier = None
+    masses = None
+    weighed = chain
+    if settings.masses:
+        # a fit alone loads no dynamics
+        from calib.identification.model_file import identified_masses
+
+        masses = identified_masses(settings.masses, chain)
+        weighed = replace(chain, inertias=masses)
+
+    read_blocks: list[tuple[Path, PoseMeasurements]] = []
+    for path, source in zip(paths, measured):
+        read_blocks += [(path, block) for block in read_file(source, weighed, options)]
     unseen: dict[str, Unseen] = {}
-    fit = []
-    for block in blocks:
-        kept, aside = hold_out(block, settings.holdout, settings.seed)
-        fit.append(kept)
-        if aside is not None:
-            unseen[_free_name(unseen, block.file)] = Unseen(aside, held_out=True)
+    fitted_blocks = []
+    for block in _with_station_and_tool_names(read_blocks, options, settings.stations, settings.tools):
+        fitted, held_out = hold_out(block, settings.holdout, settings.seed)
+        fitted_blocks.append(fitted)
+        if held_out is not None:
+            unseen[_free_name(unseen, block.file)] = Unseen(held_out, held_out=True)
+
     notes = remarks(chain)
     if masses is not None:
         notes += (f"gravity torques of the compliance are those of the masses identified in {settings.masses}",)
-    given = Inputs(chain, source, tuple(fit), unseen, notes, earlier, masses)
-    given = with_unseen(given, validate, options, settings)
+    inputs = Inputs(chain, robot_file, tuple(fitted_blocks), unseen, notes, earlier, masses)
+    inputs = with_unseen(inputs, validate, options, settings)
     if earlier is None or earlier.corrections is None:
-        return given
-    name, count = source if isinstance(robot, CalibratedChain) else robot, len(earlier.deflection.terms)
-    return replace(
-        given, notes=(*given.notes, f"{name} has {count} deflection terms of an earlier fit; these stay unchanged")
-    )
+        return inputs
+    name = robot_file if isinstance(robot, CalibratedChain) else robot
+    count = len(earlier.deflection.terms)
+    note = f"{name} has {count} deflection terms of an earlier fit; these stay unchanged"
+    return replace(inputs, notes=(*inputs.notes, note))
 
 
 def with_unseen(
-    given: Inputs, validate: Sequence[Path | PoseMeasurements], options: FitOptions, settings: FitSettings
+    inputs: Inputs, validate: Sequence[Path | PoseMeasurements], options: FitOptions, settings: FitSettings
 ) -> Inputs:
     """Return the inputs with further validation rows; copies of fitted rows are marked as seen.
 
     Args:
-        given: robot, fitted rows, and unseen rows so far.
+        inputs: robot, fitted rows, and unseen rows so far.
         validate: files, or blocks in memory.
         options: how files are read.
         settings: whether they have frames of their own.
     """
-    unseen, notes, fit = dict(given.unseen), list[str](), given.fit
-    files = {Path(block.file).resolve() for block in fit}
-    for each in validate:
-        for block in read_file(each, given.weighed, options, fit):
-            again = _path(each).resolve() in files
-            if again:
+    unseen = dict(inputs.unseen)
+    notes: list[str] = []
+    fit_files = {Path(block.file).resolve() for block in inputs.fit}
+    for source in validate:
+        fitted = _path(source).resolve() in fit_files
+        for block in read_file(source, inputs.weighed, options, inputs.fit):
+            if fitted:
                 notes.append(f"{block.file} is also a fit file, so its errors do not count as validation")
-            shared = block if settings.refit_frames else _shared(block, fit, notes)
-            unseen[_free_name(unseen, block.file)] = Unseen(shared, own_frames=settings.refit_frames, seen=again)
-    copied, remarks = repeated(fit, {name: each.block for name, each in unseen.items()})
-    unseen = {
-        name: replace(each, seen=each.seen or (name in copied and not each.held_out)) for name, each in unseen.items()
-    }
-    return replace(given, unseen=unseen, notes=(*given.notes, *notes, *remarks))
+            name = _free_name(unseen, block.file)
+            if settings.refit_frames:
+                unseen[name] = Unseen(block, own_frames=True, seen=fitted)
+            else:
+                unseen[name] = Unseen(_with_frames_of_fit(block, inputs.fit, notes), seen=fitted)
+
+    # a file under another name may repeat fitted rows; rows that were held out are no copies
+    blocks = {name: rows.block for name, rows in unseen.items()}
+    copied, copy_notes = repeated(inputs.fit, blocks)
+    for name, rows in unseen.items():
+        if name in copied and not rows.held_out:
+            unseen[name] = replace(rows, seen=True)
+    return replace(inputs, unseen=unseen, notes=(*inputs.notes, *notes, *copy_notes))
 
 
 def plain_reference(nominal: Installation, inputs: Inputs) -> Installation | None:
@@ -217,12 +234,14 @@ def load_robot(
         return load(robot, base, tip), source
     names: list[str] = []
     if measured is not None and tip is None:
-        known = read_tree(text(source)[0], str(source)).joints
+        joints = read_tree(text(source)[0], str(source)).joints
         table = measured / JOINTS if measured.is_dir() else measured
         header = joint_columns(table)
-        columns = [*header, *options.for_file(measured).columns]
-        names = [name for name in dict.fromkeys(columns) if name in known and known[name].actuated]
-        names = [] if f"q{len(names) + 1}" in header else names  # numbered columns hold more joints than are named
+        columns = dict.fromkeys([*header, *options.for_file(measured).columns])
+        names = [column for column in columns if column in joints and joints[column].actuated]
+        # numbered columns hold more joints than are named
+        if f"q{len(names) + 1}" in header:
+            names = []
     return load(robot, base, tip, names or None), source
 
 
@@ -237,49 +256,70 @@ def load_rigid(
     if isinstance(robot, CalibratedChain):
         return robot, Path(robot.source or robot.chain.name)
     chain, source = load_robot(robot, measured, FitOptions(), base, tip)
-    if measured is not None and tip is None and is_urdf(source):
-        _check_whole(chain, source, measured, base)
-    return CalibratedChain(chain) if is_urdf(source) else calibrated.read(source), source
+    if not is_urdf(source):
+        return calibrated.read(source), source
+    if measured is not None and tip is None:
+        _check_joint_columns(chain, source, measured, base)
+    return CalibratedChain(chain), source
 
 
-def _check_whole(chain: Chain, source: Path, measured: Path, base: str | None) -> None:
+def _check_joint_columns(chain: Chain, source: Path, measured: Path, base: str | None) -> None:
     """Refuse a table without columns of some revolute joints of the arm, since their positions would be unknown."""
     try:
-        whole = urdf.read(source, base)
+        arm = urdf.read(source, base)
     except CalibError:  # the URDF does not say by itself where its arm ends
         return
-    missing = [one.name for one in whole.joints if one.name not in chain.joint_names and one.kind != "prismatic"]
-    if missing and set(chain.joint_names) < set(whole.joint_names):
+    revolute = [joint.name for joint in arm.joints if joint.kind != "prismatic"]
+    missing = [name for name in revolute if name not in chain.joint_names]
+    if missing and set(chain.joint_names) < set(arm.joint_names):
         raise UsageError(
-            f"{measured}: column '{missing[0]}' is missing: the arm of {source.name} has {whole.n} joints, but the "
+            f"{measured}: column '{missing[0]}' is missing: the arm of {source.name} has {arm.n} joints, but the "
             f"table has {chain.n}; if the arm ends at {chain.tip}, give --tip {chain.tip}"
         )
 
 
 def read_file(
-    each: Path | PoseMeasurements, chain: Chain, options: FitOptions, like: Sequence[PoseMeasurements] = ()
+    source: Path | PoseMeasurements, chain: Chain, options: FitOptions, like: Sequence[PoseMeasurements] = ()
 ) -> list[PoseMeasurements]:
     """Read the measurements of a file (or folder of images) for a chain, and check them against its joint limits.
 
     Args:
-        each, chain, options: what (or a block in memory, which is checked alike), for whom, and how.
+        source: the file, or a block in memory, which is checked alike.
+        chain: the arm.
+        options: how it is read.
         like: blocks read before; images of the same size are taken to be by the same camera.
     """
-    path, joints = _path(each), joints_of(chain)
-    own = options.for_file(path)
-    if not isinstance(each, (str, Path)):
-        fits = tuple(each.joint_names) == chain.joint_names or len(each.joint_names) == chain.n
-        blocks = [check_block(each, own, joints) if fits else each]
+    path = _path(source)
+    joints = joints_of(chain)
+    file_options = options.for_file(path)
+    if not isinstance(source, (str, Path)):
+        blocks = [source]
+        if tuple(source.joint_names) == chain.joint_names or len(source.joint_names) == chain.n:
+            blocks = [check_block(source, file_options, joints)]
     elif is_image_folder(path):
-        blocks = [IMAGE_FOLDERS.one().read_images(path, joints, own)]
+        from calib.data.images.image_folders import read_images
+
+        blocks = [read_images(path, joints, file_options)]
     else:
-        rooms = PLANNED_POSES.all() if own.planned else ()
-        blocks = [block for room in rooms for block in room(path, chain, own)] or read_measurements(path, joints, own)
-    blocks = [CAMERA_GUESS.one().complete_camera(chain, b, like) if b.kind == IMAGES else b for b in blocks]
+        blocks = []
+        if file_options.planned:
+            for planned_poses in PLANNED_POSES.all():
+                blocks += planned_poses(path, chain, file_options)
+        if not blocks:
+            blocks = read_measurements(path, joints, file_options)
+
+    result = []
     for block in blocks:
-        check_scale(block, chain)  # unseen files, too: the fit looks at its own only
+        if block.kind == IMAGES:
+            from calib.geometry.camera.camera_guess import complete_camera
+
+            block = complete_camera(chain, block, like)
+        result.append(block)
+    for block in result:
+        # of unseen files, too: the fit checks the rows that it fits only
+        check_scale(block, chain)
         check_orientations(chain, block)
-    return [replace(block, torque=gravity_of(chain, block.q)) for block in blocks]
+    return [replace(block, torque=gravity_of(chain, block.q)) for block in result]
 
 
 def gravity_of(chain: Chain, q: np.ndarray) -> np.ndarray | None:
@@ -289,8 +329,10 @@ def gravity_of(chain: Chain, q: np.ndarray) -> np.ndarray | None:
     return gravity_torques(chain, q)
 
 
-def _path(each: Path | PoseMeasurements) -> Path:
-    return Path(each) if isinstance(each, (str, Path)) else Path(each.file or "measured")
+def _path(source: Path | PoseMeasurements) -> Path:
+    if isinstance(source, (str, Path)):
+        return Path(source)
+    return Path(source.file or "measured")
 
 
 def hold_out(block: PoseMeasurements, share: float, seed: int) -> tuple[PoseMeasurements, PoseMeasurements | None]:
@@ -301,17 +343,19 @@ def hold_out(block: PoseMeasurements, share: float, seed: int) -> tuple[PoseMeas
     """
     if share == 0.0:
         return block, None
-    unit = _units(block)
-    count = int(unit.max()) + 1
-    held = round(share * count)
+    pose = _pose_of_row(block)
+    count = int(pose.max()) + 1
+    held_count = round(share * count)
     order = np.random.default_rng(seed).permutation(count)
-    if held == 0 or held == count:
-        raise MeasurementError(f"a hold-out share of {share:g} gives {held} of {count} poses; change it", block.file)
-    aside = np.isin(unit, order[count - held :])
-    return take(block, np.flatnonzero(~aside)), take(block, np.flatnonzero(aside))
+    if held_count == 0 or held_count == count:
+        raise MeasurementError(
+            f"a hold-out share of {share:g} gives {held_count} of {count} poses; change it", block.file
+        )
+    held_out = np.isin(pose, order[count - held_count :])
+    return take(block, np.flatnonzero(~held_out)), take(block, np.flatnonzero(held_out))
 
 
-def _units(block: PoseMeasurements) -> np.ndarray:
+def _pose_of_row(block: PoseMeasurements) -> np.ndarray:
     """Return the index (m,) of the pose (or measured pair) of each row.
 
     Cycles of one repeated pose are one pose.
@@ -319,8 +363,9 @@ def _units(block: PoseMeasurements) -> np.ndarray:
     labels = np.array(block.together)
     for cycles in repeated_rows(block):
         labels[np.isin(labels, labels[cycles])] = labels[cycles[0]]
-    rank = {label: k for k, label in enumerate(dict.fromkeys(labels.tolist()))}
-    return np.array([rank[label] for label in labels.tolist()], dtype=int)
+    row_labels = labels.tolist()
+    index = {label: k for k, label in enumerate(dict.fromkeys(row_labels))}
+    return np.array([index[label] for label in row_labels], dtype=int)
 
 
 def pose_count(blocks: Sequence[PoseMeasurements]) -> int:
@@ -328,49 +373,67 @@ def pose_count(blocks: Sequence[PoseMeasurements]) -> int:
     return sum(len(np.unique(block.rows)) for block in blocks)
 
 
-def _named(
-    read: Sequence[tuple[Path, PoseMeasurements]], options: FitOptions, stations: str, tools: str
+def _with_station_and_tool_names(
+    read_blocks: Sequence[tuple[Path, PoseMeasurements]], options: FitOptions, stations: str, tools: str
 ) -> list[PoseMeasurements]:
     """Return the blocks to fit with station and tool names from --stations and --tools; all names are distinct.
 
     Where an arm carried a camera and something else, or two cameras, these are several tools whatever --tools says.
     """
-    result, count, names = [], dict[str, int](), dict[Path, str]()
-    carried = list(dict.fromkeys(block.carried for _, block in read))
-    for path, block in read:
+    carried = list(dict.fromkeys(block.carried for _, block in read_blocks))
+    station_of: dict[Path, str] = {}
+    files_of_station: dict[str, int] = {}
+    blocks = []
+    for path, block in read_blocks:
         if tools == "one" and len(carried) > 1 and block.tool_names == (FileOptions().tool,):
             block = replace(block, tool_names=(_carried_name(block.carried, carried),))
         if tools == "each":
             block = replace(block, tool_names=tuple(f"{path.stem} {name}" for name in block.tool_names))
-        if path not in names:
-            name = "station" if stations == "one" else block.station
+        if path not in station_of:
+            station = "station" if stations == "one" else block.station
             if stations == "each" and not options.for_file(path).station:
-                count[name] = count.get(name, 0) + 1
-                name = f"{name} {count[name]}" if count[name] > 1 else name
-            names[path] = name
-        result.append(replace(block, station=names[path]))
-    targets = {name for block in result for name in block.tool_names}
-    return [replace(b, station=f"{b.station} station") if b.station in targets else b for b in result]
+                number = files_of_station.get(station, 0) + 1
+                files_of_station[station] = number
+                if number > 1:
+                    station = f"{station} {number}"
+            station_of[path] = station
+        blocks.append(replace(block, station=station_of[path]))
+
+    # a station that is called like a target gets a name of its own
+    target_names = {name for block in blocks for name in block.tool_names}
+    for index, block in enumerate(blocks):
+        if block.station in target_names:
+            blocks[index] = replace(block, station=f"{block.station} station")
+    return blocks
 
 
-def _carried_name(own: tuple[str, object], carried: Sequence[tuple[str, object]]) -> str:
+def _carried_name(device: tuple[str, object], carried: Sequence[tuple[str, object]]) -> str:
     """Return the name of a file's tool, with a number from the second tool of its kind on."""
-    number = [each for each in carried if each[0] == own[0]].index(own) + 1
-    return f"{own[0]} {number}" if number > 1 else own[0]
+    kind = device[0]
+    of_kind = [candidate for candidate in carried if candidate[0] == kind]
+    number = of_kind.index(device) + 1
+    if number == 1:
+        return kind
+    return f"{kind} {number}"
 
 
-def _free_name(taken: Mapping[str, Unseen], file: str) -> str:
+def _free_name(unseen: Mapping[str, Unseen], file: str) -> str:
     """Return a file's name, or its path if another file has the same name."""
-    names = (Path(file).name, file, *(f"{file} ({number})" for number in range(2, len(taken) + 2)))
-    return next(name for name in names if name not in taken)
+    if Path(file).name not in unseen:
+        return Path(file).name
+    name = file
+    number = 1
+    while name in unseen:
+        number += 1
+        name = f"{file} ({number})"
+    return name
 
 
-def _shared(block: PoseMeasurements, fit: Sequence[PoseMeasurements], notes: list[str]) -> PoseMeasurements:
-    """Return a validation block that uses the station and the tools of the fit."""
-    fit = [other for other in fit if other.carried == block.carried] or fit
-    first = fit[0]
+def _with_frames_of_fit(block: PoseMeasurements, fit: Sequence[PoseMeasurements], notes: list[str]) -> PoseMeasurements:
+    """Return a validation block that uses the station and the tools of the fit; adds to the notes."""
+    fit = [fitted for fitted in fit if fitted.carried == block.carried] or fit
     if block.has_instrument:
-        stations = [other.station for other in fit if other.has_instrument]
+        stations = [fitted.station for fitted in fit if fitted.has_instrument]
         if not stations:
             raise UsageError(f"{block.file}: no fit file has this instrument; refit its frames (--refit-frames)")
         if block.station not in stations:
@@ -379,12 +442,12 @@ def _shared(block: PoseMeasurements, fit: Sequence[PoseMeasurements], notes: lis
                 f"{Path(block.file).name} is predicted with the fit's station '{stations[0]}'; if the instrument stood "
                 "elsewhere, refit its frames (--refit-frames)"
             )
-    known = {name for other in fit for name in other.tool_names}
-    if not set(block.tool_names) <= known:
-        if len(block.tool_names) != len(first.tool_names):
-            found = ", ".join(block.tool_names)
-            raise UsageError(
-                f"{block.file}: the fit has no tool {found}, only {', '.join(sorted(known))}; refit_frames"
-            )
-        block = replace(block, tool_names=first.tool_names)
-    return block
+    fit_tools = {name for fitted in fit for name in fitted.tool_names}
+    if set(block.tool_names) <= fit_tools:
+        return block
+    if len(block.tool_names) != len(fit[0].tool_names):
+        tools = ", ".join(block.tool_names)
+        raise UsageError(
+            f"{block.file}: the fit has no tool {tools}, only {', '.join(sorted(fit_tools))}; refit_frames"
+        )
+    return replace(block, tool_names=fit[0].tool_names)

@@ -12,7 +12,8 @@ from calib.geometry.model_choice.ladder import ModelStep
 from calib.geometry.repeatability import RepeatedPoses
 from calib.procedure.findings import Verdict
 
-SCHEMA = 3  # of metrics.json; 1 had no findings, 2 kept sentences in place of codes
+# of metrics.json; 1 had no findings, 2 kept sentences in place of codes
+SCHEMA = 3
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,9 @@ class ComparedRows:
 
     def judged(self, deliverable: str) -> ArmErrors:
         """Return the errors of the deliverable (robot file) on which the verdict is based."""
-        return self.calibrated if deliverable != "urdf" or self.urdf_alone is None else self.urdf_alone
+        if deliverable == "urdf" and self.urdf_alone is not None:
+            return self.urdf_alone
+        return self.calibrated
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from calib.procedure.measuring import prediction as forecast
 from calib.procedure.measuring.pose_limits import Limits, read_limits
 from calib.procedure.measuring.prediction import Prediction, SelectionPrediction
 from calib.procedure.measuring.run import Drivable, Exchange, Run, RunSettings, drivable
-from calib.procedure.measuring.run import lines as ways
+from calib.procedure.measuring.run import lines as run_lines
 from calib.procedure.robot_kinds import joints_of
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, joint_kinds
@@ -32,10 +32,14 @@ from poses.select import SearchSettings, Selection, select_poses
 from poses.space import SearchSpace, is_feasible
 
 Progress = Callable[[int, int, str], None]
-VIEWS = 600  # postures that see a camera's board, to choose from (our choice)
-FIGURES = ("predicted", "outlook")  # sigma of the tool over the workspace, and by the number of poses
-
-TYPICAL = 300  # poses all over the workspace, seen or not, at which the tool's sigma is predicted; our choice
+# postures that see a camera's board, to choose from (our choice)
+VIEWS = 600
+# sigma of the tool over the workspace, and by the number of poses
+FIGURES = ("predicted", "outlook")
+# poses all over the workspace, seen or not, at which the tool's sigma is predicted (our choice)
+TYPICAL = 300
+# random postures by which the share is estimated that keeps each constraint
+RANDOM_POSTURES = 2000
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,13 +95,20 @@ class Chosen:
     @property
     def figures(self) -> tuple[str, ...]:
         """Names of the available figures; none if a parameter is not identifiable."""
-        return () if self.prediction is None else FIGURES if self.outlook.others else FIGURES[:1]
+        if self.prediction is None:
+            return ()
+        if self.outlook.others:
+            return FIGURES
+        return FIGURES[:1]
 
     def kept(self) -> list[str]:
         """Return lines on the checked constraints, on the constraints not checked, and on the run."""
-        lines = [f"kept: {', '.join(self.checked)}"] if self.checked else []
-        lines += [f"NOT checked: {', '.join(self.unchecked)}"] if self.unchecked else []
-        return [*lines, *ways(self.run, self.driven)]
+        lines = []
+        if self.checked:
+            lines.append(f"kept: {', '.join(self.checked)}")
+        if self.unchecked:
+            lines.append(f"NOT checked: {', '.join(self.unchecked)}")
+        return lines + run_lines(self.run, self.driven)
 
 
 def choose(
@@ -125,34 +136,41 @@ def choose(
         progress: called with (done, total, what).
     """
     require(m >= 1, f"-m {m}: give a number of poses, 1 or more", UsageError)
-    chain, source = load_robot(robot, existing if isinstance(existing, Path) else None, FitOptions(), base, tip)
+    existing_file = existing if isinstance(existing, Path) else None
+    chain, source = load_robot(robot, existing_file, FitOptions(), base, tip)
     cell = targets_of(chain, settings.tools)
     limits = read_limits(constraints, cell, source, settings.without)
-    view, joints = limits.camera, None
+    view = limits.camera
     if view is None:
         jacobian = observation(cell, settings.kind, settings.sigmas, settings.seed)
     else:
         jacobian = view.observation(limits.lower, limits.upper, settings.seed)
     space = limits.space(jacobian)
+
+    candidates = None
     if view is not None:
         if progress:
             progress(0, 1, "views of the board")
-        number = min(settings.candidates, VIEWS)
-        joints = view.draw(number, partial(is_feasible, space), limits.lower, limits.upper, settings.seed)
-        if len(joints) < 2 * m:
+        count = min(settings.candidates, VIEWS)
+        feasible = partial(is_feasible, space)
+        candidates = view.draw(count, feasible, limits.lower, limits.upper, settings.seed)
+        if len(candidates) < 2 * m:
             raise UsageError(
-                f"{len(joints)} feasible postures see the board, but {2 * m} are needed to choose {m}: "
+                f"{len(candidates)} feasible postures see the board, but {2 * m} are needed to choose {m}: "
                 "check carried, stands, tilt and range in [camera]"
             )
-    index, method = cast(Any, settings.index), cast(Any, settings.method)  # checked by `select_poses`
-    before = value = None
+
+    # `select_poses` checks index and method
+    index, method = cast(Any, settings.index), cast(Any, settings.method)
+    existing_jacobian = existing_value = None
     notes = list(limits.notes)
     if existing is not None:
-        q = read_poses(existing, joints_of(chain))
-        before = jacobian(q)
-        value = observability(before, index) or None
-        if not is_feasible(space, q).all():
-            notes.append(f"{int((~is_feasible(space, q)).sum())} of the {len(q)} existing poses break the constraints")
+        existing_q = read_poses(existing, joints_of(chain))
+        existing_jacobian = jacobian(existing_q)
+        existing_value = observability(existing_jacobian, index) or None
+        infeasible = int((~is_feasible(space, existing_q)).sum())
+        if infeasible:
+            notes.append(f"{infeasible} of the {len(existing_q)} existing poses break the constraints")
     search = SearchSettings(
         index,
         method,
@@ -163,94 +181,122 @@ def choose(
         seconds=np.inf if settings.seconds is None else settings.seconds,
         climbs=settings.climbs,
     )
-    candidates = _drawn(space, limits, settings) if joints is None else joints
-    found = select_poses(None, m, search, q=candidates, space=space, existing=before, map=map, progress=progress)
-    comparable = float(found.history[0]) if method == "polish" else found.value
-    notes += [] if view is None else [view.assumed]
-    pool = Exchange(space.jacobian, candidates, before, index)
-    driven = drivable(
-        chain, found.joints, pool, limits, settings.run, settings.seed, lambda words: progress and progress(0, 1, words)
+    if candidates is None:
+        candidates = _draw_feasible(space, limits, settings)
+    selection = select_poses(
+        None, m, search, q=candidates, space=space, existing=existing_jacobian, map=map, progress=progress
     )
-    found, run = _driven(found, driven), driven.run
-    notes += [driven.words] if driven.replaced else []
-    outlook = _outlook(jacobian, limits, search, driven.q, pool, comparable)
+    # the selection without sight limits is not polished: the start of a polished one compares with it
+    comparable = float(selection.history[0]) if method == "polish" else selection.value
+    if view is not None:
+        notes.append(view.assumed)
+
+    def progress_of_run(stage: str) -> None:
+        if progress:
+            progress(0, 1, stage)
+
+    exchange = Exchange(space.jacobian, candidates, existing_jacobian, index)
+    driven = drivable(chain, selection.joints, exchange, limits, settings.run, settings.seed, progress_of_run)
+    if driven.replaced:
+        notes.append(driven.words)
     return Chosen(
-        chain,
-        found,
-        len(jacobian.free),
-        value,
-        limits.checked,
-        limits.unchecked,
-        tuple(notes),
-        outlook,
-        run,
-        settings.run,
-        view is not None,
+        chain=chain,
+        selection=_in_driving_order(selection, driven),
+        parameters=len(jacobian.free),
+        existing=existing_value,
+        checked=limits.checked,
+        unchecked=limits.unchecked,
+        notes=tuple(notes),
+        outlook=_outlook(jacobian, limits, search, driven.q, exchange, comparable),
+        run=driven.run,
+        driven=settings.run,
+        by_images=view is not None,
     )
 
 
-def _driven(found: Selection, driven: Drivable) -> Selection:
+def _in_driving_order(selection: Selection, driven: Drivable) -> Selection:
     """Return the selection in driving order, with index and efficiency updated for replaced poses."""
-    indices, value = found.indices, driven.value[1] if driven.replaced else found.value
+    value = selection.value
+    history = selection.history
+    if driven.replaced:
+        value = driven.value[1]
+        history = np.append(history, value)
+    indices = selection.indices
     if indices is not None:
         indices = indices.copy()
         indices[list(driven.replaced)] = list(driven.replaced.values())
         indices = indices[driven.run.order]
-    history = np.append(found.history, value) if driven.replaced else found.history
     return replace(
-        found,
+        selection,
         q=driven.q[driven.run.order],
         indices=indices,
         value=value,
         history=history,
-        efficiency=found.efficiency * float(np.exp(driven.gain)),
+        efficiency=selection.efficiency * float(np.exp(driven.gain)),
     )
 
 
-def _drawn(space: SearchSpace, limits: Limits, settings: SelectionSettings) -> np.ndarray:
+def _draw_feasible(space: SearchSpace, limits: Limits, settings: SelectionSettings) -> np.ndarray:
     """Return the candidate poses; an error names the constraints if too few poses are feasible."""
+    feasible = partial(is_feasible, space)
     try:
-        return draw_candidates(
-            space.lower, space.upper, settings.candidates, partial(is_feasible, space), seed=settings.seed
-        )
+        return draw_candidates(space.lower, space.upper, settings.candidates, feasible, seed=settings.seed)
     except NothingFeasible as error:
-        q = np.random.default_rng(settings.seed).uniform(limits.lower, limits.upper, (2000, len(limits.lower)))
-        shares = [(one.name, (np.asarray(one.function(q)) <= 0.0).all(1).mean()) for one in space.constraints]
-        named = ", ".join(f"{name} {100 * share:.2g} %" for name, share in sorted(shares, key=lambda each: each[1]))
-        hint = " (does the target face the arm? check facing in [target])" if limits.sight is not None else ""
-        raise UsageError(f"{error}; share of random postures that keep each constraint: {named}{hint}") from error
+        stream = np.random.default_rng(settings.seed)
+        q = stream.uniform(limits.lower, limits.upper, (RANDOM_POSTURES, len(limits.lower)))
+        shares = []
+        for constraint in space.constraints:
+            satisfied = (np.asarray(constraint.function(q)) <= 0.0).all(1)
+            shares.append((constraint.name, satisfied.mean()))
+        shares.sort(key=lambda named_share: named_share[1])
+        listed = ", ".join(f"{name} {100 * share:.2g} %" for name, share in shares)
+        hint = ""
+        if limits.sight is not None:
+            hint = " (does the target face the arm? check facing in [target])"
+        raise UsageError(f"{error}; share of random postures that keep each constraint: {listed}{hint}") from error
 
 
 def _outlook(
-    seen: Observation, limits: Limits, search: SearchSettings, q: np.ndarray, pool: Exchange, comparable: float
+    jacobian: Observation, limits: Limits, search: SearchSettings, q: np.ndarray, exchange: Exchange, comparable: float
 ) -> PoseOutlook:
     """Return the predicted accuracy with chosen poses q (m, n), with other pose counts, and without sight limits."""
-    free, before = limits.space(seen, sight=False), pool.before
+    space = limits.space(jacobian, sight=False)
+    existing = exchange.before
     stream = np.random.default_rng([search.seed, 2])
-    typical = draw_candidates(free.lower, free.upper, TYPICAL, partial(is_feasible, free), seed=stream)
-    past = [] if before is None else [before]
+    typical = draw_candidates(space.lower, space.upper, TYPICAL, partial(is_feasible, space), seed=stream)
 
-    def known(chosen: np.ndarray) -> Prediction:
-        return forecast.predicted(seen, np.concatenate([free.jacobian(chosen), *past]), typical, len(q))
+    def predicted(chosen: np.ndarray) -> Prediction:
+        jacobians = np.asarray(space.jacobian(chosen))
+        if existing is not None:
+            jacobians = np.concatenate([jacobians, existing])
+        return forecast.predicted(jacobian, jacobians, typical, len(q))
 
     blind = None
     if limits.sight is not None:
-        other = select_poses(None, len(q), replace(search, method="detmax", climbs=0), space=free, existing=before)
-        blind = other.value, known(other.joints)
-    others = forecast.by_count(seen, pool.jacobian(pool.candidates), typical, before)
-    return PoseOutlook(known(q), others, blind, comparable)
+        search = replace(search, method="detmax", climbs=0)
+        selection = select_poses(None, len(q), search, space=space, existing=existing)
+        blind = selection.value, predicted(selection.joints)
+    others = forecast.by_count(jacobian, exchange.jacobian(exchange.candidates), typical, existing)
+    return PoseOutlook(predicted(q), others, blind, comparable)
 
 
 def beside_poses(out: Path, plots: bool, chosen: Chosen | None = None) -> dict[str, Path]:
     """Return the files written next to a selection's CSV: the prediction, and the figures by name."""
-    figures = () if not plots else FIGURES if chosen is None else chosen.figures
-    predicted = {} if chosen is not None and chosen.prediction is None else {"prediction": forecast.beside(out)}
-    return predicted | {name: out.parent / f"{out.stem}_{name}.png" for name in figures}
+    paths = {}
+    if chosen is None or chosen.prediction is not None:
+        paths["prediction"] = forecast.beside(out)
+    figures = ()
+    if plots:
+        figures = FIGURES if chosen is None else chosen.figures
+    for name in figures:
+        paths[name] = out.parent / f"{out.stem}_{name}.png"
+    return paths
 
 
 def targets(out: Path, plots: bool) -> files.Results:
     """Return the paths of all files that a selection may write."""
-    return [(out, (".csv",)), *((path, (path.suffix,)) for path in beside_poses(out, plots).values())]
+    beside = beside_poses(out, plots).values()
+    return [(out, (".csv",)), *((path, (path.suffix,)) for path in beside)]
 
 
 def write(chosen: Chosen, path: Path) -> Path:
@@ -258,28 +304,42 @@ def write(chosen: Chosen, path: Path) -> Path:
     if chosen.prediction is not None:
         forecast.write(chosen.prediction, path)
     else:
-        forecast.beside(path).unlink(missing_ok=True)  # an earlier selection's
+        # an earlier selection's
+        forecast.beside(path).unlink(missing_ok=True)
     return write_poses(path, chosen.selection.joints, chosen.chain.joint_names, joint_kinds(chosen.chain))
 
 
-def bound_words(found: Selection) -> str:
+def bound_words(selection: Selection) -> str:
     """Return a text on the poses for which the bound of an efficiency holds, and on the bound's accuracy."""
-    climbs, gap = found.ceiling.climbs, 100 * found.ceiling.gap
-    if not climbs:
-        return f"of the candidates{' and these poses' if found.indices is None else ''}, not of all feasible poses"
-    return f"of all feasible poses found by {climbs} searches; the bound is at most {gap:.2g} % too high"
+    ceiling = selection.ceiling
+    if ceiling.climbs:
+        percent = 100 * ceiling.gap
+        return (
+            f"of all feasible poses found by {ceiling.climbs} searches; the bound is at most {percent:.2g} % too high"
+        )
+    if selection.indices is None:
+        return "of the candidates and these poses, not of all feasible poses"
+    return "of the candidates, not of all feasible poses"
 
 
 def record(chosen: Chosen) -> dict[str, Any]:
     """Return the results of the selection as numbers; `table` returns them as text."""
-    found, rms = chosen.selection, chosen.outlook.poses.rms
-    search = ("index", "method", "value", "random_baseline", "efficiency", "seconds")
+    selection = chosen.selection
+    rms = chosen.outlook.poses.rms
     return {
-        **{name: getattr(found, name) for name in search},
-        **{name: getattr(chosen, name) for name in ("parameters", "existing")},
-        **{name: list(getattr(chosen, name)) for name in ("checked", "unchecked", "notes")},
-        "start": float(found.history[0]),
-        "efficiency_covers": bound_words(found),
+        "index": selection.index,
+        "method": selection.method,
+        "value": selection.value,
+        "random_baseline": selection.random_baseline,
+        "efficiency": selection.efficiency,
+        "seconds": selection.seconds,
+        "parameters": chosen.parameters,
+        "existing": chosen.existing,
+        "checked": list(chosen.checked),
+        "unchecked": list(chosen.unchecked),
+        "notes": list(chosen.notes),
+        "start": float(selection.history[0]),
+        "efficiency_covers": bound_words(selection),
         "tool_sigma": rms if np.isfinite(rms) else None,
         "run_seconds": chosen.run.seconds,
     }
@@ -287,29 +347,36 @@ def record(chosen: Chosen) -> dict[str, Any]:
 
 def table(chosen: Chosen) -> list[tuple[str, str]]:
     """Return the results of the selection as pairs of label and value."""
-    found = chosen.selection
-    known = [] if chosen.existing is None else [("existing poses alone", f"{chosen.existing:.6g}")]
-    return [
-        ("index", f"{found.index}" + (" (ranks pose sets independently of units)" if found.index == "O1" else "")),
+    selection = chosen.selection
+    index = f"{selection.index}"
+    if selection.index == "O1":
+        index += " (ranks pose sets independently of units)"
+    rows = [
+        ("index", index),
         ("identifiable parameters", str(chosen.parameters)),
-        ("best of 1000 random sets", f"{found.random_baseline:.6g}"),
-        *known,
-        ("start of the search", f"{float(found.history[0]):.6g}"),
-        ("chosen poses", f"{found.value:.6g}"),
-        ("efficiency against the convex bound", f"{found.efficiency:.4f} (det^(1/p); {bound_words(found)})"),
-        ("seconds", f"{found.seconds:.2f}"),
-        *predicted_rows(chosen),
+        ("best of 1000 random sets", f"{selection.random_baseline:.6g}"),
     ]
+    if chosen.existing is not None:
+        rows.append(("existing poses alone", f"{chosen.existing:.6g}"))
+    efficiency = f"{selection.efficiency:.4f} (det^(1/p); {bound_words(selection)})"
+    rows += [
+        ("start of the search", f"{float(selection.history[0]):.6g}"),
+        ("chosen poses", f"{selection.value:.6g}"),
+        ("efficiency against the convex bound", efficiency),
+        ("seconds", f"{selection.seconds:.2f}"),
+    ]
+    return rows + predicted_rows(chosen)
 
 
 def predicted_rows(chosen: Chosen) -> list[tuple[str, str]]:
     """Return the table rows of the predicted accuracy, with the accuracy lost to line-of-sight constraints."""
-    rows = forecast.table(chosen.outlook.poses, chosen.outlook.others)
-    if chosen.outlook.blind is None:
+    outlook = chosen.outlook
+    rows = forecast.table(outlook.poses, outlook.others)
+    if outlook.blind is None:
         return rows
-    (index, blind), one = chosen.outlook.blind, chosen.outlook.poses
-    words = (
-        f"index {chosen.outlook.comparable:.5g} instead of {index:.5g} without it, "
-        f"σ of the tool {1e3 * one.rms:.3g} instead of {1e3 * blind.rms:.3g} mm"
+    blind_index, blind = outlook.blind
+    cost = (
+        f"index {outlook.comparable:.5g} instead of {blind_index:.5g} without it, "
+        f"σ of the tool {1e3 * outlook.poses.rms:.3g} instead of {1e3 * blind.rms:.3g} mm"
     )
-    return [*rows, ("cost of line of sight", words)]
+    return [*rows, ("cost of line of sight", cost)]

@@ -8,9 +8,11 @@ from calib.config_types import Expect, Flag, Holdout, OneOf, Positive, Real, See
 from calib.data.poses import MIN_SIGMA, Loss, Model
 from calib.procedure.measuring import DEFAULT_RUN, RunSettings
 
-DELIVERABLES = ("urdf", "corrections")  # what a verdict is about: robot.urdf alone, or with joint_corrections.csv
-Place = Annotated[float, Real(least=-100.0, most=100.0, unit="m", quantity="length")]  # of a target in the tip's frame
-Point = Annotated[tuple[Place, Place, Place], Expect("x,y,z [m]")]
+# what a verdict is about: robot.urdf alone, or with joint_corrections.csv
+DELIVERABLES = ("urdf", "corrections")
+# position of a target in the tip's frame
+Coordinate = Annotated[float, Real(least=-100.0, most=100.0, unit="m", quantity="length")]
+Point = Annotated[tuple[Coordinate, Coordinate, Coordinate], Expect("x,y,z [m]")]
 Sigma = Annotated[float, Real(above=0.0, least=MIN_SIGMA, most=10.0, unit="m or rad", quantity="1")]
 Tolerance = Annotated[float, Real(above=0.0, quantity="length"), Typed(unit="mm")] | None
 Stations = Annotated[str, OneOf(("each", "one"))]

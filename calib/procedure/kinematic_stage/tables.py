@@ -16,7 +16,7 @@ from calib.data.poses.measurements import Positions
 from calib.errors import UsageError
 from calib.geometry.accuracy import NATURE
 from calib.geometry.installation import Installation
-from calib.geometry.observation import layout, observe, positions, prepare
+from calib.geometry.observation import Block, layout, observe, positions, prepare
 from calib.geometry.residuals import inverse_right_jacobian
 from calib.geometry.weighing import GeometricFit
 from calib.procedure.kinematic_stage.comparison import INTERVAL, Comparison, interval_cells
@@ -26,12 +26,28 @@ from calib.robot.chain import Chain
 from calib.transforms import invert, rotation_vector
 from calib.units import ERRORS
 
-PLACES = tuple(
-    f"{name} [{unit}]"
-    for head, unit in (("", "m"), ("to_nominal_", "mm"), ("to_calibrated_", "mm"))
-    for name in (f"{head}x", f"{head}y", f"{head}z")
+PLACES = (
+    "x [m]",
+    "y [m]",
+    "z [m]",
+    "to_nominal_x [mm]",
+    "to_nominal_y [mm]",
+    "to_nominal_z [mm]",
+    "to_calibrated_x [mm]",
+    "to_calibrated_y [mm]",
+    "to_calibrated_z [mm]",
 )
 HEADER = ("name", "unit", "nominal", "value", "sigma", "rsd [%]")
+# nature of a residual -> its columns of residuals.csv
+COMPONENTS = {
+    "position": ("dx [mm]", "dy [mm]", "dz [mm]"),
+    "orientation": ("drx [deg]", "dry [deg]", "drz [deg]"),
+    "distance": ("ddistance [mm]",),
+}
+# no derivatives are needed where residuals alone are
+NO_PARAMETERS = np.array([], dtype=int)
+# a tabulated value whose row of the Jacobian is below this was not fitted
+NOT_FITTED = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,30 +62,35 @@ class EstimateTable:
 
     def rows(self) -> list[tuple[str, str, float, float, float, float | None]]:
         """Return name, unit, nominal, value, σ and RSD [%] of each row; RSD is empty for a value of 0."""
-        sigma = np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
-        numbers = zip(self.names, self.units, self.nominal, self.values, sigma)
-        return [
-            (name, unit, float(n), float(v), float(s), float(100.0 * s / abs(v)) if v else None)
-            for name, unit, n, v, s in numbers
-        ]
+        sigmas = np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
+        rows = []
+        for name, unit, nominal, value, sigma in zip(self.names, self.units, self.nominal, self.values, sigmas):
+            rsd = float(100.0 * sigma / abs(value)) if value else None
+            rows.append((name, unit, float(nominal), float(value), float(sigma), rsd))
+        return rows
 
 
-def estimate_table(found: GeometricFit, nominal: Installation) -> EstimateTable:
+def estimate_table(fit: GeometricFit, nominal: Installation) -> EstimateTable:
     """Return the table of fitted parameters: arm elements, placements, deflection coefficients.
 
     Args:
-        found: the fit.
+        fit: the fit.
         nominal: the nominal arm with its frames fitted; whose values stand in the column ``nominal``.
     """
-    table, full = layout(found.cell), _to_table(found.cell)[:, found.free]
-    values, before = _values(found.cell), np.zeros(len(table.names))
-    first = _values(replace(nominal, deflection=Deflection()))
-    before[: len(first)] = first
-    shown = np.flatnonzero(np.abs(full).max(axis=1, initial=0.0) > 1e-9)
-    full = full[shown]
-    covariance = full @ found.estimate.covariance @ full.T
-    names, units = (tuple(part[k] for k in shown) for part in (table.names, table.units))
-    return EstimateTable(names, units, before[shown], values[shown], covariance)
+    parameters = layout(fit.cell)
+    values = _values(fit.cell)
+    # the nominal arm has no deflection terms; these start from 0
+    nominal_values = np.zeros(len(parameters.names))
+    start = _values(replace(nominal, deflection=Deflection()))
+    nominal_values[: len(start)] = start
+
+    to_table = _to_table(fit.cell)[:, fit.free]
+    fitted = np.flatnonzero(np.abs(to_table).max(axis=1, initial=0.0) > NOT_FITTED)
+    to_table = to_table[fitted]
+    covariance = to_table @ fit.estimate.covariance @ to_table.T
+    names = tuple(parameters.names[k] for k in fitted)
+    units = tuple(parameters.units[k] for k in fitted)
+    return EstimateTable(names, units, nominal_values[fitted], values[fitted], covariance)
 
 
 def read_covariance(folder: Path, cell: Installation) -> tuple[np.ndarray, np.ndarray]:
@@ -83,41 +104,41 @@ def read_covariance(folder: Path, cell: Installation) -> tuple[np.ndarray, np.nd
         UsageError: where it belongs to another fit.
     """
     names, table = folders.read_covariance(folder)
-    place = {name: k for k, name in enumerate(layout(cell).names)}
-    strange = [name for name in names if name not in place]
-    if strange:
+    index = {name: k for k, name in enumerate(layout(cell).names)}
+    unknown = [name for name in names if name not in index]
+    if unknown:
         raise UsageError(
-            f"{folder}/covariance.csv does not belong to the robot.toml next to it: '{strange[0]}' is not a "
+            f"{folder}/covariance.csv does not belong to the robot.toml next to it: '{unknown[0]}' is not a "
             "parameter there; fit again"
         )
-    back = np.linalg.inv(_to_table(cell))[:, [place[name] for name in names]]
-    free = np.flatnonzero(np.abs(back).max(axis=1, initial=0.0) > 0.0)
-    return free, back[free] @ table @ back[free].T
+    columns = [index[name] for name in names]
+    from_table = np.linalg.inv(_to_table(cell))[:, columns]
+    free = np.flatnonzero(np.abs(from_table).max(axis=1, initial=0.0) > 0.0)
+    return free, from_table[free] @ table @ from_table[free].T
 
 
 def _values(cell: Installation) -> np.ndarray:
     """Return the full parameter vector of an installation, frames as position and rotation vector."""
-    frames = [np.concatenate([t[:3, 3], rotation_vector(t[:3, :3])]) for t in (*cell.stations, *cell.tools)]
-    terms = np.asarray(cell.deflection.coefficients)
-    return np.concatenate([cell.chain.values, *frames, cell.optics.values, terms])
+    frames = []
+    for frame in (*cell.stations, *cell.tools):
+        frames += [frame[:3, 3], rotation_vector(frame[:3, :3])]
+    coefficients = np.asarray(cell.deflection.coefficients)
+    return np.concatenate([cell.chain.values, *frames, cell.optics.values, coefficients])
 
 
 def _to_table(cell: Installation) -> np.ndarray:
     """Return the Jacobian (p, p) of the tabulated values with respect to steps along the parameters."""
-    result, start = np.eye(len(layout(cell).names)), len(cell.chain.elements)
-    for k, frame in enumerate((*cell.stations, *cell.tools)):
-        at, turn = start + 6 * k, rotation_vector(frame[:3, :3])[:, None]
-        result[at : at + 3, at : at + 3] = frame[:3, :3]
-        result[at + 3 : at + 6, at + 3 : at + 6] = inverse_right_jacobian(turn, np.eye(3)[:, :, None])[:, :, 0].T
-    return result
-
-
-_NONE = np.array([], dtype=int)
-COMPONENTS = {
-    "position": ("dx [mm]", "dy [mm]", "dz [mm]"),
-    "orientation": ("drx [deg]", "dry [deg]", "drz [deg]"),
-    "distance": ("ddistance [mm]",),
-}
+    jacobian = np.eye(len(layout(cell).names))
+    start = len(cell.chain.elements)
+    for frame in (*cell.stations, *cell.tools):
+        rotation = frame[:3, :3]
+        vector = rotation_vector(rotation)[:, None]
+        position_rows = slice(start, start + 3)
+        rotation_rows = slice(start + 3, start + 6)
+        jacobian[position_rows, position_rows] = rotation
+        jacobian[rotation_rows, rotation_rows] = inverse_right_jacobian(vector, np.eye(3)[:, :, None])[:, :, 0].T
+        start += 6
+    return jacobian
 
 
 def residuals(outcome: Outcome) -> tuple[Iterator[Sequence[object]], list[str]]:
@@ -127,40 +148,63 @@ def residuals(outcome: Outcome) -> tuple[Iterator[Sequence[object]], list[str]]:
     deviation that the fit expects of the calibrated arm's position error there, ``interval95`` within which 95 % of
     such errors are to be, ``extrapolated`` 1 where a joint stands outside the training range.
     """
-    sets, unseen = [("fit", outcome.fit)], outcome.inputs.unseen.items()
-    sets += [("held out" if one.held_out else "validation", outcome.validation[name]) for name, one in unseen]
-    joints = outcome.inputs.chain.joints
-    header = ["set", "file", "row", "station", "tool", *(f"{joint.name} [{joint.unit}]" for joint in joints)]
-    header += [name for names in COMPONENTS.values() for name in names]
+    sets = [("fit", outcome.fit)]
+    for name, unseen in outcome.inputs.unseen.items():
+        label = "held out" if unseen.held_out else "validation"
+        sets.append((label, outcome.validation[name]))
+    joints = [f"{joint.name} [{joint.unit}]" for joint in outcome.inputs.chain.joints]
+    header = ["set", "file", "row", "station", "tool", *joints]
+    for names in COMPONENTS.values():
+        header += names
+    header += ["size [mm]", "nominal size [mm]", "weight", "outlier", *INTERVAL]
     rows = chain.from_iterable(_residual_rows(label, comparison, outcome) for label, comparison in sets)
-    return rows, [*header, "size [mm]", "nominal size [mm]", "weight", "outlier", *INTERVAL]
+    return rows, header
 
 
 def _residual_rows(label: str, comparison: Comparison, outcome: Outcome) -> Iterator[Sequence[object]]:
-    nominal, cell = comparison.cells
-    named = {(each.file, each.row) for each in outcome.outliers if label == "fit"}
-    stated = iter(interval_cells(comparison))
-    weights = iter(outcome.selection.fit.row_weights() if label == "fit" else ())
-    for before, block in zip(*(prepare(each, comparison.blocks) for each in comparison.cells)):
-        measured, m = block.measured, len(block.measured)
-        columns = {nature: np.full((len(names), m), np.nan) for nature, names in COMPONENTS.items()}
-        for part in observe(cell, block, _NONE):
-            nature, own = NATURE[part.label], part.per_row()
-            columns[nature][: len(own.value), own.index] = ERRORS[nature][0] * own.value
-        first = np.full(m, np.nan)
-        for part in observe(nominal, before, _NONE):
-            own = part.per_row()
-            if NATURE[part.label] == "position" or np.isnan(first[own.index]).all():
-                first[own.index] = 1e3 * own.sizes()
-        position, distance = columns["position"], columns["distance"]
-        length = np.sqrt(np.nansum(position**2, axis=0))
-        size = np.where(np.isnan(position).all(axis=0), np.abs(distance[0]), length)
-        weight = next(weights, np.full(m, np.nan))
-        numbers = np.column_stack([measured.q, *(values.T for values in columns.values()), size, first, weight])
-        station, file = measured.station if measured.has_instrument else "", measured.file
-        for number, tool, row in zip(measured.rows.tolist(), measured.tool.tolist(), numbers):
-            outlier = int((file, number) in named)
-            yield [label, file, number, station, measured.tool_names[tool], *row.tolist(), outlier, *next(stated)]
+    """Yield the rows of one set in ``residuals.csv``."""
+    nominal, calibrated = comparison.cells
+    nominal_blocks = prepare(nominal, comparison.blocks)
+    blocks = prepare(calibrated, comparison.blocks)
+    intervals = iter(interval_cells(comparison))
+    outliers = set()
+    weights = iter(())
+    if label == "fit":
+        outliers = {(outlier.file, outlier.row) for outlier in outcome.outliers}
+        weights = iter(outcome.selection.fit.row_weights())
+    for nominal_block, block in zip(nominal_blocks, blocks):
+        measured = block.measured
+        count = len(measured)
+        columns = {nature: np.full((len(names), count), np.nan) for nature, names in COMPONENTS.items()}
+        for part in observe(calibrated, block, NO_PARAMETERS):
+            nature = NATURE[part.label]
+            residual = part.per_row()
+            factor, _ = ERRORS[nature]
+            columns[nature][: len(residual.value), residual.index] = factor * residual.value
+        nominal_size = _nominal_sizes(nominal, nominal_block, count)
+
+        # the size of a row is that of its position error, else of its distance error
+        without_position = np.isnan(columns["position"]).all(axis=0)
+        length = np.sqrt(np.nansum(columns["position"] ** 2, axis=0))
+        size = np.where(without_position, np.abs(columns["distance"][0]), length)
+        weight = next(weights, np.full(count, np.nan))
+        components = [values.T for values in columns.values()]
+        numbers = np.column_stack([measured.q, *components, size, nominal_size, weight])
+        station = measured.station if measured.has_instrument else ""
+        for row, tool, values in zip(measured.rows.tolist(), measured.tool.tolist(), numbers):
+            outlier = int((measured.file, row) in outliers)
+            tool_name = measured.tool_names[tool]
+            yield [label, measured.file, row, station, tool_name, *values.tolist(), outlier, *next(intervals)]
+
+
+def _nominal_sizes(nominal: Installation, block: Block, count: int) -> np.ndarray:
+    """Return the size (m,) of the nominal arm's residuals [mm]: positions where there are such, else the first part."""
+    sizes = np.full(count, np.nan)
+    for part in observe(nominal, block, NO_PARAMETERS):
+        residual = part.per_row()
+        if NATURE[part.label] == "position" or np.isnan(sizes[residual.index]).all():
+            sizes[residual.index] = 1e3 * residual.sizes()
+    return sizes
 
 
 def write_errors(path: Path, arm: Chain, validation: Mapping[str, Comparison]) -> None:
@@ -170,25 +214,33 @@ def write_errors(path: Path, arm: Chain, validation: Mapping[str, Comparison]) -
     puts it, all in the calibrated arm's base. After them `INTERVAL`, as in ``residuals.csv``.
     """
     rows: list[list[object]] = []
-    for name, each in validation.items():
-        q = np.concatenate([block.q for block in each.blocks])
-        numbers = [int(row) for block in each.blocks for row in block.rows]
-        sizes = [found.main for found in each.errors]
-        if len(sizes[0]) == len(q):
-            places = np.concatenate([_places(each, number) for number in range(len(each.blocks))])
-            cells = np.column_stack([q, *(1e3 * size for size in sizes), places, interval_cells(each)])
-            rows += [[name, number, *values] for number, values in zip(numbers, cells)]
+    for name, comparison in validation.items():
+        q = np.concatenate([block.q for block in comparison.blocks])
+        row_numbers = [int(row) for block in comparison.blocks for row in block.rows]
+        nominal, calibrated = (arm.main for arm in comparison.errors)
+        # errors of pairs are not of single rows
+        if len(nominal) != len(q):
+            continue
+        vectors = np.concatenate([_error_vectors(comparison, k) for k in range(len(comparison.blocks))])
+        intervals = interval_cells(comparison)
+        cells = np.column_stack([q, 1e3 * nominal, 1e3 * calibrated, vectors, intervals])
+        rows += [[name, row, *values] for row, values in zip(row_numbers, cells)]
     joints = [f"{joint.name} [{joint.unit}]" for joint in arm.joints]
-    files.write_table(path, ["file", "row", *joints, "nominal [mm]", "calibrated [mm]", *PLACES, *INTERVAL], rows)
+    header = ["file", "row", *joints, "nominal [mm]", "calibrated [mm]", *PLACES, *INTERVAL]
+    files.write_table(path, header, rows)
 
 
-def _places(found: Comparison, number: int) -> np.ndarray:
+def _error_vectors(comparison: Comparison, number: int) -> np.ndarray:
     """Return measured positions [m] and error vectors of both arms [mm] of a block (m, 9); NaN without positions."""
-    block = found.blocks[number]
+    block = comparison.blocks[number]
     if not isinstance(block, Positions):
         return np.full((len(block), 9), np.nan)
-    ready = [prepare(cell, [block])[0] for cell in found.cells]
-    base = invert(found.cells[1].stations[ready[1].station])
-    ways = [1e3 * (positions(cell, one).T - block.position) for cell, one in zip(found.cells, ready)]
-    turn = base[:3, :3].T
-    return np.hstack([block.position @ turn + base[:3, 3], *(way @ turn for way in ways)])
+    prepared = [prepare(cell, [block])[0] for cell in comparison.cells]
+    calibrated = comparison.cells[1]
+    T_base_station = invert(calibrated.stations[prepared[1].station])
+    rotation = T_base_station[:3, :3].T
+    columns = [block.position @ rotation + T_base_station[:3, 3]]
+    for cell, cell_block in zip(comparison.cells, prepared):
+        error_mm = 1e3 * (positions(cell, cell_block).T - block.position)
+        columns.append(error_mm @ rotation)
+    return np.hstack(columns)

@@ -5,7 +5,7 @@
 The rules of the verdict have their limits and sentences in the catalogue of findings, chapter 4.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -26,8 +26,20 @@ from calib.procedure.kinematic_stage.plausibility import FLOOR, TOO_GOOD
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.robot.chain import Chain
 
-WORSE = limit("worse-than-nominal", "times")  # ratio of errors from which the calibrated arm is the worse one
-RIGID = ("rigid-misfit", "gross-rows", "earlier-misfit")  # no rigid geometry explains the measurements
+# ratio of errors from which the calibrated arm is the worse one
+WORSE = limit("worse-than-nominal", "times")
+# codes of findings: no rigid geometry explains the measurements
+RIGID = ("rigid-misfit", "gross-rows", "earlier-misfit")
+# nominal errors this many times the fit's: the instrument must have stood elsewhere (our choice)
+ELSEWHERE = 20.0
+# times the median error: a row from which on is probably measured wrongly (our choice)
+OUTLIER_SIGMAS = 8.0
+# error [m] below which none is taken in a ratio
+TINY = 1e-300
+# share of errors that the fit states to be within the intervals
+NOMINAL_COVERAGE = 0.95
+# name of each deliverable in messages
+ARM = {"urdf": "calibrated", "corrections": "with joint corrections"}
 
 
 @dataclass(frozen=True)
@@ -40,9 +52,9 @@ class _Proof:
     rows: Comparison | None = None
 
     @property
-    def left(self) -> float:
+    def ratio(self) -> float:
         """Ratio of the calibrated to the nominal arm's error."""
-        return self.after / max(self.before, 1e-300)
+        return self.after / max(self.before, TINY)
 
 
 def judge(
@@ -50,7 +62,7 @@ def judge(
     validation: Mapping[str, Comparison],
     findings: Findings,
     *,
-    asked: str = "auto",
+    requested_model: str = "auto",
     tolerance: float | None = None,
     cross_validated: float | None = None,
     arm: str = "",
@@ -76,152 +88,187 @@ def judge(
     Args:
         fit: both arms on the fit's rows.
         validation: both arms on other rows.
-        findings: what the fit says of itself.
-        asked: the model asked for.
+        findings: warnings and notes on the fit.
+        requested_model: the model that the settings name, or auto.
         tolerance: largest rms on unseen poses that is good enough [m]; None where none was given.
         cross_validated: error of what is judged on held-out rows [m]; None where it was not computed.
         arm: what is judged, in a word or two, where there are several deliverables.
     """
-    proofs = {name: comparison for name, comparison in validation.items() if comparison.proves}
-    nominal, own = (each.rms for each in fit.errors)
+    unseen = {name: comparison for name, comparison in validation.items() if comparison.proves}
+    nominal_rms, fitted_rms = (arm.rms for arm in fit.errors)
+    frames_only = findings.model == requested_model == "frames"
+
+    # The errors to judge by: on unseen rows, else by cross-validation, else on the fitted rows.
+    proofs = []
+    for name, comparison in unseen.items():
+        nominal, calibrated = comparison.errors
+        proofs.append(_Proof(nominal.rms, calibrated.rms, f"on {name}, unseen", comparison))
     if findings.nominal_cross_validated is not None:
-        nominal = findings.nominal_cross_validated
-    found = [_Proof(one.errors[0].rms, one.errors[1].rms, f"on {name}, unseen", one) for name, one in proofs.items()]
-    if not found and cross_validated is not None:
-        found = [_Proof(nominal, cross_validated, "by cross-validation only")]
-    frames_only = findings.model == asked == "frames"
-    if not found and frames_only:
+        nominal_rms = findings.nominal_cross_validated
+    if not proofs and cross_validated is not None:
+        proofs = [_Proof(nominal_rms, cross_validated, "by cross-validation only")]
+    if not proofs and frames_only:
         # so few parameters leave the errors on the fitted poses as they are
-        found = [_Proof(nominal, own, "on the fitted poses")]
-    worst = max(found, key=lambda proof: proof.after, default=None)
-    gross = [one for proof in found for one in _gross(proof, findings.reach) if level_of(one)]
-    others = [*gross, *(one for one in findings.noticed if one.code not in RIGID)]
-    for rules in (
-        _far_off(found, {"the fitted poses": fit, **proofs}, tolerance, findings.reach),
-        () if frames_only else _nothing_gained(found, findings),
-        _worse(found, findings.reach),
-    ):
-        if group := list(filter(level_of, rules)):
-            if level_of(group[0]) == "note":  # it stands for the figures
-                return Verdict.of(sentence(group[0]), others)
-            return Verdict.of("" if worst is None else _figures(worst, arm), [*others, *group])
+        proofs = [_Proof(nominal_rms, fitted_rms, "on the fitted poses")]
+    worst = max(proofs, key=lambda proof: proof.after, default=None)
+
+    gross: list[Finding] = []
+    for proof in proofs:
+        gross += filter(level_of, _gross(proof, findings.reach))
+    common = [*gross, *(noticed for noticed in findings.noticed if noticed.code not in RIGID)]
+
+    # The first group of rules that says something decides.
+    groups: list[Iterable[Finding]] = [_far_off(proofs, {"the fitted poses": fit, **unseen}, tolerance, findings.reach)]
+    if not frames_only:
+        groups.append(_nothing_gained(proofs, findings))
+    groups.append(_worse(proofs, findings.reach))
+    for rules in groups:
+        group = list(filter(level_of, rules))
+        if not group:
+            continue
+        if level_of(group[0]) == "note":
+            # the note stands for the figures
+            return Verdict.of(sentence(group[0]), common)
+        figures = "" if worst is None else _figures(worst, arm)
+        return Verdict.of(figures, [*common, *group])
     if worst is None:
-        return Verdict.of("", [finding("no-unseen-poses"), *others])
+        return Verdict.of("", [finding("no-unseen-poses"), *common])
     if frames_only:
-        return _frames_verdict(worst, tolerance, arm, others)
+        return _frames_verdict(worst, tolerance, arm, common)
+
+    # Grossly wrong unseen rows refute no promise of the fit.
     promised = None if gross else cross_validated
-    rules = [*gross, *findings.noticed, *_doubts(worst, own, promised, proofs, findings)]
-    verdict = Verdict.of(_figures(worst, arm), rules)
-    return Verdict("pass", _figures(worst, arm, tolerance)) if verdict.level == "pass" else verdict
+    doubts = _doubts(worst, fitted_rms, promised, unseen, findings)
+    verdict = Verdict.of(_figures(worst, arm), [*gross, *findings.noticed, *doubts])
+    if verdict.level == "pass":
+        return Verdict("pass", _figures(worst, arm, tolerance))
+    return verdict
 
 
-def _frames_verdict(worst: _Proof, tolerance: float | None, arm: str, others: Sequence[Finding]) -> Verdict:
+def _frames_verdict(worst: _Proof, tolerance: float | None, arm: str, findings: Sequence[Finding]) -> Verdict:
     """Return the verdict where only frames were fitted and the arm errs within the tolerance, if there is one."""
     if tolerance is not None:
-        return Verdict.of(_figures(worst, arm, tolerance), others)
-    verdict = Verdict.of(sentence(finding("frames-only", rms=worst.after, where=worst.where)), others)
-    return replace(verdict, level=NOT_JUDGED) if verdict.level == "pass" else verdict
+        return Verdict.of(_figures(worst, arm, tolerance), findings)
+    verdict = Verdict.of(sentence(finding("frames-only", rms=worst.after, where=worst.where)), findings)
+    if verdict.level == "pass":
+        return replace(verdict, level=NOT_JUDGED)
+    return verdict
 
 
 def _figures(worst: _Proof, arm: str, tolerance: float | None = None) -> str:
-    values = {"after": worst.after, "before": worst.before, "where": worst.where, "arm": arm, "tolerance": tolerance}
-    return sentence(finding("errors", **values))
+    """Return the sentence on the errors before and after that a verdict is based on."""
+    figures = finding("errors", after=worst.after, before=worst.before, where=worst.where, arm=arm, tolerance=tolerance)
+    return sentence(figures)
 
 
 def _far_off(
-    found: Sequence[_Proof], sets: Mapping[str, Comparison], tolerance: float | None, reach: float
+    proofs: Sequence[_Proof], sets: Mapping[str, Comparison], tolerance: float | None, reach: float
 ) -> Iterator[Finding]:
     """Yield findings on files where both arms are far off (moved instrument or another robot), or above the tolerance.
 
     Orientations that are off, of all sets of rows, and errors above the tolerance.
     """
-    for proof in found:
+    for proof in proofs:
         if proof.rows is not None:
             code = "placed-elsewhere" if proof.rows.shares_frames else "far-off"
             yield finding(code, share=min(proof.before, proof.after) / reach)
     for name, rows in sets.items():
-        if (angle := rows.errors[1].orientation) is not None:
+        angle = rows.errors[1].orientation
+        if angle is not None:
             yield finding("orientations-off", where=name, angle=float(np.sqrt(np.mean(angle**2))))
     if tolerance is not None:
-        for proof in found:
+        for proof in proofs:
             yield finding("above-tolerance", tolerance=tolerance, times=proof.after / tolerance)
 
 
 def _gross(proof: _Proof, reach: float) -> Iterator[Finding]:
     """Yield the finding that rows far off for both arms alike, probably measured wrongly, make most of the error."""
-    if proof.rows is not None:
-        before, after = (found.main for found in proof.rows.errors)
-        if rows := _rows_off(proof.rows, far := _far(before) & _far(after)):
-            left = float(np.sqrt(np.mean(after[~far] ** 2)))
-            share = min(proof.before, proof.after) / reach
-            yield finding("gross-unseen-rows", rows=rows, without=left, times=proof.after / left, share=share)
+    if proof.rows is None:
+        return
+    before, after = (arm.main for arm in proof.rows.errors)
+    gross = _far_above_median(before) & _far_above_median(after)
+    rows = _row_texts(proof.rows, gross)
+    if rows:
+        without = float(np.sqrt(np.mean(after[~gross] ** 2)))
+        share = min(proof.before, proof.after) / reach
+        yield finding("gross-unseen-rows", rows=rows, without=without, times=proof.after / without, share=share)
 
 
-def _far(sizes: np.ndarray) -> np.ndarray:
+def _far_above_median(sizes: np.ndarray) -> np.ndarray:
+    """Return which errors (m,) are far above the median error."""
     return sizes > OUTLIER_SIGMAS * np.median(sizes)
 
 
-def _rows_off(rows: Comparison, far: np.ndarray) -> list[str]:
-    """Return number and error of the rows (m,) that are far off; none where errors are not of single rows."""
-    numbers, sizes = [int(row) for block in rows.blocks for row in block.rows], rows.errors[1].main
-    if len(numbers) != len(far):
+def _row_texts(comparison: Comparison, selected: np.ndarray) -> list[str]:
+    """Return number and error of the selected rows (m,); none where errors are not of single rows."""
+    numbers = [int(row) for block in comparison.blocks for row in block.rows]
+    sizes = comparison.errors[1].main
+    if len(numbers) != len(selected):
         return []
-    return [f"row {numbers[k]} ({1e3 * sizes[k]:.3g} mm)" for k in np.flatnonzero(far)]
+    return [f"row {numbers[k]} ({1e3 * sizes[k]:.3g} mm)" for k in np.flatnonzero(selected)]
 
 
-def _nothing_gained(found: Sequence[_Proof], findings: Findings) -> list[Finding]:
+def _nothing_gained(proofs: Sequence[_Proof], findings: Findings) -> list[Finding]:
     """Return a finding where the calibrated arm is as good as the nominal one: nothing to gain, or no model helps."""
-    if not found:
+    if not proofs:
         return []
-    proof = max(found, key=lambda proof: proof.before)
-    nothing = [finding("nothing-to-gain", before=proof.before, where=proof.where)]
+    proof = max(proofs, key=lambda proof: proof.before)
+    nothing_to_gain = finding("nothing-to-gain", before=proof.before, where=proof.where)
     if proof.before < TOO_GOOD:
-        return nothing
-    if any(not 1.0 - MIN_GAIN < proof.left <= WORSE for proof in found):
-        return []
-    if not np.isfinite(findings.reach):
+        return [nothing_to_gain]
+    as_good = all(1.0 - MIN_GAIN < proof.ratio <= WORSE for proof in proofs)
+    if not as_good or not np.isfinite(findings.reach):
         return []
     if proof.before > FLOOR * findings.reach:
         return [finding("no-better-model")]
-    return [finding("transfer-untested", stations=findings.blind)] if findings.blind else nothing
+    if findings.blind:
+        return [finding("transfer-untested", stations=findings.blind)]
+    return [nothing_to_gain]
 
 
-def _worse(found: Sequence[_Proof], reach: float) -> list[Finding]:
-    worse = [one for proof in found if level_of(one := finding("worse-than-nominal", times=proof.left))]
-    if worse and found[0].rows is None and found[0].after <= FLOOR * reach < np.inf:
+def _worse(proofs: Sequence[_Proof], reach: float) -> list[Finding]:
+    """Return findings where the calibrated arm is worse than the nominal one."""
+    rules = [finding("worse-than-nominal", times=proof.ratio) for proof in proofs]
+    worse = list(filter(level_of, rules))
+    if worse and proofs[0].rows is None and proofs[0].after <= FLOOR * reach < np.inf:
         return [finding("keep-nominal")]
     return worse
 
 
 def _doubts(
-    worst: _Proof, own: float, cross_validated: float | None, proofs: Mapping[str, Comparison], findings: Findings
+    worst: _Proof,
+    fitted_rms: float,
+    cross_validated: float | None,
+    unseen: Mapping[str, Comparison],
+    findings: Findings,
 ) -> Iterator[Finding]:
     """Yield the remaining findings, worst first: no transfer, narrow intervals, small gain, outliers."""
-    times = worst.after / max(own, 1e-300)
-    shared = any(rows.shares_frames for rows in proofs.values())
-    remedy = catalogue()["placed-elsewhere"].advice if shared else ""
-    if proofs and cross_validated is not None and not any(one.code in RIGID for one in findings.noticed):
-        promised = worst.after / max(cross_validated, 1e-300)
-        yield finding("refuted", times=times, promised=promised, left=worst.left, remedy=remedy)
+    times = worst.after / max(fitted_rms, TINY)
+    remedy = ""
+    if any(rows.shares_frames for rows in unseen.values()):
+        remedy = catalogue()["placed-elsewhere"].advice
+    rigid_explains = not any(noticed.code in RIGID for noticed in findings.noticed)
+    if unseen and cross_validated is not None and rigid_explains:
+        promised = worst.after / max(cross_validated, TINY)
+        yield finding("refuted", times=times, promised=promised, left=worst.ratio, remedy=remedy)
     yield finding("no-transfer", times=times, remedy=remedy)
-    for name, rows in proofs.items():
-        if (held := rows.intervals) is not None:
-            chance = 3.0 * float(np.sqrt(0.95 * 0.05 / len(held.size)))
-            yield finding(
-                "intervals-too-narrow",
-                where=name,
-                errors=len(held.size),
-                covered=held.covered,
-                median=np.median(held.radius),
-                missing=0.95 - chance - held.covered,
-            )
-    yield finding("small-gain", left=worst.left)
+    for name, rows in unseen.items():
+        if rows.intervals is None:
+            continue
+        count = len(rows.intervals.size)
+        covered = rows.intervals.covered
+        # three standard deviations of the share of a binomial distribution
+        chance = 3.0 * float(np.sqrt(NOMINAL_COVERAGE * 0.05 / count))
+        yield finding(
+            "intervals-too-narrow",
+            where=name,
+            errors=count,
+            covered=covered,
+            median=np.median(rows.intervals.radius),
+            missing=NOMINAL_COVERAGE - chance - covered,
+        )
+    yield finding("small-gain", left=worst.ratio)
     yield finding("many-outliers", share=findings.outlier_share)
-
-
-ELSEWHERE = 20.0  # nominal errors this many times the fit's: the instrument must have stood elsewhere (our choice)
-OUTLIER_SIGMAS = 8.0  # our choice
-ARM = {"urdf": "calibrated", "corrections": "with joint corrections"}  # words for what is delivered
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,8 +315,9 @@ class Assessment:
     @property
     def record(self) -> ValidationMetrics:
         """Unseen rows, verdict and warnings, in the form of ``metrics.json``."""
+        rows = {name: comparison.record() for name, comparison in self.validation.items()}
         return ValidationMetrics(
-            validation={name: comparison.record() for name, comparison in self.validation.items()},
+            validation=rows,
             verdict=self.verdict.level,
             reason=self.verdict.reason,
             code=self.verdict.code,
@@ -281,121 +329,146 @@ class Assessment:
         )
 
 
-def assess(arms: Arms, inputs: Inputs, findings: Findings, settings: Settings, wanted: FitSettings) -> Assessment:
+def assess(arms: Arms, inputs: Inputs, findings: Findings, weighing: Settings, settings: FitSettings) -> Assessment:
     """Return the errors of both arms on fitted and validation rows, and the verdict.
 
     Args:
         arms: what is compared.
         inputs: the rows.
-        findings: what the fit says of itself.
-        settings: of the fit, as asked for; the loss is the one that the fit chose.
-        wanted: the model asked for, tolerance, deliverable, and the seed of the pairs whose distances are compared.
+        findings: warnings and notes on the fit.
+        weighing: of the fit, as asked for; the loss is the one that the fit chose.
+        settings: the requested model, tolerance, deliverable, and the seed of the pairs whose distances are compared.
     """
-    settings = replace(settings, loss=findings.loss or settings.loss)
-    alone = without_corrections(arms.calibrated, arms.rigid, inputs.fit, settings)
-    cells = [each for each in (arms.nominal, arms.calibrated, alone) if each is not None]
-    fitted = compare(cells, inputs.fit, "fitted on these rows", False, wanted.seed)
-    validation = {
-        name: compare_unseen(cells, unseen, settings, wanted.seed, arms.expected, arms.plain)
-        for name, unseen in inputs.unseen.items()
-    }
-    judged = judge_deliverables(fitted, validation, findings, wanted)
-    chosen = wanted.deliverable if wanted.deliverable in judged else "urdf"
-    others = [
-        finding("other-deliverable", arm=ARM[other], rms=_worst(validation, findings, other), level=judged[other].level)
-        for other in judged.keys() - {chosen}
-    ]
-    copies = _copies(inputs)
-    usual = float(np.median(fitted.errors[0].main)) if len(fitted.errors[0].main) else np.inf
-    frames_only = findings.model == (wanted.model or "auto") == "frames"
-    references: list[Finding] = []
+    weighing = replace(weighing, loss=findings.loss or weighing.loss)
+    cells = [arms.nominal, arms.calibrated]
+    urdf_cell = without_corrections(arms.calibrated, arms.rigid, inputs.fit, weighing)
+    if urdf_cell is not None:
+        cells.append(urdf_cell)
+    fitted = compare(cells, inputs.fit, "fitted on these rows", False, settings.seed)
+    validation = {}
+    for name, unseen in inputs.unseen.items():
+        validation[name] = compare_unseen(cells, unseen, weighing, settings.seed, arms.expected, arms.plain)
+    verdicts = judge_deliverables(fitted, validation, findings, settings)
+    deliverable = settings.deliverable if settings.deliverable in verdicts else "urdf"
+
+    noticed: list[Finding] = []
+    for name in verdicts.keys() - {deliverable}:
+        rms = _worst_rms(validation, findings, name)
+        noticed.append(finding("other-deliverable", arm=ARM[name], rms=rms, level=verdicts[name].level))
+    frames_only = findings.model == (settings.model or "auto") == "frames"
     for name, rows in validation.items():
-        references += filter(level_of, _references(name, rows, chosen, frames_only))
-    noticed = (
-        *others,
-        *references,
-        *findings.noticed,
-        *([finding("not-unseen", files=copies)] if copies else []),
-        *(one for name, each in validation.items() for one in _noticed(name, each, usual)),
-    )
+        noticed += filter(level_of, _references(name, rows, deliverable, frames_only))
+    noticed += findings.noticed
+    copies = _copies(inputs)
+    if copies:
+        noticed.append(finding("not-unseen", files=copies))
+    usual = np.inf
+    if len(fitted.errors[0].main):
+        usual = float(np.median(fitted.errors[0].main))
+    for name, rows in validation.items():
+        noticed += _noticed(name, rows, usual)
+
     blocks = (*inputs.fit, *(unseen.block for unseen in inputs.unseen.values()))
     notes = (*inputs.notes, *(note for block in blocks for note in block.notes))
-    return Assessment(fitted, validation, judged[chosen], noticed, notes, judged, chosen)
+    return Assessment(fitted, validation, verdicts[deliverable], tuple(noticed), notes, verdicts, deliverable)
 
 
 def _references(name: str, rows: Comparison, deliverable: str, frames_only: bool) -> Iterator[Finding]:
     """Yield the nominal arm's, the plain fit's and the delivered arm's error on validation rows, and what is worse."""
     if rows.plain is None or not rows.proves:
         return
-    delivered = (rows.of_urdf if deliverable == "urdf" else rows).errors[1].rms
-    values = {"where": name, "plain": rows.plain.rms, "delivered": delivered}
-    yield finding("plain-reference", nominal=rows.errors[0].rms, **values)
+    delivered_rows = rows.of_urdf if deliverable == "urdf" else rows
+    delivered = delivered_rows.errors[1].rms
+    plain = rows.plain.rms
+    yield finding("plain-reference", nominal=rows.errors[0].rms, where=name, plain=plain, delivered=delivered)
     if not frames_only:
-        yield finding("worse-than-plain", times=delivered / max(rows.plain.rms, 1e-300), **values)
+        times = delivered / max(plain, TINY)
+        yield finding("worse-than-plain", times=times, where=name, plain=plain, delivered=delivered)
 
 
 def judge_deliverables(
-    fit: Comparison, validation: Mapping[str, Comparison], findings: Findings, wanted: FitSettings
+    fit: Comparison, validation: Mapping[str, Comparison], findings: Findings, settings: FitSettings
 ) -> dict[str, Verdict]:
     """Return the verdict on each deliverable: robot.urdf alone, and (if fitted) with joint corrections."""
-    common = partial(judge, findings=findings, asked=wanted.model or "auto", tolerance=wanted.tolerance)
+    model = settings.model or "auto"
+    judge_arm = partial(judge, findings=findings, requested_model=model, tolerance=settings.tolerance)
     if fit.alone is None:
-        return {"urdf": common(fit, validation, cross_validated=findings.cross_validated)}
-    bare = {name: each.of_urdf for name, each in validation.items()}
+        return {"urdf": judge_arm(fit, validation, cross_validated=findings.cross_validated)}
+    urdf_rows = {name: rows.of_urdf for name, rows in validation.items()}
+    rigid = findings.rigid_cross_validated
     return {
-        "urdf": common(fit.of_urdf, bare, cross_validated=findings.rigid_cross_validated, arm=ARM["urdf"]),
-        "corrections": common(fit, validation, cross_validated=findings.cross_validated, arm=ARM["corrections"]),
+        "urdf": judge_arm(fit.of_urdf, urdf_rows, cross_validated=rigid, arm=ARM["urdf"]),
+        "corrections": judge_arm(fit, validation, cross_validated=findings.cross_validated, arm=ARM["corrections"]),
     }
 
 
-def _worst(validation: Mapping[str, Comparison], findings: Findings, deliverable: str) -> float:
+def _worst_rms(validation: Mapping[str, Comparison], findings: Findings, deliverable: str) -> float:
     """Return the largest rms error [m] of a deliverable on validation rows; without such rows, by cross-validation."""
-    alone = deliverable == "urdf"
-    sizes = [(each.of_urdf if alone else each).errors[1].rms for each in validation.values() if each.proves]
-    by_folds = findings.rigid_cross_validated if alone else findings.cross_validated
-    return max(sizes, default=np.nan if by_folds is None else by_folds)
+    comparisons = [rows for rows in validation.values() if rows.proves]
+    cross_validated = findings.cross_validated
+    if deliverable == "urdf":
+        comparisons = [rows.of_urdf for rows in comparisons]
+        cross_validated = findings.rigid_cross_validated
+    if comparisons:
+        return max(rows.errors[1].rms for rows in comparisons)
+    return np.nan if cross_validated is None else cross_validated
 
 
 def _copies(inputs: Inputs) -> list[str]:
     """Return a note for each validation file that contains fitted rows."""
-    words = []
+    notes = []
     for name, unseen in inputs.unseen.items():
-        if unseen.seen:
-            rows = unseen.block.q, unseen.block.measured
-            own = next((Path(b.file).name for b in inputs.fit if all(map(np.array_equal, (b.q, b.measured), rows))), "")
-            same = "was fitted on" if own == name else f"is a copy of {own}"
-            words.append(f"{name} {same if own else 'repeats rows of the fit'}")
-    return words
+        if not unseen.seen:
+            continue
+        original = ""
+        for block in inputs.fit:
+            same_joints = np.array_equal(block.q, unseen.block.q)
+            if same_joints and np.array_equal(block.measured, unseen.block.measured):
+                original = Path(block.file).name
+                break
+        if not original:
+            notes.append(f"{name} repeats rows of the fit")
+        elif original == name:
+            notes.append(f"{name} was fitted on")
+        else:
+            notes.append(f"{name} is a copy of {original}")
+    return notes
 
 
-def _noticed(name: str, each: Comparison, usual: float) -> Iterator[Finding]:
+def _noticed(name: str, rows: Comparison, usual: float) -> Iterator[Finding]:
     """Yield the findings on one set of validation rows: moved instrument, doubtful rows, frames, intervals.
 
     Errors that look like another placement of the instrument than the `usual` nominal ones [m], rows that may be wrong
     measurements, a placement of base and tool that did not settle or took up most of the errors, and how many errors
     are within the 95 % interval.
     """
-    before, sizes = (found.main for found in each.errors)
+    before, sizes = (arm.main for arm in rows.errors)
+    intervals = rows.intervals
     if np.median(before) > ELSEWHERE * usual:
         yield finding("validation-elsewhere", file=name, rms=float(np.median(before)))
-    if rows := _rows_off(each, far := _far(sizes)):
-        beyond = np.zeros(len(sizes), bool) if each.intervals is None else each.intervals.beyond
+    doubtful = _far_above_median(sizes)
+    doubtful_rows = _row_texts(rows, doubtful)
+    if doubtful_rows:
+        outside = 0
+        if intervals is not None:
+            outside = int(np.count_nonzero(intervals.beyond[doubtful]))
         yield finding(
             "doubtful-rows",
             file=name,
-            rows=rows,
+            rows=doubtful_rows,
             median=np.median(sizes),
-            without=float(np.sqrt(np.mean(sizes[~far] ** 2))),
-            outside=int(np.count_nonzero(beyond[far])),
+            without=float(np.sqrt(np.mean(sizes[~doubtful] ** 2))),
+            outside=outside,
         )
-    if not each.settled:
+    if not rows.settled:
         yield finding("placement-unsettled", file=name)
-    elif each.placed_by is not None:
-        measured, fitted = each.placed_by
+    elif rows.placed_by is not None:
+        measured, fitted = rows.placed_by
         yield finding("placement-takes-all", file=name, measured=measured, fitted=fitted, wanted=MARGIN * fitted)
-    elif (found := each.intervals) is not None:
-        count = len(found.size)
-        values = {"covered": found.covered, "errors": count, "median": np.median(found.radius)}
-        yield finding("interval-coverage", file=name, **values)
-        if beyond := int(found.beyond.sum()):
-            yield finding("outside-fitted-range", file=name, beyond=beyond, poses=count, joints=found.joints)
+    elif intervals is not None:
+        count = len(intervals.size)
+        median = np.median(intervals.radius)
+        yield finding("interval-coverage", file=name, covered=intervals.covered, errors=count, median=median)
+        outside = int(intervals.beyond.sum())
+        if outside:
+            yield finding("outside-fitted-range", file=name, beyond=outside, poses=count, joints=intervals.joints)

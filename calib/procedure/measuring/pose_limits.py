@@ -5,7 +5,7 @@ between the arm's own links, and the floor that the arm stands on: `Limits.check
 `Limits.unchecked` names what could not be, since nobody has stated it.
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -16,12 +16,14 @@ import numpy as np
 from calib.config import Tables, check_keys, read
 from calib.config_types import number
 from calib.errors import RobotError, UsageError, listing, one_of, refused_as, require
-from calib.extensions import Point
 from calib.geometry.installation import Installation
 from calib.geometry.observability import Observation, Target, TargetJacobian
 from calib.procedure.measuring import constraints_file
+from calib.procedure.measuring.camera_view import camera_view
 from calib.procedure.measuring.constraints_file import CameraTable, CollisionTable, ConstraintsFile, InstrumentTable
+from calib.procedure.measuring.moveit import limit_tables
 from calib.procedure.measuring.sight import SeenOnly, Sight, sight_of
+from calib.robot.beside import links_of
 from calib.robot.capsules import Obstacle, Wall, signed_distance
 from calib.robot.chain import Chain
 from calib.robot.description import MAX_TURN, remarks
@@ -31,13 +33,6 @@ from calib.robot.tables import load as load_table
 from calib.robot.tables import placement
 from poses import constraints
 from poses.space import PoseConstraint, SearchSpace
-
-LIMIT_TABLES: Point[Callable[[Path, Chain, Path | None], Tables | None]] = Point(
-    "limit_tables", "tables of `calib formats limits` from other programs' files"
-)
-CAMERA_VIEW: Point[Callable[[CameraTable, Chain, str, Path], Any]] = Point(
-    "camera_view", "what the camera of a constraints file sees"
-)
 
 MAX_REACHES = 100.0  # times the arm's reach: no cell is that large (our choice)
 BODY = 1.2  # of the reach is where a link's body ends (our choice)
@@ -52,7 +47,7 @@ class Limits:
         collision: a `calib.robot.collision.Collision` or `calib.robot.capsules.Capsules`; None without one.
         clearance: the least distance it asks for [m].
         sight: lines of sight; None where nothing is asked.
-        camera: the view of a camera (`calib.rooms.camera.camera_view.CameraView`), where that is the instrument.
+        camera: the view of a camera (`calib.procedure.measuring.camera_view.CameraView`), where that is the instrument.
         views: what it takes to be seen by it.
         checked: names of the checked limits.
         unchecked: names of the limits that are not checked, since nobody has stated them.
@@ -123,16 +118,16 @@ def read_limits(
 
 
 def tables_of(given: Tables | None, chain: Chain, source: Path | None, name: str) -> tuple[Tables | None, str]:
-    """Return limits as a file or tables, from other programs' files where a room reads them, and their name.
+    """Return limits as a file or tables, from MoveIt's files where they are such, and their name.
 
     Args:
         given: a file, a folder, or tables, which are named by `name`.
         chain, source: the arm, and its file.
     """
     if isinstance(given, str | Path):
-        for room in LIMIT_TABLES.all():
-            if (found := room(Path(given), chain, source)) is not None:
-                return found, str(given)
+        found = limit_tables(Path(given), chain, source)
+        if found is not None:
+            return found, str(given)
     return given, name
 
 
@@ -145,7 +140,7 @@ def _with_camera(
         words = f"{constraints_file.VIEW_UNCHECKED} (not known: {', '.join(stated.unknown)})"
         return replace(limits, unchecked=(*unchecked, words))
     with refused_as(UsageError, RobotError, "{}"):
-        view = CAMERA_VIEW.one()(stated, cell.chain, where, folder)
+        view = camera_view(stated, cell.chain, where, folder)
     arm = replace(view.cell, stations=np.eye(4)[None])
     model = None if "view" in absent else limits.collision
     sight = sight_of(arm, view.stand, [[0.0, 0.0, 1.0]], None, (0.0, np.inf), model)
@@ -436,13 +431,6 @@ def _description(source: Path | None, chain: Chain) -> Path | None:
         if place.is_file() and is_urdf(place) and {chain.base, chain.tip} <= set(links_of(chain, place)):
             return place
     return None
-
-
-def links_of(chain: Chain, source: Path | None) -> Collection[str]:
-    """Return the names of a robot's links: of all in its URDF, else of the arm's capsules."""
-    if source is not None and is_urdf(source):
-        return read_tree(text(source)[0], str(source)).bodies
-    return (chain.base, *(chain.links or [f"{name}_link" for name in chain.joint_names]), chain.tip)
 
 
 def _walls(box: tuple[Any, ...] | None, where: str) -> list[Wall]:

@@ -8,10 +8,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial, wraps
 from pathlib import Path
-from typing import Any, Concatenate, ParamSpec
+from typing import Any, Concatenate, Literal, ParamSpec
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import XAxis, YAxis
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator, NullLocator
@@ -21,8 +22,12 @@ from calib.procedure.report import style
 from calib.procedure.report.page import Picture
 from calib.procedure.report.style import AFTER, INK, MARK, PAGE_WIDTH, QUIET, log_axis
 
-SIZE = 16.0  # of a coloured dot [pt²]
-HALO = [withStroke(linewidth=2.0, foreground="white")]  # around labels, so that a line behind them does not hide them
+# of a coloured dot [pt²]
+DOT_SIZE = 16.0
+# around labels, so that a line behind them does not hide them
+HALO = [withStroke(linewidth=2.0, foreground="white")]
+# tick labels along an axis from which on they are set small
+MANY_LABELS = 60
 
 
 P = ParamSpec("P")
@@ -36,10 +41,12 @@ def layer(draw: Callable[Concatenate[Axes, P], None]) -> Callable[P, Layer]:
     """
 
     @wraps(draw)
-    def made(*given: Any, on: Axes | None = None, **options: Any) -> Any:
-        return partial(made, *given, **options) if on is None else draw(on, *given, **options)
+    def make(*arguments: Any, on: Axes | None = None, **options: Any) -> Any:
+        if on is None:
+            return partial(make, *arguments, **options)
+        return draw(on, *arguments, **options)
 
-    return made
+    return make
 
 
 @layer
@@ -91,10 +98,15 @@ def bars(
 ) -> None:
     """Draw bars (k,) from `base` at 0, 1, …, in one colour or one each; `spread` (k,): half the error bars' length."""
     values = np.asarray(values, dtype=float)
-    kind, error = (axes.bar, "yerr") if upright else (axes.barh, "xerr")
-    errors: Any = {error: spread, "ecolor": MARK, "capsize": 1.8, "error_kw": {"elinewidth": 0.9}}
-    place = np.arange(len(values)) + shift
-    kind(place, values - base, thick, base, color=colours, label=label, **({} if spread is None else errors))
+    position = np.arange(len(values)) + shift
+    options: Any = {"color": colours, "label": label}
+    if spread is not None:
+        direction = "yerr" if upright else "xerr"
+        options |= {direction: spread, "ecolor": MARK, "capsize": 1.8, "error_kw": {"elinewidth": 0.9}}
+    if upright:
+        axes.bar(position, values - base, thick, base, **options)
+    else:
+        axes.barh(position, values - base, thick, base, **options)
 
 
 @layer
@@ -108,19 +120,35 @@ def level(
     height: float = 0.98,
 ) -> None:
     """Draw a horizontal or vertical line across the panel, with a label (for a vertical line at the given height)."""
-    (axes.axvline if upright else axes.axhline)(at, color=colour, linewidth=0.8, linestyle=form)
-    right = not upright or axes.transAxes.inverted().transform(axes.transData.transform((at, at)))[0] < 0.6
-    axes.annotate(
-        words,
-        (at, height) if upright else (0.0, at),
-        xycoords=("data", "axes fraction") if upright else ("axes fraction", "data"),
-        xytext=(3 if right else -3, 0 if upright else 1),
-        textcoords="offset points",
-        color=colour,
-        va="top" if upright else "bottom",
-        ha="left" if right else "right",
-        path_effects=HALO,
-    )
+    if upright:
+        axes.axvline(at, color=colour, linewidth=0.8, linestyle=form)
+        # the label of a line at the right edge stands on its left
+        x, _ = axes.transAxes.inverted().transform(axes.transData.transform((at, at)))
+        right = bool(x < 0.6)
+        axes.annotate(
+            words,
+            (at, height),
+            xycoords=("data", "axes fraction"),
+            xytext=(3 if right else -3, 0),
+            textcoords="offset points",
+            color=colour,
+            va="top",
+            ha="left" if right else "right",
+            path_effects=HALO,
+        )
+    else:
+        axes.axhline(at, color=colour, linewidth=0.8, linestyle=form)
+        axes.annotate(
+            words,
+            (0.0, at),
+            xycoords=("axes fraction", "data"),
+            xytext=(3, 1),
+            textcoords="offset points",
+            color=colour,
+            va="bottom",
+            ha="left",
+            path_effects=HALO,
+        )
 
 
 @layer
@@ -142,11 +170,14 @@ def text(
 @layer
 def dots(axes: Axes, x: Any, y: Any, values: Any, least: float, most: float, unit: str = "") -> None:
     """Draw points (k,) coloured by their values (k,) from `least` to `most`, with a colour bar if `unit` is given."""
-    order = np.argsort(values)  # the largest on top
-    x, y, values = (np.asarray(each)[order] for each in (x, y, values))
-    drawn = axes.scatter(x, y, SIZE, values, cmap="cividis_r", vmin=least, vmax=most, edgecolors=QUIET, linewidths=0.25)
+    # the largest on top
+    order = np.argsort(values)
+    x, y, values = np.asarray(x)[order], np.asarray(y)[order], np.asarray(values)[order]
+    points = axes.scatter(
+        x, y, DOT_SIZE, values, cmap="cividis_r", vmin=least, vmax=most, edgecolors=QUIET, linewidths=0.25
+    )
     if unit:
-        _scale(axes, drawn, unit, extend="max" if values[-1] > most else "neither")
+        _scale(axes, points, unit, extend="max" if values[-1] > most else "neither")
 
 
 @layer
@@ -166,19 +197,14 @@ def heat(
         limits: of the colours; from 0 by default.
         written: whether values stand in their cells.
     """
-    drawn = axes.imshow(
-        values,
-        colours,
-        vmin=limits[0],
-        vmax=limits[1],
-        extent=extent,
-        interpolation="nearest",
-        aspect="equal" if extent else "auto",
-    )
-    for (i, j), value in np.ndenumerate(values) if written else ():
-        colour = INK if abs(value) <= 0.6 else "white"
-        axes.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=5.5, color=colour)
-    _scale(axes, drawn, unit)
+    low, high = limits
+    aspect: Literal["equal", "auto"] = "equal" if extent else "auto"
+    image = axes.imshow(values, colours, vmin=low, vmax=high, extent=extent, interpolation="nearest", aspect=aspect)
+    if written:
+        for (i, j), value in np.ndenumerate(values):
+            colour = INK if abs(value) <= 0.6 else "white"
+            axes.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=5.5, color=colour)
+    _scale(axes, image, unit)
 
 
 @layer
@@ -207,8 +233,10 @@ def box(axes: Axes, values: Any, place: float, colour: str = AFTER) -> None:
     )
 
 
-def _scale(axes: Axes, drawn: Any, unit: str, **options: Any) -> None:
-    scale = axes.get_figure().colorbar(drawn, ax=axes, pad=0.02, aspect=30, **options)  # type: ignore[union-attr]
+def _scale(axes: Axes, mappable: Any, unit: str, **options: Any) -> None:
+    """Draw the colour bar of a layer, with its unit."""
+    figure: Any = axes.get_figure()
+    scale = figure.colorbar(mappable, ax=axes, pad=0.02, aspect=30, **options)
     scale.ax.set_title(unit, fontsize=7.0, fontweight="normal")
 
 
@@ -245,29 +273,37 @@ class Panel:
     def draw(self, axes: Axes) -> None:
         """Draw the panel's layers, labels and limits on matplotlib axes."""
         axes.set(title=self.title, xlabel=self.x, ylabel=self.y)
-        for axis, names, limits in ((axes.xaxis, self.xnames, self.xlim), (axes.yaxis, self.ynames, self.ylim)):
-            if limits:
-                axes.set(**{f"{axis.axis_name}lim": limits})
-            if names is not None:
-                turned = axis is axes.xaxis and not any("\n" in name for name in names)
-                small = 5.0 if len(names) > 60 else 6.5
-                axis.set_ticks(range(len(names)), names, fontsize=small, rotation=90 * turned)
-                axes.set(**{f"{axis.axis_name}lim": (-0.6, len(names) - 0.4)})
-            elif axis.axis_name in self.log and limits:
-                log_axis(axis, *limits)
-            elif self.ticks:
-                axes.locator_params(axis.axis_name, nbins=self.ticks)  # type: ignore[arg-type]
+        self._set_axis(axes, axes.xaxis, self.xnames, self.xlim)
+        self._set_axis(axes, axes.yaxis, self.ynames, self.ylim)
         if self.ynames is not None:
             axes.invert_yaxis()
         if self.symlog:
             axes.set_yscale("symlog", linthresh=self.symlog)
-            axes.yaxis.set(major_formatter=lambda value, _: style.number(value), minor_locator=NullLocator())
+            axes.yaxis.set(major_formatter=style.tick_text, minor_locator=NullLocator())
         if self.equal:
             axes.set_aspect("equal", adjustable="datalim")
-        for show in self.layers:
-            show(on=axes)
+        for draw_layer in self.layers:
+            draw_layer(on=axes)
         if self.grid:
             axes.grid(axis=self.grid)  # type: ignore[arg-type]
+
+    def _set_axis(
+        self, axes: Axes, axis: XAxis | YAxis, names: Sequence[str] | None, limits: tuple[float, float] | None
+    ) -> None:
+        """Set limits, scale and labels of an axis."""
+        letter = axis.axis_name
+        if limits:
+            axes.set(**{f"{letter}lim": limits})
+        if names is not None:
+            # names of one line stand upright along x
+            upright = letter == "x" and not any("\n" in name for name in names)
+            size = 5.0 if len(names) > MANY_LABELS else 6.5
+            axis.set_ticks(range(len(names)), names, fontsize=size, rotation=90 * upright)
+            axes.set(**{f"{letter}lim": (-0.6, len(names) - 0.4)})
+        elif letter in self.log and limits:
+            log_axis(axis, *limits)
+        elif self.ticks:
+            axes.locator_params(letter, nbins=self.ticks)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,20 +334,22 @@ def figure(chart: Chart) -> Figure:
     """Return the matplotlib figure of a chart, without a window."""
     with style.styled(quiet_titles=bool(chart.title)):
         rows = -(-len(chart.panels) // chart.columns)
-        result, axes = style.sheet(rows, chart.columns, chart.width, chart.height, 0.25 if chart.title else 0.0)
-        for k, (panel, place) in enumerate(zip(chart.panels, axes)):
-            panel.draw(place)
-            if "x" in chart.shared and k + chart.columns < len(chart.panels):
-                place.set_xlabel("")
-                place.tick_params(labelbottom=False)
-            if "y" in chart.shared and k % chart.columns:
-                place.set_ylabel("")
-                place.tick_params(labelleft=False)
-        for place in axes[len(chart.panels) :]:
-            place.set_axis_off()
+        head = 0.25 if chart.title else 0.0
+        sheet, axes = style.sheet(rows, chart.columns, chart.width, chart.height, head)
+        for k, (panel, panel_axes) in enumerate(zip(chart.panels, axes)):
+            panel.draw(panel_axes)
+            lowest, first = k + chart.columns >= len(chart.panels), k % chart.columns == 0
+            if "x" in chart.shared and not lowest:
+                panel_axes.set_xlabel("")
+                panel_axes.tick_params(labelbottom=False)
+            if "y" in chart.shared and not first:
+                panel_axes.set_ylabel("")
+                panel_axes.tick_params(labelleft=False)
+        for empty in axes[len(chart.panels) :]:
+            empty.set_axis_off()
         if chart.title:
-            style.legend(result, axes[0], chart.title)
-    return result
+            style.legend(sheet, axes[0], chart.title)
+    return sheet
 
 
 def picture(chart: Chart, caption: str) -> Picture:
@@ -321,7 +359,7 @@ def picture(chart: Chart, caption: str) -> Picture:
 
 def pictures(charts: Mapping[str, Captioned]) -> dict[str, Picture]:
     """Return charts with their captions as pictures, by name."""
-    return {name: picture(*one) for name, one in charts.items()}
+    return {name: picture(chart, caption) for name, (chart, caption) in charts.items()}
 
 
 def vector(chart: Chart, caption: str) -> Picture:

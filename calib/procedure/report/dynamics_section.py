@@ -483,7 +483,7 @@ def _effect_table(effects: Sequence[geometry_tables.GeometricEffect]) -> page.Ta
     )
     rows = []
     for effect in effects:
-        sigma = small(effect.sigma, effect.unit)
+        sigma = small(effect.sigma or 0.0, effect.unit)
         shift, count = f"{effect.shift_sigma:.2f}", str(effect.parameters_moved)
         torque = f"{effect.torque_rms or 0.0:.2g}"
         rows.append([effect.element, sigma, effect.parameter, shift, count, torque])

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,11 +13,11 @@ from calib import files
 from calib.data.poses import IMAGES
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import UsageError
-from calib.extensions import Point
 from calib.geometry.observation import layout, positions, prepare
 from calib.procedure.kinematic_stage.comparison import Comparison
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.folder import metrics
+from calib.procedure.kinematic_stage.image_findings import image_coverage
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import FitMetrics, ImageCoverage, ValidationMetrics
 from calib.procedure.kinematic_stage.tables import estimate_table
@@ -27,12 +26,17 @@ from calib.procedure.report.page import FileRow
 from calib.records import read_json
 from calib.transforms import invert
 
-IMAGE_COVERAGE: Point[Callable[[Any], list[Any]]] = Point("image_coverage", "how a fit's images cover the view")
-
+# version of ``report.json``, and those that can be read: 1 kept the findings in it, too
 SCHEMA = 2
-READ = (1, SCHEMA)  # 1 kept the findings here, too
+READABLE_SCHEMAS = (1, SCHEMA)
+# name of a set of rows that folds of the fit left out in turn
+CROSS_VALIDATED = "cross-validated"
+# rows that figures show at most
+MAX_ROWS = 2000
+# absolute correlation from which on a pair of parameters is listed
+STRONG_CORRELATION = 0.9
+
 NATURES = ("position", "orientation", "distance")
-CROSS_VALIDATED = "cross-validated"  # name of a set of rows that folds of the fit left out in turn
 
 
 class FittedParameter(NamedTuple):
@@ -61,9 +65,6 @@ class CorrelationMatrix:
 
     names: tuple[str, ...]
     matrix: tuple[tuple[float, ...], ...]
-
-
-SHOWN = 2000  # rows that figures show at most
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,9 @@ class RowErrors:
 
     def judged(self, deliverable: str) -> Mapping[str, tuple[float, ...]]:
         """Return the errors of the deliverable on which the verdict is based, by nature."""
-        return self.calibrated if deliverable != "urdf" or not self.urdf_alone else self.urdf_alone
+        if deliverable == "urdf" and self.urdf_alone:
+            return self.urdf_alone
+        return self.calibrated
 
     def judged_arm(self, deliverable: str) -> str:
         """Return the words for that deliverable."""
@@ -142,22 +145,34 @@ class Report:
     files: tuple[FileRow, ...] = ()
     source: str = ""
 
-    def with_unseen(self, found: ValidationMetrics, sets: Sequence[RowErrors]) -> Report:
+    def with_unseen(self, validation: ValidationMetrics, sets: Sequence[RowErrors]) -> Report:
         """Return the report, extended by unseen rows (`rows_of`) and updated verdict, reason and warnings."""
-        metrics = replace(self.metrics, **vars(found))
-        fresh = {one.name for one in sets}
-        return replace(self, metrics=metrics, sets=(*(one for one in self.sets if one.name not in fresh), *sets))
+        metrics = replace(self.metrics, **vars(validation))
+        replaced = {rows.name for rows in sets}
+        remaining = [rows for rows in self.sets if rows.name not in replaced]
+        return replace(self, metrics=metrics, sets=(*remaining, *sets))
 
 
 def collect(outcome: Outcome) -> Report:
     """Return the report of a fit's outcome, for its certificate."""
     chain, fit = outcome.inputs.chain, outcome.selection.fit
-    table, names = estimate_table(fit, outcome.selection.nominal.cell), layout(fit.cell)
+    table = estimate_table(fit, outcome.selection.nominal.cell)
+    names = layout(fit.cell)
     groups = dict(zip(names.names, names.kinds))
+    parameters = [FittedParameter(*row, groups[row[0]]) for row in table.rows()]
     fitted = set(table.names)
+    fixed = [name for name in chain.names if name not in fitted]
+    correlations = [CorrelatedPair(*pair) for pair in fit.estimate.strong_correlations(STRONG_CORRELATION)]
+
     sets = [rows_of("fit", outcome.fit, False)]
-    sets += [rows_of(name, found, found.proves) for name, found in outcome.validation.items()]
-    values = [] if fit.split is None else fit.split.singular_values.tolist()
+    for name, comparison in outcome.validation.items():
+        sets.append(rows_of(name, comparison, comparison.proves))
+    values: list[float] = []
+    rank = 0
+    if fit.split is not None:
+        values = fit.split.singular_values.tolist()
+        rank = fit.split.rank
+
     return Report(
         schema=SCHEMA,
         robot=chain.name,
@@ -166,16 +181,16 @@ def collect(outcome: Outcome) -> Report:
         joints=tuple(chain.joint_names),
         prismatic=tuple(joint.kind == "prismatic" for joint in chain.joints),
         metrics=metrics(outcome),
-        parameters=tuple(FittedParameter(*row, groups[row[0]]) for row in table.rows()),
-        kept=tuple(name for name in chain.names if name not in fitted),
-        correlations=tuple(CorrelatedPair(*pair) for pair in fit.estimate.strong_correlations(0.9)),
+        parameters=tuple(parameters),
+        kept=tuple(fixed),
+        correlations=tuple(correlations),
         correlated=most_correlated(table.names, table.covariance),
         singular_values=tuple(values),
-        rank=len(values) if fit.split is None else fit.split.rank,
+        rank=rank,
         sets=tuple(sets),
         noise=_noise(outcome.fit.blocks),
-        images=tuple(each for coverage in IMAGE_COVERAGE.all() for each in coverage(fit)),
-        files=_files(outcome.inputs),
+        images=image_coverage(fit),
+        files=_file_rows(outcome.inputs),
         source=str(outcome.inputs.source),
     )
 
@@ -187,59 +202,80 @@ def file_row(name: str, role: str, path: Path) -> FileRow:
 
 def unseen_role(role: str, seen: bool, judged: str) -> str:
     """Return the role of a validation file, and whether the file was unseen by `judged` (fit or identification)."""
-    return f"{role}, {'NOT unseen' if seen else 'unseen'} by {judged}"
+    unseen = "NOT unseen" if seen else "unseen"
+    return f"{role}, {unseen} by {judged}"
 
 
-def _files(inputs: Inputs) -> tuple[FileRow, ...]:
+def _file_rows(inputs: Inputs) -> tuple[FileRow, ...]:
     """Return the entries of the robot's description and of the files for fit and validation."""
-    found = {inputs.source: "nominal robot", **{Path(block.file): "measured" for block in inputs.fit if block.file}}
+    roles = {inputs.source: "nominal robot"}
+    for block in inputs.fit:
+        if block.file:
+            roles[Path(block.file)] = "measured"
     for unseen in inputs.unseen.values():
         if not unseen.held_out and unseen.block.file:
-            found.setdefault(Path(unseen.block.file), unseen_role("measured", unseen.seen, "the fit"))
-    return tuple(file_row(path.name, role, path) for path, role in found.items() if path.is_file())
+            roles.setdefault(Path(unseen.block.file), unseen_role("measured", unseen.seen, "the fit"))
+    return tuple(file_row(path.name, role, path) for path, role in roles.items() if path.is_file())
 
 
 def rows_of(name: str, comparison: Comparison, unseen: bool) -> RowErrors:
     """Return the errors of one set of rows, with joint values and target positions if each row has one error.
 
-    Of more than `SHOWN` such rows a random sample, and the worst.
+    Of more than `MAX_ROWS` such rows a random sample, and the worst.
     """
     sizes = comparison.errors[1].main
-    points = _points(comparison) if len(sizes) == sum(map(len, comparison.blocks)) else None
-    chosen = partial(_row_errors, name, comparison, unseen, points)
-    if points is None or len(sizes) <= SHOWN:
-        return chosen(slice(None))
-    some = np.sort(np.random.default_rng(0).choice(len(sizes), SHOWN, replace=False))
-    return replace(chosen(some), worst=chosen(np.array([np.argmax(sizes)])))
-
-
-def _row_errors(
-    name: str, comparison: Comparison, unseen: bool, points: np.ndarray | None, chosen: slice | np.ndarray
-) -> RowErrors:
-    """Return the errors of the chosen rows; with joints and `points` (rows, 3) where each row has one error."""
-    nominal, calibrated, alone = (
-        {nature: _plain(size[chosen]) for nature in NATURES if (size := getattr(found, nature, None)) is not None}
-        for found in (*comparison.errors, comparison.alone)
-    )
-    rows = RowErrors(name, unseen, comparison.poses, nominal, calibrated, urdf_alone=alone)
-    if points is None:
-        return rows
-    q = np.concatenate([block.q for block in comparison.blocks])
-    expected = () if comparison.intervals is None else _plain(comparison.intervals.radius[chosen])
-    numbers = np.concatenate([block.rows for block in comparison.blocks])[chosen]
+    if len(sizes) != sum(map(len, comparison.blocks)):
+        # several rows share an error: sockets, planes, distances
+        return _errors_by_nature(name, comparison, unseen, slice(None))
+    if len(sizes) <= MAX_ROWS:
+        return _errors_by_row(name, comparison, unseen, slice(None))
+    sample = np.random.default_rng(0).choice(len(sizes), MAX_ROWS, replace=False)
+    worst = np.array([np.argmax(sizes)])
     return replace(
-        rows, q=_plain(q[chosen]), points=_plain(points[chosen]), expected=expected, rows=tuple(map(int, numbers))
+        _errors_by_row(name, comparison, unseen, np.sort(sample)), worst=_errors_by_row(name, comparison, unseen, worst)
+    )
+
+
+def _errors_by_nature(name: str, comparison: Comparison, unseen: bool, selection: slice | np.ndarray) -> RowErrors:
+    """Return the selected errors of the nominal and the calibrated arm, and of the latter without corrections."""
+    errors_by_arm = []
+    for errors in (*comparison.errors, comparison.alone):
+        by_nature = {}
+        for nature in NATURES:
+            sizes = getattr(errors, nature, None)
+            if sizes is not None:
+                by_nature[nature] = _plain(sizes[selection])
+        errors_by_arm.append(by_nature)
+    nominal, calibrated, urdf_alone = errors_by_arm
+    return RowErrors(name, unseen, comparison.poses, nominal, calibrated, urdf_alone=urdf_alone)
+
+
+def _errors_by_row(name: str, comparison: Comparison, unseen: bool, selection: slice | np.ndarray) -> RowErrors:
+    """Return the errors of the selected rows with their joints, points, expected errors and numbers in their files."""
+    q = np.concatenate([block.q for block in comparison.blocks])
+    numbers = np.concatenate([block.rows for block in comparison.blocks])
+    points = _points(comparison)
+    expected: tuple[float, ...] = ()
+    if comparison.intervals is not None:
+        expected = _plain(comparison.intervals.radius[selection])
+    return replace(
+        _errors_by_nature(name, comparison, unseen, selection),
+        q=_plain(q[selection]),
+        points=_plain(points[selection]),
+        expected=expected,
+        rows=tuple(map(int, numbers[selection])),
     )
 
 
 def _points(comparison: Comparison) -> np.ndarray:
     """Return the target positions (rows, 3) [m] in the arm's base frame."""
-    cell, points = comparison.cells[1], []
+    cell = comparison.cells[1]
+    points = []
     for block in prepare(cell, comparison.blocks):
-        point = positions(cell, block).T
-        base = cell.stations[block.station] if block.measured.has_instrument else cell.stations[0]
-        back = invert(base)
-        points.append(point @ back[:3, :3].T + back[:3, 3])
+        station = cell.stations[block.station] if block.measured.has_instrument else cell.stations[0]
+        T_base_station = invert(station)
+        position = positions(cell, block).T
+        points.append(position @ T_base_station[:3, :3].T + T_base_station[:3, 3])
     return np.concatenate(points)
 
 
@@ -247,26 +283,37 @@ def most_correlated(names: Sequence[str], covariance: np.ndarray, most: int = 12
     """Return the most correlated parameters and their correlation matrix."""
     sigma = np.sqrt(np.clip(np.diag(covariance), 1e-300, None))
     matrix = covariance / np.outer(sigma, sigma)
-    off = np.abs(matrix - np.diag(np.diag(matrix))).max(axis=1, initial=0.0)
-    chosen = np.sort(np.argsort(-off, kind="stable")[:most])
-    return CorrelationMatrix(tuple(str(names[k]) for k in chosen), _plain(matrix[np.ix_(chosen, chosen)]))
+    strongest = np.abs(matrix - np.diag(np.diag(matrix))).max(axis=1, initial=0.0)
+    chosen = np.sort(np.argsort(-strongest, kind="stable")[:most])
+    chosen_names = [str(names[k]) for k in chosen]
+    return CorrelationMatrix(tuple(chosen_names), _plain(matrix[np.ix_(chosen, chosen)]))
 
 
 def _noise(blocks: Sequence[PoseMeasurements]) -> dict[str, float | None]:
-    result: dict[str, float | None] = {}
-    for nature, name in (("position", "sigma"), ("orientation", "sigma_rotation")):
-        found = [(block, None if block.kind == IMAGES else getattr(block, name, None)) for block in blocks]
+    """Return the rms that the stated sigmas alone give, by nature [m, rad]; None where a block states none."""
+    return {"position": _stated_rms(blocks, "sigma"), "orientation": _stated_rms(blocks, "sigma_rotation")}
+
+
+def _stated_rms(blocks: Sequence[PoseMeasurements], field_name: str) -> float | None:
+    stated = []
+    for block in blocks:
+        sigma = getattr(block, field_name, None)
+        # the sigma of images is one of pixels
+        if block.kind == IMAGES or sigma is None:
+            return None
         # a kind with one number per row states it for each axis
-        stated = [np.broadcast_to(s.reshape(len(block), -1), (len(block), 3)) for block, s in found if s is not None]
-        whole = len(stated) == len(blocks)
-        result[nature] = float(np.sqrt(np.mean(np.sum(np.concatenate(stated) ** 2, axis=1)))) if whole else None
-    return result
+        stated.append(np.broadcast_to(sigma.reshape(len(block), -1), (len(block), 3)))
+    squares = np.sum(np.concatenate(stated) ** 2, axis=1)
+    return float(np.sqrt(np.mean(squares)))
 
 
 def _plain(values: np.ndarray) -> tuple[Any, ...]:
     """Return numbers rounded to seven digits, as nested tuples."""
-    rounded = np.array([float(f"{value:.7g}") for value in np.ravel(values)]).reshape(np.shape(values))
-    return tuple(rounded.tolist()) if rounded.ndim == 1 else tuple(map(tuple, rounded.tolist()))
+    rounded = [float(f"{value:.7g}") for value in np.ravel(values)]
+    nested = np.array(rounded).reshape(np.shape(values)).tolist()
+    if np.ndim(values) == 1:
+        return tuple(nested)
+    return tuple(map(tuple, nested))
 
 
 def write(report: Report, path: Path) -> None:
@@ -281,6 +328,6 @@ def read(path: Path) -> Report:
         UsageError: where it is missing or made by another version.
     """
     schema = read_json(path, "fit again").get("schema")
-    if schema not in READ:
+    if schema not in READABLE_SCHEMAS:
         raise UsageError(f"{path}: schema {schema}, this version reads {SCHEMA}; fit again")
     return read_json(path, "fit again", Report)

@@ -14,8 +14,15 @@ from calib.procedure.report.fit_report import FittedParameter, Report
 from calib.procedure.report.style import AFTER, BEFORE, BROWN, HALF_WIDTH, INK, MARK, PAGE_WIDTH, number
 from calib.units import ERRORS
 
+# (effort, sigma) pairs
 Curve = Sequence[tuple[float, float]]
-PALE = "#c3ccd6"  # of changes below two sigmas
+
+# colour of changes below two sigmas
+PALE = "#c3ccd6"
+# ratio of the medians from which on bins are logarithmic: equal ones would show one bar of the smaller errors
+LOGARITHMIC_RATIO = 6.0
+# edges of the bins of a histogram
+BIN_EDGES = 31
 
 
 def error_histogram(
@@ -30,27 +37,36 @@ def error_histogram(
         arm: whose errors `after` are, in a word or two.
     """
     factor, unit = ERRORS[nature]
-    one, two = factor * np.asarray(before), factor * np.asarray(after)
-    top = max(one.max(), two.max(), 1e-9) * 1.02
-    apart = np.median(two) < np.median(one) / 6.0  # then equal bins would show one bar of the smaller errors
-    seen = factor * noise if noise else top
-    least = max(min(one.min(), two.min(), seen), 1e-4 * top) * 0.9
-    edges = np.geomspace(least, top, 31) if apart else np.linspace(0.0, top, 31)
-    rms = [float(np.sqrt(np.mean(sizes**2))) for sizes in (one, two)]
-    counts = [np.histogram(sizes, edges)[0] for sizes in (one, two)]
+    before, after = factor * np.asarray(before), factor * np.asarray(after)
+    largest = max(before.max(), after.max(), 1e-9) * 1.02
+    logarithmic = bool(np.median(after) < np.median(before) / LOGARITHMIC_RATIO)
+    if logarithmic:
+        instrument = factor * noise if noise else largest
+        smallest = max(min(before.min(), after.min(), instrument), 1e-4 * largest) * 0.9
+        edges = np.geomspace(smallest, largest, BIN_EDGES)
+    else:
+        edges = np.linspace(0.0, largest, BIN_EDGES)
+    rms_before = float(np.sqrt(np.mean(before**2)))
+    rms_after = float(np.sqrt(np.mean(after**2)))
+    count_before, _ = np.histogram(before, edges)
+    count_after, _ = np.histogram(after, edges)
+
+    layers = [
+        histogram(count_before, edges, BEFORE),
+        histogram(count_after, edges, AFTER),
+        level(rms_before, BROWN, upright=True, words="nominal"),
+        level(rms_after, AFTER, upright=True, words=arm, height=0.9),
+    ]
+    if noise:
+        layers.append(level(factor * noise, INK, ":", upright=True, words="instrument", height=0.82))
     panel = Panel(
-        [
-            *(histogram(count, edges, colour) for count, colour in zip(counts, (BEFORE, AFTER))),
-            level(rms[0], BROWN, upright=True, words="nominal"),
-            level(rms[1], AFTER, upright=True, words=arm, height=0.9),
-            *([level(seen, INK, ":", upright=True, words="instrument", height=0.82)] if noise else []),
-        ],
-        f"{rms[0]:.3g} {unit} rms before, {rms[1]:.3g} {unit} after",
+        layers,
+        f"{rms_before:.3g} {unit} rms before, {rms_after:.3g} {unit} after",
         f"{nature} error [{unit}]",
         "poses",
         xlim=(edges[0], edges[-1]),
-        ylim=(0.0, 1.3 * max(1, *map(max, counts))),
-        log="x" if apart else "",
+        ylim=(0.0, 1.3 * max(1, count_before.max(), count_after.max())),
+        log="x" if logarithmic else "",
     )
     return Chart([panel], 2.4, width=HALF_WIDTH)
 
@@ -74,21 +90,33 @@ def residuals_by_joint(
         nature, arm: as in `error_histogram`.
     """
     factor, unit = ERRORS[nature]
-    n = q.shape[1]
-    columns = n if n < 4 else 4 if n in (4, 7, 8) else -(-n // 2) if n < 7 else 4
     sizes = factor * np.concatenate([before, after])
-    limits = float(max(np.percentile(sizes, 2), 1e-9)) * 0.5, float(max(sizes.max(), 1e-8)) * 1.3
+    smallest = max(np.percentile(sizes, 2), 1e-9)
+    largest = max(sizes.max(), 1e-8)
+    limits = float(smallest) * 0.5, float(largest) * 1.3
+
     panels = []
-    for j in range(n):
-        x = q[:, j] if prismatic[j] else np.rad2deg(q[:, j])
-        cloud = [
-            line(x, factor * errors, ".", colour, size=4.5, label=label)
-            for errors, colour, label in ((before, BEFORE, "nominal"), (after, AFTER, arm))
+    for j, name in enumerate(joint_names):
+        x, joint_unit = np.rad2deg(q[:, j]), "deg"
+        if prismatic[j]:
+            x, joint_unit = q[:, j], "m"
+        clouds = [
+            line(x, factor * before, ".", BEFORE, size=4.5, label="nominal"),
+            line(x, factor * after, ".", AFTER, size=4.5, label=arm),
         ]
-        name = f"{joint_names[j]} [{'m' if prismatic[j] else 'deg'}]"
-        panels.append(Panel(cloud, x=name, y=f"error [{unit}]", ylim=limits, log="y", grid="y", ticks=5))
+        label = f"{name} [{joint_unit}]"
+        panels.append(Panel(clouds, x=label, y=f"error [{unit}]", ylim=limits, log="y", grid="y", ticks=5))
+
+    n = q.shape[1]
+    columns = 4
+    if n < 4:
+        columns = n
+    elif n in (5, 6):
+        # two rows of the same length
+        columns = -(-n // 2)
+    rows = -(-n // columns)
     title = f"{nature} errors of {len(q)} poses"
-    return Chart(panels, 0.55 + 1.35 * -(-n // columns), columns, title=title, shared="y")
+    return Chart(panels, 0.55 + 1.35 * rows, columns, title=title, shared="y")
 
 
 def error_map(
@@ -107,32 +135,35 @@ def error_map(
         expected: (m,) radius within which 95 % of such errors are to be [m]; None or empty where it is not known.
         least: where the colours begin [m].
     """
-    top = 1e3 * float(np.max(sizes, initial=1e-9))
-    both = [sizes] if expected is None or not len(expected) else [sizes, expected]
-    every = 1e3 * np.concatenate([*both, [1e-9]])
-    most = min(float(every.max()), 1.5 * float(np.percentile(every, 99)))  # few far off do not hide the rest
-    titles = (
-        (f"from above: {words.format(f'{top:.3g} mm')}", "from the side"),
-        ("from above: expected 95 % radius", ""),
-    )
-    panels = [
-        Panel(
-            [
-                dots(points[:, 0], points[:, j], 1e3 * np.asarray(values), 1e3 * least, most, "[mm]" if j == 2 else ""),
-                line([0.0], [0.0], "+", INK, size=9.0),
-                text("base", 0.0, 0.0, (-5, 4), across="right"),
-            ],
-            title,
-            "x [m]",
-            f"{'xyz'[j]} [m]",
-            grid="both",
-            equal=True,
-            ticks=6,
-        )
-        for values, row in zip(both, titles)
-        for j, title in zip((1, 2), row)
+    largest_mm = 1e3 * float(np.max(sizes, initial=1e-9))
+    title = f"from above: {words.format(f'{largest_mm:.3g} mm')}"
+    maps = [(sizes, title, "from the side")]
+    shown = [sizes]
+    if expected is not None and len(expected):
+        maps.append((expected, "from above: expected 95 % radius", ""))
+        shown.append(expected)
+
+    # few values far off do not hide the differences of the others
+    values_mm = 1e3 * np.concatenate([*shown, [1e-9]])
+    colour_limits_mm = 1e3 * least, min(float(values_mm.max()), 1.5 * float(np.percentile(values_mm, 99)))
+    panels = []
+    for values, from_above, from_side in maps:
+        sizes_mm = 1e3 * np.asarray(values)
+        panels.append(_map_panel(points, sizes_mm, colour_limits_mm, 1, from_above))
+        panels.append(_map_panel(points, sizes_mm, colour_limits_mm, 2, from_side))
+    return Chart(panels, 3.0 * len(maps), 2)
+
+
+def _map_panel(
+    points: np.ndarray, sizes_mm: np.ndarray, limits_mm: tuple[float, float], axis: int, title: str
+) -> Panel:
+    """Return the map of sizes at points (m, 3) over x and another axis; the second map has the colours' scale."""
+    layers = [
+        dots(points[:, 0], points[:, axis], sizes_mm, *limits_mm, "[mm]" if axis == 2 else ""),
+        line([0.0], [0.0], "+", INK, size=9.0),
+        text("base", 0.0, 0.0, (-5, 4), across="right"),
     ]
-    return Chart(panels, 3.0 * len(both), 2)
+    return Panel(layers, title, "x [m]", f"{'xyz'[axis]} [m]", grid="both", equal=True, ticks=6)
 
 
 def predicted_map(points: np.ndarray, sigma: np.ndarray) -> Chart:
@@ -148,16 +179,17 @@ def image_coverage(size: tuple[int, int], count: np.ndarray, rms: np.ndarray) ->
         count: (rows, columns) corners per cell of the image.
         rms: (rows, columns) reprojection error there [px].
     """
-    wide, high = size
-    shown = (
-        (count.astype(float), "", f"corners seen, in {np.mean(count > 0):.0%} of the image"),
-        (rms, "[px]", "reprojection error, rms"),
-    )
+    width, height = size
+    extent = 0, width, height, 0
+    covered = count > 0
+    counts = heat(np.where(covered, count.astype(float), np.nan), "", extent)
+    errors = heat(np.where(covered, rms, np.nan), "[px]", extent)
+    counts_title = f"corners seen, in {np.mean(covered):.0%} of the image"
     panels = [
-        Panel([heat(np.where(count > 0, values, np.nan), unit, (0, wide, high, 0))], title, "u [px]", "v [px]", ticks=5)
-        for values, unit, title in shown
+        Panel([counts], counts_title, "u [px]", "v [px]", ticks=5),
+        Panel([errors], "reprojection error, rms", "u [px]", "v [px]", ticks=5),
     ]
-    return Chart(panels, 0.8 + 0.5 * (PAGE_WIDTH - 2.0) * high / wide, 2)
+    return Chart(panels, 0.8 + 0.5 * (PAGE_WIDTH - 2.0) * height / width, 2)
 
 
 def parameter_changes(rows: Sequence[FittedParameter], most: int = 48, of: str = "fitted - nominal") -> Chart:
@@ -168,20 +200,23 @@ def parameter_changes(rows: Sequence[FittedParameter], most: int = 48, of: str =
         most: parameters per panel, those furthest from nominal by their sigma.
         of: of what the difference is, in words.
     """
-    panels, longest = [], 5
-    for base, unit, what in (("m", "mm", "lengths"), ("rad", "mrad", "angles")):
-        own = [row for row in rows if row.unit == base]
-        change = np.array([row.value - row.nominal for row in own])
-        sigma = np.array([row.sigma for row in own])
-        chosen = np.sort(np.argsort(-np.abs(change) / np.maximum(sigma, 1e-15), kind="stable")[:most])
+    panels = []
+    longest = 5
+    for si_unit, unit, quantity in (("m", "mm", "lengths"), ("rad", "mrad", "angles")):
+        parameters = [row for row in rows if row.unit == si_unit]
+        change = np.array([row.value - row.nominal for row in parameters])
+        sigma = np.array([row.sigma for row in parameters])
+        changed_most = np.argsort(-np.abs(change) / np.maximum(sigma, 1e-15), kind="stable")[:most]
+        chosen = np.sort(changed_most)
         if not len(chosen):
             continue
-        value, spread = 1e3 * change[chosen], 2e3 * sigma[chosen]
-        clear = np.abs(value) > spread
-        shown = bars(value, [AFTER if one else PALE for one in clear], spread=spread)
-        words = f"{int(clear.sum())} of {len(chosen)} {what} clearly changed"
-        labels = [own[k].name for k in chosen]
-        panels.append(Panel([shown], words, f"{of} [{unit}], bars ±2σ", ynames=labels, grid="x"))
+        value, two_sigmas = 1e3 * change[chosen], 2e3 * sigma[chosen]
+        clear = np.abs(value) > two_sigmas
+        colours = np.where(clear, AFTER, PALE).tolist()
+        title = f"{int(clear.sum())} of {len(chosen)} {quantity} clearly changed"
+        labels = [parameters[k].name for k in chosen]
+        layer = bars(value, colours, spread=two_sigmas)
+        panels.append(Panel([layer], title, f"{of} [{unit}], bars ±2σ", ynames=labels, grid="x"))
         longest = max(longest, len(chosen))
     return Chart(panels, 0.65 + 0.155 * longest, max(1, len(panels)))
 
@@ -194,18 +229,19 @@ def singular_values(values: np.ndarray, rank: int) -> Chart:
         rank: how many are kept.
     """
     values = np.asarray(values, dtype=float)
-    shown = np.maximum(values, max(values[0] * 1e-17, 1e-17))
-    count = np.arange(1, len(values) + 1)
-    layers: list = [line(count[:rank], shown[:rank], "o"), line(count[rank:], shown[rank:], "o", MARK, hollow=True)]
+    # zeros have no place on a logarithmic axis
+    sizes = np.maximum(values, max(values[0] * 1e-17, 1e-17))
+    number_of = np.arange(1, len(values) + 1)
+    layers = [line(number_of[:rank], sizes[:rank], "o"), line(number_of[rank:], sizes[rank:], "o", MARK, hollow=True)]
     if 0 < rank < len(values):
-        last, first = shown[rank - 1], shown[rank]
-        middle = rank + 0.5, float(np.sqrt(last * first))
-        layers.append(text(f"gap {number(last / first)}", *middle, (-6, 0), MARK, across="right", along="center"))
+        last, first = sizes[rank - 1], sizes[rank]
+        middle = float(np.sqrt(last * first))
+        gap = f"gap {number(last / first)}"
+        layers.append(text(gap, rank + 0.5, middle, (-6, 0), MARK, across="right", along="center"))
     title = f"{rank} of {len(values)} parameters are identifiable"
-    limits = 0.3 * float(shown.min()), 3.0 * float(shown.max())
-    return Chart(
-        [Panel(layers, title, "number", "singular value", ylim=limits, log="y", grid="y")], 2.4, width=HALF_WIDTH
-    )
+    limits = 0.3 * float(sizes.min()), 3.0 * float(sizes.max())
+    panel = Panel(layers, title, "number", "singular value", ylim=limits, log="y", grid="y")
+    return Chart([panel], 2.4, width=HALF_WIDTH)
 
 
 def ladder(steps: Sequence[ModelStep], noise: float | None = None) -> Chart:
@@ -215,27 +251,35 @@ def ladder(steps: Sequence[ModelStep], noise: float | None = None) -> Chart:
         steps: models with such an error; the last one kept, without a note, is the model chosen.
         noise: rms of the instrument's own error [m].
     """
-    errors, x = np.array([step.cross_validated_mm for step in steps], dtype=float), np.arange(len(steps))
-    taken = np.flatnonzero([not step.note for step in steps])
-    left_out, last = np.setdiff1d(x, taken), taken[-1:]
-    layers: list = [
-        line(x[taken], errors[taken], "o-", size=5.0),
-        line(x[left_out], errors[left_out], "o", size=5.0, hollow=True),
-        line(x[last], errors[last], "o", size=8.0),
-        *(text(f"{error:.3g}", place, error, (0, 8), across="center") for place, error in enumerate(errors)),
+    errors = np.array([step.cross_validated_mm for step in steps], dtype=float)
+    x = np.arange(len(steps))
+    kept = np.flatnonzero([not step.note for step in steps])
+    rejected, chosen = np.setdiff1d(x, kept), kept[-1:]
+    layers = [
+        line(x[kept], errors[kept], "o-", size=5.0),
+        line(x[rejected], errors[rejected], "o", size=5.0, hollow=True),
+        line(x[chosen], errors[chosen], "o", size=8.0),
     ]
+    for k, error in enumerate(errors):
+        layers.append(text(f"{error:.3g}", k, error, (0, 8), across="center"))
+    lowest = errors.min()
     if noise:
         layers.append(level(1e3 * noise, INK, ":", words="instrument"))
-    limits = 0.7 * min(errors.min(), 1e3 * (noise or np.inf)), 2.4 * errors.max()
-    ends = (f"{steps[k].model.removeprefix('+ ')} is the last to reduce the error: to {errors[k]:.3g} mm" for k in last)
+        lowest = min(lowest, 1e3 * noise)
+
+    title = ""
+    for k in chosen:
+        model = steps[k].model.removeprefix("+ ")
+        title = f"{model} is the last to reduce the error: to {errors[k]:.3g} mm"
+    labels = [f"{step.model}\n{step.parameters}" for step in steps]
     panel = Panel(
         layers,
-        next(ends, ""),
+        title,
         "model, parameters",
         "cross-validated error [mm]",
-        ylim=limits,
+        ylim=(0.7 * lowest, 2.4 * errors.max()),
         log="y",
-        xnames=[f"{step.model}\n{step.parameters}" for step in steps],
+        xnames=labels,
         grid="y",
     )
     return Chart([panel], 2.4)
@@ -259,7 +303,8 @@ def outlook_figure(others: Curve, own: tuple[float, float], along: str, across: 
         along, across: what they are, with units.
     """
     points = np.array(sorted(others)).reshape(-1, 2)
-    low, high = np.vstack([points, [own]]).min(axis=0), np.vstack([points, [own]]).max(axis=0)
+    with_plan = np.vstack([points, [own]])
+    low, high = with_plan.min(axis=0), with_plan.max(axis=0)
     layers = [
         line(points[:, 0], points[:, 1], "o-", BEFORE),
         line([own[0]], [own[1]], "o", MARK, size=5.5),
@@ -270,8 +315,8 @@ def outlook_figure(others: Curve, own: tuple[float, float], along: str, across: 
         "predicted before measuring",
         along,
         across,
-        (0.8 * low[0], 1.25 * high[0]),
-        (0.7 * low[1], 1.4 * high[1]),
+        xlim=(0.8 * low[0], 1.25 * high[0]),
+        ylim=(0.7 * low[1], 1.4 * high[1]),
         log="xy",
         grid="both",
     )
@@ -280,41 +325,55 @@ def outlook_figure(others: Curve, own: tuple[float, float], along: str, across: 
 
 def captioned(report: Report) -> dict[str, Captioned]:
     """Return the charts of a report with captions, by name; charts without data are omitted."""
+    proof = report.sets[0]
+    for rows in report.sets:
+        if rows.unseen:
+            proof = rows
+            break
+    role = "unseen" if proof.unseen else "fitted"
+    label = f"{proof.poses} {role} poses ({proof.name})"
+    deliverable = report.metrics.deliverable
+    delivered, arm = proof.judged(deliverable), proof.judged_arm(deliverable)
+
     result: dict[str, Captioned] = {}
-    proof = next((rows for rows in report.sets if rows.unseen), report.sets[0])
-    label = f"{proof.poses} {'unseen' if proof.unseen else 'fitted'} poses ({proof.name})"
-    delivered, arm = proof.judged(report.metrics.deliverable), proof.judged_arm(report.metrics.deliverable)
     for nature in ("position", "orientation", "distance"):
         if nature in delivered:
             before, after = np.array(proof.nominal[nature]), np.array(delivered[nature])
             chart = error_histogram(before, after, nature, report.noise.get(nature), arm)
-            named = report.metrics.fit.words(nature).capitalize()
-            result[nature] = chart, f"{named} errors before and after, {label}; dashed: rms."
-    rungs = [rung for rung in report.metrics.ladder if rung.cross_validated_mm is not None]
-    if len(rungs) > 1:
-        chart = ladder(rungs, report.noise.get("position"))
+            quantity = report.metrics.fit.words(nature).capitalize()
+            result[nature] = chart, f"{quantity} errors before and after, {label}; dashed: rms."
+
+    steps = [step for step in report.metrics.ladder if step.cross_validated_mm is not None]
+    if len(steps) > 1:
+        chart = ladder(steps, report.noise.get("position"))
         result["ladder"] = chart, "Models tried, by their cross-validated error. Filled: kept; open: rejected."
     if report.singular_values:
         chart = singular_values(np.array(report.singular_values), report.rank)
-        words = "Singular values of the scaled observation matrix; filled: identifiable, open: not identifiable."
-        result["singular_values"] = chart, words
+        caption = "Singular values of the scaled observation matrix; filled: identifiable, open: not identifiable."
+        result["singular_values"] = chart, caption
+
     if proof.q:
         nature = "position" if "position" in delivered else "distance"
         before, after = np.array(proof.nominal[nature]), np.array(delivered[nature])
         chart = residuals_by_joint(np.array(proof.q), before, after, report.joints, report.prismatic, nature, arm)
         result["joints"] = chart, f"Errors against each joint, {label}: a trend shows an unmodelled effect."
+
         # intervals hold the joint corrections' errors: they say nothing of the robot without them
         expected = proof.expected if delivered is proof.calibrated else ()
         chart = error_map(np.array(proof.points), after, expected=np.array(expected))
-        below = "; below: radius expected to contain 95 % of the errors." if expected else "."
-        named = report.metrics.fit.words(nature)
-        result["map"] = chart, f"Remaining {named} error over the workspace, {label}{below}"
-    for count, seen in enumerate(report.images, 1):
-        chart = image_coverage(seen.size, np.array(seen.count), np.array(seen.rms))
-        words = f"Number of corners and reprojection error over the image ({seen.file})."
-        result["coverage" if count == 1 else f"coverage_{count}"] = chart, words
-    if moved := [row for row in report.parameters if row.group == "arm"]:
-        result["parameters"] = parameter_changes(moved), "Parameter changes by the fit. Grey: less than two sigmas."
+        quantity = report.metrics.fit.words(nature)
+        caption = f"Remaining {quantity} error over the workspace, {label}"
+        caption += "; below: radius expected to contain 95 % of the errors." if expected else "."
+        result["map"] = chart, caption
+
+    for k, images in enumerate(report.images, 1):
+        name = "coverage" if k == 1 else f"coverage_{k}"
+        chart = image_coverage(images.size, np.array(images.count), np.array(images.rms))
+        result[name] = chart, f"Number of corners and reprojection error over the image ({images.file})."
+
+    of_arm = [row for row in report.parameters if row.group == "arm"]
+    if of_arm:
+        result["parameters"] = parameter_changes(of_arm), "Parameter changes by the fit. Grey: less than two sigmas."
     if len(report.correlated.names) > 1:
         chart = correlation_map(report.correlated.names, np.array(report.correlated.matrix))
         result["correlations"] = chart, "The most strongly correlated parameters."

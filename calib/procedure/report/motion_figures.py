@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from calib.procedure.report.style import AFTER, BEFORE, HALF_WIDTH, MARK, QUIET
 from calib.robot.chain import Chain, Joint
 from calib.robot.kinematics import sweep
 from calib.units import motion_units
+from trajectories.basis import SampledMotion
 from trajectories.constraints import BoxLimit
 from trajectories.design.pareto import Front
 from trajectories.design.verify import dense_motion
@@ -21,9 +22,13 @@ from trajectories.design.verify import dense_motion
 if TYPE_CHECKING:
     from calib.procedure.excitation.design import Designed
     from calib.procedure.excitation.planning import Planned
-
+# instants at which a designed motion is drawn
 POINTS = 800
-Limited = tuple[np.ndarray, np.ndarray, np.ndarray]  # values, lower and upper limit
+# letters of a joint's name from which on it is broken into lines
+LONG_NAME = 12
+# values, lower and upper limit
+Limited = tuple[np.ndarray, np.ndarray, np.ndarray]
+
 TITLES = ("position", "velocity", "acceleration", "torque")
 
 
@@ -36,57 +41,55 @@ def motion_sheet(times: np.ndarray, series: Sequence[Limited], joints: Sequence[
         joints: of the robot (n).
     """
     units = motion_units(joint.kind for joint in joints)
-    panels, nearest, title = [], np.inf, ""
+    panels = []
+    smallest_gap, title = np.inf, ""
     for j, joint in enumerate(joints):
-        label = joint.name.replace("_", "_\n") if len(joint.name) > 12 else joint.name
-        for (values, lower, upper), quantity, unit in zip(series, TITLES, units):
-            first = values is series[0][0]
-            bounds = [level(float(bound)) for bound in (lower[j], upper[j]) if np.isfinite(bound)]
-            head, curve = f"{quantity} [{unit}]" if j == 0 else "", line(times, values[:, j])
-            limits = times[0], times[-1]
-            panels.append(Panel([curve, *bounds], head, "time [s]", label if first else "", xlim=limits, ticks=4))
-            if len(bounds) < 2 or upper[j] <= lower[j]:
-                continue
-            gap = min(upper[j] - values[:, j].max(), values[:, j].min() - lower[j]) / (upper[j] - lower[j])
-            if gap < nearest:
-                nearest, title = gap, f"{quantity} of {joint.name} comes closest to its limit (dashed)"
+        name = joint.name.replace("_", "_\n") if len(joint.name) > LONG_NAME else joint.name
+        for k, (values, lower, upper) in enumerate(series):
+            quantity, unit = TITLES[k], units[k]
+            layers = [line(times, values[:, j])]
+            bounds = [float(bound) for bound in (lower[j], upper[j]) if np.isfinite(bound)]
+            layers += map(level, bounds)
+            panel_title = f"{quantity} [{unit}]" if j == 0 else ""
+            label = name if k == 0 else ""
+            panels.append(Panel(layers, panel_title, "time [s]", label, xlim=(times[0], times[-1]), ticks=4))
+            if len(bounds) == 2 and upper[j] > lower[j]:
+                gap = min(upper[j] - values[:, j].max(), values[:, j].min() - lower[j]) / (upper[j] - lower[j])
+                if gap < smallest_gap:
+                    smallest_gap = gap
+                    title = f"{quantity} of {joint.name} comes closest to its limit (dashed)"
     return Chart(panels, 0.7 + 0.75 * len(joints), len(series), title=title, shared="x")
 
 
 def _motion_figure(designed: Designed) -> Chart:
     """Return the chart of q, v, a and τ of every joint over one period, limits dashed."""
-    motion, model, limits = _motion(designed), designed.inputs.model, designed.inputs.limits
-    boxes = {limit.order: (limit.lower, limit.upper) for limit in limits.constraints if isinstance(limit, BoxLimit)}
-    none = np.full(designed.inputs.chain.n, np.inf)
-    rows: list[Limited] = [
-        (values, *boxes.get(order, (-none, none))) for order, values in enumerate((motion.q, motion.v, motion.a))
-    ]
+    motion, model, limits = _dense_motion(designed), designed.inputs.model, designed.inputs.limits
+    infinite = np.full(designed.inputs.chain.n, np.inf)
+    # the order of the derivative that is limited: 0 position, 1 velocity, 2 acceleration
+    boxes = dict.fromkeys(range(3), (-infinite, infinite))
+    for limit in limits.constraints:
+        if isinstance(limit, BoxLimit):
+            boxes[limit.order] = limit.lower, limit.upper
+    series: list[Limited] = [(motion.q, *boxes[0]), (motion.v, *boxes[1]), (motion.a, *boxes[2])]
     if model.values is not None:
         torque = model.exact.largest_torques(model.values, motion.q, motion.v, motion.a)
-        rows.append((torque, -limits.torque, limits.torque))
-    return motion_sheet(motion.times, rows, designed.inputs.chain.joints)
+        series.append((torque, -limits.torque, limits.torque))
+    return motion_sheet(motion.times, series, designed.inputs.chain.joints)
 
 
 def _path_figure(designed: Designed) -> Chart:
     """Return the chart of the tool's path from above and from the side."""
-    tool = sweep(designed.inputs.chain, _motion(designed).q).position
-    panels = [
-        Panel(
-            [
-                line(tool[0], tool[j], form="-"),
-                line(tool[0, :1], tool[j, :1], "o", MARK),
-                text("start", tool[0, 0], tool[j, 0]),
-                line([0.0], [0.0], "+", QUIET),
-                text("base", 0.0, 0.0),
-            ],
-            title,
-            "x [m]",
-            f"{'xyz'[j]} [m]",
-            grid="both",
-            equal=True,
-        )
-        for j, title in ((1, "the tool's path from above"), (2, "from the side"))
-    ]
+    position = sweep(designed.inputs.chain, _dense_motion(designed).q).position
+    panels = []
+    for axis, title in ((1, "the tool's path from above"), (2, "from the side")):
+        layers = [
+            line(position[0], position[axis], form="-"),
+            line(position[0, :1], position[axis, :1], "o", MARK),
+            text("start", position[0, 0], position[axis, 0]),
+            line([0.0], [0.0], "+", QUIET),
+            text("base", 0.0, 0.0),
+        ]
+        panels.append(Panel(layers, title, "x [m]", f"{'xyz'[axis]} [m]", grid="both", equal=True))
     return Chart(panels, 3.2, 2)
 
 
@@ -100,22 +103,23 @@ def _history_figure(designed: Designed) -> Chart:
 
 def front_figure(front: Front) -> Chart:
     """Return the chart of a condition number over the mean torque that it was traded for; open: dominated points."""
-    index, torque = front.values[:, 0], 1.0 - front.values[:, 1]
+    condition, torque = front.values[:, 0], 1.0 - front.values[:, 1]
     order = np.argsort(torque)
-    good, rest = order[front.best[order]], order[~front.best[order]]
-    own = front.designed
-    points = [
-        line(torque[good], index[good], "o-", size=4.0),
-        line(torque[rest], index[rest], "o", BEFORE, hollow=True),
-        line(torque[[own]], index[[own]], "s", MARK, size=5.5),
-        text("designed", torque[own], index[own]),
+    efficient, dominated = order[front.best[order]], order[~front.best[order]]
+    designed = front.designed
+    layers = [
+        line(torque[efficient], condition[efficient], "o-", size=4.0),
+        line(torque[dominated], condition[dominated], "o", BEFORE, hollow=True),
+        line(torque[[designed]], condition[[designed]], "s", MARK, size=5.5),
+        text("designed", torque[designed], condition[designed]),
     ]
-    title = f"{len(np.unique(front.values[good], axis=0))} motions to choose from"
-    words = f"mean {front.names[1].replace('slack ', '')} / limit"
-    return Chart([Panel(points, title, words, front.names[0])], 2.5, width=HALF_WIDTH)
+    count = len(np.unique(front.values[efficient], axis=0))
+    label = f"mean {front.names[1].replace('slack ', '')} / limit"
+    panel = Panel(layers, f"{count} motions to choose from", label, front.names[0])
+    return Chart([panel], 2.5, width=HALF_WIDTH)
 
 
-def _motion(designed: Designed) -> Any:
+def _dense_motion(designed: Designed) -> SampledMotion:
     times = np.linspace(0.0, designed.period, POINTS)
     return dense_motion(designed.family, designed.found.x, times, designed.found.factor)
 
@@ -127,10 +131,11 @@ def design_figures(designed: Designed) -> dict[str, Chart]:
         figures["path"] = _path_figure(designed)
     if designed.front is not None and len(designed.front.values):
         figures["front"] = front_figure(designed.front)
-    if (look := designed.outlook) is not None and look.by_period:
-        curve = [(one.seconds, 100 * one.torque_sigma_share) for one in look.by_period]
-        own = (look.own.seconds, 100 * look.own.torque_sigma_share)
-        figures["outlook"] = outlook_figure(curve, own, "motion [s]", "σ of torques [% of limits]")
+    outlook = designed.outlook
+    if outlook is not None and outlook.by_period:
+        curve = [(period.seconds, 100 * period.torque_sigma_share) for period in outlook.by_period]
+        plan = outlook.own.seconds, 100 * outlook.own.torque_sigma_share
+        figures["outlook"] = outlook_figure(curve, plan, "motion [s]", "σ of torques [% of limits]")
     return figures
 
 
@@ -152,26 +157,33 @@ def write_plan(planned: Planned, folder: Path) -> None:
 def _plan_figure(planned: Planned) -> Chart:
     """Return the chart of q, v, a and τ of every joint, limits dashed."""
     track, limits = planned.track, planned.limits
-    rows: list[Limited] = [(track.q, planned.lower, planned.upper), (track.v, -limits.velocity, limits.velocity)]
-    rows.append((track.a, -limits.acceleration, limits.acceleration))
+    series: list[Limited] = [
+        (track.q, planned.lower, planned.upper),
+        (track.v, -limits.velocity, limits.velocity),
+        (track.a, -limits.acceleration, limits.acceleration),
+    ]
     if track.tau is not None:
-        rows.append((track.tau, -limits.torque, limits.torque))
-    return motion_sheet(track.times, rows, planned.chain.joints)
+        series.append((track.tau, -limits.torque, limits.torque))
+    return motion_sheet(track.times, series, planned.chain.joints)
 
 
 def _profile_figure(planned: Planned) -> Chart:
     """Return the chart of the speed along the path, and of the share reached of each limit."""
-    above, below, start = [], [], 0.0
-    for one in planned.timings:
-        times = start + one.profile.times
-        above.append(line(times, np.sqrt(one.profile.x)))
-        instants = np.repeat(times[:-1], len(one.sampled.s) // (len(times) - 1))
-        for (name, used), colour in zip(one.used.items(), (BEFORE, AFTER, QUIET)):
-            below.append(line(instants, used.max(axis=1), colour=colour, label=name if start == 0.0 else ""))
+    speeds, shares = [], []
+    start = 0.0
+    for timing in planned.timings:
+        times = start + timing.profile.times
+        speeds.append(line(times, np.sqrt(timing.profile.x)))
+        per_interval = len(timing.sampled.s) // (len(times) - 1)
+        instants = np.repeat(times[:-1], per_interval)
+        for (name, share), colour in zip(timing.used.items(), (BEFORE, AFTER, QUIET)):
+            # the legend names the curves of the first path only
+            label = name if start == 0.0 else ""
+            shares.append(line(instants, share.max(axis=1), colour=colour, label=label))
         start = float(times[-1])
-    below.append(level(1.0))
+    shares.append(level(1.0))
     panels = [
-        Panel(below, x="time [s]", y="share of the limit", xlim=(0.0, start), ylim=(0.0, 1.05)),
-        Panel(above, x="time [s]", y="speed along the path", xlim=(0.0, start)),
+        Panel(shares, x="time [s]", y="share of the limit", xlim=(0.0, start), ylim=(0.0, 1.05)),
+        Panel(speeds, x="time [s]", y="speed along the path", xlim=(0.0, start)),
     ]
     return Chart(panels, 3.8, title=f"{start:.3g} s, close to a limit for {planned.active_share:.0%} of the time")

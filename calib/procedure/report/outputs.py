@@ -1,20 +1,12 @@
-"""What the folder of a result holds besides its numbers: the data of its report, figures, and pages made by rooms."""
+"""What the folder of a result holds besides its numbers: the data of its report, figures, and its certificate."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from calib.extensions import Point
 from calib.files import write_json
-
-FIT_PAGES: Point[Callable[[Any, Mapping[str, Any], Path], None]] = Point(
-    "fit_pages", "writes a fit's certificate into its folder"
-)
-MODEL_PAGES: Point[Callable[[Any, Mapping[str, Any], Path], None]] = Point(
-    "model_pages", "writes an identification's certificate into its folder"
-)
 
 if TYPE_CHECKING:
     from calib.procedure.dynamic_stage.identify import IdentificationOutcome
@@ -35,8 +27,10 @@ def write_fit(outcome: Outcome, folder: Path, plots: bool = True, pages: bool = 
         from calib.procedure.report.geometry_figures import captioned
 
         drawn = saved(captioned(report), folder)
-    for write in FIT_PAGES.all() if pages else ():
-        write(report, drawn, folder)
+    if pages:
+        from calib.procedure.report.certificate import results
+
+        results.write_fit(report, drawn, folder)
 
 
 def write_model(outcome: IdentificationOutcome, folder: Path, plots: bool = True, pages: bool = True) -> None:
@@ -58,5 +52,6 @@ def write_model(outcome: IdentificationOutcome, folder: Path, plots: bool = True
     write_json(UnseenFolder(folder).report, report.unseen)
     if plots:
         drawn = charts.saved(dynamics_figures.captioned(report, folder), folder)
-    for write in MODEL_PAGES.all():
-        write(report, drawn, folder)
+    from calib.procedure.report.certificate import results
+
+    results.write_model(report, drawn, folder)

@@ -22,11 +22,16 @@ from PIL import Image
 from calib import files
 
 BEFORE, AFTER, MARK, QUIET, INK = "#e2a26b", "#17486e", "#b3261e", "#8a8f98", "#22262b"
-BROWN = "#a8622a"  # BEFORE, dark enough for letters
-PAGE_WIDTH, HALF_WIDTH = 7.4, 3.6  # a page's line and half of it [in]
-DPI = 200  # of print
-COLOURS = 256  # of a PNG with a palette, a third as large as one without
-POINTS = 700  # stretches of a curve, of which each keeps its smallest and its largest value
+# BEFORE, dark enough for letters
+BROWN = "#a8622a"
+# a page's line and half of it [in]
+PAGE_WIDTH, HALF_WIDTH = 7.4, 3.6
+# of print
+DPI = 200
+# of a PNG with a palette, a third as large as one without
+COLOURS = 256
+# stretches of a curve, of which each keeps its smallest and its largest value
+STRETCHES = 700
 STYLE: Any = {
     "font.family": "DejaVu Sans",
     "font.size": 7.5,
@@ -60,7 +65,10 @@ STYLE: Any = {
 @contextmanager
 def styled(quiet_titles: bool = False) -> Iterator[None]:
     """Apply the common style within a context, then restore matplotlib's settings; `quiet` makes titles small."""
-    with matplotlib.rc_context(STYLE | ({"axes.titleweight": "normal", "axes.titlesize": 7.5} if quiet_titles else {})):
+    settings = dict(STYLE)
+    if quiet_titles:
+        settings |= {"axes.titleweight": "normal", "axes.titlesize": 7.5}
+    with matplotlib.rc_context(settings):
         yield
 
 
@@ -90,8 +98,14 @@ def sheet(
 def log_axis(axis: XAxis | YAxis, low: float, high: float, most: int = 7) -> None:
     """Make an axis logarithmic from `low` to `high`, with at most about `most` ticks: 1, 2, 5 or powers of ten."""
     axis.axes.set(**{f"{axis.axis_name}scale": "log", f"{axis.axis_name}lim": (low, high)})
-    locator = LogLocator(subs=(1.0, 2.0, 5.0) if high < 100.0 * low else (1.0,), numticks=most)
-    axis.set(major_locator=locator, minor_locator=NullLocator(), major_formatter=lambda value, _: number(value))
+    steps = (1.0, 2.0, 5.0) if high < 100.0 * low else (1.0,)
+    locator = LogLocator(subs=steps, numticks=most)
+    axis.set(major_locator=locator, minor_locator=NullLocator(), major_formatter=tick_text)
+
+
+def tick_text(value: float, _: object) -> str:
+    """Return the text of a tick, as a formatter of matplotlib."""
+    return number(value)
 
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -102,8 +116,12 @@ def number(value: float) -> str:
     if value == 0.0 or 0.99e-3 < abs(value) < 0.99e5:
         return f"{value:g}"
     digits, power = f"{value:.0e}".split("e")
-    head = "" if digits == "1" else "-" if digits == "-1" else f"{digits}·"
-    return f"{head}10{str(int(power)).translate(_RAISED)}"
+    power_of_ten = f"10{str(int(power)).translate(_RAISED)}"
+    if digits == "1":
+        return power_of_ten
+    if digits == "-1":
+        return f"-{power_of_ten}"
+    return f"{digits}·{power_of_ten}"
 
 
 def legend(figure: Figure, axes: Axes | None, title: str) -> None:
@@ -112,25 +130,34 @@ def legend(figure: Figure, axes: Axes | None, title: str) -> None:
     figure.text(0.1 / width, 1.0 - 0.06 / height, title, va="top", fontsize=9.0, fontweight="bold")
     if axes is not None:
         handles, labels = axes.get_legend_handles_labels()
-        place = {"loc": "upper right", "bbox_to_anchor": (1.0 - 0.05 / width, 1.0 - 0.04 / height)}
-        figure.legend(handles, labels, ncols=len(labels), fontsize=7.0, handlelength=1.4, markerscale=4.0, **place)
+        figure.legend(
+            handles,
+            labels,
+            ncols=len(labels),
+            fontsize=7.0,
+            handlelength=1.4,
+            markerscale=4.0,
+            loc="upper right",
+            bbox_to_anchor=(1.0 - 0.05 / width, 1.0 - 0.04 / height),
+        )
 
 
 def thinned(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a long curve reduced to the minimum and maximum of each of `POINTS` segments; all peaks are kept.
+    """Return a long curve reduced to the minimum and maximum of each of `STRETCHES`; all peaks are kept.
 
     Args:
         t: (N,) [s].
         values: (N,).
     """
-    size = len(t) // POINTS
+    size = len(t) // STRETCHES
     if size < 3:
         return t, values
     count = len(t) // size
-    blocks = values[: count * size].reshape(count, size)
-    both = np.sort(np.stack([blocks.argmin(axis=1), blocks.argmax(axis=1)]), axis=0) + size * np.arange(count)
-    kept = np.append(both.T.ravel(), len(t) - 1)
-    return t[kept], values[kept]
+    stretches = values[: count * size].reshape(count, size)
+    extremes = np.stack([stretches.argmin(axis=1), stretches.argmax(axis=1)])
+    rows = np.sort(extremes, axis=0) + size * np.arange(count)
+    chosen = np.append(rows.T.ravel(), len(t) - 1)
+    return t[chosen], values[chosen]
 
 
 def png(figure: Figure, dpi: float = DPI) -> bytes:
@@ -139,10 +166,12 @@ def png(figure: Figure, dpi: float = DPI) -> bytes:
         figure.set_dpi(dpi)
         canvas = FigureCanvasAgg(figure)
         canvas.draw()
-    colours = Image.fromarray(np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., :3]))
-    image = colours.quantize(COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    pixels = np.asarray(canvas.buffer_rgba())[..., :3]
+    image = Image.fromarray(np.ascontiguousarray(pixels))
+    image = image.quantize(COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
     palette = np.array(image.getpalette(), dtype=np.uint8)
-    palette[palette > 251] = 255  # the paper is white; the search for a palette misses it by a digit
+    # the paper is white; the search for a palette misses it by a digit
+    palette[palette > 251] = 255
     image.putpalette(palette.tolist())
     buffer = io.BytesIO()
     image.save(buffer, "png", dpi=(dpi, dpi))
@@ -151,7 +180,8 @@ def png(figure: Figure, dpi: float = DPI) -> bytes:
 
 def svg(figure: Figure) -> bytes:
     """Return a figure as SVG, letters as outlines: it looks the same wherever it is shown."""
-    with styled(), matplotlib.rc_context({"svg.hashsalt": "calib"}):  # the same figure is the same file
+    # with a fixed salt the same figure is the same file
+    with styled(), matplotlib.rc_context({"svg.hashsalt": "calib"}):
         buffer = io.BytesIO()
         FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None})
     return buffer.getvalue()

@@ -3,7 +3,7 @@
 A waiting session prints two lines: what to do at the robot, and which file to provide in which format.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,10 @@ from rich.text import Text
 
 from calib.arguments import checked
 from calib.config import parse
+from calib.controllers.table import check_controller
 from calib.data.csv_table import read_table
 from calib.data.poses import IMAGES
 from calib.errors import UsageError, command_line, require
-from calib.extensions import Point
 from calib.folders import CERTIFICATE, PAGES, SESSION
 from calib.geometry.observability import targets_of
 from calib.procedure.excitation.coefficients import RUN, SAMPLES
@@ -31,17 +31,13 @@ from calib.procedure.session import steps
 from calib.procedure.session.folder import POSES, UNSEEN, WAYS, Say, Session, create, locked, open_session, read_state
 from calib.procedure.session.geometry_steps import chain_of
 from calib.procedure.session.questions import instrument_named
+from calib.procedure.session.second_round import promised
 from calib.procedure.session.settings import NOTHING, SessionSettings
 from calib.procedure.session.steps import DONE, KEPT, WAITING, State
 from calib.robot.chain import Chain
 from calib.robot.collision import meshes_beside
 from calib.robot.library import load, resolve
 from calib.robot.tables import dumps
-
-CHECK_CONTROLLER: Point[Callable[[str, int], None]] = Point(
-    "check_controller", "raises where a controller takes no arm of n joints"
-)
-ENDINGS: Point[Callable[[Session], list[str]]] = Point("endings", "lines on a complete session")
 
 
 def asks(session: Session, state: State) -> tuple[str, str]:
@@ -213,7 +209,7 @@ def new_session(
     require(dynamics or device.measures != NOTHING, words, UsageError)
     chain = load(robot, base or None, tip or None)
     if program:
-        CHECK_CONTROLLER.one()(program, chain.n)
+        check_controller(program, chain.n)
     copied, named = _limits(limits, chain, source, dynamics)
     table = {
         "name": chain.name,
@@ -275,7 +271,7 @@ def _ending(session: Session) -> tuple[str, ...]:
     """Return the closing lines of a complete session: the verdict, where certificate and robot are."""
     first, *others = PAGES
     page = f"{session.path(first)} ({', '.join(others)})"
-    found, further = session.verdicts(), [line for ending in ENDINGS.all() for line in ending(session)]
+    found, further = session.verdicts(), promised(session)
     robot = session.path(f"{session.export}/{URDF}")
     corrected = session.path(f"{session.export}/{CORRECTED_URDF}")
     use = ""

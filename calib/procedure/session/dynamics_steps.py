@@ -3,7 +3,7 @@
 The same functions as `calib excite` and `calib identify`; only the files are the session's.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -17,7 +17,6 @@ from calib.data.recordings.recording import Recording
 from calib.data.recordings.recording_files import read_recording
 from calib.dynamics.torque_rows import torque_rows
 from calib.errors import CalibError, Finding, finding, refuse_data
-from calib.extensions import Point
 from calib.identification.checks.recorded_motion import (
     EDGE_TIME,
     DesignedMotion,
@@ -36,13 +35,10 @@ from calib.procedure.excitation.coefficients import Periodic
 from calib.procedure.findings import UNJUDGED, Verdict, lines_of
 from calib.procedure.robot_kinds import joints_of
 from calib.procedure.session.folder import CUTS, MOTION_CHECKED, ROUND, Say, Session
+from calib.procedure.session.masses import return_masses
 from calib.records import read_json
 from calib.robot.chain import Chain
 from calib.robot.library import load_calibrated
-
-RETURN_MASSES: Point[Callable[[Session], list[str]]] = Point(
-    "return_masses", "hands identified masses to a session's fit; notes"
-)
 
 Cuts = Mapping[str, tuple[float, float] | None]  # of recordings, by their names [s]
 MIN_TRACKED_SHARE = 0.98  # of the motion, explained by a recorded period; below it is noted
@@ -315,7 +311,7 @@ def identify(session: Session, say: Say) -> list[str]:
     designed = session.path(f"6-excitation/{before if before in designed_motions(session) else 'training'}")
     if session.settings.dynamics.plan and (designed / prediction.NAME).is_file():
         notes.append(prediction.compared_with_identification(designed, outcome))
-    notes += [note for back in RETURN_MASSES.all() for note in back(session)]
+    notes += return_masses(session)
     later = lines_of([one for one in outcome.noticed if one.code == "no-unseen-motion"])  # `predict` judges
     return [*notes, *(words for words in outcome.warnings if words not in later)]
 

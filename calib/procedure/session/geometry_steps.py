@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from calib import files
+from calib.data.images.coverage import image_words
 from calib.data.poses import IMAGES
 from calib.data.poses.fit_options import FileOptions, FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
@@ -31,7 +32,6 @@ from calib.errors import CalibError, Finding, UsageError, finding
 from calib.extensions import Point
 from calib.folders import write_staged
 from calib.geometry.observability import SIGMA_ORIENTATION, observation, targets_of
-from calib.geometry.weighing import Settings
 from calib.identification.model_file import MODEL
 from calib.procedure.findings import UNJUDGED, Warned, lines_of
 from calib.procedure.kinematic_stage import fit as fitting
@@ -48,7 +48,7 @@ from calib.procedure.measuring.run import same_turn, write_run
 from calib.procedure.report import fit_report
 from calib.procedure.report.geometry_section import error_words, outlier_sentences, parameter_words
 from calib.procedure.report.outputs import write_fit
-from calib.procedure.session import folder
+from calib.procedure.session import drift, folder
 from calib.procedure.session.folder import Say, Session
 from calib.robot import calibrated
 from calib.robot.chain import Chain, joint_kinds
@@ -61,10 +61,6 @@ from poses.space import is_feasible
 WRITE_PROGRAM: Point[Callable[[Path, Path, str], Any]] = Point(
     "write_program", "files of a program of the poses in a CSV"
 )
-DRIFT: Point[Callable[[Session, Chain, Any, Any], list[Finding]]] = Point(
-    "drift", "drift of targets measured more than once"
-)
-IMAGE_WORDS: Point[Callable[[PoseMeasurements], str]] = Point("image_words", "what is said of images as they arrive")
 
 HOW = "add [camera] to the limits file, see `calib formats constraints`"
 
@@ -210,8 +206,7 @@ def arrive(session: Session, say: Say) -> list[str]:
     chain = chain_of(session)
     blocks, again = (read_measured(session, chain, session.brought(kind)) for kind in ("measured", "drift"))
     notes = notes_on(session, chain, blocks, folder.POSES)
-    for drift in DRIFT.all():
-        notes += lines_of(drift(session, chain, *([block for _, block in own] for own in (blocks, again))))
+    notes += lines_of(drift.of_session(session, chain, *([block for _, block in own] for own in (blocks, again))))
     files.write(session.path(folder.POSES_CHECKED), "\n".join(notes) + "\n")
     return notes
 
@@ -240,7 +235,7 @@ def notes_on(session: Session, chain: Chain, blocks: Sequence[tuple[str, PoseMea
         if measures == Poses.kind and isinstance(block, Positions) and not isinstance(block, Poses):
             found.append("only positions, although the instrument measures poses")
         if block.kind == IMAGES:
-            found.append(IMAGE_WORDS.one()(block))
+            found.append(image_words(block))
         elif measures == IMAGES:
             found.append("contains no images, although the instrument is a camera; the file is fitted nevertheless")
         found += block.notes
@@ -318,7 +313,7 @@ def validate(session: Session, say: Say) -> list[str]:
     notes = notes_on(session, chain, read_measured(session, chain, unseen, like), folder.UNSEEN)
     say("comparing on unseen poses")
     given, options, wanted = _gathered(session, unseen), _options_of(session), _fit_settings(session)
-    settings = Settings(wanted.loss or options.loss, options.loss_scale)
+    settings = fitting.weighing_settings(options, wanted)
     asked = replace(wanted, model=wanted.model or options.model)
     found = assess(fit.arms(given, settings), given, fit.findings(), settings, asked)
     rows = [fit_report.rows_of(name, each, each.proves) for name, each in found.validation.items()]

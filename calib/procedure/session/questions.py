@@ -11,17 +11,15 @@ from scipy.spatial.transform import Rotation
 
 from calib.config import described, parse
 from calib.config_types import OneOf, Real
+from calib.data.images.board import read_board
+from calib.data.images.lens import read_lens
 from calib.data.poses import BOARD, IMAGES, IN_HAND, TO_HAND
 from calib.errors import UsageError, one_of, refused_as, require
-from calib.extensions import Point
+from calib.procedure.answers import CAMERA, CELL, Answers, CertificateSection
 from calib.procedure.measuring.constraints_file import AXES, ConstraintsFile
-from calib.procedure.session.answers import CAMERA, CELL, Answers, CertificateSection
 from calib.procedure.session.settings import NOTHING, InstrumentSection
 from calib.robot.library import resolve
 from calib.transforms import pose, to_xyz_rpy
-
-READ_LENS: Point[Callable[[Path], object]] = Point("read_lens", "a camera's file")
-READ_BOARD: Point[Callable[[Path], object]] = Point("read_board", "a board's file")
 
 MAX_MASS = 2000.0  # [kg]: of a payload (our choice)
 
@@ -197,7 +195,7 @@ def cell_tables(**answers: str | Sequence[str] | None) -> dict[str, Any]:
     means that it does not exist, so that nothing has to be checked.
 
     Args:
-        answers: by the names of `calib.procedure.session.answers.Answers`.
+        answers: by the names of `calib.procedure.answers.Answers`.
 
     Raises:
         UsageError: for an invalid answer, with the valid form.
@@ -265,12 +263,12 @@ def _mounting(text: str) -> str:
     return OneOf((IN_HAND, TO_HAND)).read(text.lower().replace("-", " ").replace("_", " "))
 
 
-def _file(read: "Point[Callable[[Path], object]]", text: str) -> str:
+def _file(read: Callable[[Path], object], text: str) -> str:
     """Return the path of a lens or board file, after checking that it can be read."""
     path = Path(text).expanduser()
-    path = path / BOARD if read is READ_BOARD and path.is_dir() else path
+    path = path / BOARD if read is read_board and path.is_dir() else path
     require(path.is_file(), "no such file; give an existing one", ValueError)
-    read.one()(path)
+    read(path)
     return str(path)
 
 
@@ -301,8 +299,8 @@ _KEYS: dict[str, tuple[str, Any]] = {  # of the limits file, and how the answer 
     "box": ("collision.box", _box),
     "obstacles": ("obstacle", _obstacles),
     "mounting": ("camera.mounting", _mounting),
-    "lens": ("camera.lens", partial(_file, READ_LENS)),
-    "board": ("camera.board", partial(_file, READ_BOARD)),
+    "lens": ("camera.lens", partial(_file, read_lens)),
+    "board": ("camera.board", partial(_file, read_board)),
     "carried": ("camera.carried", partial(_turned, "carried", MAX_HELD)),
     "stands": ("camera.stands", partial(_turned, "stands", MAX_FAR)),
 }

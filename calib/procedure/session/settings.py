@@ -20,6 +20,7 @@ from calib.errors import SessionError
 from calib.identification.friction.friction_ladder import NAMES as FRICTION
 from calib.identification.registry import METHODS
 from calib.identification.settings import IdentificationSettings
+from calib.procedure.answers import CertificateSection, Torques
 from calib.procedure.excitation.settings import (
     DEFAULT_DESIGN,
     HARMONICS,
@@ -39,7 +40,6 @@ from calib.procedure.kinematic_stage.settings import (
     Method,
     Stations,
 )
-from calib.procedure.session.answers import CertificateSection, Torques
 
 SCHEMA = 2
 READ = (1, SCHEMA)  # a session of schema 1 knows no dynamics; it goes on as geometry alone

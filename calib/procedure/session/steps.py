@@ -9,7 +9,7 @@ are kept and reported. A running step is marked; if its command was killed, the 
 import json
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime
@@ -29,7 +29,96 @@ from calib.procedure.session.settings import default_keys
 
 MORE_STEPS: "Point[SessionStep]" = Point("steps", "steps after the export")
 
-FOLDERS = {"geometry": ("2-", "3-", "4-", "5-", "export/"), "dynamics": ("6-", "7-", "8-")}  # of one stage alone
+# beginnings of the files of one stage alone
+GEOMETRIC_FILES = ("2-", "3-", "4-", "5-")
+DYNAMIC_FILES = ("6-", "7-", "8-")
+# states of a step
+DONE, READY, WAITING, STALE, KEPT, AFTER = "done", "ready", "waiting", "stale", "kept", "after"
+
+
+@dataclass(frozen=True)
+class SessionFile:
+    """A file that a step reads, by its name in the session's folder; none in sessions without the file's stage.
+
+    Attributes:
+        optional: whether it may be missing.
+        without_geometry: whether it is read only where no geometry is fitted.
+    """
+
+    name: str
+    optional: bool = False
+    without_geometry: bool = False
+
+    def paths(self, session: Session) -> list[Path]:
+        """Return the file's path."""
+        if self.name.startswith(GEOMETRIC_FILES) and not session.geometric:
+            return []
+        if self.name.startswith(DYNAMIC_FILES) and not session.dynamic:
+            return []
+        if self.without_geometry and session.geometric:
+            return []
+        return [session.path(self.name)]
+
+
+@dataclass(frozen=True)
+class FitFile:
+    """A file that a step reads from the folder of the fit or, without a fit, of the nominal robot."""
+
+    name: str
+    optional: bool = False
+
+    def paths(self, session: Session) -> list[Path]:
+        """Return the file's path."""
+        return [session.fit.path / self.name]
+
+
+@dataclass(frozen=True)
+class ExportedFile:
+    """A file that a step reads from the folder of the export; none where no geometry is fitted."""
+
+    name: str
+    optional: bool = False
+
+    def paths(self, session: Session) -> list[Path]:
+        """Return the file's path."""
+        return [session.path(f"{session.export}/{self.name}")] if session.geometric else []
+
+
+@dataclass(frozen=True)
+class NamedFile:
+    """A file that a step reads, named by a key of ``session.toml``; none where the key is empty."""
+
+    section: str
+    key: str
+    optional: bool = False
+
+    def paths(self, session: Session) -> list[Path]:
+        """Return the file's path."""
+        name = getattr(getattr(session.settings, self.section), self.key)
+        return [session.path(name)] if name else []
+
+
+@dataclass(frozen=True)
+class UserFiles:
+    """Files that a step reads and people provide, of a kind of `folder.BROUGHT`."""
+
+    kind: str
+    optional: bool = False
+
+    def paths(self, session: Session) -> list[Path]:
+        """Return the paths of the files, including those in folders."""
+        return session.files_brought(self.kind)
+
+
+Input = SessionFile | FitFile | ExportedFile | NamedFile | UserFiles
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A section or value of ``session.toml`` on which a step depends: all of it, or these keys of it."""
+
+    section: str
+    keys: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -39,11 +128,9 @@ class SessionStep:
     Attributes:
         name, purpose: for people.
         make: runs it; returns what is to be said.
-        reads: the files it reads, by names between blanks: of the session, with ``?`` where one may be missing;
-            ``fit/`` and ``export/`` stand for the folders of this session; ``poses:constraints``: what that key of
-            ``session.toml`` names; ``measured`` …: what people brought (`BROUGHT`).
+        reads: the files it reads.
         makes: names or patterns of what it makes.
-        settings: sections of ``session.toml`` it depends on, or keys of one (``dynamics.period,rate``).
+        settings: what it depends on in ``session.toml``.
         stage: ``geometry`` or ``dynamics``, where only sessions with that have it; ``need``: those that state one.
         brings: what people bring before it, and in words.
         kept: what it is not made again for, once that is brought, and in words; empty: always made again.
@@ -52,149 +139,183 @@ class SessionStep:
     name: str
     purpose: str
     make: Callable[[Session, Say], list[str]]
-    reads: str
-    makes: str
-    settings: str
+    reads: tuple[Input, ...]
+    makes: tuple[str, ...]
+    settings: tuple[Setting, ...]
     stage: str = ""
     brings: tuple[str, str] = ("", "")
     kept: tuple[tuple[str, ...], str] = ((), "")
 
     def inputs(self, session: Session) -> dict[Path, bool]:
         """Return the files that the step reads, and for each whether it may be missing."""
-        names = self.reads.split()
-        return {path: name.endswith("?") for name in names for path in _paths(session, name.rstrip("?"))}
+        paths = {}
+        for source in self.reads:
+            paths |= dict.fromkeys(source.paths(session), source.optional)
+        return paths
 
     def waits(self, session: Session) -> str:
         """Return a text on the user's files that the step waits for; empty if none are missing."""
         kind, words = self.brings
-        poses, dynamics = session.settings.poses, session.settings.dynamics
-        holdouts = {"validation": (poses, session.settings.fit), "unseen": (dynamics, dynamics)}
-        if kind in holdouts:
-            planned, judged = holdouts[kind]
-            if not planned.validation or judged.holdout:
-                return ""
-        return "" if not kind or session.brought(kind) else words
+        # a part of the measured poses or recordings may be held out instead
+        poses, fit, dynamics = session.settings.poses, session.settings.fit, session.settings.dynamics
+        if kind == "validation" and (not poses.validation or fit.holdout):
+            return ""
+        if kind == "unseen" and (not dynamics.validation or dynamics.holdout):
+            return ""
+        if not kind or session.brought(kind):
+            return ""
+        return words
 
 
-def _paths(session: Session, name: str) -> Iterator[Path]:
-    """Yield the paths of the files that a name in `SessionStep.reads` denotes."""
-    left_out = () if session.geometric else FOLDERS["geometry"]
-    left_out += () if session.dynamic else FOLDERS["dynamics"]
-    if name in folder.BROUGHT:
-        yield from session.files_brought(name)
-    elif name.startswith("fit/"):
-        yield session.fit.path / name.removeprefix("fit/")
-    elif ":" in name:
-        section, key = name.split(":")
-        if named := getattr(getattr(session.settings, section), key):
-            yield session.path(named)
-    elif not name.startswith(left_out) and not (name == folder.VERDICT and session.geometric):
-        yield session.path(name.replace("export/", f"{session.export}/"))
-
-
-MODEL = "torques,friction,method,options,payloads,holdout"
+ROBOT = NamedFile("robot", "file")
+FITTED_ROBOT = FitFile("robot.toml")
+FIT_OPTIONS = NamedFile("fit", "options")
+IDENTIFY_OPTIONS = NamedFile("dynamics", "options")
+# keys of [dynamics] on which the identified model depends
+MODEL_KEYS = ("torques", "friction", "method", "options", "payloads", "holdout")
+# and those of a designed motion
+DESIGN_KEYS = ("plan", "validation", "period", "harmonics", "rate", "starts", "evaluations", "limits")
 STEPS = (
     SessionStep(
         "describe",
         "read the robot",
         geometry_steps.describe,
-        "robot:file",
-        f"{folder.SUMMARY} {folder.AS_GIVEN}/*",
-        "robot",
+        reads=(ROBOT,),
+        makes=(folder.SUMMARY, f"{folder.AS_GIVEN}/*"),
+        settings=(Setting("robot"),),
     ),
     SessionStep(
         "select",
         "choose the poses to measure",
         geometry_steps.select,
-        "robot:file poses:constraints",
-        f"2-poses/{folder.POSES} 2-poses/{folder.WAYS} 2-poses/{folder.UNSEEN} "
-        f"{folder.SELECTION} {folder.PREDICTED} {folder.PREDICTION}",
-        "robot instrument poses seed",
-        "geometry",
+        reads=(ROBOT, NamedFile("poses", "constraints")),
+        makes=(
+            f"2-poses/{folder.POSES}",
+            f"2-poses/{folder.WAYS}",
+            f"2-poses/{folder.UNSEEN}",
+            folder.SELECTION,
+            folder.PREDICTED,
+            folder.PREDICTION,
+        ),
+        settings=(Setting("robot"), Setting("instrument"), Setting("poses"), Setting("seed")),
+        stage="geometry",
         kept=(("measured",), "these poses were already measured; `calib redo select` chooses new ones"),
     ),
     SessionStep(
         "measure",
         "check what was measured",
         geometry_steps.arrive,
-        f"robot:file 2-poses/{folder.POSES}? fit:options measured drift",
-        folder.POSES_CHECKED,
-        "robot instrument poses fit",
-        "geometry",
-        ("measured", "a file of measured poses"),
+        reads=(
+            ROBOT,
+            SessionFile(f"2-poses/{folder.POSES}", optional=True),
+            FIT_OPTIONS,
+            UserFiles("measured"),
+            UserFiles("drift"),
+        ),
+        makes=(folder.POSES_CHECKED,),
+        settings=(Setting("robot"), Setting("instrument"), Setting("poses"), Setting("fit")),
+        stage="geometry",
+        brings=("measured", "a file of measured poses"),
     ),
     SessionStep(
         "fit",
         "fit the geometry",
         geometry_steps.fit,
-        f"robot:file fit:options measured {folder.MASSES}/dynamics.json?",
-        "4-fit/*",
-        "robot instrument fit seed",
-        "geometry",
+        reads=(ROBOT, FIT_OPTIONS, UserFiles("measured"), SessionFile(f"{folder.MASSES}/dynamics.json", optional=True)),
+        makes=("4-fit/*",),
+        settings=(Setting("robot"), Setting("instrument"), Setting("fit"), Setting("seed")),
+        stage="geometry",
     ),
     SessionStep(
         "validate",
         "validate the geometry on unseen poses",
         geometry_steps.validate,
-        f"fit/robot.toml fit/report.json 2-poses/{folder.UNSEEN}? fit:options validation",
-        "5-validation/*",
-        "robot instrument poses fit seed",
-        "geometry",
-        ("validation", "a file of measured validation poses"),
+        reads=(
+            FITTED_ROBOT,
+            FitFile("report.json"),
+            SessionFile(f"2-poses/{folder.UNSEEN}", optional=True),
+            FIT_OPTIONS,
+            UserFiles("validation"),
+        ),
+        makes=("5-validation/*",),
+        settings=(Setting("robot"), Setting("instrument"), Setting("poses"), Setting("fit"), Setting("seed")),
+        stage="geometry",
+        brings=("validation", "a file of measured validation poses"),
     ),
     SessionStep(
         "excite",
         "design the motions to record",
         dynamics_steps.excite,
-        "fit/robot.toml dynamics:limits",
-        "6-excitation/training/* 6-excitation/validation/*",
-        "dynamics.plan,validation,period,harmonics,rate,starts,evaluations,limits seed",
-        "dynamics",
+        reads=(FITTED_ROBOT, NamedFile("dynamics", "limits")),
+        makes=("6-excitation/training/*", "6-excitation/validation/*"),
+        settings=(Setting("dynamics", DESIGN_KEYS), Setting("seed")),
+        stage="dynamics",
         kept=(("training", "unseen"), "these motions were already recorded; `calib redo excite` designs new ones"),
     ),
     SessionStep(
         "record",
         "check what was recorded",
         dynamics_steps.record,
-        f"fit/robot.toml 6-excitation/training/{MOTION}? dynamics:options training",
-        f"{folder.MOTION_CHECKED} {folder.CUTS}",
-        "dynamics.plan,repeats,torques,options,payloads,holdout",
-        "dynamics",
-        ("training", "a recording of the training motion"),
+        reads=(
+            FITTED_ROBOT,
+            SessionFile(f"6-excitation/training/{MOTION}", optional=True),
+            IDENTIFY_OPTIONS,
+            UserFiles("training"),
+        ),
+        makes=(folder.MOTION_CHECKED, folder.CUTS),
+        settings=(Setting("dynamics", ("plan", "repeats", "torques", "options", "payloads", "holdout")),),
+        stage="dynamics",
+        brings=("training", "a recording of the training motion"),
     ),
     SessionStep(
         "identify",
         "identify the dynamics",
         dynamics_steps.identify,
-        f"fit/robot.toml {folder.CUTS} dynamics:options training",
-        "8-dynamics/*",
-        f"dynamics.{MODEL} seed",
-        "dynamics",
+        reads=(FITTED_ROBOT, SessionFile(folder.CUTS), IDENTIFY_OPTIONS, UserFiles("training")),
+        makes=("8-dynamics/*",),
+        settings=(Setting("dynamics", MODEL_KEYS), Setting("seed")),
+        stage="dynamics",
     ),
     SessionStep(
         "predict",
         "validate the dynamics on unseen motion",
         dynamics_steps.predict,
-        "8-dynamics/robot.toml 8-dynamics/dynamics.json 8-dynamics/metrics.json "
-        f"6-excitation/validation/{MOTION}? {folder.CUTS} dynamics:options training unseen",
-        "8-dynamics/unseen/*",
-        f"dynamics.plan,validation,repeats,tolerance_percent,{MODEL} seed",
-        "dynamics",
-        ("unseen", "a recording of the validation motion"),
+        reads=(
+            SessionFile("8-dynamics/robot.toml"),
+            SessionFile("8-dynamics/dynamics.json"),
+            SessionFile("8-dynamics/metrics.json"),
+            SessionFile(f"6-excitation/validation/{MOTION}", optional=True),
+            SessionFile(folder.CUTS),
+            IDENTIFY_OPTIONS,
+            UserFiles("training"),
+            UserFiles("unseen"),
+        ),
+        makes=("8-dynamics/unseen/*",),
+        settings=(
+            Setting("dynamics", ("plan", "validation", "repeats", "tolerance_percent", *MODEL_KEYS)),
+            Setting("seed"),
+        ),
+        stage="dynamics",
+        brings=("unseen", "a recording of the validation motion"),
     ),
     SessionStep(
         "export",
         "write the calibrated robot",
         geometry_steps.export,
-        "robot:file fit/robot.toml 4-fit/robot.urdf 5-validation/metrics.json 8-dynamics/dynamics.json "
-        "8-dynamics/estimate.csv 8-dynamics/covariance.csv 8-dynamics/unseen/report.json",
-        f"6-export/* 9-export/* {folder.VERDICT}",
-        "robot",
+        reads=(
+            ROBOT,
+            FITTED_ROBOT,
+            SessionFile("4-fit/robot.urdf"),
+            SessionFile("5-validation/metrics.json"),
+            SessionFile("8-dynamics/dynamics.json"),
+            SessionFile("8-dynamics/estimate.csv"),
+            SessionFile("8-dynamics/covariance.csv"),
+            SessionFile("8-dynamics/unseen/report.json"),
+        ),
+        makes=("6-export/*", "9-export/*", folder.VERDICT),
+        settings=(Setting("robot"),),
     ),
 )
-
-
-DONE, READY, WAITING, STALE, KEPT, AFTER = "done", "ready", "waiting", "stale", "kept", "after"
 
 
 @dataclass(frozen=True)
@@ -206,10 +327,15 @@ class State:
     words: str
 
 
+def all_steps() -> tuple[SessionStep, ...]:
+    """Return the steps of any session, in their order."""
+    return (*STEPS, *MORE_STEPS.all())
+
+
 def steps_of(session: Session) -> tuple[SessionStep, ...]:
     """Return the steps of a session, without those of stages that the settings exclude."""
-    left_out = {"dynamics": not session.dynamic, "geometry": not session.geometric, "need": not session.needs}
-    return tuple(step for step in (*STEPS, *MORE_STEPS.all()) if not left_out.get(step.stage))
+    included = {"": True, "dynamics": session.dynamic, "geometry": session.geometric, "need": session.needs}
+    return tuple(step for step in all_steps() if included[step.stage])
 
 
 def find(session: Session, name: str) -> SessionStep:
@@ -218,81 +344,102 @@ def find(session: Session, name: str) -> SessionStep:
     Raises:
         SessionError: with the names there are.
     """
-    there = steps_of(session)
-    for number, step in enumerate(there, 1):
+    included = steps_of(session)
+    for number, step in enumerate(included, 1):
         if name in (step.name, str(number)):
             return step
-    if stage := next((step.stage for step in (*STEPS, *MORE_STEPS.all()) if step.name == name), ""):
-        keys = {"dynamics": "wanted = true under [dynamics]", "need": "sigma_percent under [dynamics]"}
-        key = keys.get(stage, "what measures under [instrument]")
-        raise SessionError(f"this session does not include the {stage}; for '{name}' write {key} in session.toml")
-    raise SessionError(f"unknown step '{name}'; steps: {', '.join(step.name for step in there)}")
+    for step in all_steps():
+        if step.name == name:
+            keys = {"dynamics": "wanted = true under [dynamics]", "need": "sigma_percent under [dynamics]"}
+            key = keys.get(step.stage, "what measures under [instrument]")
+            raise SessionError(
+                f"this session does not include the {step.stage}; for '{name}' write {key} in session.toml"
+            )
+    raise SessionError(f"unknown step '{name}'; steps: {', '.join(step.name for step in included)}")
 
 
 def states(session: Session) -> list[State]:
     """Return the status of every step."""
-    recorded, result, current = read_state(session), [], True
+    recorded = read_state(session)
+    result: list[State] = []
     for step in steps_of(session):
-        words = (
-            "was completed, but an earlier step has to be repeated first"
-            if step.name in recorded.steps
-            else "comes later"
-        )
-        state = _state(session, step, recorded) if current else State(step, AFTER, words)
-        result.append(state)
-        current = current and state.kind in (DONE, KEPT)
+        if all(state.kind in (DONE, KEPT) for state in result):
+            result.append(_state(session, step, recorded))
+        elif step.name in recorded.steps:
+            result.append(State(step, AFTER, "was completed, but an earlier step has to be repeated first"))
+        else:
+            result.append(State(step, AFTER, "comes later"))
     return result
 
 
 def _state(session: Session, step: SessionStep, recorded: StateFile) -> State:
-    entry = recorded.steps.get(step.name)
-    if missing := _missing(session, step):
+    """Return the status of a step before which all are done."""
+    missing = _missing(session, step)
+    if missing:
         return State(step, WAITING, missing)
     if recorded.running == step.name:
         return State(step, READY, "was interrupted; will be repeated")
+    entry = recorded.steps.get(step.name)
     if entry is None:
         return State(step, READY, step.purpose)
-    if changes := changed_inputs(entry.inputs, _inputs(session, step)):
-        kinds, used = step.kept
+    changes = changed_inputs(entry.inputs, _fingerprints(session, step))
+    if changes:
+        kinds, reason = step.kept
         if session.brought(*kinds):
-            return State(step, KEPT, f"{changes}; kept, since {used}")
+            return State(step, KEPT, f"{changes}; kept, since {reason}")
         return State(step, STALE, changes)
-    gone = [name for name in entry.outputs if not session.path(name).exists()]
-    if gone:
-        return State(step, STALE, f"{gone[0]} is missing")
+    for name in entry.outputs:
+        if not session.path(name).exists():
+            return State(step, STALE, f"{name} is missing")
     replaced = [name for name, mark in entry.outputs.items() if fingerprint(session.path(name)) != mark]
-    by_hand = f"; replaced manually: {', '.join(replaced)}" if replaced else ""
-    return State(step, DONE, f"{entry.finished[:16].replace('T', ' ')}{by_hand}")
+    words = entry.finished[:16].replace("T", " ")
+    if replaced:
+        words += f"; replaced manually: {', '.join(replaced)}"
+    return State(step, DONE, words)
 
 
 def _missing(session: Session, step: SessionStep) -> str:
     """Return a text on the user's files that a step waits for."""
-    absent = (path for path, may_miss in step.inputs(session).items() if not may_miss and not path.exists())
-    path = next(absent, None)
-    return step.waits(session) or ("" if path is None else f"{path.relative_to(session.folder)}, which is missing")
+    waits = step.waits(session)
+    if waits:
+        return waits
+    for path, optional in step.inputs(session).items():
+        if not optional and not path.exists():
+            return f"{path.relative_to(session.folder)}, which is missing"
+    return ""
 
 
-def _inputs(session: Session, step: SessionStep) -> dict[str, str]:
+def _fingerprints(session: Session, step: SessionStep) -> dict[str, str]:
     """Return the fingerprints of the files and settings on which a step depends."""
-    marks = {str(path.relative_to(session.folder)): fingerprint(path) for path in step.inputs(session) if path.exists()}
-    settings = asdict(session.settings)
-    for setting in step.settings.split():
-        section, _, keys = setting.partition(".")
-        for key in keys.split(",") if session.dynamic or section != "dynamics" else ():
-            values = settings[section]
-            place = f"{folder.SETTINGS} [{section}] {key}".rstrip()
-            marks[place] = json.dumps(values[key] if key else values, sort_keys=True)
+    marks = {}
+    for path in step.inputs(session):
+        if path.exists():
+            marks[str(path.relative_to(session.folder))] = fingerprint(path)
+    values = asdict(session.settings)
+    for setting in step.settings:
+        section = setting.section
+        if section == "dynamics" and not session.dynamic:
+            continue
+        if not setting.keys:
+            marks[f"{folder.SETTINGS} [{section}]"] = json.dumps(values[section], sort_keys=True)
+        for key in setting.keys:
+            marks[f"{folder.SETTINGS} [{section}] {key}"] = json.dumps(values[section][key], sort_keys=True)
     return marks
 
 
-def changed_inputs(before: Mapping[str, str], now: Mapping[str, str]) -> str:
+def changed_inputs(before: Mapping[str, str], after: Mapping[str, str]) -> str:
     """Return a text on the differences between two sets of fingerprints."""
-    changed = [name for name in now if _value(name, before.get(name, "{}")) != _value(name, now[name])]
-    parts = [f"{name} {'has changed' if name in before else 'is new'}" for name in changed]
-    return ", ".join([*parts, *(f"{name} is gone" for name in sorted(before.keys() - now))])
+    parts = []
+    for name, mark in after.items():
+        if name not in before and _comparable(name, "{}") != _comparable(name, mark):
+            parts.append(f"{name} is new")
+        if name in before and _comparable(name, before[name]) != _comparable(name, mark):
+            parts.append(f"{name} has changed")
+    parts += [f"{name} is gone" for name in sorted(before.keys() - after)]
+    return ", ".join(parts)
 
 
-def _value(name: str, mark: str) -> Any:
+def _comparable(name: str, mark: str) -> Any:
     """Return a fingerprint in comparable form: settings as values (3 equals 3.0), missing keys as their defaults."""
     if not name.startswith(folder.SETTINGS):
         return mark
@@ -300,7 +447,9 @@ def _value(name: str, mark: str) -> Any:
     value = json.loads(mark)
     if key and mark != "{}":
         value = {key.strip(): value}
-    return default_keys(section) | value if isinstance(value, dict) else value
+    if isinstance(value, dict):
+        return default_keys(section) | value
+    return value
 
 
 def run_next(session: Session, say: Say, progress: Say, command: str = "calib next") -> State | None:
@@ -309,45 +458,59 @@ def run_next(session: Session, say: Say, progress: Say, command: str = "calib ne
     The session has to be locked.
     """
     clear_staging(session)
-    with suppress(OSError):  # the folder of a session with the other stages is missing, or this one has files
+    # the folder of a session with the other stages is missing, or this one has files
+    with suppress(OSError):
         os.replace(session.path(folder.EXPORT[not session.dynamic]), session.path(session.export))
     while True:
-        state = next((each for each in states(session) if each.kind not in (DONE, KEPT)), None)
-        if state is None or state.kind == WAITING:
-            return state
-        _run(session, state.step, say, progress, command)
+        pending = [state for state in states(session) if state.kind not in (DONE, KEPT)]
+        if not pending:
+            return None
+        if pending[0].kind == WAITING:
+            return pending[0]
+        _run(session, pending[0].step, say, progress, command)
 
 
 def _run(session: Session, step: SessionStep, say: Say, progress: Say, command: str) -> None:
+    """Run a step, record it in ``state.json``, and print its notes."""
     number = steps_of(session).index(step) + 1
     recorded = read_state(session).without(step.name)
     session.write_state(replace(recorded, running=step.name))
-    inputs, started = _inputs(session, step), time.perf_counter()
+    # files that change while the step runs make it stale
+    inputs = _fingerprints(session, step)
+    started = time.perf_counter()
     progress(step.purpose)
     try:
         notes = step.make(session, progress)
     except BaseException:
         session.write_state(recorded)
         raise
-    produced = sorted({path for name in step.makes.split() for path in session.folder.glob(name) if path.is_file()})
-    made = StepRecord(
+    produced: set[Path] = set()
+    for pattern in step.makes:
+        produced.update(path for path in session.folder.glob(pattern) if path.is_file())
+    outputs = {str(path.relative_to(session.folder)): fingerprint(path) for path in sorted(produced)}
+    record = StepRecord(
         finished=datetime.now().astimezone().isoformat(timespec="seconds"),
         inputs=inputs,
-        outputs={str(path.relative_to(session.folder)): fingerprint(path) for path in produced},
+        outputs=outputs,
         seconds=round(time.perf_counter() - started, 2),
         command=command,
         seed=session.settings.seed,
         toolkit=versions(),
         notes=tuple(notes),
     )
-    session.write_state(StateFile({**recorded.steps, step.name: made}))
+    session.write_state(StateFile({**recorded.steps, step.name: record}))
     say(f"{number} {step.name}: {notes[0] if notes else 'done'}")
     for note in notes[1:]:
-        say(f"    {'warning: ' if isinstance(note, Warned) else ''}{note}")
+        warning = "warning: " if isinstance(note, Warned) else ""
+        say(f"    {warning}{note}")
 
 
 def forget(session: Session, step: SessionStep) -> None:
     """Mark a step and all steps after it to be run again, but not a design that people have carried out."""
-    there = steps_of(session)
-    again = (later for later in there[there.index(step) :] if later is step or not session.brought(*later.kept[0]))
-    session.write_state(read_state(session).without(*(later.name for later in again)))
+    included = steps_of(session)
+    names = [step.name]
+    for later in included[included.index(step) + 1 :]:
+        kinds, _ = later.kept
+        if not session.brought(*kinds):
+            names.append(later.name)
+    session.write_state(read_state(session).without(*names))

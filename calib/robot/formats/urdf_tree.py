@@ -15,7 +15,7 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Protocol
 from xml.parsers import expat
 
 import numpy as np
@@ -25,9 +25,20 @@ from calib.extensions import Point
 from calib.robot.chain import MIN_LIMIT, Joint
 from calib.transforms import from_xyz_rpy
 
-DESCRIPTIONS: Point[Any] = Point(
-    "descriptions", "a module: `takes` says whether it reads a file, `urdf` returns that robot as URDF"
-)
+
+class DescriptionReader(Protocol):
+    """Reader of robots that another program describes, as URDF."""
+
+    def takes(self, path: str) -> bool:
+        """Return whether `urdf` converts this file."""
+        ...
+
+    def urdf(self, path: str) -> str:
+        """Return the URDF text of a file."""
+        ...
+
+
+DESCRIPTIONS: Point[DescriptionReader] = Point("descriptions", "readers of robots' descriptions that are no URDF")
 
 XACRO = "this is a xacro file; name it so (robot.urdf.xacro)"
 _DECLARED = re.compile(rb"""^\s*<\?xml[^>]*?encoding\s*=\s*["']([A-Za-z0-9._-]+)["']""")
@@ -55,11 +66,11 @@ class Node:
         return next(self.all(tag), None)
 
 
-def converter(path: str | Path) -> Any:
-    """Return the module of a room that converts this file to a URDF (``descriptions``); None where there is none."""
-    for description in DESCRIPTIONS.all():
-        if description.takes(str(path)):
-            return description
+def converter(path: str | Path) -> DescriptionReader | None:
+    """Return the reader that converts this file to a URDF; None where there is none."""
+    for reader in DESCRIPTIONS.all():
+        if reader.takes(str(path)):
+            return reader
     return None
 
 

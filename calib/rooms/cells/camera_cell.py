@@ -17,18 +17,18 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib import files
+from calib.data.images import board as boards
+from calib.data.images.board import Board, corners
+from calib.data.images.lens import Lens, write_lens
+from calib.data.images.optics import BoardShape, Optics, shaped_points
+from calib.data.images.pixels import Pixels
 from calib.data.poses import BOARD, IN_HAND, JOINTS
 from calib.errors import CannotSimulate
 from calib.geometry.installation import Installation
+from calib.procedure.measuring.camera_view import CameraView
 from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain, random_joints
 from calib.robot.kinematics import forward
-from calib.rooms.camera import board as boards
-from calib.rooms.camera.board import Board, corners
-from calib.rooms.camera.camera_view import CameraView
-from calib.rooms.camera.lens import Lens, write_lens
-from calib.rooms.camera.optics import BoardShape, Optics, shaped_points
-from calib.rooms.camera.pixels import Pixels
 from calib.rooms.cells.cell import Cell, true_poses
 from calib.transforms import invert, pose, to_xyz_rpy
 from calib.units import JOINT
@@ -220,7 +220,7 @@ def take_pictures(
         moving: (m, n) how far the joints move during the exposure [rad or m]; None: the arm stands still.
         say: called with a line on each image.
     """
-    from calib.rooms.camera.pictures.images import write_image
+    from calib.data.images.images import write_image
     from calib.rooms.cells.rendered_camera import render
 
     boards.write_board(found.board, folder / BOARD)

@@ -12,10 +12,10 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from calib.rooms.camera.board import Board
-from calib.rooms.camera.lens import Lens, rays
-from calib.rooms.camera.optics import BoardShape, shaped_points
-from calib.rooms.camera.pictures.board_print import raster
+from calib.data.images.board import Board
+from calib.data.images.board_print import raster
+from calib.data.images.lens import Lens, rays
+from calib.data.images.optics import BoardShape, shaped_points
 
 SUB = 3  # sub-pixels each way
 NODES = 16  # pixels between the nodes at which rays are computed; cubic in between

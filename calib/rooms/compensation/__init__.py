@@ -6,6 +6,6 @@ TOPICS = {
         "targets of calib compensate, and the commands it writes",
         "calib.data.poses.pose_lists calib.rooms.compensation.joint_commands calib.rooms.compensation.programs "
         "calib.rooms.compensation.program_frames "
-        "calib.rooms.controllers.languages calib.rooms.controllers.configurations",
+        "calib.apps.controller_programs.languages calib.apps.controller_programs.configurations",
     )
 }

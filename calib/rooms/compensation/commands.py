@@ -60,13 +60,13 @@ def compensate(
         partial: write the reached targets even if others are not reached
     """
     from calib import files
+    from calib.apps.controller_programs.frames import stated_frame
+    from calib.apps.controller_programs.targets import is_program, read_program, text_of
     from calib.errors import UsageError
     from calib.procedure.export.geometry import results
     from calib.rooms.compensation import api
     from calib.rooms.compensation.program_frames import Statements
     from calib.rooms.compensation.programs import compensated
-    from calib.rooms.controllers.frames import stated_frame
-    from calib.rooms.controllers.targets import is_program, read_program, text_of
 
     may = numbers(tolerance, 2, "--tolerance")
     fitted = api.read_fitted(folder)

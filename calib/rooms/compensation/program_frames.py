@@ -1,8 +1,10 @@
 """Where the poses of a controller's program stand: its tools and user frames, read or stated.
 
 A pose P in user frame U for a tool T means, in the description's terms, the flange at  B · U · P · T⁻¹ · F⁻¹  of the
-arm's base, with the controller's base B and flange F (`calib.rooms.controllers.frames`). Numbers are read from the
-program and from files beside it (`calib.rooms.controllers.languages`), or stated; a frame that is neither is named, and
+arm's base, with the controller's base B and flange F (`calib.apps.controller_programs.frames`). Numbers are read from
+the
+program and from files beside it (`calib.apps.controller_programs.languages`), or stated; a frame that is neither is
+named, and
 the program is refused.
 """
 
@@ -11,12 +13,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from calib.apps.controller_programs.frames import Description, base_frame, flange_frame, stated_frame
+from calib.apps.controller_programs.languages import LANGUAGES, ProgramFrames, frames_in
+from calib.apps.controller_programs.targets import Program
+from calib.controllers.table import Controller
 from calib.errors import UsageError, listing
 from calib.rooms.compensation.joint_commands import Fitted
-from calib.rooms.controllers.frames import Description, base_frame, flange_frame, stated_frame
-from calib.rooms.controllers.languages import LANGUAGES, ProgramFrames, frames_in
-from calib.rooms.controllers.table import Controller
-from calib.rooms.controllers.targets import Program
 from calib.transforms import invert, to_xyz_rpy
 
 AGREE = 5e-5  # [m, or as a rotation matrix] a frame that is stated and read in the program may differ by this

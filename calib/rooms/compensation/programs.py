@@ -1,12 +1,15 @@
 """Compensation inside a controller's program: ``calib compensate FIT PROGRAM.src --out SENT.src``.
 
-The targets in a program (`calib.rooms.controllers.targets`) are replaced by ones that bring the real tool to where
+The targets in a program (`calib.apps.controller_programs.targets`) are replaced by ones that bring the real tool to
+where
 they are meant; every other byte stays. A joint target becomes the joint command. A pose becomes the pose that the
 nominal robot, the controller's own model, has at the joint command.
 
-Tool and user frame of a pose are read from the program (`calib.rooms.controllers.languages`), or stated: ``--tool``,
+Tool and user frame of a pose are read from the program (`calib.apps.controller_programs.languages`), or stated:
+``--tool``,
 ``--user-frame``, ``--frames`` with a file of the controller; else the program is refused. Elbow, wrist and turns are
-those of its configuration (`calib.rooms.controllers.configurations`); where it says none, of the solution nearest to
+those of its configuration (`calib.apps.controller_programs.configurations`); where it says none, of the solution
+nearest to
 ``--start``.
 """
 
@@ -18,20 +21,20 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.data.poses.pose_lists import Targets
-from calib.errors import UsageError, listing
-from calib.geometry.installation import see
-from calib.geometry.inverse import Goal
-from calib.rooms.compensation.joint_commands import Commands, Fitted, computed, lines, placements
-from calib.rooms.compensation.program_frames import Group, Statements, placed, tool_in_tip, user_poses
-from calib.rooms.controllers.configurations import (
+from calib.apps.controller_programs.configurations import (
     Configuration,
     Postures,
     configuration_of,
     has_spherical_wrist,
     postures,
 )
-from calib.rooms.controllers.targets import Program, pose_values
+from calib.apps.controller_programs.targets import Program, pose_values
+from calib.data.poses.pose_lists import Targets
+from calib.errors import UsageError, listing
+from calib.geometry.installation import see
+from calib.geometry.inverse import Goal
+from calib.rooms.compensation.joint_commands import Commands, Fitted, computed, lines, placements
+from calib.rooms.compensation.program_frames import Group, Statements, placed, tool_in_tip, user_poses
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +118,7 @@ def compensated(
 
     Args:
         fitted: the calibrated arm.
-        program: see `calib.rooms.controllers.targets.read_program`.
+        program: see `calib.apps.controller_programs.targets.read_program`.
         frame: as for joint commands; a station: it is the program's user frame.
         statements: tool and frames that the program does not say.
         start: (n,) near which the joints of poses are sought [rad]; needed where they have no configuration.

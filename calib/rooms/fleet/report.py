@@ -107,8 +107,8 @@ class FleetReport(Judged):
         return out
 
     def _write(self, folder: Path) -> None:
-        from calib.rooms.certificate.record import report
-        from calib.rooms.certificate.rendering import html
+        from calib.procedure.report.certificate.record import report
+        from calib.procedure.report.certificate.rendering import html
 
         count = sum(len(one.arms) for one in self.types)
         files.write(folder / PAGE, html(report("Fleet", f"{count} arms", (), [self.section()])))

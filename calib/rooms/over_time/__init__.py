@@ -1,3 +1,3 @@
 """A robot over time: two calibrations compared, drift during a measurement, the log of a robot's certificates."""
 
-OFFERS = {"commands": "commands:app", "drift": "drift:of_session"}
+OFFERS = {"commands": "commands:app"}

@@ -16,9 +16,9 @@ from calib.errors import Finding, UsageError, require
 from calib.procedure.findings import Verdict, lines_of, settle
 from calib.procedure.kinematic_stage import inputs
 from calib.procedure.report.page import Column, Section, Text, table
+from calib.procedure.session.drift import Trend, noise_of_difference, repeats, trends
 from calib.records import plain
 from calib.rooms.over_time import pages
-from calib.rooms.over_time.drift import Trend, noise_of_difference, repeats, trends
 from calib.rooms.over_time.settings import DEFAULT_DRIFT, DriftSettings
 
 if TYPE_CHECKING:

@@ -45,9 +45,9 @@ def save(
 
 
 def _write(folder: Path, title: str, setup: Mapping[str, str], parts: Sequence[ResultPart], numbers: Any) -> None:
+    from calib.procedure.report.certificate.record import Entry, report
+    from calib.procedure.report.certificate.rendering import html
     from calib.procedure.report.charts import picture
-    from calib.rooms.certificate.record import Entry, report
-    from calib.rooms.certificate.rendering import html
 
     sections = list[Section]()
     for part in parts:

@@ -82,8 +82,8 @@ class _ActuatorLimit(TwoSided):
         return np.tile(self.limits, 2)
 
     def values(self, motion: SampledMotion) -> np.ndarray:
-        own = self.of(self.plan.motion(motion.q, motion.v, motion.a))
-        return np.concatenate([own - self.limits, -own - self.limits], axis=1)
+        values = self.of(self.plan.motion(motion.q, motion.v, motion.a))
+        return np.concatenate([values - self.limits, -values - self.limits], axis=1)
 
     def slopes(self, motion: SampledMotion, weights: np.ndarray) -> np.ndarray:
         k = len(self.limits)
@@ -118,15 +118,19 @@ class ParallelExcitation(ExcitationDesign):
     def _actuators(self, track: Setpoints) -> Setpoints:
         """Return the setpoints of the actuators (q, v, a, torques) for setpoints of the platform."""
         motion = self.plan.motion(track.q, track.v, track.a)
-        own = self.robot.chain.actuated
+        actuated = self.robot.chain.actuated
         return Setpoints(
-            track.rate, motion.posture.q[:, own], motion.v[:, own], motion.a[:, own], self._torques(motion)
+            track.rate,
+            motion.posture.q[:, actuated],
+            motion.v[:, actuated],
+            motion.a[:, actuated],
+            self._torques(motion),
         )
 
     def _torques(self, motion: LoopMotion) -> np.ndarray:
         """Return the torques of the actuators (N, n), each of the load under which it is largest."""
-        every = self.plan.torques(motion).reshape(len(motion.v), -1, self.robot.chain.n)
-        return np.take_along_axis(every, np.abs(every).argmax(axis=1, keepdims=True), axis=1)[:, 0]
+        torques = self.plan.torques(motion).reshape(len(motion.v), -1, self.robot.chain.n)
+        return np.take_along_axis(torques, np.abs(torques).argmax(axis=1, keepdims=True), axis=1)[:, 0]
 
     @property
     def peaks(self) -> tuple[np.ndarray, np.ndarray]:
@@ -138,18 +142,20 @@ class ParallelExcitation(ExcitationDesign):
         """Write the result folder of `calib excite`: one period at the controller's rate, and the actuators' series."""
         from calib.procedure.report import motion_figures
 
-        one = folder.one_period(self)
+        period_motion = folder.one_period(self)
         bounds = self.inputs.limits.bounds
 
-        def more(place: Path) -> None:
+        def more(target: Path) -> None:
             series = coefficients.table(self._series(), ROBOT, bounds.lines())
-            files.write(place / coefficients.NAME, dumps(series))
+            files.write(target / coefficients.NAME, dumps(series))
             if self.predicted:
-                prediction.write(self.predicted, place)
+                prediction.write(self.predicted, target)
             if plots:
-                motion_figures.write_design(self, place)
+                motion_figures.write_design(self, target)
 
-        return write_motion(self.robot, Path(out), self._actuators(one), one.q, bounds, self.to_dict(), more)
+        return write_motion(
+            self.robot, Path(out), self._actuators(period_motion), period_motion.q, bounds, self.to_dict(), more
+        )
 
     def _series(self, max_error: float = 1e-8, samples: int = 2048) -> coefficients.Periodic:
         """Return the periodic motion of the actuators as Fourier series.
@@ -159,18 +165,20 @@ class ParallelExcitation(ExcitationDesign):
             samples: over the period, of which the series are made.
         """
         x, _, _ = self.orders(self.period / samples * np.arange(samples))
-        lines = np.fft.rfft(self.robot.known.place(x).q[:, self.robot.chain.actuated], axis=0) / samples
+        lines = np.fft.rfft(self.robot.mechanism.place(x).q[:, self.robot.chain.actuated], axis=0) / samples
         above = np.cumsum(2.0 * np.abs(lines[::-1]), axis=0)[::-1].max(axis=1)
         last = 1 + max(1, int((above[1:] > max_error).sum()))
-        own = tuple(np.concatenate([[c[0].real], -2.0 * c[1:last].imag, 2.0 * c[1:last].real]) for c in lines.T)
-        names, kinds = zip(*((one.name, one.kind) for one in self.robot.chain.joints))
-        return coefficients.Periodic(names, kinds, self.period, self.settings.rate, 1, "fourier", own)
+        line_coefficients = tuple(
+            np.concatenate([[c[0].real], -2.0 * c[1:last].imag, 2.0 * c[1:last].real]) for c in lines.T
+        )
+        names, kinds = zip(*((joint.name, joint.kind) for joint in self.robot.chain.joints))
+        return coefficients.Periodic(names, kinds, self.period, self.settings.rate, 1, "fourier", line_coefficients)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics of ``metrics.json``."""
         torque, acceleration = (peaks.tolist() for peaks in self.peaks)
-        own = {"robot": self.robot.chain.name, "peak_torque": torque, "peak_acceleration": acceleration}
-        return super().to_dict() | own
+        content = {"robot": self.robot.chain.name, "peak_torque": torque, "peak_acceleration": acceleration}
+        return super().to_dict() | content
 
     def __repr__(self) -> str:
         return f"<ParallelExcitation for {self.robot.chain.name}: {self.period:g} s>"
@@ -209,20 +217,20 @@ def excite_parallel(
     require(after is None or model is None, "after: its folder is also the model; leave --model out", UsageError)
     folder = model or after
     if options is None and after is None and not settings.loads and not settings.columns:
-        made, values = read_model(robot, folder, settings.drives or "Fv Fc off")
-        return design_parallel(robot, made, values, settings, map=map, progress=progress)
+        parallel_model, values = read_model(robot, folder, settings.drives or "Fv Fc off")
+        return design_parallel(robot, parallel_model, values, settings, map=map, progress=progress)
     require(
         options is None or folder is None,
         f"{folder} already states rows, drives and payloads; leave the options out",
         UsageError,
     )
     if folder is None:
-        made, values, loads, notes = of_options(robot, options, settings)
+        parallel_model, values, loads, notes = of_options(robot, options, settings)
     else:
-        made, values, loads, notes = of_folder(robot, folder, settings)
-    purpose = purpose_of(made, values, loads, notes, settings, folder, after)
-    found = design_parallel(robot, made, values, settings, purpose=purpose, map=map, progress=progress)
-    return found if after is None else foretold(found)
+        parallel_model, values, loads, notes = of_folder(robot, folder, settings)
+    purpose = purpose_of(parallel_model, values, loads, notes, settings, folder, after)
+    design = design_parallel(robot, parallel_model, values, settings, purpose=purpose, map=map, progress=progress)
+    return design if after is None else foretold(design)
 
 
 def design_parallel(
@@ -252,25 +260,27 @@ def design_parallel(
         UsageError: where nothing limits an actuator's speed or torque.
         NothingFeasible: naming the limit that stands in the way.
     """
-    known = model.known
-    own = model.known.robot
-    bounds = actuator_bounds(known)
+    mechanism = model.mechanism
+    parallel_robot = model.mechanism.robot
+    bounds = actuator_bounds(mechanism)
     purpose = purpose or whole(model, values)
     plan: Any = purpose.model.exact
-    rows = getattr(plan, "row_names", own.joint_names)
-    coordinates = tuple(f"platform {name}" for name in own.freedom)
-    constraints: list[MotionConstraint] = [BoxLimit(0, own.lower, own.upper, rows=coordinates)]
+    rows = getattr(plan, "row_names", parallel_robot.joint_names)
+    coordinates = tuple(f"platform {name}" for name in parallel_robot.freedom)
+    constraints: list[MotionConstraint] = [BoxLimit(0, parallel_robot.lower, parallel_robot.upper, rows=coordinates)]
     if acceleration is not None:
         constraints.append(BoxLimit(2, -acceleration, acceleration, rows=coordinates))
     constraints += [
         _ActuatorLimit(plan, plan.torques, np.resize((1.0 - GUARD) * bounds.torque, len(rows)), rows),
-        _ActuatorLimit(plan, plan.speeds, bounds.velocity, own.joint_names, "velocity", "rad/s"),
+        _ActuatorLimit(plan, plan.speeds, bounds.velocity, parallel_robot.joint_names, "velocity", "rad/s"),
     ]
-    joints = tuple(Joint(name, "revolute" if "r" in name else "prismatic") for name in own.freedom)
+    joints = tuple(Joint(name, "revolute" if "r" in name else "prismatic") for name in parallel_robot.freedom)
     # like an arm's
-    platform: Any = SimpleNamespace(name=own.name, n=own.r, joint_names=own.freedom, joints=joints)
-    free = np.full(own.r, np.inf)
-    given = ExcitationInputs(
+    platform: Any = SimpleNamespace(
+        name=parallel_robot.name, n=parallel_robot.r, joint_names=parallel_robot.freedom, joints=joints
+    )
+    free = np.full(parallel_robot.r, np.inf)
+    inputs = ExcitationInputs(
         platform,
         MotionLimits(tuple(constraints), bounds, free, None, 0.0, None, None, ()),
         replace(purpose.model, values=None, covariance=None),
@@ -280,22 +290,23 @@ def design_parallel(
     )
     goals = settings.goals or ("logdet",)
     harmonics = settings.harmonics or COARSE
-    asked = replace(settings, goals=goals, harmonics=harmonics, samples=SAMPLES)
-    return ParallelExcitation(**vars(search_motion(given, asked, map, progress)), robot=robot, plan=plan)
+    design_settings = replace(settings, goals=goals, harmonics=harmonics, samples=SAMPLES)
+    return ParallelExcitation(**vars(search_motion(inputs, design_settings, map, progress)), robot=robot, plan=plan)
 
 
-def actuator_bounds(known: ClosedRobot) -> MotionBounds:
+def actuator_bounds(mechanism: ClosedRobot) -> MotionBounds:
     """Return the limits of the actuators: speeds and efforts of the robot's file.
 
     Raises:
         UsageError: where nothing limits one.
     """
-    joints = known.robot.joints
-    velocity, effort = (np.array([getattr(joint, key) for joint in joints]) for key in ("velocity", "effort"))
+    joints = mechanism.robot.joints
+    velocity = np.array([joint.velocity for joint in joints])
+    effort = np.array([joint.effort for joint in joints])
     free = np.full(len(joints), np.inf)
     origin: dict[str, str] = dict.fromkeys(("velocity", "torque"), "robot's file")
-    place = "in the robot's file: velocity and effort of the actuated joints"
-    return MotionBounds(known.robot.name, joints, velocity, free, effort, origin, place)
+    location = "in the robot's file: velocity and effort of the actuated joints"
+    return MotionBounds(mechanism.robot.name, joints, velocity, free, effort, origin, location)
 
 
 def check_motion_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
@@ -310,7 +321,7 @@ def write_motion(
     coordinates: np.ndarray,
     bounds: MotionBounds,
     metrics: dict[str, Any],
-    more: Callable[[Path], None],
+    write_files: Callable[[Path], None],
 ) -> Path:
     """Write the folder of a motion: ``robot.toml``, ``motion.csv``, ``metrics.json`` and what `more` adds.
 
@@ -320,14 +331,14 @@ def write_motion(
     """
     parts = {"q": track.q, "v": track.v, "tau": track.tau}
     names = [f"{name} [{'rad' if name[0] == 'r' else 'm'}]" for name in robot.chain.freedom]
-    names += [name for what in parts for name in headings(what, robot.chain.joints)]
+    names += [name for part in parts for name in headings(part, robot.chain.joints)]
     table = np.hstack([track.times[:, None], coordinates, *parts.values()])
 
     def write(folder: Path) -> None:
         robot.write(folder)
         bounds.check(track)
         files.write_numbers(folder / PLANNED, ["t [s]", *names], table, notes=bounds.lines())
-        more(folder)
+        write_files(folder)
         files.write_json(folder / METRICS, metrics)
 
     check_motion_target(out, [robot.source])

@@ -46,9 +46,9 @@ from calib.folders import (
     write_staged,
 )
 from calib.identification.model_file import MODEL, refuse_currents
-from calib.identification.possible import information
-from calib.identification.possible.problem import find_prior_bodies
-from calib.identification.possible.solve import PossibleBodies, find_possible
+from calib.identification.physical_consistency import information
+from calib.identification.physical_consistency.problem import find_prior_bodies
+from calib.identification.physical_consistency.solve import PossibleBodies, find_possible
 from calib.identification.prediction import Dynamics
 from calib.identification.prior import RADIUS
 from calib.procedure.export.delivery import DRIVES, MJCF, README, TO_SIMULATE, write_drives
@@ -101,18 +101,18 @@ class OpenedRobot:
     drives: Drives
 
     @property
-    def known(self) -> ClosedRobot:
-        return self.model.known
+    def mechanism(self) -> ClosedRobot:
+        return self.model.mechanism
 
     @cached_property
     def rigid(self) -> list[Leg]:
         """The legs whose last link is the platform; the first carries it in the tree."""
-        return [leg for leg in self.known.robot.legs if leg.end == "rigid"]
+        return [leg for leg in self.mechanism.robot.legs if leg.end == "rigid"]
 
     @property
     def closing(self) -> list[Leg]:
         """The legs that the tree leaves open."""
-        return [leg for leg in self.known.robot.legs if leg not in self.rigid[:1]]
+        return [leg for leg in self.mechanism.robot.legs if leg not in self.rigid[:1]]
 
     @property
     def free(self) -> np.ndarray:
@@ -122,23 +122,23 @@ class OpenedRobot:
     @cached_property
     def chains(self) -> list[Chain]:
         """The legs under names of their own, the last link of each rigid one with its share of the platform."""
-        robot = self.known.robot
+        robot = self.mechanism.robot
         rows = self.model.leg_parameters(self.values)
-        every = [joint.name for leg in robot.legs for joint in leg.chain.joints]
-        found = []
+        names = [joint.name for leg in robot.legs for joint in leg.chain.joints]
+        chains = []
         for leg, row in zip(robot.legs, rows):
             bodies = row.reshape(-1, 10)
             if leg.end == "rigid":
-                place = leg.chain.tail @ invert(leg.attachment)
-                bodies[-1] = transform_body(self.free / len(self.rigid), place)
+                T_tip = leg.chain.tail @ invert(leg.attachment)
+                bodies[-1] = transform_body(self.free / len(self.rigid), T_tip)
             joints = tuple(
-                replace(one, name=f"{leg.name}_{one.name}") if every.count(one.name) > 1 else one
-                for one in leg.chain.joints
+                replace(joint, name=f"{leg.name}_{joint.name}") if names.count(joint.name) > 1 else joint
+                for joint in leg.chain.joints
             )
-            found.append(
+            chains.append(
                 replace(leg.chain, joints=joints, base="base", tip=f"{leg.name}_end", inertias=bodies, links=())
             )
-        return found
+        return chains
 
     @property
     def joints(self) -> tuple[Joint, ...]:
@@ -147,26 +147,26 @@ class OpenedRobot:
 
     @property
     def actuated(self) -> list[str]:
-        return [self.joints[j].name for j in self.known.robot.actuated]
+        return [self.joints[j].name for j in self.mechanism.robot.actuated]
 
     @property
     def home(self) -> dict[str, float]:
         """Values of all joints at which the loops close with the platform at home [rad or m]."""
-        return dict(zip((joint.name for joint in self.joints), self.known.home.q[0].tolist()))
+        return dict(zip((joint.name for joint in self.joints), self.mechanism.home.q[0].tolist()))
 
     def rows(self, values: np.ndarray) -> list[np.ndarray]:
         """Return values (n_t, …) of all joints, by leg."""
-        return np.split(values, self.known.robot.starts[1:-1])
+        return np.split(values, self.mechanism.robot.starts[1:-1])
 
     def urdf(self) -> str:
         """Return the text of ``robot.urdf``."""
-        root = ET.Element("robot", name=self.known.robot.name)
+        root = ET.Element("robot", name=self.mechanism.robot.name)
         for chain in self.chains:
             root.extend([*ET.fromstring(write_new(chain))][1 if len(root) else 0 :])
         link = ET.SubElement(root, "link", name=PLATFORM)
         if self.rigid:
-            own = self.rigid[0]
-            add_joint(root, "platform_fixed", "fixed", f"{own.name}_end", PLATFORM, invert(own.attachment))
+            first_leg = self.rigid[0]
+            add_joint(root, "platform_fixed", "fixed", f"{first_leg.name}_end", PLATFORM, invert(first_leg.attachment))
         else:
             mass, centre, moments = centred(self.free)
             inertial = ET.SubElement(link, "inertial")
@@ -174,7 +174,7 @@ class OpenedRobot:
             ET.SubElement(inertial, "mass", value=repr(mass))
             names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
             ET.SubElement(inertial, "inertia", {name: repr(float(x)) for name, x in zip(names, moments)})
-            add_joint(root, "platform_floating", "floating", "base", PLATFORM, self.known.robot.home)
+            add_joint(root, "platform_floating", "floating", "base", PLATFORM, self.mechanism.robot.home)
         for leg in self.closing:
             ET.SubElement(root, "link", name=f"{leg.name}_attachment")
             name = f"{leg.name}_attachment"
@@ -198,20 +198,20 @@ class OpenedRobot:
 
     def mjcf(self) -> str:
         """Return the text of ``robot.xml``."""
-        robot = self.known.robot
-        root = ET.Element("mujoco", model=self.known.robot.name)
+        robot = self.mechanism.robot
+        root = ET.Element("mujoco", model=self.mechanism.robot.name)
         world = ET.Element("worldbody")
-        home = numbers_text(self.known.home.q[0])
+        home = numbers_text(self.mechanism.home.q[0])
         for chain, drives in zip(self.chains, self.rows(self.drives.values)):
-            own: Any = ET.fromstring(mjcf_text(chain, np.asarray(chain.inertias), *drives.T[:3]))
+            model: Any = ET.fromstring(mjcf_text(chain, np.asarray(chain.inertias), *drives.T[:3]))
             if not len(root):
-                root.extend([own.find("compiler"), own.find("option"), world])
+                root.extend([model.find("compiler"), model.find("option"), world])
                 root[1].set("timestep", "0.001")
-            world.extend(own.find("worldbody"))
+            world.extend(model.find("worldbody"))
         if self.rigid:
             last = self.chains[robot.legs.index(self.rigid[0])].joint_names[-1]
-            body = next(one for one in world.iter("body") if one.get("name") == f"{last}_body")
-            place = self.rigid[0].chain.tail @ invert(self.rigid[0].attachment)
+            body = next(element for element in world.iter("body") if element.get("name") == f"{last}_body")
+            T_tip = self.rigid[0].chain.tail @ invert(self.rigid[0].attachment)
         else:
             mass, centre, (xx, xy, xz, yy, yz, zz) = centred(self.free)
             body = ET.SubElement(world, "body", {"name": "platform_body", **pose_attributes(robot.home)})
@@ -219,17 +219,20 @@ class OpenedRobot:
             full = numbers_text(np.array([xx, yy, zz, xy, xz, yz]))
             ET.SubElement(body, "inertial", pos=numbers_text(centre), mass=repr(mass), fullinertia=full)
             home += " " + " ".join(pose_attributes(robot.home).values())
-            place = np.eye(4)
-        ET.SubElement(body, "site", {"name": PLATFORM, **pose_attributes(place)})
+            T_tip = np.eye(4)
+        ET.SubElement(body, "site", {"name": PLATFORM, **pose_attributes(T_tip)})
         ties = ET.SubElement(root, "equality")
         motors = ET.SubElement(root, "actuator")
         for leg in self.closing:
             name = f"{leg.name}_attachment"
-            ET.SubElement(body, "site", {"name": name, **pose_attributes(place @ leg.attachment)})
+            ET.SubElement(body, "site", {"name": name, **pose_attributes(T_tip @ leg.attachment)})
             tie = {"name": leg.name, "site1": name, "site2": f"{leg.name}_end_tip", **CLOSED}
             ET.SubElement(ties, "weld" if leg.end == "rigid" else "connect", tie)
         for name, joint in zip(self.actuated, robot.joints):
-            limit = {"ctrlrange": f"{-joint.effort!r} {joint.effort!r}"} if np.isfinite(joint.effort) else {}
+            if np.isfinite(joint.effort):
+                limit = {"ctrlrange": f"{-joint.effort!r} {joint.effort!r}"}
+            else:
+                limit = {}
             ET.SubElement(motors, "motor", {"name": name, "joint": name, **limit})
         ET.SubElement(ET.SubElement(root, "keyframe"), "key", name="home", qpos=home)
         return xml_text(root)
@@ -253,23 +256,23 @@ def _side_by_side(model: ParallelModel, bodies: np.ndarray | None) -> tuple[Any,
     count = len(labels) - len(model.payloads)
     if bodies is None:
         rods = [pseudo_inertia.ball(1.0, RADIUS)] * count
-        legs = model.known.robot.legs[: 1 if model.identical_legs else None]
+        legs = model.mechanism.robot.legs[: 1 if model.identical_legs else None]
         ends = [x[:3, 3] for leg in legs for x in _next_frames(leg)[: leg.bodies]]
         bodies = np.array([*(pseudo_inertia.rod(1.0, end, RADIUS / 4) for end in ends), *rods[len(ends) :]])
-    own = bodies.reshape(-1, 10)[:count]
+    rows = bodies.reshape(-1, 10)[:count]
     joints = tuple(Joint(label) for label in labels[:count])
     elements = tuple(Element(joint.name, "rz", joint=k, owner=k) for k, joint in enumerate(joints))
-    chain = Chain(model.known.robot.name, joints, elements, inertias=own)
+    chain = Chain(model.mechanism.robot.name, joints, elements, inertias=rows)
     coordinates = np.array([*range(count), *[-1] * len(model.payloads)])
-    n = int(model.known.robot.starts[-1])
-    named = SimpleNamespace(
+    n = int(model.mechanism.robot.starts[-1])
+    model_ = SimpleNamespace(
         bodies=SimpleNamespace(count=len(labels), n=n, labels=labels, coordinates=coordinates),
         columns=model.columns,
         names=model.names,
         inertial=model.inertial,
         torque_rows=model.torque_rows,
     )
-    return chain, named
+    return chain, model_
 
 
 def _next_frames(leg: Leg) -> np.ndarray:
@@ -285,22 +288,22 @@ def _identified(robot: ParallelMechanism, folder: Path, prior: str) -> _Source:
         RobotError: of an identification by an earlier version, which did not write how parameters regroup.
     """
     refuse_currents(folder, "an export of masses")
-    model, own = read_model(robot, folder)
-    chain, named = _side_by_side(model, model.known_parameters())
-    estimate = information.read(folder, (chain, Dynamics(named, own)))
-    found = find_possible(estimate, prior=prior)
+    model, parameters = read_model(robot, folder)
+    chain, arm = _side_by_side(model, model.known_parameters())
+    estimate = information.read(folder, (chain, Dynamics(arm, parameters)))
+    possible = find_possible(estimate, prior=prior)
     single = model.single
-    values = model.spread(found.dynamics.values)
-    covariance = found.covariance[np.ix_(model.owners, model.owners)]
+    values = model.spread(possible.dynamics.values)
+    covariance = possible.covariance[np.ix_(model.owners, model.owners)]
     drives = drive_table(Dynamics(_side_by_side(single, single.known_parameters())[1], values), covariance)
-    same = ("possible", "nearest", "distance", "allowed", "weight", "prior", "notes")
+    keys = ("possible", "nearest", "distance", "allowed", "weight", "prior", "notes")
     table = {
         "base": {key: getattr(estimate, key) for key in ("names", "units", "values", "covariance")},
         "standard": {"names": single.names, "units": single.units, "values": values}
         | {"covariance": covariance, "frames": "about the frame of each link (robot.toml)"},
-        "consistency": {key: getattr(found, key) for key in same},
+        "consistency": {key: getattr(possible, key) for key in keys},
     }
-    notes = [_consistency(found, estimate.b), *found.notes]
+    notes = [_consistency(possible, estimate.b), *possible.notes]
     if drives.left or np.any(drives.values[:, 3]):
         notes.append(f"not in URDF and MJCF, but in parameters.json: {', '.join(('offsets', *drives.left))}")
     if model.payloads:
@@ -308,10 +311,10 @@ def _identified(robot: ParallelMechanism, folder: Path, prior: str) -> _Source:
     return _Source(OpenedRobot(single, values, drives), {"dynamics": table}, tuple(notes))
 
 
-def _consistency(found: PossibleBodies, count: int) -> str:
-    head = f"consistent inertias {found.distance:.2g} σ from the estimate of {count} parameters"
-    limit = f"95 % of correct models are within {found.allowed:.2g}"
-    worst = "; ".join(f"{name} (without it {left:.3g})" for name, left in found.blamed)
+def _consistency(possible: PossibleBodies, count: int) -> str:
+    head = f"consistent inertias {possible.distance:.2g} σ from the estimate of {count} parameters"
+    limit = f"95 % of correct models are within {possible.allowed:.2g}"
+    worst = "; ".join(f"{name} (without it {ratio:.3g})" for name, ratio in possible.blamed)
     return f"{head}; {limit}" + (f"; contradicted most by {worst}" if worst else "")
 
 
@@ -321,20 +324,20 @@ def _calibrated(robot: ParallelMechanism, folder: Path) -> _Source:
     Raises:
         UsageError: where the file has none.
     """
-    model = make_parallel_model(robot.known, ("",))
+    model = make_parallel_model(robot.mechanism, ("",))
     bodies = model.known_parameters()
     if bodies is None:
         raise UsageError(
             f"{robot.source} has no inertias, and simulators need masses: state them there, or export an identification"
         )
-    chain, named = _side_by_side(model, bodies)
-    known = next(find_prior_bodies(chain, named))
+    chain, arm = _side_by_side(model, bodies)
+    prior_bodies = next(find_prior_bodies(chain, arm))
     estimate = read_estimate(folder)
     covariance = read_covariance(folder / COVARIANCE)[1]
-    table = {key: [getattr(one, key[:-1]) for one in estimate] for key in ("names", "units", "values")}
-    drives = drive_table(Dynamics(named, np.zeros(model.p)))
-    notes = ("masses are those of the robot's file, not identified; no friction", *known.notes)
-    opened = OpenedRobot(model, known.parameters.ravel(), drives)
+    table = {key: [getattr(row, key[:-1]) for row in estimate] for key in ("names", "units", "values")}
+    drives = drive_table(Dynamics(arm, np.zeros(model.p)))
+    notes = ("masses are those of the robot's file, not identified; no friction", *prior_bodies.notes)
+    opened = OpenedRobot(model, prior_bodies.parameters.ravel(), drives)
     return _Source(opened, {"geometry": {**table, "covariance": covariance}}, notes)
 
 
@@ -357,30 +360,33 @@ def export_parallel(robot: ParallelMechanism, folder: Path, into: Path, prior: s
     check_export_target(
         into, [robot.source, *(folder / name for name in (ROBOT, METRICS, MODEL, ESTIMATE, COVARIANCE))]
     )
-    source = _identified(robot, folder, prior) if (folder / MODEL).is_file() else _calibrated(robot, folder)
+    if (folder / MODEL).is_file():
+        source = _identified(robot, folder, prior)
+    else:
+        source = _calibrated(robot, folder)
     opened, (level, verdict) = source.opened, _verdict(folder)
     remark = verdict if level in ("marginal", "fail") else ""
     texts = {URDF: opened.urdf(), MJCF: opened.mjcf()}
     for name, text in texts.items():
         _check(opened, text, name)
 
-    def write(place: Path) -> None:
-        robot.write(place)
+    def write(target: Path) -> None:
+        robot.write(target)
         for name, text in texts.items():
             if name == URDF:
                 content = with_comment(text.encode(), "its loops are closed by robot.yaml")
             else:
                 content = text.encode()
-            files.write(place / name, with_comment(content, remark) if remark else content)
-        files.write(place / CLOSURES, opened.closures())
-        write_drives(opened.joints, opened.drives, place / DRIVES)
-        files.write_json(place / PARAMETERS, {"robot": robot.chain.name, **source.parameters})
-        files.write(place / README, "\n".join([verdict or "verdict unknown", "", *_uses(), ""]))
+            files.write(target / name, with_comment(content, remark) if remark else content)
+        files.write(target / CLOSURES, opened.closures())
+        write_drives(opened.joints, opened.drives, target / DRIVES)
+        files.write_json(target / PARAMETERS, {"robot": robot.chain.name, **source.parameters})
+        files.write(target / README, "\n".join([verdict or "verdict unknown", "", *_uses(), ""]))
 
     write_staged(into, tuple(USES), write)
-    made = f"{URDF} ({len(opened.closing)} loops open, closed by {CLOSURES}), {MJCF} (loops closed)"
-    said = f"{made}; Pinocchio reads the same loops and forces to 1e-9"
-    return (*([remark] if remark else []), said, *source.notes)
+    files_written = f"{URDF} ({len(opened.closing)} loops open, closed by {CLOSURES}), {MJCF} (loops closed)"
+    message = f"{files_written}; Pinocchio reads the same loops and forces to 1e-9"
+    return (*([remark] if remark else []), message, *source.notes)
 
 
 def check_export_target(out: Path, inputs: Any = ()) -> None:
@@ -398,12 +404,12 @@ def _verdict(folder: Path) -> tuple[str, str]:
         table = json.loads((folder / METRICS).read_text(encoding="utf-8"))
     else:
         table = {}
-    own = table.get("verdict", "")
-    if isinstance(own, Mapping):
-        level = own["level"]
-        reason = own["reason"]
+    verdict = table.get("verdict", "")
+    if isinstance(verdict, Mapping):
+        level = verdict["level"]
+        reason = verdict["reason"]
     else:
-        level = own
+        level = verdict
         reason = table.get("reason", "")
     if level not in LEVELS:
         return "", ""
@@ -412,19 +418,22 @@ def _verdict(folder: Path) -> tuple[str, str]:
 
 def _check(opened: OpenedRobot, text: str, where: str, postures: int = 5) -> None:
     """Refuse a file if Pinocchio reads loops that do not close, or other forces on the platform, on random motion."""
-    known = opened.known
+    mechanism = opened.mechanism
     rng = np.random.default_rng(0)
-    r = opened.known.robot.r
+    r = opened.mechanism.robot.r
     mjcf = where.endswith(".xml")
-    posture = known.place(0.9 * rng.uniform(known.robot.lower, known.robot.upper, (postures, r)))
-    motion = of_platform(known, posture, *rng.uniform(-1.0, 1.0, (2, postures, r)))
+    posture = mechanism.place(0.9 * rng.uniform(mechanism.robot.lower, mechanism.robot.upper, (postures, r)))
+    motion = of_platform(mechanism, posture, *rng.uniform(-1.0, 1.0, (2, postures, r)))
     rigid = np.concatenate([opened.values[: opened.model.inertial], np.zeros(len(opened.model.terms))])
-    wanted = opened.model.platform_force(rigid, motion, ())
+    expected = opened.model.platform_force(rigid, motion, ())
     if mjcf:
-        wanted += np.einsum("ntr,nt->nr", motion.jacobians.joints, opened.drives.values[:, 0] * motion.a)
-    forces = np.zeros_like(wanted)
-    apart = 0.0
-    parts = _models(text) if mjcf else [pinocchio_model(text)]
+        expected += np.einsum("ntr,nt->nr", motion.jacobians.joints, opened.drives.values[:, 0] * motion.a)
+    forces = np.zeros_like(expected)
+    gap_size = 0.0
+    if mjcf:
+        parts = _models(text)
+    else:
+        parts = [pinocchio_model(text)]
     for m in range(postures):
         frames: dict[str, np.ndarray] = {}
         for model in parts:
@@ -432,12 +441,12 @@ def _check(opened: OpenedRobot, text: str, where: str, postures: int = 5) -> Non
         for leg in opened.closing:
             ends = (frames[f"{leg.name}_end" + "_tip" * mjcf], frames[f"{leg.name}_attachment"])
             gap = invert(ends[0]) @ ends[1] - np.eye(4)
-            apart = max(apart, float(np.abs(gap if leg.end == "rigid" else gap[:, 3]).max()))
-    if apart > MAX_DIFFERENCE:
+            gap_size = max(gap_size, float(np.abs(gap if leg.end == "rigid" else gap[:, 3]).max()))
+    if gap_size > MAX_DIFFERENCE:
         raise RobotError(
-            f"{where}: loops stay {apart:.2g} m (or rad) open when Pinocchio reads it; nothing was written"
+            f"{where}: loops stay {gap_size:.2g} m (or rad) open when Pinocchio reads it; nothing was written"
         )
-    off = float(np.abs(forces - wanted).max()) / max(1.0, float(np.abs(wanted).max()))
+    off = float(np.abs(forces - expected).max()) / max(1.0, float(np.abs(expected).max()))
     if off > MAX_DIFFERENCE:
         raise RobotError(f"{where}: forces differ by {off:.2g} of the largest when Pinocchio reads it; nothing written")
 
@@ -450,13 +459,13 @@ def _models(text: str) -> list[Any]:
     root = ET.fromstring(text)
     world = root.find("worldbody")
     assert world is not None
-    found = []
+    models = []
     for body in list(world):
-        one = ET.Element("mujoco", model=root.get("model", ""))
-        one.extend([*root.findall("compiler"), *root.findall("option"), world])
+        document = ET.Element("mujoco", model=root.get("model", ""))
+        document.extend([*root.findall("compiler"), *root.findall("option"), world])
         world[:] = [body]
-        found.append(pinocchio_model(xml_text(one), mjcf=True))
-    return found
+        models.append(pinocchio_model(xml_text(document), mjcf=True))
+    return models
 
 
 def _forces(opened: OpenedRobot, model: Any, motion: LoopMotion, m: int, frames: dict[str, np.ndarray]) -> np.ndarray:
@@ -465,15 +474,15 @@ def _forces(opened: OpenedRobot, model: Any, motion: LoopMotion, m: int, frames:
 
     pin: Any = pinocchio
     data = model.createData()
-    known = opened.known
-    model.gravity = pin.Motion(np.array(known.robot.gravity), np.zeros(3))
+    mechanism = opened.mechanism
+    model.gravity = pin.Motion(np.array(mechanism.robot.gravity), np.zeros(3))
     q = pin.neutral(model)
     v = np.zeros(model.nv)
     a = np.zeros(model.nv)
-    J = np.zeros((model.nv, known.robot.r))
-    for j, own in enumerate(opened.joints):
-        if model.existJointName(own.name):
-            joint = model.joints[model.getJointId(own.name)]
+    J = np.zeros((model.nv, mechanism.robot.r))
+    for j, drive in enumerate(opened.joints):
+        if model.existJointName(drive.name):
+            joint = model.joints[model.getJointId(drive.name)]
             value = motion.posture.q[m, j]
             if joint.nq == 1:
                 q[joint.idx_q : joint.idx_q + joint.nq] = [value]
@@ -484,20 +493,20 @@ def _forces(opened: OpenedRobot, model: Any, motion: LoopMotion, m: int, frames:
     for k, joint in enumerate(model.joints):
         if joint.nv == 6:
             pose = motion.posture.pose[m]
-            own = slice(joint.idx_v, joint.idx_v + 6)
+            drive = slice(joint.idx_v, joint.idx_v + 6)
             turn = np.kron(np.eye(2), pose[:3, :3].T)
             if "platform_floating" in model.names:
                 placed = model.jointPlacements[k].homogeneous
             else:
                 placed = np.eye(4)
             q[joint.idx_q : joint.idx_q + 7] = pin.SE3ToXYZQUAT(pin.SE3(invert(placed) @ pose))
-            v[own], a[own], J[own] = (
+            v[drive], a[drive], J[drive] = (
                 turn @ motion.twist[m],
                 turn @ motion.change[m],
                 turn @ motion.jacobians.platform[m],
             )
             # Pinocchio's accelerations are spatial
-            a[own] -= [*np.cross(v[own][3:], v[own][:3]), 0.0, 0.0, 0.0]
+            a[drive] -= [*np.cross(v[drive][3:], v[drive][:3]), 0.0, 0.0, 0.0]
     pin.framesForwardKinematics(model, data, q)
     frames.update({frame.name: data.oMf[k].homogeneous.copy() for k, frame in enumerate(model.frames)})
     return J.T @ pin.rnea(model, data, q, v, a)

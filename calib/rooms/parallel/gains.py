@@ -41,7 +41,7 @@ def drive_gains(
     robot: ParallelRobot,
     cases: Sequence[Case],
     settings: IdentificationSettings,
-    known: Mapping[str, float],
+    known_values: Mapping[str, float],
     reference: int | None,
 ) -> DriveGains:
     """Return the drive gains of a parallel robot; their sigmas are the larger of the residuals' and a jackknife's.
@@ -61,22 +61,22 @@ def drive_gains(
             "currents without gains: state gains = [...] (N m/A), or identify them with [gain_identification], runs "
             "without and with a payload of known mass"
         )
-    own = closed(robot)
-    model = model_of(own, replace(settings, torque_rows=rows_named(own, PLATFORM)))
+    mechanism = closed(robot)
+    model = model_of(mechanism, replace(settings, torque_rows=rows_named(mechanism, PLATFORM)))
     base = find_base(model, cases, bases.random_samples(model, seed=settings.seed))
     names = [model.names[k] for k in base.kept]
-    missing = [name for name in known if name not in names]
+    missing = [name for name in known_values if name not in names]
     if missing:
         raise UsageError(f"'{missing[0]}' is not separately identifiable here; was the payload attached?")
     decimator = common_decimator(cases, settings)
     rows = []
     squares = []
     noises = []
-    fixed = np.array([name in known for name in names])
-    given = np.array([known.get(name, 0.0) for name in names])
+    fixed = np.array([name in known_values for name in names])
+    drive_values = np.array([known_values.get(name, 0.0) for name in names])
     for case in cases:
         motion = case.motion
-        J = loop_jacobians(own, own.locate(motion.q)).readings.transpose(0, 2, 1)
+        J = loop_jacobians(mechanism, mechanism.locate(motion.q)).readings.transpose(0, 2, 1)
         currents = J * case.target[:, None]
         projected = replace(
             case,
@@ -84,13 +84,13 @@ def drive_gains(
             torque_rows=model.torque_rows,
             present=model.torque_rows.of_joints(case.present),
         )
-        seen = observe(model, base.kept, projected, decimator)
-        matrix = np.concatenate([decimate(currents, decimator, motion.segment), -seen.matrix[:, :, ~fixed]], axis=2)
+        row_set = observe(model, base.kept, projected, decimator)
+        matrix = np.concatenate([decimate(currents, decimator, motion.segment), -row_set.matrix[:, :, ~fixed]], axis=2)
         rows.append(
             replace(
-                seen,
+                row_set,
                 matrix=matrix,
-                target=seen.matrix @ given,
+                target=row_set.matrix @ drive_values,
                 names=(*robot.joint_names, *np.array(names)[~fixed]),
                 units=("",) * matrix.shape[2],
             )
@@ -101,24 +101,24 @@ def drive_gains(
     squares = noise * np.mean(squares, axis=0)
     folds = max(settings.folds, 2 * len(cases))
     data = triangulate(with_blocks(rows, folds))
-    found = _total_least_squares(data, squares, rows)
-    again = []
+    solution = _total_least_squares(data, squares, rows)
+    pseudo_values = []
     blocks = np.flatnonzero(data.rows.reshape(-1, len(squares)).any(axis=1)).tolist()
-    for left in blocks:
+    for block in blocks:
         # without the only run that carries the payload
         with suppress(NotConverged, Unidentifiable):
-            again.append(_total_least_squares(data, squares, rows, [k for k in blocks if k != left]).gains)
-    jackknife = np.sqrt((len(again) - 1) * np.var(again, axis=0))
-    wider = np.maximum(1.0, jackknife / np.sqrt(np.diag(found.covariance)))
+            pseudo_values.append(_total_least_squares(data, squares, rows, [k for k in blocks if k != block]).gains)
+    jackknife = np.sqrt((len(pseudo_values) - 1) * np.var(pseudo_values, axis=0))
+    wider = np.maximum(1.0, jackknife / np.sqrt(np.diag(solution.covariance)))
     values = np.zeros(len(names))
-    values[fixed], values[~fixed] = given[fixed], found.others
-    scale = ", ".join(f"{name} = {value:g}" for name, value in known.items())
+    values[fixed], values[~fixed] = drive_values[fixed], solution.remaining
+    scale = ", ".join(f"{name} = {value:g}" for name, value in known_values.items())
     return DriveGains(
-        frozen(found.gains),
-        frozen(found.covariance * np.outer(wider, wider)),
+        frozen(solution.gains),
+        frozen(solution.covariance * np.outer(wider, wider)),
         tuple(names),
         frozen(values),
-        frozen(np.sqrt(found.share * noise)),
+        frozen(np.sqrt(solution.share * noise)),
         scale,
     )
 
@@ -128,7 +128,7 @@ class _Solution(NamedTuple):
 
     gains: np.ndarray
     covariance: np.ndarray
-    others: np.ndarray
+    remaining: np.ndarray
     share: float
 
 
@@ -155,13 +155,13 @@ def _total_least_squares(
     for _ in range(max_rounds):
         gain = x[:n] / size[:n]
         scatter = squares @ gain**2
-        left = matrix @ x - target
+        residual = matrix @ x - target
         weigh = 1.0 / np.sqrt(scatter * tau)[:, None]
         slopes = matrix.copy()
-        slopes[:, :, :n] -= left[:, :, None] * (gain * squares / scatter[:, None] / size[:n])[:, None]
+        slopes[:, :, :n] -= residual[:, :, None] * (gain * squares / scatter[:, None] / size[:n])[:, None]
         flat = (slopes * weigh[:, :, None]).reshape(-1, len(x))
-        rest = (left * weigh).ravel()
-        step = np.linalg.lstsq(flat, -rest, rcond=1e-12)[0]
+        weighted = (residual * weigh).ravel()
+        step = np.linalg.lstsq(flat, -weighted, rcond=1e-12)[0]
         x = x + step
         if np.abs(step[:n]).max() < 1e-9 * np.abs(x[:n]).max():
             break
@@ -170,6 +170,6 @@ def _total_least_squares(
     if np.linalg.matrix_rank(flat, rtol=1e-10) < len(x):
         raise Unidentifiable("these runs do not identify the drive gains: record richer motion", data.names[:n])
     inverse = np.linalg.pinv(flat) / size[:-1, None]
-    variance = float(rest @ rest) / max((data.rows / tau).sum() - len(x), 1.0)
-    squared = np.sum(left**2 / scatter[:, None]) / max(data.rows.sum() - len(x), 1)
+    variance = float(weighted @ weighted) / max((data.rows / tau).sum() - len(x), 1.0)
+    squared = np.sum(residual**2 / scatter[:, None]) / max(data.rows.sum() - len(x), 1)
     return _Solution(x[:n] / size[:n], variance * (inverse @ inverse.T)[:n, :n], x[n:] / size[n:-1], float(squared))

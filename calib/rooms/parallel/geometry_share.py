@@ -1,6 +1,7 @@
 """Share of the geometry's uncertainty in the identified dynamics of a parallel robot.
 
-The estimator and its implicit derivative are those of serial arms (`calib.identification.geometry_uncertainty`). What
+The estimator and its implicit derivative are those of serial arms
+(`calib.identification.uncertainty.geometry_uncertainty`). What
 differs: a changed geometry moves every joint of the loops at the same encoder readings, and the torques' projection on
 the platform's coordinates,
 
@@ -19,9 +20,9 @@ import scipy.linalg
 
 from calib.data.signals.filtering import Decimator, decimate, spread
 from calib.dynamics.torque_rows import POWER
-from calib.identification.geometry_uncertainty import TILTS, GeometryUncertainty, solve_sensitivity
 from calib.identification.identify import Identification
 from calib.identification.rows import Case, power_block, segments
+from calib.identification.uncertainty.geometry_uncertainty import TILTS, GeometryUncertainty, solve_sensitivity
 from calib.records import frozen
 from calib.rooms.parallel.mechanism.closure import Posture, closed
 from calib.rooms.parallel.mechanism.geometric_fit import LoopCovariance, LoopParameter, changed, visible_directions
@@ -35,7 +36,7 @@ SAMPLES = 6000
 
 
 def propagate(
-    found: Identification[ParallelModel],
+    identification: Identification[ParallelModel],
     covariance: LoopCovariance,
     cases: Sequence[Case],
     torques: Callable[[Case], np.ndarray],
@@ -44,30 +45,31 @@ def propagate(
     """Return the covariance of identified parameters with the share of the geometry's covariance.
 
     Args:
-        found: the identification.
+        identification: with parallel-robot model.
         covariance: of the geometry that it was made on.
         cases: its training data; torques: of the actuators (N, n) in a case [N m or N].
 
     Raises:
         RobotError: for a covariance of another robot.
     """
-    known = found.dynamics.model.known
-    parameters = covariance.of(known)
-    differences = _Differences.of(found, parameters, torques)
-    matrix, felt, left = solve_sensitivity(found, cases, differences, SAMPLES, progress)
-    own = matrix[:, : len(parameters)]
+    mechanism = identification.dynamics.model.mechanism
+    parameters = covariance.of(mechanism)
+    differences = _Differences.of(identification, parameters, torques)
+    matrix, felt, residual = solve_sensitivity(identification, cases, differences, SAMPLES, progress)
+    slopes = matrix[:, : len(parameters)]
     deviations = np.sqrt(np.clip(np.diag(covariance.matrix), 0.0, None))
-    names, units = (tuple(getattr(one, key) for one in parameters) for key in ("name", "unit"))
+    names = tuple(parameter.name for parameter in parameters)
+    units = tuple(parameter.unit for parameter in parameters)
     return GeometryUncertainty(
-        found.names,
+        identification.names,
         (*names, *TILTS),
         (*units, *("rad" for _ in TILTS)),
         matrix,
-        found.fitted.estimate.covariance,
+        identification.fitted.estimate.covariance,
         np.append(np.where(deviations > 0.0, deviations, np.nan), np.full(len(TILTS), np.nan)),
-        frozen(own @ covariance.matrix @ own.T),
+        frozen(slopes @ covariance.matrix @ slopes.T),
         felt,
-        left,
+        residual,
     )
 
 
@@ -76,13 +78,13 @@ class _Differences:
     """Derivatives of an identification's residuals by the K constants of the loops and the tilts of gravity.
 
     Attributes:
-        found: the identification.
+        identification: with parallel-robot model.
         pairs: models on a geometry moved along a direction by `STEP`, and back.
         by_direction: (directions, K + 2) what each constant, and each tilt, is of the directions.
         torques: of the actuators (N, n) in a case.
     """
 
-    found: Identification[ParallelModel]
+    identification: Identification[ParallelModel]
     pairs: Sequence[tuple[ParallelModel, ParallelModel]]
     by_direction: np.ndarray
     torques: Callable[[Case], np.ndarray]
@@ -90,22 +92,22 @@ class _Differences:
     @classmethod
     def of(
         cls,
-        found: Identification[ParallelModel],
+        identification: Identification[ParallelModel],
         parameters: Sequence[LoopParameter],
         torques: Callable[[Case], np.ndarray],
     ) -> _Differences:
         """Return the derivatives by constants of the loops of an identification's robot."""
-        model = found.dynamics.model
-        directions = visible_directions(model.known, parameters)
+        model = identification.dynamics.model
+        directions = visible_directions(model.mechanism, parameters)
 
         def on(robot: ParallelRobot) -> ParallelModel:
-            return replace(model, known=closed(robot))
+            return replace(model, mechanism=closed(robot))
 
-        robot = model.known.robot
+        robot = model.mechanism.robot
         steps = STEP * directions.T
-        pairs = [(on(changed(robot, parameters, one)), on(changed(robot, parameters, -one))) for one in steps]
+        pairs = [(on(changed(robot, parameters, step)), on(changed(robot, parameters, -step))) for step in steps]
         pairs += [(on(robot.tilted(axis)), on(robot.tilted(-axis))) for axis in STEP * np.eye(3)[: len(TILTS)]]
-        return cls(found, pairs, np.array(scipy.linalg.block_diag(directions.T, np.eye(len(TILTS)))), torques)
+        return cls(identification, pairs, np.array(scipy.linalg.block_diag(directions.T, np.eye(len(TILTS)))), torques)
 
     def __call__(
         self, case: Case, span: slice, weighed: np.ndarray, decimator: Decimator
@@ -115,32 +117,34 @@ class _Differences:
         Args:
             weighed: (M, rows) R⁻¹ (y - W φ) of the rows that the samples make.
         """
-        kept = self.found.base.kept
-        values = self.found.fitted.estimate.values
-        rows = self.found.dynamics.model.rows
-        near = self.found.dynamics.model.known.locate(case.motion.q[span])
-        felt = spread(weighed if weighed.shape[1] == rows else weighed.sum(axis=1)[:, None], decimator, len(near))
-        change = np.empty((len(near), rows, len(self.pairs)))
-        pulled = np.empty((len(kept), len(self.pairs)))
+        columns = self.identification.base.kept
+        values = self.identification.fitted.estimate.values
+        rows = self.identification.dynamics.model.rows
+        posture = self.identification.dynamics.model.mechanism.locate(case.motion.q[span])
+        felt = spread(weighed if weighed.shape[1] == rows else weighed.sum(axis=1)[:, None], decimator, len(posture))
+        change = np.empty((len(posture), rows, len(self.pairs)))
+        pulled = np.empty((len(columns), len(self.pairs)))
         for k, pair in enumerate(self.pairs):
             ends = []
-            for own in pair:
-                W, target = self._observed(own, case, span, near)
+            for model in pair:
+                W, target = self._observed(model, case, span, posture)
                 ends.append((W @ values - target, np.einsum("nrp,nr->p", W, felt)))
-            change[:, :, k], pulled[:, k] = ((one - two) / (2.0 * STEP) for one, two in zip(*ends))
+            change[:, :, k], pulled[:, k] = ((upper - two) / (2.0 * STEP) for upper, two in zip(*ends))
         return decimate(change, decimator) @ self.by_direction, pulled @ self.by_direction
 
     def _observed(
-        self, model: ParallelModel, case: Case, span: slice, near: Posture
+        self, model: ParallelModel, case: Case, span: slice, posture: Posture
     ) -> tuple[np.ndarray, np.ndarray | float]:
         """Return W (N, rows, b), and the target (N, rows) where it depends on the geometry, else zero."""
-        kept = self.found.base.kept
+        columns = self.identification.base.kept
         if model.torque_rows.name == POWER.name:
-            whole = next(slice(a, b) for a, b in segments(case.motion.segment) if a <= span.start < b)
-            return power_block(model, kept, case, span, np.zeros((0, len(case.motion))), whole).T[:, None], 0.0
-        q, v, a = (np.asarray(x[span]) for x in (case.motion.q, case.motion.v, case.motion.a))
-        motion = model.moved(q, v, a, near)
-        W = model.on_rows(model.platform_regressor(motion, case.carried), motion)[:, :, kept]
+            segment = next(slice(a, b) for a, b in segments(case.motion.segment) if a <= span.start < b)
+            return power_block(model, columns, case, span, np.zeros((0, len(case.motion))), segment).T[:, None], 0.0
+        q = np.asarray(case.motion.q[span])
+        v = np.asarray(case.motion.v[span])
+        a = np.asarray(case.motion.a[span])
+        motion = model.moved(q, v, a, posture)
+        W = model.on_rows(model.platform_regressor(motion, case.carried), motion)[:, :, columns]
         if model.torque_rows.name != PLATFORM:
             return W, 0.0
         return W, np.einsum("nar,na->nr", motion.jacobians.readings, self.torques(case)[span])

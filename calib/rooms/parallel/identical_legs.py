@@ -20,35 +20,39 @@ from calib.identification.rows import Case, observe, pool, triangulate
 from calib.rooms.parallel.mechanism.parallel_model import ParallelModel
 
 
-def legs_differ(found: Identification[ParallelModel], cases: Sequence[Case], level: float = 0.001) -> list[Finding]:
+def legs_differ(
+    identification: Identification[ParallelModel], cases: Sequence[Case], level: float = 0.001
+) -> list[Finding]:
     """Return the finding that legs are not identical, with the parameters that differ most; none where they may be.
 
     Args:
         found: identification with identical legs; cases: its training data.
         level: probability of a finding on legs that are identical (our choice).
     """
-    one = found.dynamics.model
-    fitted = found.fitted
-    base = find_base(one.single, cases, bases.random_samples(one.single, seed=found.settings.seed))
-    decimator = common_decimator(cases, found.settings)
-    rows = [observe(one.single, base.kept, case, decimator) for case in cases]
+    model = identification.dynamics.model
+    fitted = identification.fitted
+    base = find_base(model.single, cases, bases.random_samples(model.single, seed=identification.settings.seed))
+    decimator = common_decimator(cases, identification.settings)
+    rows = [observe(model.single, base.kept, case, decimator) for case in cases]
     # power rows, weighed by recording
-    if len(fitted.std) != one.rows:
+    if len(fitted.std) != model.rows:
         rows = [part.by_recording(k, len(cases)) for k, part in enumerate(rows)]
     data = pool(triangulate(rows), len(fitted.std))
-    fits = [wls(own, fitted.std, fitted.inflation).estimate for own in (fitted.pooled, data)]
+    fits = [wls(data_, fitted.std, fitted.inflation).estimate for data_ in (fitted.pooled, data)]
     squares = [
-        np.sum(own.residual_squares(fit.values) / fitted.std**2 / fitted.inflation)
-        for own, fit in zip((fitted.pooled, data), fits)
+        np.sum(data_.residual_squares(fit.values) / fitted.std**2 / fitted.inflation)
+        for data_, fit in zip((fitted.pooled, data), fits)
     ]
-    more = data.parameters - fitted.pooled.parameters
-    left = fits[1].dof
-    f = (squares[0] - squares[1]) / max(more, 1) / (squares[1] / left)
-    p = float(fdtrc(more, left, max(f, 0.0))) if more else 1.0
+    added = data.parameters - fitted.pooled.parameters
+    dof = fits[1].dof
+    f = (squares[0] - squares[1]) / max(added, 1) / (squares[1] / dof)
+    p = 1.0
+    if added:
+        p = float(fdtrc(added, dof, max(f, 0.0)))
     if p >= level:
         return []
-    alike = base.transform @ one.spread(found.base.to_standard(fits[0].values[: found.base.b]))
-    shared = np.bincount(one.owners)[one.owners[base.kept]] > 1
+    alike = base.transform @ model.spread(identification.base.to_standard(fits[0].values[: identification.base.b]))
+    shared = np.bincount(model.owners)[model.owners[base.kept]] > 1
     away = np.where(shared, np.abs(fits[1].values - alike) / fits[1].sigma, 0.0)
     names = [f"{base.names[k]} ({away[k]:.2g} σ)" for k in np.argsort(-away)[: shared.sum()]]
     return [finding("legs-differ", p=p, names=names)]

@@ -94,9 +94,9 @@ def identify_parallel(
         MeasurementError: for recordings that cannot be right.
     """
     options = options or IdentifyOptions()
-    known = robot.known
-    asked = options.settings.torque_rows.name
-    rows = rows_named(known, "" if asked == "motor" else asked)
+    mechanism = robot.mechanism
+    row_kind = options.settings.torque_rows.name
+    rows = rows_named(mechanism, "" if row_kind == "motor" else row_kind)
     chosen = {key: value for key, value in (("method", method), ("friction", friction)) if value is not None}
     options = replace(options, settings=replace(options.settings, torque_rows=rows, seed=seed, **chosen))
     refuse_options_of_arms(options.settings, options)
@@ -104,34 +104,37 @@ def identify_parallel(
     inputs = gather(robot, recordings, validate, options=options, seed=seed, designed=designed, progress=progress)
     if on_read is not None:
         on_read(inputs)
-    model = model_of(known, settings)
-    found: Any = identify_model(model, inputs.cases, settings, cad=model.known_parameters(), progress=progress)
-    noticed = [*_payloads(model, found, inputs.cases)]
+    model = model_of(mechanism, settings)
+    identification: Any = identify_model(model, inputs.cases, settings, cad=model.known_parameters(), progress=progress)
+    noticed = [*_payloads(model, identification, inputs.cases)]
     if settings.identical_legs:
-        noticed += legs_differ(found, inputs.cases)
-    if known.robot.redundant:
-        noticed.append(finding("torques-projected", actuators=known.robot.n, freedoms=known.robot.r))
-        preloads = [_preload(known, inputs, case) for case in inputs.cases]
-        noticed += [one for own in preloads for one in own]
-        mean = np.mean([[one.values["mean"] for one in own] for own in preloads], axis=0)
-        found = replace(found, dynamics=replace(found.dynamics, model=replace(model, preload=tuple(mean.tolist()))))
-    noticed = (*parameter_findings(found), *found.loop.findings, *settle(noticed))
-    findings = ModelFindings(resting_parameters(found), noticed=noticed)
-    judged = assess(inputs, found, findings)
+        noticed += legs_differ(identification, inputs.cases)
+    if mechanism.robot.redundant:
+        noticed.append(finding("torques-projected", actuators=mechanism.robot.n, freedoms=mechanism.robot.r))
+        preloads = [_preload(mechanism, inputs, case) for case in inputs.cases]
+        noticed += [item for preload in preloads for item in preload]
+        mean = np.mean([[item.values["mean"] for item in preload] for preload in preloads], axis=0)
+        identification = replace(
+            identification,
+            dynamics=replace(identification.dynamics, model=replace(model, preload=tuple(mean.tolist()))),
+        )
+    noticed = (*parameter_findings(identification), *identification.loop.findings, *settle(noticed))
+    findings = ModelFindings(resting_parameters(identification), noticed=noticed)
+    assessment = assess(inputs, identification, findings)
     carried = None
     if robot.covariance is not None:
-        (progress or (lambda words: None))("the geometry's share of the covariance")
-        carried = propagate(found, robot.covariance, inputs.cases, partial(actuator_torques, inputs), progress)
+        (progress or (lambda message: None))("the geometry's share of the covariance")
+        carried = propagate(identification, robot.covariance, inputs.cases, partial(actuator_torques, inputs), progress)
     return ParallelDynamics(
-        **vars(judged), inputs=inputs, found=found, findings=findings, carried=carried, seed=settings.seed
+        **vars(assessment), inputs=inputs, found=identification, findings=findings, carried=carried, seed=settings.seed
     )
 
 
-def model_of(known: ClosedRobot, settings: IdentificationSettings) -> ParallelModel:
+def model_of(mechanism: ClosedRobot, settings: IdentificationSettings) -> ParallelModel:
     """Return the model of a robot that the settings ask for, with their torque rows."""
     v0 = per_joint(settings.v0, 1, "v0")[0]
     return make_parallel_model(
-        known,
+        mechanism,
         settings.sets,
         v0,
         settings.torque_rows,
@@ -147,12 +150,14 @@ def actuator_torques(inputs: IdentificationInputs, case: Case) -> np.ndarray:
     return np.asarray(case.motion.effort if gains is None else case.motion.effort * gains)
 
 
-def _preload(known: ClosedRobot, inputs: IdentificationInputs, case: Case) -> list[Finding]:
+def _preload(mechanism: ClosedRobot, inputs: IdentificationInputs, case: Case) -> list[Finding]:
     """Return findings on the overconstraint of redundant actuators in a recording: mean with sigma, and spread."""
-    jacobians = loop_jacobians(known, known.locate(case.motion.q))
-    own = overconstraint(known, jacobians, actuator_torques(inputs, case))
-    own = case.motion.in_band(own)[:: case.motion.decimator.factor]
-    unit = "N" if known.robot.joints[0].kind == "prismatic" else "N m"
+    jacobians = loop_jacobians(mechanism, mechanism.locate(case.motion.q))
+    forces = overconstraint(mechanism, jacobians, actuator_torques(inputs, case))
+    forces = case.motion.in_band(forces)[:: case.motion.decimator.factor]
+    unit = "N m"
+    if mechanism.robot.joints[0].kind == "prismatic":
+        unit = "N"
     return [
         finding(
             "preload",
@@ -163,75 +168,79 @@ def _preload(known: ClosedRobot, inputs: IdentificationInputs, case: Case) -> li
             unit=unit,
             sigma=x.std() * np.sqrt(inflation(x) / len(x)),
         )
-        for k, x in enumerate(own.T, 1)
+        for k, x in enumerate(forces.T, 1)
     ]
 
 
-def assess(inputs: IdentificationInputs, found: Identification[RegressorModel], findings: ModelFindings) -> Assessment:
+def assess(
+    inputs: IdentificationInputs, identification: Identification[RegressorModel], findings: ModelFindings
+) -> Assessment:
     """Return the prediction errors of a model on all recordings, with the verdict and its findings."""
-    model = found.dynamics.model
+    model = identification.dynamics.model
     cases = inputs.cases
     unseen = inputs.unseen
     assert isinstance(model, ParallelModel)
-    errors = errors_of(inputs, found.dynamics)
-    verdict, rules = _judged(model, found, cases, errors)
+    errors = errors_of(inputs, identification.dynamics)
+    verdict, rules = _judged(model, identification, cases, errors)
     noticed = (
         *rules,
         *motion_findings(errors.validation, errors.repeated),
         *findings.noticed,
-        *settle(_encoders(model.known, (*cases, *unseen))),
+        *settle(_encoders(model.mechanism, (*cases, *unseen))),
     )
     notes = (*lines_of(noticed), *excitation_notes(errors.excitation), *findings.notes)
     return Assessment(**vars(errors), verdict=verdict, warnings=notes, noticed=noticed)
 
 
 def _judged(
-    model: ParallelModel, found: Identification[RegressorModel], cases: Sequence[Case], errors: Errors
+    model: ParallelModel, identification: Identification[RegressorModel], cases: Sequence[Case], errors: Errors
 ) -> tuple[Verdict, list[Finding]]:
-    drives = friction_drives(_driven_joints(model, found, cases), "a payload that the options do not name")
+    drives = friction_drives(_driven_joints(model, identification, cases), "a payload that the options do not name")
     if drives:
         return Verdict.of("", drives), drives
-    labels = found.settings.torque_rows.titles(model.known.robot.joint_names)
+    labels = identification.settings.torque_rows.titles(model.mechanism.robot.joint_names)
     kind = "platform" if model.torque_rows.name == PLATFORM else "joint"
     figures, rules = judge(errors.fit, errors.proofs, errors.repeated, errors.excitation, labels, kind)
-    verdict = with_prior(Verdict.of(figures, rules), resting_parameters(found))
+    verdict = with_prior(Verdict.of(figures, rules), resting_parameters(identification))
     return with_duration(verdict, errors.excitation), rules
 
 
 def _driven_joints(
-    model: ParallelModel, found: Identification[RegressorModel], cases: Sequence[Case]
+    model: ParallelModel, identification: Identification[RegressorModel], cases: Sequence[Case]
 ) -> tuple[str, ...]:
     """Return the names of joints whose identified friction would drive the motion: a wrong sign of power."""
-    joints = [joint.name for leg in model.known.robot.legs for joint in leg.chain.joints]
-    friction = np.array([False] * model.inertial + [one.form.dissipative for one in model.columns])
-    values = np.where(friction, found.dynamics.values, 0.0)
-    taken = np.zeros(len(joints))
-    moved = 0.0
+    joints = [joint.name for leg in model.mechanism.robot.legs for joint in leg.chain.joints]
+    friction = np.array([False] * model.inertial + [column.form.dissipative for column in model.columns])
+    values = np.where(friction, identification.dynamics.values, 0.0)
+    energy = np.zeros(len(joints))
+    total = 0.0
     for case in cases:
-        every = max(1, len(case.motion) // (10 * MAX_SAMPLES))
-        q, v, a = (getattr(case.motion, key)[::every] for key in "qva")
+        step = max(1, len(case.motion) // (10 * MAX_SAMPLES))
+        q, v, a = (getattr(case.motion, key)[::step] for key in "qva")
         motion = model.moved(q, v, a)
-        target = case.target[::every]
+        target = case.target[::step]
         if case.torque_rows.name == PLATFORM:
             speeds = motion.rate
         else:
-            speeds = v if target.shape[1] == model.n else 1.0
-        moved += np.abs((target * speeds).sum(axis=1)).sum()
-        taken += (model.tree_torque(values, motion) * motion.v).sum(axis=0)
-    return tuple(name for name, own in zip(joints, taken) if own < MIN_ENERGY_SHARE * moved)
+            speeds = 1.0
+            if target.shape[1] == model.n:
+                speeds = v
+        total += np.abs((target * speeds).sum(axis=1)).sum()
+        energy += (model.tree_torque(values, motion) * motion.v).sum(axis=0)
+    return tuple(name for name, joint_energy in zip(joints, energy) if joint_energy < MIN_ENERGY_SHARE * total)
 
 
 def refuse_options_of_arms(settings: IdentificationSettings, options: IdentifyOptions) -> None:
     """Raise an error for settings and options that apply to serial arms only."""
-    read = {each.name for each in fields(settings)} - OF_ARMS
+    read = {field.name for field in fields(settings)} - OF_ARMS
     refuse_unread(settings, IdentificationSettings(), read, options.source)
     if settings.friction not in ("auto", "standard"):
         raise UsageError(f"friction = '{settings.friction}': a parallel robot has standard friction only (Fv Fc off)")
     method = method_named(settings.method)
     if _of_arms(method):
-        what = "simulates" if method.needs_simulation else "differentiates the torques of"
-        known = ", ".join(name for name, one in METHODS.items() if not _of_arms(one))
-        raise UsageError(f"method '{method.name}' {what} a serial arm; parallel robots take {known}")
+        activity = "simulates" if method.needs_simulation else "differentiates the torques of"
+        accepted = ", ".join(name for name, candidate in METHODS.items() if not _of_arms(candidate))
+        raise UsageError(f"method '{method.name}' {activity} a serial arm; parallel robots take {accepted}")
 
 
 def _of_arms(method: Method) -> bool:
@@ -239,26 +248,28 @@ def _of_arms(method: Method) -> bool:
     return method.name in ("ml", "gtls") or (method.needs_simulation and method.name not in SIMULATED)
 
 
-def _encoders(known: ClosedRobot, cases: Sequence[Case]) -> Iterator[Finding]:
+def _encoders(mechanism: ClosedRobot, cases: Sequence[Case]) -> Iterator[Finding]:
     """Yield findings on contradictory redundant encoders, and on columns of passive joints that are not used."""
-    robot = known.robot
+    robot = mechanism.robot
     passive = [joint.name for leg in robot.legs for joint in leg.chain.joints if joint.name not in robot.joint_names]
     for case in cases:
         q = case.motion.q[:: max(1, len(case.motion) // MAX_SAMPLES)]
         if robot.redundant:
-            apart = float(np.sqrt(np.mean((q - known.locate(q).q[:, robot.actuated]) ** 2)))
+            difference = float(np.sqrt(np.mean((q - mechanism.locate(q).q[:, robot.actuated]) ** 2)))
         else:
-            apart = 0.0
-        yield finding("encoders-contradict", file=case.name, count=robot.n, rms=apart)
+            difference = 0.0
+        yield finding("encoders-contradict", file=case.name, count=robot.n, rms=difference)
         unread = " ".join(note for note in case.motion.notes if note.startswith("not read: "))
-        named = [name for name in passive if name in unread]
-        if named:
-            yield finding("passive-joints-unread", file=case.name, joints=named)
+        unread_names = [name for name in passive if name in unread]
+        if unread_names:
+            yield finding("passive-joints-unread", file=case.name, joints=unread_names)
 
 
-def _payloads(model: ParallelModel, found: Identification[Any], cases: Sequence[Case]) -> Iterator[Finding]:
+def _payloads(model: ParallelModel, identification: Identification[Any], cases: Sequence[Case]) -> Iterator[Finding]:
     """Yield findings on each payload: always or never attached in the recordings, or identified with negative mass."""
-    masses = dict(zip(found.base.names, zip(found.fitted.estimate.values, found.fitted.estimate.sigma)))
+    masses = dict(
+        zip(identification.base.names, zip(identification.fitted.estimate.values, identification.fitted.estimate.sigma))
+    )
     for label in model.payloads:
         on = sum(label in case.carried for case in cases)
         if on in (0, len(cases)):

@@ -66,37 +66,37 @@ class ParallelFit(Drawn, Judged):
         nominal: the robot before.
         files: that were read.
         rows: (m, n) encoder readings that were fitted, or (m, n + r) with the platform's coordinates behind them.
-        found: the calibration.
-        own: errors on the fitted rows, nominal and calibrated (2, m, k): platform coordinates; or what encoders
+        fit: the calibration.
+        errors: on the fitted rows, nominal and calibrated (2, m, k): platform coordinates; or what encoders
             contradict each other by.
         unseen: the same of unseen rows, by name.
-        kept: the unseen rows themselves, by name, but those of a cross-validation.
+        unseen_rows: the unseen rows themselves, by name, but those of a cross-validation.
         settings: what was asked for.
     """
 
     nominal: ParallelMechanism
     files: tuple[Path, ...]
     rows: np.ndarray
-    found: LoopFit
-    own: np.ndarray
+    fit: LoopFit
+    errors: np.ndarray
     unseen: Mapping[str, np.ndarray]
-    kept: Mapping[str, np.ndarray]
+    unseen_rows: Mapping[str, np.ndarray]
     settings: FitSettings
 
     @property
     def robot(self) -> ParallelMechanism:
         """The calibrated robot, as input of identification, excitation and planning."""
-        return ParallelMechanism(self.found.known, self.nominal.source, LoopCovariance.fitted(self.found))
+        return ParallelMechanism(self.fit.mechanism, self.nominal.source, LoopCovariance.fitted(self.fit))
 
     @property
     def estimate(self) -> Estimate:
         """Changes of the loops' constants [m, rad] with their covariance."""
-        return self.found.estimate
+        return self.fit.estimate
 
     @property
     def verdict(self) -> Verdict:
         """Pass, marginal or fail, with the reason (rules: see the module; limits: catalogue of findings)."""
-        kinds = {"contradictions": (np.ones(self.own.shape[2], dtype=bool), "mrad (or mm)")}
+        kinds = {"contradictions": (np.ones(self.errors.shape[2], dtype=bool), "mrad (or mm)")}
         figures = []
         rules = [finding("readings-alone")]
         if self.measured:
@@ -106,18 +106,18 @@ class ParallelFit(Drawn, Judged):
         for (where, errors), (kind, (columns, unit)) in product(self.unseen.items(), kinds.items()):
             if not columns.any():
                 continue
-            before, after = (_rms(one[:, columns]) for one in errors)
+            before, after = (_rms(error[:, columns]) for error in errors)
             figures.append(f"{kind} {1e3 * after:.3g} {unit} rms on {where} rows (nominal {1e3 * before:.3g})")
             tolerance = self.settings.tolerance
             if tolerance is not None and kind == "position":
                 rules.append(finding("above-tolerance", tolerance=tolerance, times=after / tolerance))
                 figures[-1] += f", tolerance {1e3 * tolerance:g} mm"
-            left = after / max(before, 1e-300)
-            times = after / max(_rms(self.own[1][:, columns]), 1e-300)
+            share = after / max(before, 1e-300)
+            times = after / max(_rms(self.errors[1][:, columns]), 1e-300)
             rules += [
-                finding("worse-than-nominal", times=left),
+                finding("worse-than-nominal", times=share),
                 finding("no-transfer", times=times, remedy=""),
-                finding("small-gain", left=left),
+                finding("small-gain", left=share),
             ]
         return Verdict.of("; ".join(figures), rules if figures else [finding("no-unseen-poses")])
 
@@ -131,12 +131,12 @@ class ParallelFit(Drawn, Judged):
         """Names of the error components."""
         if self.measured:
             return self.nominal.chain.freedom
-        return tuple(f"contradiction {k + 1}" for k in range(self.own.shape[2]))
+        return tuple(f"contradiction {k + 1}" for k in range(self.errors.shape[2]))
 
     @property
     def judged(self) -> Mapping[str, np.ndarray]:
         """Errors of the unseen rows by name or, without unseen rows, of the fitted rows."""
-        return self.unseen or {"fitted": self.own}
+        return self.unseen or {"fitted": self.errors}
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
@@ -144,14 +144,14 @@ class ParallelFit(Drawn, Judged):
         # slow to load, as all reports
         from calib.rooms.parallel import loop_report
 
-        found = self.estimate
+        estimate = self.estimate
 
         def write(folder: Path) -> None:
-            words = f"calibrated from {self.nominal.source}"
-            read = {"files": [str(each) for each in self.files]}
-            parallel_robot.write(folder / ROBOT, self.robot.chain, words, read)
+            origin = f"calibrated from {self.nominal.source}"
+            read = {"files": [str(file) for file in self.files]}
+            parallel_robot.write(folder / ROBOT, self.robot.chain, origin, read)
             files.write_table(folder / ESTIMATE, HEADER, list(self._table()))
-            write_covariance(folder / COVARIANCE, found.names, found.covariance)
+            write_covariance(folder / COVARIANCE, estimate.names, estimate.covariance)
             files.write_table(folder / RESIDUALS, *self._residuals())
             self.robot.write_covariance(folder)
             loop_report.write(self, folder, plots)
@@ -168,25 +168,27 @@ class ParallelFit(Drawn, Judged):
         return {name: chart for name, (chart, _) in captioned(report_of(self)).items()}
 
     def _table(self) -> Iterator[tuple[str, str, float, float]]:
-        found = self.estimate
-        return zip(found.names, found.units, found.values.tolist(), found.sigma.tolist())
+        estimate = self.estimate
+        return zip(estimate.names, estimate.units, estimate.values.tolist(), estimate.sigma.tolist())
 
     def _residuals(self) -> tuple[list[str], list[list[object]]]:
         """Return header and rows of ``residuals.csv``: readings, measured coordinates, and errors of both robots."""
         robot = self.nominal.chain
-        scale = np.ones(self.own.shape[2])
+        scale = np.ones(self.errors.shape[2])
         rows = []
         head = ["set", *(f"{joint.name} [{joint.unit}]" for joint in robot.joints)]
         if self.measured:
             scale = np.where(robot.selected < 3, 1e3, np.degrees(1.0))
-            named = [f"{name} [{'mm' if k < 3 else 'deg'}]" for name, k in zip(robot.freedom, robot.selected)]
-            head += [*named, *(f"d{name}" for name in named), *(f"nominal d{name}" for name in named)]
+            headings = [f"{name} [{'mm' if k < 3 else 'deg'}]" for name, k in zip(robot.freedom, robot.selected)]
+            head += [*headings, *(f"d{name}" for name in headings), *(f"nominal d{name}" for name in headings)]
         else:
             head += [*self.columns, *(f"nominal {name}" for name in self.columns)]
-        parts = {"fit": (self.rows, self.own)} | {name: (own, self.unseen[name]) for name, own in self.kept.items()}
-        for name, (given, (before, after)) in parts.items():
-            readings = given[:, : robot.n]
-            coordinates = scale * given[:, robot.n :]
+        parts = {"fit": (self.rows, self.errors)} | {
+            name: (unseen_rows, self.unseen[name]) for name, unseen_rows in self.unseen_rows.items()
+        }
+        for name, (table_rows, (before, after)) in parts.items():
+            readings = table_rows[:, : robot.n]
+            coordinates = scale * table_rows[:, robot.n :]
             table = np.hstack([readings, coordinates, scale * after, scale * before])
             rows += [[name, *row] for row in table.tolist()]
         return head, rows
@@ -197,22 +199,22 @@ class ParallelFit(Drawn, Judged):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of ``metrics.json``."""
-        found = self.found
+        fit = self.fit
         verdict = self.verdict
-        both = np.concatenate(list(self.judged.values()), axis=1)
+        all_errors = np.concatenate(list(self.judged.values()), axis=1)
         errors = {
             key: dict(zip(self.columns, row.tolist()))
-            for key, row in zip(("nominal", "calibrated"), np.sqrt(np.mean(both**2, axis=1)))
+            for key, row in zip(("nominal", "calibrated"), np.sqrt(np.mean(all_errors**2, axis=1)))
         }
         return {
             "robot": self.nominal.chain.name,
-            "parameters": len(found.parameters),
-            "not_told": list(found.vague),
-            "reading_rms": {"nominal": found.before, "calibrated": found.after},
+            "parameters": len(fit.parameters),
+            "not_told": list(fit.vague),
+            "reading_rms": {"nominal": fit.before, "calibrated": fit.after},
             "platform_rms": errors if self.measured else None,
             "contradiction_rms": None if self.measured else errors,
             "judged_on": ", ".join(self.judged),
-            "iterations": found.iterations,
+            "iterations": fit.iterations,
             "verdict": {"level": verdict.level, "reason": verdict.reason},
         }
 
@@ -220,12 +222,12 @@ class ParallelFit(Drawn, Judged):
         """Return errors on unseen rows and the verdict as a section of a report."""
         from calib.procedure.report.page import Section, Text
 
-        found = self.found
+        fit = self.fit
         verdict = self.verdict
-        identified = len(found.parameters) - len(found.vague)
+        identified = len(fit.parameters) - len(fit.vague)
         lines = [
-            f"{self.nominal.chain.name}: {identified} of {len(found.parameters)} constants of the loops identified; "
-            f"encoders off by {found.before:.3g}, calibrated by {found.after:.3g} (rms, rad or m)"
+            f"{self.nominal.chain.name}: {identified} of {len(fit.parameters)} constants of the loops identified; "
+            f"encoders off by {fit.before:.3g}, calibrated by {fit.after:.3g} (rms, rad or m)"
         ]
         for where, errors in self.judged.items():
             for name, (before, after) in zip(self.columns, 1e3 * np.sqrt(np.mean(errors**2, axis=1)).T):
@@ -242,12 +244,12 @@ class ParallelFit(Drawn, Judged):
     def with_unseen(self, unseen: Sequence[str | Path]) -> ParallelFit:
         """Return the same fit with a verdict on additional unseen files, without refitting."""
         validate = _paths(unseen)
-        proofs = {name: self.unseen[name] for name in self.kept}
-        kept = dict(self.kept)
+        proofs = {name: self.unseen[name] for name in self.unseen_rows}
+        unseen_rows = dict(self.unseen_rows)
         for path, rows in zip(validate, _read(self.nominal.chain, validate, self.rows.shape[1])):
             name = f"{path.name}, unseen"
-            proofs[name], kept[name] = _errors(self.nominal.known, self.found.known, rows), rows
-        return replace(self, unseen=proofs, kept=kept, files=(*self.files, *validate))
+            proofs[name], unseen_rows[name] = _errors(self.nominal.mechanism, self.fit.mechanism, rows), rows
+        return replace(self, unseen=proofs, unseen_rows=unseen_rows, files=(*self.files, *validate))
 
 
 def check_fit_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
@@ -275,39 +277,43 @@ def fit_parallel(
         MeasurementError: for columns that are missing, or rows that no posture reaches.
         Unidentifiable: for readings alone of a robot without redundant encoders.
     """
-    say = progress or (lambda words: None)
+    say = progress or (lambda message: None)
     settings = settings or FitSettings()
-    known = robot.known
+    mechanism = robot.mechanism
     measured = _paths(measured)
     validate = _paths(validate)
-    held = _held(known, settings, options or FitOptions())
-    tables = _read(known.robot, (*measured, *validate))
+    fixed = _held(mechanism, settings, options or FitOptions())
+    tables = _read(mechanism.robot, (*measured, *validate))
     rows = np.concatenate(tables[: len(measured)])
-    kept = {f"{path.name}, unseen": own for path, own in zip(validate, tables[len(measured) :]) if len(own)}
-    if settings.tolerance is not None and not (rows.shape[1] > known.robot.n and (known.robot.selected < 3).any()):
+    unseen_rows = {
+        f"{path.name}, unseen": table for path, table in zip(validate, tables[len(measured) :]) if len(table)
+    }
+    if settings.tolerance is not None and not (
+        rows.shape[1] > mechanism.robot.n and (mechanism.robot.selected < 3).any()
+    ):
         raise UsageError("a tolerance needs a measured platform position; none was measured")
     if settings.holdout:
         order = np.random.default_rng(settings.seed).permutation(len(rows))
         count = len(rows) - round(settings.holdout * len(rows))
         held_out = rows[order[count:]]
         rows = rows[order[:count]]
-        kept |= {"held out, unseen": held_out} if len(held_out) else {}
+        unseen_rows |= {"held out, unseen": held_out} if len(held_out) else {}
     say("fitting")
     try:
-        found = fit_loops(known, *_parts(known, rows), held=held)
+        fit = fit_loops(mechanism, *_parts(mechanism, rows), fixed=fixed)
         say("judging")
-        proofs = {name: _errors(known, found.known, own) for name, own in kept.items()}
-        own = _errors(known, found.known, rows)
+        proofs = {name: _errors(mechanism, fit.mechanism, fit_errors) for name, fit_errors in unseen_rows.items()}
+        fit_errors = _errors(mechanism, fit.mechanism, rows)
     except NoPosture as error:
         raise MeasurementError(f"{error}", measured[0]) from error
     if not proofs:
-        proofs = _cross_validated(known, rows, held, settings.seed)
-    return ParallelFit(robot, (*measured, *validate), rows, found, own, proofs, kept, settings)
+        proofs = _cross_validated(mechanism, rows, fixed, settings.seed)
+    return ParallelFit(robot, (*measured, *validate), rows, fit, fit_errors, proofs, unseen_rows, settings)
 
 
 def _paths(measured: Sequence[object]) -> tuple[Path, ...]:
-    if all(isinstance(one, (str, Path)) for one in measured):
-        return tuple(Path(str(one)) for one in measured)
+    if all(isinstance(item, (str, Path)) for item in measured):
+        return tuple(Path(str(item)) for item in measured)
     raise UsageError("a parallel robot's measurements are CSV files (calib formats parallel), not values in memory")
 
 
@@ -339,11 +345,11 @@ def read_coordinates(table: Table, robot: ParallelRobot) -> np.ndarray:
     return np.column_stack(columns)
 
 
-def _held(known: ClosedRobot, settings: FitSettings, options: FitOptions) -> tuple[str, ...]:
+def _held(mechanism: ClosedRobot, settings: FitSettings, options: FitOptions) -> tuple[str, ...]:
     """Return the names of fixed constants; raise an error for options that apply to serial arms only."""
     refuse_unread(settings, FitSettings(), READ)
     refuse_unread(options, FitOptions(), ("source", "fix"), options.source)
-    names = [one.name for one in loop_parameters(known)]
+    names = [parameter.name for parameter in loop_parameters(mechanism)]
     for name in options.fix:
         if name not in names:
             refuse_option(options.source, f"fix '{name}' is not a constant of the loops{suggestion(name, names)}")
@@ -359,9 +365,9 @@ def _read(robot: ParallelRobot, paths: Sequence[Path], width: int = 0) -> list[n
     return tables
 
 
-def _parts(known: ClosedRobot, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+def _parts(mechanism: ClosedRobot, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     """Return the readings (m, n) of rows, and the platform's coordinates (m, r) or None."""
-    n = known.robot.n
+    n = mechanism.robot.n
     return rows[:, :n], rows[:, n:] if rows.shape[1] > n else None
 
 
@@ -369,24 +375,26 @@ def _errors(nominal: ClosedRobot, calibrated: ClosedRobot, rows: np.ndarray) -> 
     """Return the errors (2, m, k) of nominal and calibrated robot: platform coordinates, or `contradictions`."""
     readings, coordinates = _parts(nominal, rows)
     if coordinates is None:
-        return np.array([contradictions(known, readings) for known in (nominal, calibrated)])
-    return np.array([platform_errors(known, readings, coordinates) for known in (nominal, calibrated)])
+        return np.array([contradictions(mechanism, readings) for mechanism in (nominal, calibrated)])
+    return np.array([platform_errors(mechanism, readings, coordinates) for mechanism in (nominal, calibrated)])
 
 
-def _cross_validated(known: ClosedRobot, rows: np.ndarray, held: Sequence[str], seed: int) -> dict[str, np.ndarray]:
+def _cross_validated(
+    mechanism: ClosedRobot, rows: np.ndarray, fixed: Sequence[str], seed: int
+) -> dict[str, np.ndarray]:
     """Return the cross-validated errors of all rows; empty if a fold cannot be fitted."""
     # of the rows, where none are unseen
     folds_wanted = 4
     folds = np.array_split(np.random.default_rng(seed).permutation(len(rows)), folds_wanted)
-    found = []
-    for k, own in enumerate(folds):
-        rest = rows[np.concatenate(folds[:k] + folds[k + 1 :])]
+    errors = []
+    for k, fold in enumerate(folds):
+        training = rows[np.concatenate(folds[:k] + folds[k + 1 :])]
         try:
-            fitted = fit_loops(known, *_parts(known, rest), held=held)
-            found.append(_errors(known, fitted.known, rows[own]))
+            fitted = fit_loops(mechanism, *_parts(mechanism, training), fixed=fixed)
+            errors.append(_errors(mechanism, fitted.mechanism, rows[fold]))
         except CalibError:
             return {}
-    return {LEFT_OUT: np.concatenate(found, axis=1)}
+    return {LEFT_OUT: np.concatenate(errors, axis=1)}
 
 
 def _rms(errors: np.ndarray) -> float:

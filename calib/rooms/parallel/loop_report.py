@@ -16,7 +16,6 @@ from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.report import fit_report
 from calib.procedure.report.fit_report import CorrelatedPair, FittedParameter, Report, RowErrors
-from calib.procedure.report.outputs import FIT_PAGES
 from calib.rooms.parallel.mechanism.geometric_fit import LEFT_OUT, LoopFit, LoopParameter
 from calib.rooms.parallel.mechanism.parallel_robot import ParallelRobot
 from calib.rooms.parallel.robots import ParallelMechanism
@@ -30,9 +29,9 @@ class ReportedFit(Protocol):
     @property
     def files(self) -> tuple[Path, ...]: ...
     @property
-    def found(self) -> LoopFit: ...
+    def fit(self) -> LoopFit: ...
     @property
-    def own(self) -> np.ndarray: ...
+    def errors(self) -> np.ndarray: ...
     @property
     def unseen(self) -> Mapping[str, np.ndarray]: ...
     @property
@@ -55,14 +54,16 @@ def report_of(fit: ReportedFit) -> Report:
     Encoders that contradict each other measure neither position nor orientation: of readings alone it states no errors.
     """
     robot = fit.nominal.chain
-    found = fit.found
+    fit_ = fit.fit
     estimate = fit.estimate
-    sets = {"fit": fit.own} | _unseen(fit)
+    sets = {"fit": fit.errors} | _unseen(fit)
     parameters = []
-    for one, change, sigma in zip(found.parameters, estimate.values.tolist(), estimate.sigma.tolist()):
-        nominal = _nominal_value(robot, one)
+    for parameter, change, sigma in zip(fit_.parameters, estimate.values.tolist(), estimate.sigma.tolist()):
+        nominal = _nominal_value(robot, parameter)
         value = nominal + change
-        parameters.append(FittedParameter(one.name, one.unit, nominal, value, sigma, _relative(sigma, value), "arm"))
+        parameters.append(
+            FittedParameter(parameter.name, parameter.unit, nominal, value, sigma, _relative(sigma, value), "arm")
+        )
     return Report(
         schema=fit_report.SCHEMA,
         robot=robot.name,
@@ -77,7 +78,7 @@ def report_of(fit: ReportedFit) -> Report:
         correlated=fit_report.most_correlated(estimate.names, estimate.covariance),
         singular_values=(),
         rank=0,
-        sets=tuple(_row_errors(fit, name, both) for name, both in sets.items()),
+        sets=tuple(_row_errors(fit, name, errors) for name, errors in sets.items()),
         noise={"position": None, "orientation": None},
         files=_files(fit),
         source=str(fit.nominal.source),
@@ -91,23 +92,26 @@ def write(fit: ReportedFit, folder: Path, plots: bool) -> None:
 
     report = report_of(fit)
     fit_report.write(report, folder / REPORT)
-    drawn = saved(captioned(report), folder) if plots else {}
-    for pages in FIT_PAGES.all():
-        pages(report, drawn, folder)
+    from calib.procedure.report.certificate import results
+
+    drawn = {}
+    if plots:
+        drawn = saved(captioned(report), folder)
+    results.write_fit(report, drawn, folder)
 
 
 def _metrics(fit: ReportedFit) -> FitMetrics:
     verdict = fit.verdict
     tolerance = fit.settings.tolerance
-    vague = fit.found.vague
+    vague = fit.fit.vague
     return FitMetrics(
-        validation={name: _compared(fit, both) for name, both in _unseen(fit).items()},
+        validation={name: _compared(fit, errors) for name, errors in _unseen(fit).items()},
         verdict=verdict.level,
         reason=verdict.reason,
         warnings=(),
         code=verdict.code,
         advice=verdict.advice,
-        fit=_compared(fit, fit.own, unseen=False, parameters=len(fit.found.parameters)),
+        fit=_compared(fit, fit.errors, unseen=False, parameters=len(fit.fit.parameters)),
         model=MODEL,
         ladder=(),
         seed=fit.settings.seed,
@@ -119,42 +123,45 @@ def _metrics(fit: ReportedFit) -> FitMetrics:
 
 def _unseen(fit: ReportedFit) -> dict[str, np.ndarray]:
     """Return the errors of both robots on rows that were not fitted, by the names that reports have for them."""
-    return {fit_report.CROSS_VALIDATED if name == LEFT_OUT else name: both for name, both in fit.unseen.items()}
+    return {fit_report.CROSS_VALIDATED if name == LEFT_OUT else name: errors for name, errors in fit.unseen.items()}
 
 
-def _compared(fit: ReportedFit, both: np.ndarray, unseen: bool = True, parameters: int = 0) -> ComparedRows:
+def _compared(fit: ReportedFit, errors: np.ndarray, unseen: bool = True, parameters: int = 0) -> ComparedRows:
     """Return the statistics of the errors (2, m, k) of both robots on some rows."""
-    nominal, calibrated = (_errors(fit, own).summary() for own in both)
-    return ComparedRows(both.shape[1], "the file's own", nominal, calibrated, unseen=unseen, parameters=parameters)
+    nominal, calibrated = (_errors(fit, joint_errors).summary() for joint_errors in errors)
+    return ComparedRows(errors.shape[1], "the file's own", nominal, calibrated, unseen=unseen, parameters=parameters)
 
 
-def _errors(fit: ReportedFit, own: np.ndarray) -> Errors:
+def _errors(fit: ReportedFit, joint_errors: np.ndarray) -> Errors:
     """Return the sizes of errors (m, k) by kind; none where no coordinate of the platform was measured."""
     if not fit.measured:
         return Errors(None, None, None)
     places = fit.nominal.chain.selected < 3
-    position, orientation = (
-        np.linalg.norm(own[:, columns], axis=1) if columns.any() else None for columns in (places, ~places)
-    )
+    position = None
+    if places.any():
+        position = np.linalg.norm(joint_errors[:, places], axis=1)
+    orientation = None
+    if (~places).any():
+        orientation = np.linalg.norm(joint_errors[:, ~places], axis=1)
     return Errors(position, orientation, None)
 
 
-def _row_errors(fit: ReportedFit, name: str, both: np.ndarray) -> RowErrors:
+def _row_errors(fit: ReportedFit, name: str, errors: np.ndarray) -> RowErrors:
     nominal, calibrated = (
         {
             nature: tuple(size.tolist())
             for nature in ("position", "orientation")
-            if (size := getattr(found, nature)) is not None
+            if (size := getattr(summary, nature)) is not None
         }
-        for found in (_errors(fit, own) for own in both)
+        for summary in (_errors(fit, joint_errors) for joint_errors in errors)
     )
-    return RowErrors(name, name != "fit", both.shape[1], nominal, calibrated)
+    return RowErrors(name, name != "fit", errors.shape[1], nominal, calibrated)
 
 
-def _nominal_value(robot: ParallelRobot, one: LoopParameter) -> float:
+def _nominal_value(robot: ParallelRobot, parameter: LoopParameter) -> float:
     """Return a constant's nominal value; 0 for a displacement of a leg's base or attachment."""
-    if one.part == "element":
-        return float(robot.legs[one.leg].chain.elements[one.index].value)
+    if parameter.part == "element":
+        return float(robot.legs[parameter.leg].chain.elements[parameter.index].value)
     return 0.0
 
 

@@ -58,8 +58,8 @@ class _PlatformDynamics:
         still = np.zeros_like(q)
         rigid = np.where(self._rubbing(), 0.0, self.values)
         gravity = self._torque(rigid, q, still, still)
-        moved = self._torque(rigid, q, slope, curvature)
-        return self._torque(rigid, q, still, slope) - gravity, moved - gravity, gravity
+        torque = self._torque(rigid, q, slope, curvature)
+        return self._torque(rigid, q, still, slope) - gravity, torque - gravity, gravity
 
     def friction(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the actuator torques (N, n) against friction, including that of passive joints."""
@@ -76,8 +76,8 @@ class _PlatformDynamics:
         return self.model.actuator_torques(values, self.model.moved(q, v, a), self.carried)
 
     def _rubbing(self) -> np.ndarray:
-        own = [one.shape in ("velocity", "sign") for one in self.model.columns]
-        return np.array([False] * self.model.inertial + own)
+        rubs = [column.shape in ("velocity", "sign") for column in self.model.columns]
+        return np.array([False] * self.model.inertial + rubs)
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -96,9 +96,9 @@ class ParallelPlan(MotionPlan):
         """Write the result folder of `calib plan`."""
         from calib.procedure.report import motion_figures
 
-        def more(place: Path) -> None:
+        def more(target: Path) -> None:
             if plots:
-                motion_figures.write_plan(self, place)
+                motion_figures.write_plan(self, target)
 
         return write_motion(self.robot, Path(out), self.track, self.coordinates, self.bounds, self.to_dict(), more)
 
@@ -129,55 +129,55 @@ def plan_parallel(
         UsageError: for options that only serial arms know, waypoints out of the platform's box, no limits to keep.
         NoPosture: for a path that leaves the workspace, naming the place.
     """
-    say = progress or (lambda words: None)
-    known = robot.known
+    say = progress or (lambda message: None)
+    mechanism = robot.mechanism
     refuse_unread(settings, DEFAULT_PLAN, READ)
     law = _law(robot, model, settings.payloads)
-    bounds = actuator_bounds(known)
-    kept = TimingLimits(bounds.velocity, bounds.acceleration, bounds.torque)
-    points = _read_waypoints(waypoints, known)
+    bounds = actuator_bounds(mechanism)
+    limits = TimingLimits(bounds.velocity, bounds.acceleration, bounds.torque)
+    points = _read_waypoints(waypoints, mechanism)
     say("the path")
-    paths = _paths(known, points, settings.lines)
+    paths = _paths(mechanism, points, settings.lines)
     for path in paths:
-        check_within(path, known.robot.lower, known.robot.upper, points)
-    own = [_of_actuators(known, path) for path in paths]
+        check_within(path, mechanism.robot.lower, mechanism.robot.upper, points)
+    actuator_paths = [_of_actuators(mechanism, path) for path in paths]
     say("timing")
-    timings = tuple(time_optimal(path, kept, law, rate=settings.rate) for path in own)
-    motion = joined([track(one.path, one.profile, settings.rate, law.torque) for one in timings])
-    joints = joints_of(known.robot)
+    timings = tuple(time_optimal(path, limits, law, rate=settings.rate) for path in actuator_paths)
+    motion = joined([track(timing.path, timing.profile, settings.rate, law.torque) for timing in timings])
+    joints = joints_of(mechanism.robot)
     return ParallelPlan(
-        chain=cast(Any, known.robot),
+        chain=cast(Any, mechanism.robot),
         bounds=bounds,
-        limits=kept,
+        limits=limits,
         lower=joints.lower,
         upper=joints.upper,
         timings=timings,
         track=motion,
         notes=() if model else (FRICTIONLESS,),
         robot=robot,
-        coordinates=coordinates_of(known, known.locate(motion.q)),
+        coordinates=coordinates_of(mechanism, mechanism.locate(motion.q)),
     )
 
 
-def _read_waypoints(path: Path | np.ndarray, known: ClosedRobot) -> np.ndarray:
+def _read_waypoints(path: Path | np.ndarray, mechanism: ClosedRobot) -> np.ndarray:
     """Return the platform coordinates (m, r) of waypoints: an array of them, or a CSV (see the module).
 
     Raises:
         MeasurementError: for columns that are missing, and readings that no posture has.
     """
     if not isinstance(path, Path):
-        return shaped(path, (None, len(known.robot.freedom)), "waypoints")
+        return shaped(path, (None, len(mechanism.robot.freedom)), "waypoints")
     table = read_table(path)
-    if any(name in table for name in known.robot.freedom):
-        return read_coordinates(table, known.robot)
-    if not any(name in table for name in known.robot.joint_names):
+    if any(name in table for name in mechanism.robot.freedom):
+        return read_coordinates(table, mechanism.robot)
+    if not any(name in table for name in mechanism.robot.joint_names):
         refuse_data(
             path,
-            f"neither the platform's coordinates ({', '.join(known.robot.freedom)}) nor the actuators "
-            f"({', '.join(known.robot.joint_names)}) are among its columns: {', '.join(table.header)}",
+            f"neither the platform's coordinates ({', '.join(mechanism.robot.freedom)}) nor the actuators "
+            f"({', '.join(mechanism.robot.joint_names)}) are among its columns: {', '.join(table.header)}",
         )
     try:
-        return coordinates_of(known, known.locate(read_rows(path, known.robot)[:, : known.robot.n]))
+        return coordinates_of(mechanism, mechanism.locate(read_rows(path, mechanism.robot)[:, : mechanism.robot.n]))
     except NoPosture as error:
         raise MeasurementError(f"waypoint out of reach: {error}", path) from error
 
@@ -192,19 +192,19 @@ def _law(robot: ParallelMechanism, folder: Path | None, payloads: tuple[str, ...
         refuse_option(folder, f"no payload '{unknown[0]}' was identified; known: {', '.join(model.payloads) or 'none'}")
     # smoothing of Coulomb's sign: along a path its direction is known
     smoothing = 1e-9
-    terms = tuple(replace(one, settings=(smoothing,)) if one.shape == "sign" else one for one in model.terms)
+    terms = tuple(replace(term, settings=(smoothing,)) if term.shape == "sign" else term for term in model.terms)
     return _PlatformDynamics(replace(model, terms=terms), values, payloads)
 
 
-def _paths(known: ClosedRobot, points: np.ndarray, lines: bool, lever: float = 0.1) -> list[JointPath]:
+def _paths(mechanism: ClosedRobot, points: np.ndarray, lines: bool, lever: float = 0.1) -> list[JointPath]:
     # lever: of the base's size that a radian counts as in the length of a path (our choice)
-    scale = np.where(known.robot.selected < 3, 1.0, 1.0 / lever)
+    scale = np.where(mechanism.robot.selected < 3, 1.0, 1.0 / lever)
     if not lines:
         return [spline(points, scale=scale)]
     return [spline(points[k : k + 2], scale=scale) for k in range(len(points) - 1)] or [spline(points)]
 
 
-def _of_actuators(known: ClosedRobot, path: JointPath, places_per_span: int = 100) -> JointPath:
+def _of_actuators(mechanism: ClosedRobot, path: JointPath, places_per_span: int = 100) -> JointPath:
     """Return the path of the actuated joints that corresponds to a path in platform coordinates.
 
     `places_per_span`: places per span of the path at which the actuators are solved for.
@@ -212,8 +212,8 @@ def _of_actuators(known: ClosedRobot, path: JointPath, places_per_span: int = 10
     spans = len(path.knots) - 1
     s = np.interp(np.linspace(0.0, spans, places_per_span * spans + 1), np.arange(spans + 1), path.knots)
     try:
-        posture = known.place(path(s))
+        posture = mechanism.place(path(s))
     except NoPosture as error:
         raise UsageError(f"the path leaves the workspace: {error}; move or add waypoints") from error
-    dense = through(posture.q[:, known.robot.actuated], s)
+    dense = through(posture.q[:, mechanism.robot.actuated], s)
     return JointPath(dense.derivative, path.knots)

@@ -50,19 +50,19 @@ class LoadedPlatform(PlatformRegressor):
     @property
     def row_names(self) -> tuple[str, ...]:
         """Names of the limited torques: of the actuators, with the load if there are several."""
-        names = self.model.known.robot.joint_names
+        names = self.model.mechanism.robot.joint_names
         if len(self.loads) == 1:
             return names
-        words = ["all payloads" if one is None else " + ".join(one) or "no payload" for one in self.loads]
-        return tuple(f"{name} ({load})" for load in words for name in names)
+        load_names = ["all payloads" if load is None else " + ".join(load) or "no payload" for load in self.loads]
+        return tuple(f"{name} ({load})" for load in load_names for name in names)
 
     def torques(self, motion: LoopMotion) -> np.ndarray:
         """Return the actuators' torques (N, loads · n) of a motion, run after run."""
-        runs = (replace(self, loads=(None,), carried=one) for one in self.loads)
-        return np.concatenate([super(LoadedPlatform, one).torques(motion) for one in runs], axis=1)
+        runs = (replace(self, loads=(None,), carried=load) for load in self.loads)
+        return np.concatenate([super(LoadedPlatform, run).torques(motion) for run in runs], axis=1)
 
     def _columns(self, motion: LoopMotion) -> np.ndarray:
-        runs = [self.model.along(motion, one).transpose(2, 1, 0)[self.columns] for one in self.loads]
+        runs = [self.model.along(motion, load).transpose(2, 1, 0)[self.columns] for load in self.loads]
         return np.concatenate(runs, axis=1).transpose(2, 1, 0)
 
 
@@ -92,18 +92,18 @@ def read_model(robot: ParallelMechanism, folder: Path | None, drives: str = "") 
         UsageError: where the robot's file has no inertias.
     """
     if folder is None:
-        model = make_parallel_model(robot.known, (drives,), v0=0.05)
+        model = make_parallel_model(robot.mechanism, (drives,), v0=0.05)
         return model, np.append(file_bodies(robot, model), np.zeros(len(model.terms)))
     path = folder / MODEL
-    tree = robot.known.robot
+    tree = robot.mechanism.robot
     table = read_table(folder)
     unreadable = f"{path} contains no model of a parallel robot ({{}}); give a folder of calib identify"
     with refused_as(RobotError, (ValueError, KeyError, TypeError, AttributeError), unreadable):
-        known = {str(name): float(value) for name, value in table["values"].items()}
-        texts = [" ".join(one for one in DRIVES if one + label in known) for label in tree.labels]
+        values_ = {str(name): float(value) for name, value in table["values"].items()}
+        texts = [" ".join(drive for drive in DRIVES if drive + label in values_) for label in tree.labels]
         passive = next((text for j, text in enumerate(texts) if j not in tree.actuated and text), "")
         model = make_parallel_model(
-            robot.known,
+            robot.mechanism,
             [texts[j] for j in tree.actuated],
             v0=float(table.get("v0", V0)),
             payloads=[str(label) for label in table.get("payloads", ())],
@@ -112,10 +112,10 @@ def read_model(robot: ParallelMechanism, folder: Path | None, drives: str = "") 
         model = replace(
             model, identical_legs=bool(table.get("identical_legs")), preload=tuple(map(float, table.get("preload", ())))
         )
-    missing = [name for name in model.names[: model.inertial] if name not in known]
+    missing = [name for name in model.names[: model.inertial] if name not in values_]
     if missing:
         raise RobotError(f"{path} is of another robot: parameter {missing[0]} is missing")
-    return model, np.array([known.get(name, 0.0) for name in model.names])
+    return model, np.array([values_.get(name, 0.0) for name in model.names])
 
 
 def file_bodies(robot: ParallelMechanism, model: ParallelModel) -> np.ndarray:
@@ -139,12 +139,15 @@ def of_options(
     """Return the model of an identification's options, its values (p,) where known, the loads, and notes."""
     if options is None:
         return *read_model(robot, None, settings.drives or "Fv Fc off"), loads_of(settings.loads, (), False), ()
-    asked = options_of(options) if isinstance(options, IdentifySettings) else read_options(options)
-    refuse_options_of_arms(asked.settings, asked)
-    made = asked.settings
-    rows = rows_named(robot.known, "" if made.torque_rows.name == MOTOR.name else made.torque_rows.name)
-    model = model_of(robot.known, replace(made, torque_rows=rows, v0=(SMOOTH,)))
-    payloads, notes = stated_payloads(made)
+    if isinstance(options, IdentifySettings):
+        identify_options = options_of(options)
+    else:
+        identify_options = read_options(options)
+    refuse_options_of_arms(identify_options.settings, identify_options)
+    settings_ = identify_options.settings
+    rows = rows_named(robot.mechanism, "" if settings_.torque_rows.name == MOTOR.name else settings_.torque_rows.name)
+    model = model_of(robot.mechanism, replace(settings_, torque_rows=rows, v0=(SMOOTH,)))
+    payloads, notes = stated_payloads(settings_)
     values = np.append(file_bodies(robot, model), np.zeros(len(model.columns)))
     values[model.inertial - 10 * len(payloads) : model.inertial] = np.ravel(payloads)
     return model, values, loads_of(settings.loads, model.payloads, with_payloads=True), tuple(notes)
@@ -156,7 +159,7 @@ def of_folder(
     """Return the model of an identification's folder with its rows, its values (p,), the loads, and no notes."""
     refuse_currents(folder, "an excitation within torque limits")
     model, values = read_model(robot, folder)
-    model = replace(model, torque_rows=rows_named(robot.known, read_table(folder).get("kind", "")))
+    model = replace(model, torque_rows=rows_named(robot.mechanism, read_table(folder).get("kind", "")))
     return model, values, loads_of(settings.loads, model.payloads, with_payloads=False) if settings.loads else ((),), ()
 
 
@@ -179,62 +182,72 @@ def purpose_of(
         base = bases.find(model, loads=loads)
         names = base.names
         units = base.units
-        kept = base.kept
+        base_columns = base.kept
         chosen = base.transform @ values
     else:
         names, covariance = read_covariance(after)
-        kept = np.array([standard.index(standard_name(name, standard)) for name in names])
-        units = tuple(model.units[k] for k in kept)
-        chosen = values[kept]
-    exact, smooth = (
-        LoadedPlatform(replace(model, terms=terms), kept, values, names=names, units=units, loads=loads)
-        for terms in (model.terms, tuple(_smoothed(one) for one in model.terms))
+        base_columns = np.array([standard.index(standard_name(name, standard)) for name in names])
+        units = tuple(model.units[k] for k in base_columns)
+        chosen = values[base_columns]
+    exact = LoadedPlatform(
+        replace(model, terms=model.terms), base_columns, values, names=names, units=units, loads=loads
+    )
+    smooth = LoadedPlatform(
+        replace(model, terms=tuple(_smoothed(term) for term in model.terms)),
+        base_columns,
+        values,
+        names=names,
+        units=units,
+        loads=loads,
     )
     excited: Any = ExcitedModel(cast(Any, smooth), cast(Any, exact), chosen, covariance, folder is not None, notes)
-    prior = read_prior((), excited, cast(Any, model.known.robot), after)
-    sigmas = np.ones(model.rows * len(loads)) if prior is None else prior.sigmas
+    prior = read_prior((), excited, cast(Any, model.mechanism.robot), after)
+    if prior is None:
+        sigmas = np.ones(model.rows * len(loads))
+    else:
+        sigmas = prior.sigmas
     columns = selected_columns(IdentifiableColumns(None, sigmas, names), excited, settings, folder)
     return Purpose(excited, columns, prior)
 
 
-def _smoothed(one: DriveTerm) -> DriveTerm:
-    if one.shape == "sign":
-        return replace(one, settings=(max(SMOOTH, one.settings[0]),))
-    return one
+def _smoothed(term: DriveTerm) -> DriveTerm:
+    if term.shape == "sign":
+        return replace(term, settings=(max(SMOOTH, term.settings[0]),))
+    return term
 
 
-def foretold(found: Any, states: int = 400) -> Any:
+def foretold(excitation: Any, states: int = 400) -> Any:
     """Return a motion with the predicted σ of parameters and of the actuators' torques, before and after it.
 
     States of the typical task are random: the platform in its box, actuators at up to half of their speeds.
     """
-    given = found.inputs
-    plan = cast(LoadedPlatform, found.plan)
-    known = found.robot.known
-    assert given.prior is not None and given.columns.sigmas is not None
-    robot = known.robot
-    rng = np.random.default_rng([found.settings.seed, 3])
-    sigmas = given.columns.sigmas
-    times = found.period / INSTANTS * np.arange(INSTANTS)
-    Y = plan.regressor(*found.orders(times)) / sigmas[:, None]
-    new = np.einsum("nri,nrj->ij", Y, Y, optimize=True) * (found.period / INSTANTS)
-    roots = [np.linalg.cholesky(_inverse(given.prior.information + more)) for more in (0.0 * new, new)]
+    inputs = excitation.inputs
+    plan = cast(LoadedPlatform, excitation.plan)
+    mechanism = excitation.robot.mechanism
+    assert inputs.prior is not None and inputs.columns.sigmas is not None
+    robot = mechanism.robot
+    rng = np.random.default_rng([excitation.settings.seed, 3])
+    sigmas = inputs.columns.sigmas
+    times = excitation.period / INSTANTS * np.arange(INSTANTS)
+    Y = plan.regressor(*excitation.orders(times)) / sigmas[:, None]
+    new = np.einsum("nri,nrj->ij", Y, Y, optimize=True) * (excitation.period / INSTANTS)
+    roots = [np.linalg.cholesky(_inverse(inputs.prior.information + information)) for information in (0.0 * new, new)]
     x = rng.uniform(robot.lower, robot.upper, (states, robot.r))
-    still = loop_jacobians(known, known.home).readings[0]
-    fast = 0.5 * np.min(given.limits.bounds.velocity / np.linalg.norm(still, axis=1)) * np.ones(robot.r)
+    still = loop_jacobians(mechanism, mechanism.home).readings[0]
+    fast = 0.5 * np.min(inputs.limits.bounds.velocity / np.linalg.norm(still, axis=1)) * np.ones(robot.r)
     motion = plan.motion(x, *(fast * (2.0 * rng.random((2, states, robot.r)) - 1.0) * [[[1.0]], [[DEFAULT_RISE]]]))
     W = model_rows(plan, motion)
     torque = [np.sqrt(np.mean(np.sum((W @ root) ** 2, axis=2), axis=0)) for root in roots]
-    shares = [float(np.sqrt(np.mean((one / given.limits.bounds.torque) ** 2))) for one in torque]
-    own = MotionPrediction(found.period, found.period, torque[1], shares[1])
-    outlook = MotionOutlook(shares[0], torque[0], own, (), shares[0])
+    shares = [float(np.sqrt(np.mean((torques / inputs.limits.bounds.torque) ** 2))) for torques in torque]
+    prediction = MotionPrediction(excitation.period, excitation.period, torque[1], shares[1])
+    outlook = MotionOutlook(shares[0], torque[0], prediction, (), shares[0])
     values = cast(np.ndarray, plan.values)[plan.columns]
     spread = [np.linalg.norm(root, axis=1).tolist() for root in roots]
     rows = [
         PredictedSigma(name, unit, value or None, after, 100.0 * after / abs(value) if value else None, before)
         for name, unit, value, before, after in zip(plan.names, plan.units, values.tolist(), *spread)
     ]
-    return replace(found, outlook=outlook, predicted=rows)
+    return replace(excitation, outlook=outlook, predicted=rows)
 
 
 def model_rows(plan: LoadedPlatform, motion: LoopMotion) -> np.ndarray:
@@ -250,9 +263,9 @@ def _inverse(information: np.ndarray) -> np.ndarray:
 
 def whole(model: ParallelModel, values: np.ndarray) -> Purpose:
     """Return the purpose of all base parameters, rows in units of what equal noise of all torques makes of them."""
-    known = model.known
-    base = bases.find(ParallelModel(known, model.terms, rows_named(known), ()))
+    mechanism = model.mechanism
+    base = bases.find(ParallelModel(mechanism, model.terms, rows_named(mechanism), ()))
     columns = np.array([model.names.index(base.standard[k]) for k in base.kept])
     plan: Any = PlatformRegressor(model, columns, values)
-    sigmas = np.linalg.norm(loop_jacobians(known, known.home).readings[0], axis=0)
+    sigmas = np.linalg.norm(loop_jacobians(mechanism, mechanism.home).readings[0], axis=0)
     return Purpose(ExcitedModel(plan, plan, None, None, False), IdentifiableColumns(None, sigmas, base.names))

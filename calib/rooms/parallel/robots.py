@@ -38,12 +38,12 @@ class ParallelMechanism:
     """A parallel robot whose loops close at home, and the file that describes it.
 
     Attributes:
-        known: the robot.
+        mechanism: the robot, prepared for closing its loops.
         source: its file.
         covariance: of its loops' constants, as a fit states it; None: the geometry is taken as exact.
     """
 
-    known: ClosedRobot
+    mechanism: ClosedRobot
     source: Path
     covariance: LoopCovariance | None = None
     kind = "parallel robot"
@@ -52,11 +52,11 @@ class ParallelMechanism:
     @property
     def chain(self) -> ParallelRobot:
         """The robot in place of a serial `Chain`: names, limits and number of the actuated joints."""
-        return self.known.robot
+        return self.mechanism.robot
 
     def write(self, folder: Path) -> None:
         """Write the robot as ``robot.toml`` into a folder, with the covariance of its geometry if known."""
-        parallel_robot.write(folder / ROBOT, self.known.robot, f"from {self.source}")
+        parallel_robot.write(folder / ROBOT, self.mechanism.robot, f"from {self.source}")
         self.write_covariance(folder)
 
     def write_covariance(self, folder: Path) -> None:
@@ -80,7 +80,7 @@ class ParallelMechanism:
             "payloads": list(model.payloads),
             "preload": model.preload,
             "identical_legs": model.identical_legs,
-            "v0": next((one.settings[0] for one in model.terms if one.shape == "sign"), V0),
+            "v0": next((term.settings[0] for term in model.terms if term.shape == "sign"), V0),
             "values": dict(zip(model.single.names, model.spread(dynamics.values).tolist())),
             "base": dict(zip(base.names, expressions(base))),
             "regrouping": regrouping(base),
@@ -88,7 +88,7 @@ class ParallelMechanism:
         }
 
     def __repr__(self) -> str:
-        robot = self.known.robot
+        robot = self.mechanism.robot
         return (
             f"<ParallelMechanism {robot.name}: {len(robot.legs)} legs, {robot.n} actuators, {robot.r} freedoms "
             f"({', '.join(robot.freedom)})>"
@@ -106,7 +106,10 @@ def find(robot: object) -> ParallelMechanism | None:
     """
     if not isinstance(robot, (str, Path)):
         return None
-    path = Path(robot) / ROBOT if Path(robot).is_dir() else Path(robot)
+    if Path(robot).is_dir():
+        path = Path(robot) / ROBOT
+    else:
+        path = Path(robot)
     if not path.is_file():
         path = parallel_robot.library().get(str(robot))
     elif path.suffix != ".toml" or not parallel_robot.is_parallel(path):
@@ -132,9 +135,9 @@ def refuse_unread(settings: Any, plain: Any, read: Collection[str], where: objec
     Raises:
         UsageError: naming the first.
     """
-    for each in fields(settings):
-        value = getattr(settings, each.name)
-        if each.name not in read and value is not False and value != getattr(plain, each.name):
-            place = f"{where}: " if where else ""
-            shown = f" '{value}'" if isinstance(value, str) else ""
-            raise UsageError(f"{place}{each.name}{shown} is for serial arms only, not for this kind of robot")
+    for field in fields(settings):
+        value = getattr(settings, field.name)
+        if field.name not in read and value is not False and value != getattr(plain, field.name):
+            prefix = f"{where}: " if where else ""
+            quoted = f" '{value}'" if isinstance(value, str) else ""
+            raise UsageError(f"{prefix}{field.name}{quoted} is for serial arms only, not for this kind of robot")

@@ -22,75 +22,80 @@ DIMENSIONS = {name: "length" if k < 3 else "angle" for k, name in enumerate(COOR
 class Picture:
     """A parallel robot to draw, a `calib.rooms.viewer.scene.Drawn`; q (m, n) are readings of its actuated joints."""
 
-    known: ClosedRobot
+    mechanism: ClosedRobot
 
     @property
     def n(self) -> int:
         """Number of actuated joints."""
-        return self.known.robot.n
+        return self.mechanism.robot.n
 
     @property
     def joints(self) -> tuple[Joint, ...]:
         """The actuated joints with their limits."""
-        return self.known.robot.joints
+        return self.mechanism.robot.joints
 
     @property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the actuated joints."""
-        return self.known.robot.joint_names
+        return self.mechanism.robot.joint_names
 
     def strips(self, q: np.ndarray) -> list[np.ndarray]:
         """Return lines (m, k, 3) [m] in the base: each leg up to the platform's origin, and the platform's outline.
 
         A leg's line passes its joints, its end and its attachment: where the loop does not close, these are apart.
         """
-        robot = self.known.robot
-        posture = self.known.locate(q)
+        robot = self.mechanism.robot
+        posture = self.mechanism.locate(q)
         legs = []
         ends = []
         for leg, first in zip(robot.legs, robot.starts):
-            own = posture.q[:, first : first + leg.chain.n]
-            joints = joint_frames(leg.chain, own)[:, :, :3, 3].transpose(1, 0, 2)
-            end = forward(leg.chain, own)[:, :3, 3]
-            held = (posture.pose @ leg.attachment)[:, :3, 3]
-            legs.append(np.concatenate([joints, np.stack([end, held, posture.pose[:, :3, 3]], axis=1)], axis=1))
-            ends.append(held)
+            q_leg = posture.q[:, first : first + leg.chain.n]
+            joints = joint_frames(leg.chain, q_leg)[:, :, :3, 3].transpose(1, 0, 2)
+            end = forward(leg.chain, q_leg)[:, :3, 3]
+            attachment = (posture.pose @ leg.attachment)[:, :3, 3]
+            legs.append(np.concatenate([joints, np.stack([end, attachment, posture.pose[:, :3, 3]], axis=1)], axis=1))
+            ends.append(attachment)
         return [*legs, np.stack([*ends, ends[0]], axis=1)]
 
     def torque_rows(self, kind: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Return titles and units of the torque rows of an identification: platform, motor or power."""
-        rows = rows_named(self.known, kind)
+        rows = rows_named(self.mechanism, kind)
         if kind == "power":
             units = ("W",)
         else:
             units = rows.units([joint.kind == "prismatic" for joint in self.joints])
         return rows.titles(self.joint_names), units
 
-    def measured(self, place: Path) -> tuple[np.ndarray, ...]:
+    def measured(self, path: Path) -> tuple[np.ndarray, ...]:
         """Return what a fit's folder holds of its poses, in the order of `calib.rooms.viewer.scene.Measured`.
 
         Readings q (m, n); positions (m, 3) of the platform seen, by the nominal and by the calibrated robot [m];
         whether each was unseen (m,); rotation vectors from the calibrated to the measured orientation (m, 3) [rad], NaN
         where no angle was measured. Without measured coordinates all positions are the calibrated robot's.
         """
-        robot = self.known.robot
-        table = read_table(FitFolder(place).residuals)
+        robot = self.mechanism.robot
+        table = read_table(FitFolder(path).residuals)
         q = np.column_stack([table.numbers(joint.name, "joint") for joint in robot.joints])
-        calibrated = self.known.locate(q).pose
+        calibrated = self.mechanism.locate(q).pose
         turned = np.full((len(q), 3), np.nan)
         places = [calibrated[:, :3, 3]] * 3
         if robot.freedom[0] in table:
-            at, after, before = (
-                np.column_stack([table.numbers(head + name, DIMENSIONS[name]) for name in robot.freedom])
-                for head in ("", "d", "nominal d")
-            )
-            seen, nominal, still = (pose_of(self.known, x) for x in (at, at - before, at - after))
-            places = [one[:, :3, 3] - still[:, :3, 3] + calibrated[:, :3, 3] for one in (seen, nominal, still)]
+            at = np.column_stack([table.numbers("" + name, DIMENSIONS[name]) for name in robot.freedom])
+            after = np.column_stack([table.numbers("d" + name, DIMENSIONS[name]) for name in robot.freedom])
+            before = np.column_stack([table.numbers("nominal d" + name, DIMENSIONS[name]) for name in robot.freedom])
+            measured_pose = pose_of(self.mechanism, at)
+            nominal = pose_of(self.mechanism, at - before)
+            still = pose_of(self.mechanism, at - after)
+            places = [
+                pose[:, :3, 3] - still[:, :3, 3] + calibrated[:, :3, 3] for pose in (measured_pose, nominal, still)
+            ]
             if (robot.selected > 2).any():
-                turned = Rotation.from_matrix(seen[:, :3, :3] @ still[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
+                turned = Rotation.from_matrix(
+                    measured_pose[:, :3, :3] @ still[:, :3, :3].transpose(0, 2, 1)
+                ).as_rotvec()
         return q, *places, np.array(table.texts("set")) != "fit", turned
 
 
 def picture(robot: ParallelMechanism) -> Picture:
     """Return what is drawn of a robot."""
-    return Picture(robot.known)
+    return Picture(robot.mechanism)

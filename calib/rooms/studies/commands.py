@@ -127,7 +127,10 @@ def compare(
     from calib.rooms.studies import method_comparison
     from calib.rooms.studies.method_comparison import caveats, compare_methods, write_table
 
-    table = [] if out is None else [(out, (".csv",))]
+    if out is None:
+        table = []
+    else:
+        table = [(out, (".csv",))]
     files.check_results(table, [robot, *recordings, *(validate or []), options], overwrite)
     names = _names(methods)
     with reporting() as (say_line, progress):

@@ -316,12 +316,17 @@ def _name_part(axis: str, value: Any) -> str:
         return f"{value:g}Hz" if value else "own"
     if axis == "decimation":
         return f"r{value}"
-    return value.name if isinstance(value, Noise) else str(value)
+    if isinstance(value, Noise):
+        return value.name
+    return str(value)
 
 
 def _counts(study: StudyFile, methods: Sequence[str] | None, runs: int | None) -> dict[str, int]:
     """Return the number of runs of each method; `methods` and `runs` in place of the file's."""
-    names = list(METHODS) if "all" in study.methods else list(study.methods)
+    if "all" in study.methods:
+        names = list(METHODS)
+    else:
+        names = list(study.methods)
     if methods is not None:
         names = list(methods)
     if runs is not None:

@@ -124,7 +124,10 @@ def _set_up(robot: str, duration: float, motion: str) -> Setup:
     if motion == "random":
         training = _best_random_motion(robot, chain, duration, rate)
     else:
-        folder = LIBRARY / robot if motion == "designed" else Path(motion)
+        if motion == "designed":
+            folder = LIBRARY / robot
+        else:
+            folder = Path(motion)
         series = coefficients.read(folder)
         t = np.arange(round(duration * rate) + 1) / rate
         training = Reference(t, *series.orders(t))
@@ -134,12 +137,12 @@ def _set_up(robot: str, duration: float, motion: str) -> Setup:
 def _best_random_motion(robot: str, chain: Chain, duration: float, rate: float) -> Reference:
     """Return the best of `MOTION_TRIES` random motions by the condition number of the base regressor."""
     model = known_robots.model(known_robots.plant(robot))
-    kept = _nominal_base(robot).kept
+    base_columns = _nominal_base(robot).kept
     part = slice(None, None, 2 * THIN)
 
     def condition_number(motion: Reference) -> float:
         regressor = model.regressor(motion.q[part], motion.v[part], motion.a[part])
-        matrix = regressor[:, :, kept].reshape(-1, len(kept))
+        matrix = regressor[:, :, base_columns].reshape(-1, len(base_columns))
         return float(np.linalg.cond(matrix / np.linalg.norm(matrix, axis=0)))
 
     motions = (_drawn(chain, duration, rate, number) for number in range(MOTION_TRIES))
@@ -213,7 +216,10 @@ def data_set(condition: Condition, seed: int) -> Experiment:
     validation = Reference(other.t[part], other.q[part], other.v[part], other.a[part])
     matrix = model.regressor(validation.q, validation.v, validation.a)[:, :, base.kept]
     # A payload that nobody knows of is no part of the robot that the model shall predict.
-    predicted = robots.truth if condition.mismatch == "payload" else robots.true
+    if condition.mismatch == "payload":
+        predicted = robots.truth
+    else:
+        predicted = robots.true
     torque = feed_forward(predicted, validation)
     return Experiment(problem, model, base.transform @ robots.truth.parameters, matrix, torque)
 
@@ -276,8 +282,8 @@ def _recorded(condition: Condition, setup: Setup, true: Plant, controller: Contr
     rate = 1.0 / (period * setup.every)
     torque = log.tau
     if condition.mismatch == "clock":
-        late = np.rint((log.t - log.t[0] - TORQUE_LAG) / period).astype(int)
-        torque = run(1).tau[np.maximum(late, 0)]
+        late_ticks = np.rint((log.t - log.t[0] - TORQUE_LAG) / period).astype(int)
+        torque = run(1).tau[np.maximum(late_ticks, 0)]
     q_ref = CubicSpline(setup.reference.t, setup.reference.q)(log.t)
     names = setup.chain.joint_names
     recording = Recording(log.t, log.measured, torque, "torque", names, q_ref=q_ref, file=condition.name)

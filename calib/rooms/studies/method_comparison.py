@@ -193,7 +193,9 @@ def _settings(inputs: IdentificationInputs, method: Method, friction: str) -> Id
         settings = replace(settings, constraints=None)
     if not method.takes_prior:
         settings = replace(settings, weights="residuals")
-    return settings if method.needs_controller else replace(settings, loop=None)
+    if method.needs_controller:
+        return settings
+    return replace(settings, loop=None)
 
 
 def _judged(

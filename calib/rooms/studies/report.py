@@ -210,7 +210,10 @@ def reasons(conditions: Sequence[ConditionSummary]) -> list[str]:
             by_reason.setdefault(summary.why_none, []).append(summary.condition.name)
     sentences = []
     for reason, names in by_reason.items():
-        concerned = "all" if 1 < len(names) == len(conditions) else ", ".join(names)
+        if 1 < len(names) == len(conditions):
+            concerned = "all"
+        else:
+            concerned = ", ".join(names)
         sentences.append(f"no method recommended for {concerned}: {reason}")
     return sentences
 
@@ -246,7 +249,9 @@ def failures(summary: ConditionSummary) -> list[Text]:
     for method in sorted(summary.methods, key=lambda method: method.method):
         for status, count in method.failures.items():
             lines.append(f"{method.method}: {count} {status}, e.g. {method.examples[status]}")
-    return [Text("Without an estimate", lines)] if lines else []
+    if lines:
+        return [Text("Without an estimate", lines)]
+    return []
 
 
 def summary_table(conditions: Sequence[ConditionSummary]) -> tuple[list[str], list[list[object]]]:

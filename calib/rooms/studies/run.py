@@ -122,7 +122,10 @@ def run(study: Study, store: RowStore, workers: Workers, say: Callable[[Progress
             progress.done += len(rows)
             for row in rows:
                 progress.failed += not row.found
-                seconds = 0.0 if math.isnan(row.seconds) else row.seconds
+                if math.isnan(row.seconds):
+                    seconds = 0.0
+                else:
+                    seconds = row.seconds
                 progress.spent.setdefault(row.method, []).append(seconds)
         if time.monotonic() - last_message > MESSAGE_INTERVAL:
             last_message = time.monotonic()

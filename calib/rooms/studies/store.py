@@ -102,7 +102,9 @@ def read_rows(folder: Path) -> list[TrialRow]:
         return []
     with closing(_connected(folder / ROWS)) as database:
         # A command that was killed before its first row leaves an empty file.
-        return _read(database, folder / ROWS) if _format(database) else []
+        if _format(database):
+            return _read(database, folder / ROWS)
+        return []
 
 
 def check_format(folder: Path) -> None:

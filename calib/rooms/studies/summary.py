@@ -152,7 +152,10 @@ def _ranked(condition: Condition, rows: Mapping[str, Sequence[TrialRow]]) -> Con
         for row in method_rows:
             # Of several guesses the first is compared.
             if row.seed % condition.guesses == 0:
-                errors[name][row.seed] = row.torque_error if row.found else FAILED_ERROR
+                if row.found:
+                    errors[name][row.seed] = row.torque_error
+                else:
+                    errors[name][row.seed] = FAILED_ERROR
     summaries.sort(key=lambda method: (not method.reliable, method.figures["torque_error"].median))
     best = next((method for method in summaries if method.enough), None)
     ranked = []
@@ -187,7 +190,9 @@ def _median_ratio(errors: Mapping[int, float], reference: Mapping[int, float]) -
     for error, reference_error in _pairs(errors, reference):
         if np.isfinite(reference_error):
             ratios.append(error / max(reference_error, 1e-300))
-    return float(np.median(ratios)) if ratios else float("inf")
+    if ratios:
+        return float(np.median(ratios))
+    return float("inf")
 
 
 def _summary(name: str, rows: Sequence[TrialRow]) -> MethodSummary:

@@ -216,7 +216,10 @@ def _message(error: BaseException | None) -> str:
     """Return the message of an error as one line, with its class if it is an unexpected one."""
     if error is None:
         return ""
-    message = str(error) if isinstance(error, CalibError) else f"{type(error).__name__}: {error}"
+    if isinstance(error, CalibError):
+        message = str(error)
+    else:
+        message = f"{type(error).__name__}: {error}"
     return " ".join(message.split())[:MAX_MESSAGE]
 
 

@@ -6,13 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
+from calib.data.images.board import read_board
+from calib.data.images.image_bags import read_image_bag, write_image_folder
+from calib.data.images.image_folders import problem_words, read_images
+from calib.data.images.lens import Lens, write_lens
 from calib.data.poses import is_image_folder
 from calib.data.poses.fit_options import parse_options
 from calib.errors import MeasurementError
-from calib.rooms.camera.board import read_board
-from calib.rooms.camera.lens import Lens, write_lens
-from calib.rooms.camera.pictures.image_bags import read_image_bag, write_image_folder
-from calib.rooms.camera.pictures.image_folders import problem_words, read_images
 from calib.rooms.cells import camera_cell as camera
 from calib.rooms.cells.cell import SimulatedInstrument
 from calib.rooms.cells.virtual_cells import rigid, virtual_cell

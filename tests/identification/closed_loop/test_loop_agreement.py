@@ -36,7 +36,7 @@ def test_gains_that_are_off_are_named_with_their_factor():
     np.testing.assert_allclose(found.factor, 2.0, rtol=0.02)
     (finding,) = another_loop(found)
     assert level_of(finding) == "fail" and finding.values["times"] == pytest.approx(2.0, rel=0.02)
-    (loop,) = test.findings(taken=False)
+    (loop,) = test.findings(is_estimate=False)
     assert (loop.code, loop.values["joints"]) == ("loop-gains-off", ("2 times at joint 1", "2 times at joint 2"))
     assert read_record(LoopDisagreement, asdict(found)) == found
 
@@ -53,7 +53,7 @@ def test_a_velocity_formed_otherwise_is_named():
 def test_noise_wider_than_the_smoothed_sign_is_noted():
     one = problem(0, 1e-3, v0=0.005)
     test = compare_with_loop(one, METHODS["iv"].estimate(one))
-    assert "noisy-signs" in [one.code for one in test.findings(taken=True)]
+    assert "noisy-signs" in [one.code for one in test.findings(is_estimate=True)]
 
 
 @pytest.mark.slow
@@ -63,14 +63,14 @@ def test_of_a_loop_that_is_right_nothing_is_said(name: str, noise: tuple[float, 
     for seed in range(3):
         found, test = judged(name, *noise, seed=seed)
         assert found is None
-        assert "loop-gains-off" not in [one.code for one in test.findings(taken=False)]
+        assert "loop-gains-off" not in [one.code for one in test.findings(is_estimate=False)]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["iv", "didim"])
 def test_estimates_that_bear_another_loop_come_with_a_note(name: str):
     found, test = judged(name, 1e-5, 0.05, **times(0.5))
-    assert found is None and "loop-gains-off" in [one.code for one in test.findings(taken=True)]
+    assert found is None and "loop-gains-off" in [one.code for one in test.findings(is_estimate=True)]
     assert test.found is not None
     np.testing.assert_allclose(test.found.stray, 0.5, rtol=0.05)
 
@@ -78,7 +78,7 @@ def test_estimates_that_bear_another_loop_come_with_a_note(name: str):
 def test_a_loop_that_explains_less_torque_than_the_model_is_named():
     """0.8 of the reference's velocity, whose gains no tracking error tells: 4 for 2 %, and 6 for 0.8."""
     _, test = judged("iv", 1e-5, 0.05, share=0.8, timing="stated")
-    (said,) = test.findings(taken=True)
+    (said,) = test.findings(is_estimate=True)
     assert said.code == "loop-unexplained"
     assert [row[-10:] for row in said.values["rows"]] == ["at joint 1", "at joint 2"]
 
@@ -86,7 +86,7 @@ def test_a_loop_that_explains_less_torque_than_the_model_is_named():
 def test_weak_instruments_are_named_beside_an_estimate_and_in_its_failure():
     """Positions of 1.5 mrad noise: Cragg-Donald 8.8; of 2 mrad the estimate does not settle."""
     _, test = judged("iv", 1.5e-3, 0.05)
-    (said,) = test.findings(taken=True)
+    (said,) = test.findings(is_estimate=True)
     assert said.code == "weak-instruments" and 5.0 < said.values["donald"] < 10.0
     failed = METHODS["iv"].estimate(problem(0, 2e-3, 0.05)).failure
     weak = re.search(r"The instruments are weak \(Cragg-Donald (\S+), sound above 10", str(failed))

@@ -21,12 +21,12 @@ from calib.identification import identify_options
 from calib.identification import loop as loop_settings
 from calib.identification.closed_loop import controllers
 from calib.identification.closed_loop.simulation import Plant, Sensing, SimulatedRun, simulate
-from calib.identification.geometry_uncertainty import sensitivity
 from calib.identification.identify import Identification
 from calib.identification.identify import identify as identified
-from calib.identification.possible import information
+from calib.identification.physical_consistency import information
 from calib.identification.rows import Case, make_case
 from calib.identification.settings import IdentificationSettings
+from calib.identification.uncertainty.geometry_uncertainty import sensitivity
 from calib.procedure.excitation.coefficients import NAME, Periodic, read, table
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.tables import dumps

@@ -263,7 +263,7 @@ def test_lwr_full_parameters_hold_where_it_has_not_been(data, tmp_path):
     """Half of the one closed curve learnt, the other half predicted: plain least squares is worse than the CAD."""
     from calib.dynamics.bodies import standard_parameters
     from calib.identification import prediction
-    from calib.identification.possible import information, solve
+    from calib.identification.physical_consistency import information, solve
     from calib.procedure.dynamic_stage.inputs import gather
 
     folder = data / "kuka_lwr4plus_iit"

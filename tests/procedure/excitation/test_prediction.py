@@ -10,14 +10,14 @@ import pytest
 
 from calib.data.recordings.recording import Recording
 from calib.errors import UsageError
-from calib.identification.geometry_uncertainty import propagate
 from calib.identification.identify_options import IdentifyOptions
+from calib.identification.uncertainty.geometry_uncertainty import propagate
 from calib.procedure.dynamic_stage import identify, inputs
 from calib.procedure.excitation import design, prediction
 from calib.procedure.excitation import folder as motion_folder
+from calib.procedure.excitation.geometry_spread import geometry_spread
 from calib.procedure.excitation.settings import ExcitationSettings
 from calib.robot.calibrated import CalibratedChain
-from calib.rooms.further_motion.geometry_spread import geometry_spread
 
 SHORT = ExcitationSettings(
     starts=1, evaluations=30, period=10.0, harmonics=4, rate=100.0, samples=100, repeat=2,

@@ -168,8 +168,8 @@ def test_what_is_mounted_behind_wrist_3_is_not_in_its_kinematics(cell, calib, ol
 
 
 def test_an_arm_without_ur_axes_has_no_ur_kinematics(cell, calib):
+    from calib.procedure.export.ur_kinematics import kinematics
     from calib.robot.calibrated import CalibratedChain
-    from calib.rooms.controllers.ur_kinematics import kinematics
 
     panda = load("panda")
     with pytest.raises(Exception, match="not have the axes of a UR arm"):

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from calib import cli, config
+from calib.apps.controller_programs.targets import pose_values, read_program
+from calib.controllers.table import controller_named
 from calib.data.poses.measurements import Poses
 from calib.data.poses.pose_lists import Targets, read_targets
 from calib.geometry import inverse
@@ -23,8 +25,6 @@ from calib.robot.library import load
 from calib.rooms.cells.cell import Cell, SimulatedInstrument, measure, true_poses
 from calib.rooms.cells.virtual_cells import perturbed_cell
 from calib.rooms.compensation import joint_commands
-from calib.rooms.controllers.table import controller_named
-from calib.rooms.controllers.targets import pose_values, read_program
 from calib.transforms import from_quaternion, from_xyz_rpy, rotation_vector, to_quaternion
 
 SIGMA = 20e-6

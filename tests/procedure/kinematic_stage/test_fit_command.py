@@ -434,7 +434,7 @@ def test_a_placement_that_ran_out_of_steps_proves_nothing(monkeypatch: pytest.Mo
         [replace(other, file="other.csv")],
         settings=wanted,
     )
-    found = fit.run(given, wanted=wanted)
+    found = fit.run(given, settings=wanted)
     (name,) = found.validation
     assert found.validation[name].settled and found.validation[name].proves and name in found.verdict.reason
     monkeypatch.setattr(geometric_fit, "CRAWLS", 1)

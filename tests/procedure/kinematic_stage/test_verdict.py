@@ -36,7 +36,7 @@ def with_row_off(nominal, calibrated, nominal_off, calibrated_off) -> Comparison
 FITTED = Findings("geometry", 1e-4, None, 0.0, np.inf)
 MISFIT = finding("rigid-misfit", rms=1e-3, folds=2e-3, reach=1.0, healthy=4e-4, left=2.0)
 LIGHT = finding("rigid-misfit", rms=1e-3, folds=2e-3, reach=1.0, healthy=4e-4, left=0.5)
-ASKED = {"model": "frames", "asked": "frames"}
+ASKED = {"model": "frames", "requested_model": "frames"}
 SCALE = finding("lengths-grew", factor=1.01, sigma=1e-4, explained=0.9, off=0.01, sigmas=100.0)
 
 
@@ -93,7 +93,7 @@ SCALE = finding("lengths-grew", factor=1.01, sigma=1e-4, explained=0.9, off=0.01
     ],
 )
 def test_rules(unseen, changes, level, code):
-    asked = {name: changes[name] for name in ("asked", "tolerance") if name in changes}
+    asked = {name: changes[name] for name in ("requested_model", "tolerance") if name in changes}
     findings = replace(FITTED, **{name: value for name, value in changes.items() if name not in asked})
     found = judge(rows(1.0, 0.1, False), unseen, findings, cross_validated=findings.cross_validated, **asked)
     assert (found.level, found.code) == (level, code), found

@@ -10,6 +10,10 @@ import pytest
 from sessions import begin
 
 from calib.cli import run
+from calib.data.images.board import read_board
+from calib.data.images.board_print import make
+from calib.data.images.image_bags import ImageBag, write_image_folder
+from calib.data.images.pixels import Detection, Found
 from calib.data.poses.measurements import Distances, PoseMeasurements
 from calib.data.poses.pose_lists import read_poses
 from calib.errors import UsageError
@@ -22,10 +26,6 @@ from calib.procedure.session.folder import open_session
 from calib.procedure.session.questions import cell_tables
 from calib.robot.calibrated import Deflection
 from calib.robot.library import load
-from calib.rooms.camera.board import read_board
-from calib.rooms.camera.pictures.board_print import make
-from calib.rooms.camera.pictures.image_bags import ImageBag, write_image_folder
-from calib.rooms.camera.pixels import Detection, Found
 from calib.rooms.cells import camera_cell as camera
 from calib.rooms.cells.cell import SimulatedInstrument
 from calib.rooms.cells.virtual_cells import rigid, virtual_cell
@@ -178,12 +178,12 @@ def test_a_session_with_images_goes_to_its_certificate(cell, tmp_path):
 @pytest.mark.slow
 def test_the_prediction_is_what_a_fit_then_states(cell):
     """Sigma over the workspace from poses alone, against that of a fit of noisy images at them."""
+    from calib.geometry.camera.camera_guess import complete_camera
     from calib.geometry.first_guess import install
     from calib.geometry.fit import fit
     from calib.geometry.observation import layout, pose_sigmas
     from calib.procedure.measuring.prediction import predicted as foretold
     from calib.robot.chain import random_joints
-    from calib.rooms.camera.camera_guess import complete_camera
 
     with camera.limits_of(cell) as path:
         limits = read_limits(path, targets_of(cell.cell.nominal))
@@ -204,12 +204,12 @@ def test_the_prediction_is_what_a_fit_then_states(cell):
 @pytest.mark.slow
 def test_images_beside_another_instrument_are_another_tool_and_their_coverage_is_drawn(cell, tmp_path):
     """A tracker's reflector in the same hand, and distances of pairs of it; no option names the tools."""
+    from calib.geometry.camera.camera_guess import complete_camera
     from calib.procedure.kinematic_stage.fit import run as fitted
     from calib.procedure.kinematic_stage.inputs import gather
     from calib.procedure.kinematic_stage.settings import FitSettings
     from calib.procedure.report import fit_report, geometry_figures
     from calib.robot.chain import random_joints
-    from calib.rooms.camera.camera_guess import complete_camera
     from calib.rooms.cells.cell import measure, true_poses
 
     arm, reflector = cell.cell.nominal, pose(None, [0.1, 0.0, 0.1])
@@ -228,7 +228,7 @@ def test_images_beside_another_instrument_are_another_tool_and_their_coverage_is
     pairs = Distances(q, arm.joint_names, np.repeat(length, 2), group=np.repeat(np.arange(20), 2))
     given = gather("lwr4plus", [images, points, pairs], settings=FitSettings(model="geometry"))
     assert [block.tool_names for block in given.fit] == [("camera",), ("tool",), ("tool",)]
-    found = fitted(given, wanted=FitSettings(model="geometry"))
+    found = fitted(given, settings=FitSettings(model="geometry"))
     assert found.verdict.level == "pass"
     block = complete_camera(arm, images)
     (seen,) = fit_report.collect(found).images
@@ -248,5 +248,5 @@ def test_a_board_printed_too_large_or_too_small_is_no_pass(cell, share, word):
     block = camera.photograph(cell, camera.views(cell, 36, 5), 0.05, 5)
     board = replace(block.board, square=share * block.board.square, marker=share * block.board.marker)
     given = gather("lwr4plus", [replace(block, board=board)])
-    found = fitted(given, wanted=FitSettings(model="geometry"))
+    found = fitted(given, settings=FitSettings(model="geometry"))
     assert found.verdict.level == word and (word == "pass" or "lengths are" in found.verdict.reason)

@@ -9,8 +9,9 @@ from sessions import begin
 from calib.data.poses.fit_options import FitOptions
 from calib.data.poses.measurements import take
 from calib.errors import Finding, MeasurementError, UsageError
+from calib.procedure.answers import CAMERA, Answers
 from calib.procedure.kinematic_stage import inputs
-from calib.procedure.session.answers import CAMERA, Answers
+from calib.procedure.session import drift
 from calib.procedure.session.dynamics_steps import options_of
 from calib.procedure.session.folder import Session
 from calib.procedure.session.geometry_steps import chain_of, read_measured, readback
@@ -18,7 +19,6 @@ from calib.procedure.session.questions import QUESTIONS, checked, with_answer
 from calib.robot.chain import random_joints
 from calib.rooms.cells.cell import measure, wandering
 from calib.rooms.cells.virtual_cells import virtual_cell
-from calib.rooms.over_time import drift
 
 CELL = virtual_cell("lwr4plus")
 Q = random_joints(CELL.nominal, 30, 3)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.rooms.further_motion.second_round import promised
+from calib.procedure.session.second_round import promised
 
 HEADER = "name,unit,value,sigma,rsd,essential\n"
 

@@ -21,8 +21,8 @@ from without_figures import run
 from calib.errors import CalibError
 from calib.geometry.model_choice.ladder import ModelStep
 from calib.procedure.report import charts, fit_report, geometry_figures, style
+from calib.procedure.report.certificate import rendering, results
 from calib.procedure.session.folder import Session
-from calib.rooms.certificate import rendering, results
 
 
 class References(HTMLParser):
@@ -228,7 +228,7 @@ def test_paper_is_white_and_peaks_are_kept() -> None:
     values = np.zeros(len(t))
     values[[31_415, 92_653]] = 1.0, -1.0
     x, y = style.thinned(t, values)
-    assert len(x) < 3 * style.POINTS and (np.diff(x) >= 0.0).all() and x[0] < 0.002 and x[-1] == 1.0
+    assert len(x) < 3 * style.STRETCHES and (np.diff(x) >= 0.0).all() and x[0] < 0.002 and x[-1] == 1.0
     assert x[y == 1.0] == t[31_415] and x[y == -1.0] == t[92_653]
 
 

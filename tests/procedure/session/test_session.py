@@ -15,10 +15,10 @@ from calib import cli
 from calib.errors import CalibError, MeasurementError, SessionError
 from calib.procedure.findings import UNJUDGED
 from calib.procedure.session import commands, steps
+from calib.procedure.session.certificate import listed
 from calib.procedure.session.folder import Session, locked, open_session, read_state
 from calib.robot.formats.urdf_tree import with_comment
 from calib.robot.library import load
-from calib.rooms.certificate.session import listed
 
 
 def words(session: Session, name: str) -> str:

@@ -14,9 +14,9 @@ from calib.data.poses.fit_options import FitOptions
 from calib.dynamics.torque_rows import torque_rows
 from calib.errors import SessionError, UsageError
 from calib.identification.settings import IdentificationSettings
+from calib.procedure.answers import CertificateSection
 from calib.procedure.excitation.settings import HARMONICS, ExcitationSettings
 from calib.procedure.kinematic_stage.settings import FitSettings, SelectionSettings
-from calib.procedure.session.answers import CertificateSection
 from calib.procedure.session.folder import open_session
 from calib.procedure.session.settings import (
     DynamicsSection,

@@ -15,7 +15,7 @@ from calib.dynamics.idim import IdentificationModel
 from calib.errors import UsageError, require
 from calib.identification import model_file
 from calib.identification.prediction import Dynamics
-from calib.identification.torque_errors import estimated_columns
+from calib.identification.uncertainty.torque_errors import estimated_columns
 from calib.robot import calibrated
 from calib.robot.calibrated import CalibratedChain
 from calib.rooms.over_time.comparison.places import Place, check_same_robot

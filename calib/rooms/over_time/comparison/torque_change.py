@@ -15,7 +15,7 @@ import numpy as np
 
 from calib.dynamics.base import standard_name
 from calib.dynamics.idim import IdentificationModel
-from calib.identification.torque_errors import parameter_variances
+from calib.identification.uncertainty.torque_errors import parameter_variances
 from calib.rooms.over_time.comparison.change_test import ChangeTest, ParameterChange, Tested, tested
 from calib.rooms.over_time.comparison.identifications import Identified, MotionStates
 

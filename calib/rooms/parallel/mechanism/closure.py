@@ -93,7 +93,8 @@ def links_of(leg: Leg, q: np.ndarray, pose: np.ndarray) -> LegLinks:
     full, inverse, carried, gap, lever = (np.zeros((count, *shape)) for shape in shapes)
     bodies, tail = compiled(leg)
     # numba compiles per kind of array
-    q, pose = (np.require(x, requirements=["C", "W"]) for x in (q, pose))
+    q = np.require(q, requirements=["C", "W"])
+    pose = np.require(pose, requirements=["C", "W"])
     closure_kernels.legs(
         bodies.links, bodies.constants, tail, leg.attachment, q, pose, full, inverse, carried, gap, lever
     )
@@ -134,7 +135,7 @@ class ClosedRobot:
     signs: np.ndarray
     fixed: bool
 
-    def locate(self, readings: np.ndarray, near: Posture | None = None) -> Posture:
+    def locate(self, readings: np.ndarray, start: Posture | None = None) -> Posture:
         """Return the postures for given encoder readings of the actuated joints.
 
         Args:
@@ -145,12 +146,12 @@ class ClosedRobot:
             NoPosture: for samples out of reach, beyond a singularity, or in one.
         """
         readings = shaped(readings, (None, self.robot.n), f"readings of '{self.robot.name}'")
-        return _reached(self, readings, self.home.q[0, self.robot.actuated], _from_readings, near)
+        return _reached(self, readings, self.home.q[0, self.robot.actuated], _from_readings, start)
 
-    def place(self, coordinates: np.ndarray, near: Posture | None = None) -> Posture:
+    def place(self, coordinates: np.ndarray, start: Posture | None = None) -> Posture:
         """Return the postures at platform coordinates (N, r) [m, rad] relative to home; arguments: see `locate`."""
         coordinates = shaped(coordinates, (None, self.robot.r), f"platform coordinates of '{self.robot.name}'")
-        return _reached(self, coordinates, np.zeros(self.robot.r), _from_coordinates, near)
+        return _reached(self, coordinates, np.zeros(self.robot.r), _from_coordinates, start)
 
 
 _Aim = Callable[[ClosedRobot, Sequence[LegLinks], np.ndarray, np.ndarray, Posture, np.ndarray], np.ndarray]
@@ -165,26 +166,26 @@ def closed(robot: ParallelRobot) -> ClosedRobot:
     start = Posture(np.concatenate([leg.home for leg in robot.legs])[None], robot.home[None])
     # each leg by itself, the platform at rest
     for _ in range(10):
-        steps = [-times(one.inverse, one.gap) for one in leg_links(robot, start)]
+        steps = [-times(link.inverse, link.gap) for link in leg_links(robot, start)]
         start = Posture(start.q + np.clip(np.concatenate(steps, axis=1), -BOUND, BOUND), start.pose)
-    gap = max(float(np.abs(one.gap).max()) for one in leg_links(robot, start))
+    gap = max(float(np.abs(link.gap).max()) for link in leg_links(robot, start))
     # what the loops make of the platform's other coordinates
     with suppress(NoPosture, np.linalg.LinAlgError):
         if gap > CLOSED:
             free = ClosedRobot(robot, start, (), np.zeros(0), False)
             start = _newton(free, start, np.zeros((1, robot.r)), _from_coordinates)
     links = leg_links(robot, start)
-    for leg, one in zip(robot.legs, links):
-        apart = float(np.abs(one.gap).max())
-        if apart > 1e3 * CLOSED:
+    for leg, leg_link in zip(robot.legs, links):
+        distance = float(np.abs(leg_link.gap).max())
+        if distance > 1e3 * CLOSED:
             robot.refuse(
                 f"the loop of {leg.name} does not close at the platform's home: its end stays "
-                f"{1e3 * apart:.3g} mm (or mrad) from its attachment; check its home, base, attachment and lengths"
+                f"{1e3 * distance:.3g} mm (or mrad) from its attachment; check its home, base, attachment and lengths"
             )
-        rcond = float(_leg_rcond(one, one)[0])
+        rcond = float(_leg_rcond(leg_link, leg_link)[0])
         if rcond < SINGULAR:
             robot.refuse(f"{leg.name} {_why_singular(robot, start, leg)}: rcond {rcond:.1g}")
-    minors = tuple(_best_rows(one.jacobian[0]) for one in links)
+    minors = tuple(_best_rows(link.jacobian[0]) for link in links)
     fixed = _check_freedom(robot, start, links)
     opened = ClosedRobot(robot, start, minors, np.zeros(len(links) + 1), fixed)
     rows = _reading_rows(opened, links)
@@ -199,7 +200,10 @@ def _why_singular(robot: ParallelRobot, home: Posture, leg: Leg) -> str:
     rng = np.random.default_rng(0)
     k = robot.legs.index(leg)
     elsewhere = [Posture(home.q + rng.uniform(-1.0, 1.0, home.q.shape), home.pose) for _ in range(4)]
-    if all(float(_leg_rcond(one, one)[0]) < SINGULAR for one in (leg_links(robot, own)[k] for own in elsewhere)):
+    if all(
+        float(_leg_rcond(leg_link, leg_link)[0]) < SINGULAR
+        for leg_link in (leg_links(robot, posture_)[k] for posture_ in elsewhere)
+    ):
         return (
             f"is singular in all postures: its joints do not move its {leg.end} end in {leg.chain.n} independent "
             "ways (parallel axes behind a spherical end?)"
@@ -207,180 +211,190 @@ def _why_singular(robot: ParallelRobot, home: Posture, leg: Leg) -> str:
     return "is singular at home (stretched or folded)"
 
 
-def coordinates_of(known: ClosedRobot, posture: Posture) -> np.ndarray:
+def coordinates_of(mechanism: ClosedRobot, posture: Posture) -> np.ndarray:
     """Return the platform coordinates (N, r) of postures, relative to home: position, roll-pitch-yaw in base axes."""
-    home = known.robot.home
+    home = mechanism.robot.home
     turned = posture.pose[:, :3, :3] @ home[:3, :3].T
     angles = Rotation.from_matrix(turned).as_euler("xyz")
-    return np.hstack([posture.pose[:, :3, 3] - home[:3, 3], angles])[:, known.robot.selected]
+    return np.hstack([posture.pose[:, :3, 3] - home[:3, 3], angles])[:, mechanism.robot.selected]
 
 
-def pose_of(known: ClosedRobot, coordinates: np.ndarray) -> np.ndarray:
+def pose_of(mechanism: ClosedRobot, coordinates: np.ndarray) -> np.ndarray:
     """Return platform poses (N, 4, 4) at coordinates (N, r); coordinates that the loops determine are zero."""
     full = np.zeros((len(coordinates), 6))
-    full[:, known.robot.selected] = coordinates
-    pose = np.tile(known.robot.home, (len(full), 1, 1))
+    full[:, mechanism.robot.selected] = coordinates
+    pose = np.tile(mechanism.robot.home, (len(full), 1, 1))
     pose[:, :3, 3] += full[:, :3]
-    pose[:, :3, :3] = Rotation.from_euler("xyz", full[:, 3:]).as_matrix() @ known.robot.home[:3, :3]
+    pose[:, :3, :3] = Rotation.from_euler("xyz", full[:, 3:]).as_matrix() @ mechanism.robot.home[:3, :3]
     return pose
 
 
 def twists(
-    known: ClosedRobot, links: Sequence[LegLinks], shifts: Sequence[np.ndarray] | None = None
+    mechanism: ClosedRobot, links: Sequence[LegLinks], shifts: Sequence[np.ndarray] | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return D (N, 6, r) and t_0 (N, 6): platform twists t_0 + D v that all legs can follow, v the independent parts.
 
     Args:
         shifts: (N, c) per leg, the right-hand side e in J q̇ = G t - e; None: zero.
     """
-    robot = known.robot
+    robot = mechanism.robot
     count = len(links[0].gap)
-    if known.fixed:
+    if mechanism.fixed:
         return np.broadcast_to(np.eye(6)[:, robot.selected], (count, 6, robot.r)), np.zeros((count, 6))
     rows = []
     right = []
-    for k, one in enumerate(links):
-        across = np.eye(one.gap.shape[1]) - one.jacobian @ one.inverse
-        rows.append(across @ one.carried)
-        right.append(np.zeros_like(one.gap) if shifts is None else times(across, shifts[k]))
+    for k, link in enumerate(links):
+        across = np.eye(link.gap.shape[1]) - link.jacobian @ link.inverse
+        rows.append(across @ link.carried)
+        right.append(np.zeros_like(link.gap) if shifts is None else times(across, shifts[k]))
     U, s, Vt = np.linalg.svd(np.concatenate(rows, axis=1), full_matrices=False)
     rank = 6 - robot.r
     free = Vt[:, rank:].transpose(0, 2, 1)
     D = free @ np.linalg.inv(free[:, robot.selected])
     along = np.einsum("nkr,nk->nr", U[:, :, :rank], np.concatenate(right, axis=1)) / s[:, :rank]
-    least = np.einsum("nrk,nr->nk", Vt[:, :rank], along)
-    return D, least - times(D, least[:, robot.selected])
+    minimum = np.einsum("nrk,nr->nk", Vt[:, :rank], along)
+    return D, minimum - times(D, minimum[:, robot.selected])
 
 
-def _reading_rows(known: ClosedRobot, links: Sequence[LegLinks]) -> np.ndarray:
+def _reading_rows(mechanism: ClosedRobot, links: Sequence[LegLinks]) -> np.ndarray:
     """Return J_p^inv (N, n, r), which maps the twist's independent parts to encoder rates (eqs 5, 15; B_p = -1)."""
-    D, _ = twists(known, links)
-    return np.concatenate([one.inverse @ (one.carried @ D) for one in links], axis=1)[:, known.robot.actuated]
+    D, _ = twists(mechanism, links)
+    return np.concatenate([link.inverse @ (link.carried @ D) for link in links], axis=1)[:, mechanism.robot.actuated]
 
 
-def _check_postures(known: ClosedRobot, posture: Posture) -> None:
+def _check_postures(mechanism: ClosedRobot, posture: Posture) -> None:
     """Raise an error for postures at a singularity, or on another branch than home.
 
     Raises:
         NoPosture: naming the sample, the leg or the platform, and the type: 1 (a leg is stretched or folded), 2 (the
             actuators do not hold the platform).
     """
-    links = leg_links(known.robot, posture)
-    home = leg_links(known.robot, known.home)
-    signs = _determinants(known, links)
-    for k, (leg, one, at_home) in enumerate(zip(known.robot.legs, links, home)):
-        weak = _leg_rcond(one, at_home) < SINGULAR
-        _refuse(known, posture, weak, f"{leg.name} is singular (type 1: stretched or folded)")
-        _refuse(known, posture, signs[:, k] * known.signs[k] < 0, f"{leg.name} is on another branch than at home")
-    weak = _platform_rcond(known, _reading_rows(known, links), _reading_rows(known, home)) < SINGULAR
-    _refuse(known, posture, weak, "the platform is singular (type 2: locked actuators do not hold it)")
-    _refuse(known, posture, signs[:, -1] * known.signs[-1] < 0, "the platform is beyond a type 2 singularity from home")
+    links = leg_links(mechanism.robot, posture)
+    home = leg_links(mechanism.robot, mechanism.home)
+    signs = _determinants(mechanism, links)
+    for k, (leg, link, at_home) in enumerate(zip(mechanism.robot.legs, links, home)):
+        weak = _leg_rcond(link, at_home) < SINGULAR
+        _refuse(mechanism, posture, weak, f"{leg.name} is singular (type 1: stretched or folded)")
+        _refuse(
+            mechanism, posture, signs[:, k] * mechanism.signs[k] < 0, f"{leg.name} is on another branch than at home"
+        )
+    weak = _platform_rcond(mechanism, _reading_rows(mechanism, links), _reading_rows(mechanism, home)) < SINGULAR
+    _refuse(mechanism, posture, weak, "the platform is singular (type 2: locked actuators do not hold it)")
+    _refuse(
+        mechanism,
+        posture,
+        signs[:, -1] * mechanism.signs[-1] < 0,
+        "the platform is beyond a type 2 singularity from home",
+    )
 
 
-def _refuse(known: ClosedRobot, posture: Posture, bad: np.ndarray, what: str) -> None:
+def _refuse(mechanism: ClosedRobot, posture: Posture, bad: np.ndarray, message: str) -> None:
     if bad.any():
-        own = np.flatnonzero(bad)
-        more = f" ({len(own)} of {len(bad)} samples)" if len(own) > 1 else ""
+        indices = np.flatnonzero(bad)
+        count_text = f" ({len(indices)} of {len(bad)} samples)" if len(indices) > 1 else ""
         raise NoPosture(
-            f"sample {own[0] + 1}, platform at {_where(known, posture[own[:1]])}: {what}{more}", own.tolist()
+            f"sample {indices[0] + 1}, platform at {_where(mechanism, posture[indices[:1]])}: {message}{count_text}",
+            indices.tolist(),
         )
 
 
-def _where(known: ClosedRobot, posture: Posture) -> str:
-    values = coordinates_of(known, posture)[0]
-    return ", ".join(f"{name} = {value:.4g}" for name, value in zip(known.robot.freedom, values))
+def _where(mechanism: ClosedRobot, posture: Posture) -> str:
+    values = coordinates_of(mechanism, posture)[0]
+    return ", ".join(f"{name} = {value:.4g}" for name, value in zip(mechanism.robot.freedom, values))
 
 
-def _reached(known: ClosedRobot, goals: np.ndarray, own: np.ndarray, aim: _Aim, near: Posture | None) -> Posture:
+def _reached(
+    mechanism: ClosedRobot, goals: np.ndarray, coordinates: np.ndarray, aim: _Aim, start: Posture | None
+) -> Posture:
     """Return the postures at targets (N, k), found by Newton's method on a straight line from the values at home."""
     if not len(goals):
-        return known.home[:0]
-    if near is not None:
-        return _newton(known, near, goals, aim)
+        return mechanism.home[:0]
+    if start is not None:
+        return _newton(mechanism, start, goals, aim)
     # samples of a record of which the first is reached from home, the others from it
-    every = 16
+    spacing = 16
     # of a reading or coordinate between two solutions on the way from home [rad or m] (our choice)
     max_stride = 0.25
-    if len(goals) > 2 * every and np.abs(np.diff(goals, axis=0)).max() < max_stride / every:
-        first = _reached(known, goals[::every], own, aim, None)
-        nearest = np.minimum((np.arange(len(goals)) + every // 2) // every, len(first) - 1)
-        found = _newton(known, first[nearest], goals, aim)
+    if len(goals) > 2 * spacing and np.abs(np.diff(goals, axis=0)).max() < max_stride / spacing:
+        first = _reached(mechanism, goals[::spacing], coordinates, aim, None)
+        nearest = np.minimum((np.arange(len(goals)) + spacing // 2) // spacing, len(first) - 1)
+        posture = _newton(mechanism, first[nearest], goals, aim)
     else:
-        count = max(1, int(np.ceil(np.abs(goals - own).max() / max_stride)))
-        found = known.home[np.zeros(len(goals), dtype=int)]
+        count = max(1, int(np.ceil(np.abs(goals - coordinates).max() / max_stride)))
+        posture = mechanism.home[np.zeros(len(goals), dtype=int)]
         for share in np.arange(1, count) / count:
-            found = _newton(known, found, own + share * (goals - own), aim, rough=True)
-        found = _newton(known, found, goals, aim)
-    _check_postures(known, found)
-    return found
+            posture = _newton(mechanism, posture, coordinates + share * (goals - coordinates), aim, rough=True)
+        posture = _newton(mechanism, posture, goals, aim)
+    _check_postures(mechanism, posture)
+    return posture
 
 
-def _newton(known: ClosedRobot, start: Posture, goals: np.ndarray, aim: _Aim, rough: bool = False) -> Posture:
+def _newton(mechanism: ClosedRobot, start: Posture, goals: np.ndarray, aim: _Aim, rough: bool = False) -> Posture:
     """Return the postures near `start` that meet the targets, by Newton's method (two steps if `rough`)."""
     q = np.array(start.q)
     pose = np.array(start.pose)
-    left = np.arange(len(q))
+    open_rows = np.arange(len(q))
     # Newton steps
     max_steps = 60
     for _ in range(2 if rough else max_steps):
-        own = Posture(q[left], pose[left])
-        links = leg_links(known.robot, own)
-        D, t = twists(known, links, [one.gap for one in links])
-        twist = t + times(D, aim(known, links, D, t, own, goals[left]))
-        steps = np.concatenate([times(one.inverse, times(one.carried, twist) - one.gap) for one in links], axis=1)
+        posture = Posture(q[open_rows], pose[open_rows])
+        links = leg_links(mechanism.robot, posture)
+        D, t = twists(mechanism, links, [link.gap for link in links])
+        twist = t + times(D, aim(mechanism, links, D, t, posture, goals[open_rows]))
+        steps = np.concatenate([times(link.inverse, times(link.carried, twist) - link.gap) for link in links], axis=1)
         size = np.maximum(np.abs(steps).max(axis=1), np.abs(twist).max(axis=1))
         share = np.minimum(1.0, BOUND / np.maximum(size, 1e-300))[:, None]
-        q[left] += share * steps
-        pose[left] = _moved(own.pose, share * twist)
-        gap = np.max([np.abs(one.gap).max(axis=1) for one in links], axis=0)
-        left = left[~(np.maximum(size, gap) < CLOSED)]
-        if not len(left):
+        q[open_rows] += share * steps
+        pose[open_rows] = _moved(posture.pose, share * twist)
+        gap = np.max([np.abs(link.gap).max(axis=1) for link in links], axis=0)
+        open_rows = open_rows[~(np.maximum(size, gap) < CLOSED)]
+        if not len(open_rows):
             break
-    if len(left) and not rough:
-        _tell_unreached(known, Posture(q, pose), left)
+    if len(open_rows) and not rough:
+        _tell_unreached(mechanism, Posture(q, pose), open_rows)
     return Posture(q, pose)
 
 
-def _tell_unreached(known: ClosedRobot, found: Posture, left: np.ndarray, max_rcond: float = 0.02) -> None:
+def _tell_unreached(mechanism: ClosedRobot, posture: Posture, unreached: np.ndarray, max_rcond: float = 0.02) -> None:
     # max_rcond: the same, where Newton's steps fail: that explains it (our choice)
-    own = found[left[:1]]
-    at_home = leg_links(known.robot, known.home)
-    links = dict(zip((leg.name for leg in known.robot.legs), leg_links(known.robot, own)))
+    first = posture[unreached[:1]]
+    at_home = leg_links(mechanism.robot, mechanism.home)
+    links = dict(zip((leg.name for leg in mechanism.robot.legs), leg_links(mechanism.robot, first)))
     worst = max(links, key=lambda name: float(np.abs(links[name].gap).max()))
     gap = 1e3 * float(np.abs(links[worst].gap).max())
-    weak = [n for (n, one), home in zip(links.items(), at_home) if float(_leg_rcond(one, home)[0]) < max_rcond]
+    weak = [n for (n, link), home in zip(links.items(), at_home) if float(_leg_rcond(link, home)[0]) < max_rcond]
     if gap > 1.0:
-        why = f"{worst} stays {gap:.3g} mm from its attachment: out of reach"
+        reason = f"{worst} stays {gap:.3g} mm from its attachment: out of reach"
     else:
         if weak:
-            why = f"{weak[0]} is stretched or folded: a singularity (type 1), the end of its reach"
+            reason = f"{weak[0]} is stretched or folded: a singularity (type 1), the end of its reach"
         else:
-            why = "Newton's method does not converge: singularity (type 2) or contradictory readings"
-    more = f" ({len(left)} of {len(found)} samples)" if len(left) > 1 else ""
+            reason = "Newton's method does not converge: singularity (type 2) or contradictory readings"
+    count_text = f" ({len(unreached)} of {len(posture)} samples)" if len(unreached) > 1 else ""
     raise NoPosture(
-        f"sample {left[0] + 1}: the loops of '{known.robot.name}' cannot be closed (last try: platform at "
-        f"{_where(known, own)}): {why}{more}; check units, zeros and order of the encoders",
-        left.tolist(),
+        f"sample {unreached[0] + 1}: the loops of '{mechanism.robot.name}' cannot be closed (last try: platform at "
+        f"{_where(mechanism, first)}): {reason}{count_text}; check units, zeros and order of the encoders",
+        unreached.tolist(),
     )
 
 
 def _from_readings(
-    known: ClosedRobot, links: Sequence[LegLinks], D: np.ndarray, t: np.ndarray, posture: Posture, goals: np.ndarray
+    mechanism: ClosedRobot, links: Sequence[LegLinks], D: np.ndarray, t: np.ndarray, posture: Posture, goals: np.ndarray
 ) -> np.ndarray:
     """Return the independent twist components (N, r) that bring the encoder readings closest to their targets."""
-    A = np.concatenate([one.inverse @ one.carried for one in links], axis=1)
-    steps = np.concatenate([times(one.inverse, one.gap) for one in links], axis=1) - times(A, t)
-    own = known.robot.actuated
-    return times(pseudo_inverse(A[:, own] @ D), goals - posture.q[:, own] + steps[:, own])
+    A = np.concatenate([link.inverse @ link.carried for link in links], axis=1)
+    steps = np.concatenate([times(link.inverse, link.gap) for link in links], axis=1) - times(A, t)
+    actuated = mechanism.robot.actuated
+    return times(pseudo_inverse(A[:, actuated] @ D), goals - posture.q[:, actuated] + steps[:, actuated])
 
 
 def _from_coordinates(
-    known: ClosedRobot, links: Sequence[LegLinks], D: np.ndarray, t: np.ndarray, posture: Posture, goals: np.ndarray
+    mechanism: ClosedRobot, links: Sequence[LegLinks], D: np.ndarray, t: np.ndarray, posture: Posture, goals: np.ndarray
 ) -> np.ndarray:
     """Return the independent twist components (N, r) that move the platform to target coordinates (N, r)."""
-    target = pose_of(known, goals)
+    target = pose_of(mechanism, goals)
     turn = Rotation.from_matrix(target[:, :3, :3] @ posture.pose[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
-    return np.hstack([target[:, :3, 3] - posture.pose[:, :3, 3], turn])[:, known.robot.selected]
+    return np.hstack([target[:, :3, 3] - posture.pose[:, :3, 3], turn])[:, mechanism.robot.selected]
 
 
 def _moved(pose: np.ndarray, twist: np.ndarray) -> np.ndarray:
@@ -391,18 +405,18 @@ def _moved(pose: np.ndarray, twist: np.ndarray) -> np.ndarray:
     return result
 
 
-def _leg_rcond(one: LegLinks, home: LegLinks) -> np.ndarray:
+def _leg_rcond(links: LegLinks, home: LegLinks) -> np.ndarray:
     """Return reciprocal conditions (N,) of a leg's Jacobian; lengths are scaled by its longest lever at home."""
-    moved = np.linalg.norm(home.full[0, :3], axis=0)
+    travel = np.linalg.norm(home.full[0, :3], axis=0)
     turns = np.linalg.norm(home.full[0, 3:], axis=0) > 0.5
-    length = max(float(moved[turns].max(initial=0.0)), 1e-6)
-    by_row = np.where(np.arange(one.jacobian.shape[1]) < 3, length, 1.0)[:, None] / np.where(turns, 1.0, length)
-    return _rcond(one.jacobian / by_row, one.inverse * by_row.T)
+    length = max(float(travel[turns].max(initial=0.0)), 1e-6)
+    by_row = np.where(np.arange(links.jacobian.shape[1]) < 3, length, 1.0)[:, None] / np.where(turns, 1.0, length)
+    return _rcond(links.jacobian / by_row, links.inverse * by_row.T)
 
 
-def _platform_rcond(known: ClosedRobot, rows: np.ndarray, home: np.ndarray) -> np.ndarray:
+def _platform_rcond(mechanism: ClosedRobot, rows: np.ndarray, home: np.ndarray) -> np.ndarray:
     """Return reciprocal conditions (N,) of J_p^inv; translations and rotations are scaled by their maxima at home."""
-    turns = known.robot.selected > 2
+    turns = mechanism.robot.selected > 2
     size = np.linalg.norm(home[0], axis=0)
     scale = np.where(turns, size[turns].max(initial=0.0), size[~turns].max(initial=0.0))
     scaled = rows / scale / np.linalg.norm(home[0] / scale, axis=1)[:, None]
@@ -415,12 +429,12 @@ def _rcond(J: np.ndarray, inverse: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(size), 1.0 / np.maximum(size, 1e-300), 0.0)
 
 
-def _determinants(known: ClosedRobot, links: Sequence[LegLinks]) -> np.ndarray:
+def _determinants(mechanism: ClosedRobot, links: Sequence[LegLinks]) -> np.ndarray:
     """Return the signs (N, L + 1) of the legs' minors, and of the platform's determinant if J_p^inv is square."""
-    signs = [np.sign(np.linalg.det(one.jacobian[:, minor])) for one, minor in zip(links, known.minors)]
+    signs = [np.sign(np.linalg.det(link.jacobian[:, minor])) for link, minor in zip(links, mechanism.minors)]
     last = np.zeros(len(links[0].gap))
-    if not known.robot.redundant:
-        last = np.sign(np.linalg.det(_reading_rows(known, links)))
+    if not mechanism.robot.redundant:
+        last = np.sign(np.linalg.det(_reading_rows(mechanism, links)))
     return np.column_stack([*signs, last])
 
 
@@ -436,30 +450,31 @@ def _check_freedom(robot: ParallelRobot, home: Posture, links: Sequence[LegLinks
     Raises:
         RobotError: for another number of freedoms than named, or names that do not distinguish them.
     """
-    named = np.eye(6)[:, robot.selected]
+    freedoms = np.eye(6)[:, robot.selected]
     fixed = True
     rng = np.random.default_rng(0)
     free = ClosedRobot(robot, home, (), np.zeros(0), False)
     for trial in range(4):
-        rows = [(np.eye(one.gap.shape[1]) - one.jacobian @ one.inverse) @ one.carried for one in links]
+        rows = [(np.eye(link.gap.shape[1]) - link.jacobian @ link.inverse) @ link.carried for link in links]
         values = np.linalg.svd(np.concatenate(rows, axis=1)[0])
-        left = 6 - int((values[1] > 1e-9 * max(1.0, values[1][0])).sum())
-        if left != robot.r:
+        remaining = 6 - int((values[1] > 1e-9 * max(1.0, values[1][0])).sum())
+        if remaining != robot.r:
             robot.refuse(
-                f"its platform has {left} freedoms, but the key 'freedom' lists {robot.r} "
-                f"({', '.join(robot.freedom)}); its free motions are {_motions(values[2][6 - left :])}"
+                f"its platform has {remaining} freedoms, but the key 'freedom' lists {robot.r} "
+                f"({', '.join(robot.freedom)}); its free motions are {_motions(values[2][6 - remaining :])}"
             )
-        if np.linalg.cond(values[2][6 - left :, robot.selected]) > 1e8:
+        if np.linalg.cond(values[2][6 - remaining :, robot.selected]) > 1e8:
             robot.refuse(
-                f"the platform can move in {_motions(values[2][6 - left :])}; freedom lists {', '.join(robot.freedom)}"
+                f"the platform can move in {_motions(values[2][6 - remaining :])}; "
+                f"freedom lists {', '.join(robot.freedom)}"
             )
-        fixed = fixed and float(np.abs(np.concatenate(rows, axis=1)[0] @ named).max()) < 1e-9
+        fixed = fixed and float(np.abs(np.concatenate(rows, axis=1)[0] @ freedoms).max()) < 1e-9
         if trial == 3:
             break
         # a little away from home, where a special posture does not hide what the loops leave
         step = 0.05 * (robot.upper - robot.lower) * rng.uniform(-1.0, 1.0, robot.r)
-        near = _newton(free, home, step[None], _from_coordinates)
-        links = leg_links(robot, near)
+        neighbour = _newton(free, home, step[None], _from_coordinates)
+        links = leg_links(robot, neighbour)
     return fixed
 
 

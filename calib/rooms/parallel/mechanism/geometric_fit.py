@@ -67,14 +67,14 @@ class LoopFit:
     """A geometric calibration of a parallel robot: the calibrated robot and its estimate.
 
     Attributes:
-        known: the calibrated robot, its loops closed.
+        mechanism: the calibrated robot, its loops closed.
         parameters: that may change; estimate: their changes from the nominal robot, with covariance.
         vague: names of parameters of which the data identify less than half of what was known beforehand.
         before, after: rms of the encoders' residuals [rad or m], nominal and calibrated.
         iterations: of Gauss and Newton.
     """
 
-    known: ClosedRobot
+    mechanism: ClosedRobot
     parameters: tuple[LoopParameter, ...]
     estimate: Estimate
     vague: tuple[str, ...]
@@ -96,41 +96,41 @@ class LoopCovariance:
     matrix: np.ndarray
 
     @classmethod
-    def fitted(cls, found: LoopFit) -> LoopCovariance:
+    def fitted(cls, fit: LoopFit) -> LoopCovariance:
         """Return the covariance of a fit, without the part that is a choice of frames."""
-        directions = visible_directions(found.known, found.parameters)
+        directions = visible_directions(fit.mechanism, fit.parameters)
         across = directions @ directions.T
-        names = tuple(one.name for one in found.parameters)
-        return cls(names, frozen(across @ found.estimate.covariance @ across))
+        names = tuple(parameter.name for parameter in fit.parameters)
+        return cls(names, frozen(across @ fit.estimate.covariance @ across))
 
-    def of(self, known: ClosedRobot) -> tuple[LoopParameter, ...]:
+    def of(self, mechanism: ClosedRobot) -> tuple[LoopParameter, ...]:
         """Return the constants of a robot that the names are of.
 
         Raises:
             RobotError: for a name that none of its loops has.
         """
-        found = {one.name: one for one in loop_parameters(known)}
-        missing = [name for name in self.names if name not in found]
+        by_name = {parameter.name: parameter for parameter in loop_parameters(mechanism)}
+        missing = [name for name in self.names if name not in by_name]
         if missing:
-            refuse_robot(known.robot.name, f"none of its loops has '{missing[0]}', which its covariance is of")
-        return tuple(found[name] for name in self.names)
+            refuse_robot(mechanism.robot.name, f"none of its loops has '{missing[0]}', which its covariance is of")
+        return tuple(by_name[name] for name in self.names)
 
 
-def loop_parameters(known: ClosedRobot) -> tuple[LoopParameter, ...]:
+def loop_parameters(mechanism: ClosedRobot) -> tuple[LoopParameter, ...]:
     """Return the geometric constants of a robot that may change without opening a loop for good."""
-    robot = known.robot
-    links = leg_links(robot, known.home)
-    jacobians = loop_jacobians(known, known.home)
-    found = []
-    for k, (leg, one) in enumerate(zip(robot.legs, links)):
-        follows = np.hstack([one.jacobian[0], one.carried[0] @ jacobians.platform[0]])
+    robot = mechanism.robot
+    links = leg_links(robot, mechanism.home)
+    jacobians = loop_jacobians(mechanism, mechanism.home)
+    parameters = []
+    for k, (leg, link) in enumerate(zip(robot.legs, links)):
+        follows = np.hstack([link.jacobian[0], link.carried[0] @ jacobians.platform[0]])
         across = np.eye(leg.held) - follows @ np.linalg.pinv(follows)
         for parameter in _candidates(leg, k):
-            slope = _gap_slope(robot, known.home, parameter)[0]
+            slope = _gap_slope(robot, mechanism.home, parameter)[0]
             size = float(np.abs(slope).max())
             if size > 1e-9 and float(np.abs(across @ slope).max()) < OPENS * size:
-                found.append(parameter)
-    return tuple(found)
+                parameters.append(parameter)
+    return tuple(parameters)
 
 
 def fit_loops(
@@ -138,7 +138,7 @@ def fit_loops(
     readings: np.ndarray,
     coordinates: np.ndarray | None = None,
     *,
-    held: Sequence[str] = (),
+    fixed: Sequence[str] = (),
     loss: float = 1e-6,
 ) -> LoopFit:
     """Return the geometry of a parallel robot fitted to encoder readings, with or without platform coordinates.
@@ -162,21 +162,22 @@ def fit_loops(
             f"'{robot.name}' has as many encoders as freedoms: readings alone determine nothing of its geometry; "
             "measure platform poses"
         )
-    parameters = tuple(one for one in loop_parameters(nominal) if one.name not in held)
+    parameters = tuple(parameter for parameter in loop_parameters(nominal) if parameter.name not in fixed)
     count = len(parameters)
-    known = nominal
+    mechanism = nominal
     square = np.inf
     before = np.nan
     std = np.nan
     changes = np.zeros(count)
     W = np.zeros((0, count))
     for iteration in range(1, LIMIT + 1):
-        residual, W = _observed(known, readings, coordinates, parameters)
+        residual, W = _observed(mechanism, readings, coordinates, parameters)
         rank = len(split_columns(W, tolerance=TOLERANCE).kept)
         if not rank or len(residual) <= rank:
             raise Unidentifiable(f"{len(residual)} residuals for {rank} parameters of the loops: measure more poses")
         total = float(residual @ residual)
-        before = float(np.sqrt(total / len(residual))) if iteration == 1 else before
+        if iteration == 1:
+            before = float(np.sqrt(total / len(residual)))
         std = float(np.sqrt(total / (len(residual) - rank)))
         if total < 1e-24 or (np.isfinite(square) and abs(square - total) <= loss * square):
             break
@@ -184,85 +185,94 @@ def fit_loops(
         pull = max(std, 1e-12) / SPREAD
         rows = np.vstack([W, pull * np.eye(count)])
         changes = changes + np.linalg.lstsq(rows, np.concatenate([residual, -pull * changes]), rcond=None)[0]
-        known = closed(changed(nominal.robot, parameters, changes))
+        mechanism = closed(changed(nominal.robot, parameters, changes))
     else:
-        raise NotConverged(f"the geometry of '{robot.name}' does not settle within {LIMIT} steps", known)
+        raise NotConverged(f"the geometry of '{robot.name}' does not settle within {LIMIT} steps", mechanism)
     inverse = np.linalg.inv(np.linalg.qr(np.vstack([W / max(std, 1e-12), np.eye(count) / SPREAD]), mode="r"))
     covariance = inverse @ inverse.T
-    out = tuple(one.name for one, own in zip(parameters, np.sqrt(np.diag(covariance))) if own > 0.5 * SPREAD)
-    names, units = (tuple(getattr(one, key) for one in parameters) for key in ("name", "unit"))
+    out = tuple(
+        parameter.name for parameter, sigma in zip(parameters, np.sqrt(np.diag(covariance))) if sigma > 0.5 * SPREAD
+    )
+    names = tuple(parameter.name for parameter in parameters)
+    units = tuple(parameter.unit for parameter in parameters)
     estimate = Estimate(names, units, changes, covariance, std, len(residual) - rank)
-    return LoopFit(known, parameters, estimate, out, before, float(np.sqrt(np.mean(residual**2))), iteration)
+    return LoopFit(mechanism, parameters, estimate, out, before, float(np.sqrt(np.mean(residual**2))), iteration)
 
 
-def visible_directions(known: ClosedRobot, parameters: Sequence[LoopParameter], postures: int = 100) -> np.ndarray:
+def visible_directions(mechanism: ClosedRobot, parameters: Sequence[LoopParameter], postures: int = 100) -> np.ndarray:
     """Return orthonormal directions (p, k) of the constants that relate encoders to the platform somewhere in its box.
 
     Across them, constants change without effect: they are choices of frames.
     """
-    robot = known.robot
+    robot = mechanism.robot
     coordinates = np.random.default_rng(0).uniform(robot.lower, robot.upper, (postures, robot.r))
-    readings = known.place(coordinates).q[:, robot.actuated]
-    _, sizes, directions = np.linalg.svd(_observed(known, readings, coordinates, parameters)[1], full_matrices=False)
+    readings = mechanism.place(coordinates).q[:, robot.actuated]
+    _, sizes, directions = np.linalg.svd(
+        _observed(mechanism, readings, coordinates, parameters)[1], full_matrices=False
+    )
     return directions[sizes > TOLERANCE * sizes[0]].T
 
 
 def changed(robot: ParallelRobot, parameters: Sequence[LoopParameter], values: np.ndarray) -> ParallelRobot:
     """Return the robot with its parameters changed by values (p,)."""
     legs = list(robot.legs)
-    for one, value in zip(parameters, values):
+    for parameter, value in zip(parameters, values):
         if value != 0.0:
-            legs[one.leg] = _changed_leg(legs[one.leg], one, float(value))
+            legs[parameter.leg] = _changed_leg(legs[parameter.leg], parameter, float(value))
     return robot.with_legs(tuple(legs))
 
 
-def platform_errors(known: ClosedRobot, readings: np.ndarray, coordinates: np.ndarray) -> np.ndarray:
+def platform_errors(mechanism: ClosedRobot, readings: np.ndarray, coordinates: np.ndarray) -> np.ndarray:
     """Return measured less computed platform coordinates (m, r) [m, rad] at encoder readings (m, n)."""
-    return coordinates - coordinates_of(known, known.locate(readings))
+    return coordinates - coordinates_of(mechanism, mechanism.locate(readings))
 
 
-def contradictions(known: ClosedRobot, readings: np.ndarray) -> np.ndarray:
+def contradictions(mechanism: ClosedRobot, readings: np.ndarray) -> np.ndarray:
     """Return the contradictions (m, n - r) Nᵀ (q - q(x̂)) of redundant encoder readings (m, n) [rad or m]."""
-    posture = known.locate(readings)
-    across = preload_directions(known, loop_jacobians(known, posture)).transpose(0, 2, 1)
-    return times(across, readings - posture.q[:, known.robot.actuated])
+    posture = mechanism.locate(readings)
+    across = preload_directions(mechanism, loop_jacobians(mechanism, posture)).transpose(0, 2, 1)
+    return times(across, readings - posture.q[:, mechanism.robot.actuated])
 
 
 def _observed(
-    known: ClosedRobot, readings: np.ndarray, coordinates: np.ndarray | None, parameters: Sequence[LoopParameter]
+    mechanism: ClosedRobot, readings: np.ndarray, coordinates: np.ndarray | None, parameters: Sequence[LoopParameter]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return residuals (m n or m (n - r),) and their Jacobian with respect to the parameters: r ≈ W δg."""
-    robot = known.robot
-    posture = known.place(coordinates) if coordinates is not None else known.locate(readings)
+    robot = mechanism.robot
+    if coordinates is not None:
+        posture = mechanism.place(coordinates)
+    else:
+        posture = mechanism.locate(readings)
     links = leg_links(robot, posture)
     residual = readings - posture.q[:, robot.actuated]
     W = np.zeros((len(readings), robot.n, len(parameters)))
     first = np.concatenate([[0], np.cumsum([len(leg.actuated) for leg in robot.legs])]).astype(int)
-    for p, one in enumerate(parameters):
-        rows = slice(first[one.leg], first[one.leg + 1])
-        inverse = links[one.leg].inverse[:, list(robot.legs[one.leg].actuated)]
-        W[:, rows, p] = -times(inverse, _gap_slope(robot, posture, one))
+    for p, parameter in enumerate(parameters):
+        rows = slice(first[parameter.leg], first[parameter.leg + 1])
+        inverse = links[parameter.leg].inverse[:, list(robot.legs[parameter.leg].actuated)]
+        W[:, rows, p] = -times(inverse, _gap_slope(robot, posture, parameter))
     if coordinates is None:
-        across = preload_directions(known, loop_jacobians(known, posture)).transpose(0, 2, 1)
+        across = preload_directions(mechanism, loop_jacobians(mechanism, posture)).transpose(0, 2, 1)
         residual = times(across, residual)
         W = across @ W
     return residual.ravel(), W.reshape(-1, len(parameters))
 
 
-def _gap_slope(robot: ParallelRobot, posture: Posture, one: LoopParameter) -> np.ndarray:
+def _gap_slope(robot: ParallelRobot, posture: Posture, parameter: LoopParameter) -> np.ndarray:
     """Return ∂gap/∂parameter (N, c) of the parameter's leg, by central differences."""
-    a = robot.starts[one.leg]
-    b = robot.starts[one.leg + 1]
+    a = robot.starts[parameter.leg]
+    b = robot.starts[parameter.leg + 1]
     ends = []
     for step in (STEP, -STEP):
-        leg = _changed_leg(robot.legs[one.leg], one, step)
+        leg = _changed_leg(robot.legs[parameter.leg], parameter, step)
         ends.append(links_of(leg, posture.q[:, a:b], posture.pose).gap)
     return (ends[0] - ends[1]) / (2.0 * STEP)
 
 
 def _candidates(leg: Leg, k: int) -> list[LoopParameter]:
     elements = [
-        LoopParameter(f"{leg.name}.{one.name}", one.unit, k, "element", e) for e, one in enumerate(leg.chain.elements)
+        LoopParameter(f"{leg.name}.{element.name}", element.unit, k, "element", e)
+        for e, element in enumerate(leg.chain.elements)
     ]
     places = [
         LoopParameter(f"{leg.name}.{part}.{axis}", "m" if i < 3 else "rad", k, part, i)
@@ -273,15 +283,18 @@ def _candidates(leg: Leg, k: int) -> list[LoopParameter]:
     return elements + places
 
 
-def _changed_leg(leg: Leg, one: LoopParameter, value: float) -> Leg:
-    if one.part == "attachment":
-        return replace(leg, attachment=displace(leg.attachment, value * np.eye(6)[one.index]))
+def _changed_leg(leg: Leg, parameter: LoopParameter, value: float) -> Leg:
+    if parameter.part == "attachment":
+        return replace(leg, attachment=displace(leg.attachment, value * np.eye(6)[parameter.index]))
     elements = list(leg.chain.elements)
-    if one.part == "base":
+    if parameter.part == "base":
         first = elements[0]
-        held = np.eye(4) if first.placement is None else first.placement
-        elements[0] = replace(first, placement=displace(held, value * np.eye(6)[one.index]))
+        if first.placement is None:
+            placement = np.eye(4)
+        else:
+            placement = first.placement
+        elements[0] = replace(first, placement=displace(placement, value * np.eye(6)[parameter.index]))
     else:
-        own = elements[one.index]
-        elements[one.index] = replace(own, value=own.value + value)
+        element = elements[parameter.index]
+        elements[parameter.index] = replace(element, value=element.value + value)
     return replace(leg, chain=replace(leg.chain, elements=tuple(elements)))

@@ -50,20 +50,23 @@ def wrench_regressor(pose: np.ndarray, twist: np.ndarray, change: np.ndarray, gr
         gravity: (3,) [m/s²].
     """
     R = pose[:, :3, :3]
-    a, w, b = (np.einsum("nji,nj->ni", R, x) for x in (change[:, :3] - gravity, twist[:, 3:], change[:, 3:]))
-    own = np.zeros((len(R), 6, 10))
+    a = np.einsum("nji,nj->ni", R, change[:, :3] - gravity)
+    w = np.einsum("nji,nj->ni", R, twist[:, 3:])
+    b = np.einsum("nji,nj->ni", R, change[:, 3:])
+    regressor = np.zeros((len(R), 6, 10))
     spin = _skew(w)
-    own[:, :3, 9] = a
-    own[:, :3, 6:9] = _skew(b) + spin @ spin
-    own[:, 3:, 6:9] = -_skew(a)
-    own[:, 3:, :6] = _inertia_columns(b) + spin @ _inertia_columns(w)
-    return np.concatenate([R @ own[:, :3], R @ own[:, 3:]], axis=1)
+    regressor[:, :3, 9] = a
+    regressor[:, :3, 6:9] = _skew(b) + spin @ spin
+    regressor[:, 3:, 6:9] = -_skew(a)
+    regressor[:, 3:, :6] = _inertia_columns(b) + spin @ _inertia_columns(w)
+    return np.concatenate([R @ regressor[:, :3], R @ regressor[:, 3:]], axis=1)
 
 
 def energy_columns(pose: np.ndarray, twist: np.ndarray, gravity: np.ndarray) -> np.ndarray:
     """Return kinetic and potential energy (N, 10) per unit of each standard parameter; see `wrench_regressor`."""
     R = pose[:, :3, :3]
-    u, w = (np.einsum("nji,nj->ni", R, x) for x in (twist[:, :3], twist[:, 3:]))
+    u = np.einsum("nji,nj->ni", R, twist[:, :3])
+    w = np.einsum("nji,nj->ni", R, twist[:, 3:])
     result = np.empty((len(R), 10))
     result[:, :6] = 0.5 * np.einsum("ni,nik->nk", w, _inertia_columns(w))
     down = np.einsum("nji,j->ni", R, gravity)
@@ -99,7 +102,7 @@ class ParallelModel:
     """Legs, platform, payloads and drives as one regressor; a `calib.dynamics.regressor_model.RegressorModel`.
 
     Attributes:
-        known: the robot, its loops closed.
+        mechanism: the robot, its loops closed.
         terms: the drives' terms; their joints are those of the tree.
         torque_rows: ``platform``, ``motor`` or ``power`` rows (`rows_named`).
         payloads: labels of bodies that the platform may carry.
@@ -108,7 +111,7 @@ class ParallelModel:
         preload: (n - r,) mean overconstraint of redundant actuators (`velocities.overconstraint`) [N m or N]; (): 0.
     """
 
-    known: ClosedRobot
+    mechanism: ClosedRobot
     terms: tuple[DriveTerm, ...]
     torque_rows: TorqueRows
     payloads: tuple[str, ...] = ()
@@ -116,7 +119,7 @@ class ParallelModel:
     preload: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        legs = self.known.robot.legs
+        legs = self.mechanism.robot.legs
         kinds = [(leg.bodies, [joint.kind for joint in leg.chain.joints]) for leg in legs]
         for leg, kind in zip(legs, kinds if self.identical_legs else ()):
             require(kind == kinds[0], f"identical_legs: {leg.name} is built unlike {legs[0].name}", UsageError)
@@ -127,12 +130,12 @@ class ParallelModel:
     @property
     def n(self) -> int:
         """Number of actuated joints, whose motion is recorded."""
-        return self.known.robot.n
+        return self.mechanism.robot.n
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
         """Labels of the bodies: the legs', the platform's, the payloads'."""
-        robot = self.known.robot
+        robot = self.mechanism.robot
         legs = [robot.labels[a + j] for leg, a in zip(robot.legs, robot.starts) for j in range(leg.bodies)]
         return (*legs, robot.platform_label, *self.payloads)
 
@@ -149,9 +152,11 @@ class ParallelModel:
         first = np.arange(self._bodies + len(self.terms))
         if self.identical_legs:
             size = self.legs[0][2].stop
-            starts = self.known.robot.starts
+            starts = self.mechanism.robot.starts
             first[: size * len(self.legs)] %= size
-            inertias = [(one.joint, k) for k, one in enumerate(self.terms, self._bodies) if one.name.startswith("Ia")]
+            inertias = [
+                (term.joint, k) for k, term in enumerate(self.terms, self._bodies) if term.name.startswith("Ia")
+            ]
             motors = {joint: k for joint, k in inertias if joint is not None}
             for joint, k in motors.items():
                 first[k] = motors.get(joint % int(starts[1]), k)
@@ -180,8 +185,8 @@ class ParallelModel:
             result[owner] += column
         return result
 
-    def _chosen(self, every: Sequence[Any]) -> tuple[Any, ...]:
-        return tuple(every[k] for k in self._kept)
+    def _chosen(self, entries: Sequence[Any]) -> tuple[Any, ...]:
+        return tuple(entries[k] for k in self._kept)
 
     @property
     def _bodies(self) -> int:
@@ -199,11 +204,11 @@ class ParallelModel:
     @cached_property
     def _names(self) -> tuple[str, ...]:
         bodies = (name + label for label in self.labels for name in STANDARD)
-        return self._chosen((*bodies, *(one.name for one in self.terms)))
+        return self._chosen((*bodies, *(term.name for term in self.terms)))
 
     @property
     def units(self) -> tuple[str, ...]:
-        return self._chosen((*UNITS * len(self.labels), *(one.unit for one in self.terms)))
+        return self._chosen((*UNITS * len(self.labels), *(term.unit for term in self.terms)))
 
     @property
     def p(self) -> int:
@@ -224,7 +229,7 @@ class ParallelModel:
     @cached_property
     def legs(self) -> tuple[tuple[Bodies, slice, slice], ...]:
         """For each leg: its bodies, its joints' indices in the tree, and its bodies' columns."""
-        robot = self.known.robot
+        robot = self.mechanism.robot
         ends = 10 * np.cumsum([0, *(leg.bodies for leg in robot.legs)])
         return tuple(
             (bodies_of(leg.chain), slice(*robot.starts[k : k + 2]), slice(*ends[k : k + 2]))
@@ -260,25 +265,25 @@ class ParallelModel:
         motion = self.moved(q, v, a)
         return self.on_rows(self.platform_force(values, motion, carried)[:, :, None], motion)[:, :, 0]
 
-    def moved(self, q: np.ndarray, v: np.ndarray, a: np.ndarray, near: Posture | None = None) -> LoopMotion:
+    def moved(self, q: np.ndarray, v: np.ndarray, a: np.ndarray, start: Posture | None = None) -> LoopMotion:
         """Return the whole robot's motion from the encoders' q, v, a (N, n); `near`: postures to start from."""
-        posture = self.known.locate(q, near)
-        return of_readings(self.known, posture, np.asarray(v, dtype=float), np.asarray(a, dtype=float))
+        posture = self.mechanism.locate(q, start)
+        return of_readings(self.mechanism, posture, np.asarray(v, dtype=float), np.asarray(a, dtype=float))
 
     def platform_regressor(self, motion: LoopMotion, carried: Collection[str] | None = None) -> np.ndarray:
         """Return the regressor W (N, r, p) in platform coordinates, stored in the order (p, r, N)."""
-        robot = self.known.robot
+        robot = self.mechanism.robot
         J = motion.jacobians
         out = np.zeros((self._bodies + len(self.terms), robot.r, len(motion.v)))
         for bodies, joints, columns in self.legs:
             W = rigid_body.regressor(bodies, motion.posture.q[:, joints], motion.v[:, joints], motion.a[:, joints])
             W = W[:, :, : columns.stop - columns.start]
             out[columns] = np.einsum("njr,njc->crn", J.joints[:, joints], W, optimize=True)
-        own = wrench_regressor(motion.posture.pose, motion.twist, motion.change, robot.gravity)
-        self._fill_platform(out, (J.platform.transpose(0, 2, 1) @ own).transpose(2, 1, 0), carried)
+        platform = wrench_regressor(motion.posture.pose, motion.twist, motion.change, robot.gravity)
+        self._fill_platform(out, (J.platform.transpose(0, 2, 1) @ platform).transpose(2, 1, 0), carried)
         motions = [motion.posture.q.T, motion.v.T, motion.a.T, None]
-        for k, one in enumerate(self.terms):
-            for joint, column in one.acting(motions, np.zeros((0, len(motion.v)))):
+        for k, term in enumerate(self.terms):
+            for joint, column in term.acting(motions, np.zeros((0, len(motion.v)))):
                 out[self._bodies + k] += J.joints[:, joint].T * column
         return self._merged(out).transpose(2, 1, 0)
 
@@ -286,7 +291,7 @@ class ParallelModel:
         self, values: np.ndarray, motion: LoopMotion, carried: Collection[str] | None = None
     ) -> np.ndarray:
         """Return the forces and moments (N, r) in platform coordinates for parameters (p,)."""
-        robot = self.known.robot
+        robot = self.mechanism.robot
         J = motion.jacobians
         tree = self.tree_torque(values, motion)
         fixed = self.platform_parameters(values, carried)
@@ -298,18 +303,18 @@ class ParallelModel:
     ) -> np.ndarray:
         """Return the torques (N, n) of the actuators for parameters (p,): of redundant ones with the preload."""
         forces = self.platform_force(values, motion, carried)
-        return distributed(self.known, motion.jacobians, forces, np.array(self.preload or [0.0]))
+        return distributed(self.mechanism, motion.jacobians, forces, np.array(self.preload or [0.0]))
 
     def tree_torque(self, values: np.ndarray, motion: LoopMotion) -> np.ndarray:
         """Return the torques (N, n_t) of the opened legs with their drives, without the platform."""
-        own = [motion.posture.q, motion.v, motion.a]
+        states = [motion.posture.q, motion.v, motion.a]
         parts = [
-            rigid_body.inverse_dynamics(bodies, parameters, *(x[:, joints] for x in own))
+            rigid_body.inverse_dynamics(bodies, parameters, *(x[:, joints] for x in states))
             for (bodies, joints, _), parameters in zip(self.legs, self.leg_parameters(values))
         ]
         result = np.concatenate(parts, axis=1)
-        for one, value in zip(self.terms, self.spread(values)[self._bodies :]):
-            for joint, column in one.acting([*(x.T for x in own), None], np.zeros((0, len(result)))):
+        for term, value in zip(self.terms, self.spread(values)[self._bodies :]):
+            for joint, column in term.acting([*(x.T for x in states), None], np.zeros((0, len(result)))):
                 result[:, joint] += value * column
         return result
 
@@ -322,9 +327,9 @@ class ParallelModel:
 
     def platform_parameters(self, values: np.ndarray, carried: Collection[str] | None = None) -> np.ndarray:
         """Return the ten standard parameters of the platform together with the payloads on board."""
-        own = self.spread(values)[self.legs[-1][2].stop : self._bodies].reshape(-1, 10)
+        bodies = self.spread(values)[self.legs[-1][2].stop : self._bodies].reshape(-1, 10)
         present = [True, *(carried is None or label in carried for label in self.payloads)]
-        return own[present].sum(axis=0)
+        return bodies[present].sum(axis=0)
 
     def energy_columns(self, q: np.ndarray, v: np.ndarray, carried: Collection[str] | None = None) -> np.ndarray:
         """Return the energy regressor h (N, p) at encoder q, v (N, n), like `IdentificationModel.energy_columns`."""
@@ -334,18 +339,18 @@ class ParallelModel:
         """Return the columns h (N, p) of kinetic and potential energy; zero for friction (eq. 3 of the power paper)."""
         out = np.zeros((self._bodies + len(self.terms), len(motion.v)))
         for bodies, joints, columns in self.legs:
-            own = rigid_body.energies(bodies, motion.posture.q[:, joints], motion.v[:, joints])
-            out[columns] = own[:, : columns.stop - columns.start].T
-        platform = energy_columns(motion.posture.pose, motion.twist, self.known.robot.gravity)
+            leg_energies = rigid_body.energies(bodies, motion.posture.q[:, joints], motion.v[:, joints])
+            out[columns] = leg_energies[:, : columns.stop - columns.start].T
+        platform = energy_columns(motion.posture.pose, motion.twist, self.mechanism.robot.gravity)
         self._fill_platform(out, platform.T, carried)
         drives.fill_energies(self.terms, out[self._bodies :], motion.v.T)
         return self._merged(out).T
 
-    def _fill_platform(self, out: np.ndarray, own: np.ndarray, carried: Collection[str] | None) -> None:
+    def _fill_platform(self, out: np.ndarray, platform: np.ndarray, carried: Collection[str] | None) -> None:
         """Write the ten columns of the platform, and ten columns for each payload on board."""
         for first, label in zip(range(self.legs[-1][2].stop, self._bodies, 10), (None, *self.payloads)):
             if label is None or carried is None or label in carried:
-                out[first : first + 10] = own
+                out[first : first + 10] = platform
 
     def acting(self) -> np.ndarray:
         states = self.sample(4, np.random.default_rng(0))
@@ -356,63 +361,66 @@ class ParallelModel:
 
         Of bodies next to the platform, inertia and mass regroup on it and on the links before (Khalil & Ibrahim 2007).
         """
-        own = [(bodies, (columns.stop - columns.start) // 10) for bodies, _, columns in self.legs]
-        order, kinds = (np.concatenate([getattr(b, key)[:k] for b, k in own]) for key in ("order", "kinds"))
+        body_order = [(bodies, (columns.stop - columns.start) // 10) for bodies, _, columns in self.legs]
+        order = np.concatenate([b.order[:k] for b, k in body_order])
+        kinds = np.concatenate([b.kinds[:k] for b, k in body_order])
         ranks: dict[str, list[int]] = {"moments": [], "inertias": [], "late": []}
-        for i, (own, kind) in enumerate(zip(order, kinds)):
+        for i, (body_order, kind) in enumerate(zip(order, kinds)):
             last = KEPT_LAST["prismatic" if kind == PRISMATIC else "revolute"]
             for c in range(10):
                 if c in last or c == 9:
                     rank = "late"
                 else:
                     rank = "moments" if c > 5 else "inertias"
-                ranks[rank].append(10 * i + int(own[c]))
+                ranks[rank].append(10 * i + int(body_order[c]))
         platform = 10 * len(order)
         drive = range(self._bodies, self._bodies + len(self.terms))
         first = range(platform, platform + 10)
         payloads = range(platform + 10, self._bodies)
-        every = [*first, *ranks["moments"], *ranks["inertias"], *drive, *ranks["late"], *payloads]
-        return np.array(list(dict.fromkeys(self.owners[every])), dtype=int)
+        order_ = [*first, *ranks["moments"], *ranks["inertias"], *drive, *ranks["late"], *payloads]
+        return np.array(list(dict.fromkeys(self.owners[order_])), dtype=int)
 
     def plant(self, values: np.ndarray, terms: Sequence[DriveTerm] = ()) -> Any:
         """Return the robot to simulate with values of its parameters and of further terms of the actuated joints."""
         # stands on this module
         from calib.rooms.parallel.mechanism.simulation import ParallelPlant
 
-        joints = [int(self.known.robot.actuated[one.acts[0][0]]) for one in terms]
-        own = (replace(one, acts=((j, ((j, 1.0),)),)) for one, j in zip(terms, joints))
-        return ParallelPlant(replace(self, terms=(*self.terms, *own)), values)
+        joints = [int(self.mechanism.robot.actuated[term.acts[0][0]]) for term in terms]
+        actuated_terms = (replace(term, acts=((j, ((j, 1.0),)),)) for term, j in zip(terms, joints))
+        return ParallelPlant(replace(self, terms=(*self.terms, *actuated_terms)), values)
 
     def joint_noise(self, noise: np.ndarray) -> np.ndarray:
         """Return the velocity noise (n_t,) of all joints at home from that of the actuated ones (n,)."""
-        at_home = loop_jacobians(self.known, self.known.home)
+        at_home = loop_jacobians(self.mechanism, self.mechanism.home)
         return np.sqrt((at_home.joints[0] @ np.linalg.pinv(at_home.readings[0])) ** 2 @ noise**2)
 
     def load_cases(self) -> Loads:
-        return (None, ()) if self.payloads else (None,)
+        if self.payloads:
+            return (None, ())
+        return (None,)
 
     def sample(
         self, count: int, rng: np.random.Generator, lower: np.ndarray | None = None, upper: np.ndarray | None = None
     ) -> States:
         """Draw random states: the platform uniform in its box, its twist and the twist's derivative within ±3."""
-        robot = self.known.robot
-        posture = self.known.place(rng.uniform(robot.lower, robot.upper, (count, robot.r)))
-        motion = of_platform(self.known, posture, *rng.uniform(-RATE, RATE, (2, count, robot.r)))
-        own = robot.actuated
-        return States(posture.q[:, own], motion.v[:, own], motion.a[:, own])
+        robot = self.mechanism.robot
+        posture = self.mechanism.place(rng.uniform(robot.lower, robot.upper, (count, robot.r)))
+        motion = of_platform(self.mechanism, posture, *rng.uniform(-RATE, RATE, (2, count, robot.r)))
+        actuated = robot.actuated
+        return States(posture.q[:, actuated], motion.v[:, actuated], motion.a[:, actuated])
 
     def known_parameters(self) -> np.ndarray | None:
         """Return the inertial parameters of the robot's file (inertial,), zero for payloads; None if it has none.
 
         Identical legs have the mean of the file's.
         """
-        robot = self.known.robot
+        robot = self.mechanism.robot
         parts = [leg.chain.inertias[: leg.bodies] for leg in robot.legs if leg.chain.inertias is not None]
         if len(parts) < len(robot.legs) or robot.platform is None:
             return None
-        every = np.concatenate([*parts, robot.platform[None], np.zeros((len(self.payloads), 10))]).ravel()
-        own = self.owners[: self._bodies]
-        return np.bincount(own, every) / np.bincount(own)
+        parameters = np.concatenate([*parts, robot.platform[None], np.zeros((len(self.payloads), 10))]).ravel()
+        owners = self.owners[: self._bodies]
+        return np.bincount(owners, parameters) / np.bincount(owners)
 
     def on_rows(self, W: np.ndarray, motion: LoopMotion) -> np.ndarray:
         """Return the regressor (N, rows, p) of the torque rows from the one in platform coordinates, W (N, r, p)."""
@@ -426,17 +434,17 @@ class ParallelModel:
 PLATFORM = "platform"
 
 
-def rows_named(known: ClosedRobot, name: str = "") -> TorqueRows:
+def rows_named(mechanism: ClosedRobot, name: str = "") -> TorqueRows:
     """Return the rows of the option ``platform``, ``motor`` or ``power``; by default those possible for a robot.
 
     Raises:
         UsageError: for motor rows of redundant actuators, whose torques no model determines; for other names.
     """
-    robot = known.robot
+    robot = mechanism.robot
     name = name or (PLATFORM if robot.redundant else MOTOR.name)
     if name == PLATFORM:
-        units = tuple(FORCES[COORDINATES.index(one)] for one in robot.freedom)
-        return projected(PLATFORM, Projection(robot.freedom, units, partial(_to_platform, known)))
+        units = tuple(FORCES[COORDINATES.index(coordinate)] for coordinate in robot.freedom)
+        return projected(PLATFORM, Projection(robot.freedom, units, partial(_to_platform, mechanism)))
     if name == POWER.name:
         return POWER
     require(name == MOTOR.name, f"rows = '{name}': for a parallel robot expected platform, motor or power", UsageError)
@@ -449,7 +457,7 @@ def rows_named(known: ClosedRobot, name: str = "") -> TorqueRows:
 
 
 def make_parallel_model(
-    known: ClosedRobot,
+    mechanism: ClosedRobot,
     sets: Sequence[str] = (),
     v0: float = V0,
     rows: TorqueRows | None = None,
@@ -466,47 +474,50 @@ def make_parallel_model(
         passive: names for all passive joints, e.g. ``Fv Fc``.
         identical_legs: see `ParallelModel`.
     """
-    robot = known.robot
-    each = list(sets) or ["Ia Fv Fc off"]
-    each = each * robot.n if len(each) == 1 else each
-    if len(each) != robot.n:
-        raise UsageError(f"drives: {len(each)} texts for the {robot.n} actuated joints; give one, or one per joint")
+    robot = mechanism.robot
+    drive_sets = list(sets) or ["Ia Fv Fc off"]
+    if len(drive_sets) == 1:
+        drive_sets = drive_sets * robot.n
+    if len(drive_sets) != robot.n:
+        raise UsageError(
+            f"drives: {len(drive_sets)} texts for the {robot.n} actuated joints; give one, or one per joint"
+        )
     joints = [joint for leg in robot.legs for joint in leg.chain.joints]
     texts = [passive] * len(joints)
-    for j, text in zip(robot.actuated, each):
+    for j, text in zip(robot.actuated, drive_sets):
         texts[j] = text
     linear = [joint.kind == "prismatic" for joint in joints]
     plain = drives.standard(texts, v0, linear)
-    terms = tuple(replace(one, name=_renamed(one, robot.labels)) for one in plain)
-    return ParallelModel(known, terms, rows or rows_named(known), tuple(payloads), identical_legs)
+    terms = tuple(replace(term, name=_renamed(term, robot.labels)) for term in plain)
+    return ParallelModel(mechanism, terms, rows or rows_named(mechanism), tuple(payloads), identical_legs)
 
 
-def _renamed(one: DriveTerm, labels: Sequence[str]) -> str:
+def _renamed(term: DriveTerm, labels: Sequence[str]) -> str:
     """Return the name of a term with its joint's label instead of its number."""
-    joint = one.acts[0][0]
-    return one.name.removesuffix(str(joint + 1)) + labels[joint]
+    joint = term.acts[0][0]
+    return term.name.removesuffix(str(joint + 1)) + labels[joint]
 
 
-def _to_platform(known: ClosedRobot, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+def _to_platform(mechanism: ClosedRobot, q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Return J_p^invᵀ (N, r, n), which maps actuator torques to platform coordinates."""
-    return loop_jacobians(known, known.locate(q)).readings.transpose(0, 2, 1)
+    return loop_jacobians(mechanism, mechanism.locate(q)).readings.transpose(0, 2, 1)
 
 
 # of the differences by x, v and a
 STEPS = (1e-6, 1e-3, 1.0)
 
 
-def along(known: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> LoopMotion:
+def along(mechanism: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> LoopMotion:
     """Return the motion of all joints for platform coordinates x (N, r) and their derivatives v, a."""
-    return of_platform(known, known.place(x), *_twist_of(known, x, v, a))
+    return of_platform(mechanism, mechanism.place(x), *_twist_of(mechanism, x, v, a))
 
 
-def _twist_of(known: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _twist_of(mechanism: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the independent parts of the platform's twist and their derivatives, each (N, r).
 
     Position's are v and a themselves; ω = ψ̇ z + φ̇ Rz y + ρ̇ Rz Ry x of roll ρ, pitch φ, yaw ψ about the base's axes.
     """
-    selected = known.robot.selected
+    selected = mechanism.robot.selected
     if not (selected > 2).any() or ((selected > 2).sum() == 1 and 5 in selected):
         return v, a
     full = np.zeros((3, len(x), 6))
@@ -525,27 +536,29 @@ def _twist_of(known: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarray) -
 
 # of a search, whose objectives and limits all ask for the same motion and for those beside it
 @lru_cache(maxsize=4)
-def _moving(known: ClosedRobot, *motion: bytes) -> LoopMotion:
+def _moving(mechanism: ClosedRobot, *motion: bytes) -> LoopMotion:
     """Return the motion of all joints for x, v, a (N, r) of the platform."""
-    x, v, a = (np.frombuffer(one).reshape(-1, known.robot.r) for one in motion)
-    return along(known, x, v, a)
+    x, v, a = (np.frombuffer(series).reshape(-1, mechanism.robot.r) for series in motion)
+    return along(mechanism, x, v, a)
 
 
 @lru_cache(maxsize=4)
-def _beside(known: ClosedRobot, *motion: bytes) -> list[tuple[LoopMotion, LoopMotion]]:
+def _beside(mechanism: ClosedRobot, *motion: bytes) -> list[tuple[LoopMotion, LoopMotion]]:
     """Return the motions of all joints beside x, v, a (N, r): each of their columns raised and lowered by its step."""
-    given = [np.frombuffer(one).reshape(-1, known.robot.r) for one in motion]
+    states = [np.frombuffer(series).reshape(-1, mechanism.robot.r) for series in motion]
     result = []
-    near = _moving(known, *motion).posture
-    still = loop_jacobians(known, near)
+    start = _moving(mechanism, *motion).posture
+    still = loop_jacobians(mechanism, start)
     for order, step in enumerate(STEPS):
-        for shift in step * np.eye(known.robot.r):
+        for shift in step * np.eye(mechanism.robot.r):
             ends = []
-            for moved in ([*given], [*given]):
-                moved[order] = moved[order] + (-shift if ends else shift)
-                posture = known.place(moved[0], near) if order == 0 else near
-                twist = _twist_of(known, *moved)
-                ends.append(of_platform(known, posture, *twist, None if order == 0 else still))
+            for shifted in ([*states], [*states]):
+                shifted[order] = shifted[order] + (-shift if ends else shift)
+                posture = start
+                if order == 0:
+                    posture = mechanism.place(shifted[0], start)
+                twist = _twist_of(mechanism, *shifted)
+                ends.append(of_platform(mechanism, posture, *twist, None if order == 0 else still))
             result.append(tuple(ends))
     return result
 
@@ -567,7 +580,7 @@ class PlatformRegressor:
 
     def motion(self, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> LoopMotion:
         """Return the motion of all joints for x, v, a (N, r); x is clipped to the robot's box."""
-        return _moving(self.model.known, *(one.tobytes() for one in (self._reachable(x), v, a)))
+        return _moving(self.model.mechanism, *(series.tobytes() for series in (self._reachable(x), v, a)))
 
     def regressor(self, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return W (N, r, b) in the selected columns."""
@@ -586,14 +599,14 @@ class PlatformRegressor:
 
     def speeds(self, motion: LoopMotion) -> np.ndarray:
         """Return the actuators' speeds (N, n) of a motion."""
-        return motion.v[:, self.model.known.robot.actuated]
+        return motion.v[:, self.model.mechanism.robot.actuated]
 
     def _reachable(self, x: np.ndarray, spare_share: float = 0.01) -> np.ndarray:
         """Return coordinates clipped to the robot's box, since a search may leave the box.
 
         `spare_share`: of the box's width, beyond it (our choice).
         """
-        robot = self.model.known.robot
+        robot = self.model.mechanism.robot
         spare = spare_share * (robot.upper - robot.lower)
         return np.clip(x, robot.lower - spare, robot.upper + spare)
 
@@ -610,8 +623,8 @@ class PlatformRegressor:
         """
         within = self._reachable(x)
         result = np.empty((3, *x.shape))
-        found = _beside(self.model.known, *(one.tobytes() for one in (within, v, a)))
-        for k, (raised, lowered) in enumerate(found):
+        pairs = _beside(self.model.mechanism, *(series.tobytes() for series in (within, v, a)))
+        for k, (raised, lowered) in enumerate(pairs):
             order, j = divmod(k, x.shape[1])
             change = ((of(raised) - of(lowered)) * weights).reshape(len(x), -1)
             result[order, :, j] = change.sum(axis=1) / (2.0 * STEPS[order])

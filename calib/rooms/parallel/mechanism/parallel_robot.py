@@ -73,15 +73,15 @@ class Leg(Frozen):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        place = f"leg '{self.name}'"
+        location = f"leg '{self.name}'"
         n = self.chain.n
         if self.end not in ENDS:
-            refuse_robot(place, f"its end '{self.end}' is neither {' nor '.join(ENDS)}")
+            refuse_robot(location, f"its end '{self.end}' is neither {' nor '.join(ENDS)}")
         if self.home.shape != (n,):
-            refuse_robot(place, f"home has {self.home.size} values for its {n} joints")
+            refuse_robot(location, f"home has {self.home.size} values for its {n} joints")
         if n > self.held:
             refuse_robot(
-                place,
+                location,
                 f"{n} joints behind a {self.end} end leave motions that no loop determines; at most {self.held} can be "
                 "solved for",
             )
@@ -151,9 +151,9 @@ class ParallelRobot(Frozen):
                 f"{self.lower.tolist()} and {self.upper.tolist()}"
             )
 
-    def refuse(self, words: str) -> NoReturn:
+    def refuse(self, message: str) -> NoReturn:
         """Refuse the robot for the reason `words`."""
-        refuse_robot(f"robot '{self.name}'", words)
+        refuse_robot(f"robot '{self.name}'", message)
 
     @property
     def r(self) -> int:
@@ -255,12 +255,12 @@ def _from_table(table: Mapping[str, Any], where: str) -> ParallelRobot:
             where, f'kind is {shown(table.get("kind"))}; for a robot with legs and a platform state kind = "parallel"'
         )
     gravity = vector(table.get("gravity", list(GRAVITY)), 3, f"{where}, gravity")
-    own = table.get("platform")
-    place = f"{where}, [platform]"
-    if not isinstance(own, Mapping):
+    platform = table.get("platform")
+    location = f"{where}, [platform]"
+    if not isinstance(platform, Mapping):
         refuse_robot(where, "no [platform] table found")
-    check_keys(own, _PLATFORM, place)
-    freedom = _words(own.get("freedom"), f"{place}, freedom")
+    check_keys(platform, _PLATFORM, location)
+    freedom = _words(platform.get("freedom"), f"{location}, freedom")
     turns = [name in COORDINATES[3:] for name in freedom]
     legs = table.get("leg")
     if not isinstance(legs, list) or not legs or not all(isinstance(leg, Mapping) for leg in legs):
@@ -269,10 +269,10 @@ def _from_table(table: Mapping[str, Any], where: str) -> ParallelRobot:
         name=word(table, "name", where),
         legs=tuple(_leg(leg, k, gravity, where) for k, leg in enumerate(legs)),
         freedom=freedom,
-        home=placement(own.get("home", {}), f"{place}, home"),
-        lower=_values(own.get("lower"), turns, f"{place}, lower", "coordinate of freedom"),
-        upper=_values(own.get("upper"), turns, f"{place}, upper", "coordinate of freedom"),
-        platform=frozen(vector(own["inertia"], 10, f"{place}, inertia")) if "inertia" in own else None,
+        home=placement(platform.get("home", {}), f"{location}, home"),
+        lower=_values(platform.get("lower"), turns, f"{location}, lower", "coordinate of freedom"),
+        upper=_values(platform.get("upper"), turns, f"{location}, upper", "coordinate of freedom"),
+        platform=frozen(vector(platform["inertia"], 10, f"{location}, inertia")) if "inertia" in platform else None,
         gravity=gravity,
     )
 
@@ -302,22 +302,22 @@ def to_table(robot: ParallelRobot, source: str = "") -> dict[str, Any]:
 
 
 def _leg(entry: Mapping[str, Any], number_: int, gravity: np.ndarray, where: str) -> Leg:
-    place = f"{where}, [[leg]] number {number_ + 1}"
-    check_keys(entry, _LEG, place)
-    name = word(entry, "name", place, f"leg{number_ + 1}")
-    place = f"{place} ('{name}')"
+    location = f"{where}, [[leg]] number {number_ + 1}"
+    check_keys(entry, _LEG, location)
+    name = word(entry, "name", location, f"leg{number_ + 1}")
+    location = f"{location} ('{name}')"
     rows = {"name": name, "joint": entry.get("joint"), "gravity": gravity.tolist(), "propose_beta": False}
     if "tail" in entry:
         rows["tail"] = entry["tail"]
-    chain = _based(mdh.from_table(rows, place), placement(entry.get("base", {}), f"{place}, base"))
+    chain = _based(mdh.from_table(rows, location), placement(entry.get("base", {}), f"{location}, base"))
     turns = [joint.kind == "revolute" for joint in chain.joints]
     return Leg(
         name,
         chain,
-        _actuated(entry, chain, place),
-        _values(entry.get("home", [0.0] * chain.n), turns, f"{place}, home", "joint"),
-        placement(entry.get("attachment", {}), f"{place}, attachment"),
-        word(entry, "end", place, "rigid"),
+        _actuated(entry, chain, location),
+        _values(entry.get("home", [0.0] * chain.n), turns, f"{location}, home", "joint"),
+        placement(entry.get("attachment", {}), f"{location}, attachment"),
+        word(entry, "end", location, "rigid"),
     )
 
 
@@ -327,38 +327,40 @@ def _based(chain: Chain, base: np.ndarray) -> Chain:
     return replace(chain, elements=(first, *chain.elements[1:]))
 
 
-def _actuated(entry: Mapping[str, Any], chain: Chain, place: str) -> tuple[int, ...]:
-    named = _words(entry.get("actuated", []), f"{place}, actuated")
-    for one in named:
-        if one not in chain.joint_names:
-            near = suggestion(one, chain.joint_names)
-            refuse_robot(place, f"actuated '{one}' is not one of its joints{near}: {', '.join(chain.joint_names)}")
-    return tuple(sorted(chain.joint_names.index(one) for one in dict.fromkeys(named)))
+def _actuated(entry: Mapping[str, Any], chain: Chain, location: str) -> tuple[int, ...]:
+    names = _words(entry.get("actuated", []), f"{location}, actuated")
+    for name in names:
+        if name not in chain.joint_names:
+            advice = suggestion(name, chain.joint_names)
+            refuse_robot(
+                location, f"actuated '{name}' is not one of its joints{advice}: {', '.join(chain.joint_names)}"
+            )
+    return tuple(sorted(chain.joint_names.index(fromkey) for fromkey in dict.fromkeys(names)))
 
 
 def _words(value: Any, where: str) -> tuple[str, ...]:
-    if not isinstance(value, list) or not all(isinstance(one, str) for one in value):
+    if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
         refuse_robot(where, f"expected a list of names, found {shown(value)}")
     return tuple(value)
 
 
-def _values(values: Any, turns: Sequence[bool], place: str, each: str) -> np.ndarray:
+def _values(values: Any, turns: Sequence[bool], location: str, quantity: str) -> np.ndarray:
     """Return a list of values [rad where `turns`, else m], one per `each`."""
     if not isinstance(values, list) or len(values) != len(turns):
-        refuse_robot(place, f"expected one value per {each}, {len(turns)}; found {shown(values)}")
-    return np.array([number(value, place, "angle" if turn else "length") for value, turn in zip(values, turns)])
+        refuse_robot(location, f"expected one value per {quantity}, {len(turns)}; found {shown(values)}")
+    return np.array([number(value, location, "angle" if turn else "length") for value, turn in zip(values, turns)])
 
 
 def _leg_table(leg: Leg) -> dict[str, Any]:
     base = leg.chain.elements[0].placement
-    own = mdh.to_table(_based(leg.chain, np.eye(4)))
+    chain_table = mdh.to_table(_based(leg.chain, np.eye(4)))
     table: dict[str, Any] = {"name": leg.name}
     if base is not None:
         table["base"] = placement_table(base)
     table |= {"attachment": placement_table(leg.attachment), "end": leg.end}
     table["actuated"] = [leg.chain.joint_names[j] for j in leg.actuated]
     table["home"] = [spelled(float(value)) for value in leg.home]
-    if "tail" in own:
-        table["tail"] = own["tail"]
-    table["joint"] = own["joint"]
+    if "tail" in chain_table:
+        table["tail"] = chain_table["tail"]
+    table["joint"] = chain_table["joint"]
     return table

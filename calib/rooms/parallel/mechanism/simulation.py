@@ -90,14 +90,15 @@ class ParallelPlant:
         """
         from calib.rooms.parallel.mechanism import simulation_kernels
 
-        known = self.model.known
+        mechanism = self.model.mechanism
         sensing = sensing or Sensing()
         n = self.model.n
         rng = np.random.default_rng(seed)
         shape = reference.q.shape
-        encoder, heard = (rng.normal(size=shape) * size for size in (sensing.sigma_q, sensing.sigma_tau))
-        start = known.locate(reference.q[:1])
-        rate = np.linalg.pinv(loop_jacobians(known, start).readings[0]) @ reference.v[0]
+        encoder = rng.normal(size=shape) * sensing.sigma_q
+        heard = rng.normal(size=shape) * sensing.sigma_tau
+        start = mechanism.locate(reference.q[:1])
+        rate = np.linalg.pinv(loop_jacobians(mechanism, start).readings[0]) @ reference.v[0]
         out = np.empty((3, *shape))
         period = reference.period
         status, reached = simulation_kernels.run(
@@ -119,33 +120,33 @@ class ParallelPlant:
         if status != simulation_kernels.FINE:
             raise failure(status, reached * period)
         tick = sample_ticks(len(out[0]), sensing.every)
-        whole = tick.astype(int)
+        ticks = tick.astype(int)
         spline = CubicSpline(np.arange(len(out[0])), out[0])
         q, v, a = (spline(tick, order) / period**order for order in range(3))
         t = reference.t[0] + tick * period
-        noise = encoder[whole]
-        return SimulatedRun(t, frozen(q), v, a, frozen(q + noise), frozen(out[2, whole] + heard[whole]), out[2, whole])
+        noise = encoder[ticks]
+        return SimulatedRun(t, frozen(q), v, a, frozen(q + noise), frozen(out[2, ticks] + heard[ticks]), out[2, ticks])
 
     def _values(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the parameters of legs, platform and drives as `simulation_kernels.run` takes them."""
         model = self.model
         values = self.parameters
-        drives = np.zeros((int(model.known.robot.starts[-1]), 5))
+        drives = np.zeros((int(model.mechanism.robot.starts[-1]), 5))
         drives[:, 4] = 1.0
-        for one, value in zip(model.terms, model.spread(values)[-len(model.terms) :] if model.terms else ()):
-            require(one.shape in SHAPES, f"term '{one.name}' ({one.shape}) cannot be simulated", UsageError)
-            drives[one.joint, SHAPES[one.shape]] += value
-            if one.shape == "sign":
-                require(one.settings[0] > 0.0, f"'{one.name}' cannot be simulated without v0 above 0", CannotSimulate)
-                drives[one.joint, 4] = one.settings[0]
+        for term, value in zip(model.terms, model.spread(values)[-len(model.terms) :] if model.terms else ()):
+            require(term.shape in SHAPES, f"term '{term.name}' ({term.shape}) cannot be simulated", UsageError)
+            drives[term.joint, SHAPES[term.shape]] += value
+            if term.shape == "sign":
+                require(term.settings[0] > 0.0, f"'{term.name}' cannot be simulated without v0 above 0", CannotSimulate)
+                drives[term.joint, 4] = term.settings[0]
         legs = zip(model.legs, model.leg_parameters(values))
-        own = [rigid_body.kernel_parameters(bodies, parameters) for (bodies, *_), parameters in legs]
-        return _stacked(own), model.platform_parameters(values, self.carried), drives
+        bodies_values = [rigid_body.kernel_parameters(bodies, parameters) for (bodies, *_), parameters in legs]
+        return _stacked(bodies_values), model.platform_parameters(values, self.carried), drives
 
 
 def _robot(model: Any) -> tuple:
     """Return the arrays that describe a robot to `simulation_kernels.run`."""
-    robot = model.known.robot
+    robot = model.mechanism.robot
     legs = [compiled(leg) for leg in robot.legs]
     kinds = [bodies.links for bodies, _ in legs], [bodies.constants for bodies, _ in legs], [tail for _, tail in legs]
     links, constants, tails, attachments = map(_stacked, (*kinds, [leg.attachment for leg in robot.legs]))
@@ -159,7 +160,7 @@ def _robot(model: Any) -> tuple:
         robot.selected,
         robot.actuated,
         robot.gravity,
-        model.known.fixed,
+        model.mechanism.fixed,
     )
 
 

@@ -51,16 +51,20 @@ class LoopMotion:
     rate: np.ndarray
 
 
-def loop_jacobians(known: ClosedRobot, posture: Posture) -> LoopJacobians:
+def loop_jacobians(mechanism: ClosedRobot, posture: Posture) -> LoopJacobians:
     """Return the Jacobians of postures."""
-    links = leg_links(known.robot, posture)
-    D, _ = twists(known, links)
-    joints = np.concatenate([one.inverse @ (one.carried @ D) for one in links], axis=1)
-    return LoopJacobians(joints, joints[:, known.robot.actuated], D, links)
+    links = leg_links(mechanism.robot, posture)
+    D, _ = twists(mechanism, links)
+    joints = np.concatenate([link.inverse @ (link.carried @ D) for link in links], axis=1)
+    return LoopJacobians(joints, joints[:, mechanism.robot.actuated], D, links)
 
 
 def of_platform(
-    known: ClosedRobot, posture: Posture, rate: np.ndarray, change: np.ndarray, jacobians: LoopJacobians | None = None
+    mechanism: ClosedRobot,
+    posture: Posture,
+    rate: np.ndarray,
+    change: np.ndarray,
+    jacobians: LoopJacobians | None = None,
 ) -> LoopMotion:
     """Return velocities and accelerations at postures from those of the platform.
 
@@ -68,20 +72,22 @@ def of_platform(
         rate, change: (N, r) independent parts of its twist, and their derivatives.
         jacobians: of the postures, where they are known already.
     """
-    found = jacobians or loop_jacobians(known, posture)
-    v = np.einsum("ntr,nr->nt", found.joints, rate)
-    twist = np.einsum("nkr,nr->nk", found.platform, rate)
+    loop = jacobians or loop_jacobians(mechanism, posture)
+    v = np.einsum("ntr,nr->nt", loop.joints, rate)
+    twist = np.einsum("nkr,nr->nk", loop.platform, rate)
     shifts = []
-    starts = known.robot.starts
-    for one, a, b in zip(found.links, starts, starts[1:]):
-        shifts.append(_end_bias(one, v[:, a:b]) - _attachment_bias(one, twist))
-    _, still = twists(known, found.links, shifts)
-    turning = still + np.einsum("nkr,nr->nk", found.platform, change)
-    accelerations = [times(one.inverse, times(one.carried, turning) - shift) for one, shift in zip(found.links, shifts)]
-    return LoopMotion(posture, found, v, np.concatenate(accelerations, axis=1), twist, turning, rate)
+    starts = mechanism.robot.starts
+    for link, a, b in zip(loop.links, starts, starts[1:]):
+        shifts.append(_end_bias(link, v[:, a:b]) - _attachment_bias(link, twist))
+    _, still = twists(mechanism, loop.links, shifts)
+    turning = still + np.einsum("nkr,nr->nk", loop.platform, change)
+    accelerations = [
+        times(link.inverse, times(link.carried, turning) - shift) for link, shift in zip(loop.links, shifts)
+    ]
+    return LoopMotion(posture, loop, v, np.concatenate(accelerations, axis=1), twist, turning, rate)
 
 
-def of_readings(known: ClosedRobot, posture: Posture, v: np.ndarray, a: np.ndarray) -> LoopMotion:
+def of_readings(mechanism: ClosedRobot, posture: Posture, v: np.ndarray, a: np.ndarray) -> LoopMotion:
     """Return velocities and accelerations at postures from those of the encoders (eqs 16, 18).
 
     All joints and the platform; with redundant encoders, by least squares.
@@ -89,40 +95,43 @@ def of_readings(known: ClosedRobot, posture: Posture, v: np.ndarray, a: np.ndarr
     Args:
         v, a: (N, n) of the actuated joints.
     """
-    found = loop_jacobians(known, posture)
-    back = np.linalg.pinv(found.readings) if known.robot.redundant else np.linalg.inv(found.readings)
+    loop = loop_jacobians(mechanism, posture)
+    if mechanism.robot.redundant:
+        back = np.linalg.pinv(loop.readings)
+    else:
+        back = np.linalg.inv(loop.readings)
     rate = times(back, v)
-    still = of_platform(known, posture, rate, np.zeros_like(rate), found)
-    change = times(back, a - still.a[:, known.robot.actuated])
-    turned = still.change + np.einsum("nkr,nr->nk", found.platform, change)
-    return replace(still, a=still.a + np.einsum("ntr,nr->nt", found.joints, change), change=turned)
+    still = of_platform(mechanism, posture, rate, np.zeros_like(rate), loop)
+    change = times(back, a - still.a[:, mechanism.robot.actuated])
+    turned = still.change + np.einsum("nkr,nr->nk", loop.platform, change)
+    return replace(still, a=still.a + np.einsum("ntr,nr->nt", loop.joints, change), change=turned)
 
 
-def _attachment_bias(one: LegLinks, twist: np.ndarray) -> np.ndarray:
+def _attachment_bias(links: LegLinks, twist: np.ndarray) -> np.ndarray:
     """Return the attachment's acceleration (N, c) at ṫ = 0: ω × (ω × lever); its angular part is zero."""
-    result = np.zeros(one.gap.shape)
+    result = np.zeros(links.gap.shape)
     turn = twist[:, 3:]
     result[:, :3] = (
-        turn * np.einsum("ni,ni->n", turn, one.lever)[:, None] - one.lever * np.sum(turn**2, axis=1)[:, None]
+        turn * np.einsum("ni,ni->n", turn, links.lever)[:, None] - links.lever * np.sum(turn**2, axis=1)[:, None]
     )
     return result
 
 
-def _end_bias(one: LegLinks, v: np.ndarray) -> np.ndarray:
+def _end_bias(links: LegLinks, v: np.ndarray) -> np.ndarray:
     """Return J̇ q̇ (N, c) of a leg's end: Σ_j [(2 w_j + ω_j q̇_j) × v_j q̇_j; w_j × ω_j q̇_j], w_j = Σ_{i<j} ω_i q̇_i.
 
     The columns [v_j; ω_j] of the Jacobian are those of axes fixed in link j - 1, see
     `calib.robot.kinematics.twist_product`.
     """
     w = np.zeros((len(v), 3))
-    result = np.zeros(one.full.shape[:2])
+    result = np.zeros(links.full.shape[:2])
     for j in range(v.shape[1]):
-        moved = one.full[:, :3, j] * v[:, j : j + 1]
-        turned = one.full[:, 3:, j] * v[:, j : j + 1]
-        result[:, :3] += cross(2.0 * w + turned, moved)
+        lever = links.full[:, :3, j] * v[:, j : j + 1]
+        turned = links.full[:, 3:, j] * v[:, j : j + 1]
+        result[:, :3] += cross(2.0 * w + turned, lever)
         result[:, 3:] += cross(w, turned)
         w = w + turned
-    return result[:, : one.gap.shape[1]]
+    return result[:, : links.gap.shape[1]]
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -130,40 +139,40 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a[:, [1, 2, 0]] * b[:, [2, 0, 1]] - a[:, [2, 0, 1]] * b[:, [1, 2, 0]]
 
 
-def preload_directions(known: ClosedRobot, jacobians: LoopJacobians) -> np.ndarray:
+def preload_directions(mechanism: ClosedRobot, jacobians: LoopJacobians) -> np.ndarray:
     """Return N (N, n, n - r), orthonormal torques without effect on the platform.
 
     Their signs are those of home carried along, so that a constant preload does not jump; with more than one redundant
     actuator the basis is the one nearest to home's (Procrustes).
     """
-    robot = known.robot
-    found = _left_null(jacobians.readings, robot.r)
-    home = _left_null(loop_jacobians(known, known.home).readings, robot.r)[0]
+    robot = mechanism.robot
+    directions = _left_null(jacobians.readings, robot.r)
+    home = _left_null(loop_jacobians(mechanism, mechanism.home).readings, robot.r)[0]
     if home.shape[1] and home[np.argmax(np.abs(home[:, 0])), 0] < 0:
         home = -home
-    u, _, vt = np.linalg.svd(found.transpose(0, 2, 1) @ home)
-    return found @ (u @ vt)
+    u, _, vt = np.linalg.svd(directions.transpose(0, 2, 1) @ home)
+    return directions @ (u @ vt)
 
 
-def overconstraint(known: ClosedRobot, jacobians: LoopJacobians, torques: np.ndarray) -> np.ndarray:
+def overconstraint(mechanism: ClosedRobot, jacobians: LoopJacobians, torques: np.ndarray) -> np.ndarray:
     """Return c (N, n - r) [N m or N] of actuator torques (N, n): their part that does no work."""
-    torques = shaped(torques, (len(jacobians.readings), known.robot.n), "torques of the actuators")
-    return np.einsum("nac,na->nc", preload_directions(known, jacobians), torques)
+    torques = shaped(torques, (len(jacobians.readings), mechanism.robot.n), "torques of the actuators")
+    return np.einsum("nac,na->nc", preload_directions(mechanism, jacobians), torques)
 
 
 def distributed(
-    known: ClosedRobot, jacobians: LoopJacobians, forces: np.ndarray, preload: np.ndarray | float = 0.0
+    mechanism: ClosedRobot, jacobians: LoopJacobians, forces: np.ndarray, preload: np.ndarray | float = 0.0
 ) -> np.ndarray:
     """Return actuator torques (N, n) that produce forces (N, r) in platform coordinates, with overconstraint c.
 
     Args:
         preload: c, (N, n - r) or one for all [N m or N]; 0: the torques of least norm.
     """
-    least = np.einsum("nar,nr->na", np.linalg.pinv(jacobians.readings).transpose(0, 2, 1), forces)
-    if not known.robot.redundant:
-        return least
-    N = preload_directions(known, jacobians)
-    return least + np.einsum("nac,nc->na", N, np.broadcast_to(preload, (len(N), N.shape[2])))
+    minimum = np.einsum("nar,nr->na", np.linalg.pinv(jacobians.readings).transpose(0, 2, 1), forces)
+    if not mechanism.robot.redundant:
+        return minimum
+    N = preload_directions(mechanism, jacobians)
+    return minimum + np.einsum("nac,nc->na", N, np.broadcast_to(preload, (len(N), N.shape[2])))
 
 
 def _left_null(A: np.ndarray, rank: int) -> np.ndarray:

@@ -1,0 +1,1 @@
+"""Applications: what commands offer beside the procedure, each a package that can be deleted."""

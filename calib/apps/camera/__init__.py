@@ -1,0 +1,3 @@
+"""Commands for boards and images: calib board, calib images."""
+
+OFFERS = {"commands": "commands:app"}

@@ -1,0 +1,3 @@
+"""Command that writes a certificate again: calib certificate."""
+
+OFFERS = {"commands": "commands:app"}

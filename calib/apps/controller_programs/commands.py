@@ -1,0 +1,102 @@
+"""Commands for controllers: program, deliver."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calib.apps.controller_programs.program_settings import CSV, ProgramSettings
+from calib.cli.shared import command, say
+
+app = typer.Typer()
+
+
+@command(app, "Geometry")
+def program(
+    settings: ProgramSettings,
+    poses: Annotated[Path | None, typer.Argument()] = None,
+    controller: Annotated[str, typer.Option("--for", metavar="NAME")] = "",
+    source: Annotated[str, typer.Option("--from", metavar="NAME")] = "",
+    out: Path | None = None,
+    overwrite: bool = False,
+    listed: Annotated[bool, typer.Option("--list")] = False,
+) -> None:
+    """Write a program that drives the poses of a list, and waits at each for the measurement.
+
+    A program that was edited by hand is read back with --for csv.
+
+    Example: calib program poses.csv --for krl
+
+    Args:
+        poses: CSV of poses to drive, a motion or its folder (UR, KUKA RSI, ABB EGM), or a program of poses
+        controller: the robot's controller; csv: the poses as a table; --list shows all
+        source: the controller of a program that is read, if its suffix does not say it
+        out: file of the program; by default beside the poses
+        listed: list controllers, with what each can be told of a calibration
+    """
+    from calib import files
+    from calib.apps.controller_programs.motion import motion_file
+    from calib.apps.controller_programs.program import program_files
+    from calib.apps.controller_programs.targets import is_program, read_program
+    from calib.controllers.table import controllers
+    from calib.errors import UsageError, require
+
+    if listed:
+        for name, each in controllers().items():
+            say(
+                f"{name}: {each.title}, {', '.join(place.format(name='NAME') for place in each.files.values())}",
+                result=True,
+            )
+            say(
+                f"    takes: {each.takes}", f"    closed: {each.closed}", f"    checked by: {each.checked}", result=True
+            )
+        return
+    known = ", ".join((*controllers(), CSV))
+    require(poses is not None and controller, f"give a list of poses and its controller: --for {known}", UsageError)
+    assert poses is not None
+    poses = motion_file(poses)
+    beside = poses.with_suffix(".csv") if controller == CSV else poses.with_name(poses.name.partition(".")[0])
+    target = out or beside
+    texts = program_files(poses, target, controller, settings, source)
+    if (source or is_program(poses)) and (words := read_program(poses, source).unread):
+        say(words)
+    with files.results([(path, ()) for path in texts], [poses], overwrite):
+        say(*(f"written to {files.write(path, text)}" for path, text in texts.items()))
+
+
+@command(app, "Geometry")
+def deliver(
+    folder: Annotated[Path, typer.Argument(metavar="FIT")],
+    controller: Annotated[str, typer.Option("--for", metavar="NAME")],
+    world: Annotated[str | None, typer.Option(metavar="POSE")] = None,
+    flange: Annotated[str | None, typer.Option(metavar="POSE")] = None,
+    out: Path | None = None,
+    overwrite: bool = False,
+) -> None:
+    """State a calibration in a controller's words: tool and base frames, mastering offsets, what it cannot take.
+
+    Frames stand in the controller's base and flange: World of a FANUC at the height of axis 2, Base of a UR turned by
+    180°. The URDF's links base and tool0 say where; where nothing says it, state it.
+
+    Example: calib deliver fit --for krl
+
+    Args:
+        folder: the folder of a fit, or of a session with a fit
+        controller: the robot's controller: calib program --list
+        world: x,y,z[,roll,pitch,yaw] [m, rad] of the controller's base frame in the arm's, if the URDF does not say it
+        flange: the same of the controller's flange (its all-zero tool) in the arm's tip
+        out: text file; by default it is printed
+    """
+    from calib import files
+    from calib.apps.controller_programs.delivery import delivery_text
+    from calib.apps.controller_programs.frames import stated_frame
+    from calib.controllers.table import controller_named
+    from calib.procedure.export.geometry import results
+
+    statements = stated_frame(world, "--world"), stated_frame(flange, "--flange")
+    text = delivery_text(folder, controller_named(controller), *statements)
+    if out is None:
+        say(text, result=True)
+        return
+    with files.results([(out, (".txt",))], results(folder), overwrite):
+        say(f"written to {files.write(out, text)}")

@@ -1,0 +1,102 @@
+"""A calibration in a controller's words: `calib deliver FIT --for NAME`.
+
+A controller that keeps its nominal geometry takes the tool's and the instrument's frames with which the nominal arm
+meets the measurements best. One whose axes are mastered anew takes joint offsets with the frames that belong to them:
+from a fit with ``--model offsets``, since offsets of a richer model are not the best ones by themselves.
+
+Each frame stands in the controller's base or flange (`calib.apps.controller_programs.frames`), and is printed with it.
+Where
+nothing says where that is, no number is printed.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from calib.apps.controller_programs.frames import ControllerFrame, Description, base_frame, flange_frame
+from calib.apps.controller_programs.targets import number, pose_values
+from calib.controllers.table import Controller
+from calib.geometry.installation import Installation, read_arms
+from calib.procedure.export.delivery import verdicts
+from calib.procedure.export.geometry import read
+from calib.procedure.kinematic_stage.folder import IN_SESSION, FitFolder
+from calib.robot.calibrated import CalibratedChain, nominal_of
+from calib.transforms import invert
+
+DECIMALS = {"m": 7, "mm": 4}  # of frames, by the unit of lengths
+
+
+def delivery_text(
+    folder: Path, controller: Controller, world: np.ndarray | None = None, flange: np.ndarray | None = None
+) -> str:
+    """Return what a controller can be told of a fit, as text for the person who enters it.
+
+    Args:
+        folder: of a fit, or of a session with one.
+        controller: whose words.
+        world, flange: (4, 4) poses of the controller's base in the arm's base, and of its flange in the arm's tip,
+            where the user states them.
+
+    Raises:
+        UsageError: for a folder without a fit.
+    """
+    fit = folder / IN_SESSION if FitFolder(folder / IN_SESSION).robot.is_file() else folder
+    robot, (cell, nominal) = read(fit, "deliver"), read_arms(fit)
+    arm = Description.of_fit(fit, nominal.chain)
+    frames = base_frame(controller, arm, world), flange_frame(controller, arm, flange)
+    lines = [f"{controller.title}: calibration of {robot.chain.name}", str(verdicts(fit)), ""]
+    lines += [f"It takes: {controller.takes}.", f"It does not: {controller.closed}.", ""]
+    if len(nominal.tools):
+        lines += [
+            "Frames if the controller's geometry and mastering stay as they are:",
+            *_frames(nominal, controller, *frames),
+            "",
+        ]
+    if not controller.mastered:
+        lines.append("Its axes are not mastered by their users.")
+    elif FitFolder(fit).metrics().model == "offsets":
+        lines += [
+            "Mastering, with frames that belong to it:",
+            *_mastering(robot, controller),
+            *_frames(cell, controller, *frames),
+        ]
+    else:
+        lines.append("Mastering offsets: fit with --model offsets, and deliver that fit.")
+    lines += ["", *(f"Warning: {frame.warning}." for frame in frames if frame.warning)]
+    lines.append(f"{controller.base}, {controller.flange}: {controller.frames}.")
+    lines.append("A tool's angles are nominal where only its position was measured.")
+    return "\n".join([*lines, ""])
+
+
+def _frames(arm: Installation, controller: Controller, base: ControllerFrame, flange: ControllerFrame) -> Iterator[str]:
+    """Yield the tools and instrument frames of an arm as the controller writes them, each with what it stands in."""
+    for index, (name, pose) in enumerate(zip(arm.tool_names, arm.tools), 1):
+        yield from _stood(f"tool {name}", controller.tool_frame, controller, pose, flange, index)
+    for index, (name, pose) in enumerate(zip(arm.station_names, invert(arm.stations)), 1):
+        yield from _stood(f"instrument {name}", controller.base_frame, controller, pose, base, index)
+
+
+def _stood(
+    name: str, form: str, controller: Controller, pose: np.ndarray, frame: ControllerFrame, index: int
+) -> Iterator[str]:
+    """Yield the lines of one frame: its numbers in the controller's frame, and which frames they relate."""
+    if frame.pose is None:
+        yield f"  {name}: not printed, since {frame.name} is {frame.words}"
+        return
+    yield f"  {name}: {_written(form, controller, invert(frame.pose) @ pose, index)}"
+    yield f"    is {name} in {frame}"
+
+
+def _written(form: str, controller: Controller, pose: np.ndarray, place: int) -> str:
+    values = (number(value, DECIMALS[controller.length]) for value in pose_values(controller, pose[None])[0])
+    return form.format(*values, n=place)
+
+
+def _mastering(robot: CalibratedChain, controller: Controller) -> Iterator[str]:
+    """Yield the offset of each axis in the controller's unit, to add to what it shows."""
+    chain, before = robot.chain, nominal_of(robot)
+    moved = [(chain.elements[k].value - before.elements[k].value) / chain.elements[k].ratio for k in chain.moving]
+    for axis, value in enumerate(controller.shown(np.array(moved)), 1):
+        kept = "" if value else " (kept at nominal)"
+        yield f"  axis {axis}: true angle = shown angle {value:+.5f} {controller.unit}{kept}"

@@ -1,0 +1,279 @@
+"""Where a controller's base and flange stand in a robot's description.
+
+A number that is typed into a controller stands in the controller's frames, not in the description's: a FANUC's World is
+at the height of axis 2, a UR's Base is base_link turned by 180° about z. What is known comes from, in this order,
+
+    --world, --flange   what the user states: pose of the controller's frame in the arm's base, or in its tip
+    links base, tool0   ROS-Industrial's convention, REP 199: ``base`` is the frame in which the controller reports
+                        poses, ``tool0`` its all-zero tool
+    the controller      rules of ``controllers.toml``, each with its source: against ``base_link``, or by axes 1 and 2;
+                        against ``flange``
+
+What none of these says is not known, and no number is given in it.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from calib.controllers.table import Controller
+from calib.errors import UsageError
+from calib.procedure.kinematic_stage.folder import FitFolder
+from calib.robot.chain import AXES, Chain
+from calib.robot.formats.urdf_tree import UrdfTree, text
+from calib.robot.formats.urdf_tree import read as read_tree
+from calib.robot.kinematics import forward, joint_frames
+from calib.transforms import from_xyz_rpy, invert, rotation_vector, to_xyz_rpy
+from calib.units import plain_number
+
+SAME = 1e-3  # [m or rad] two frames that differ by less are one: descriptions are rounded to that
+FARTHEST = 20.0  # [m] no controller's base or tool stands farther off: such numbers are millimetres
+STRAIGHT = 0.02  # [rad] between a tool frame's z and the last axis, between axis 1 and base_link's z
+
+
+@dataclass(frozen=True, eq=False)
+class ControllerFrame:
+    """A controller's frame in a description.
+
+    Attributes:
+        name: what the controller calls it.
+        pose: (4, 4) in the arm's base, or in its tip; None where it is not known.
+        words: by what it is known, or why not and what to state.
+        warning: what speaks against it; else empty.
+    """
+
+    name: str
+    pose: np.ndarray | None
+    words: str
+    warning: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.words})"
+
+
+@dataclass(frozen=True, eq=False)
+class Description:
+    """The nominal arm, and all links of its URDF where there is one."""
+
+    chain: Chain
+    tree: UrdfTree | None = None
+
+    @classmethod
+    def of_fit(cls, folder: Path, chain: Chain) -> Self:
+        """Return the description of a fit's nominal arm; its URDF keeps the links of the URDF that was fitted."""
+        path = FitFolder(folder).urdf
+        return cls(chain, read_tree(text(path)[0], str(path)) if path.is_file() else None)
+
+    @property
+    def prefix(self) -> str:
+        """What stands before the names of the arm's links, as ``left_``."""
+        names = [self.chain.base, self.chain.tip, *(self._links_at_base() if self.tree else [])]
+        for name in names:
+            for standard in ("base_link", "tool0"):
+                if name.endswith(standard):
+                    return name.removesuffix(standard)
+        return ""
+
+    def has(self, link: str) -> bool:
+        """Return whether there is such a link."""
+        return link in self.tree.bodies if self.tree else link in (self.chain.base, self.chain.tip)
+
+    def pose(self, link: str, start: str) -> np.ndarray | None:
+        """Return the pose (4, 4) of a link in another one; None where joints between them move.
+
+        Args:
+            link, start: names of links that exist.
+        """
+        if link == start:
+            return np.eye(4)
+        if self.tree is None:
+            return None
+        (first, placed), (second, begun) = (_fixed_to(self.tree, name) for name in (link, start))
+        return invert(begun) @ placed if first == second else None
+
+    def moving_joint(self, link: str) -> str:
+        """Return the name of the nearest moving joint above a link."""
+        above = self.tree.ancestry(link) if self.tree else []
+        return next((joint.name for joint in above[::-1] if joint.kind != "fixed"), "")
+
+    def _links_at_base(self) -> list[str]:
+        assert self.tree is not None
+        root = _fixed_to(self.tree, self.chain.base)[0]
+        return [name for name, _ in self.tree.rigid(root)]
+
+
+def _fixed_to(tree: UrdfTree, link: str) -> tuple[str, np.ndarray]:
+    """Return the topmost link that a link is fixed to, and its pose (4, 4) in that."""
+    pose = np.eye(4)
+    while link in tree.above and tree.above[link].kind == "fixed":
+        pose = tree.above[link].origin @ pose
+        link = tree.above[link].parent
+    return link, pose
+
+
+def stated_frame(words: str | None, option: str) -> np.ndarray | None:
+    """Return the pose (4, 4) that an option states as ``x,y,z[,roll,pitch,yaw]`` [m, rad]; None for no words.
+
+    Raises:
+        UsageError: for other than three or six finite numbers, and for positions that can only be millimetres.
+    """
+    if words is None:
+        return None
+    try:
+        values = [plain_number(part) for part in words.split(",")]
+    except ValueError:
+        values = []
+    if len(values) not in (3, 6) or not np.isfinite(values).all():
+        count = len(words.split(","))
+        expected = "x,y,z or x,y,z,roll,pitch,yaw [m, rad], separated by commas"
+        raise UsageError(f"{option} {words}: expected {expected}; found {count} values")
+    if np.abs(values[:3]).max() > FARTHEST:
+        raise UsageError(f"{option} {words}: {max(values[:3], key=abs):g} m is too far for a robot; are these mm?")
+    return from_xyz_rpy(values[:3], values[3:] or [0.0, 0.0, 0.0])
+
+
+def base_frame(controller: Controller, arm: Description, statement: np.ndarray | None = None) -> ControllerFrame:
+    """Return the controller's base frame, its pose in the arm's base.
+
+    Args:
+        controller: whose frame.
+        arm: the nominal arm with its links.
+        statement: by the user; it counts before all else.
+    """
+    name, chain = controller.base, arm.chain
+    if statement is not None:
+        return ControllerFrame(name, statement, f"stated: {_relation(statement, chain.base)}")
+    if controller.base_at == "chain":
+        return ControllerFrame(name, np.eye(4), f"link {chain.base}")
+    ruled, rule = _by_rule(controller, arm)
+    link, foot = arm.prefix + "base", arm.prefix + "base_link"
+    footed = arm.has(foot)
+    state = f"state it: --world x,y,z[,roll,pitch,yaw], its pose in '{chain.base}' [m, rad]"
+    if not arm.has(link):
+        if ruled is None or not footed:
+            why = rule if ruled is None else f"no link '{foot}' whose axes it would have"
+            return ControllerFrame(name, None, f"not known: no link '{link}', and {why}; {state}")
+        return ControllerFrame(name, ruled, rule)
+    pose = arm.pose(link, chain.base)
+    if pose is None:
+        joint = arm.moving_joint(link)
+        return ControllerFrame(name, None, f"not known: link '{link}' moves with joint '{joint}'; {state}")
+    if not footed and ruled is not None and _differs(pose, ruled):
+        words = f"not known: link '{link}' is the description's root, and {name} stands {rule}; {state}"
+        return ControllerFrame(name, None, words)
+    against = arm.pose(link, foot) if footed else None
+    where = _relation(pose, chain.base) if against is None else _relation(against, foot)
+    warning = ""
+    if ruled is not None and _differs(pose, ruled):
+        warning = f"link '{link}' does not stand where {name} usually does ({rule}): compare with the pendant"
+    return ControllerFrame(name, pose, f"link {link}, {where}", warning)
+
+
+def flange_frame(controller: Controller, arm: Description, statement: np.ndarray | None = None) -> ControllerFrame:
+    """Return the controller's flange (its all-zero tool), its pose in the arm's tip; arguments as in `base_frame`."""
+    name, chain = controller.flange, arm.chain
+    if statement is not None:
+        return ControllerFrame(name, statement, f"stated: {_relation(statement, chain.tip)}")
+    if controller.base_at == "chain":
+        return ControllerFrame(name, np.eye(4), f"link {chain.tip}")
+    state = f"state it: --flange x,y,z[,roll,pitch,yaw], its pose in '{chain.tip}' [m, rad]"
+    for link, turn in ((arm.prefix + "tool0", ()), (arm.prefix + "flange", controller.flange_turn)):
+        if not arm.has(link) or (link.endswith("flange") and not turn):
+            continue
+        pose = arm.pose(link, chain.tip)
+        if pose is None:
+            return ControllerFrame(name, None, f"not known: link '{link}' is not fixed to '{chain.tip}'; {state}")
+        pose = pose @ from_xyz_rpy([0.0, 0.0, 0.0], np.radians(turn or (0.0, 0.0, 0.0)))
+        if _off_axis(chain, pose) > STRAIGHT:
+            words = f"not known: z of link '{link}' is not along the last axis, as a flange's is; {state}"
+            return ControllerFrame(name, None, words)
+        by = f"link {link}" + (", turned as this controller's" if turn else "")
+        return ControllerFrame(name, pose, by)
+    return ControllerFrame(name, None, f"not known: no link 'tool0' or 'flange' in the description; {state}")
+
+
+def _by_rule(controller: Controller, arm: Description) -> tuple[np.ndarray | None, str]:
+    """Return where the controller's base stands by its rule, in the arm's base, and the rule in words."""
+    foot = arm.prefix + "base_link"
+    if not controller.base_at:
+        return None, f"nothing is known of {controller.title}"
+    start = foot if arm.has(foot) else arm.chain.base
+    placed = arm.pose(start, arm.chain.base)
+    if placed is None:
+        return None, f"link '{start}' is not fixed to '{arm.chain.base}'"
+    if controller.base_at == "axis 2":
+        height = _height_of_axis_2(arm.chain, placed)
+        if height is None:
+            return None, f"{controller.base}'s height, that of axis 2, is none in this arm"
+        rule = f"by rule at the height of axis 2, {height:.6g} m above {start}"
+        return placed @ from_xyz_rpy([0.0, 0.0, height], [0.0, 0.0, 0.0]), rule
+    if not arm.has(foot):
+        return None, f"there is no link '{foot}' against which {controller.base} stands"
+    if controller.base_at == "turned":
+        return placed @ from_xyz_rpy([0.0, 0.0, 0.0], [0.0, 0.0, np.pi]), f"by rule {foot}, turned by 180° about z"
+    return placed, f"by rule at {foot}"
+
+
+def _height_of_axis_2(chain: Chain, foot: np.ndarray) -> float | None:
+    """Return the height of axis 2 over a frame [m]; None where axis 1 is not its z, or axis 2 not level."""
+    if chain.n < 2:
+        return None
+    back = invert(foot)
+    point_1, axis_1 = _line(chain, 0)
+    point_2, axis_2 = _line(chain, 1)
+    axis_1, axis_2 = back[:3, :3] @ axis_1, back[:3, :3] @ axis_2
+    point_1, point_2 = back[:3, :3] @ point_1 + back[:3, 3], back[:3, :3] @ point_2 + back[:3, 3]
+    beside = np.linalg.norm((point_1 - axis_1 * (point_1 @ axis_1))[:2])
+    level = abs(float(axis_2[2])) < STRAIGHT
+    upright = abs(abs(float(axis_1[2])) - 1.0) < STRAIGHT**2
+    return float(point_2[2]) if level and upright and beside < SAME else None
+
+
+def _line(chain: Chain, joint: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return a point of a joint's axis and its direction at q = 0, in the arm's base."""
+    frame = joint_frames(chain, np.zeros((1, chain.n)))[joint, 0]
+    element = chain.elements[int(chain.moving[joint])]
+    return frame[:3, 3], element.sign * frame[:3, AXES.index(element.axis) % 3]
+
+
+def _off_axis(chain: Chain, pose: np.ndarray) -> float:
+    """Return the angle [rad] between z of a frame in the tip and the arm's last axis."""
+    z = (forward(chain, np.zeros((1, chain.n)))[0] @ pose)[:3, 2]
+    return float(np.linalg.norm(np.cross(z, _line(chain, chain.n - 1)[1])))
+
+
+def _differs(first: np.ndarray, second: np.ndarray) -> bool:
+    between = invert(first) @ second
+    return bool(max(np.linalg.norm(between[:3, 3]), np.linalg.norm(rotation_vector(between[:3, :3]))) > SAME)
+
+
+def _relation(pose: np.ndarray, link: str) -> str:
+    """Return in words where a frame stands against a link."""
+    xyz, rpy = to_xyz_rpy(pose)
+    turned, moved = np.abs(rpy) > 1e-9, np.abs(xyz) > 1e-9
+    if not turned.any() and not moved.any():
+        return f"at {link}"
+    if not turned.any() and not moved[:2].any():
+        return f"{abs(xyz[2]):.6g} m {'above' if xyz[2] > 0 else 'below'} {link}"
+    words = []
+    if moved.any():
+        words.append(f"at {', '.join(f'{value:.6g}' for value in xyz)} m in {link}")
+    if turned.any() and not turned[:2].any():
+        words.append(f"{'' if words else link + ' '}turned by {np.degrees(rpy[2]):.6g}° about z")
+    elif turned.any():
+        angles = ", ".join(f"{value:.6g}" for value in np.degrees(rpy))
+        words.append(f"{'' if words else link + ' '}turned by roll, pitch, yaw {angles}°")
+    return ", ".join(words)
+
+
+def check_known(frames: list[ControllerFrame], what: str) -> None:
+    """Refuse to go on where a frame is not known, with all that is to be stated.
+
+    Raises:
+        UsageError: with `what` cannot be said, and for each frame what to state.
+    """
+    missing = [f"  {frame.name} is {frame.words}" for frame in frames if frame.pose is None]
+    if missing:
+        raise UsageError("\n".join([what, *missing]))

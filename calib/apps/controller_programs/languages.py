@@ -1,0 +1,341 @@
+"""Tool, user frame and configuration of the poses in a controller's program, as the program says them.
+
+==========  ===========================================================================================================
+TP          ``UF : 1, UT : 2, CONFIG : 'N U T, 0, 0, 0'`` of each position; where it says ``F``, the program's only
+            ``UFRAME_NUM=``, ``UTOOL_NUM=``. Their numbers are in no program: in ``SYSFRAME.VA`` of a backup
+KRL         ``$TOOL =``, ``$BASE =``, ``BAS(#TOOL,1)``, ``BAS(#BASE,2)`` before a motion; ``TOOL_NO``, ``BASE_NO`` of a
+            point's FDAT; numbers ``TOOL_DATA[1]={...}`` (``$config.dat``); ``S`` and ``T`` of the point
+RAPID       tool and ``\\WObj`` of the moves that use a robtarget; numbers of tooldata and wobjdata; confdata
+URScript    ``set_tcp(p[...])`` before the move; poses stand in Base and have no configuration
+==========  ===========================================================================================================
+
+Numbers that a program does not have are read of further files (``--frames``): the controller's own, or lines as
+`calib deliver` prints them.
+"""
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from calib.apps.controller_programs.targets import NUMBER, Program, Target, pose_of_values
+from calib.controllers.table import Controller
+from calib.errors import UsageError
+
+BLOCK = 400  # letters before a FANUC's pose in which its UF, UT and CONFIG stand
+BEHIND = 120  # letters behind a pose in which its configuration stands
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What a program says of one of its poses.
+
+    Attributes:
+        tool, user: names of the tool and of the user frame as `ProgramFrames` has them; empty where it says none.
+        configuration: as the program writes it; empty where it says none.
+    """
+
+    tool: str
+    user: str
+    configuration: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class ProgramFrames:
+    """Settings of a program's poses in their order, and the frames with numbers, by name: poses (4, 4) [m]."""
+
+    settings: tuple[Setting, ...]
+    tools: Mapping[str, np.ndarray] = field(default_factory=dict)
+    users: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+
+def frames_in(program: Program, further: Mapping[str, str] | None = None) -> ProgramFrames:
+    """Return what a program, and further files of its controller, say of the frames of its poses.
+
+    Args:
+        program: the program.
+        further: texts by file name.
+
+    Raises:
+        UsageError: for a language whose frames are not read, tools that stand in the cell, and a frame that the texts
+            give twice with other numbers.
+    """
+    language = LANGUAGES.get(program.controller.language)
+    if language is None:
+        raise UsageError(f"{program.path}: tool and user frames of {program.controller.title} are not read")
+    blank = language.without_comments(program.text)
+    settings = tuple(language.setting(blank, program.targets[k]) for k in program.of("pose"))
+    tools: dict[str, np.ndarray] = {}
+    users: dict[str, np.ndarray] = {}
+    texts = {str(program.path): program.text} | dict(further or {})
+    for file, text in texts.items():
+        for kind, frames in zip((tools, users), language.numbers(language.without_comments(text), program.controller)):
+            for name, pose in frames.items():
+                if name in kind and np.abs(kind[name] - pose).max() > 1e-9:
+                    raise UsageError(f"{file}: {name} is given twice, with other numbers")
+                kind[name] = pose
+    return ProgramFrames(settings, tools | dict.fromkeys(language.flange, np.eye(4)), users | language.base())
+
+
+Frames = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Language:
+    """How a language says frames.
+
+    Attributes:
+        comment: what begins a comment, or an empty text.
+        setting: text without comments, target → what is said of it.
+        numbers: text without comments, controller → tools and user frames with numbers.
+        flange, world: names of the all-zero tool and of the controller's base.
+        files: which files hold the numbers, in words; empty for none.
+    """
+
+    comment: str
+    setting: Callable[[str, Target], Setting]
+    numbers: Callable[[str, Controller], tuple[Frames, Frames]]
+    flange: tuple[str, ...]
+    world: tuple[str, ...]
+    files: str
+
+    def base(self) -> Frames:
+        """Return the user frames that are the controller's base."""
+        return dict.fromkeys(self.world, np.eye(4))
+
+    def without_comments(self, text: str) -> str:
+        """Return a text of the same length with blanks in place of comments."""
+        if not self.comment:
+            return text
+        return re.sub(f"{self.comment}[^\n]*", lambda found: " " * len(found[0]), text)
+
+
+def _frame(form: str) -> str:
+    """Return a regular expression of a frame: NUM stands for a number, a blank for any blanks."""
+    return form.replace(" ", r"\s*").replace("NUM", NUMBER)
+
+
+def _posed(match: re.Match[str], first: int, controller: Controller, count: int = 6) -> np.ndarray:
+    """Return the pose (4, 4) of the numbers of a match from a group on."""
+    values = np.array([[float(match[k]) for k in range(first, first + count)]])
+    return pose_of_values(controller, values)[0]
+
+
+def _either(pairs: set[tuple[str, str]]) -> tuple[str, str]:
+    """Return the names of tool and user frame of several moves; where they differ, a name that no frame has."""
+    tools, users = ({names[k] for names in pairs} for k in (0, 1))
+    return " or ".join(sorted(tools)), " or ".join(sorted(users))
+
+
+# --- FANUC TP
+
+_TP_HEAD = re.compile(r"UF\s*:\s*(\w+)\s*,\s*UT\s*:\s*(\w+)\s*,(?:\s*CONFIG\s*:\s*'([^']*)')?", re.I)
+_TP_LINE = re.compile(_frame(r"\b(UTOOL|UFRAME) \[ (\d+) \] : X NUM , Y NUM , Z NUM mm , W NUM , P NUM , R NUM deg"))
+_TP_SECTION = re.compile(r"\[\*SYSTEM\*\]\$(MNUTOOL|MNUFRAME)\b(.*?)(?=\[\*SYSTEM\*\]|\Z)", re.S)
+_TP_ENTRY = re.compile(
+    r"\[1,(\d+)\]\s*=\s*(?:Group:[^\n]*\n)?\s*" + _frame("X : NUM Y : NUM Z : NUM W : NUM P : NUM R : NUM")
+)
+
+
+def _tp_setting(text: str, target: Target) -> Setting:
+    begin = target.spans[0][0]
+    heads = list(_TP_HEAD.finditer(text[max(begin - BLOCK, 0) : begin]))
+    if not heads:
+        return Setting("", "")
+    user, tool, configuration = heads[-1].groups(default="")
+    return Setting(
+        _tp_name(text, "UTOOL", tool), _tp_name(text, "UFRAME", user), " ".join(configuration.replace(",", " ").split())
+    )
+
+
+def _tp_name(text: str, kind: str, number: str) -> str:
+    """Return the name of a frame; for ``F`` (whichever is active) that of the only one that the program selects."""
+    if not number.isdigit():
+        selected = set(re.findall(rf"{kind}_NUM\s*=\s*(\d+)", text))
+        if len(selected) != 1:
+            return ""
+        number = selected.pop()
+    return f"{kind}[{int(number)}]"
+
+
+def _tp_numbers(text: str, controller: Controller) -> tuple[Frames, Frames]:
+    frames: dict[str, Frames] = {"UTOOL": {}, "UFRAME": {}}
+    for match in _TP_LINE.finditer(text):
+        frames[match[1]][f"{match[1]}[{match[2]}]"] = _posed(match, 3, controller)
+    for section in _TP_SECTION.finditer(text):
+        kind = "UTOOL" if section[1] == "MNUTOOL" else "UFRAME"
+        for match in _TP_ENTRY.finditer(section[2]):
+            frames[kind][f"{kind}[{match[1]}]"] = _posed(match, 2, controller)
+    return frames["UTOOL"], frames["UFRAME"]
+
+
+# --- KUKA KRL
+
+_KRL_FRAME = _frame(r"\{ (?:FRAME : )?X NUM , Y NUM , Z NUM , A NUM , B NUM , C NUM \}")
+_KRL_DECLARED = re.compile(rf"(?i)(?<![$\w])(\w+(?:\s*\[\s*\d+\s*\])?)\s*=\s*{_KRL_FRAME}")
+_KRL_SELECTED = re.compile(r"(?i)\$(TOOL|BASE)\s*=\s*([^\n]*)|\bBAS\s*\(\s*#(TOOL|BASE)\s*,\s*(\d+)\s*\)")
+_KRL_POINT = re.compile(r"(?i)(\w+)\s*=\s*\{\s*(?:E6POS\s*:|POS\s*:)?\s*X\s*$")
+_KRL_DATA = r"(?i)\b{}\s*=\s*\{{[^}}]*?TOOL_NO\s+(\d+)\s*,\s*BASE_NO\s+(\d+)[^}}]*\}}"
+_KRL_STATUS = re.compile(r"(?i)^\s*,\s*S\s+'?(B?[01]+|\d+)'?\s*,\s*T\s+'?(B?[01]+|\d+)'?")
+
+
+def _krl_setting(text: str, target: Target) -> Setting:
+    begin, end = target.spans[0][0], target.spans[-1][1]
+    status = _KRL_STATUS.match(text[end : end + BEHIND])
+    configuration = f"S {_binary(status[1])} T {_binary(status[2])}" if status else ""
+    point = _KRL_POINT.search(text[max(begin - BLOCK, 0) : begin])
+    if point is None:
+        return Setting(*_krl_active(text, begin), configuration)
+    if point[1][:1].upper() == "X" and (data := re.search(_KRL_DATA.format("F" + point[1][1:]), text)):
+        if re.search(r"(?i)IPO_FRAME\s+#TCP", data[0]):
+            raise UsageError(
+                f"line {target.line}: {point[1]} moves about a tool in the cell (IPO_FRAME #TCP): not read"
+            )
+        return Setting(_krl_name("TOOL", data[1]), _krl_name("BASE", data[2]), configuration)
+    moves = re.finditer(rf"(?im)^\s*S?(?:PTP|LIN|CIRC)\b[^\n]*\b{re.escape(point[1])}\b", text)
+    active = {_krl_active(text, move.start()) for move in moves} or {_krl_active(text, len(text))}
+    return Setting(*_either(active), configuration)
+
+
+def _krl_active(text: str, position: int) -> tuple[str, str]:
+    """Return the names of the tool and the base that are selected before a position in the text."""
+    active = {"TOOL": "", "BASE": ""}
+    for match in _KRL_SELECTED.finditer(text, 0, position):
+        if match[3]:
+            active[match[3].upper()] = _krl_name(match[3].upper(), match[4])
+            continue
+        words = re.sub(r"\s+", "", match[2])
+        numbered = re.fullmatch(r"(?i)(TOOL|BASE)_DATA\[0*(\d+)\]", words)
+        kind = match[1].upper()
+        if numbered:
+            active[kind] = _krl_name(numbered[1].upper(), numbered[2])
+        elif re.fullmatch(_KRL_FRAME, match[2].strip()):
+            active[kind] = f"${kind} of line {text.count(chr(10), 0, match.start()) + 1}"
+        else:
+            active[kind] = words.upper()
+    return active["TOOL"], active["BASE"]
+
+
+def _krl_name(kind: str, number: str) -> str:
+    return f"{kind.upper()}_DATA[{int(number)}]"
+
+
+def _binary(words: str) -> int:
+    """Return the number of ``2`` or of ``B010``."""
+    return int(words[1:], 2) if words[:1].upper() == "B" else int(words)
+
+
+def _krl_numbers(text: str, controller: Controller) -> tuple[Frames, Frames]:
+    frames: Frames = {}
+    for match in _KRL_DECLARED.finditer(text):
+        frames[re.sub(r"\s+", "", match[1]).upper()] = _posed(match, 2, controller)
+    selected: dict[str, Frames] = {"TOOL": {}, "BASE": {}}
+    for match in _KRL_SELECTED.finditer(text):
+        literal = re.fullmatch(_KRL_FRAME, (match[2] or "").strip())
+        if literal:
+            line = text.count("\n", 0, match.start()) + 1
+            kind = match[1].upper()
+            selected[kind][f"${kind} of line {line}"] = _posed(literal, 1, controller)
+    return frames | selected["TOOL"], frames | selected["BASE"]
+
+
+# --- ABB RAPID
+
+_RAPID_TARGET = re.compile(r"(?i)\brobtarget\s+(\w+)\s*(?:\{[^}]*\}\s*)?:=\s*\[*\s*$")
+_RAPID_POSE = _frame(r"\[ \[ NUM , NUM , NUM \] , \[ NUM , NUM , NUM , NUM \] \]")
+_RAPID_TOOL = re.compile(rf"(?i)\btooldata\s+(\w+)\s*:=\s*\[\s*(TRUE|FALSE)\s*,\s*{_RAPID_POSE}")
+_RAPID_WORK = re.compile(
+    rf'(?i)\bwobjdata\s+(\w+)\s*:=\s*\[\s*(TRUE|FALSE)\s*,\s*(TRUE|FALSE)\s*,\s*"([^"]*)"\s*,\s*{_RAPID_POSE}\s*,\s*'
+    rf"{_RAPID_POSE}"
+)
+_RAPID_CONFIGURATION = re.compile(r"\s*\]\s*,\s*\[\s*(-?\d+)\s*,\s*(-?\d+)\s*,\s*(-?\d+)\s*,\s*(-?\d+)\s*\]")
+_RAPID_WOBJ = re.compile(r"(?i)\\WObj\s*:=\s*(\w+)")
+
+
+def _rapid_setting(text: str, target: Target) -> Setting:
+    begin, end = target.spans[0][0], target.spans[-1][1]
+    configured = _RAPID_CONFIGURATION.match(text, end)
+    configuration = " ".join(configured.groups()) if configured else ""
+    declared = _RAPID_TARGET.search(text[max(begin - BLOCK, 0) : begin])
+    if declared is None:
+        statement = text[end : text.find(";", end)]
+        return Setting(*_rapid_frames(statement), configuration)
+    moves = re.finditer(rf"(?i)\bMove\w+\b([^;]*?\b{declared[1]}\b[^;]*);", text)
+    used = {_rapid_frames(move[1]) for move in moves}
+    return Setting(*_either(used), configuration)
+
+
+def _rapid_frames(statement: str) -> tuple[str, str]:
+    """Return the names of tool (the last argument) and work object of a move's arguments."""
+    work = _RAPID_WOBJ.search(statement)
+    plain = re.sub(r"\\\w+(?:\s*:=\s*\w+)?", "", statement)
+    tool = re.search(r",\s*([A-Za-z_]\w*)\s*$", plain)
+    return tool[1].lower() if tool else "", work[1].lower() if work else "wobj0"
+
+
+def _rapid_numbers(text: str, controller: Controller) -> tuple[Frames, Frames]:
+    tools: Frames = {}
+    for match in _RAPID_TOOL.finditer(text):
+        if match[2].upper() == "FALSE":
+            raise UsageError(f"tooldata {match[1]}: a tool that the robot does not hold (robhold FALSE) is not read")
+        tools[match[1].lower()] = _posed(match, 3, controller, 7)
+    users: Frames = {}
+    for match in _RAPID_WORK.finditer(text):
+        if match[2].upper() == "TRUE":
+            raise UsageError(f"wobjdata {match[1]}: a work object that the robot holds (robhold TRUE) is not read")
+        if match[3].upper() == "FALSE" or match[4]:
+            raise UsageError(f"wobjdata {match[1]}: a work object on a moving mechanical unit is not read")
+        users[match[1].lower()] = _posed(match, 5, controller, 7) @ _posed(match, 12, controller, 7)
+    return tools, users
+
+
+# --- URScript
+
+_UR_TCP = re.compile(r"\bset_tcp\s*\(\s*(.*)")
+_UR_POSE = re.compile(_frame(r"p \[ NUM , NUM , NUM , NUM , NUM , NUM \]"))
+
+
+def _ur_setting(text: str, target: Target) -> Setting:
+    begin = target.spans[0][0]
+    calls = [match for match in _UR_TCP.finditer(text) if match.start() < begin]
+    if not calls:
+        return Setting("", "Base")
+    return Setting(_ur_name(text, calls[-1]), "Base")
+
+
+def _ur_name(text: str, call: re.Match[str]) -> str:
+    return f"set_tcp of line {text.count(chr(10), 0, call.start()) + 1}"
+
+
+def _ur_numbers(text: str, controller: Controller) -> tuple[Frames, Frames]:
+    tools: Frames = {}
+    for call in _UR_TCP.finditer(text):
+        pose = _UR_POSE.match(call[1])
+        if pose:
+            tools[_ur_name(text, call)] = _posed(pose, 1, controller)
+    return tools, {}
+
+
+LANGUAGES = {
+    "tp": Language(
+        "!",
+        _tp_setting,
+        _tp_numbers,
+        ("UTOOL[0]",),
+        ("UFRAME[0]",),
+        "SYSFRAME.VA of a backup, or lines as 'UTOOL[1]: X 0.0, Y 0.0, Z 0.0 mm, W 0.0, P 0.0, R 0.0 deg'",
+    ),
+    "krl": Language(
+        ";",
+        _krl_setting,
+        _krl_numbers,
+        ("TOOL_DATA[0]", "$NULLFRAME"),
+        ("BASE_DATA[0]", "$NULLFRAME", "$WORLD"),
+        "$config.dat, or lines as 'TOOL_DATA[1]={X 0.0,Y 0.0,Z 0.0,A 0.0,B 0.0,C 0.0}'",
+    ),
+    "rapid": Language(
+        "!", _rapid_setting, _rapid_numbers, ("tool0",), ("wobj0",), "the module that declares tooldata and wobjdata"
+    ),
+    "urscript": Language("#", _ur_setting, _ur_numbers, (), ("Base",), ""),
+}

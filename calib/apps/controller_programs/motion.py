@@ -1,0 +1,70 @@
+"""Motions for controllers that take streams: ``calib program 6-excitation/motion.csv --for ur``.
+
+A motion of `calib excite` or `calib plan` (columns ``t [s]``, ``q_joint1 [rad]`` …) becomes setpoints at the
+controller's cycle, by cubic splines: for UR a program of ``servoj``, for KUKA (RSI) and ABB (EGM) a table that a host
+program sends. For ROS these commands write a JointTrajectory themselves. The motion keeps its speed.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.apps.controller_programs.targets import number
+from calib.controllers.table import Controller
+from calib.data.csv_table import read_header, read_table
+from calib.errors import UsageError, require
+from calib.procedure.excitation.coefficients import PLANNED, RUN, SAMPLES
+from calib.result_kinds import refusal
+
+PREFIX = "q_"
+
+
+def motion_file(path: Path) -> Path:
+    """Return the file to play of a motion's folder: the whole run if there is one; of a file, that file.
+
+    Raises:
+        UsageError: for a folder without a motion.
+    """
+    if not path.is_dir():
+        return path
+    names = (RUN, PLANNED, SAMPLES)
+    found = [path / name for name in names if (path / name).is_file()]
+    require(found, refusal(path, "program"), UsageError)
+    return found[0]
+
+
+def is_motion(path: Path) -> bool:
+    """Return whether a CSV file holds a motion: it has a column t."""
+    return "t" in read_header(path)[0]
+
+
+def setpoints(path: Path, controller: Controller) -> tuple[np.ndarray, list[str]]:
+    """Return the setpoints (k, n) [rad] of a motion at a controller's cycle, and the joints' names.
+
+    Raises:
+        UsageError: for a controller that takes no stream, and a file without positions.
+    """
+    from scipy.interpolate import CubicSpline  # slow to load
+
+    if not controller.stream:
+        raise UsageError(f"{path} is a motion, and {controller.title} takes no stream; give a list of poses")
+    table = read_table(path)
+    names = [name for name in table.header if name.startswith(PREFIX)]
+    require(names, f"{path}: no positions ({PREFIX}joint1 [rad]); found {', '.join(table.header)}", UsageError)
+    t, q = table.numbers("t", None), np.column_stack([table.numbers(name, "angle") for name in names])
+    rising = len(t) > 3 and bool(np.all(np.diff(t) > 0.0))
+    require(rising, f"{path}: expected at least four rows of rising t", UsageError)
+    count = round(float(t[-1] - t[0]) / controller.cycle)
+    when = np.minimum(t[0] + controller.cycle * np.arange(count + 1), t[-1])
+    return CubicSpline(t, q)(when), [name.removeprefix(PREFIX) for name in names]
+
+
+def stream_values(controller: Controller, q: np.ndarray) -> dict[str, Any]:
+    """Return what the templates of streams print of setpoints (k, n) [rad]."""
+    shown = controller.shown(q)
+    rows, relative = (
+        [[number(value, controller.decimals) for value in row] for row in values]
+        for values in (shown, shown - shown[0])
+    )
+    return {"rows": rows, "relative": relative, "cycle": controller.cycle, "unit": controller.unit}

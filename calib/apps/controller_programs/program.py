@@ -1,0 +1,159 @@
+"""Programs of poses for robot controllers: `calib program POSES.csv --for NAME`.
+
+A program moves joint by joint to each pose, waits until the arm has settled, reads its joints, and then waits for the
+operator's key, or raises a digital output for the instrument (``--output``). The pose's number is shown. The joints
+that were read are where the program's head says; they are better than the planned ones, since those of the program are
+rounded, and the arm stops only near them.
+
+A program that was edited by hand is read again, ``calib program EDITED.src --for csv``, and so are the joints that a
+KUKA keeps in its ``.dat`` file. `calib compensate FIT PROGRAM` corrects the targets inside a program.
+
+No program was run on a real controller. Run it first at low override, beam and cables off, one pose at a time.
+"""
+
+import re
+from functools import cache
+from pathlib import Path
+
+import jinja2
+import numpy as np
+
+from calib import files
+from calib.apps.controller_programs.motion import is_motion, setpoints, stream_values
+from calib.apps.controller_programs.program_settings import CSV, ProgramSettings
+from calib.apps.controller_programs.targets import is_program, number, read_program
+from calib.controllers.table import Controller, check_controller, controller_named
+from calib.data.csv_table import Table, read_table
+from calib.data.poses.columns import OURS
+from calib.data.poses.pose_lists import read_poses
+from calib.errors import UsageError, require
+from calib.procedure.report.templates import read
+from calib.units import ANGLES, LENGTHS
+
+
+def joints_in(path: Path, source: str = "") -> tuple[np.ndarray, list[str]]:
+    """Return joint values (m, n) [rad] of a CSV of poses or of a program, and the joints' names.
+
+    In a CSV, the joints are the columns whose header states an angle (``joint1 [deg]``).
+
+    Args:
+        source: the controller of a program, where its suffix does not say it.
+
+    Raises:
+        UsageError: for sliding joints, and where no column is a joint.
+    """
+    if source or is_program(path):
+        found = read_program(path, source)
+        require(found.of("joints"), f"{path}: its targets are poses of the tool, not joints", UsageError)
+        q = found.joints()
+        return q, [f"q{k + 1}" for k in range(q.shape[1])]
+    table = read_table(path)
+    named = [(name, unit.lower()) for name, unit in zip(table.header, table.units) if name not in OURS]
+    sliding = [name for name, unit in named if unit in LENGTHS]
+    require(not sliding, f"{path}: programs have turning joints only; {', '.join(sliding)} slides", UsageError)
+    names = [name for name, unit in named if unit in ANGLES]
+    words = f"{path}: no column of joint angles, as 'joint1 [deg]'; found {', '.join(table.header)}"
+    require(names, words, UsageError)
+    return read_poses(path, names), names
+
+
+def joints_table(path: Path, source: str = "") -> Table:
+    """Return the joints of `joints_in` as a table [deg], with a column ``pose`` where the program numbers all of them.
+
+    So do the joints that a controller kept: a UR's log, a KUKA's ``.dat``, a FANUC's ``POSREG.VA``.
+    """
+    q, names = joints_in(path, source)
+    found = read_program(path, source) if source or is_program(path) else None
+    numbers = np.array([found.targets[k].number for k in found.of("joints")] if found else [0])
+    numbered = {"pose": numbers} if numbers.all() else {}
+    rows = np.arange(1, len(q) + 1)
+    cells = (*numbered.values(), *(q / ANGLES["deg"]).T)
+    return Table(str(path), (*numbered, *names), (*("" for _ in numbered), *("deg" for _ in names)), cells, rows)
+
+
+def program_files(
+    path: Path, out: Path, name: str, settings: ProgramSettings | None = None, source: str = ""
+) -> dict[Path, str]:
+    """Return the files of a program of the poses in a CSV file or in another program: path → text.
+
+    Args:
+        path: CSV of poses (``joint1 [deg]``) or of a motion (``t [s]``), or a program whose targets are joints.
+        out: its name, without the suffix, is the program's. A program of one file is written there as named; without a
+            suffix, and for programs of several files, the suffixes are the controller's.
+        name: of a controller, or ``csv``: the poses as a table.
+        settings: how it moves and waits.
+        source: see `joints_in`.
+
+    Raises:
+        UsageError: for an unknown controller, a name that it does not take, another number of axes, and an output where
+            it has none.
+    """
+    settings, moving = settings or ProgramSettings(), not (source or is_program(path)) and is_motion(path)
+    if name == CSV:
+        table = joints_table(path, source)
+        header = [f"{name} [{unit}]" if unit else name for name, unit in zip(table.header, table.units)]
+        rows = [",".join(f"{value:.12g}" for value in row) for row in zip(*table.cells)]
+        return {out: "\n".join([",".join(header), *rows, ""])}
+    controller, stem = controller_named(name), out.stem
+    if not re.fullmatch(controller.names, stem):
+        raise UsageError(f"{out}: '{stem}' is no name for a program of {controller.title}: {_words(controller.names)}")
+    q, names = setpoints(path, controller) if moving else joints_in(path, source)
+    check_controller(name, q.shape[1], settings.pulses)
+    if settings.output is not None and not controller.outputs:
+        raise UsageError(f"--output: {controller.title} raises no output; the operator presses a key")
+    values = stream_values(controller, q) if moving else {"poses": _poses(controller, q, settings)}
+    values |= {"name": stem, "joints": names, "head": _head(controller, names, moving), **vars(settings)}
+    templates = controller.stream if moving else controller.files
+    paths = _targets(out, [place.format(name=stem) for place in templates.values()], controller)
+    return {path: _template(file).render(values) for path, file in zip(paths, templates)}
+
+
+def _targets(out: Path, names: list[str], controller: Controller) -> list[Path]:
+    """Return where the files of a program are written; `names` are the controller's for them."""
+    usual = [out.with_name(name) for name in names]
+    if not out.suffix:
+        return usual
+    if len(names) == 1:
+        return [out]
+    suffixes = [path.suffix for path in usual]
+    words = f"{out}: {controller.title} takes {', '.join(suffixes)}, written together; end the name in {suffixes[0]}"
+    require(out.suffix.lower() in suffixes, words, UsageError)
+    return usual
+
+
+def write_program(path: Path, out: Path, name: str) -> list[Path]:
+    """Write the program of a session's planned poses; return its files."""
+    return [files.write(target, content) for target, content in program_files(path, out, name).items()]
+
+
+def _poses(controller: Controller, q: np.ndarray, settings: ProgramSettings) -> list[list[str]]:
+    """Return poses (m, n) [rad] as a controller's programs have them."""
+    shown = controller.shown(q) * (np.array(settings.pulses) if controller.pulses else 1.0)
+    return [[number(value, controller.decimals) for value in row] for row in shown]
+
+
+def _head(controller: Controller, names: list[str], moving: bool) -> list[str]:
+    """Return what stands at a program's head: what is not checked, and whose joints these are."""
+    way = {1: "+", -1: "-"}
+    coupled = [
+        f"axis {axis} = {names[axis - 1]} {way[sign]} {names[other - 1]}" for axis, other, sign in controller.coupled
+    ]
+    return [
+        "Not run on a real controller" + ("." if moving else f"; checked by {controller.checked}."),
+        "Simulate first, then run at low override" + ("." if moving else ", one pose at a time."),
+        f"Joints: {', '.join(names)}" + "".join(f"; {each}" for each in coupled) + ".",
+        *([f"Joints read at each pose: {controller.keeps}."] if controller.keeps and not moving else []),
+    ]
+
+
+def _words(pattern: str) -> str:
+    longest = re.search(r"\{0,(\d+)\}", pattern)
+    return "letters, digits and _, a letter first" + (f", at most {int(longest[1]) + 1}" if longest else "")
+
+
+@cache
+def _template(file: str) -> jinja2.Template:
+    environment = jinja2.Environment(
+        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, undefined=jinja2.StrictUndefined
+    )
+    return environment.from_string(read("calib.apps.controller_programs", f"templates/{file}"))

@@ -1,0 +1,200 @@
+"""Targets in a controller's program: read with their places in the text, and written back, all else byte for byte.
+
+Joint targets and poses of the tool are recognised by the patterns of ``controllers.toml``, not in comments. Relative
+moves, targets that a program computes, and targets with some axes left out are not touched.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib.controllers.table import Controller, controller_of
+from calib.errors import MeasurementError, UsageError, listing
+from calib.transforms import pose as pose_of
+from calib.units import ANGLES
+
+NUMBER = r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)"
+ENCODING = "latin-1"  # one letter for each byte, whatever the program is in
+
+
+NEAR = 200  # letters before a target in which its number stands (our choice)
+
+
+@dataclass(frozen=True)
+class Target:
+    """One target in a program.
+
+    Attributes:
+        line: in the file, from 1.
+        spans: begin and end of each of its numbers in the text.
+        values: these numbers, in the controller's units.
+        kind: ``joints`` or ``pose``.
+        number: of the pose, where the text before it says one; else 0.
+    """
+
+    line: int
+    spans: tuple[tuple[int, int], ...]
+    values: tuple[float, ...]
+    kind: str
+    number: int = 0
+
+
+@dataclass(frozen=True)
+class Program:
+    """The text of a program with its targets, in their order.
+
+    Attributes:
+        path, controller, text: where it is, whose it is, and its bytes as Latin-1.
+    """
+
+    path: Path
+    controller: Controller
+    text: str
+    targets: tuple[Target, ...]
+
+    def of(self, kind: str) -> list[int]:
+        """Return the indices of the targets of a kind."""
+        return [k for k, each in enumerate(self.targets) if each.kind == kind]
+
+    @property
+    def moves(self) -> int:
+        """Number of motion statements, comments aside."""
+        return len(_matches(self.text, self.controller.moves, self.controller.comment))
+
+    @property
+    def unread(self) -> str:
+        """Warning where motion statements have no target here, with the first of their lines; else empty."""
+        known = {each.line for each in self.targets}
+        lines = [line for line in _lines_of_moves(self.text, self.controller) if line not in known]
+        if self.moves <= len(self.targets) or not lines:
+            return ""
+        place = f"line {listing(lines, 3)}"
+        words = "relative moves, and targets that are computed, named or incomplete, are not read"
+        return f"warning: {self.moves} moves, {len(self.targets)} targets: {words} ({place})"
+
+    def joints(self) -> np.ndarray:
+        """Return the joint targets (m, n) as joints of a description [rad]."""
+        shown = [self.targets[k].values for k in self.of("joints")]
+        return self.controller.described(np.array(shown) * ANGLES[self.controller.unit])
+
+    def poses(self) -> np.ndarray:
+        """Return the pose targets (m, 4, 4) [m]."""
+        return pose_of_values(self.controller, np.array([self.targets[k].values for k in self.of("pose")]))
+
+    def rewritten(self, values: Sequence[np.ndarray | None]) -> bytes:
+        """Return the program with other numbers in its targets, in the controller's units; None leaves a target."""
+        text, parts, place = self.text, [], 0
+        for target, new in zip(self.targets, values, strict=True):
+            for (begin, end), was, value in zip(target.spans, target.values, [] if new is None else new):
+                decimals = max(self.controller.decimals, len(text[begin:end].partition(".")[2]))
+                parts += [text[place:begin], text[begin:end] if value == was else number(value, decimals)]
+                place = end
+        return "".join([*parts, text[place:]]).encode(ENCODING)
+
+
+def number(value: float, decimals: int) -> str:
+    """Return a number with fixed decimals; no negative zero."""
+    written = f"{value:.{decimals}f}"
+    return written.removeprefix("-") if float(written) == 0.0 else written
+
+
+def pose_values(controller: Controller, poses: np.ndarray) -> np.ndarray:
+    """Return the numbers (m, 6 or 7) of poses (m, 4, 4) [m] as they stand in a controller's programs."""
+    turn, rotation = controller.turn, Rotation.from_matrix(poses[:, :3, :3])
+    if turn == "wxyz":
+        angles = rotation.as_quat(canonical=True)[:, [3, 0, 1, 2]]
+    elif turn == "vector":
+        angles = rotation.as_rotvec()
+    else:
+        order, degrees = _order(turn)
+        angles = rotation.as_euler(order, degrees)
+    return np.concatenate([poses[:, :3, 3] / controller.metres, angles], axis=1)
+
+
+def pose_of_values(controller: Controller, values: np.ndarray) -> np.ndarray:
+    """Return the poses (m, 4, 4) [m] of their numbers (m, 6 or 7) in a controller's programs."""
+    return pose_of(_rotation(controller.turn, values[:, 3:]), values[:, :3] * controller.metres)
+
+
+def _rotation(turn: str, values: np.ndarray) -> Rotation:
+    if turn == "wxyz":
+        return Rotation.from_quat(values[:, [1, 2, 3, 0]])
+    if turn == "vector":
+        return Rotation.from_rotvec(values)
+    order, degrees = _order(turn)
+    return Rotation.from_euler(order, values, degrees)
+
+
+def _order(turn: str) -> tuple[str, bool]:
+    """Return the axes of a pose's angles as SciPy names them, and whether the angles are in degrees."""
+    axes, how, *unit = turn.split()
+    return axes.upper() if how == "moving" else axes, unit != ["rad"]
+
+
+def is_program(path: Path) -> bool:
+    """Return whether a file is a controller's program, by its suffix."""
+    try:
+        return bool(controller_of(path))
+    except UsageError:
+        return False
+
+
+def text_of(path: Path) -> str:
+    """Return the text of a controller's file, one letter for each byte.
+
+    Raises:
+        MeasurementError: where it cannot be read.
+    """
+    try:
+        return path.read_bytes().decode(ENCODING)
+    except OSError as error:
+        raise MeasurementError(f"cannot be read: {error.strerror or error}", path) from error
+
+
+def read_program(path: Path, controller: str = "") -> Program:
+    """Return a program with its targets.
+
+    Args:
+        path: of the program's file.
+        controller: its name in ``controllers.toml``; by default the suffix says it.
+
+    Raises:
+        MeasurementError: where the file cannot be read, or has no targets.
+    """
+    kind = controller_of(path, controller)
+    text = text_of(path)
+    found = [each for name in ("joints", "pose") for each in _found(text, name, kind)]
+    if not found:
+        moves = listing(_lines_of_moves(text, kind), 3)
+        words = f"has no targets with all their numbers, as {kind.title} writes them"
+        raise MeasurementError(words + (f"; its moves are in line {moves}" if moves else "; nor any moves"), path)
+    return Program(path, kind, text, tuple(sorted(found, key=lambda each: each.spans[0])))
+
+
+def _matches(text: str, pattern: str, comment: str) -> list[re.Match[str]]:
+    """Return what matches a pattern outside comments."""
+    found = re.finditer(pattern.replace("NUM", NUMBER), text) if pattern else ()
+    return [
+        one for one in found if not comment or comment not in text[text.rfind("\n", 0, one.start()) + 1 : one.start()]
+    ]
+
+
+def _lines_of_moves(text: str, controller: Controller) -> list[int]:
+    """Return the lines of the motion statements, from 1."""
+    found = _matches(text, controller.moves, controller.comment)
+    return [text.count("\n", 0, one.end()) + 1 for one in found]
+
+
+def _found(text: str, kind: str, controller: Controller) -> list[Target]:
+    targets = []
+    for match in _matches(text, getattr(controller, kind), controller.comment):
+        places = range(1, len(match.groups()) + 1)
+        spans, values = tuple(map(match.span, places)), tuple(float(match[k]) for k in places)
+        numbered = re.search(rf"(?:{controller.numbered})$", text[max(match.start() - NEAR, 0) : match.start(1)])
+        number = int(next(filter(None, numbered.groups()))) if controller.numbered and numbered else 0
+        targets.append(Target(text.count("\n", 0, match.start()) + 1, spans, values, kind, number))
+    return targets

@@ -1,0 +1,303 @@
+"""Join joint values and measured points, each in a file of its own, to one table of measured poses.
+
+==================  ===================================================================================================
+joints              ``joints.csv``: one row per pose, or a log over time: a column per joint; or what a program of
+                    `calib program` left at the controller (`calib formats programs`)
+points              ``points.csv``: ``x y z``, with or without an orientation, sigmas, ``tool``
+by name             a column ``name``, ``point``, ``pose``, ``id``, ``label`` or ``target`` in both; ``P_007`` is ``p7``
+by time             a column ``t``, ``time`` or ``timestamp`` in both (a number, or ISO 8601), of the same clock; points
+                    measured while the arm moved are left out
+by row              as many rows in both
+by geometry         with a robot: the order in which the nominal arm explains the points
+by motion           with a robot: points measured while the arm moves, by a clock of their own, and a log over time
+==================  ===================================================================================================
+
+Several readings of one pose are averaged; their pooled scatter becomes ``sigma_x``, ``_y``, ``_z`` of the mean where it
+has at least five degrees of freedom and the file states no sigma. A pose whose readings are further apart than
+1 mm, and than ten times what such readings usually are, is left out and named. Units are those of the two files.
+
+By motion, both files have a column of times (seconds, or ``t [ms]``; 5 Hz or more), each by its own clock, and run
+while the arm moves slowly. Offset and drift of the clocks are found from the motion; rows that cannot be used are left
+out and counted; the rest is thinned to rows whose errors are independent. Notes above the table's header say all of it.
+A clock that steps (by 5 ms or more, as far as that stands out from noise and backlash: not in each short stream),
+wanders or restarts on the way is refused, with the row: cut the file there, and give `calib fit` the parts, each joined
+on its own (`--stations one`).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from datetime import datetime
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.distance import pdist
+
+from calib.apps.controller_programs.program import joints_table
+from calib.apps.controller_programs.targets import is_program
+from calib.apps.joining.joined import CLOCKS, NAMES, Joined, column_of
+from calib.apps.joining.order import MAX_MISFIT, MIN_FOUND, MIN_POINTS, find_order
+from calib.apps.joining.streams import join_streams
+from calib.arguments import checked
+from calib.data.csv_table import Table, read_table
+from calib.data.poses.columns import POSITION, SIGMA, Sheet
+from calib.data.poses.measurements import PoseMeasurements
+from calib.errors import MeasurementError, UsageError, counted, finding, listing, one_of, refuse_data, require
+from calib.geometry.first_guess import check_scale
+from calib.procedure.findings import lines_of
+from calib.robot.calibrated import CalibratedChain
+from calib.robot.chain import Chain
+from calib.robot.library import load_calibrated
+from calib.units import TIMES
+
+WAYS = ("name", "time", "row", "geometry", "motion")
+MAX_APART = 1e-3  # of two readings of one pose [m], where nothing is known of their scatter (our choice)
+TIMES_USUAL = 10.0  # the median distance of two readings of one pose, up to which they are one (our choice)
+MIN_REPEATS = 5  # degrees of freedom of a scatter that is stated as sigma (our choice)
+STANDSTILL = 0.25  # before and after a point the arm stands [s], moving at most
+MAX_MOTION = 1e-3  # of a joint's whole travel (our choice)
+_MEASURED = re.compile(r"[xyz]\d*(_meas|_measured)?")
+
+
+@checked
+def join(
+    joints: str | Path,
+    points: str | Path,
+    *,
+    by: str = "",
+    robot: str | Path | CalibratedChain | None = None,
+    base: str | None = None,
+    tip: str | None = None,
+) -> Joined:
+    """Join a controller's joint values and an instrument's points to one table of measured poses.
+
+    Args:
+        joints: CSV file of joint values, one row per pose, or a log over time; or the file in which a controller kept
+            the joints of `calib program`.
+        points: CSV file of measured points.
+        by: ``name``, ``time``, ``row``, ``geometry`` or ``motion``; empty: the first of these that both files have
+            columns for, but not ``motion``.
+        robot, base, tip: the nominal robot, as of `calib.load`, whose geometry checks the order, or finds it.
+
+    Returns:
+        The table, the index of each row's pose, and notes; ``write(path)`` writes the CSV that `fit_geometry` takes. By
+        motion, also the clock (`calib.apps.joining.streams.Streamed`).
+
+    Raises:
+        UsageError: for another `by`, or one that the files have no columns for.
+        MeasurementError: where the files do not go together.
+    """
+    one_of(by or "row", WAYS, "by", UsageError)
+    arm = load_calibrated(robot, base, tip) if isinstance(robot, str | Path) else robot
+    if by == "motion":
+        if arm is None:
+            raise UsageError("by motion the clocks are found from the nominal arm's path: give --robot")
+        return join_streams(Path(joints), Path(points), arm.complete)
+    own = joints_table(Path(joints)) if is_program(Path(joints)) else read_table(joints)
+    return _joined(own, read_table(points), by, arm and arm.complete)
+
+
+def _joined(joints: Table, points: Table, by: str, chain: Chain | None) -> Joined:
+    named, timed = ([column_of(table, known) for table in (joints, points)] for known in (NAMES, CLOCKS))
+    possible = {"name": all(named), "time": all(timed), "row": len(joints) == len(points), "geometry": bool(chain)}
+    by = by or next((way for way, holds in possible.items() if holds), "")
+    words = "both files need a column of names (name, pose, id …)", "of times (t)", "as many rows", "give --robot"
+    counts = f"{len(joints)} rows of joints, {len(points)} points"
+    require(by and possible[by], f"{counts} cannot be joined{by and f' by {by}'}: {', or '.join(words)}", UsageError)
+    keys, notes = {*named, *timed}, ()
+    if by == "time":
+        joints, pose, notes = _at_times(joints, points, *timed)
+    else:
+        pose = _same_names(joints, points, *named) if by == "name" else np.arange(len(points))
+        require(by != "name" or (pose >= 0).any(), f"{points.file}: no name is one of {joints.file}", MeasurementError)
+    if chain is not None and by != "time":
+        q = Sheet(joints).joints(chain.joint_names)[0]
+        pose, notes = ordered(chain, q, points, {} if by == "geometry" else {f"joined by {by}": pose})
+    else:
+        notes = (f"{counts}, joined by {by}", *notes)
+    notes = (*joints.notes, *points.notes, *notes)
+    return merged(joints, points, pose, notes, [name for name in keys if name])
+
+
+def ordered(
+    chain: Chain, q: np.ndarray, points: Table, stated: dict[str, np.ndarray], sheet: Sheet | None = None
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return which of the poses q (n, joints) each point belongs to, -1 for none, and notes on it.
+
+    Args:
+        stated: orders to try first, in words → (m,) index of each point's pose.
+        sheet: the points with the options for reading them.
+
+    Raises:
+        MeasurementError: where no order explains the points.
+    """
+    position = _positions(sheet or Sheet(points))
+    seen = np.flatnonzero(np.isfinite(position).all(axis=1))
+    few = f"{len(seen)} points are too few to find their poses by the robot's geometry (at least {MIN_POINTS})"
+    if len(seen) < MIN_POINTS:
+        how, pose = next(((how, pose) for how, pose in stated.items() if (pose >= 0).all()), ("", seen))
+        require(how, f"{few}: name them (a column 'pose' with the pose's number)", MeasurementError, points.file)
+        return pose, (f"{len(pose)} points, {how}; {few}",)
+    spread = PoseMeasurements.of(q[seen % len(q)], position[seen], joint_names=chain.joint_names, file=points.file)
+    check_scale(spread, chain)  # says which unit explains points that spread too far
+    found = find_order(chain, q, position[seen], {how: pose[seen] for how, pose in stated.items()})
+    if found is None:
+        order, advice = "any order", ""
+        if len(seen) < MIN_FOUND:
+            order, advice = (
+                "their order",
+                f" With {MIN_FOUND} points or more any order is found; else name them (a column 'pose')",
+            )
+        limit = 1e3 * MAX_MISFIT * chain.stretched_length()
+        refuse_data(
+            points.file,
+            f"its {len(seen)} points are not those of these {len(q)} poses in {order} (within {limit:.0f} mm of the "
+            f"nominal arm): is it this robot and this list, and did instrument and target stay in place?{advice}",
+        )
+    pose = np.full(len(position), -1)
+    pose[seen] = found.pose
+    notes = [f"{len(seen)} points, {found.how} ({1e3 * found.rms:.2g} mm rms from the nominal arm)"]
+    if len(strange := seen[found.pose < 0]):
+        notes.append(f"belonging to no pose, left out: rows {listing(points.rows[strange])}")
+    if found.rivals:
+        doubtful = seen[list(found.rivals)]
+        pose[doubtful] = -1
+        notes.append(f"poses too close together to tell apart, left out: rows {listing(points.rows[doubtful])}")
+    return pose, tuple(notes)
+
+
+def merged(
+    joints: Table, points: Table, pose: np.ndarray, notes: Sequence[str], keys: Sequence[str], told: bool = True
+) -> Joined:
+    """Return the joints' rows with the points (m,) of each, several readings of one pose averaged.
+
+    Args:
+        pose: (m,) index of each point's row of joints; -1 for none.
+        keys: columns by which they were joined, left out.
+        told: whether a note names the poses without a point.
+    """
+    position, label = _positions(Sheet(points)), _labels(joints)
+    groups = {int(k): np.flatnonzero(pose == k) for k in np.unique(pose[pose >= 0])}
+    missing, stray = [label[k] for k in range(len(joints)) if k not in groups], points.rows[pose < 0]
+    groups, apart = _consistent(position, groups, label, points)
+    require(groups, f"{points.file}: none of its {len(points)} points is left", MeasurementError)
+    notes = [*notes, *apart]
+    if missing and told:
+        notes.append(f"without a point: {len(missing)} of {len(joints)} poses: {listing(missing)}")
+    if len(stray):
+        notes.append(f"points left out: rows {listing(stray)}")
+    kept, count = np.array(list(groups), dtype=int), np.array([[len(rows)] for rows in groups.values()])
+    mine = [name for name in points.header if name not in keys]
+    own = [name for name in joints.header if name not in keys and name not in mine]
+    columns = {name: joints.cells[joints.index(name)][kept] for name in own}
+    columns |= {name: _averaged(points, name, groups, position) for name in mine}
+    units = [table.units[table.index(name)] for table, names in ((joints, own), (points, mine)) for name in names]
+    if repeats := int(count.sum() - len(count)):
+        squares = sum(((position[rows] - position[rows].mean(axis=0)) ** 2).sum(axis=0) for rows in groups.values())
+        sigma = 1e3 * np.sqrt(squares / repeats)
+        notes.append(f"{counted(repeats, 'repeated reading')} averaged, σ of one {np.mean(sigma):.2g} mm per axis")
+        if repeats >= MIN_REPEATS and not any(name.startswith("sigma") for name in mine) and np.all(sigma):
+            columns |= dict(zip(SIGMA.names, (sigma / np.sqrt(count)).T))
+            units += ["mm"] * 3
+    labels = np.array([label[k] for k in kept], dtype=object)
+    header, cells = ("pose", *columns), (labels, *columns.values())
+    return Joined(Table(points.file, header, ("", *units), cells, kept + 1), kept, tuple(notes))
+
+
+def _positions(sheet: Sheet) -> np.ndarray:
+    """Return the measured positions (m, 3) [m], of several targets those of the first; NaN where it was not seen."""
+    columns = sheet.family(POSITION.names) or sheet.family(POSITION.names, "1")
+    require(columns, f"has no x, y, z; found {', '.join(sheet.table.header)}", MeasurementError, sheet.table.file)
+    return sheet.numbers(columns, POSITION, gaps=True)
+
+
+def _consistent(
+    position: np.ndarray, groups: dict[int, np.ndarray], label: Sequence[str], points: Table
+) -> tuple[dict[int, np.ndarray], list[str]]:
+    """Return the groups of readings without those whose readings contradict each other, and what is to be said."""
+    wide = {k: float(pdist(position[rows]).max()) for k, rows in groups.items() if len(rows) > 1}
+    bound = max(MAX_APART, TIMES_USUAL * float(np.median(list(wide.values()))) if len(wide) > 2 else 0.0)
+    torn = {k: apart for k, apart in wide.items() if apart > bound}
+    said = [
+        finding("readings-apart", pose=label[k], apart=apart, rows=points.rows[groups[k]]) for k, apart in torn.items()
+    ]
+    return {k: rows for k, rows in groups.items() if k not in torn}, lines_of(said)
+
+
+def _averaged(points: Table, name: str, groups: dict[int, np.ndarray], position: np.ndarray) -> np.ndarray:
+    """Return a column of points, one cell per group: the mean of positions, else of the reading nearest the mean."""
+    cells = points.cells[points.index(name)]
+    if _MEASURED.fullmatch(name) and cells.dtype == float:
+        return np.array([cells[rows].mean() for rows in groups.values()])
+    away = (np.linalg.norm(position[rows] - position[rows].mean(axis=0), axis=1) for rows in groups.values())
+    return cells[[rows[np.argmin(size)] for rows, size in zip(groups.values(), away)]]
+
+
+def _labels(joints: Table) -> list[str]:
+    """Return a name per row of joints: those of its column of names, else its numbers from 1."""
+    name = column_of(joints, NAMES)
+    return joints.texts(name) if name else [str(row) for row in joints.rows]
+
+
+def _same_names(joints: Table, points: Table, one: str, other: str) -> np.ndarray:
+    """Return the row of joints (m,) with each point's name, -1 without one."""
+    theirs, ours = points.texts(other), joints.texts(one)
+    for plain in (_plain, _number):
+        places = {plain(text): k for k, text in enumerate(ours)}
+        if len(places) < len(joints):
+            refuse_data(joints.file, "has a name twice: each pose needs a name of its own", one)
+        if (pose := np.array([places.get(plain(text), -1) for text in theirs])).max() >= 0:
+            break
+    return pose
+
+
+def _plain(text: str) -> str:
+    """Return a name in comparable form: small letters and digits, without zeros in front: ``P_007`` is ``p7``."""
+    return re.sub(r"(?<!\d)0+(?=\d)", "", re.sub(r"[^a-z0-9]", "", text.lower()))
+
+
+def _number(text: str) -> str:
+    """Return the last number in a name, or the name where it has none."""
+    return (re.findall(r"\d+", text) or [text])[-1].lstrip("0")
+
+
+def _at_times(joints: Table, points: Table, one: str, other: str) -> tuple[Table, np.ndarray, tuple[str, ...]]:
+    """Return the joints at the times of the points, which of them stood still (m,), and notes."""
+    t, at = _seconds(joints, one), _seconds(points, other)
+    if unsorted := next((k for k, (a, b) in enumerate(pairwise(t)) if b <= a), None):
+        joints.fail("the times do not increase", one, unsorted + 1)
+    inside = (at >= t[0]) & (at <= t[-1])
+    if inside.mean() < 0.5:
+        words = f"its points are of {at.min():.10g} to {at.max():.10g} s, the joints of {t[0]:.10g} to {t[-1]:.10g} s"
+        refuse_data(
+            points.file, f"{words}: are both times of the same clock? Otherwise join by motion, row or name", other
+        )
+    names = [name for name in joints.header if name != one and joints.cells[joints.index(name)].dtype == float]
+    values = np.column_stack([joints.numbers(name, None) for name in names])
+    around = np.stack([_interpolated(at + shift, t, values) for shift in np.linspace(-STANDSTILL, STANDSTILL, 5)])
+    still = (np.ptp(around, axis=0) <= MAX_MOTION * np.ptp(values, axis=0) + 1e-12).all(axis=1)
+    units = tuple(joints.units[joints.index(name)] for name in names)
+    found = Table(joints.file, tuple(names), units, tuple(around[2].T), points.rows)
+    notes = [f"{len(points)} points, joined by time with a log of {t[-1] - t[0]:.4g} s"]
+    if (moving := inside & ~still).any():
+        notes.append(f"measured while the arm moved: rows {listing(points.rows[moving])}")
+    if not inside.all():
+        notes.append(f"outside the log: rows {listing(points.rows[~inside])}")
+    return found, np.where(inside & still, np.arange(len(at)), -1), tuple(notes)
+
+
+def _interpolated(at: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
+    return np.column_stack([np.interp(at, t, column) for column in values.T])
+
+
+def _seconds(table: Table, name: str) -> np.ndarray:
+    """Return a column of times (m,) [s]: numbers in the header's unit, or dates and times by ISO 8601."""
+    column = table.index(name)
+    if table.cells[column].dtype == float:
+        return table.numbers(name, None) * table.factor(column, TIMES, "")
+    try:
+        return np.array([datetime.fromisoformat(text).timestamp() for text in table.texts(name)])
+    except ValueError as error:
+        table.fail(f"{error}: expected seconds, or a date and time as 2026-11-27T08:15:30.250", name)

@@ -1,0 +1,1 @@
+"""Robot controllers: what each shows, and what it can be told."""

@@ -1,0 +1,141 @@
+"""Robot controllers, as ``controllers.toml`` declares them: their joints, their programs, what they can be told.
+
+A controller shows  s_i = sign_i · (q_i + Σ way · q_j)  for a description's joints q: signs and coupled axes (a
+FANUC's J3 counts from the horizontal). Descriptions are ROS-Industrial's or the maker's; where a description counts a
+joint from another zero, its programs would be wrong: play them in the controller's simulation first.
+"""
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from calib.config import parse, strict
+from calib.errors import UsageError, one_of, require
+from calib.files import shipped_text
+from calib.units import ANGLES, LENGTHS
+
+
+@strict
+@dataclass(frozen=True)
+class Controller:
+    """One entry of ``controllers.toml``; what each key means stands at the head of that file."""
+
+    title: str
+    files: Mapping[str, str]
+    names: str
+    unit: str
+    decimals: int
+    source: str
+    takes: str
+    closed: str
+    checked: str
+    tool_frame: str = ""
+    base_frame: str = ""
+    base: str = ""
+    flange: str = ""
+    base_at: str = ""
+    flange_turn: tuple[float, ...] = ()
+    frames: str = ""
+    language: str = ""
+    stream: Mapping[str, str] = field(default_factory=dict)
+    cycle: float = 0.0
+    keeps: str = ""
+    outputs: bool = True
+    mastered: bool = True
+    pulses: bool = False
+    axes: tuple[int, ...] = ()
+    suffixes: tuple[str, ...] = ()
+    saved: tuple[str, ...] = ()
+    signs: tuple[int, ...] = ()
+    coupled: tuple[tuple[int, int, int], ...] = ()
+    joints: str = ""
+    pose: str = ""
+    numbered: str = ""
+    moves: str = ""
+    turn: str = ""
+    length: str = "m"
+    comment: str = ""
+
+    def matrix(self, n: int) -> np.ndarray:
+        """Return the matrix (n, n) from a description's joints to those that the controller shows."""
+        coupling = np.eye(n)
+        for axis, other, way in self.coupled:
+            if max(axis, other) <= n:
+                coupling[axis - 1, other - 1] = way
+        return np.array(self.signs or [1] * n)[:, None] * coupling
+
+    def shown(self, q: np.ndarray) -> np.ndarray:
+        """Return the joints (…, n) [rad] of a description as the controller shows them, in its unit."""
+        return q @ self.matrix(q.shape[-1]).T / ANGLES[self.unit]
+
+    def described(self, shown: np.ndarray) -> np.ndarray:
+        """Return the joints (…, n) of a description from those that the controller shows, in the same unit."""
+        return shown @ np.linalg.inv(self.matrix(shown.shape[-1])).T
+
+    @property
+    def metres(self) -> float:
+        """Size of the unit of lengths in poses [m]."""
+        return LENGTHS[self.length]
+
+
+@cache
+def controllers() -> dict[str, Controller]:
+    """Return all controllers by name."""
+    table = tomllib.loads(shipped_text("calib.controllers", "controllers.toml"))
+    return {
+        name: parse(
+            Controller, (table[entry["like"]] if "like" in entry else {}) | _own(entry), f"controllers.toml: {name}"
+        )
+        for name, entry in table.items()
+    }
+
+
+def _own(entry: Mapping[str, object]) -> dict[str, object]:
+    return {key: value for key, value in entry.items() if key != "like"}
+
+
+def controller_named(name: str) -> Controller:
+    """Return a controller by its name.
+
+    Raises:
+        UsageError: for an unknown name, with the known ones.
+    """
+    return controllers()[one_of(name, controllers(), "controller", UsageError)]
+
+
+def check_controller(name: str, axes: int, pulses: Sequence[float] = ()) -> None:
+    """Refuse an unknown name, a controller that takes no arm of so many axes, and one whose pulses are not given."""
+    found = controller_named(name)
+    allowed = " or ".join(map(str, found.axes))
+    require(not allowed or axes in found.axes, f"{axes} joints; {found.title} takes {allowed}", UsageError)
+    words = f"{found.title} needs the pulses per degree of each of {axes} axes: calib program --pulse"
+    require(not found.pulses or (len(pulses) == axes and all(pulses)), words, UsageError)
+
+
+def controller_of(path: Path, name: str = "") -> Controller:
+    """Return the controller whose program stands at `path`: by name, or by the file's suffix.
+
+    Raises:
+        UsageError: where no controller's programs whose targets are read end so.
+    """
+    if name:
+        return controller_named(name)
+    for each in controllers().values():
+        if path.suffix.lower() in each.suffixes:
+            return each
+    known = ", ".join(suffix for each in controllers().values() for suffix in each.suffixes)
+    raise UsageError(f"{path}: no program of a known controller: expected a suffix of {known}")
+
+
+def as_described(name: str, shown: np.ndarray) -> np.ndarray:
+    """Return a description's joints, or their speeds (…, n), from those that a controller shows, in the same unit."""
+    return controller_named(name).described(shown)
+
+
+def motors_as_described(name: str, shown: np.ndarray) -> np.ndarray:
+    """Return motors' torques or currents (…, n) with the description's signs; coupled axes do not change a motor."""
+    return shown * np.array(controller_named(name).signs or 1.0)

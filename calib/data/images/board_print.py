@@ -1,0 +1,232 @@
+"""Boards to print: SVG and PDF at true scale with a ruler, and their raster for a rendered camera."""
+
+from contextlib import suppress
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from calib import files
+from calib.config import parse
+from calib.data.images.board import KINDS, MIN_CORNERS, Board, corners, read_board, write_board
+from calib.data.images.images import quiet
+from calib.data.poses import BOARD
+from calib.errors import CalibError, UsageError, require
+
+PAPERS = {"a4": (0.210, 0.297), "a3": (0.297, 0.420), "a2": (0.420, 0.594), "a1": (0.594, 0.841), "a0": (0.841, 1.189)}
+EDGE = 0.008  # printers leave this free [m]
+RULER = 0.016  # height of the strip with the ruler and the words [m]
+USUAL = {"charuco": ("5x5_100", 0.7, 9), "chessboard": ("5x5_100", 0.7, 10), "apriltag": ("apriltag_36h11", 0.3, 9)}
+POINT = 0.0254 / 72.0  # PDF's unit [m]
+
+
+def charuco(board: Board) -> cv2.aruco.CharucoBoard:
+    """Return OpenCV's ChArUco board object (lengths in metres)."""
+    size = board.columns, board.rows
+    with quiet():
+        return cv2.aruco.CharucoBoard(size, board.square, board.marker, dictionary(board.dictionary))
+
+
+def dictionary(name: str) -> cv2.aruco.Dictionary:
+    """Return OpenCV's marker dictionary by its name."""
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name.upper()}"))
+
+
+def _black(board: Board) -> np.ndarray:
+    """Return the black rectangles (N, 4) of a board: x, y, width, height [m] in its frame."""
+    side, found = board.square, []
+    fields = [(r, c) for r in range(board.rows) for c in range(board.columns)]
+    if board.kind == "apriltag":
+        pitch = side + board.marker
+        places = [(c * pitch, r * pitch, side) for r, c in fields]
+    else:
+        found = [np.array([[c * side, r * side, side, side]]) for r, c in fields if (r + c) % 2 == 0]
+        margin, white = 0.5 * (side - board.marker), [field for field in fields if sum(field) % 2 == 1]
+        places = [(c * side + margin, r * side + margin, board.marker) for r, c in white if board.kind == "charuco"]
+    words = dictionary(board.dictionary)
+    for number, (x, y, size) in enumerate(places):
+        bits = cv2.aruco.generateImageMarker(words, number, words.markerSize + 2, borderBits=1)
+        found.append(_rectangles(bits == 0, x, y, size / len(bits)))
+    return np.concatenate(found)
+
+
+def _rectangles(dark: np.ndarray, x: float, y: float, side: float) -> np.ndarray:
+    """Return rectangles (N, 4) [m] that cover the black fields of a marker, one per horizontal run."""
+    result = []
+    for row, line in enumerate(dark):
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(int), [0]])))
+        for first, last in zip(edges[::2], edges[1::2]):
+            result.append([x + first * side, y + row * side, (last - first) * side, side])
+    return np.array(result).reshape(-1, 4)
+
+
+def raster(board: Board, pixels_per_metre: float, margin: float) -> np.ndarray:
+    """Return the image (H, W) of a board with a white margin [m]: reflectances, 0 black to 1 white.
+
+    Every pixel holds the share of its area that is white, so that edges lie where they belong.
+    """
+    width, height = (round((length + 2.0 * margin) * pixels_per_metre) for length in board.extent)
+    image = np.ones((height, width), dtype=np.float32)
+    for x, y, w, h in _black(board):
+        shares = []
+        for first, length, count in ((y, h, height), (x, w, width)):
+            low, high = ((place + margin) * pixels_per_metre for place in (first, first + length))
+            cells = np.arange(int(np.floor(low)), min(int(np.ceil(high)), count))
+            shares.append((cells, np.clip(np.minimum(cells + 1, high) - np.maximum(cells, low), 0.0, 1.0)))
+        (rows, down), (columns, across) = shares
+        image[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] -= np.outer(down, across).astype(np.float32)
+    return np.clip(image, 0.0, 1.0)
+
+
+def page_size(board: Board, paper: str = "") -> tuple[float, float]:
+    """Return width and height [m] of the page that the board fits on: the stated paper, or the smallest one.
+
+    Raises:
+        UsageError: where the board does not fit, with the largest square that would.
+    """
+    needed = board.extent[0] + 2 * EDGE, board.extent[1] + 2 * EDGE + RULER
+    papers = [PAPERS[paper]] if paper else list(PAPERS.values())
+    sizes = [size for short, long in papers for size in ((short, long), (long, short))]
+    shares = [min(size[0] / needed[0], size[1] / needed[1]) for size in sizes]
+    if fitting := [size for size, share in zip(sizes, shares) if share >= 1.0]:
+        return fitting[0]
+    if not paper:
+        return needed
+    raise UsageError(
+        f"the board takes {1e3 * needed[0]:.0f} x {1e3 * needed[1]:.0f} mm with margins and ruler, larger than "
+        f"{paper.upper()}; squares of {int(1e3 * board.square * max(shares) * 0.97)} mm would fit"
+    )
+
+
+def svg(board: Board, size: tuple[float, float]) -> str:
+    """Return the page as SVG, in millimetres."""
+    boxes, words = _page(board, size)
+    body = [
+        f'<rect x="{1e3 * x:.4f}" y="{1e3 * y:.4f}" width="{1e3 * w:.4f}" height="{1e3 * h:.4f}"/>'
+        for x, y, w, h in boxes
+    ]
+    body += [
+        f'<text x="{1e3 * x:.2f}" y="{1e3 * y:.2f}" font-size="2.8" font-family="Helvetica, Arial">{text}</text>'
+        for x, y, text in words
+    ]
+    wide, high = (f"{1e3 * length:g}" for length in size)
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{wide}mm" height="{high}mm" viewBox="0 0 {wide} {high}" '
+        f'shape-rendering="crispEdges">\n<rect width="{wide}" height="{high}" fill="white"/>\n'
+        + "\n".join(body)
+        + "\n</svg>\n"
+    )
+
+
+def pdf(board: Board, size: tuple[float, float]) -> bytes:
+    """Return the page as a PDF at true scale, with print scaling switched off."""
+    boxes, words = _page(board, size)
+    wide, high = (length / POINT for length in size)
+    lines = [f"{x / POINT:.4f} {high - (y + h) / POINT:.4f} {w / POINT:.4f} {h / POINT:.4f} re" for x, y, w, h in boxes]
+    lines.append("f")
+    for x, y, text in words:
+        shown = text.replace("\\", r"\\").replace("(", r"\(").replace(")", r"\)")
+        lines.append(f"BT /F1 8 Tf {x / POINT:.3f} {high - y / POINT:.3f} Td ({shown}) Tj ET")
+    content = "\n".join(lines).encode("latin-1", "replace")
+    objects = [
+        b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
+        b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
+        f"<< /Type /Page /Parent 2 0 R /MediaBox [0 0 {wide:.4f} {high:.4f}] /Contents 4 0 R "
+        "/Resources << /Font << /F1 5 0 R >> >> >>".encode(),
+        f"<< /Length {len(content)} >>\nstream\n".encode() + content + b"\nendstream",
+        b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica /Encoding /WinAnsiEncoding >>",
+    ]
+    result, places = b"%PDF-1.4\n", []
+    for number, each in enumerate(objects, 1):
+        places.append(len(result))
+        result += f"{number} 0 obj\n".encode() + each + b"\nendobj\n"
+    table = "".join(f"{place:010d} 00000 n \n" for place in places)
+    tail = f"xref\n0 {len(objects) + 1}\n0000000000 65535 f \n{table}"
+    tail += f"trailer\n<< /Size {len(objects) + 1} /Root 1 0 R >>\nstartxref\n{len(result)}\n%%EOF\n"
+    return result + tail.encode()
+
+
+def _page(board: Board, size: tuple[float, float]) -> tuple[np.ndarray, list[tuple[float, float, str]]]:
+    """Return the black rectangles (N, 4) [m] and the texts of a page: board in the middle, ruler below."""
+    left, top = 0.5 * (size[0] - board.extent[0]), 0.5 * (size[1] - RULER - board.extent[1])
+    boxes = _black(board) + np.array([left, top, 0.0, 0.0])
+    length = 0.01 * int(100 * min(board.extent[0], 0.2) + 1e-9)
+    base, thin = size[1] - EDGE - 0.006, 0.0002
+    ticks = [[left - thin / 2, base, length + thin, thin]]
+    for millimetre in range(round(1e3 * length) + 1):
+        tall = 0.004 if millimetre % 10 == 0 else 0.003 if millimetre % 5 == 0 else 0.002
+        ticks.append([left + 1e-3 * millimetre - thin / 2, base - tall, thin, tall])
+    advice = f"{board.words}, {board.dictionary}: print at 100 %, measure, put it into board.toml"
+    words = [
+        (left, base + 0.0035, "0"),
+        (left + length - 0.006, base + 0.0035, f"{1e3 * length:.0f} mm"),
+        (left + 0.008, base + 0.0035, advice),
+    ]
+    return np.concatenate([boxes, ticks]), words
+
+
+def make(
+    out: Path,
+    kind: str,
+    columns: int | None,
+    rows: int,
+    square: float,
+    marker: float | None,
+    words: str | None,
+    paper: str | None,
+    overwrite: bool = False,
+) -> list[str]:
+    """Write ``board.toml``, ``board.pdf`` and ``board.svg``; return printing instructions.
+
+    Args:
+        out: folder.
+        kind, columns, rows, words, paper: see `calib.data.images.board`; a dictionary, and the paper's name. None: the
+            usual ones.
+        square, marker: [mm].
+        overwrite: replace another board that is there, whose squares somebody may have measured.
+
+    Raises:
+        UsageError: for a board that cannot be, or does not fit onto its paper, and for another that is there already.
+    """
+    require(kind in KINDS, f"--kind {kind}: expected one of {', '.join(KINDS)}", UsageError)
+    if paper is not None and paper.lower() not in PAPERS:
+        raise UsageError(f"--paper {paper}: expected one of {', '.join(PAPERS)}")
+    min_square = 1.0  # side of a square [mm]
+    if square < min_square:
+        raise UsageError(f"--square {square:g}: a square of {square:g} mm cannot be printed; --square is in mm")
+    usual, share, across = USUAL[kind]
+    between = (share * square if marker is None else marker) / 1e3
+    stated = {"kind": kind, "columns": columns or across, "rows": rows, "square": square / 1e3, "marker": between}
+    made = parse(Board, stated | {"dictionary": words or usual}, "impossible board")
+    if (count := len(corners(made))) < MIN_CORNERS:
+        raise UsageError(f"a {made.words} has {count} corners, an image needs {MIN_CORNERS}: take more squares")
+    size = page_size(made, (paper or "").lower())
+    there = out / BOARD
+    if not overwrite and there.exists() and not _as_printed(out):
+        raise UsageError(
+            f"{there} was changed after printing (measured squares?) or describes another board; nothing was written. "
+            "Take another folder (--out), or give --overwrite"
+        )
+    files.write(out / "board.pdf", pdf(made, size))
+    files.write(out / "board.svg", svg(made, size))
+    write_board(made, out / BOARD)
+    wide, high = (round(1e3 * length) for length in size)
+    return [
+        f"{made.words}, {len(corners(made))} corners, on a page of {wide} x {high} mm: {out / 'board.pdf'}",
+        "print it at 100 % (not fitted to the page), check the ruler, glue it onto glass or aluminium; then measure "
+        f"several squares together and put the size of one into {out / BOARD}: the robot's lengths get their "
+        "scale from it",
+    ]
+
+
+def _as_printed(out: Path) -> bool:
+    """Return whether a folder's ``board.toml`` is unchanged since `make` wrote it with ``board.svg``."""
+    try:
+        found, drawn = read_board(out), (out / "board.svg").read_bytes()
+        sizes = []
+        for paper in ("", *PAPERS):
+            with suppress(UsageError):  # a paper that it does not fit onto
+                sizes.append(page_size(found, paper))
+        return any(svg(found, size).encode() == drawn for size in dict.fromkeys(sizes))
+    except (OSError, ValueError, CalibError):
+        return False

@@ -1,0 +1,162 @@
+"""Images of a board from ROS 1 and 2 bags and MCAP: sensor_msgs/Image or CompressedImage, with JointState.
+
+Every image takes the joint values at its own stamp, between the joint states before and after it. An image during which
+a joint moved faster than `max_joint_speed` is left out: its joint values are not those of its exposure. Of images taken
+at one stop of the arm the first `max_per_stop` are kept. What is kept is written as a folder (``calib images BAG
+--board board.toml --out FOLDER``): ``joints.csv``, ``corners.csv``, ``board.toml``, no images.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib import files
+from calib.data.images.board import Board, read_board, write_board
+from calib.data.images.detection import detected
+from calib.data.images.image_folders import detection_summary
+from calib.data.images.pixels import Found, write_corners
+from calib.data.poses import BOARD, CORNERS, JOINTS
+from calib.data.recordings.bags import JOINT_STATE, connections_of, header_stamp, joint_states, opened
+from calib.errors import MeasurementError, require
+
+IMAGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/Image", "sensor_msgs/CompressedImage")
+
+
+@dataclass(frozen=True, eq=False)
+class ImageBag:
+    """Usable images of a bag with corners and joint values.
+
+    Attributes:
+        names: of the images kept.
+        joint_names: as in the bag.
+        q: (m, n) joint values of the images kept [rad or m].
+        corners: what was found in them.
+        notes: what was left out.
+    """
+
+    names: tuple[str, ...]
+    joint_names: tuple[str, ...]
+    q: np.ndarray
+    corners: Found
+    notes: tuple[str, ...]
+
+
+def read_image_bag(
+    path: Path,
+    board: Board,
+    image_topic: str = "",
+    joint_topic: str = "",
+    say: Callable[[int, str], None] | None = None,
+) -> ImageBag:
+    """Return the detected corners and the joint values of a bag's images.
+
+    Args:
+        path: of the bag (a file, or the folder of a ROS 2 bag).
+        board: to look for.
+        image_topic, joint_topic: where there are several.
+        say: called with the number and the name of each image.
+
+    Raises:
+        MeasurementError: where it cannot be read, a topic is missing, or no image was taken at rest.
+    """
+    with opened(path) as reader:
+        states = connections_of(reader, JOINT_STATE, joint_topic, path, "joint states", "--joint-topic")
+        names, parts, _ = joint_states(reader, states, None, path)
+        few = f"{len(parts['q'])} joint states are too few to interpolate joint values"
+        require(len(parts["q"]) >= 2, few, MeasurementError, path)
+        order = np.argsort(parts["stamp"], kind="stable")
+        connections = connections_of(reader, IMAGE, image_topic, path, "images", "--image-topic")
+        chosen, own, notes = _at_rest(_image_stamps(reader, connections), parts["stamp"][order], parts["q"][order])
+        require(len(chosen), f"no image was taken with the arm at rest: {'; '.join(notes)}", MeasurementError, path)
+        labels = [f"image {k + 1}" for k in chosen]
+        images = zip(labels, _images(reader, connections, set(chosen.tolist())))
+        found = detected(images, board, len(labels), None if say is None else lambda k, _, name: say(k, name))
+    return ImageBag(tuple(labels), names, own, found, tuple(notes))
+
+
+def _image_stamps(reader: Any, connections: list[Any]) -> np.ndarray:
+    messages = reader.messages(connections=connections)
+    return np.array([header_stamp(reader.deserialize(raw, c.msgtype)) or logged for c, logged, raw in messages])
+
+
+def _images(reader: Any, connections: list[Any], wanted: set[int]) -> Any:
+    """Yield the images with the given numbers as 8-bit grey levels, in the bag's order."""
+    for number, (connection, _, raw) in enumerate(reader.messages(connections=connections)):
+        if number in wanted:
+            yield _grey(reader.deserialize(raw, connection.msgtype))
+
+
+def _grey(message: Any) -> np.ndarray:
+    from calib.data.images.images import decode, to_grey
+
+    if hasattr(message, "format"):
+        return decode(bytes(message.data))
+    kinds = {"mono8": (np.uint8, 1), "8UC1": (np.uint8, 1), "mono16": (np.uint16, 1), "16UC1": (np.uint16, 1)}
+    kinds |= {name: (np.uint8, 3) for name in ("bgr8", "rgb8", "8UC3")} | {
+        "bgra8": (np.uint8, 4),
+        "rgba8": (np.uint8, 4),
+    }
+    if message.encoding not in kinds:
+        raise ValueError(f"images of encoding '{message.encoding}'; known are {', '.join(kinds)}")
+    kind, depth = kinds[message.encoding]
+    order = ">" if message.is_bigendian else "<"
+    rows = np.frombuffer(bytes(message.data), np.uint8).reshape(message.height, message.step)
+    flat = np.ascontiguousarray(rows[:, : message.width * depth * np.dtype(kind).itemsize])
+    values = flat.view(np.dtype(kind).newbyteorder(order)).astype(kind).reshape(message.height, message.width, depth)
+    if message.encoding.startswith("rgb"):
+        values = values[:, :, 2::-1]
+    return to_grey(values[:, :, 0] if depth == 1 else values)
+
+
+def _at_rest(images: np.ndarray, stamps: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Return the numbers of images taken at rest, their joint values, and notes on the other images."""
+    notes = []
+    after = np.clip(np.searchsorted(stamps, images), 1, len(stamps) - 1)
+    before = after - 1
+    gap = np.maximum(stamps[after] - stamps[before], 1)
+    share = np.clip((images - stamps[before]) / gap, 0.0, 1.0)[:, None]
+    own = q[before] * (1.0 - share) + q[after] * share
+    max_delay = 0.1  # an image further from the nearest joint state has none [s]
+    near = np.minimum(np.abs(images - stamps[before]), np.abs(images - stamps[after])) < max_delay * 1e9
+    speed = np.abs(q[after] - q[before]).max(axis=1) / (gap * 1e-9)
+    max_joint_speed = 2e-3  # of a joint about an image [rad/s or m/s]; our choice
+    still = speed < max_joint_speed
+    if not near.all():
+        notes.append(f"{int((~near).sum())} images have no joint state within {max_delay:g} s (do the clocks agree?)")
+    if moving := int((near & ~still).sum()):
+        notes.append(
+            f"{moving} images were taken while the arm moved (faster than {1e3 * max_joint_speed:g} mrad/s): left out"
+        )
+    kept, stop = [], 0
+    max_apart = 1e-3  # joints of one stop differ by less [rad or m]
+    max_per_stop = 3  # images of one stop that are kept
+    for k in np.flatnonzero(near & still):
+        stop = stop + 1 if kept and np.abs(own[k] - own[kept[-1]]).max() < max_apart else 1
+        if stop <= max_per_stop:
+            kept.append(int(k))
+    if more := int((near & still).sum()) - len(kept):
+        notes.append(f"{more} more images of the same stops were left out ({max_per_stop} of each are kept)")
+    return np.array(kept, dtype=int), own[kept], notes
+
+
+def write_image_folder(found: ImageBag, board: Board, folder: Path) -> Path:
+    """Write a bag's images as a folder for `calib.data.images.image_folders`."""
+    write_board(board, folder / BOARD)
+    rows = [[name, *map(float, joints)] for name, joints in zip(found.names, found.q)]
+    files.write_table(folder / JOINTS, ["image", *(f"{name} [rad]" for name in found.joint_names)], rows)
+    write_corners(folder / CORNERS, found.corners)
+    return folder
+
+
+def from_bag(
+    bag: Path, board: Path, out: Path, image_topic: str | None, joint_topic: str | None, show: Callable[[str], None]
+) -> list[str]:
+    """Write a bag's corners and joint values into a folder; return a summary as sentences."""
+    made = read_board(board)
+    found = read_image_bag(bag, made, image_topic or "", joint_topic or "", lambda k, name: show(f"image {k}: {name}"))
+    write_image_folder(found, made, out)
+    lines = detection_summary(found.corners, made, found.names)
+    return [*lines, *found.notes, f"written to {out}; calib fit ROBOT {out} --out FOLDER fits it"]

@@ -1,0 +1,207 @@
+"""Calibration parameters of images: lenses and shapes of printed boards, with derivatives.
+
+A corner (x, y, 0) of the table stands on the board at (s x, s y, w), w = b₁ X² + b₂ XY + b₃ Y² with X, Y counted
+from the board's middle: s is the scale of the print, b how the board bends [1/m]. In ``robot.toml`` of a fit::
+
+    [[camera]]                       # its lens
+    name = "camera"
+    model = "pinhole"                # or fisheye
+    size = [2448, 2048]              # of its images [px]
+    values = [2400.0, ...]           # fx fy cx cy k1 k2 p1 p2 k3 [k4 k5 k6], or fx fy cx cy k1 k2 k3 k4
+    [[board]]                        # the print: scale, and bending [1/m]
+    name = "board"
+    scale = 1.0
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from calib.data.images.board import Board
+from calib.data.images.lens import Lens
+from calib.data.images.pixels import Pixels
+from calib.data.poses.measurements import PoseMeasurements
+from calib.errors import refuse_option
+from calib.records import read_record
+
+SHAPE = ("scale", "bend_xx", "bend_xy", "bend_yy")
+UNITS = ("", "1/m", "1/m", "1/m")
+
+
+@dataclass(frozen=True)
+class BoardShape:
+    """Deviation of a printed board from its nominal shape: scale, and bending [1/m]."""
+
+    scale: float = 1.0
+    bend_xx: float = 0.0
+    bend_xy: float = 0.0
+    bend_yy: float = 0.0
+
+    @property
+    def values(self) -> np.ndarray:
+        """The four values (scale and bending)."""
+        return np.array([self.scale, self.bend_xx, self.bend_xy, self.bend_yy])
+
+    @property
+    def bent(self) -> bool:
+        """Whether the board is not flat."""
+        return any((self.bend_xx, self.bend_xy, self.bend_yy))
+
+
+@dataclass(frozen=True, eq=False)
+class Optics:
+    """All cameras and boards of an installation; empty without images.
+
+    Attributes:
+        lenses: one per camera, by name.
+        boards: one per board, by name.
+        free: names of the parameters that may be fitted.
+    """
+
+    lenses: tuple[Lens, ...] = ()
+    lens_names: tuple[str, ...] = ()
+    boards: tuple[BoardShape, ...] = ()
+    board_names: tuple[str, ...] = ()
+    free: frozenset[str] = frozenset()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters: the lenses' values first, then the boards' shapes."""
+        own = [f"{name}.{value}" for name, lens in zip(self.lens_names, self.lenses) for value in lens.names]
+        return (*own, *(f"{name}.{value}" for name in self.board_names for value in SHAPE))
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the parameters."""
+        own = [unit for lens in self.lenses for unit in ("px", "px", "px", "px", *[""] * (len(lens.values) - 4))]
+        return (*own, *(UNITS * len(self.boards)))
+
+    @property
+    def values(self) -> np.ndarray:
+        """Values of all parameters."""
+        own = [lens.values for lens in self.lenses] + [board.values for board in self.boards]
+        return np.concatenate([np.zeros(0), *own])
+
+    @property
+    def moving(self) -> np.ndarray:
+        """Indices of the parameters that may be fitted."""
+        return np.array([k for k, name in enumerate(self.names) if name in self.free], dtype=int)
+
+    def __len__(self) -> int:
+        return sum(len(lens.values) for lens in self.lenses) + len(SHAPE) * len(self.boards)
+
+    def with_values(self, values: np.ndarray) -> Optics:
+        """Return the optics with other parameter values; a focal length changes by at most half of its value."""
+        lenses, start = [], 0
+        for lens in self.lenses:
+            own = np.array(values[start : start + len(lens.values)])
+            own[:2] = np.clip(own[:2], 0.5 * lens.values[:2], 1.5 * lens.values[:2])
+            lenses.append(lens.with_values(own))
+            start += len(lens.values)
+        shapes = np.asarray(values[start:]).reshape(-1, len(SHAPE))
+        return replace(self, lenses=tuple(lenses), boards=tuple(BoardShape(*map(float, row)) for row in shapes))
+
+    def like(self, other: Optics) -> Optics:
+        """Return these optics with the values of other optics (same lens model, same board), not to be fitted."""
+        known = {(lens.model, lens.size): lens for lens in reversed(other.lenses)}
+        lenses = tuple(known.get((lens.model, lens.size), lens) for lens in self.lenses)
+        shapes = {name: shape for name, shape in zip(other.board_names, other.boards)}
+        alone = other.boards[0] if len(other.boards) == 1 else BoardShape()
+        boards = tuple(shapes.get(name, alone) for name in self.board_names)
+        return replace(self, lenses=lenses, boards=boards, free=frozenset())
+
+    def view(self, measured: PoseMeasurements, free: np.ndarray) -> View | None:
+        """Return lens, board shape and free parameters of a block of images; None for other measurements."""
+        if not isinstance(measured, Pixels):
+            return None
+        if measured.camera not in self.lens_names or measured.target not in self.board_names:
+            refuse_option(
+                measured.file,
+                f"camera '{measured.camera}' with board '{measured.target}' is not part of the "
+                f"installation, which has {', '.join(self.lens_names) or 'no camera'}",
+            )
+        edges = np.cumsum([0, *(len(lens.values) for lens in self.lenses)])
+        lens, board = self.lens_names.index(measured.camera), self.board_names.index(measured.target)
+        first = int(edges[-1]) + len(SHAPE) * board
+        used = np.concatenate([np.arange(edges[lens], edges[lens + 1]), np.arange(first, first + len(SHAPE))])
+        _, own, place = np.intersect1d(used, free, return_indices=True)
+        return View(self.lenses[lens], self.boards[board], own, place)
+
+    def tables(self) -> dict[str, Any]:
+        """Return the tables ``camera`` and ``board`` of ``robot.toml``; `read_optics` reads them."""
+        lenses, boards = zip(self.lens_names, self.lenses), zip(self.board_names, self.boards)
+        return {
+            "camera": [
+                {"name": name, "model": lens.model, "size": list(lens.size), "values": lens.values.tolist()}
+                for name, lens in lenses
+            ],
+            "board": [{"name": name, **asdict(shape)} for name, shape in boards],
+        }
+
+
+@dataclass(frozen=True)
+class _Camera:
+    """An entry of the table ``camera``."""
+
+    name: str
+    model: str
+    size: tuple[int, int]
+    values: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class _Board(BoardShape):
+    """An entry of the table ``board``."""
+
+    name: str = ""
+
+
+def read_optics(cameras: Sequence[Mapping[str, Any]], boards: Sequence[Mapping[str, Any]]) -> Optics:
+    """Return the cameras and boards of the tables ``camera`` and ``board`` of a fit's ``robot.toml``.
+
+    Raises:
+        ValueError, CalibError: for a table that is not one.
+    """
+    lenses, shapes = read_record(tuple[_Camera, ...], cameras), read_record(tuple[_Board, ...], boards)
+    return Optics(
+        tuple(Lens(each.model, np.array(each.values), each.size) for each in lenses),
+        tuple(each.name for each in lenses),
+        tuple(BoardShape(*each.values) for each in shapes),
+        tuple(each.name for each in shapes),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """Lens and board shape that predict one block of images.
+
+    Attributes:
+        lens, shape: of the camera and the board.
+        own: (k,) which of their values (the lens's, then the board's) are among the free parameters.
+        place: (k,) where those stand among the f free parameters.
+    """
+
+    lens: Lens
+    shape: BoardShape
+    own: np.ndarray
+    place: np.ndarray
+
+
+def shaped_points(board: Board, shape: BoardShape, points: np.ndarray) -> np.ndarray:
+    """Return the positions (N, 3) [m] of nominal board points on the printed board."""
+    return shape_slopes(board, shape, points)[0]
+
+
+def shape_slopes(board: Board, shape: BoardShape, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions (N, 3) [m] on the printed board, and their Jacobian (N, 3, 4) with respect to its shape."""
+    x, y = (points[:, :2] - 0.5 * np.array(board.extent)).T
+    slope = np.zeros((len(points), 3, 4))
+    slope[:, :2, 0] = points[:, :2]
+    slope[:, 2, 1:] = np.stack([x * x, x * y, y * y], axis=1)
+    place = points * [shape.scale, shape.scale, 0.0]
+    place[:, 2] = slope[:, 2, 1:] @ shape.values[1:]
+    return place, slope

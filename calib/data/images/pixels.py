@@ -1,0 +1,169 @@
+"""Camera measurements: corners of a board in images, one row per image.
+
+``corners.csv``: the corners detected in the images of a folder, one per row, and why other images are unusable.
+
+Columns ``image``, ``corner``, ``u [px]``, ``v [px]``, ``sigma [px]``; an image without a usable board has one row with
+its ``problem`` and nothing else. Written beside the images, so that they are looked at once; a file that another
+program has written is read as well (without ``sigma``: 0.1 px).
+"""
+
+from dataclasses import KW_ONLY, dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from calib import files
+from calib.data.images.board import Board, corners
+from calib.data.images.lens import Lens
+from calib.data.poses import IMAGES, IN_HAND
+from calib.data.poses.measurements import PoseMeasurements
+from calib.errors import MeasurementError, refuse_data, refused_as
+
+
+@dataclass(frozen=True, eq=False)
+class Pixels(PoseMeasurements):
+    """Measured pixel positions of a board's corners in m images.
+
+    The camera in the hand: the arm carries the camera (``tool``), ``station`` is the board's place. The camera to the
+    hand: the arm carries the board (``tool``), ``station`` is the camera's place.
+
+    Attributes:
+        pixel: (m, K, 2) corners of the board's table [px]; NaN where not seen.
+        board: the board.
+        lens: of the camera, where known beforehand or estimated from images.
+        mounting: ``in hand`` or ``to hand``; empty where it is yet to be found.
+        sigma: (m, K) standard deviation of a coordinate [px].
+        names: of all images of the file; ``rows`` count them from 1.
+        size: width and height of the images [px]; 0, 0 where unknown.
+        model: of a lens that is yet to be found.
+        known: whether the lens was given, and not found from these images.
+        free: what is fitted of the lens (``fx`` …) and of the board (``scale``, ``bend_xx`` …).
+    """
+
+    pixel: np.ndarray
+    board: Board
+    lens: Lens | None
+    _: KW_ONLY
+    mounting: str = ""
+    sigma: np.ndarray | None = None
+    names: tuple[str, ...] = ()
+    size: tuple[int, int] = (0, 0)
+    model: str = "pinhole"
+    known: bool = False
+    free: tuple[str, ...] = ()
+
+    kind: ClassVar[str] = IMAGES
+    placing: ClassVar[int] = 1
+    has_instrument: ClassVar[bool] = True
+
+    @property
+    def seen(self) -> np.ndarray:
+        """Whether each corner was detected, (m, K)."""
+        return ~np.isnan(self.pixel[:, :, 0])
+
+    @property
+    def measured(self) -> np.ndarray:
+        return np.nan_to_num(self.pixel.reshape(len(self), -1), nan=-1.0)
+
+    @property
+    def camera(self) -> str:
+        """Name of the camera among an installation's lenses: the tool or station that holds it."""
+        return self.tool_names[0] if self.mounting == IN_HAND else self.station
+
+    @property
+    def carried(self) -> tuple[str, object]:
+        return ("camera", self.size) if self.mounting == IN_HAND else ("board", self.board)
+
+    @property
+    def target(self) -> str:
+        """Name of the board among an installation's boards."""
+        return self.station if self.mounting == IN_HAND else self.tool_names[0]
+
+    def name(self, row: int) -> str:
+        """Return the image's name by its row number in the file."""
+        return self.names[row - 1] if 0 < row <= len(self.names) else f"image {row}"
+
+
+HEADER = ("image", "corner", "u [px]", "v [px]", "sigma [px]", "edge [px]", "problem")
+USUAL = 0.1  # sigma where a file states none [px]; our choice
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """Corners detected in one image.
+
+    Attributes:
+        pixel: (K, 2) of each corner of the board; NaN where it was not seen.
+        sigma: (K,) standard deviation of each coordinate [px].
+        problem: why the image is not usable; empty if it is.
+        edge: median width of the edges [px]; NaN without a board.
+    """
+
+    pixel: np.ndarray
+    sigma: np.ndarray
+    problem: str = ""
+    edge: float = float("nan")
+
+    @property
+    def seen(self) -> np.ndarray:
+        """Whether each corner was detected, (K,)."""
+        return ~np.isnan(self.pixel[:, 0])
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Detected corners by image name, and the images' width and height (0, 0 if unknown)."""
+
+    images: dict[str, Detection]
+    size: tuple[int, int] = (0, 0)
+
+
+def write_corners(path: Path, found: Found) -> Path:
+    """Write detections as ``corners.csv``."""
+    rows: list[list[object]] = [["", "", *found.size, None, None, "size of the images"]]
+    for name, one in found.images.items():
+        if one.problem:
+            rows.append([name, None, None, None, None, one.edge, one.problem])
+        rows += [
+            [name, int(k), float(one.pixel[k, 0]), float(one.pixel[k, 1]), float(one.sigma[k]), one.edge, ""]
+            for k in np.flatnonzero(one.seen)
+        ]
+    return files.write_table(path, HEADER, rows)
+
+
+def read_corners(path: Path, board: Board) -> Found:
+    """Return the detections of a ``corners.csv`` for a board.
+
+    Raises:
+        MeasurementError: for corners that the board does not have.
+    """
+    import csv
+
+    count, images, size = len(corners(board)), dict[str, Detection](), (0, 0)
+    kinds = (OSError, UnicodeDecodeError, csv.Error)
+    readable = refused_as(MeasurementError, kinds, "cannot be read as a table ({})", path)
+    with readable, path.open(encoding="utf-8-sig", newline="") as file:
+        rows = list(csv.DictReader(file, restkey="further cells", restval=""))
+    for number, row in enumerate(rows, 1):
+        if "further cells" in row:
+            refuse_data(path, "has more cells than the header names columns", row=number)
+        cells = {(key or "").split("[")[0].strip(): (value or "").strip() for key, value in row.items()}
+        name, problem = cells.get("image", ""), cells.get("problem", "")
+        with refused_as(
+            MeasurementError, (KeyError, ValueError, OverflowError), "expected image, corner, u, v ({})", path, number
+        ):
+            if not name and problem:
+                size = int(float(cells["u"])), int(float(cells["v"]))
+                continue
+            if name not in images:
+                images[name] = Detection(
+                    np.full((count, 2), np.nan), np.full(count, np.nan), problem, float(cells.get("edge") or "nan")
+                )
+            if problem or not cells.get("corner"):
+                continue
+            k, place = int(cells["corner"]), (float(cells["u"]), float(cells["v"]))
+        if not 0 <= k < count:
+            refuse_data(path, f"corner {k}: the board ({board.words}) has {count}", "corner", number)
+        images[name].pixel[k], images[name].sigma[k] = place, float(cells.get("sigma") or USUAL)
+    return Found(images, size)

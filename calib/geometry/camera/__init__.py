@@ -1,0 +1,1 @@
+"""What images say of the geometry: first guesses, residuals of corners."""

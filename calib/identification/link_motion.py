@@ -1,0 +1,86 @@
+"""Motion of the links behind joints with corrections, and what the corrections' uncertainty means for the dynamics.
+
+A geometric fit with joint corrections (`calib.robot.calibrated`) says how far the link of joint j is from its reading,
+
+    q_link,j = q_j + δ_j(q, τ),    δ_j = Σ_terms c · b(q, τ),
+
+of compliance under the torque τ_j, gear ratio, coupled axes, harmonics and sag. Compliance was fitted at rest, where τ
+is the gravity torque; in motion it is the torque of the bodies, gravity, Coriolis and inertia alike (a joint of
+stiffness 1/c, Spong 1987, whose motor and link are both of one position signal), computed at the measured motion from
+the masses that the fit's gravity torques were made of, and low-passed to the identification band. δ is added to the
+filtered positions; its first and second differences in time are added to v and a. First order in c: the torque that
+bends the joint is that of the unbent arm.
+
+Terms that move other elements than joints (tilting axes, wobble) are left out of the dynamics, and so is everything
+where an identification simulates the robot, which is rigid there, and for rows of power.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from calib.data.signals.motion import Motion
+from calib.dynamics.bodies import standard_parameters
+from calib.dynamics.torque_rows import POWER
+from calib.identification.registry import method_named
+from calib.identification.rows import Case, segments
+from calib.identification.settings import IdentificationSettings, make_model
+from calib.robot.calibrated import CalibratedChain, Deflection, evaluate, target_elements
+from calib.robot.chain import Chain
+
+
+def with_link_motion(robot: CalibratedChain, case: Case, settings: IdentificationSettings) -> Case:
+    """Return a case with its links' motion (`Case.link`) by the robot's joint corrections; unchanged without any."""
+    simulated = settings.loop is not None or method_named(settings.method).needs_simulation
+    rigid = simulated or not settings.deflections or settings.torque_rows == POWER
+    chain = robot.complete
+    terms = joint_terms(robot.complete, robot.deflection)
+    if rigid or not terms.terms or len(chain.driven) != chain.n:
+        return case
+    elements = target_elements(chain, terms)
+    torque = bodies_torques(terms, case, settings)
+    positions = np.zeros((3, *case.motion.q.shape))
+    for j, element in enumerate(chain.moving):
+        chosen = chosen_terms(terms, elements == element)
+        if len(chosen.terms):
+            bases = motion_of_bases(chosen, case.motion, torque)
+            positions[:, :, j] = np.einsum("e,sen->sn", np.asarray(chosen.coefficients), bases)
+    motion = case.motion
+    return replace(case, link=tuple(x + dx for x, dx in zip((motion.q, motion.v, motion.a), positions)))
+
+
+def joint_terms(chain: Chain, deflection: Deflection) -> Deflection:
+    """Return the terms that move joints, which the dynamics follow."""
+    return chosen_terms(deflection, np.isin(target_elements(chain, deflection), chain.moving))
+
+
+def chosen_terms(deflection: Deflection, mask: np.ndarray) -> Deflection:
+    terms = tuple(term for term, chosen in zip(deflection.terms, mask) if chosen)
+    return replace(deflection, terms=terms, coefficients=np.asarray(deflection.coefficients)[mask])
+
+
+def bodies_torques(terms: Deflection, case: Case, settings: IdentificationSettings) -> np.ndarray | None:
+    """Return the bodies' torques (N, n) along a case in its band [N m or N]; None where no term depends on them."""
+    if not any(term.basis == "torque" for term in terms.terms) or terms.reference is None:
+        return None
+    model = make_model(terms.reference, settings)
+    values = np.zeros(10 * model.bodies.count)
+    parameters = standard_parameters(terms.reference)
+    values[: len(parameters)] = parameters
+    for label, payload in settings.payloads.items():
+        load = settings.payload_values.get(label, payload.parameters)
+        if load is not None:
+            first = 10 * model.bodies.labels.index(label)
+            values[first : first + 10] = load
+    motion = case.motion
+    return motion.in_band(model.transmitted(values, motion.q, motion.v, motion.a, case.carried))
+
+
+def motion_of_bases(terms: Deflection, motion: Motion, torque: np.ndarray | None) -> np.ndarray:
+    """Return the terms' bases along a motion and their first and second derivatives in time, (3, E, N)."""
+    result = np.zeros((3, len(terms.terms), len(motion)))
+    result[0] = evaluate(terms, motion.q, torque)
+    for start, stop in segments(motion.segment):
+        for order in (1, 2) if stop - start > 2 else ():
+            result[order, :, start:stop] = np.gradient(result[order - 1, :, start:stop], 1.0 / motion.rate, axis=1)
+    return result

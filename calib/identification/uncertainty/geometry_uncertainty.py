@@ -1,0 +1,567 @@
+"""Effect of the geometry's uncertainty on the identified dynamics: sensitivities and the total covariance.
+
+The estimate on a geometry g (values of the chain's elements) minimises ‖(y - W(g) φ) / σ‖² (plus a prior's term, if
+there is one), so that at fixed torques y and weights
+
+    dφ/dg_k = A⁻¹ [ (∂W/∂g_k)ᵀ R⁻¹ (y - W φ) - Wᵀ R⁻¹ (∂W/∂g_k) φ ],     A = Wᵀ R⁻¹ W (+ the prior's information),
+
+with R the residuals' variances as the estimate weighed them, and W, ∂W/∂g_k φ, y low-passed and thinned alike. It is
+the implicit derivative of the normal equations; ∂W/∂g_k is a central difference of the regressor's kernel, element by
+element, good to nine digits. Errors of the geometric fit and of the torques are independent of each other, hence
+
+    Σ = Σ_torque + S Σ_geometry Sᵀ.
+
+What the intervals are about: φ* = T(g*) χ*, the standard parameters χ* of the real bodies in the link frames of the
+real geometry g*, regrouped there. Link frames are those of the fit's own convention: elements that it keeps at their
+nominal because they merge with the instrument's or the tool's frame have no error of their own, they are a choice of
+frames. The coefficients of T printed with an estimate are those of T(ĝ); that they are uncertain, too, widens no
+interval of φ*, for the estimate never uses them.
+
+Not part of S: the weights' and the prior's own dependence on g, and that of load-dependent friction's columns (which
+rest on the fitted torque, and that hardly changes with g). With instruments Z, Zᵀ R⁻¹ (y - W φ) = 0 gives
+
+    dφ/dg_k = -(Zᵀ R⁻¹ W)⁻¹ Zᵀ R⁻¹ (∂W/∂g_k) φ    [+ (Zᵀ R⁻¹ W)⁻¹ (dZ/dg_k)ᵀ R⁻¹ (y - W φ)],
+
+the bracket left out: it vanishes with the residual, and in the mean, since no function of the reference is correlated
+with the noise. (`didim`: W is Z.) For other methods the sensitivity is that of WLS with their residuals' spread.
+
+`compare` adds one identification on two geometries, the nominal and the calibrated one, from the same torques.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+from scipy.spatial.transform import Rotation
+
+from calib.data.signals.filtering import Decimator, decimate, kept, spread
+from calib.dynamics import rigid_body
+from calib.dynamics.bodies import Bodies
+from calib.dynamics.torque_rows import BODIES
+from calib.estimation.triangles import retriangulate
+from calib.identification.identify import Identification, common_decimator
+from calib.identification.link_motion import bodies_torques, chosen_terms, joint_terms, motion_of_bases
+from calib.identification.rows import Case, ObservationRows, observe, segments
+from calib.identification.settings import make_bodies, make_model
+from calib.records import Frozen, frozen
+from calib.robot.calibrated import CalibratedChain, as_calibrated, target_elements
+from calib.robot.chain import Chain
+
+STEP = 1e-5
+"""Step of the central differences [m or rad]."""
+SAMPLES = 30_000
+"""Samples at the full rate; longer recordings are represented by pieces spread over them (our choice)."""
+DEFLECTION_SAMPLES = 10_000
+"""The same for the sensitivity to joint corrections (our choice)."""
+MIN_PIECE = 32
+"""Decimated samples of such a piece, at least."""
+PIECE = 4096
+"""Samples of such a piece at the full rate, about."""
+BLOCK = 256
+"""Samples at a time: the regressor of so many stays in the processor's cache."""
+CHUNK = 2000
+"""Decimated samples at a time, where each needs its own line of a matrix."""
+NOTHING = 0.01
+"""Share below which a growth of σ is no change (our choice)."""
+TILTS = ("gravity.rx", "gravity.ry")
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class _Estimator:
+    """An estimate as a function of its rows: A φ = Wᵀ R⁻¹ y + pull, A = Wᵀ R⁻¹ W + LᵀL.
+
+    Attributes:
+        deviation: (rows,) R = diag(deviation²).
+        beforehand: (k, p) L, whitened rows of the prior; (0, p) without one.
+        pull: (p,) information of the prior times its mean, including the effect of bounds.
+    """
+
+    deviation: np.ndarray
+    beforehand: np.ndarray
+    pull: np.ndarray
+
+
+def estimator(identification: Identification[Any]) -> _Estimator:
+    """Return an identification's estimator: weights of its rows and prior."""
+    fitted = identification.fitted
+    p = fitted.pooled.parameters
+    deviation = np.array(fitted.std) if fitted.weighted else np.ones(len(fitted.std))
+    prior_rows = fitted.beforehand
+    if prior_rows is None:
+        return _Estimator(deviation, np.zeros((0, p)), np.zeros(p))
+    deviation = deviation * np.sqrt(fitted.inflation)
+    factors = (fitted.pooled.factors / deviation[:, None, None]).reshape(-1, p + 1)
+    matrix, target = factors[:, :p], factors[:, p]
+    values = fitted.estimate.values
+    pull = matrix.T @ (matrix @ values - target) + prior_rows.T @ (prior_rows @ values)
+    return _Estimator(deviation, prior_rows, pull)
+
+
+def estimate(estimator: _Estimator, all_rows: Sequence[ObservationRows]) -> tuple[np.ndarray, np.ndarray]:
+    """Return φ (p,) from rows, and A⁻¹ (p, p); by QR of the whitened rows."""
+    p = len(estimator.pull)
+    factor = np.hstack([estimator.beforehand, np.zeros((len(estimator.beforehand), 1))])
+    for rows in all_rows:
+        augmented = np.column_stack([stacked(rows), rows.target.ravel()])
+        whitened = augmented * weights(estimator, rows)[:, None]
+        factor = retriangulate(np.vstack([factor, whitened]))
+    inverse = inverted(factor[:p, :p])
+    solution = factor[:p, p]
+    return inverse @ (solution + inverse.T @ estimator.pull), inverse @ inverse.T
+
+
+def rows_on(identification: Identification, chain: Chain, cases: Sequence[Case]) -> list[ObservationRows]:
+    """Return the rows of an identification recomputed for another geometry; friction columns are unchanged."""
+    model = make_model(chain, identification.settings)
+    decimator = common_decimator(cases, identification.settings)
+    base_count = identification.base.b
+    result = []
+    for rows, case in zip(identification.rows, cases):
+        observed = observe(model, identification.base.kept, case, decimator)
+        # In a standstill nothing decides Coulomb's friction: its column is zero there.
+        at_rest = (rows.standing > 0.0)[:, :, None] & rows.coulomb[:, :base_count]
+        base_columns = np.where(at_rest, 0.0, observed.matrix)
+        matrix = np.concatenate([base_columns, rows.matrix[:, :, base_count:]], axis=2)
+        result.append(replace(rows, matrix=matrix))
+    return result
+
+
+def cut(rows: ObservationRows, part: slice) -> ObservationRows:
+    """Return the part of the rows in a slice."""
+    return replace(
+        rows,
+        matrix=rows.matrix[part],
+        target=rows.target[part],
+        present=rows.present[part],
+        block=rows.block[part],
+        standing=rows.standing[part],
+        swing=rows.swing[part],
+    )
+
+
+def inverted(upper: np.ndarray) -> np.ndarray:
+    """Return the inverse of an upper triangular matrix (p, p) whose columns have different units."""
+    unit = np.linalg.norm(upper, axis=0)
+    return np.asarray(scipy.linalg.solve_triangular(upper / unit, np.eye(len(unit)))) / unit[:, None]
+
+
+def stacked(rows: ObservationRows) -> np.ndarray:
+    """Return the matrix of the rows (M rows, p), sample by sample."""
+    return rows.matrix.reshape(-1, rows.matrix.shape[2])
+
+
+def weights(estimator: _Estimator, rows: ObservationRows, divisor: np.ndarray | None = None) -> np.ndarray:
+    """Return the weight of each stacked row, 1 / deviation (or 1 / `divisor`); zero for rows not used in training."""
+    if divisor is None:
+        divisor = estimator.deviation
+    return (rows.weight / divisor).ravel()
+
+
+@dataclass(frozen=True, eq=False)
+class GeometryUncertainty(Frozen):
+    """Sensitivity of the estimate to the geometry, and its contribution to the covariance.
+
+    Attributes:
+        names: names of the p estimated parameters.
+        elements, units: the K elements of the chain, then the tilts of gravity about the base's x and y axes.
+        sensitivity: (p, K + 2) dφ/dg.
+        torque: (p, p) covariance from the torques' noise: the estimate's own.
+        deviations: (K + 2,) standard deviations of the geometry; NaN where unknown.
+        geometry: (p, p) S Σ_geometry Sᵀ; None where no covariance of the geometry is known.
+        felt, left: (K + 2,) rms change of the rigid torque over rows and samples per unit of each element [N m or N],
+            at fixed parameters, and after estimating them again.
+    """
+
+    names: tuple[str, ...]
+    elements: tuple[str, ...]
+    units: tuple[str, ...]
+    sensitivity: np.ndarray
+    torque: np.ndarray
+    deviations: np.ndarray
+    geometry: np.ndarray | None
+    felt: np.ndarray
+    left: np.ndarray
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Total covariance (p, p): Σ_torque + S Σ_geometry Sᵀ."""
+        return np.asarray(self.torque) if self.geometry is None else self.torque + self.geometry
+
+    @property
+    def sigma_torque(self) -> np.ndarray:
+        """Standard deviation (p,) of the parameters due to the torques' noise."""
+        return np.sqrt(np.clip(np.diag(self.torque), 0.0, None))
+
+    @property
+    def sigma_geometry(self) -> np.ndarray:
+        """Standard deviation (p,) of the parameters due to the uncertain geometry; zero if the geometry is exact."""
+        if self.geometry is None:
+            return np.zeros(len(self.names))
+        return np.sqrt(np.clip(np.diag(self.geometry), 0.0, None))
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """Standard deviation (p,) of the parameters due to both."""
+        return np.hypot(self.sigma_torque, self.sigma_geometry)
+
+    @property
+    def changed(self) -> np.ndarray:
+        """Parameters whose σ grows by more than `NOTHING` (p,) bool."""
+        return self.sigma > (1.0 + NOTHING) * self.sigma_torque
+
+    @property
+    def dominated(self) -> np.ndarray:
+        """Parameters whose geometric part of σ exceeds the torque part (p,) bool."""
+        return self.sigma_geometry > self.sigma_torque
+
+
+def propagate(
+    identification: Identification,
+    robot: Chain | CalibratedChain,
+    cases: Sequence[Case],
+    progress: Progress | None = None,
+) -> GeometryUncertainty:
+    """Return the share of the identified parameters' covariance that comes from the covariance of the geometry.
+
+    Args:
+        identification: the model and its rows.
+        robot: the one it was made on; where it brings no covariance (K, K), the geometry is taken as exact. Where
+            joint corrections move the links, their coefficients' uncertainty takes part.
+        cases: its training data.
+        progress: called with a few words at each part.
+    """
+    robot = as_calibrated(robot)
+    chain, covariance = robot.chain, robot.covariance
+    deflected = cases[0].link is not None
+    if deflected and robot.corrections is not None:
+        chain, covariance = robot.complete, robot.corrections.covariance
+    matrix, felt, left = sensitivity(identification, chain, cases, progress)
+
+    element_count = len(chain.elements)
+    deviations = np.full(element_count + len(TILTS), np.nan)
+    geometry = None
+    if covariance is not None:
+        by_geometry = matrix[:, :element_count]
+        if deflected:
+            by_deflection = deflection_sensitivity(identification, robot, cases)
+            by_geometry = np.hstack([by_geometry, by_deflection])
+        geometry = frozen(by_geometry @ covariance @ by_geometry.T)
+        element_deviations = np.sqrt(np.clip(np.diag(covariance)[:element_count], 0.0, None))
+        deviations[:element_count] = np.where(element_deviations > 0.0, element_deviations, np.nan)
+    return GeometryUncertainty(
+        names=identification.names,
+        elements=(*chain.names, *TILTS),
+        units=(*chain.units, *(["rad"] * len(TILTS))),
+        sensitivity=matrix,
+        torque=identification.fitted.estimate.covariance,
+        deviations=deviations,
+        geometry=geometry,
+        felt=felt,
+        left=left,
+    )
+
+
+def sensitivity(
+    identification: Identification, chain: Chain, cases: Sequence[Case], progress: Progress | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return dφ/dg (p, K + 2), and rms changes of the rigid torque per unit, with φ fixed or re-estimated (K + 2,).
+
+    The last two columns turn gravity about the base's x and y axes [per rad].
+    """
+    if not identification.dynamics.model.torque_rows.has_bodies:
+        # Without bodies, no geometry affects the rows.
+        count = len(chain.elements) + len(TILTS)
+        return np.zeros((len(identification.names), count)), np.zeros(count), np.zeros(count)
+    differences = partial(_differences, identification, _neighbours(identification, chain))
+    return solve_sensitivity(identification, cases, differences, SAMPLES, progress)
+
+
+def solve_sensitivity(
+    identification: Identification[Any],
+    cases: Sequence[Case],
+    differences: Callable[..., tuple[np.ndarray, np.ndarray]],
+    samples: int,
+    progress: Progress | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the results of `sensitivity` for any robot, K changes of whose geometry `differences` evaluates.
+
+    Args:
+        identification: the model and its rows.
+        cases: its training data.
+        differences: takes a case, samples of it, R⁻¹ (y - W φ) and the decimator; returns ∂(W φ - y)/∂g (M, rows, K)
+            and (∂W/∂g)ᵀ R⁻¹ (y - W φ) (b, K).
+        samples: at the full rate; longer recordings are represented by pieces.
+        progress: called with a few words at each part.
+    """
+    weighting = estimator(identification)
+    p = len(weighting.pull)
+    decimator = common_decimator(cases, identification.settings)
+    values = identification.fitted.estimate.values
+    total_samples = sum(len(case.motion) for case in cases)
+    step = -(-total_samples // samples)
+    recordings = identification.fitted.instruments
+    if not recordings:
+        recordings = tuple((case, rows, None) for rows, case in zip(identification.rows, cases))
+
+    # Whitened columns, changes of the residuals and instruments of all pieces.
+    matrices, row_weights, changes, instruments = [], [], [], []
+    pull: np.ndarray | float = 0.0
+    present_rows = 0
+    for case, rows, instrument in recordings:
+        present_rows += np.count_nonzero(rows.present)
+        for number, (part, span) in enumerate(pieces(case, decimator, step)):
+            if progress is not None:
+                progress(f"sensitivity to the geometry: {case.name}, part {number + 1}")
+            piece = cut(rows, part)
+            residual = piece.target - piece.matrix @ values
+            weighted_residual = residual * piece.weight**2 / weighting.deviation**2
+            change, piece_pull = differences(case, span, weighted_residual, decimator)
+            # Power has a row per recording, of which each piece fills one.
+            change = np.broadcast_to(change, (*residual.shape, change.shape[2]))
+            matrices.append(stacked(piece))
+            row_weights.append(weights(weighting, piece))
+            changes.append(change.reshape(-1, change.shape[2]))
+            pull = pull + piece_pull
+            if instrument is not None:
+                instruments.append(instrument[part].reshape(-1, p))
+    matrix = np.concatenate(matrices)
+    scale = np.concatenate(row_weights)
+    change = np.concatenate(changes)
+
+    if instruments:
+        augmented = np.hstack([np.concatenate(instruments), matrix, change])
+        factor = retriangulate(augmented * scale[:, None])[:p, p:]
+        unit = np.linalg.norm(factor[:, :p], axis=0)
+        slopes = -np.linalg.solve(factor[:, :p] / unit, factor[:, p:]) / unit[:, None]
+    else:
+        # The prior counts as much beside the pieces as it did beside all rows.
+        share = float(np.count_nonzero(scale) / present_rows)
+        prior_rows = np.sqrt(share) * np.pad(weighting.beforehand, ((0, 0), (0, change.shape[1])))
+        whitened = np.hstack([matrix, change]) * scale[:, None]
+        factor = retriangulate(np.vstack([prior_rows, whitened]))
+        inverse = inverted(factor[:p, :p])
+        slopes = inverse @ (inverse[: identification.base.b].T @ pull - factor[:p, p:])
+    used = scale > 0.0
+    after = change + matrix @ slopes
+    return slopes, _rms(change[used]), _rms(after[used])
+
+
+def _neighbours(identification: Identification, chain: Chain) -> list[tuple[Bodies, Bodies]]:
+    """Return pairs of bodies with one geometric element or one tilt of gravity changed by `STEP` up and down."""
+    settings = identification.settings
+    values = np.array(chain.values)
+    pairs = []
+    for step in STEP * np.eye(len(chain.elements)):
+        up = make_bodies(chain.with_values(values + step), settings)
+        down = make_bodies(chain.with_values(values + -step), settings)
+        pairs.append((up, down))
+    gravity = np.array(identification.dynamics.model.bodies.gravity)
+    for turn in STEP * np.eye(3)[:2]:
+        gravity_up = Rotation.from_rotvec(turn).apply(gravity)
+        gravity_down = Rotation.from_rotvec(-turn).apply(gravity)
+        up = make_bodies(chain, replace(settings, gravity=tuple(gravity_up.tolist())))
+        down = make_bodies(chain, replace(settings, gravity=tuple(gravity_down.tolist())))
+        pairs.append((up, down))
+    return pairs
+
+
+def pieces(case: Case, decimator: Decimator, step: int = 1) -> list[tuple[slice, slice]]:
+    """Return (decimated rows, full-rate samples that they depend on) of every `step`-th piece of a case.
+
+    With step 1 each segment is one piece.
+    """
+    factor = decimator.factor
+    size = max(PIECE // factor, MIN_PIECE)
+    result = []
+    first = 0
+    for start, stop in segments(case.motion.segment):
+        count = len(kept(np.zeros(stop - start, dtype=int), decimator))
+        length = max(count, 1) if step == 1 else size
+        for number, row in enumerate(range(0, count, length)):
+            if number % step:
+                continue
+            row_count = min(length, count - row)
+            begin = start + row * factor
+            end = begin + (row_count - 1) * factor + 2 * decimator.reach + 1
+            result.append((slice(first + row, first + row + row_count), slice(begin, end)))
+        first += count
+    return result
+
+
+def _differences(
+    identification: Identification,
+    pairs: Sequence[tuple[Bodies, Bodies]],
+    case: Case,
+    span: slice,
+    residual: np.ndarray,
+    decimator: Decimator,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return (∂W/∂g) φ (M, rows, K + 2), filtered and decimated, and (∂W/∂g)ᵀ R⁻¹ (y - W φ) (b, K + 2).
+
+    Args:
+        pairs: bodies with a changed geometry, see `_neighbours`.
+        residual: (M, rows) R⁻¹ (y - W φ) of the rows that the samples in `span` make.
+    """
+    model = identification.dynamics.model
+    base = identification.base
+    n = model.bodies.n
+    inertial = model.inertial
+    onboard = model.carried_columns(case.carried)
+    parameters = base.to_standard(identification.fitted.estimate.values[: base.b])[:inertial] * onboard
+    q, v, a = (np.asarray(series[span]) for series in case.links)
+
+    # The residuals as torques of the joints at the full rate.
+    torque_rows = model.torque_rows
+    joint_residual = spread(residual, decimator, len(q))[:, :, None]
+    if torque_rows.projection is not None:
+        # No geometry changes the projection.
+        joint_residual = np.einsum("nrk,nrc->nkc", torque_rows.projection.torques(q, v), joint_residual)
+    joint_residual = replace(torque_rows, projection=None).fold(joint_residual, (BODIES,))[:, :, 0]
+
+    change = np.zeros((len(pairs), n, len(q)))
+    pull = np.zeros((inertial, len(pairs)))
+    for start in range(0, len(q), BLOCK):
+        part = slice(start, min(start + BLOCK, len(q)))
+        block_residual = np.ascontiguousarray(joint_residual[part].T).ravel()
+        # One array for all pairs: what is zero in one regressor is so in all of them.
+        out = np.zeros((inertial, n, min(BLOCK, len(q) - start)))
+        regressor = out.reshape(inertial, -1)
+        for k, pair in enumerate(pairs):
+            for bodies, factor in zip(pair, (0.5 / STEP, -0.5 / STEP)):
+                rigid_body.fill_regressor(bodies, q[part], v[part], a[part], out)
+                change[k, :, part] += factor * (parameters @ regressor).reshape(n, -1)
+                pull[:, k] += factor * (regressor @ block_residual)
+    rows = torque_rows.observe(change.transpose(2, 1, 0), (BODIES,) * len(pairs), q, v)
+    of_bodies = base.kept < inertial
+    base_pull = np.zeros((base.b, len(pairs)))
+    base_pull[of_bodies] = (pull * onboard[:, None])[base.kept[of_bodies]]
+    return decimate(rows, decimator), base_pull
+
+
+def _rms(values: np.ndarray) -> np.ndarray:
+    """Return the root mean square of each column."""
+    return np.sqrt(np.mean(values**2, axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class GeometryComparison:
+    """Two estimates from the same torques, on two geometries.
+
+    Attributes:
+        names, units: names and units of the p parameters.
+        values: (2, p) on the nominal (CAD) and on the calibrated geometry.
+        sigma: (2, p) of both: from torque noise alone on the nominal, total on the calibrated geometry.
+        difference: (p,) standard deviation of the difference: the geometry's part, and the small part of the noise that
+            the two estimates do not share.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    values: np.ndarray
+    sigma: np.ndarray
+    difference: np.ndarray
+
+    @property
+    def relative(self) -> np.ndarray:
+        """Relative difference (p,): 100 (nominal - calibrated) / |calibrated| [%]; NaN at zero."""
+        nominal, calibrated = self.values
+        with np.errstate(divide="ignore", invalid="ignore"):
+            percent = 100.0 * (nominal - calibrated) / np.abs(calibrated)
+        return np.where(calibrated == 0.0, np.nan, percent)
+
+
+def compare(
+    identification: Identification, uncertainty: GeometryUncertainty, nominal: Chain, cases: Sequence[Case]
+) -> GeometryComparison:
+    """Return the comparison of the estimate with one from the same torques on the nominal geometry.
+
+    Both by weighted least squares with the same weights; the difference is added to the identification's estimate.
+    """
+    fitted = identification.fitted
+    weighting = estimator(identification)
+    undeflected = [replace(case, link=None) for case in cases]
+    nominal_rows = rows_on(identification, nominal, undeflected)
+    nominal_values, nominal_inverse = estimate(weighting, nominal_rows)
+    calibrated_values, calibrated_inverse = estimate(weighting, identification.rows)
+
+    # Variances of the nominal estimate, and of the difference: the noise of each sample acts on both estimates.
+    noise = np.array(fitted.std) * np.sqrt(fitted.inflation)
+    variance = np.zeros(len(nominal_values))
+    difference_variance = np.array(uncertainty.sigma_geometry**2)
+    for nominal_part, calibrated_part in zip(nominal_rows, identification.rows):
+        for start in range(0, len(nominal_part.target), CHUNK):
+            chunk = slice(start, start + CHUNK)
+            nominal_gain = _gain(nominal_inverse, weighting, cut(nominal_part, chunk))
+            calibrated_gain = _gain(calibrated_inverse, weighting, cut(calibrated_part, chunk))
+            row_noise = np.tile(noise, len(nominal_part.target[chunk]))
+            variance += np.sum((nominal_gain * row_noise) ** 2, axis=1)
+            difference_variance += np.sum(((nominal_gain - calibrated_gain) * row_noise) ** 2, axis=1)
+    values = np.asarray(fitted.estimate.values)
+    return GeometryComparison(
+        identification.names,
+        fitted.estimate.units,
+        frozen(np.stack([values + nominal_values - calibrated_values, values])),
+        frozen(np.stack([np.sqrt(variance), uncertainty.sigma])),
+        frozen(np.sqrt(difference_variance)),
+    )
+
+
+def _gain(inverse: np.ndarray, weighting: _Estimator, rows: ObservationRows) -> np.ndarray:
+    """Return A⁻¹ Wᵀ R⁻¹ (p, M rows), the estimate's change by the torque of each row."""
+    weight = weights(weighting, rows, weighting.deviation**2)
+    return inverse @ (stacked(rows) * weight[:, None]).T
+
+
+def deflection_sensitivity(found: Identification, robot: CalibratedChain, cases: Sequence[Case]) -> np.ndarray:
+    """Return the derivative (p, E) of the estimate by the corrections' coefficients, zero for those left out.
+
+        dφ/dc = -(Wᵀ R⁻¹ W)⁻¹ Wᵀ R⁻¹ Σ_s ∂τ/∂s b_s,    s one of q, v, a of the joint, b_s the basis or its derivative
+
+    as in `sensitivity`, of which the part by the residual is left out: it vanishes with
+    the residual.
+    """
+    terms = robot.deflection
+    chain = robot.complete
+    settings = found.settings
+    where = target_elements(chain, terms)
+    how = estimator(found)
+    inverse = estimate(how, found.rows)[1]
+    decimator = common_decimator(cases, found.settings)
+    model = found.dynamics.model
+    standard = found.base.to_standard(found.fitted.estimate.values[: found.base.b])[: model.inertial]
+    pull = np.zeros((len(inverse), len(terms.terms)))
+    seen = 0
+    every = -(-sum(len(case.motion) for case in cases) // DEFLECTION_SAMPLES)
+    for rows, case in zip(found.rows, cases):
+        torque = bodies_torques(joint_terms(chain, terms), case, settings)
+        values = standard * model.carried_columns(case.carried)
+        spans = []
+        for chosen, span in pieces(case, decimator, every):
+            part = cut(rows, chosen)
+            white = part.matrix * (weights(how, part) ** 2).reshape(part.present.shape)[:, :, None]
+            back = spread(white, decimator, span.stop - span.start)
+            spans.append((span, model.torque_rows.fold(back, (BODIES,) * back.shape[2])))
+            seen += np.count_nonzero(part.present)
+        for j in np.flatnonzero(np.isin(chain.moving, where)):
+            own = where == chain.moving[j]
+            bases = motion_of_bases(chosen_terms(terms, own), case.motion, torque)
+            for span, felt in spans:
+                slopes = _torque_slopes(model.bodies, values, [x[span] for x in case.links], int(j))
+                pull[:, own] += np.einsum("nip,sni,sen->pe", felt, slopes, bases[:, :, span], optimize=True)
+    return -inverse @ pull * (sum(np.count_nonzero(part.present) for part in found.rows) / seen)
+
+
+def _torque_slopes(bodies: Bodies, values: np.ndarray, states: Sequence[np.ndarray], joint: int) -> np.ndarray:
+    """Return ∂τ/∂q_j, ∂τ/∂v_j and ∂τ/∂a_j (3, N, n) of one joint by central differences."""
+    result = np.zeros((3, *states[0].shape))
+    for order in range(3):
+        for sign in (1.0, -1.0):
+            moved = [np.array(x) for x in states]
+            moved[order][:, joint] += sign * STEP
+            result[order] += sign / (2.0 * STEP) * rigid_body.inverse_dynamics(bodies, values, *moved)
+    return result

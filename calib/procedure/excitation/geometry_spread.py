@@ -1,0 +1,75 @@
+"""What the uncertainty of a calibrated geometry does to the torques that a motion is designed for."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from calib.data import csv_table
+from calib.dynamics.base import places
+from calib.dynamics.load_cases import LoadCases
+from calib.procedure.dynamic_stage.geometry_tables import SENSITIVITY, TORQUE_COVARIANCE
+from calib.procedure.excitation.excited_model import ExcitedModel, moved_to
+from calib.robot import calibrated
+from calib.robot.calibrated import CalibratedChain
+from calib.robot.chain import Chain
+
+
+@dataclass(frozen=True, eq=False)
+class GeometrySpread:
+    """Errors of a geometry, see `calib.procedure.excitation.prior_motions.GeometrySpread`.
+
+    Attributes:
+        moved: r pairs of models, on the geometry with +g_i and with -g_i.
+        before: (b, r) S g_i.
+    """
+
+    moved: tuple[tuple[LoadCases, LoadCases], ...]
+    before: np.ndarray
+
+    def felt(self, values: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+        """Return the torques' changes (N, rows, r) at fixed base parameters `values` (b,)."""
+        changes = [(up.regressor(q, v, a) - down.regressor(q, v, a)) @ values / 2.0 for up, down in self.moved]
+        return np.stack(changes, axis=2)
+
+
+def geometry_spread(
+    robot: object, source: Path, chain: Chain, model: ExcitedModel, after: Path | None
+) -> GeometrySpread | None:
+    """Return the principal errors of a geometry, and what they did to the parameters of an identification.
+
+    Args:
+        robot, source: as given, and its file; chain: as designed for.
+        model: that predicts the torques.
+        after: folder of the identification; its geometry's covariance counts.
+    """
+    stored = None if after is None else after / SENSITIVITY
+    path = source if after is None else after / calibrated.ROBOT
+    exact = model.exact
+    values = model.values
+    if after is None and isinstance(robot, CalibratedChain):
+        covariance = robot.covariance
+    else:
+        covariance = None
+        if path.suffix == ".toml":
+            covariance = calibrated.read(path).covariance
+    if covariance is None or values is None:
+        return None
+    if after is not None and not all((after / name).is_file() for name in (SENSITIVITY, TORQUE_COVARIANCE)):
+        # an earlier version's
+        return None
+    sizes, axes = np.linalg.eigh(covariance)
+    errors = (axes * np.sqrt(np.maximum(sizes, 0.0)))[:, sizes > 1e-12 * sizes[-1]]
+
+    def moved(step: np.ndarray) -> LoadCases:
+        return replace(exact, model=moved_to(chain.with_values(np.asarray(chain.values) + step), exact.model))
+
+    before = np.zeros((len(exact.names), errors.shape[1]))
+    if stored is not None:
+        # an element each, then two tilts
+        names, *columns = csv_table.read_table(stored).cells
+        index = places(exact.names, names.tolist(), exact.model.names)
+        if index is None:
+            return None
+        before = (np.column_stack(columns[: len(errors)]) @ errors)[index]
+    return GeometrySpread(tuple((moved(error), moved(-error)) for error in errors.T), before)

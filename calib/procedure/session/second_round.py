@@ -1,0 +1,220 @@
+"""A further motion, where joints or parameters fall short of what ``session.toml`` asks for.
+
+Where the session states no need, its end says which joints' torques and which essential parameters' σ are above `NEED`,
+and how to have a motion designed for them. Else asked are
+``tolerance_percent``, of the torques on unseen motion, and ``sigma_percent``, of essential parameters. The
+motion is designed after the identification, into ``6-excitation/round2`` (``round3`` once round2 was recorded …); a log
+whose name begins like that folder is identified together with all others.
+
+More motion lowers the error of a joint's torque only by the part that the parameters' σ has in it: of an error e with
+the parts s before and s' after the motion, √(e² - s² + s'²) remains. Where even s' = 0 would gain less than `MIN_GAIN`,
+more motion does not help: what is left is not modelled.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from calib.errors import CalibError, command_line, listing
+from calib.folders import read_estimate
+from calib.procedure.excitation import design, prediction
+from calib.procedure.excitation import folder as motion_folder
+from calib.procedure.excitation.coefficients import RUN, SAMPLES
+from calib.procedure.excitation.inputs import ExcitationInputs, read_inputs
+from calib.procedure.excitation.settings import ExcitationSettings
+from calib.procedure.findings import limit
+from calib.procedure.session.dynamics_steps import next_round, options_of
+from calib.procedure.session.folder import ROUND, Say, Session, read_state
+from calib.procedure.session.steps import FITTED_ROBOT, IDENTIFY_OPTIONS, NamedFile, SessionFile, SessionStep, Setting
+from calib.robot.library import load_calibrated
+
+# [%] of torques and σ, where none is stated
+NEED = limit("torque-unexplained", "share", "marginal")
+# of a joint's error: a smaller gain is no reason to record more (our choice)
+MIN_GAIN = 0.02
+
+
+class _Parameter(NamedTuple):
+    name: str
+    rsd: float | None
+    essential: float | None
+
+
+class _Short(NamedTuple):
+    """A joint whose torque is worse than asked for: index, error on unseen motion [%], torque rms [N m or N]."""
+
+    joint: int
+    error: float
+    size: float
+
+    def left(self, before: np.ndarray, after: np.ndarray) -> float:
+        """Return the error [%] that remains once the torques' σ (n,) by the parameters has fallen."""
+        then = 100.0 * before[self.joint] / self.size
+        after_ = 100.0 * after[self.joint] / self.size
+        return float(np.sqrt(max(self.error**2 - then**2 + after_**2, 0.0)))
+
+
+def extend(session: Session, say: Say) -> list[str]:
+    """Design a further motion where joints or parameters fall short, and return what it will bring as notes."""
+    section = session.settings.dynamics
+    identification = session.identification
+    round_name = next_round(session)
+    short = _short_joints(session, section.tolerance_percent)
+    weak = _weak_parameters(session, section.sigma_percent or np.inf)
+    if not short and not weak:
+        return ["no further motion is needed: joints and parameters are as asked for"]
+    payloads = tuple(options_of(session).settings.payloads)
+    settings = ExcitationSettings(
+        period=section.period,
+        harmonics=section.harmonics,
+        rate=section.rate,
+        starts=section.starts,
+        evaluations=section.evaluations,
+        repeat=section.repeats,
+        outlook=False,
+        columns=weak,
+        seed=session.settings.seed + int(round_name.removeprefix(ROUND)),
+        loads=("none", *payloads) if payloads else (),
+    )
+    try:
+        inputs = read_inputs(
+            session.fit.path, settings, limits=session.named(section.limits), after=identification.path
+        )
+        before = prediction.known_sigmas(inputs, prediction.task_of(inputs, settings.seed))[0][0]
+        helped = [joint for joint in short if joint.left(before, 0.0 * before) < (1.0 - MIN_GAIN) * joint.error]
+        notes = _unmodelled(inputs, [joint for joint in short if joint not in helped])
+        if not helped and not weak:
+            return notes
+        aim = "parameters" if weak else "torque"
+        designed = design.search_motion(inputs, replace(settings, goals=(aim,)), progress=say)
+    except (CalibError, ValueError) as error:
+        return [f"joints or parameters fall short, but no further motion could be designed: {error}"]
+    if designed.found.interrupted:
+        raise KeyboardInterrupt
+    motion_folder.write_design(designed, session.path(f"6-excitation/{round_name}"))
+    return [*_gains(designed, helped, designed.inputs.columns.aimed_names if weak else ()), *notes]
+
+
+def _short_joints(session: Session, tolerance: float) -> list[_Short]:
+    """Return the joints whose motor torque is worse than tolerated [%], where the torques together are."""
+    report = session.identification.unseen.read()
+    worst = max(
+        (report.proofs or report.fit).values(), key=lambda report_: report_.raw.relative_error_percent.total
+    ).raw
+    if not tolerance or worst.relative_error_percent.total <= tolerance:
+        return []
+    n = session.identification.dynamics().model.n
+    # the motors' rows come last
+    errors = worst.relative_error_percent.joints[-n:]
+    rms = worst.rms[-n:]
+    rows = enumerate(zip(errors.tolist(), (100.0 * rms / errors).tolist()))
+    return [_Short(j, error, size) for j, (error, size) in rows if error > tolerance]
+
+
+def _weak_parameters(session: Session, tolerance: float) -> tuple[str, ...]:
+    """Return the essential parameters whose relative σ [%] is above the one asked for, and that a design can aim at."""
+    identification = session.identification
+    without = {column.name for column in identification.dynamics().model.columns if not column.form.slopes}
+    rows = read_estimate(identification.path, _Parameter)
+    return tuple(
+        row.name
+        for row in rows
+        if row.essential is not None and (row.rsd or 0.0) > tolerance and row.name not in without
+    )
+
+
+def _unmodelled(inputs: ExcitationInputs, joints: list[_Short]) -> list[str]:
+    """Return a note on the joints that more motion does not help."""
+    names = listing(f"{inputs.chain.joint_names[joint.joint]} {joint.error:.2g} %" for joint in joints)
+    if joints:
+        return [f"more motion does not help {names}: what is left is not modelled (friction, elasticity)"]
+    return []
+
+
+def _gains(designed: design.Designed, joints: list[_Short], parameters: tuple[str, ...]) -> list[str]:
+    """Return a note on what a motion will bring to joints and parameters, the worst first."""
+    outlook = designed.outlook
+    names = designed.inputs.chain.joint_names
+    rows = sorted(designed.predicted, key=lambda prediction: -(prediction.rsd or 0.0))
+    seconds = designed.playback.run.duration
+    if outlook is None or outlook.torque_sigma_before is None:
+        return []
+    errors = (outlook.torque_sigma_before, outlook.own.torque_sigma)
+    parts = [
+        f"torque error of {names[joint.joint]} from {joint.error:.2g} to {joint.left(*errors):.2g} %"
+        for joint in joints
+    ]
+    parts += [
+        f"σ of {row.name} from {100.0 * row.sigma_before / abs(row.value):.2g} to {row.rsd:.2g} %"
+        for row in rows
+        if row.name in parameters and row.value and row.sigma_before and row.rsd is not None
+    ]
+    return [f"{seconds:.0f} s more, of a motion designed for it, bring the {listing(parts, 6)}"]
+
+
+def promised(session: Session) -> tuple[str, ...]:
+    """Return what a further motion will bring to a complete session, and how to carry it out; empty without one.
+
+    Of a session that states no need: what falls short of the default ones.
+    """
+    if session.dynamic and session.settings.dynamics.plan and not session.needs:
+        return _short_of_default(session)
+    name = next_round(session)
+    notes = read_state(session).notes(STEP.name)
+    folder = session.path(f"6-excitation/{name}")
+    if not session.needs or not notes or not folder.exists():
+        return ()
+    played = folder / (RUN if session.settings.dynamics.repeats > 1 else SAMPLES)
+    task = f"play {played}, bring its log as {session.path(f'7-recorded/{name}_log.csv')}; then: "
+    return (notes[0], f"if wanted, {task}{command_line('next', session.folder)}")
+
+
+def _short_of_default(session: Session) -> tuple[str, ...]:
+    """Return a line on joints and parameters that fall short of the default needs, and what designs a motion."""
+    joints = _short_joints(session, NEED)
+    weak = _weak_parameters(session, NEED)
+    names = load_calibrated(session.fit.path).chain.joint_names
+    parts = [f"torque of {names[joint.joint]} ({joint.error:.2g} %)" for joint in joints]
+    deviations = {
+        short_joint.name: short_joint.rsd or 0.0
+        for short_joint in read_estimate(session.identification.path, _Parameter)
+    }
+    worst = listing(
+        (
+            f"{name} ({deviations[name]:.2g} %)"
+            for name in sorted(weak, key=lambda short_joint: -deviations[short_joint])
+        ),
+        4,
+    )
+    parts += [f"σ of essential parameters {worst}"] if weak else []
+    if not parts:
+        return (f"no further motion is needed: torques of joints and σ of essential parameters are within {NEED:g} %",)
+    keys = [f"sigma_percent = {NEED:g}"] * bool(weak) + [f"tolerance_percent = {NEED:g}"] * bool(joints)
+    return (
+        f"above {NEED:g} %: {'; '.join(parts)}; for a motion that improves them write {' and '.join(keys)} under "
+        f"[dynamics] in session.toml, then: {command_line('next', session.folder)}",
+    )
+
+
+STEP = SessionStep(
+    "extend",
+    "see whether more motion is needed",
+    extend,
+    reads=(
+        FITTED_ROBOT,
+        NamedFile("dynamics", "limits"),
+        IDENTIFY_OPTIONS,
+        SessionFile("8-dynamics/estimate.csv"),
+        SessionFile("8-dynamics/unseen/report.json"),
+    ),
+    makes=(f"6-excitation/{ROUND}*/*",),
+    settings=(
+        Setting(
+            "dynamics",
+            ("tolerance_percent", "sigma_percent", "period", "harmonics", "rate", "starts", "evaluations", "repeats"),
+        ),
+        Setting("seed"),
+    ),
+    stage="need",
+)

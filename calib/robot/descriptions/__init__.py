@@ -1,0 +1,1 @@
+"""Descriptions of robots by ROS, MuJoCo and Universal Robots, read as URDF."""

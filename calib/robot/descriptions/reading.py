@@ -1,0 +1,28 @@
+"""Files that are converted to a URDF when they are read, by their ending."""
+
+from functools import lru_cache
+from pathlib import Path
+
+from calib.robot.descriptions import mjcf, ur_calibration, xacro_files
+
+READERS = {".xacro": xacro_files.expand, ".xml": mjcf.convert, ".mjcf": mjcf.convert, ".conf": ur_calibration.convert}
+
+
+def takes(path: str) -> bool:
+    """Return whether `urdf` converts this file, which exists."""
+    file = Path(xacro_files.split(path)[0])
+    return file.suffix in READERS and file.is_file()
+
+
+def urdf(path: str) -> str:
+    """Return the URDF text of a file, or of a xacro file with its arguments.
+
+    Raises:
+        RobotError: saying what was found, where, and what to try.
+    """
+    return _converted(path, Path(xacro_files.split(path)[0]).stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=8)  # one command reads its robot's file several times
+def _converted(path: str, changed: int) -> str:
+    return READERS[Path(xacro_files.split(path)[0]).suffix](path)

@@ -1,0 +1,117 @@
+"""A UR controller's ``calibration.conf``, read as a robot: the geometry with which the controller itself computes.
+
+The arm's type follows the file::
+
+    calib fit "calibration.conf ur_type:=ur5e" measured.csv --out fit
+    calib diff "calibration.conf ur_type:=ur5e" fit
+
+The fit's report then says how well the factory's calibration meets the measurements, and `calib diff` what has moved
+since. The file's ``delta_theta``, ``delta_a``, ``delta_d`` and ``delta_alpha`` are added to the nominal table of the
+type (``universal_robots.toml``), T = Π Rz(q + θ) Tz(d) Tx(a) Rx(α): all values count, as is said at
+forum.universal-robots.com/t/1638. Axes 2, 3 and 4 are nearly parallel, so that their d are metres that cancel
+(``ur_calibration/doc/algorithm.rst`` of UR's ROS 2 driver): the frames written here are those points of the same axes
+that are next to the nominal ones. Two published files become arms within 5 mm of the nominal one of their type
+(UR10, forum t/18921; UR3, pyrobotlab issue 145) and 10 cm off other sizes: such a type is refused. By that a
+UR10 and a UR10e are too similar to be told apart.
+
+It is not written: a file holds ``joint_checksum``, ``joint_raw_offset`` and ``joint_selftest_data_crc`` of the robot's
+joints, and no public description of how the checksums are computed was found. For ROS: calib export --ur-kinematics.
+"""
+
+import re
+import tomllib
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib.config_types import number
+from calib.errors import RobotError, one_of, refuse_robot, refused_as, require
+from calib.files import shipped_text
+from calib.robot.descriptions.xacro_files import split
+from calib.robot.formats.urdf_tree import UNLIMITED
+from calib.robot.formats.urdf_write import add_joint, xml_text
+from calib.transforms import invert, pose
+
+KEYS = ("theta", "a", "d", "alpha")
+JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+TYPE = "ur_type"
+FARTHEST = 0.03  # [m] of a joint's axis from the nominal place of its joint: no factory's calibration (our choice)
+
+
+def convert(path: str) -> str:
+    """Return the URDF text of a ``calibration.conf``, the type of its arm behind it.
+
+    Raises:
+        RobotError: for a file that is none, without a type, or with one that cannot be the file's.
+    """
+    file, given = split(path)
+    table = tomllib.loads(shipped_text("calib.robot.descriptions", "universal_robots.toml"))
+    words = f'{file}: say of which type the arm is, in quotes: "{file} {TYPE}:=ur5e" (one of {", ".join(table)})'
+    require({*given} == {TYPE}, words, RobotError)
+    kind = one_of(given[TYPE], table, f"{file}: {TYPE}", RobotError)
+    nominal, deltas = _nominal(**table[kind]), _deltas(file)
+    frames, plain = _frames(nominal + deltas), _frames(nominal)
+    placed = np.array([_beside(axis, near) for axis, near in zip(frames[:6], plain)])
+    away = float(np.linalg.norm(placed[:, :3, 3] - plain[:6, :3, 3], axis=1).max())
+    if away > FARTHEST:
+        refuse_robot(
+            file, f"with it the axes of a {kind} are up to {1e3 * away:.0f} mm from their places: another {TYPE}?"
+        )
+    root = ET.Element("robot", name=kind)
+    ET.SubElement(root, "link", name="base")
+    parent, before = "base", np.eye(4)
+    for name, frame in zip(JOINTS, placed):
+        joint = add_joint(root, f"{name}_joint", "revolute", parent, f"{name}_link", invert(before) @ frame)
+        ET.SubElement(root, "link", name=f"{name}_link")
+        ET.SubElement(joint, "axis", xyz="0 0 1")
+        turn, free = repr(2.0 * np.pi), repr(UNLIMITED)
+        ET.SubElement(joint, "limit", lower=f"-{turn}", upper=turn, effort=free, velocity=free)
+        parent, before = f"{name}_link", frame
+    ET.SubElement(root, "link", name="tool0")
+    add_joint(root, "flange", "fixed", parent, "tool0", invert(before) @ frames[6])
+    return xml_text(root)
+
+
+def _nominal(a: list[float], d: list[float]) -> np.ndarray:
+    """Return the table (6, 4) of θ, a, d, α of a type."""
+    half = np.pi / 2
+    lengths = [0.0, *a, 0.0, 0.0, 0.0], [d[0], 0.0, 0.0, *d[1:]]
+    return np.column_stack([np.zeros(6), *lengths, [half, 0.0, 0.0, half, -half, 0.0]])
+
+
+def _deltas(path: str) -> np.ndarray:
+    """Return the deltas (6, 4) of θ, a, d, α in a file."""
+    with refused_as(RobotError, (OSError, UnicodeDecodeError), f"{path}: cannot be read: {{}}"):
+        content = Path(path).read_text(encoding="utf-8")
+    found = []
+    for key in KEYS:
+        match = re.search(rf"^\s*delta_{key}\s*=\s*\[([^\]]*)\]", content, re.M)
+        values = match[1].split(",") if match else []
+        words = f"{path}: is no calibration.conf of a UR: expected delta_{key} = [six numbers], found {len(values)}"
+        require(len(values) == 6, words, RobotError)
+        found.append([number(value.strip(), f"{path}: delta_{key}", error=RobotError) for value in values])
+    result = np.array(found).T
+    require(np.isfinite(result).all(), f"{path}: expected finite numbers", RobotError)
+    return result
+
+
+def _frames(table: np.ndarray) -> np.ndarray:
+    """Return the frames (7, 4, 4) of the six axes and of the flange, at q = 0, of a table (6, 4) of θ, a, d, α."""
+    result = [np.eye(4)]
+    for theta, a, d, alpha in table:
+        around, across = (Rotation.from_euler(axis, angle) for axis, angle in (("z", theta), ("x", alpha)))
+        result.append(result[-1] @ pose(around, [0.0, 0.0, d]) @ pose(across, [a, 0.0, 0.0]))
+    return np.array(result)
+
+
+def _beside(axis: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Return the frame (4, 4) on an axis, the z of the first frame, that is next to the second."""
+    z, start = axis[:3, 2], axis[:3, 3]
+    place = start + z * (z @ (near[:3, 3] - start))
+    x = near[:3, 0] - z * (z @ near[:3, 0])
+    x = x / np.linalg.norm(x)
+    result = np.eye(4)
+    result[:3] = np.column_stack([x, np.cross(z, x), z, place])
+    return result

@@ -1,1 +1,0 @@
-"""Boards to print, and corner detection in their images (files or bags)."""

@@ -1,0 +1,81 @@
+"""Claims: projections are OpenCV's; their derivatives are exact; rays are their inverse."""
+
+import cv2
+import numpy as np
+import pytest
+from differences import check
+
+from calib.data.images.lens import Lens, rays, read_lens, write_lens
+from calib.errors import CalibError, MeasurementError
+
+SIZE = (800, 600)
+BASE = [780.0, 782.0, 400.0, 298.0]
+LENSES = {
+    "plain": Lens("pinhole", np.array([*BASE, -0.2, 0.08, 5e-4, -3e-4, 0.02]), SIZE),
+    "rational": Lens("pinhole", np.array([*BASE, -0.2, 0.08, 5e-4, -3e-4, 0.02, 0.03, 0.01, 0.004]), SIZE),
+    "fisheye": Lens("fisheye", np.array([500.0, 505.0, 400.0, 298.0, 0.05, -0.02, 0.01, 0.003]), SIZE),
+}
+
+
+def points(count: int = 25, spread: float = 0.3) -> np.ndarray:
+    return spread * np.random.default_rng(0).normal(size=(count, 3)) + [0.0, 0.0, 1.5]
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_pixels_are_opencvs(name):
+    lens, place = LENSES[name], points()
+    matrix = np.array([[lens.values[0], 0, lens.values[2]], [0, lens.values[1], lens.values[3]], [0, 0, 1.0]])
+    if lens.model == "fisheye":
+        theirs = cv2.fisheye.projectPoints(place[:, None], np.zeros(3), np.zeros(3), matrix, lens.values[4:])[0]
+    else:
+        theirs = cv2.projectPoints(place, np.zeros(3), np.zeros(3), matrix, lens.values[4:])[0]
+    assert lens.project(place) == pytest.approx(theirs.reshape(-1, 2), abs=1e-9)
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_derivatives_and_the_inverse(name):
+    lens, place = LENSES[name], points()
+    pixel, by_point, by_value = lens.project_with_slopes(place)
+    for k in range(0, 25, 6):
+        check(lambda x: lens.project(x[None])[0], by_point[k], place[k])
+        check(lambda v: lens.with_values(v).project(place[k : k + 1])[0], by_value[k], lens.values, tolerance=1e-6)  # noqa: B023
+    assert rays(lens, pixel) == pytest.approx(place[:, :2] / place[:, 2:], abs=1e-12)
+
+
+def test_a_point_where_the_distortion_turns_back_is_out_of_sight():
+    # r (1 - 0.4 r²) falls again beyond r = 0.91
+    strong = Lens("pinhole", np.array([400.0, 400.0, *BASE[2:], -0.4, 0, 0, 0, 0]), SIZE)
+    inside, beyond = np.array([[0.3, 0.0, 1.0]]), np.array([[1.5, 0.0, 1.0]])
+    assert np.all(strong.project(beyond) < SIZE)
+    assert strong.in_sight(np.concatenate([inside, beyond, -inside])).tolist() == [True, False, False]
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_a_lens_is_written_as_ros_reads_it_and_read_back(name, tmp_path):
+    path = write_lens(LENSES[name], tmp_path / "camera.yaml")
+    again = read_lens(path)
+    assert np.array_equal(again.values, LENSES[name].values) and again.size == SIZE
+    assert again.model == LENSES[name].model
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (("distortion_model: plumb_bob", "distortion_model: plum_bob"), "distortion_model 'plum_bob' \\(did you mean"),
+        (("image_width: 800", "image_width: wide"), "image_width: expected a number of pixels, found 'wide'"),
+        (("  data: [780.0", "  data: [.nan"), "camera_matrix: expected data"),
+        (("  data: [780.0, 0.0", "  data: [780.0, 5.0"), r"expected \[fx 0 cx"),
+        (("camera_matrix", "matrix"), "camera_matrix: expected data"),
+        (("image_width: 800", "image_width: 800: 1"), "cannot be read as YAML"),
+    ],
+)
+def test_a_camera_file_that_cannot_be_is_refused_by_key(change, words, tmp_path):
+    path = write_lens(LENSES["plain"], tmp_path / "camera.yaml")
+    path.write_text(path.read_text().replace(*change))
+    with pytest.raises(MeasurementError, match=words):
+        read_lens(path)
+
+
+def test_a_lens_without_focal_length_is_refused():
+    with pytest.raises(CalibError, match="focal lengths -1, 1 px"):
+        Lens("pinhole", np.array([-1.0, 1.0, 0, 0, 0, 0, 0, 0, 0]), SIZE)
