@@ -34,7 +34,6 @@ from calib.procedure.excitation.settings import ExcitationSettings
 from calib.procedure.findings import sentence
 from calib.procedure.measuring.prediction import sigma_ratio
 from calib.records import Array, read_json, read_rows
-from calib.result_kinds import refusal
 from calib.trajectories.basis import Family, SampledMotion
 from calib.trajectories.design.problem import ExcitationProblem
 from calib.trajectories.design.search import STAGES, SearchResult, one_start
@@ -376,7 +375,7 @@ def lines(outlook: MotionOutlook, predicted: Sequence[PredictedSigma] = ()) -> l
 
 def check_folder(folder: Path) -> None:
     """Raise an error if a folder contains no prediction of `calib excite`."""
-    require((folder / NAME).is_file(), refusal(folder, "recall"), UsageError)
+    require((folder / NAME).is_file(), f"{folder} has no {NAME}: give the folder that calib excite wrote", UsageError)
 
 
 @dataclass(frozen=True)

@@ -382,8 +382,10 @@ def identify(session: Session, say: Say) -> list[str]:
     if session.settings.dynamics.plan and (designed / prediction.NAME).is_file():
         notes.append(prediction.compared_with_identification(designed, outcome))
     notes += return_masses(session)
-    later = lines_of([one for one in outcome.noticed if one.code == "no-unseen-motion"])  # `predict` judges
-    return [*notes, *(words for words in outcome.warnings if words not in later)]
+    # `predict` judges on unseen motion
+    later = lines_of([warning for warning in outcome.noticed if warning.code == "no-unseen-motion"])
+    notes += [warning for warning in outcome.warnings if warning not in later]
+    return notes
 
 
 def predict(session: Session, say: Say) -> list[str]:

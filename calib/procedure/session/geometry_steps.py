@@ -233,9 +233,12 @@ def select(session: Session, say: Say) -> list[str]:
 def arrive(session: Session, say: Say) -> list[str]:
     """Check the measured files for the fit, and return notes."""
     chain = chain_of(session)
-    blocks, again = (read_measured(session, chain, session.brought(kind)) for kind in ("measured", "drift"))
+    blocks = read_measured(session, chain, session.brought("measured"))
+    repeated = read_measured(session, chain, session.brought("drift"))
     notes = notes_on(session, chain, blocks, folder.POSES)
-    notes += lines_of(drift.of_session(session, chain, *([block for _, block in own] for own in (blocks, again))))
+    measured = [block for _, block in blocks]
+    measured_later = [block for _, block in repeated]
+    notes += lines_of(drift.of_session(session, chain, measured, measured_later))
     files.write(session.path(folder.POSES_CHECKED), "\n".join(notes) + "\n")
     return notes
 
@@ -257,24 +260,31 @@ def read_measured(
 
 def notes_on(session: Session, chain: Chain, blocks: Sequence[tuple[str, PoseMeasurements]], plan: str) -> list[str]:
     """Return the notes on measured blocks: rows, kind, ignored columns, poses missing from a list in ``2-poses``."""
-    measures, notes, path = session.settings.instrument.measures, [], session.path(f"2-poses/{plan}")
+    measures = session.settings.instrument.measures
+    path = session.path(f"2-poses/{plan}")
     planned = None
     if session.settings.poses.plan and path.exists():
         planned = read_poses(path, Joints(chain.joint_names, joint_kinds(chain)))
+    notes = []
     for name, block in blocks:
         ignored = f", ignored: {', '.join(block.ignored)}" if block.ignored else ""
-        found = [f"{len(block)} rows of kind {block.kind}{ignored}"]
+        remarks = [f"{len(block)} rows of kind {block.kind}{ignored}"]
         if measures == Poses.kind and isinstance(block, Positions) and not isinstance(block, Poses):
-            found.append("only positions, although the instrument measures poses")
+            remarks.append("only positions, although the instrument measures poses")
         if block.kind == IMAGES:
-            found.append(image_words(block))
+            remarks.append(image_words(block))
         elif measures == IMAGES:
-            found.append("contains no images, although the instrument is a camera; the file is fitted nevertheless")
-        found += block.notes
+            remarks.append("contains no images, although the instrument is a camera; the file is fitted nevertheless")
+        remarks += block.notes
         if planned is not None:
-            found += [*check_against(planned, block), *lines_of(readback(planned, block))]
-        notes += [(Warned if isinstance(note, Warned) else str)(f"{name}: {note}") for note in found]
-    return notes if planned is None else [*notes, *unmeasured(planned, [block for _, block in blocks])]
+            remarks += check_against(planned, block)
+            remarks += lines_of(readback(planned, block))
+        for remark in remarks:
+            note = f"{name}: {remark}"
+            notes.append(Warned(note) if isinstance(remark, Warned) else note)
+    if planned is not None:
+        notes += unmeasured(planned, [block for _, block in blocks])
+    return notes
 
 
 def readback(plan: np.ndarray, measured: PoseMeasurements) -> list[Finding]:
@@ -295,18 +305,23 @@ def readback(plan: np.ndarray, measured: PoseMeasurements) -> list[Finding]:
 def _fit_settings(session: Session) -> FitSettings:
     """Return the fit settings of ``session.toml``; a value ``auto`` leaves the choice to the options file."""
     section = session.settings.fit
-    masses = session.path(folder.MASSES)
-    return FitSettings(
-        model=None if section.model == "auto" else section.model,
-        loss=None if section.loss == "auto" else section.loss,
+    masses = ""
+    if (session.path(folder.MASSES) / MODEL).is_file():
+        masses = str(session.path(folder.MASSES))
+    settings = FitSettings(
         stations=section.stations,
         tolerance=1e-3 * section.tolerance_mm or None,
         refit_frames=section.validation_frames == "own",
         seed=session.settings.seed,
         holdout=section.holdout,
         deliverable=section.deliverable,
-        masses=str(masses) if (masses / MODEL).is_file() else "",
+        masses=masses,
     )
+    if section.model != "auto":
+        settings = replace(settings, model=section.model)
+    if section.loss != "auto":
+        settings = replace(settings, loss=section.loss)
+    return settings
 
 
 def _gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:

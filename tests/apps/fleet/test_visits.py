@@ -24,7 +24,7 @@ def given(monkeypatch: pytest.MonkeyPatch):
     """Return what `visits` finds of sessions (name → serial number, measured_on, created, verdict; None: no fit)."""
 
     def found(rows: dict[str, tuple[str, str, str, str | None]]) -> tuple[dict[str, list[str]], dict[str, Finding]]:
-        def place(name: Path) -> visits.Place:
+        def place(name: Path, verb: str) -> visits.Place:
             _, measured, created, verdict = rows[str(name)]
             stated = SimpleNamespace(certificate=SimpleNamespace(measured_on=measured), created=created)
             session, fit = SimpleNamespace(settings=stated, geometric=True), None if verdict is None else "4-fit"

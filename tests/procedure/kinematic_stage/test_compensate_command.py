@@ -270,7 +270,7 @@ def test_folders_and_words_that_do_not_serve_are_refused(fitted, here, calib):
     (here / "half").mkdir()
     (here / "half" / "robot.toml").write_text((fitted / "robot.toml").read_text())
     for arguments, said in (
-        (("empty", "t.csv"), "no robot.toml"),
+        (("empty", "t.csv"), "give the folder of a fit"),
         (("half", "t.csv"), "covariance.csv"),
         ((fitted, "none.csv"), "none.csv"),
         ((fitted, "t.csv", "--frame", "table"), "seen"),
