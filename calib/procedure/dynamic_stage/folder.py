@@ -188,8 +188,8 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     if identification.loop.table:
         files.write_table(folder / INSTRUMENTAL, INSTRUMENTAL_HEADER, identification.loop.table)
     # without a prior and constraints, estimate and covariance say it all
-    held = identification.fitted.held
-    binding = held is not None and (held.binding or held.postures)
+    constrained = identification.fitted.held
+    binding = constrained is not None and (constrained.binding or constrained.postures)
     if identification.prior is not None or binding:
         information.write(identification, folder)
 
@@ -255,9 +255,9 @@ def _estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:
     """
     identification, carried = outcome.found, outcome.carried
     estimate = identification.fitted.estimate
-    held = on_bounds(identification)
-    unmeasured = (*identification.friction.off, *held)
-    contents = _expressions(identification, unmeasured, held)
+    bound = on_bounds(identification)
+    unmeasured = (*identification.friction.off, *bound)
+    contents = _expressions(identification, unmeasured, bound)
 
     sigma, sigma_geometry = estimate.sigma, np.full(len(estimate.values), np.nan)
     if carried is not None:
@@ -285,13 +285,13 @@ def _estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:
     return rows
 
 
-def _expressions(identification: Identification, unmeasured: Sequence[str], held: Sequence[str]) -> list[str]:
+def _expressions(identification: Identification, unmeasured: Sequence[str], bound: Sequence[str]) -> list[str]:
     """Return for each parameter what it holds: the standard parameters, or the shape of a drive term."""
     lines = [line.split(" = ", 1)[1] for line in expressions(identification.base)]
     for term in identification.friction.terms:
         remark = ", switched off: not measured" if term.name in unmeasured else ""
         lines.append(f"{term.shape}{remark}")
     for k, name in enumerate(identification.names):
-        if name in held:
+        if name in bound:
             lines[k] += ", on its bound: no sigma"
     return lines

@@ -90,15 +90,15 @@ def find_gains(
 def _from_pair(chain: Chain, options: IdentifyOptions, pair: GainPair, motions: Mapping[str, Motion]) -> FoundGains:
     """Return the drive gains in N m from recordings without and with a payload of known mass."""
     settings = options.settings
-    known = {f"M{label}": load.mass for label, load in settings.payloads.items() if load.mass is not None}
+    known_values = {f"M{label}": load.mass for label, load in settings.payloads.items() if load.mass is not None}
     for label, load in settings.payloads.items():
         if load.com is not None and load.mass is not None:
-            known |= {f"M{axis}{label}": load.mass * c for axis, c in zip("XYZ", load.com)}
-    if not known:
+            known_values |= {f"M{axis}{label}": load.mass * c for axis, c in zip("XYZ", load.com)}
+    if not known_values:
         raise UsageError(f"{options.source}: gain_identification needs a [payload.<label>] with its mass")
     cases = [_case(name, chain, options, motions, ()) for name in pair.unloaded]
     cases += [_case(name, chain, options, motions, tuple(settings.payloads)) for name in pair.loaded]
-    gains = _identify(chain, cases, settings, known, None)
+    gains = _identify(chain, cases, settings, known_values, None)
 
     values = dict(zip(gains.names, gains.values))
     loads = {}
@@ -153,14 +153,14 @@ def _identify(
     chain: Chain,
     cases: Sequence[Case],
     settings: IdentificationSettings,
-    known: Mapping[str, float],
+    known_values: Mapping[str, float],
     reference: int | None,
 ) -> DriveGains:
     if not isinstance(chain, Chain):
-        return ROBOTS.one().drive_gains(chain, cases, settings, known, reference)
+        return ROBOTS.one().drive_gains(chain, cases, settings, known_values, reference)
     model = make_model(chain, settings)
     base = find_base(model, cases, chain_states(chain, model, settings.seed))
-    missing = [name for name in known if name not in [model.names[k] for k in base.kept]]
+    missing = [name for name in known_values if name not in [model.names[k] for k in base.kept]]
     if missing:
         raise UsageError(f"'{missing[0]}' is not separately identifiable here; was the payload attached?")
     decimator = common_decimator(cases, settings)
@@ -168,7 +168,7 @@ def _identify(
     tau = first_fit(rows)[1]
     if reference is not None:
         return identify_relative_gains(triangulate(rows), chain.n, tau, reference)
-    return identify_gains(pool(triangulate(rows), chain.n), known, tau)
+    return identify_gains(pool(triangulate(rows), chain.n), known_values, tau)
 
 
 def _case(

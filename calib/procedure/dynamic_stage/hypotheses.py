@@ -26,8 +26,8 @@ def gravity_hypotheses(inputs: IdentificationInputs) -> GravityHypotheses | None
     bodies = bodies_under(inputs.chain, inputs.options.settings.gravity)
     loads = [case.carried for case in inputs.cases]
     usual = max(loads, key=loads.count)
-    taken = [take_samples(case, bodies, MAX_SAMPLES) for case in inputs.cases if case.carried == usual]
-    usable = [samples for samples in taken if samples is not None]
+    sampled = [take_samples(case, bodies, MAX_SAMPLES) for case in inputs.cases if case.carried == usual]
+    usable = [samples for samples in sampled if samples is not None]
     return gravity_of(usable, inputs.chain, inputs.unit == TORQUE) if usable else None
 
 
@@ -48,8 +48,8 @@ def gravity_findings(hypotheses: GravityHypotheses | None, joints: Sequence[str]
         findings.append(finding("gravity-direction", rival=rival, **values))
     if hypotheses.absent:
         absent = list(hypotheses.absent)
-        known = [joint for joint in absent if np.isfinite(hypotheses.factors[joint])]
-        factors = [f"{joints[joint]} {hypotheses.factors[joint]:.2g}" for joint in known]
+        determined = [joint for joint in absent if np.isfinite(hypotheses.factors[joint])]
+        factors = [f"{joints[joint]} {hypotheses.factors[joint]:.2g}" for joint in determined]
         findings.append(finding("gravity-absent", joints=[joints[joint] for joint in absent], factors=factors))
     return findings
 
@@ -67,16 +67,16 @@ def load_findings(inputs: IdentificationInputs, gravity: Sequence[float] | None)
         return []
     bodies = bodies_under(inputs.chain, gravity)
     cases = [*inputs.cases, *inputs.unseen]
-    found = []
+    findings = []
     for carried in dict.fromkeys(case.carried for case in cases):
         samples = {}
         for case in cases:
-            taken = take_samples(case, bodies, MAX_SAMPLES) if case.carried == carried else None
-            if taken is not None and len(samples) < MAX_COMPARED:
-                samples[case.name] = taken
+            sampled = take_samples(case, bodies, MAX_SAMPLES) if case.carried == carried else None
+            if sampled is not None and len(samples) < MAX_COMPARED:
+                samples[case.name] = sampled
         load = unstated_load(samples)
         if load is not None:
-            found.append(
+            findings.append(
                 finding(
                     "payload-unstated",
                     file=load.name,
@@ -87,7 +87,7 @@ def load_findings(inputs: IdentificationInputs, gravity: Sequence[float] | None)
                     after=load.after,
                 )
             )
-    return found
+    return findings
 
 
 def _typical(shares: np.ndarray) -> float:

@@ -210,12 +210,12 @@ def silent(words: str) -> None:
 
 def _check_payloads(cases: Sequence[Case], unseen: Sequence[Case], settings: IdentificationSettings) -> None:
     """Refuse an unseen recording with a payload that is neither in the training recordings nor in the options."""
-    known = set(settings.payload_values)
-    known.update(label for label, load in settings.payloads.items() if load.parameters)
+    available = set(settings.payload_values)
+    available.update(label for label, load in settings.payloads.items() if load.parameters)
     for case in cases:
-        known.update(case.carried)
+        available.update(case.carried)
     for case in unseen:
-        for label in set(case.carried) - known:
+        for label in set(case.carried) - available:
             raise UsageError(
                 f"payload '{label}' of {case.name} is in no training recording; state its mass and com under "
                 f"[payload.{label}], or add a training recording with it"
@@ -252,13 +252,13 @@ def _check_choice(option: str, value: str, allowed: Sequence[str]) -> None:
         raise UsageError(f"--{option} {value}: expected {', '.join(allowed)}{suggestion(value, allowed)}")
 
 
-def _read_case(path: str, name: str, motion: Motion, options: IdentifyOptions, found: FoundGains, robot: Any) -> Case:
+def _read_case(path: str, name: str, motion: Motion, options: IdentifyOptions, gains: FoundGains, robot: Any) -> Case:
     """Return the case of one recording: payload, gains, and the links' motion where joints have corrections."""
-    own = options.file_settings(path)
+    file_options = options.file_settings(path)
+    rows = options.settings.torque_rows
     with refused_as(MeasurementError, NoPosture, "{}", name):
-        case = make_case(
-            name, motion, options.settings.torque_rows, gains=found.for_motion(motion, own), carried=own.payload
-        )
+        values = gains.for_motion(motion, file_options)
+        case = make_case(name, motion, rows, gains=values, carried=file_options.payload)
     if getattr(robot, "corrections", None) is not None:
         case = with_link_motion(robot, case, options.settings)
     return case

@@ -165,11 +165,11 @@ def on_bounds(identification: Identification) -> tuple[str, ...]:
 
     The covariance takes the constraint as an equality: its zeros there are what the other parameters' σ rest on.
     """
-    held = identification.fitted.held
-    if held is None:
+    constrained = identification.fitted.held
+    if constrained is None:
         return ()
     names = []
-    sigmas, free_sigmas = identification.fitted.estimate.sigma, held.free.estimate.sigma
+    sigmas, free_sigmas = identification.fitted.estimate.sigma, constrained.free.estimate.sigma
     for name, sigma, free_sigma in zip(identification.names, sigmas, free_sigmas):
         if sigma <= BOUND_SIGMA * free_sigma:
             names.append(name)
@@ -179,7 +179,7 @@ def on_bounds(identification: Identification) -> tuple[str, ...]:
 def metrics(outcome: IdentificationOutcome) -> ModelMetrics:
     """Return the content of ``metrics.json`` for an identification."""
     identification, inputs = outcome.found, outcome.inputs
-    base, held = identification.base, identification.fitted.held
+    base, constrained = identification.base, identification.fitted.held
     count = base.b + len(identification.friction.terms)
     essential, steps = count, ()
     if identification.elimination is not None:
@@ -203,7 +203,7 @@ def metrics(outcome: IdentificationOutcome) -> ModelMetrics:
         switched_off=identification.friction.off,
         drive_gains=inputs.gains and GainRecord.of(inputs.gains, inputs.unit),
         loop=identification.loop.metrics,
-        constraints=held and ConstraintMetrics(held.names, held.binding, held.postures),
+        constraints=constrained and ConstraintMetrics(constrained.names, constrained.binding, constrained.postures),
         filters=filters,
         geometry=outcome.carried and geometry_tables.metrics(outcome.carried, outcome.geometries),
         repeated=outcome.repeated,

@@ -232,13 +232,13 @@ def _off(ratio: np.ndarray | np.floating) -> float:
 
 def _limits(recording: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
     """Yield findings on torques a thousand times too large or too small for the joints' limits: another unit."""
-    known = np.isfinite(recording.limits)
-    if not known.any():
+    limited = np.isfinite(recording.limits)
+    if not limited.any():
         return
-    largest = float(recording.limits[known].max())
+    largest = float(recording.limits[limited].max())
 
     def above(times: float, digits: int) -> list[str]:
-        rows = np.flatnonzero(known & (recording.limits > times)).tolist()
+        rows = np.flatnonzero(limited & (recording.limits > times)).tolist()
         return [f"{joints[j]} {recording.limits[j]:.{digits}g}" for j in rows]
 
     in_another_unit = above(RECORDED.max_effort, 3)
@@ -253,9 +253,9 @@ def _limits(recording: RecordingSizes, joints: Sequence[str]) -> Iterator[Findin
 def _speed(recording: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
     """Compare measured velocities with the differentiated positions."""
     ratio = recording.speed
-    known = np.flatnonzero(np.isfinite(ratio))
-    median = float(np.median(ratio[known])) if len(known) else 1.0
-    alike = len(known) > 1 and np.ptp(ratio[known]) < MIN_COMMON_SPEED_ERROR * median
+    measured = np.flatnonzero(np.isfinite(ratio))
+    median = float(np.median(ratio[measured])) if len(measured) else 1.0
+    alike = len(measured) > 1 and np.ptp(ratio[measured]) < MIN_COMMON_SPEED_ERROR * median
     threshold = MIN_COMMON_SPEED_ERROR
     if not alike:
         threshold = np.maximum(MIN_SPEED_ERROR, MIN_SPEED_SIGMAS * recording.speed_sigma)

@@ -312,8 +312,8 @@ def _error_rows(score: Score, unseen: UnseenReport) -> Iterator[Sequence[str]]:
     for j, (row, whiteness) in enumerate(zip(unseen.rows, score.whiteness)):
         rms, share = rms_words(score, unseen, j)
         shares = [percent(part.joints[j]) for part in parts]
-        outside = "" if whiteness is None else f"{100 * whiteness.outside:.0f} %"
-        yield row, rms, share, *shares, percent(score.above_band_percent[j]), outside
+        acf_outside = "" if whiteness is None else f"{100 * whiteness.outside:.0f} %"
+        yield row, rms, share, *shares, percent(score.above_band_percent[j]), acf_outside
 
 
 def rms_words(score: Score, unseen: UnseenReport, row: int) -> tuple[str, str]:
@@ -356,10 +356,10 @@ def _interval_table(unseen: UnseenReport) -> page.Table:
         extrapolated = f"{coverage.extrapolated_percent:.0f} %"
         rows = [("all", f"{coverage.coverage_percent:.1f} %", "", "", extrapolated)]
         for k, (row, unit) in enumerate(zip(unseen.rows, unseen.units)):
-            inside = f"{coverage.joints_percent[k]:.0f} %"
+            coverage_text = f"{coverage.joints_percent[k]:.0f} %"
             moving = f"± {coverage.median[k]:.3g} {unit}"
             resting = f"± {at_rest[k]:.3g} {unit}" if np.isfinite(at_rest[k]) else "–"
-            rows.append((row, inside, moving, resting, ""))
+            rows.append((row, coverage_text, moving, resting, ""))
         groups[name] = rows
     return page.grouped("Intervals stated", INTERVAL_HEADER, groups, strong=_of_all)
 

@@ -295,15 +295,15 @@ def _noise(blocks: Sequence[PoseMeasurements]) -> dict[str, float | None]:
 
 
 def _stated_rms(blocks: Sequence[PoseMeasurements], field_name: str) -> float | None:
-    stated = []
+    sigmas = []
     for block in blocks:
         sigma = getattr(block, field_name, None)
         # the sigma of images is one of pixels
         if block.kind == IMAGES or sigma is None:
             return None
         # a kind with one number per row states it for each axis
-        stated.append(np.broadcast_to(sigma.reshape(len(block), -1), (len(block), 3)))
-    squares = np.sum(np.concatenate(stated) ** 2, axis=1)
+        sigmas.append(np.broadcast_to(sigma.reshape(len(block), -1), (len(block), 3)))
+    squares = np.sum(np.concatenate(sigmas) ** 2, axis=1)
     return float(np.sqrt(np.mean(squares)))
 
 

@@ -310,18 +310,18 @@ def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", 
 
 def _ending(session: Session) -> tuple[str, ...]:
     """Return the closing lines of a complete session: the verdict, where certificate and robot are."""
-    first, *others = PAGES
-    page = f"{session.path(first)} ({', '.join(others)})"
-    found, further = session.verdicts(), promised(session)
+    first, *further_pages = PAGES
+    page = f"{session.path(first)} ({', '.join(further_pages)})"
+    verdicts, further = session.verdicts(), promised(session)
     robot = session.path(f"{session.export}/{URDF}")
     corrected = session.path(f"{session.export}/{CORRECTED_URDF}")
     use = ""
     if session.settings.fit.deliverable == "corrections" and corrected.exists():
         robot, use = corrected, f" with {TERMS}"
-    if found.level == "fail":
+    if verdicts.level == "fail":
         use += " (for inspection only, do not use)"
-    made = f"robot: {robot}{use}" if robot.exists() else "no robot was exported"
-    return ("", str(found), f"certificate: {page}", made, *further)
+    deliverable = f"robot: {robot}{use}" if robot.exists() else "no robot was exported"
+    return ("", str(verdicts), f"certificate: {page}", deliverable, *further)
 
 
 def status_lines(folder: Path) -> Iterator[RenderableType]:
