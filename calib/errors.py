@@ -313,8 +313,8 @@ def exit_code(error: Exception) -> int | None:
         return NO_RESULT_CODE
     if isinstance(error, CalibError):
         return USAGE_CODE
-    module = sys.modules.get("poses.errors")
+    module = sys.modules.get("calib.poses.errors")
     if module is not None and isinstance(error, module.NotIdentifiable):
         return NO_RESULT_CODE
-    package = type(error).__module__.split(".")[0]
-    return USAGE_CODE if package in ("poses", "trajectories") else None
+    package = type(error).__module__
+    return USAGE_CODE if package.startswith(("calib.poses.", "calib.trajectories.")) else None

@@ -21,7 +21,7 @@ from calib.procedure.excitation.settings import DEFAULT_DESIGN, DEFAULT_PLAN, Ex
 from calib.procedure.robot_kinds import Mechanism, MechanismResult, stage_of
 from calib.records import as_subclass
 from calib.robot.calibrated import CalibratedChain
-from trajectories.setpoints import Setpoints
+from calib.trajectories.setpoints import Setpoints
 
 if TYPE_CHECKING:
     from calib.procedure.report.charts import Chart

@@ -7,14 +7,14 @@ from typing import Annotated
 import typer
 
 from calib.config_types import OneOf
-from calib.extensions import Point
-
-LIBRARY: Point[Path] = Point("library", "folders of robots that go by a name")
 
 
 def robots(incomplete: str) -> Iterator[str]:
     """Yield the library's robots that begin with what is typed, and then files and folders that do, too."""
-    folders = (Path(__file__).parents[1] / "robot" / "library", *LIBRARY.all())
+    from calib.procedure.robot_kinds import ROBOTS
+
+    folders = [Path(__file__).parents[1] / "robot" / "library"]
+    folders += [kind.LIBRARY for kind in ROBOTS.all()]
     names: list[str] = []
     for folder in folders:
         names += [path.stem for path in folder.glob(f"{incomplete}*.toml")]

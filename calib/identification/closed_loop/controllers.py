@@ -136,7 +136,10 @@ def stated_controller(loop: LoopSettings, n: int) -> Controller:
         second = loop.per_joint("velocity", n)
         third = loop.per_joint("reset", n)
         return completed(cascade(first, second, third, share=loop.share), loop, n)
-    return completed(pd(loop.per_joint("kp", n), loop.per_joint("kd", n), ki=loop.per_joint("ki", n)), loop, n)
+    kp = loop.per_joint("kp", n)
+    kd = loop.per_joint("kd", n)
+    ki = loop.per_joint("ki", n)
+    return completed(pd(kp, kd, ki=ki), loop, n)
 
 
 # [Hz] the usual bandwidth of an industrial position loop
@@ -186,10 +189,14 @@ def identify_controller(
     tau = low_pass(tau, rate, band)
     edge = border(rate, band)
     basis = np.linalg.qr(_instruments(reference, len(error), rate, band)[edge:-edge])[0]
-    fits = [_joint(error[edge:-edge, j], tau[edge:-edge, j], basis, orders) for j in range(error.shape[1])]
-    gains = np.array([_read(past, errors, rate, band, integral) for past, errors in fits])
+    joint_gains = []
+    explained = []
+    for joint_error, joint_tau in zip(error.T, tau.T):
+        past, errors = _joint(joint_error[edge:-edge], joint_tau[edge:-edge], basis, orders)
+        joint_gains.append(_read(past, errors, rate, band, integral))
+        explained.append(_explained(joint_error, joint_tau, joint_gains[-1], rate, band))
+    gains = np.array(joint_gains)
     controller = pd(gains[:, 0], gains[:, 1], ki=gains[:, 2])
-    explained = [_explained(error[:, j], tau[:, j], gains[j], rate, band) for j in range(len(gains))]
     return IdentifiedController(controller, frozen(explained))
 
 
@@ -206,7 +213,9 @@ def _error(reference: Reference, measured: np.ndarray, rate: float) -> np.ndarra
 def _ticks(reference: Reference, rate: float, count: int) -> np.ndarray:
     """Return the times (count,) of a log's samples in control periods, rounded if they are whole within 0.1 %."""
     every = 1.0 / (rate * reference.period)
-    return np.arange(count) * (round(every) if abs(every / max(round(every), 1) - 1.0) < 1e-3 else every)
+    if abs(every / max(round(every), 1) - 1.0) < 1e-3:
+        every = round(every)
+    return np.arange(count) * every
 
 
 def _instruments(reference: Reference, count: int, rate: float, band: float) -> np.ndarray:
@@ -216,7 +225,8 @@ def _instruments(reference: Reference, count: int, rate: float, band: float) -> 
     slow = np.tanh(v / (0.01 * np.abs(v).max(axis=0, initial=1e-9)))
     parts = [v, a, jerk, slow, np.gradient(slow, 1.0 / rate, axis=0), np.sin(q), np.cos(q)]
     series = low_pass(np.hstack(parts), rate, band)
-    return np.column_stack([series / np.maximum(np.linalg.norm(series, axis=0), 1e-12), np.ones(count)])
+    size = np.maximum(np.linalg.norm(series, axis=0), 1e-12)
+    return np.column_stack([series / size, np.ones(count)])
 
 
 def _joint(
@@ -242,8 +252,10 @@ def _read(past: np.ndarray, errors: np.ndarray, rate: float, band: float, integr
     omega = 2.0 * np.pi * np.geomspace(band / 40.0, band / 2.0, 60)
     shift = np.exp(-1j * omega / rate)
     response = np.polyval(errors[::-1], shift) / (1.0 - shift * np.polyval(past[::-1], shift))
-    columns = np.column_stack([np.ones_like(omega), 1j * omega] + ([1.0 / (1j * omega)] if integral else []))
-    matrix = columns / np.abs(response)[:, None]
+    columns = [np.ones_like(omega), 1j * omega]
+    if integral:
+        columns.append(1.0 / (1j * omega))
+    matrix = np.column_stack(columns) / np.abs(response)[:, None]
     target = response / np.abs(response)
     stacked = np.vstack([matrix.real, matrix.imag])
     gains = np.linalg.lstsq(stacked, np.concatenate([target.real, target.imag]), rcond=None)[0]
@@ -252,8 +264,11 @@ def _read(past: np.ndarray, errors: np.ndarray, rate: float, band: float, integr
 
 def _explained(error: np.ndarray, tau: np.ndarray, gains: np.ndarray, rate: float, band: float) -> float:
     """Return the share of the low-passed torque explained by the gains (n,) [%]."""
-    feedback = gains[0] * error + gains[1] * np.gradient(error, 1.0 / rate) + gains[2] * np.cumsum(error) / rate
+    kp, kd, ki = gains
+    feedback = kp * error + kd * np.gradient(error, 1.0 / rate) + ki * np.cumsum(error) / rate
     edge = border(rate, band)
-    residual = (tau - feedback)[edge:-edge] - (tau - feedback)[edge:-edge].mean()
-    torque = tau[edge:-edge] - tau[edge:-edge].mean()
+    residual = (tau - feedback)[edge:-edge]
+    residual = residual - residual.mean()
+    torque = tau[edge:-edge]
+    torque = torque - torque.mean()
     return float(100.0 * (1.0 - np.linalg.norm(residual) / np.linalg.norm(torque)))

@@ -355,14 +355,14 @@ class _Found:
 def _estimate_round(task: _Fixed, runs: Runs, std: np.ndarray, tau: float) -> _Found:
     """Return the estimate with instruments from simulated runs; `tau` is the variance inflation of the last round."""
     columns = task.base.kept
-    simulated_cases = [simulated_case(case, run, loop) for (case, loop), run in runs]
-    simulated = [
-        task.friction.added(observe(task.model, columns, case, task.decimator), case).matrix for case in simulated_cases
-    ]
-    observed = [
-        _with_signs(task, columns, *arguments)
-        for arguments in zip(task.observed, simulated, (c for c, _ in task.cases), simulated_cases)
-    ]
+    observed: list[ObservationRows] = []
+    simulated: list[np.ndarray] = []
+    for ((case, loop), run), rows, (recorded_case, _) in zip(runs, task.observed, task.cases):
+        replayed = simulated_case(case, run, loop)
+        simulated_rows = observe(task.model, columns, replayed, task.decimator)
+        matrix = task.friction.added(simulated_rows, replayed).matrix
+        simulated.append(matrix)
+        observed.append(_with_signs(task, columns, rows, matrix, recorded_case, replayed))
     problem = _stack(observed, simulated, task.estimator.measured)
     fit, bound = _held_fit(task, problem, std, tau)
     return _Found(observed, simulated, problem, fit, _inflation(observed, fit), bound)
@@ -388,7 +388,8 @@ def _with_signs(
     followed = away <= MAX_FOLLOWING * motion.velocity_noise(band)
     if not followed.all():
         speed = np.where(followed | np.isnan(measured), simulated_case.motion.v, measured)
-        sign_rows = observe(task.model, columns[signs], replace(case, motion=replace(motion, v=speed)), task.decimator)
+        case_at_speed = replace(case, motion=replace(motion, v=speed))
+        sign_rows = observe(task.model, columns[signs], case_at_speed, task.decimator)
         simulated = simulated.copy()
         simulated[:, :, drowned] = sign_rows.matrix
     return replace(rows, matrix=np.where(drowned, simulated, rows.matrix))
@@ -410,7 +411,10 @@ def _drowned_signs(model: IdentificationModel, columns: np.ndarray, case: Case) 
         if k < 0 or model.columns[k].shape != "sign":
             continue
         term = model.columns[k]
-        speeds = [float(np.hypot.reduce([weight * noise[j] for j, weight in motion])) for _, motion in term.acts]
+        speeds = []
+        for _, motion in term.acts:
+            joint_noise = [weight * noise[joint] for joint, weight in motion]
+            speeds.append(float(np.hypot.reduce(joint_noise)))
         drowned[position] = max(speeds) > term.settings[0]
     return drowned
 
@@ -432,13 +436,12 @@ def _result(
     fit, bound = _held_fit(task, problem, std, estimate.tau)
     verdict = instrumental_variables.exogeneity(problem, std, estimate.tau)
     strength = instrumental_variables.strength(problem, std)
-    rows = zip((case for (case, _), _ in runs), estimate.observed, estimate.simulated)
-    if not task.estimator.measured:
-        simulated_cases = (simulated_case(case, run, loop) for (case, loop), run in runs)
-        rows = (
-            (case, replace(rows_, matrix=z), z)
-            for case, rows_, z in zip(simulated_cases, estimate.observed, estimate.simulated)
-        )
+    rows = []
+    for ((case, loop), run), observed, simulated in zip(runs, estimate.observed, estimate.simulated):
+        if task.estimator.measured:
+            rows.append((case, observed, simulated))
+        else:
+            rows.append((simulated_case(case, run, loop), replace(observed, matrix=simulated), simulated))
     return Instrumental(
         fit,
         ordinary,
@@ -573,7 +576,8 @@ def _inflation(observed: Sequence[ObservationRows], fit: LinearFit) -> float:
     """Return the variance inflation of the rows: mean over torque rows of the residuals' integrated autocorrelation."""
     series = [rows.target - rows.matrix @ fit.estimate.values for rows in observed]
     longest = max(series, key=len)
-    return max(1.0, float(np.mean([inflation(longest[:, row]) for row in range(longest.shape[1])])))
+    inflations = [inflation(row) for row in longest.T]
+    return max(1.0, float(np.mean(inflations)))
 
 
 def _held_fit(task: _Fixed, problem: Instruments, std: np.ndarray, tau: float) -> tuple[LinearFit, Held | None]:
@@ -601,39 +605,43 @@ def _distance(runs: Runs) -> np.ndarray:
     away, size = np.zeros((2, runs[0][0][0].motion.n))
     for (case, loop), run in runs:
         motion = case.motion
-        away += np.sum((motion.q - low_passed(run.q, motion)[simulated_samples(case, run.t, loop)]) ** 2, axis=0)
+        simulated = low_passed(run.q, motion)[simulated_samples(case, run.t, loop)]
+        away += np.sum((motion.q - simulated) ** 2, axis=0)
         size += np.sum((motion.q - motion.q.mean(axis=0)) ** 2, axis=0)
     return frozen(100.0 * np.sqrt(away / size))
 
 
 def _stray(runs: Runs) -> np.ndarray:
     """Return the ratios (n,) of recorded to simulated tracking errors, by regression; NaN where noise hides them."""
-    pairs = []
+    measured_errors = []
+    expected_errors = []
     for (case, loop), run in runs:
         motion = case.motion
         samples = simulated_samples(case, run.t, loop)
         reference = loop.reference.at(np.arange(len(run.t)) * loop.every)[0]
         reference = low_passed(reference, motion)[samples]
         position = low_passed(run.q, motion)[samples]
-        pairs.append((reference - motion.q, reference - position))
-    measured, expected = (np.concatenate(x) for x in zip(*pairs))
+        measured_errors.append(reference - motion.q)
+        expected_errors.append(reference - position)
+    measured = np.concatenate(measured_errors)
+    expected = np.concatenate(expected_errors)
     size = np.maximum(np.sum(expected**2, axis=0), 1e-300)
     slope = np.sum(measured * expected, axis=0) / size
     residual = measured - slope * expected
-    rows = [inflation(residual[:, j]) for j in range(residual.shape[1])]
-    sigma = np.sqrt(np.array(rows) * np.mean(residual**2, axis=0) / size)
+    inflations = np.array([inflation(joint) for joint in residual.T])
+    sigma = np.sqrt(inflations * np.mean(residual**2, axis=0) / size)
     return frozen(np.where(5.0 * sigma < np.abs(slope) * np.log(MAX_GAIN_RATIO), slope, np.nan))
 
 
+def _fit_simulated(problem: Instruments, std: np.ndarray, tau: float) -> LinearFit:
+    return wls(_simulated(problem), std, np.full(problem.data.groups, tau))
+
+
+def _combine_simulated(problem: Instruments, std: np.ndarray) -> np.ndarray:
+    return combine(_simulated(problem), std)
+
+
 ROUNDS = {
-    one.name: one
-    for one in (
-        _RoundEstimator("iv", instrumental_variables.iv, instrumental_variables.projected, True),
-        _RoundEstimator(
-            "didim",
-            lambda problem, std, tau: wls(_simulated(problem), std, np.full(problem.data.groups, tau)),
-            lambda problem, std: combine(_simulated(problem), std),
-            False,
-        ),
-    )
+    "iv": _RoundEstimator("iv", instrumental_variables.iv, instrumental_variables.projected, True),
+    "didim": _RoundEstimator("didim", _fit_simulated, _combine_simulated, False),
 }

@@ -83,9 +83,7 @@ class Instruments:
             fit: the result of `iv`.
         """
         p = len(self.names)
-        sigma = std
-        if std is None:
-            sigma = np.ones(self.data.groups)
+        sigma = np.ones(self.data.groups) if std is None else std
         squares = self.data.residual_squares(np.concatenate([np.zeros(p), fit.estimate.values]))
         factor = np.zeros((1, p + 1, p + 1))
         factor[0, :p] = projected(self, sigma)[:p]
@@ -115,13 +113,12 @@ def instrument(
     matrix = shaped(matrix, (None, None), "observation matrix W")
     instruments = shaped(instruments, matrix.shape, "instruments Z")
     if before is None:
-        if names is not None:
-            column_names = tuple(names)
-        else:
-            column_names = tuple(f"x{k + 1}" for k in range(matrix.shape[1]))
-        before = unseen(
-            column_names, units if units is not None else ("",) * len(column_names), int(np.max(group, initial=0)) + 1
-        )
+        if names is None:
+            names = [f"x{k + 1}" for k in range(matrix.shape[1])]
+        if units is None:
+            units = ("",) * len(names)
+        groups = int(np.max(group, initial=0)) + 1
+        before = unseen(tuple(names), units, groups)
     return replace(before, data=absorb(before.data, np.hstack([instruments, matrix]), target, group))
 
 
@@ -190,17 +187,13 @@ def strength(problem: Instruments, std: np.ndarray | None = None) -> InstrumentS
     norms = np.linalg.norm(factor[:, p : 2 * p], axis=0)
     basis = np.linalg.qr(factor[: 2 * p, p : 2 * p] / norms)[0]
     correlations = np.clip(np.linalg.svd(basis[:p], compute_uv=False), 0.0, 1.0)
-    cross = (factor[:p, :p] / np.linalg.norm(factor[:p, :p], axis=0)).T @ (explained / norms)
+    instruments = factor[:p, :p] / np.linalg.norm(factor[:p, :p], axis=0)
+    cross = instruments.T @ (explained / norms)
     minimum = correlations[-1] ** 2
     with np.errstate(divide="ignore", invalid="ignore"):
         donald = float((rows - p) / p * np.divide(minimum, 1.0 - minimum))
-    return InstrumentStrength(
-        problem.names,
-        correlations,
-        _shea(explained / norms, factor[:, p : 2 * p] / norms),
-        donald,
-        np.linalg.cond(cross),
-    )
+    partial_r2 = _shea(explained / norms, factor[:, p : 2 * p] / norms)
+    return InstrumentStrength(problem.names, correlations, partial_r2, donald, np.linalg.cond(cross))
 
 
 def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1.0) -> ExogeneityTest:

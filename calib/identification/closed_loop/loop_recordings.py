@@ -84,12 +84,13 @@ def close_loops(
     """
     for case in cases:
         _check_reference(case.motion)
-    stretches = [
-        part
-        for case in cases
-        for part in (take(case, slice(a, b)) for a, b in segments(case.motion.segment))
-        if _inside(part.motion).stop - _inside(part.motion).start > 2 * len(decimator.taps)
-    ]
+    stretches = []
+    for case in cases:
+        for first, last in segments(case.motion.segment):
+            part = take(case, slice(first, last))
+            usable = _inside(part.motion)
+            if usable.stop - usable.start > 2 * len(decimator.taps):
+                stretches.append(part)
     if not stretches:
         refuse_data(cases[0].motion.file, "no part without gaps is long enough to be simulated")
     ordered = sorted(stretches, key=lambda part: -len(part.motion))

@@ -95,6 +95,10 @@ class _Simulated(Method):
         if loop.inertia:
             inertia = loop.per_joint("inertia", model.n)
 
+        constraints = None
+        if self.takes_constraints:
+            constraints = constraints_of(problem)
+
         def estimate() -> LoopEstimate:
             identification = identify_instrumental(
                 model,
@@ -105,15 +109,18 @@ class _Simulated(Method):
                 inertia=inertia,
                 positive=loop.positive,
                 terms=terms,
-                constraints=constraints_of(problem) if self.takes_constraints else None,
+                constraints=constraints,
             )
+            simulations = 0
+            for round_ in identification.rounds:
+                simulations += len(loops.pairs) * (1 + round_.retreats)
             result = replace(
                 plain,
                 method=self.name,
                 solution=identification.fit,
                 std=identification.std,
                 iterations=len(identification.rounds),
-                simulations=len(loops.pairs) * sum(1 + round_.retreats for round_ in identification.rounds),
+                simulations=simulations,
                 beforehand=None,
                 held=identification.constrained,
                 instruments=identification.rows,
@@ -303,12 +310,12 @@ def disagreement(problem: IdentificationProblem, estimate: MethodEstimate, test:
         limit = max_beside_wls
         own_errors = problem.pooled.relative_errors(own_estimate.values)
         beside = problem.pooled.relative_errors(iv_estimate.values)
-    away = np.abs(own_estimate.values - iv_estimate.values) / np.maximum(
-        np.hypot(own_estimate.sigma, iv_estimate.sigma), 1e-300
-    )
+    sigma = np.hypot(own_estimate.sigma, iv_estimate.sigma)
+    away = np.abs(own_estimate.values - iv_estimate.values) / np.maximum(sigma, 1e-300)
     worst = int(np.argmax(away))
     if away[worst] < SIGMAS or not np.any(own_errors > limit * beside):
         return None
+    factors = _factors(problem, own_estimate.values, iv_estimate.values)
     return LoopDisagreement(
         estimate.method,
         name,
@@ -316,7 +323,7 @@ def disagreement(problem: IdentificationProblem, estimate: MethodEstimate, test:
         float(away[worst]),
         tuple(own_errors.tolist()),
         tuple(beside.tolist()),
-        _factors(problem, own_estimate.values, iv_estimate.values),
+        factors,
     )
 
 
@@ -325,25 +332,23 @@ def _factors(problem: IdentificationProblem, estimate: np.ndarray, reference: np
     factors = problem.pooled.factors[:, :, :-1]
     own_values = factors @ estimate
     reference_values = factors @ reference
-    return tuple(
-        map(
-            float,
-            np.sum(own_values * reference_values, axis=1) / np.maximum(np.sum(reference_values**2, axis=1), 1e-300),
-        )
-    )
+    products = np.sum(own_values * reference_values, axis=1)
+    squares = np.sum(reference_values**2, axis=1)
+    ratios = products / np.maximum(squares, 1e-300)
+    return tuple(ratios.tolist())
 
 
 def loop_results(problem: IdentificationProblem, estimate: MethodEstimate) -> LoopResults:
     """Return the results of an estimate's loop test, in the form that is stored and printed."""
     test = compare_with_loop(problem, estimate)
     is_estimate = isinstance(estimate, LoopEstimate) and estimate.instrumental is not None
-    return LoopResults(
-        _metrics(test, not is_estimate),
-        tuple(test.findings(is_estimate)),
-        () if test.found is None else _table(test.found),
-        test.loops and test.loops.controller,
-        disagreement(problem, estimate, test),
-    )
+    table: tuple[tuple[Any, ...], ...] = ()
+    if test.found is not None:
+        table = _table(test.found)
+    metrics = _metrics(test, not is_estimate)
+    findings = tuple(test.findings(is_estimate))
+    controller = test.loops and test.loops.controller
+    return LoopResults(metrics, findings, table, controller, disagreement(problem, estimate, test))
 
 
 def _metrics(test: LoopTest, beside: bool) -> LoopMetrics:
@@ -385,6 +390,7 @@ def _metrics(test: LoopTest, beside: bool) -> LoopMetrics:
 def _table(identification: Instrumental) -> tuple[tuple[Any, ...], ...]:
     """Return the rows of both estimates of the standard model, one for each parameter."""
     estimate = identification.fit.estimate
-    columns = (estimate.values, estimate.sigma, identification.ordinary.estimate.values, identification.shift)
+    ordinary = identification.ordinary.estimate.values
     explained = 100.0 * identification.strength.partial_r2
-    return tuple(zip(estimate.names, estimate.units, *(column.tolist() for column in (*columns, explained))))
+    columns = (estimate.values, estimate.sigma, ordinary, identification.shift, explained)
+    return tuple(zip(estimate.names, estimate.units, *[column.tolist() for column in columns]))

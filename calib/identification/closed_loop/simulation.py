@@ -176,29 +176,38 @@ def simulate(
     n = plant.bodies.n
     count = len(reference.t)
     rng = np.random.default_rng(seed)
-    noise = {name: np.broadcast_to(getattr(sensing, name), (n,)) for name in ("sigma_q", "push", "sigma_tau")}
-    drawn = {name: _draw(rng, size, count) for name, size in noise.items()}
+    # Drawn in this order, whatever of it is zero.
+    drawn = {}
+    for name in ("sigma_q", "push", "sigma_tau"):
+        sigma = np.broadcast_to(getattr(sensing, name), (n,))
+        drawn[name] = _draw(rng, sigma, count)
     if sensing.q_band is not None:
         drawn["sigma_q"] = _coloured(drawn["sigma_q"], 2.0 * np.pi * sensing.q_band * reference.period)
     if sensing.push_band is not None:
         drawn["push"] = _coloured(drawn["push"], 2.0 * np.pi * sensing.push_band * reference.period)
     if push is not None:
-        push_ = shaped(push, reference.q.shape, "push")
-        drawn["push"] = np.ascontiguousarray(push_ + drawn["push"] if len(drawn["push"]) else push_)
-    q, v = (np.array(x, dtype=float) for x in (start if start is not None else (reference.q[0], reference.v[0])))
+        total_push = shaped(push, reference.q.shape, "push")
+        if len(drawn["push"]):
+            total_push = total_push + drawn["push"]
+        drawn["push"] = np.ascontiguousarray(total_push)
+    if start is None:
+        start = reference.q[0], reference.v[0]
+    q = np.array(start[0], dtype=float)
+    v = np.array(start[1], dtype=float)
     tick = sample_ticks(count, sensing.every)
     out = np.empty((5, len(tick), n))
     if controller.model is None:
         model = np.empty((0, 0))
     else:
         model = body_rows(plant.bodies, controller.model)
+    quantum = np.ascontiguousarray(np.broadcast_to(sensing.quantum, (n,)), dtype=float)
     status, reached = loop_kernels.closed_loop(
         *packed(plant),
         model,
         controller.rows,
         reference.sampled(controller.ahead),
         drawn["sigma_q"],
-        np.ascontiguousarray(np.broadcast_to(sensing.quantum, (n,)), dtype=float),
+        quantum,
         drawn["push"],
         reference.period,
         controller.smoothing(reference.period),
@@ -218,8 +227,8 @@ def simulate(
         t = reference.t[tick.astype(int)]
     else:
         t = reference.t[0] + tick * reference.period
-    motion = [frozen(x) for x in out]
-    return SimulatedRun(t, motion[0], motion[1], motion[2], motion[3], frozen(out[4] + heard), motion[4])
+    q, v, a, measured, torque = [frozen(series) for series in out]
+    return SimulatedRun(t, q, v, a, measured, frozen(out[4] + heard), torque)
 
 
 def sample_ticks(count: int, every: float) -> np.ndarray:
@@ -242,7 +251,10 @@ def forward_dynamics(
     """
     from calib.identification.closed_loop import loop_kernels
 
-    q, v, tau = (np.ascontiguousarray(shaped(x, (len(q), plant.bodies.n), "states")) for x in (q, v, tau))
+    shape = (len(q), plant.bodies.n)
+    q = np.ascontiguousarray(shaped(q, shape, "states"))
+    v = np.ascontiguousarray(shaped(v, shape, "states"))
+    tau = np.ascontiguousarray(shaped(tau, shape, "states"))
     out = np.empty_like(q)
     count = len(plant.parameters)
     if parameters is None:
@@ -290,7 +302,8 @@ def layout_of(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
             start = n if term.shape == "velocity" else 0
             entries += [(row, start + offset, first + k) for offset, _ in motion_entries]
             shares += [weight for _, weight in motion_entries]
-    return order, np.array(entries, dtype=np.int64).reshape(-1, 3), np.array(shares), np.array(owners, dtype=np.int64)
+    entry_rows = np.array(entries, dtype=np.int64).reshape(-1, 3)
+    return order, entry_rows, np.array(shares), np.array(owners, dtype=np.int64)
 
 
 def packed(plant: Plant) -> Packed:
@@ -300,10 +313,15 @@ def packed(plant: Plant) -> Packed:
     parents = np.where(plant.bodies.parents < 0, bodies, plant.bodies.parents)
     links = np.column_stack([parents, plant.bodies.kinds, plant.bodies.coordinates]).astype(np.int64)
     linear, acts = _drives(plant.terms, plant.parameters[10 * bodies :], n)
-    kinds = np.array([[row, code] for row, code, *_ in acts], dtype=np.int64).reshape(-1, 2)
-    values = np.array([[amount, *settings, *weights] for _, _, amount, settings, weights in acts])
+    kinds = []
+    values = []
+    for row, code, amount, settings, weights in acts:
+        kinds.append([row, code])
+        values.append([amount, *settings, *weights])
     body = body_rows(plant.bodies, plant.parameters[: 10 * bodies])
-    return np.ascontiguousarray(links), body, linear, kinds, values.reshape(-1, 8 + n)
+    kind_rows = np.array(kinds, dtype=np.int64).reshape(-1, 2)
+    value_rows = np.array(values).reshape(-1, 8 + n)
+    return np.ascontiguousarray(links), body, linear, kind_rows, value_rows
 
 
 def body_rows(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:

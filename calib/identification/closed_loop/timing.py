@@ -95,7 +95,8 @@ class _Law:
         edge = border(rate, band)
         # saturated ones follow no law
         free = (np.abs(parts[2]) < 0.98 * controller.limit).all(axis=1)
-        is_inside = (np.arange(len(self.t)) >= edge) & (np.arange(len(self.t)) < len(self.t) - edge)
+        samples = np.arange(len(self.t))
+        is_inside = (samples >= edge) & (samples < len(self.t) - edge)
         self.rows = np.flatnonzero(is_inside & free)
         self.late = controller.delay * reference.period
         if controller.cutoff is None:
@@ -109,16 +110,15 @@ class _Law:
         """Return residual torques (M, n), without their means, and the law's derivative with respect to the shift."""
         controller = self.controller
         instants = self.t - self.late
-        reference = [self.asked(np.clip(instants - shift, self.t[0], self.t[-1]), order) for order in range(3)]
-        error = reference[0] - self.measured(instants)
-        speed = controller.share * reference[1] - self.measured(self.t - self.speed_late, 1)
+        shifted = np.clip(instants - shift, self.t[0], self.t[-1])
+        q_ref = self.asked(shifted, 0)
+        v_ref = self.asked(shifted, 1)
+        a_ref = self.asked(shifted, 2)
+        error = q_ref - self.measured(instants)
+        speed = controller.share * v_ref - self.measured(self.t - self.speed_late, 1)
         sums = np.cumsum(error, axis=0) * (self.t[1] - self.t[0])
         law = controller.kp * error + controller.kd * speed + controller.ki * sums + self.ahead
-        slopes = -(
-            controller.kp * reference[1]
-            + controller.kd * controller.share * reference[2]
-            + controller.ki * reference[0]
-        )
+        slopes = -(controller.kp * v_ref + controller.kd * controller.share * a_ref + controller.ki * q_ref)
         residual = (self.torque(self.t) - law)[self.rows]
         slopes = slopes[self.rows]
         return residual - residual.mean(axis=0), slopes - slopes.mean(axis=0)
@@ -129,20 +129,25 @@ class _Law:
         Of torques and residuals counts what goes with the reference, shifted or not, and its derivatives, joint by
         joint: noise of positions, which goes through the law, hides no delay (our choice).
         """
-        times = [np.clip(self.t[self.rows] - instants_, self.t[0], self.t[-1]) for instants_ in (shift, 0.0)]
-        reference = np.array([self.asked(time, order) for time in times for order in range(3)])
-        reference = (reference - reference.mean(axis=1, keepdims=True)) / np.maximum(
-            reference.std(axis=1, keepdims=True), 1e-300
-        )
+        times = self.t[self.rows]
+        derivatives = []
+        for delay in (shift, 0.0):
+            instants = np.clip(times - delay, self.t[0], self.t[-1])
+            derivatives += [self.asked(instants, order) for order in range(3)]
+        reference = np.array(derivatives)
+        scale = np.maximum(reference.std(axis=1, keepdims=True), 1e-300)
+        reference = (reference - reference.mean(axis=1, keepdims=True)) / scale
         along = np.linalg.qr(reference.transpose(2, 1, 0))[0].transpose(0, 2, 1)
-        torque, *residuals = (
-            np.sum((along @ x.T[:, :, None]) ** 2, axis=(1, 2))
-            for x in (self.torque(self.t[self.rows]), self.linearised(shift)[0], self.linearised(0.0)[0])
-        )
-        late_share, stated_share = (
-            float(np.sqrt(np.mean(residual / np.maximum(torque, 1e-300)))) for residual in residuals
-        )
-        return late_share, stated_share
+
+        def projected(torques: np.ndarray) -> np.ndarray:
+            return np.sum((along @ torques.T[:, :, None]) ** 2, axis=(1, 2))
+
+        size = np.maximum(projected(self.torque(times)), 1e-300)
+        residual_shifted, _ = self.linearised(shift)
+        residual_stated, _ = self.linearised(0.0)
+        shifted_share = float(np.sqrt(np.mean(projected(residual_shifted) / size)))
+        stated_share = float(np.sqrt(np.mean(projected(residual_stated) / size)))
+        return shifted_share, stated_share
 
 
 def _by_positions(reference: CubicSpline, measured: CubicSpline, t: np.ndarray) -> float:

@@ -65,26 +65,29 @@ class BodyCone(Frozen):
         root = np.diag([unit_length, unit_length, unit_length, 1.0])
         # of the unknowns' pseudo-inertia
         block = pseudo_inertia.to_standard(root @ pseudo_inertia.UNITS @ root).T
-        columns = unit[:base, None] / size * self.transform @ block_diag(*[block] * count, np.eye(len(self.positive)))
-        columns = np.asarray(
-            block_diag(columns, np.eye(p - base))
-        )  # b of bodies and terms, and of columns that are none of theirs
+        # b of bodies and terms, and of columns that are none of theirs
+        standard = block_diag(*[block] * count, np.eye(len(self.positive)))
+        columns = unit[:base, None] / size * self.transform @ standard
+        columns = np.asarray(block_diag(columns, np.eye(p - base)))
         bodies = pseudo_inertia.unknown_bodies(count, columns.shape[1] - 10 * count)
         # of a body in those units: keeps finite what the data do not tell
         max_trace = 1e4
         rows = [-np.einsum("irrj->ij", bodies) / max_trace]
-        rows.append(np.eye(columns.shape[1])[10 * count : 10 * count + len(self.positive)][self.positive])
+        terms = np.eye(columns.shape[1])[10 * count : 10 * count + len(self.positive)]
+        rows.append(terms[self.positive])
         low = np.isfinite(lower)
         high = np.isfinite(upper)
         sides = np.vstack([matrix[low], -matrix[high]]) / unit * size
         lengths = np.linalg.norm(sides, axis=1, keepdims=True)
         edges = np.concatenate([lower[low], -upper[high]]) / lengths[:, 0]
         sides = sides / lengths
-        offset = np.concatenate([np.repeat([1.0, 0.0], [count, int(self.positive.sum())]), -edges])
+        limits = np.repeat([1.0, 0.0], [count, int(self.positive.sum())])
+        offset = np.concatenate([limits, -edges])
         solution = minimise(R @ columns, z, np.vstack([*rows, sides @ columns]), offset, bodies)
         b = columns @ solution.values
         # the gradient's part that the cone balances
-        gradient = (R.T @ (R @ b - z) - sides.T @ solution.rows[len(offset) - len(edges) :])[:base]
+        forces = solution.rows[len(offset) - len(edges) :]
+        gradient = (R.T @ (R @ b - z) - sides.T @ forces)[:base]
         # of the gradient, from which on the cone holds the optimum
         min_multiplier = 1e-6
         if np.abs(gradient).max() < min_multiplier * max(float(np.abs(R.T @ z).max()), 1e-300):
@@ -102,6 +105,5 @@ class BodyCone(Frozen):
 def cone_of(model: RegressorModel, base: Base) -> BodyCone:
     """Return the cone of consistent base parameters of a model."""
     labels = tuple(name.removeprefix("XX") for name in model.names[: model.inertial : 10])
-    return BodyCone(
-        np.asarray(base.transform), labels, np.array([column.nonnegative for column in model.columns], dtype=bool)
-    )
+    positive = [column.nonnegative for column in model.columns]
+    return BodyCone(np.asarray(base.transform), labels, np.array(positive, dtype=bool))

@@ -66,12 +66,11 @@ def contradicting(matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> t
     limit = np.concatenate([-lower[low], upper[high]])
     size = np.maximum(np.linalg.norm(rows, axis=1), 1e-300)
     count, p = rows.shape
-    program = linprog(
-        np.concatenate([np.zeros(p), np.ones(count)]),
-        np.hstack([rows / size[:, None], -np.eye(count)]),
-        limit / size,
-        bounds=[(None, None)] * p + [(0.0, None)] * count,
-    )
+    # The least sum of violations, one unknown for each row beside the parameters.
+    goal = np.concatenate([np.zeros(p), np.ones(count)])
+    system = np.hstack([rows / size[:, None], -np.eye(count)])
+    bounds = [(None, None)] * p + [(0.0, None)] * count
+    program = linprog(goal, system, limit / size, bounds=bounds)
     if program.fun <= 1e-9 * max(1.0, float(np.abs(limit / size).max(initial=0.0))):
         return ()
     places = np.concatenate([np.flatnonzero(low), np.flatnonzero(high)])
@@ -209,7 +208,8 @@ class _Planes:
         acts = scaled.any(axis=1)
         require(acts.all(), f"equality {int(np.argmin(acts)) + 1} has only zero coefficients")
         origin, _, rank, _ = np.linalg.lstsq(scaled, edges, rcond=1e-10)
-        away = np.abs(scaled @ origin - edges) / np.maximum(np.abs(edges), max(float(np.abs(origin).max()), 1e-300))
+        largest = max(float(np.abs(origin).max()), 1e-300)
+        away = np.abs(scaled @ origin - edges) / np.maximum(np.abs(edges), largest)
         require(away.max() <= max_contradiction, "equalities contradict each other: no point satisfies all of them")
         require(rank < len(self.free), f"equalities fix all {rank} parameters: nothing remains to be estimated")
 
@@ -283,7 +283,9 @@ class _Planes:
             if small.satisfied(margins):
                 break
             worst = np.argsort(margins)[:max_entering]
-            active = np.union1d(active[bind] if rounds < max_drops else active, worst[margins[worst] < 0.0])
+            if rounds < max_drops:
+                active = active[bind]
+            active = np.union1d(active, worst[margins[worst] < 0.0])
         held_by = np.einsum("kij,kijp->kp", pushes[bind], small.matrices[active[bind]])
         normals[active[bind]] = held_by / traces[bind, None]
         force = np.zeros(len(small.matrices))
@@ -292,14 +294,11 @@ class _Planes:
         all_rows = np.vstack([rows[:c], normals, rows[c:]])
         binding = np.concatenate([mu > slack, force > 0.0, np.ones(len(rates), dtype=bool)])
         scales = np.concatenate([self.sizes[:c], np.ones(len(force)), self.sizes[c:]])
-        gaps = np.concatenate([slack, np.where(force > 0.0, np.maximum(sizes, 0.0), sizes), np.zeros(len(rates))])
-        return _frozen(
-            b * self.unit,
-            np.concatenate([mu, force, rates]) * self.length**2 / scales,
-            gaps * scales,
-            binding,
-            all_rows * scales[:, None] / self.unit,
-        )
+        margins = np.where(force > 0.0, np.maximum(sizes, 0.0), sizes)
+        gaps = np.concatenate([slack, margins, np.zeros(len(rates))])
+        multipliers = np.concatenate([mu, force, rates]) * self.length**2 / scales
+        all_normals = all_rows * scales[:, None] / self.unit
+        return _frozen(b * self.unit, multipliers, gaps * scales, binding, all_normals)
 
 
 def _frozen(*parts: np.ndarray) -> Constrained:
@@ -308,12 +307,10 @@ def _frozen(*parts: np.ndarray) -> Constrained:
 
 
 def _widened(solution: Constrained, position: int, normals: np.ndarray, slack: np.ndarray) -> Constrained:
-    """Return the optimum with further, inactive inequalities inserted at `place`."""
+    """Return the optimum with further, inactive inequalities inserted at `position`."""
     zero = np.zeros(len(slack))
-    return _frozen(
-        solution.values,
-        np.insert(solution.multipliers, position, zero),
-        np.insert(solution.slack, position, slack),
-        np.insert(solution.binding, position, zero > 0.0),
-        np.insert(solution.normals, position, normals, axis=0),
-    )
+    multipliers = np.insert(solution.multipliers, position, zero)
+    all_slack = np.insert(solution.slack, position, slack)
+    binding = np.insert(solution.binding, position, zero > 0.0)
+    all_normals = np.insert(solution.normals, position, normals, axis=0)
+    return _frozen(solution.values, multipliers, all_slack, binding, all_normals)

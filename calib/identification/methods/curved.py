@@ -95,7 +95,8 @@ class Curved:
         numeric = differences * size
         # of the derivative; of the largest one, what differences lose
         max_error, max_rounding = 1e-4, 1e-6
-        allowed = max_error * np.maximum(np.abs(analytic), np.abs(numeric)) + max_rounding * np.abs(numeric).max()
+        largest = np.maximum(np.abs(analytic), np.abs(numeric))
+        allowed = max_error * largest + max_rounding * np.abs(numeric).max()
         worst = int(np.argmax(np.abs(analytic - numeric) - allowed))
         if abs(analytic[worst] - numeric[worst]) > allowed[worst]:
             self._refuse(
@@ -118,7 +119,11 @@ def _sizes(u: np.ndarray) -> np.ndarray:
 def _differences(function: Callable[[np.ndarray], np.ndarray], u: np.ndarray) -> np.ndarray:
     """Return central differences (m, k) of a function of u (k,)."""
     steps = np.diag(1e-5 * _sizes(u))
-    return np.transpose([(function(u + step) - function(u - step)) / (2.0 * step.sum()) for step in steps])
+    slopes = []
+    for step in steps:
+        change = function(u + step) - function(u - step)
+        slopes.append(change / (2.0 * step.sum()))
+    return np.transpose(slopes)
 
 
 def make_curved(constraint: CurvedConstraint, row: Callable[[Mapping[str, float]], np.ndarray]) -> Curved:
@@ -235,23 +240,22 @@ def tangents(
 
     def merit(x: np.ndarray) -> float:
         residual = (factor[:p, :p] @ x - factor[:p, p]) / length
-        violated = np.maximum(-np.array([constraint.value(x) for constraint in curved]) / size, 0.0)
+        values = np.array([constraint.value(x) for constraint in curved])
+        violated = np.maximum(-values / size, 0.0)
         return float(0.5 * residual @ residual + price * violated.sum() + 0.5 * violated @ violated)
 
     for _ in range(MAX_ROUNDS):
         normals = np.array([constraint.normal(b) for constraint in curved])
         heights = np.array([constraint.value(b) for constraint in curved])
-        bend = -np.sum(
-            [mu / length_ * constraint.curvature(b) for mu, length_, constraint in zip(multipliers, size, curved)],
-            axis=0,
-        )
+        curvatures = []
+        for multiplier, normal_size, constraint in zip(multipliers, size, curved):
+            curvatures.append(multiplier / normal_size * constraint.curvature(b))
+        bend = -np.sum(curvatures, axis=0)
         planes = np.hstack([normals / size[:, None], np.eye(m)])
         rows = np.vstack([planes, np.eye(p + m)[p:]])
-        solution = solve(
-            _elastic(factor, b, bend, unit, price * np.full(m, length)),
-            rows,
-            np.append((normals @ b - heights) / size, np.zeros(m)),
-        )
+        lower = np.append((normals @ b - heights) / size, np.zeros(m))
+        triangle = _elastic(factor, b, bend, unit, price * np.full(m, length))
+        solution = solve(triangle, rows, lower)
         multipliers = solution.multipliers[:m]
         step = solution.values[:p] - b
         slack = solution.values[p:]
@@ -287,7 +291,13 @@ def _elastic(factor: np.ndarray, b: np.ndarray, bend: np.ndarray, unit: np.ndarr
     values, vectors = np.linalg.eigh(bend * np.outer(unit, unit))
     root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T / unit
     stacked = np.zeros((2 * p + 1 + m, p + m + 1))
-    stacked[: p + 1, :p], stacked[: p + 1, -1] = factor[:, :p], factor[:, p]
-    stacked[p + 1 : 2 * p + 1, :p], stacked[p + 1 : 2 * p + 1, -1] = root, root @ b
-    stacked[2 * p + 1 :, p : p + m], stacked[2 * p + 1 :, -1] = length * np.eye(m), -price
+    rows = slice(p + 1)
+    bent = slice(p + 1, 2 * p + 1)
+    further = slice(2 * p + 1, None)
+    stacked[rows, :p] = factor[:, :p]
+    stacked[rows, -1] = factor[:, p]
+    stacked[bent, :p] = root
+    stacked[bent, -1] = root @ b
+    stacked[further, p : p + m] = length * np.eye(m)
+    stacked[further, -1] = -price
     return retriangulate(stacked)

@@ -65,10 +65,12 @@ def tls(
     independent = count
     if inflation is not None:
         scale = np.sqrt(inflation - 1.0) / (1.0 if std is None else std)
-        prior_rows = (data.factors[:, :, :p] * np.broadcast_to(scale, (data.groups,))[:, None, None]).reshape(-1, p)
+        group_scale = np.broadcast_to(scale, (data.groups,))
+        prior_rows = (data.factors[:, :, :p] * group_scale[:, None, None]).reshape(-1, p)
         independent = int(np.sum(data.rows / inflation))
     covariance = _covariance(factor[:p, :p], noise, values, variance, count, data.names, prior_rows)
-    estimate = Estimate(data.names, data.units, values, covariance, float(np.sqrt(variance)), max(independent - p, 1))
+    dof = max(independent - p, 1)
+    estimate = Estimate(data.names, data.units, values, covariance, float(np.sqrt(variance)), dof)
     group_std = np.sqrt(data.residual_squares(values) / np.maximum(data.rows * (1.0 - p / count), 1e-300))
     return LinearFit(estimate, group_std, *condition_numbers(factor[:p, :p]))
 

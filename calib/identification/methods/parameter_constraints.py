@@ -110,50 +110,46 @@ class Constraints(Frozen):
         if plane is None:
             return replace(self, cone=None)
         label = f"bodies that can exist ({', '.join(plane.bodies) or 'all'} on the border)"
-        return replace(
-            self,
-            cone=None,
-            plane=label,
-            names=(*self.names, label),
-            matrix=np.vstack([self.matrix, plane.normal]),
-            lower=np.append(self.lower, plane.bound),
-            upper=np.append(self.upper, np.inf),
-        )
+        names = (*self.names, label)
+        matrix = np.vstack([self.matrix, plane.normal])
+        lower = np.append(self.lower, plane.bound)
+        upper = np.append(self.upper, np.inf)
+        return replace(self, cone=None, plane=label, names=names, matrix=matrix, lower=lower, upper=upper)
 
     def _flattened(self, factor: np.ndarray) -> Constraints:
         """Return the constraints with the curved ones replaced by their tangent planes at the optimum."""
         linear = replace(self, curved=())
         m = len(self.curved)
         start = linear.solve(factor).values
-        free = np.append(np.linalg.solve(factor[:-1, :-1], factor[:-1, -1]), np.zeros(m))
+        least_squares = np.linalg.solve(factor[:-1, :-1], factor[:-1, -1])
+        free = np.append(least_squares, np.zeros(m))
 
         def solve(triangle: np.ndarray, rows: np.ndarray, lower: np.ndarray) -> Constrained:
+            """Return the optimum of parameters and m further unknowns, with further inequalities."""
             wider = np.pad(self.matrix, ((0, 0), (0, m)))
-            return replace(
+            further = replace(
                 linear,
                 names=("",) * len(rows) + self.names,
                 matrix=np.vstack([rows, wider]),
                 lower=np.append(lower, self.lower),
                 upper=np.append(np.full(len(lower), np.inf), self.upper),
                 inertia=np.pad(self.inertia, ((0, 0), (0, 0), (0, 0), (0, m))),
-            ).solve(triangle, free)
+            )
+            return further.solve(triangle, free)
 
         names = tuple(constraint.name for constraint in self.curved)
         with _unsatisfied(f"no estimate satisfies {'; '.join(names)} beside {linear}: remove one of them"):
             normals, bounds = tangents(self.curved, factor, start, solve)
-        return replace(
-            linear,
-            tangents=names,
-            names=(*self.names, *names),
-            matrix=np.vstack([self.matrix, normals]),
-            lower=np.append(self.lower, bounds),
-            upper=np.append(self.upper, np.full(m, np.inf)),
-        )
+        all_names = (*self.names, *names)
+        matrix = np.vstack([self.matrix, normals])
+        lower = np.append(self.lower, bounds)
+        upper = np.append(self.upper, np.full(m, np.inf))
+        return replace(linear, tangents=names, names=all_names, matrix=matrix, lower=lower, upper=upper)
 
 
 @contextmanager
 def _unsatisfied(message: str) -> Iterator[None]:
-    """Put `words` in front of the message of a `NotConverged` that is raised inside."""
+    """Put `message` in front of the message of a `NotConverged` that is raised inside."""
     try:
         yield
     except NotConverged as error:
@@ -179,7 +175,8 @@ def make_constraints(
     requests: list[tuple[str, Mapping[str, float], float, float]]
     requests = [(name, {name: 1.0}, *bounds) for name, bounds in settings.bounds.items()]
     for number, sum_ in enumerate(settings.sum, 1):
-        location, (low, high) = f"[[constraints.sum]] number {number}", sum_.limits
+        location = f"[[constraints.sum]] number {number}"
+        low, high = sum_.limits
         label = sum_.name or " + ".join(f"{weight:g} {name}" for name, weight in sum_.weights.items())
         twice = sum_.equal is not None and (sum_.least, sum_.most) != (None, None)
         require(not twice, f"{location}: 'equal' excludes 'least' and 'most'", UsageError)
@@ -187,16 +184,24 @@ def make_constraints(
             refuse_option(f"{location} ({label})", "expected equal, or least <= most")
         requests.append((label, sum_.weights, low, high))
     if settings.signs:
-        signed = [name for name, term in zip(names, terms) if term is not None and term.nonnegative]
-        requests += [(name, {name: 1.0}, 0.0, np.inf) for name in signed if name not in settings.bounds]
-    descriptions = [_words(label, low, high) for label, _, low, high in requests]
-    matrix = np.reshape([_row(weights, base, names) for _, weights, _, _ in requests], (-1, len(names)))
-    low = np.array([sum_[2] for sum_ in requests], dtype=float)
-    high = np.array([sum_[3] for sum_ in requests], dtype=float)
+        for name, term in zip(names, terms):
+            if term is not None and term.nonnegative and name not in settings.bounds:
+                requests.append((name, {name: 1.0}, 0.0, np.inf))
+    descriptions: list[str] = []
+    rows: list[np.ndarray] = []
+    lows: list[float] = []
+    highs: list[float] = []
+    for label, weights, low, high in requests:
+        descriptions.append(_words(label, low, high))
+        rows.append(_row(weights, base, names))
+        lows.append(low)
+        highs.append(high)
+    matrix = np.reshape(rows, (-1, len(names)))
+    lower = np.array(lows, dtype=float)
+    upper = np.array(highs, dtype=float)
+    against: Sequence[int] = ()
     if len(matrix):
-        against = contradicting(matrix, low, high)
-    else:
-        against = ()
+        against = contradicting(matrix, lower, upper)
     if against:
         label = "; ".join(descriptions[k] for k in against)
         refuse_option(
@@ -205,9 +210,15 @@ def make_constraints(
     cone = None
     if settings.bodies and model.inertial:
         cone = cone_of(model, base)
-    inertia = _inertia(settings if cone is None else replace(settings, inertia=0), model, base, len(names))
-    curved = tuple(make_curved(sum_, lambda weights: _row(weights, base, names)) for sum_ in settings.curved)
-    return Constraints(tuple(descriptions), matrix, low, high, inertia, cone, curved=curved)
+        # Physically consistent bodies have a positive definite inertia matrix at every posture.
+        settings = replace(settings, inertia=0)
+    inertia = _inertia(settings, model, base, len(names))
+
+    def row_of(weights: Mapping[str, float]) -> np.ndarray:
+        return _row(weights, base, names)
+
+    curved = tuple(make_curved(constraint, row_of) for constraint in settings.curved)
+    return Constraints(tuple(descriptions), matrix, lower, upper, inertia, cone, curved=curved)
 
 
 def constraints_of(problem: IdentificationProblem) -> Constraints:
@@ -240,17 +251,17 @@ def hold(
     normals = solution.normals[solution.binding]
     before = data.residual_squares(free.values)
     after = data.residual_squares(solution.values)
+    dof = free.dof
     if len(normals):
-        dof = free.dof + int(np.linalg.matrix_rank(normals))
-    else:
-        dof = free.dof
-    ratio = float(np.sum(after / std**2) / dof / max(np.sum(before / std**2) / free.dof, 1e-300))
+        dof += int(np.linalg.matrix_rank(normals))
+    variance_before = np.sum(before / std**2) / free.dof
+    ratio = float(np.sum(after / std**2) / dof / max(variance_before, 1e-300))
     covariance = restricted(np.asarray(free.covariance), factor, normals) * (1.0 if stated_noise else ratio)
-    estimate = replace(
-        free, values=solution.values, covariance=covariance, residual_std=free.residual_std * np.sqrt(ratio), dof=dof
-    )
+    residual_std = free.residual_std * np.sqrt(ratio)
+    estimate = replace(free, values=solution.values, covariance=covariance, residual_std=residual_std, dof=dof)
     group = fit.group_std * np.sqrt(after / np.where(before > 0.0, before, np.inf))
-    held_fit = replace(fit, estimate=estimate, group_std=np.where(before > 0.0, group, fit.group_std))
+    group_std = np.where(before > 0.0, group, fit.group_std)
+    held_fit = replace(fit, estimate=estimate, group_std=group_std)
     return held_fit, _binding(constraints, solution, fit)
 
 
@@ -266,22 +277,17 @@ def _binding(constraints: Constraints, solution: Constrained, free: LinearFit) -
     binding = []
     for k in np.flatnonzero(solution.binding & (places >= 0)):
         row = constraints.matrix[places[k]]
-        bound = (constraints.upper if upper[k] else constraints.lower)[places[k]]
+        bounds = constraints.upper if upper[k] else constraints.lower
+        bound = bounds[places[k]]
         name = constraints.names[places[k]]
         origin = 0.0
         # told as h, by its plane, above zero
         if name in constraints.tangents:
             origin = bound
-        binding.append(
-            Binding(
-                name,
-                float(solution.multipliers[k]),
-                float(row @ free.estimate.values - origin),
-                float(np.sqrt(max(row @ free.estimate.covariance @ row, 0.0))),
-                float(bound - origin),
-                bool(equal[places[k]]),
-            )
-        )
+        multiplier = float(solution.multipliers[k])
+        value = float(row @ free.estimate.values - origin)
+        sigma = float(np.sqrt(max(row @ free.estimate.covariance @ row, 0.0)))
+        binding.append(Binding(name, multiplier, value, sigma, float(bound - origin), bool(equal[places[k]])))
     tight = frozen(np.flatnonzero(solution.binding[places < 0]), int)
     findings = tuple(_findings(constraints, binding, len(tight)))
     return Held(constraints.names, tuple(binding), tight, free, solution.normals[solution.binding], findings)
@@ -346,7 +352,7 @@ def _without_effect(weights: Mapping[str, float], base: Base) -> str:
     if silent:
         return f"{', '.join(silent)} has no effect on the torques of this robot: remove the bound"
     lines = bases.expressions(base)
-    parts = [line for line in lines if any(name in line.replace("=", " ").split() for name in weights)]
+    parts = [line for line in lines if not weights.keys().isdisjoint(line.replace("=", " ").split())]
     sums = "; ".join(parts[:4])
     return f"{', '.join(weights)}: identifiable only in sums with others: {sums}. State the bound for such a sum"
 
@@ -363,7 +369,8 @@ def _inertia(settings: ConstraintSettings, model: RegressorModel, base: Base, p:
     for j in range(n):
         moving = still.copy()
         moving[:, j] = 1.0
-        tensor[:, :, j, : base.b] = model.regressor(q, still, moving)[:, :, base.kept] - regressor
+        accelerated = model.regressor(q, still, moving)[:, :, base.kept]
+        tensor[:, :, j, : base.b] = accelerated - regressor
     return 0.5 * (tensor + tensor.transpose(0, 2, 1, 3))
 
 

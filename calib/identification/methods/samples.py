@@ -80,9 +80,10 @@ def variance_factor(size: np.ndarray, joints: np.ndarray) -> float:
     n = np.maximum(joints, 1)
     w = weigh(size, joints)
     h = 1e-4
-    bent = [np.where(w > 0.0, weigh(size * (1.0 + k * h), joints, False), 0.0) for k in (1, -1)]
+    above = np.where(w > 0.0, weigh(size * (1.0 + h), joints, False), 0.0)
+    below = np.where(w > 0.0, weigh(size * (1.0 - h), joints, False), 0.0)
     # w' d
-    slope = (bent[0] - bent[1]) / (2.0 * h)
+    slope = (above - below) / (2.0 * h)
     share = joints / joints.sum()
     a = np.sum(share * w**2 * size**2 / n)
     b = np.sum(share * (w + slope / n))
@@ -169,10 +170,13 @@ def stack(
         present = np.asarray(present, dtype=bool)
     if present.shape != target.shape:
         raise CalibError(f"rows present: expected an array of shape {target.shape}, found {present.shape}")
-    names_ = empty([f"x{k + 1}" for k in range(matrix.shape[2])] if names is None else names, units)
-    if names_.parameters != matrix.shape[2]:
-        raise CalibError(f"{names_.parameters} names for {matrix.shape[2]} columns")
-    return Samples(names_.names, names_.units, matrix, target, present)
+    if names is None:
+        names = [f"x{k + 1}" for k in range(matrix.shape[2])]
+    # Checks and completes names and units.
+    columns = empty(names, units)
+    if columns.parameters != matrix.shape[2]:
+        raise CalibError(f"{columns.parameters} names for {matrix.shape[2]} columns")
+    return Samples(columns.names, columns.units, matrix, target, present)
 
 
 def irls(data: Samples, inflation: float = 1.0, solve: Callable[[np.ndarray], np.ndarray] | None = None) -> SampleFit:
@@ -296,7 +300,10 @@ def _triangles(data: Samples, weights: np.ndarray) -> Triangles:
 
 def _spreads(data: Samples, residual: np.ndarray) -> np.ndarray:
     """Return the robust standard deviation of each joint's residuals (n,), always positive."""
-    std = np.array([robust.spread(column[in_use]) for column, in_use in zip(residual.T, data.present.T)])
+    spreads = []
+    for joint_residual, present in zip(residual.T, data.present.T):
+        spreads.append(robust.spread(joint_residual[present]))
+    std = np.array(spreads)
     return np.maximum(std, 1e-9 * max(std.max(initial=0.0), 1e-300))
 
 
@@ -309,14 +316,17 @@ def _share_left(data: Samples, std: np.ndarray) -> np.ndarray:
 
 def _consistent(data: Samples) -> np.ndarray:
     """Return the factor (N,) that makes the weighted covariance consistent for normal residuals."""
-    factors = [consistency(n) if n else 0.0 for n in range(data.target.shape[1] + 1)]
+    # By the number of joints in use; a sample without any has no weight.
+    factors = [0.0]
+    factors += [consistency(count) for count in range(1, data.target.shape[1] + 1)]
     return np.array(factors)[data.joints]
 
 
 def _scatter(data: Samples, residual: np.ndarray, scaled: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Return S_ij = Σ c w e_i e_j / Σ w over samples with both rows, eigenvalues kept positive."""
     present = data.present.astype(float)
-    noise = (residual * scaled[:, None]).T @ residual / np.maximum((present * weights[:, None]).T @ present, 1e-300)
+    total_weight = np.maximum((present * weights[:, None]).T @ present, 1e-300)
+    noise = (residual * scaled[:, None]).T @ residual / total_weight
     std = np.sqrt(np.diag(noise))
     values, vectors = np.linalg.eigh(noise / np.outer(std, std))
     if values[0] >= 1e-8:

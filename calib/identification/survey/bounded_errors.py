@@ -57,7 +57,8 @@ class _GeneralisedTLS(Method):
         meat = np.outer(noise @ values, noise @ values) / max(float(problem.pooled.rows.sum()), 1.0)
         for part in states.parts:
             in_use = states.present[part.own]
-            white = np.where(in_use[:, :, None], states.matrix[part.own] / std[:, None], 0.0) / norms
+            weighted = np.where(in_use[:, :, None], states.matrix[part.own] / std[:, None], 0.0)
+            white = weighted / norms
             residual = np.where(in_use, states.target[part.own] / std, 0.0) - white @ values
             meat += scatter(white, residual)
         bread = np.linalg.inv(gram) / norms[:, None]
@@ -136,7 +137,8 @@ def intervals(rows: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarra
     q, upper = np.linalg.qr(rows)
     # x = goals u, with |u| <= 2 √r wherever all rows are within the bound
     goals = np.linalg.inv(upper)
-    goals = np.vstack([goals, -goals]) / np.tile(np.linalg.norm(goals, axis=1), 2)[:, None]
+    size = np.tile(np.linalg.norm(goals, axis=1), 2)
+    goals = np.vstack([goals, -goals]) / size[:, None]
     active = np.argsort(-np.abs(ends))[: 2 * p]
     ahead = np.arange(2 * p)
     optima = np.zeros((2 * p, p))
@@ -144,11 +146,13 @@ def intervals(rows: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarra
     reach = 2.0 * np.sqrt(count)
     max_violation = 1e-6
     rounds = 0
+    bounds = [(-reach, reach)] * p
     while len(ahead) and rounds < ROUNDS:
         system = np.vstack([q[active], -q[active]])
         limit = np.concatenate([1.0 + ends[active], 1.0 - ends[active]])
         for k in ahead:
-            optima[k] = linprog(goals[k], system, limit, bounds=[(-reach, reach)] * p, method="highs-ds").x
+            program = linprog(goals[k], system, limit, bounds=bounds, method="highs-ds")
+            optima[k] = program.x
         violated = np.abs(q @ optima[ahead].T - ends[:, None])
         open_ = violated.max(axis=0) > 1.0 + max_violation
         active = np.union1d(active, np.argmax(violated[:, open_], axis=0))

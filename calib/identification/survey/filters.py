@@ -143,13 +143,15 @@ def _steps(case: Case, part: slice, max_step: float = 2.5e-3) -> Iterator[tuple[
     # as the positions were: the same band on both sides
     q = motion.q[part]
     tau = low_passed(case.target[part], motion)
-    cumulated = np.concatenate([np.zeros((1, motion.n)), np.cumsum(0.5 * (tau[1:] + tau[:-1]), axis=0)])
+    means = 0.5 * (tau[1:] + tau[:-1])
+    cumulated = np.concatenate([np.zeros((1, motion.n)), np.cumsum(means, axis=0)])
     steps = max(1, int(np.ceil(thin / (motion.rate * max_step) - 1e-6)))
     indices = np.arange(len(q), dtype=float)
     for k in range(thin, len(q), thin):
         ends = np.linspace(k - thin, k, steps + 1)
         window = slice(k - thin, k + 1)
-        sums = np.column_stack([np.interp(ends, indices[window], joint_sum) for joint_sum in cumulated[window].T])
+        joint_sums = [np.interp(ends, indices[window], joint) for joint in cumulated[window].T]
+        sums = np.column_stack(joint_sums)
         yield q[k], np.diff(sums, axis=0) * (steps / thin)
 
 
@@ -169,7 +171,8 @@ def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
     p = len(before.mean)
     robot_stepper = stepper(before.robot.at(before.mean, case), columns)
     carried = before.robot.carried(case)
-    position_noise = np.maximum(motion.cutoffs.noise / np.sqrt(thin), 1e-9 * np.ptp(motion.q, axis=0).max())
+    least_noise = 1e-9 * np.ptp(motion.q, axis=0).max()
+    position_noise = np.maximum(motion.cutoffs.noise / np.sqrt(thin), least_noise)
     period = thin / motion.rate
     torque = noise * np.sqrt(1.0 / thin)
     moving = np.maximum(motion.velocity_noise(), 1e-3 * np.abs(motion.v).max(axis=0))
@@ -184,13 +187,10 @@ def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
         require(np.isfinite(size), "the filter's estimate is no longer finite", Diverged, belief.mean)
         sizes.append(size / n)
     settled = sizes[len(sizes) // 4 :]
-    return replace(
-        before,
-        mean=belief.mean[2 * n :],
-        covariance=belief.covariance[2 * n :, 2 * n :],
-        sizes=[*before.sizes, *settled],
-        count=before.count + 1,
-    )
+    mean = belief.mean[2 * n :]
+    covariance = belief.covariance[2 * n :, 2 * n :]
+    all_sizes = [*before.sizes, *settled]
+    return replace(before, mean=mean, covariance=covariance, sizes=all_sizes, count=before.count + 1)
 
 
 def _joined(belief: Belief, parameters: np.ndarray, first: int) -> np.ndarray:
@@ -207,12 +207,12 @@ def _joined(belief: Belief, parameters: np.ndarray, first: int) -> np.ndarray:
 class _Stepping:
     """One step of the robot for a filter, with n joints and the plant's parameters, of which `columns` are states."""
 
-    made: Stepper
+    stepper: Stepper
     kind: Filter
     n: int
     size: int
     columns: np.ndarray
-    there: np.ndarray
+    carried: np.ndarray
 
     def step(self, before: Belief, tau: np.ndarray, period: float, torque: np.ndarray) -> Belief:
         """Return the predicted belief after torques tau (s, n), each held for one period.
@@ -227,9 +227,9 @@ class _Stepping:
             slopes = np.eye(len(mean))
             gain = np.eye(n)
             for torques in tau:
-                outcome = self.made.linearised(values, mean[:n], mean[n : 2 * n], torques, period, len(self.columns))
+                outcome = self.stepper.linearised(values, mean[:n], mean[n : 2 * n], torques, period, len(self.columns))
                 mean[:n], mean[n : 2 * n], gain, part = outcome
-                part[:, 2 * n :] *= self.there
+                part[:, 2 * n :] *= self.carried
                 slopes[: 2 * n] = part[:, : 2 * n] @ slopes[: 2 * n]
                 slopes[: 2 * n, 2 * n :] += part[:, 2 * n :]
             noise = self._noise(gain, len(tau) * period, torque, len(mean))
@@ -243,7 +243,7 @@ class _Stepping:
             gain = np.eye(n)
             try:
                 for torques in tau:
-                    q, v, gain = self.made.points(values, q, v, torques, period)
+                    q, v, gain = self.stepper.points(values, q, v, torques, period)
             except CalibError as error:
                 failure = error
                 continue
@@ -255,7 +255,7 @@ class _Stepping:
     def _values(self, states: np.ndarray) -> np.ndarray:
         """Return the plant's parameters (K, p) of states (K, L)."""
         result = np.zeros((len(states), self.size))
-        result[:, self.columns] = states[:, 2 * self.n :] * self.there
+        result[:, self.columns] = states[:, 2 * self.n :] * self.carried
         return result
 
     def _noise(self, gain: np.ndarray, period: float, torque: np.ndarray, size: int) -> np.ndarray:
@@ -270,29 +270,30 @@ _ASSUMES = (
     "torque noise as in the residuals of least squares, position noise as in the spectrum, both white; "
     "the robot has the model's friction"
 )
-EKF, SREKF, UKF, SRUKF, CDKF, SRCDKF = (
-    _KalmanFilter(
-        ("sr" if root else "") + rule,
-        _ASSUMES,
-        Filter(rule, bool(root)),
-        source=source,
-        description="the same, square-root form" if root else description,
-        tunes=("initial covariance of the parameters", "rate of the filter", *(["α = 0.1"] if rule == "ukf" else [])),
-    )
-    for rule, description, *sources in (
-        (
-            "ekf",
-            "extended Kalman filter, parameters as states",
-            "Gautier & Poignet 2001",
-            "Kaminski, Bryson & Schmidt 1971",
-        ),
-        ("ukf", "unscented Kalman filter, parameters as states", "Julier & Uhlmann 2004", "van der Merwe & Wan 2001"),
-        (
-            "cdkf",
-            "central-difference Kalman filter, parameters as states",
-            "Nørgaard, Poulsen & Ravn 2000",
-            "van der Merwe & Wan 2001",
-        ),
-    )
-    for root, source in enumerate(sources)
-)
+_TUNED = ("initial covariance of the parameters", "rate of the filter")
+_DESCRIPTIONS = {
+    "ekf": "extended Kalman filter, parameters as states",
+    "ukf": "unscented Kalman filter, parameters as states",
+    "cdkf": "central-difference Kalman filter, parameters as states",
+}
+
+
+def _filter(rule: str, source: str) -> _KalmanFilter:
+    """Return the method of a rule that keeps the covariance."""
+    tuned = (*_TUNED, "α = 0.1") if rule == "ukf" else _TUNED
+    description = _DESCRIPTIONS[rule]
+    return _KalmanFilter(rule, _ASSUMES, Filter(rule, False), source=source, description=description, tunes=tuned)
+
+
+def _root_filter(plain: _KalmanFilter, source: str) -> _KalmanFilter:
+    """Return the method of the same rule that keeps the root of the covariance."""
+    root = Filter(plain.kind.rule, True)
+    return replace(plain, name=f"sr{plain.name}", kind=root, source=source, description="the same, square-root form")
+
+
+EKF = _filter("ekf", "Gautier & Poignet 2001")
+SREKF = _root_filter(EKF, "Kaminski, Bryson & Schmidt 1971")
+UKF = _filter("ukf", "Julier & Uhlmann 2004")
+SRUKF = _root_filter(UKF, "van der Merwe & Wan 2001")
+CDKF = _filter("cdkf", "Nørgaard, Poulsen & Ravn 2000")
+SRCDKF = _root_filter(CDKF, "van der Merwe & Wan 2001")

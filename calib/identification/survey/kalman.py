@@ -95,8 +95,9 @@ def predicted(images: np.ndarray, noise: np.ndarray, kind: Filter, narrower: flo
     share = 0.5 / gamma**2
     shift = share * (ahead + behind).sum(axis=0)
     if kind.rule == "cdkf":
+        first = 0.5 / gamma * (ahead - behind)
         second = np.sqrt(max(gamma**2 - 1.0, 0.0)) * share * (ahead + behind)
-        return _packed(middle + shift, np.vstack([0.5 / gamma * (ahead - behind), second]).T, noise, kind, 0.0, shift)
+        return _packed(middle + shift, np.vstack([first, second]).T, noise, kind, 0.0, shift)
     outer = np.sqrt(share) * np.vstack([ahead, behind])
     # Σ w (f - m⁺)(f - m⁺)ᵀ about f_0: with Σ w_i = 1 and w_0^c = w_0 + 1 - α² + β, β - α² is left of the middle ones
     return _packed(middle + shift, outer.T, noise, kind, BETA - (narrower * ALPHA) ** 2, shift)
@@ -151,4 +152,5 @@ def _packed(
 
 def _triangle(wide: np.ndarray) -> np.ndarray:
     """Return the lower triangular matrix L with L Lᵀ = A Aᵀ, from A (L, k) by QR."""
-    return np.asarray(scipy.linalg.qr(wide.T, mode="r", check_finite=False, overwrite_a=True)[0])[: len(wide)].T
+    triangle = scipy.linalg.qr(wide.T, mode="r", check_finite=False, overwrite_a=True)[0]
+    return np.asarray(triangle)[: len(wide)].T

@@ -189,20 +189,28 @@ def _residuals(task: NoisyStates, part: _Recording, values: np.ndarray) -> tuple
     """Return the residuals r (M, n), and G Bᵀ (M, 3, n, n) and B G Bᵀ (M, n, n), of a recording."""
     by_state = _slopes(task, part, values)
     spread = np.einsum("kxj,mrxj->mkjr", part.noise.transpose(1, 2, 0), by_state)
-    residual = np.where(task.present[part.own], task.target[part.own] - task.matrix[part.own] @ values, 0.0)
+    residual = task.target[part.own] - task.matrix[part.own] @ values
+    residual = np.where(task.present[part.own], residual, 0.0)
     return residual, spread, np.einsum("mrkj,mkjs->mrs", by_state, spread)
 
 
 def _inverse(position_part: np.ndarray, noise: np.ndarray, in_use: np.ndarray) -> np.ndarray:
-    """Return the inverse (M, n, n) of S = Σ_τ + other for the rows in use (M, n); zero for other rows."""
+    """Return the inverse (M, n, n) of S = Σ_τ + position_part for the rows in use (M, n); zero for other rows."""
     pairs = in_use[:, :, None] & in_use[:, None, :]
-    return np.where(pairs, np.linalg.inv(np.where(pairs, position_part + np.diag(noise), np.eye(len(noise)))), 0.0)
+    covariance = np.where(pairs, position_part + np.diag(noise), np.eye(len(noise)))
+    return np.where(pairs, np.linalg.inv(covariance), 0.0)
 
 
 def _torque_noise(task: NoisyStates, values: np.ndarray, noise: np.ndarray, minimum: np.ndarray) -> np.ndarray:
     """Return the maximum likelihood torque noise Σ_τ (n,) for fixed parameters and position noise."""
-    parts = [_residuals(task, part, values) for part in task.parts]
-    residual, position_part = (np.concatenate(x) for x in zip(*((r, position_share) for r, _, position_share in parts)))
+    residuals = []
+    position_parts = []
+    for part in task.parts:
+        part_residual, _, part_covariance = _residuals(task, part, values)
+        residuals.append(part_residual)
+        position_parts.append(part_covariance)
+    residual = np.concatenate(residuals)
+    position_part = np.concatenate(position_parts)
     # of the residuals, after the fit
     share = max(1.0 - len(values) / task.present.sum(), 0.1)
     observed = task.present.any(axis=0)
@@ -229,7 +237,8 @@ class _Round:
     @property
     def sigma(self) -> np.ndarray:
         """Standard deviations (p,) for white residuals."""
-        return np.sqrt(sum(np.sum((white @ self.bread.T) ** 2, axis=(0, 1)) for white in self.white))
+        squares = [np.sum((white @ self.bread.T) ** 2, axis=(0, 1)) for white in self.white]
+        return np.sqrt(sum(squares))
 
 
 def _step(task: NoisyStates, values: np.ndarray, noise: np.ndarray) -> _Round:
@@ -244,8 +253,10 @@ def _step(task: NoisyStates, values: np.ndarray, noise: np.ndarray) -> _Round:
         in_use = task.present[part.own]
         inverse = _inverse(position_part, noise, in_use)
         error = np.einsum("mkjr,mrs,ms->mkj", spread, inverse, residual)
-        rows = np.where(in_use[:, :, None], task.matrix[part.own] + changed(task, part, error), 0.0)
-        root = np.linalg.cholesky(np.where(in_use[:, :, None], inverse, np.eye(len(noise)))).transpose(0, 2, 1)
+        corrected = task.matrix[part.own] + changed(task, part, error)
+        rows = np.where(in_use[:, :, None], corrected, 0.0)
+        weights = np.where(in_use[:, :, None], inverse, np.eye(len(noise)))
+        root = np.linalg.cholesky(weights).transpose(0, 2, 1)
         white.append(root @ rows)
         white_residuals.append((root @ residual[:, :, None])[:, :, 0])
         cross += np.einsum("mip,miq->pq", inverse @ rows, task.matrix[part.own], optimize=True)

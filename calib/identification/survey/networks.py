@@ -149,7 +149,8 @@ class _Hopfield(_Network):
         largest = float(np.abs(start).max())
         # without start values: what the weakest column needs to explain all torques
         if not largest:
-            largest = float((np.linalg.norm(factor[:-1, -1]) / np.linalg.norm(factor[:-1, :-1], axis=0)).max())
+            needed = np.linalg.norm(factor[:-1, -1]) / np.linalg.norm(factor[:-1, :-1], axis=0)
+            largest = float(needed.max())
         return hopfield(factor, start, 1.5 * largest, self.rate, self.steps)
 
 

@@ -177,10 +177,10 @@ class _Comparison:
             run = self.robot.sensitivities(values, case, controller, loop.reference, loop.every, relative)
             index = simulated_samples(case, run.t, loop)
             motion = case.motion
+            # Residuals and their slopes, in the order of the rows.
+            parts = []
             if self.rows.sensed:
-                parts = [self._sensed(plant, case, run, index)]
-            else:
-                parts = []
+                parts.append(self._sensed(plant, case, run, index))
             if not self.torques:
                 position = low_passed(run.q, motion)[index]
                 slope = low_passed(run.by_q, motion)[index]
@@ -191,8 +191,10 @@ class _Comparison:
                 parts.append((case.target - observed[:, :, 0], observed[:, :, 1:]))
             elif self.rows.with_motors:
                 parts.append((case.target[:, -motion.n :] - run.torque[index], run.by_torque[index]))
-            residual, slope = (np.concatenate(blocks, axis=1) for blocks in zip(*parts))
-            present = case.present[:, np.arange(residual.shape[1]) % min(motion.n, case.present.shape[1])]
+            residual = np.concatenate([part_residual for part_residual, _ in parts], axis=1)
+            slope = np.concatenate([part_slope for _, part_slope in parts], axis=1)
+            joints = np.arange(residual.shape[1]) % min(motion.n, case.present.shape[1])
+            present = case.present[:, joints]
             in_use = thinned(present, motion.segment, self.problem.decimator)
             residual = decimate(residual, self.problem.decimator, motion.segment)
             slope = decimate(slope, self.problem.decimator, motion.segment)
@@ -203,10 +205,8 @@ class _Comparison:
     def _sensed(self, plant: Plant, case: Case, run: Sensitivities, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return residuals (N, n) of the sensors' torques [N m or N], and the Jacobian (N, n, p) of simulated ones."""
         link = IdentificationModel(plant.bodies, plant.terms, LINK)
-        link_columns = [
-            *range(plant.inertial),
-            *(plant.inertial + k for k, x in enumerate(plant.terms) if x in link.columns),
-        ]
+        link_columns = list(range(plant.inertial))
+        link_columns += [column for column, term in enumerate(plant.terms, plant.inertial) if term in link.columns]
         position = np.full(len(plant.parameters), -1)
         position[link_columns] = np.arange(len(link_columns))
         columns = position[self.robot.columns]
@@ -216,14 +216,16 @@ class _Comparison:
         regressor = link.regressor(*states, None, case.carried)
         jacobian = np.where(columns >= 0, regressor[:, :, columns], 0.0)
         for row in np.eye(case.motion.n, dtype=bool):
-            for by, slope in zip(link.torque_gradient(*states, values, np.tile(row, (len(index), 1)) * 1.0), slopes):
+            weights = np.tile(row, (len(index), 1)) * 1.0
+            for by, slope in zip(link.torque_gradient(*states, values, weights), slopes):
                 jacobian[:, row] += np.einsum("kj,kjc->kc", by, slope)[:, None]
         return case.target[:, : case.motion.n] - regressor @ values, jacobian
 
     def _inertia_slopes(self, q: np.ndarray) -> np.ndarray:
         """Return the Jacobian (n, p) of the mean diagonal of the inertia matrix with respect to the parameters."""
-        p = len(self.robot.columns)
-        return np.array([self.robot.at(np.eye(p)[k]).inertia_diagonal(q) for k in range(p)]).T
+        units = np.eye(len(self.robot.columns))
+        diagonals = [self.robot.at(unit).inertia_diagonal(q) for unit in units]
+        return np.array(diagonals).T
 
     def whitened(self, values: np.ndarray, std: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return residuals (M r,) and Jacobian (M r, p) divided by std (r,); huge residuals if the simulation fails."""
@@ -244,13 +246,15 @@ class _Comparison:
         max_simulations = 25
         # standard deviations of the estimate
         step_tolerance = 0.05
+
+        def linearise(x: np.ndarray) -> nonlinear.Reduced:
+            return nonlinear.triangle(*self.whitened(x, std))
+
+        def moved(x: np.ndarray, step: np.ndarray) -> np.ndarray:
+            return x + step
+
         return nonlinear.solve(
-            lambda x: nonlinear.triangle(*self.whitened(x, std)),
-            lambda x, step: x + step,
-            values,
-            damping=first_damping,
-            tolerance=step_tolerance,
-            limit=max_simulations,
+            linearise, moved, values, damping=first_damping, tolerance=step_tolerance, limit=max_simulations
         )
 
     def spread(self, residual: np.ndarray, p: int) -> np.ndarray:
@@ -261,7 +265,11 @@ class _Comparison:
         n = self.problem.cases[0].motion.n
         # of torques and of positions: other units
         kinds = [std[k : k + n] for k in range(0, len(std), n)]
-        return np.concatenate([np.maximum(kind, 1e-6 * max(float(kind.max()), 1e-300)) for kind in kinds])
+        positive = []
+        for kind in kinds:
+            largest = max(float(kind.max()), 1e-300)
+            positive.append(np.maximum(kind, 1e-6 * largest))
+        return np.concatenate(positive)
 
 
 def _gradient(residual: np.ndarray, slopes: np.ndarray) -> np.ndarray:
@@ -287,9 +295,11 @@ def _packed(
     white_residual = residual / std
     p = len(values)
     rows = int(np.sum(residual != 0.0))
-    count_ = len(plain.pooled.names)
+    count = len(plain.pooled.names)
     plant = task.robot.plant
-    names = (*plain.pooled.names, *(plant.terms[k - plant.inertial].name for k in task.robot.columns[count_:]))
+    # Those of the motors follow, where the problem has none of them.
+    motor_terms = [plant.terms[column - plant.inertial] for column in task.robot.columns[count:]]
+    names = (*plain.pooled.names, *[term.name for term in motor_terms])
     flat = white.reshape(-1, p)
     size = np.linalg.norm(flat, axis=0)
     factor = np.asarray(np.linalg.qr(flat / np.where(size > 0.0, size, 1.0), mode="r"))
@@ -300,9 +310,8 @@ def _packed(
     rounds = 5
     for _ in range(rounds):
         covariance = bread @ scatter(white, white_residual, covariance) @ bread
-    estimate = replace(
-        plain.estimate, values=values[:count_], covariance=covariance[:count_, :count_], residual_std=1.0
-    )
+    covariance = covariance[:count, :count]
+    estimate = replace(plain.estimate, values=values[:count], covariance=covariance, residual_std=1.0)
     return LinearFit(estimate, std, *condition_numbers(flat))
 
 

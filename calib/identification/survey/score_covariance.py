@@ -44,6 +44,7 @@ def scatter(white: np.ndarray, residual: np.ndarray, covariance: np.ndarray | No
         kernel = np.zeros(size)
         kernel[0], kernel[1 : lags + 1], kernel[size - lags :] = 1.0, rho, rho[::-1]
         gain = np.fft.rfft(kernel).real
-        smooth = np.fft.irfft(np.fft.rfft(values, size, axis=0) * gain[:, None], size, axis=0)[:count]
+        spectrum = np.fft.rfft(values, size, axis=0) * gain[:, None]
+        smooth = np.fft.irfft(spectrum, size, axis=0)[:count]
         result += variance * values.T @ smooth
     return 0.5 * (result + result.T)

@@ -141,7 +141,8 @@ def simulate_differences(
     values = np.array(plant.parameters)
     nominal = moved(values)
     shifts = np.eye(len(values))[columns] * steps[:, None]
-    slopes = np.stack([(moved(values + shift) - nominal) / step for shift, step in zip(shifts, steps)], axis=-1)
+    differences = [(moved(values + shift) - nominal) / step for shift, step in zip(shifts, steps)]
+    slopes = np.stack(differences, axis=-1)
     tick = sample_ticks(len(reference.t), every)
     return Sensitivities(reference.t[0] + tick * reference.period, *map(frozen, (*nominal, *slopes)))
 
@@ -251,7 +252,8 @@ class BelievedRobot:
 
     def carried(self, case: Case) -> np.ndarray:
         """Return a factor (p,) per parameter of a serial arm: 0 for payloads not attached in a case, otherwise 1."""
-        return np.append(self.model.carried_columns(case.carried), np.ones(len(self.plant.terms)))[self.columns]
+        bodies = self.model.carried_columns(case.carried)
+        return np.append(bodies, np.ones(len(self.plant.terms)))[self.columns]
 
 
 def serial_arm(problem: IdentificationProblem, method: Method) -> IdentificationModel:
@@ -301,7 +303,8 @@ def with_friction(problem: IdentificationProblem, model: IdentificationModel) ->
     """Return a problem's model with all friction terms, and the index (p,) of each parameter in it."""
     extra = [term for term in problem.terms[problem.base.b :] if term is not None]
     model = model.with_terms(*extra)
-    return model, np.array([*problem.base.kept, *range(model.p - len(extra), model.p)], dtype=int)
+    columns = [*problem.base.kept, *range(model.p - len(extra), model.p)]
+    return model, np.array(columns, dtype=int)
 
 
 def start_of(

@@ -29,7 +29,10 @@ class GeometrySpread:
 
     def felt(self, values: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the torques' changes (N, rows, r) at fixed base parameters `values` (b,)."""
-        changes = [(up.regressor(q, v, a) - down.regressor(q, v, a)) @ values / 2.0 for up, down in self.moved]
+        changes = []
+        for up, down in self.moved:
+            change = up.regressor(q, v, a) - down.regressor(q, v, a)
+            changes.append(change @ values / 2.0)
         return np.stack(changes, axis=2)
 
 
@@ -47,22 +50,24 @@ def geometry_spread(
     path = source if after is None else after / calibrated.ROBOT
     exact = model.exact
     values = model.values
+    covariance = None
     if after is None and isinstance(robot, CalibratedChain):
         covariance = robot.covariance
-    else:
-        covariance = None
-        if path.suffix == ".toml":
-            covariance = calibrated.read(path).covariance
+    elif path.suffix == ".toml":
+        covariance = calibrated.read(path).covariance
     if covariance is None or values is None:
         return None
-    if after is not None and not all((after / name).is_file() for name in (SENSITIVITY, TORQUE_COVARIANCE)):
+    if after is not None:
+        is_complete = (after / SENSITIVITY).is_file() and (after / TORQUE_COVARIANCE).is_file()
         # an earlier version's
-        return None
+        if not is_complete:
+            return None
     sizes, axes = np.linalg.eigh(covariance)
     errors = (axes * np.sqrt(np.maximum(sizes, 0.0)))[:, sizes > 1e-12 * sizes[-1]]
 
     def moved(step: np.ndarray) -> LoadCases:
-        return replace(exact, model=moved_to(chain.with_values(np.asarray(chain.values) + step), exact.model))
+        moved_chain = chain.with_values(np.asarray(chain.values) + step)
+        return replace(exact, model=moved_to(moved_chain, exact.model))
 
     before = np.zeros((len(exact.names), errors.shape[1]))
     if stored is not None:
@@ -72,4 +77,5 @@ def geometry_spread(
         if index is None:
             return None
         before = (np.column_stack(columns[: len(errors)]) @ errors)[index]
-    return GeometrySpread(tuple((moved(error), moved(-error)) for error in errors.T), before)
+    pairs = tuple((moved(error), moved(-error)) for error in errors.T)
+    return GeometrySpread(pairs, before)

@@ -32,14 +32,13 @@ def largest_move(before: Path, after: Path) -> float:
         return float("inf")
     old = {row.name: row for row in read_estimate(before)}
     new = {row.name: row for row in read_estimate(after)}
-    moves = [
-        abs(parameter.value - old[name].value) / parameter.sigma
-        for name, parameter in new.items()
-        if name in old and parameter.sigma
-    ]
-    if old.keys() == new.keys():
-        return max(moves, default=0.0)
-    return float("inf")
+    if old.keys() != new.keys():
+        return float("inf")
+    largest = 0.0
+    for name, parameter in new.items():
+        if parameter.sigma:
+            largest = max(largest, abs(parameter.value - old[name].value) / parameter.sigma)
+    return largest
 
 
 def return_masses(session: Session) -> list[str]:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calib.errors import CalibError, command_line, listing
-from calib.folders import read_estimate
+from calib.folders import ESTIMATE, REPORT, read_estimate
 from calib.procedure.excitation import design, prediction
 from calib.procedure.excitation import folder as motion_folder
 from calib.procedure.excitation.coefficients import RUN, SAMPLES
@@ -65,6 +65,9 @@ def extend(session: Session, say: Say) -> list[str]:
     if not short and not weak:
         return ["no further motion is needed: joints and parameters are as asked for"]
     payloads = tuple(options_of(session).settings.payloads)
+    loads: tuple[str, ...] = ()
+    if payloads:
+        loads = ("none", *payloads)
     settings = ExcitationSettings(
         period=section.period,
         harmonics=section.harmonics,
@@ -75,15 +78,23 @@ def extend(session: Session, say: Say) -> list[str]:
         outlook=False,
         columns=weak,
         seed=session.settings.seed + int(round_name.removeprefix(ROUND)),
-        loads=("none", *payloads) if payloads else (),
+        loads=loads,
     )
     try:
-        inputs = read_inputs(
-            session.fit.path, settings, limits=session.named(section.limits), after=identification.path
-        )
-        before = prediction.known_sigmas(inputs, prediction.task_of(inputs, settings.seed))[0][0]
-        helped = [joint for joint in short if joint.left(before, 0.0 * before) < (1.0 - MIN_GAIN) * joint.error]
-        notes = _unmodelled(inputs, [joint for joint in short if joint not in helped])
+        limits = session.named(section.limits)
+        inputs = read_inputs(session.fit.path, settings, limits=limits, after=identification.path)
+        task = prediction.task_of(inputs, settings.seed)
+        before = prediction.known_sigmas(inputs, task)[0][0]
+        helped: list[_Short] = []
+        unmodelled: list[_Short] = []
+        for joint in short:
+            # The error that would remain if the parameters were known exactly.
+            remaining = joint.left(before, 0.0 * before)
+            if remaining < (1.0 - MIN_GAIN) * joint.error:
+                helped.append(joint)
+            else:
+                unmodelled.append(joint)
+        notes = _unmodelled(inputs, unmodelled)
         if not helped and not weak:
             return notes
         aim = "parameters" if weak else "torque"
@@ -93,43 +104,47 @@ def extend(session: Session, say: Say) -> list[str]:
     if designed.found.interrupted:
         raise KeyboardInterrupt
     motion_folder.write_design(designed, session.path(f"6-excitation/{round_name}"))
-    return [*_gains(designed, helped, designed.inputs.columns.aimed_names if weak else ()), *notes]
+    aimed = designed.inputs.columns.aimed_names if weak else ()
+    return [*_gains(designed, helped, aimed), *notes]
 
 
 def _short_joints(session: Session, tolerance: float) -> list[_Short]:
     """Return the joints whose motor torque is worse than tolerated [%], where the torques together are."""
     report = session.identification.unseen.read()
-    worst = max(
-        (report.proofs or report.fit).values(), key=lambda report_: report_.raw.relative_error_percent.total
-    ).raw
+    recordings = (report.proofs or report.fit).values()
+    worst = max(recordings, key=lambda recording: recording.raw.relative_error_percent.total).raw
     if not tolerance or worst.relative_error_percent.total <= tolerance:
         return []
     n = session.identification.dynamics().model.n
     # the motors' rows come last
     errors = worst.relative_error_percent.joints[-n:]
     rms = worst.rms[-n:]
-    rows = enumerate(zip(errors.tolist(), (100.0 * rms / errors).tolist()))
-    return [_Short(j, error, size) for j, (error, size) in rows if error > tolerance]
+    sizes = (100.0 * rms / errors).tolist()
+    short = []
+    for joint, (error, size) in enumerate(zip(errors.tolist(), sizes)):
+        if error > tolerance:
+            short.append(_Short(joint, error, size))
+    return short
 
 
 def _weak_parameters(session: Session, tolerance: float) -> tuple[str, ...]:
     """Return the essential parameters whose relative σ [%] is above the one asked for, and that a design can aim at."""
     identification = session.identification
     without = {column.name for column in identification.dynamics().model.columns if not column.form.slopes}
-    rows = read_estimate(identification.path, _Parameter)
-    return tuple(
-        row.name
-        for row in rows
-        if row.essential is not None and (row.rsd or 0.0) > tolerance and row.name not in without
-    )
+    weak = []
+    for row in read_estimate(identification.path, _Parameter):
+        uncertain = row.essential is not None and (row.rsd or 0.0) > tolerance
+        if uncertain and row.name not in without:
+            weak.append(row.name)
+    return tuple(weak)
 
 
 def _unmodelled(inputs: ExcitationInputs, joints: list[_Short]) -> list[str]:
     """Return a note on the joints that more motion does not help."""
+    if not joints:
+        return []
     names = listing(f"{inputs.chain.joint_names[joint.joint]} {joint.error:.2g} %" for joint in joints)
-    if joints:
-        return [f"more motion does not help {names}: what is left is not modelled (friction, elasticity)"]
-    return []
+    return [f"more motion does not help {names}: what is left is not modelled (friction, elasticity)"]
 
 
 def _gains(designed: design.Designed, joints: list[_Short], parameters: tuple[str, ...]) -> list[str]:
@@ -141,15 +156,14 @@ def _gains(designed: design.Designed, joints: list[_Short], parameters: tuple[st
     if outlook is None or outlook.torque_sigma_before is None:
         return []
     errors = (outlook.torque_sigma_before, outlook.own.torque_sigma)
-    parts = [
-        f"torque error of {names[joint.joint]} from {joint.error:.2g} to {joint.left(*errors):.2g} %"
-        for joint in joints
-    ]
-    parts += [
-        f"σ of {row.name} from {100.0 * row.sigma_before / abs(row.value):.2g} to {row.rsd:.2g} %"
-        for row in rows
-        if row.name in parameters and row.value and row.sigma_before and row.rsd is not None
-    ]
+    parts = []
+    for joint in joints:
+        after = joint.left(*errors)
+        parts.append(f"torque error of {names[joint.joint]} from {joint.error:.2g} to {after:.2g} %")
+    for row in rows:
+        if row.name in parameters and row.value and row.sigma_before and row.rsd is not None:
+            before = 100.0 * row.sigma_before / abs(row.value)
+            parts.append(f"σ of {row.name} from {before:.2g} to {row.rsd:.2g} %")
     return [f"{seconds:.0f} s more, of a motion designed for it, bring the {listing(parts, 6)}"]
 
 
@@ -165,7 +179,9 @@ def promised(session: Session) -> tuple[str, ...]:
     folder = session.path(f"6-excitation/{name}")
     if not session.needs or not notes or not folder.exists():
         return ()
-    played = folder / (RUN if session.settings.dynamics.repeats > 1 else SAMPLES)
+    played = folder / SAMPLES
+    if session.settings.dynamics.repeats > 1:
+        played = folder / RUN
     task = f"play {played}, bring its log as {session.path(f'7-recorded/{name}_log.csv')}; then: "
     return (notes[0], f"if wanted, {task}{command_line('next', session.folder)}")
 
@@ -176,18 +192,12 @@ def _short_of_default(session: Session) -> tuple[str, ...]:
     weak = _weak_parameters(session, NEED)
     names = load_calibrated(session.fit.path).chain.joint_names
     parts = [f"torque of {names[joint.joint]} ({joint.error:.2g} %)" for joint in joints]
-    deviations = {
-        short_joint.name: short_joint.rsd or 0.0
-        for short_joint in read_estimate(session.identification.path, _Parameter)
-    }
-    worst = listing(
-        (
-            f"{name} ({deviations[name]:.2g} %)"
-            for name in sorted(weak, key=lambda short_joint: -deviations[short_joint])
-        ),
-        4,
-    )
-    parts += [f"σ of essential parameters {worst}"] if weak else []
+    if weak:
+        rows = read_estimate(session.identification.path, _Parameter)
+        deviations = {row.name: row.rsd or 0.0 for row in rows}
+        weakest_first = sorted(weak, key=lambda name: -deviations[name])
+        worst = listing((f"{name} ({deviations[name]:.2g} %)" for name in weakest_first), 4)
+        parts.append(f"σ of essential parameters {worst}")
     if not parts:
         return (f"no further motion is needed: torques of joints and σ of essential parameters are within {NEED:g} %",)
     keys = [f"sigma_percent = {NEED:g}"] * bool(weak) + [f"tolerance_percent = {NEED:g}"] * bool(joints)
@@ -205,8 +215,8 @@ STEP = SessionStep(
         FITTED_ROBOT,
         NamedFile("dynamics", "limits"),
         IDENTIFY_OPTIONS,
-        SessionFile("8-dynamics/estimate.csv"),
-        SessionFile("8-dynamics/unseen/report.json"),
+        SessionFile(f"8-dynamics/{ESTIMATE}"),
+        SessionFile(f"8-dynamics/unseen/{REPORT}"),
     ),
     makes=(f"6-excitation/{ROUND}*/*",),
     settings=(

@@ -1,0 +1,406 @@
+"""``calib compare``: all methods on the same recordings, ranked by their error on unseen motion.
+
+All estimate the same columns (base parameters and standard friction, unless another is asked for), each as
+`calib identify --method` does it: wls regularises what the motion does not identify towards a prior. Errors are
+relative, in the identification band, over all unseen recordings together; their standard errors, and those of
+differences between methods, come from a jackknife over blocks of time (Künsch 1989), since residuals are not white.
+Methods within `MAX_SIGMAS` standard errors of the best, or within `MAX_SHARE` of its error, are as good; of these one
+is taken that is fast: at most `FAST_SECONDS` seconds, or `MAX_TIMES` times the time of the fastest, the first in rank.
+Below the table stands what `calib identify` says of it: the same verdict, from the same findings. None is taken where
+that verdict is fail, where the best predicts no better than no model does (100 %), or where all recordings repeat the
+training motion; one that does is left out.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from calib import files
+from calib.errors import CalibError, UsageError, require
+from calib.identification.identify import Identification, identify
+from calib.identification.methods.method import Method
+from calib.identification.prediction import predict
+from calib.identification.registry import METHODS, method_named
+from calib.identification.rows import Case
+from calib.identification.settings import IdentificationSettings
+from calib.procedure.dynamic_stage.identify import judged, overlaps, repeated_motion
+from calib.procedure.dynamic_stage.inputs import IdentificationInputs
+from calib.procedure.dynamic_stage.verdict import motion_findings
+from calib.procedure.findings import Verdict, lines_of
+from calib.procedure.report.page import Block, Column, Section, Text, table
+
+# Of the rule above (our choices).
+MAX_SIGMAS, MAX_SHARE, MAX_TIMES, FAST_SECONDS = 2.0, 0.05, 2.0, 1.0
+# Blocks of time in each recording, for the jackknife (our choice).
+TIME_BLOCKS = 10
+LOOP = "needs the closed loop: add [loop] to the options file (calib formats identify-options)"
+# Error of predicting no torque at all [%].
+NO_MODEL = 100.0
+
+
+@dataclass(frozen=True)
+class ComparedMethod:
+    """Result of one method.
+
+    Attributes:
+        name: of it.
+        failure: why there is no estimate; "" where there is one.
+        rank: by the error on unseen motion, from 1; 0 without an estimate.
+        unseen, sigma: error on unseen motion in the band, and its standard error [%].
+        raw: the same against the torque as recorded [%].
+        training: in the band, of the training data [%].
+        worst: joint with the largest error on unseen motion, counted from 1, and that [%].
+        behind, behind_sigma: difference from the best, and its standard error [%].
+        good, chosen: whether it is as good as the best, and the one to take.
+        parameters: number of them.
+        seconds: of the method alone.
+        iterations, simulations: of the method.
+        verdict, warnings: what `calib identify` says of it; None and empty but for the one that the rule comes to.
+    """
+
+    name: str
+    failure: str = ""
+    rank: int = 0
+    unseen: float = np.nan
+    sigma: float = np.nan
+    raw: float = np.nan
+    training: float = np.nan
+    worst: tuple[int, float] = (0, np.nan)
+    behind: float = 0.0
+    behind_sigma: float = 0.0
+    good: bool = False
+    chosen: bool = False
+    parameters: int = 0
+    seconds: float = np.nan
+    iterations: int = 0
+    simulations: int = 0
+    verdict: Verdict | None = None
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class _Sums:
+    """Sums per block of time (k, rows): squared errors and squared torques, in the band and as recorded."""
+
+    error: np.ndarray
+    size: np.ndarray
+    raw_error: np.ndarray
+    raw_size: np.ndarray
+
+
+def compare_methods(
+    inputs: IdentificationInputs,
+    methods: Sequence[str] | None = None,
+    friction: str = "standard",
+    say: Callable[[str], None] = lambda message: None,
+    done: Callable[[ComparedMethod], None] = lambda method: None,
+) -> list[ComparedMethod]:
+    """Return the results of all methods on the recordings, best first; failed methods come last.
+
+    Args:
+        inputs: training recordings, and unseen ones.
+        methods: their names; None: all.
+        friction: as of `IdentificationSettings`; methods that simulate know ``standard`` alone.
+        say: called with messages on progress.
+        done: called with every method when it is done, not yet ranked.
+
+    Raises:
+        UsageError: where no recording is unseen, or one overlaps the training recordings; where a name is none of
+            a method.
+    """
+    require(inputs.unseen, "methods are ranked on unseen motion: give a recording with --validate", UsageError)
+    shared = overlaps(inputs.cases, inputs.unseen)
+    if shared:
+        raise UsageError(f"{lines_of(shared)[0]}: cut them apart, log.npz@0:20 and log.npz@20:30")
+    # Recordings that repeat the training motion do not rank methods, unless there are no others.
+    repeated = repeated_motion(inputs.cases, inputs.unseen)
+    validation = tuple(case for case in inputs.unseen if case.name not in repeated)
+    if validation:
+        inputs = replace(inputs, unseen=validation)
+    candidates = {name: method_named(name) for name in methods or METHODS}
+    without_loop = inputs.options.settings.loop is None
+    if without_loop and all(method.needs_controller for method in candidates.values()):
+        raise UsageError(f"{', '.join(candidates)}: {LOOP}")
+    results: list[tuple[ComparedMethod, _Sums]] = []
+    models: dict[str, Identification] = {}
+    failed: list[ComparedMethod] = []
+    joints = np.arange(inputs.cases[0].target.shape[1])
+    same_unit = ~np.isin(joints, inputs.currents.own)
+    for name, method in candidates.items():
+        if method.needs_controller and without_loop:
+            failed.append(ComparedMethod(name, LOOP))
+            continue
+        say(name)
+        settings = _settings(inputs, method, friction)
+        try:
+            model = identify(inputs.robot, inputs.cases, settings, partial(_say_of, say, name))
+            compared, sums = _errors(model, inputs, same_unit)
+        except CalibError as error:
+            failed.append(ComparedMethod(name, _one_line(error)))
+            done(failed[-1])
+        except Exception as error:  # of one method: the others' results are not lost by it
+            failed.append(ComparedMethod(name, f"internal error: {type(error).__name__}: {error}"))
+            done(failed[-1])
+        else:
+            results.append((compared, sums))
+            models[name] = model
+            done(compared)
+    ranked = _ranked(results, same_unit)
+    for rank, method in enumerate(ranked):
+        if method.chosen:
+            ranked[rank] = _judged(method, inputs, models[method.name], bool(validation), say)
+    return ranked + failed
+
+
+def caveats(inputs: IdentificationInputs, compared: Sequence[ComparedMethod]) -> list[str]:
+    """Return notes on a ranking, and the reason if no method is recommended."""
+    repeated = repeated_motion(inputs.cases, inputs.unseen)
+    notes = [*inputs.currents.notes, *lines_of(motion_findings({}, repeated))]
+    for method in compared:
+        notes += method.warnings
+    if len(repeated) == len(inputs.unseen):
+        notes.append("no method recommended: all unseen files repeat the training motion; give others with --validate")
+    elif repeated:
+        notes.append(f"excluded from the ranking: {', '.join(repeated)}")
+    if compared and compared[0].unseen >= NO_MODEL:
+        notes.append(
+            f"no method recommended: best unseen error {compared[0].unseen:.3g} %, without a model {NO_MODEL:g} %: "
+            "add training motion"
+        )
+    else:
+        for method in compared:
+            if method.verdict is not None and method.verdict.level == "fail":
+                notes.append(f"no method recommended: the model of {method.name} fails in calib identify, reason below")
+                break
+    return list(dict.fromkeys(notes))
+
+
+def _say_of(say: Callable[[str], None], name: str, message: str) -> None:
+    say(f"{name}: {message}")
+
+
+def _one_line(error: CalibError) -> str:
+    return " ".join(str(error).split())
+
+
+def _settings(inputs: IdentificationInputs, method: Method, friction: str) -> IdentificationSettings:
+    """Return the identification settings for a method, without settings that it does not use."""
+    settings = replace(inputs.options.settings, method=method.name, essential="none", friction=friction)
+    if not method.takes_constraints:
+        settings = replace(settings, constraints=None)
+    if not method.takes_prior:
+        settings = replace(settings, weights="residuals")
+    if method.needs_controller:
+        return settings
+    return replace(settings, loop=None)
+
+
+def _judged(
+    method: ComparedMethod,
+    inputs: IdentificationInputs,
+    model: Identification,
+    proven: bool,
+    say: Callable[[str], None],
+) -> ComparedMethod:
+    """Return the selected method with the verdict on its model; with verdict fail it is not recommended.
+
+    Args:
+        proven: whether the recordings are motion that it has not seen.
+    """
+    warnings: tuple[str, ...] = ()
+    try:
+        outcome = judged(inputs, model, partial(_say_of, say, method.name))
+        verdict, warnings = outcome.verdict, outcome.warnings
+    except CalibError as error:
+        verdict = Verdict("fail", _one_line(error))
+    recommended = proven and method.unseen < NO_MODEL and verdict.level != "fail"
+    return replace(method, chosen=recommended, verdict=verdict, warnings=warnings)
+
+
+def _errors(model: Identification, inputs: IdentificationInputs, same_unit: np.ndarray) -> tuple[ComparedMethod, _Sums]:
+    """Return the errors of a method's model, and their sums by block of time."""
+    unseen = _sums(model, inputs.unseen)
+    training = _sums(model, inputs.cases)
+    joint_sizes = np.maximum(unseen.size.sum(axis=0), 1e-300)
+    joint_errors = 100.0 * np.sqrt(unseen.error.sum(axis=0) / joint_sizes)
+    worst = int(np.argmax(np.where(same_unit, joint_errors, -1.0)))
+    fitted = model.fitted
+    compared = ComparedMethod(
+        fitted.method,
+        unseen=_percent(unseen.error[:, same_unit], unseen.size[:, same_unit]),
+        sigma=float(_jackknife(_leaving_out(unseen, same_unit))),
+        raw=_percent(unseen.raw_error[:, same_unit], unseen.raw_size[:, same_unit]),
+        training=_percent(training.error[:, same_unit], training.size[:, same_unit]),
+        worst=(worst + 1, float(joint_errors[worst])),
+        parameters=len(fitted.estimate.values),
+        seconds=fitted.seconds,
+        iterations=fitted.iterations,
+        simulations=fitted.simulations,
+    )
+    return compared, unseen
+
+
+def _sums(model: Identification, cases: Sequence[Case]) -> _Sums:
+    """Return the sums of a model's errors over each block of time of the recordings."""
+    errors, sizes, raw_errors, raw_sizes = [], [], [], []
+    for case in cases:
+        motion = case.motion
+        usable = motion.weight > 0.5
+        starts = np.linspace(0, len(usable), TIME_BLOCKS, endpoint=False).astype(int)
+
+        def block_sums(values: np.ndarray, usable: np.ndarray = usable, starts: np.ndarray = starts) -> np.ndarray:
+            return np.add.reduceat(np.where(usable[:, None], values, 0.0) ** 2, starts, axis=0)
+
+        predicted = predict(model.dynamics, case)
+        target = motion.in_band(np.asarray(case.target))
+        errors.append(block_sums(target - motion.in_band(predicted)))
+        sizes.append(block_sums(target))
+        raw_errors.append(block_sums(case.target - predicted))
+        raw_sizes.append(block_sums(case.target))
+    return _Sums(np.concatenate(errors), np.concatenate(sizes), np.concatenate(raw_errors), np.concatenate(raw_sizes))
+
+
+def _percent(error: np.ndarray, size: np.ndarray) -> float:
+    return float(100.0 * np.sqrt(error.sum() / max(float(size.sum()), 1e-300)))
+
+
+def _leaving_out(sums: _Sums, same_unit: np.ndarray) -> np.ndarray:
+    """Return the error (k,) [%] with each of k blocks of time left out."""
+    error = sums.error[:, same_unit].sum(axis=1)
+    size = sums.size[:, same_unit].sum(axis=1)
+    return 100.0 * np.sqrt((error.sum() - error) / np.maximum(size.sum() - size, 1e-300))
+
+
+def _jackknife(values: np.ndarray) -> float:
+    """Return the jackknife's standard error of a figure from its values (k,) with each of k blocks left out."""
+    count = len(values)
+    return float(np.sqrt((count - 1) / count * np.sum((values - values.mean()) ** 2)))
+
+
+def _ranked(results: Sequence[tuple[ComparedMethod, _Sums]], same_unit: np.ndarray) -> list[ComparedMethod]:
+    """Return the methods by rank; the first fast one of the good methods is marked as chosen."""
+    if not results:
+        return []
+    order = sorted(results, key=lambda result: result[0].unseen)
+    best, best_sums = order[0]
+    ranked = []
+    for rank, (method, sums) in enumerate(order, 1):
+        behind = method.unseen - best.unseen
+        sigma = _jackknife(_leaving_out(sums, same_unit) - _leaving_out(best_sums, same_unit))
+        good = behind <= max(MAX_SIGMAS * sigma, MAX_SHARE * best.unseen)
+        ranked.append(replace(method, rank=rank, behind=behind, behind_sigma=sigma, good=bool(good)))
+    fastest = min(method.seconds for method in ranked if method.good)
+    fast = max(FAST_SECONDS, MAX_TIMES * fastest)
+    for index, method in enumerate(ranked):
+        if method.good and method.seconds <= fast:
+            ranked[index] = replace(method, chosen=True)
+            break
+    return ranked
+
+
+HEADER = [
+    "rank",
+    "method",
+    "unseen_percent",
+    "sigma",
+    "raw_percent",
+    "training_percent",
+    "worst_joint",
+    "worst_joint_percent",
+    "behind",
+    "behind_sigma",
+    "as_good",
+    "take",
+    "parameters",
+    "seconds",
+    "iterations",
+    "simulations",
+    "failure",
+]
+
+
+def write_table(compared: Sequence[ComparedMethod], path: Path) -> Path:
+    """Write the comparison as CSV."""
+    lines = []
+    for method in compared:
+        worst_joint, worst_error = method.worst
+        cells = (
+            method.rank or "",
+            method.name,
+            method.unseen,
+            method.sigma,
+            method.raw,
+            method.training,
+            worst_joint or "",
+            worst_error,
+            method.behind,
+            method.behind_sigma,
+            "yes" if method.good else "no",
+            "yes" if method.chosen else "no",
+            method.parameters,
+            method.seconds,
+            method.iterations,
+            method.simulations,
+            method.failure,
+        )
+        lines.append(cells)
+    return files.write_table(path, HEADER, lines)
+
+
+def _behind(method: ComparedMethod) -> str:
+    return "" if method.rank == 1 else f"{method.behind:.2g} ± {method.behind_sigma:.2g}"
+
+
+def _choice(method: ComparedMethod) -> str:
+    if method.chosen:
+        return "take"
+    return "as good" if method.good else ""
+
+
+COLUMNS = (
+    Column("rank", "{0.rank}"),
+    Column("method", "{0.name}", number=False),
+    Column("unseen [%]", "{0.unseen:.3g} ± {0.sigma:.2g}"),
+    Column("behind the best", _behind),
+    Column("raw [%]", "{0.raw:.3g}"),
+    Column("training [%]", "{0.training:.3g}"),
+    Column("worst joint", "{0.worst[0]}: {0.worst[1]:.3g} %"),
+    Column("parameters", "{0.parameters}"),
+    Column("rounds", "{0.iterations}"),
+    Column("simulations", "{0.simulations}"),
+    Column("seconds", "{0.seconds:.2g}"),
+    Column("choice", _choice, number=False),
+)
+
+
+def line(method: ComparedMethod) -> str:
+    """Return one line on a method's result: its error, or the reason of its failure."""
+    if method.failure:
+        return f"{method.name}: {method.failure}"
+    return f"{method.name}: {method.unseen:.3g} % on unseen motion, {method.seconds:.2g} s"
+
+
+def section(compared: Sequence[ComparedMethod], notes: Sequence[str]) -> Section:
+    """Return a report section: table of methods, notes, and the verdict on the selected method's model."""
+    blocks = [*_blocks(compared), Text("", notes, "note")]
+    for method in compared:
+        if method.verdict is not None:
+            return Section("Methods", blocks, method.verdict.level, f"{method.name}: {method.verdict.reason}")
+    return Section("Methods", blocks)
+
+
+def _blocks(compared: Sequence[ComparedMethod]) -> Iterator[Block]:
+    """Yield the ranked table, and the reasons for excluded methods."""
+    ranked = [method for method in compared if not method.failure]
+    note = (
+        "100 ‖τ - τ̂‖ / ‖τ‖ on unseen motion, in the identification band, ± its standard error over blocks of time; "
+        f"methods are as good within {MAX_SIGMAS:g} standard errors of the difference, or {MAX_SHARE:.0%}, of the best"
+    )
+    if ranked:
+        yield table("Methods", COLUMNS, ranked, note, lambda method: method.chosen)
+    lines = [line(method) for method in compared if method.failure]
+    if lines:
+        yield Text("Without an estimate", lines, "no estimate")
