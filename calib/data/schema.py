@@ -106,7 +106,7 @@ def refuse(source: Rows, bad: np.ndarray, columns: Sequence[str], says: Callable
     if not np.any(bad):
         return
     bad = np.reshape(bad, (len(bad), -1))
-    row, column = np.argwhere(bad)[0].tolist()
+    row, column = (int(index) for index in np.argwhere(bad)[0])
     message = says(row, column) + more_rows(source, bad, columns)
     raise MeasurementError(message, source.file, int(source.rows[row]), columns[column])
 

@@ -34,20 +34,20 @@ def dictionary(name: str) -> cv2.aruco.Dictionary:
 
 def _black(board: Board) -> np.ndarray:
     """Return the black rectangles (N, 4) of a board: x, y, width, height [m] in its frame."""
-    side, found = board.square, []
+    side, rectangles = board.square, []
     fields = [(r, c) for r in range(board.rows) for c in range(board.columns)]
     if board.kind == "apriltag":
         pitch = side + board.marker
-        places = [(c * pitch, r * pitch, side) for r, c in fields]
+        markers = [(c * pitch, r * pitch, side) for r, c in fields]
     else:
-        found = [np.array([[c * side, r * side, side, side]]) for r, c in fields if (r + c) % 2 == 0]
+        rectangles = [np.array([[c * side, r * side, side, side]]) for r, c in fields if (r + c) % 2 == 0]
         margin, white = 0.5 * (side - board.marker), [field for field in fields if sum(field) % 2 == 1]
-        places = [(c * side + margin, r * side + margin, board.marker) for r, c in white if board.kind == "charuco"]
-    words = dictionary(board.dictionary)
-    for number, (x, y, size) in enumerate(places):
-        bits = cv2.aruco.generateImageMarker(words, number, words.markerSize + 2, borderBits=1)
-        found.append(_rectangles(bits == 0, x, y, size / len(bits)))
-    return np.concatenate(found)
+        markers = [(c * side + margin, r * side + margin, board.marker) for r, c in white if board.kind == "charuco"]
+    marker_dictionary = dictionary(board.dictionary)
+    for number, (x, y, size) in enumerate(markers):
+        bits = cv2.aruco.generateImageMarker(marker_dictionary, number, marker_dictionary.markerSize + 2, borderBits=1)
+        rectangles.append(_rectangles(bits == 0, x, y, size / len(bits)))
+    return np.concatenate(rectangles)
 
 
 def _rectangles(dark: np.ndarray, x: float, y: float, side: float) -> np.ndarray:
@@ -100,19 +100,19 @@ def page_size(board: Board, paper: str = "") -> tuple[float, float]:
 
 def svg(board: Board, size: tuple[float, float]) -> str:
     """Return the page as SVG, in millimetres."""
-    boxes, words = _page(board, size)
+    boxes, texts = _page(board, size)
     body = [
         f'<rect x="{1e3 * x:.4f}" y="{1e3 * y:.4f}" width="{1e3 * w:.4f}" height="{1e3 * h:.4f}"/>'
         for x, y, w, h in boxes
     ]
     body += [
         f'<text x="{1e3 * x:.2f}" y="{1e3 * y:.2f}" font-size="2.8" font-family="Helvetica, Arial">{text}</text>'
-        for x, y, text in words
+        for x, y, text in texts
     ]
-    wide, high = (f"{1e3 * length:g}" for length in size)
+    width, height = (f"{1e3 * length:g}" for length in size)
     return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{wide}mm" height="{high}mm" viewBox="0 0 {wide} {high}" '
-        f'shape-rendering="crispEdges">\n<rect width="{wide}" height="{high}" fill="white"/>\n'
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}mm" height="{height}mm" viewBox="0 0 {width} {height}" '
+        f'shape-rendering="crispEdges">\n<rect width="{width}" height="{height}" fill="white"/>\n'
         + "\n".join(body)
         + "\n</svg>\n"
     )
@@ -120,27 +120,29 @@ def svg(board: Board, size: tuple[float, float]) -> str:
 
 def pdf(board: Board, size: tuple[float, float]) -> bytes:
     """Return the page as a PDF at true scale, with print scaling switched off."""
-    boxes, words = _page(board, size)
-    wide, high = (length / POINT for length in size)
-    lines = [f"{x / POINT:.4f} {high - (y + h) / POINT:.4f} {w / POINT:.4f} {h / POINT:.4f} re" for x, y, w, h in boxes]
+    boxes, texts = _page(board, size)
+    width, height = (length / POINT for length in size)
+    lines = [
+        f"{x / POINT:.4f} {height - (y + h) / POINT:.4f} {w / POINT:.4f} {h / POINT:.4f} re" for x, y, w, h in boxes
+    ]
     lines.append("f")
-    for x, y, text in words:
-        shown = text.replace("\\", r"\\").replace("(", r"\(").replace(")", r"\)")
-        lines.append(f"BT /F1 8 Tf {x / POINT:.3f} {high - y / POINT:.3f} Td ({shown}) Tj ET")
+    for x, y, text in texts:
+        escaped = text.replace("\\", r"\\").replace("(", r"\(").replace(")", r"\)")
+        lines.append(f"BT /F1 8 Tf {x / POINT:.3f} {height - y / POINT:.3f} Td ({escaped}) Tj ET")
     content = "\n".join(lines).encode("latin-1", "replace")
     objects = [
         b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
         b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
-        f"<< /Type /Page /Parent 2 0 R /MediaBox [0 0 {wide:.4f} {high:.4f}] /Contents 4 0 R "
+        f"<< /Type /Page /Parent 2 0 R /MediaBox [0 0 {width:.4f} {height:.4f}] /Contents 4 0 R "
         "/Resources << /Font << /F1 5 0 R >> >> >>".encode(),
         f"<< /Length {len(content)} >>\nstream\n".encode() + content + b"\nendstream",
         b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica /Encoding /WinAnsiEncoding >>",
     ]
-    result, places = b"%PDF-1.4\n", []
-    for number, each in enumerate(objects, 1):
-        places.append(len(result))
-        result += f"{number} 0 obj\n".encode() + each + b"\nendobj\n"
-    table = "".join(f"{place:010d} 00000 n \n" for place in places)
+    result, offsets = b"%PDF-1.4\n", []
+    for number, object_bytes in enumerate(objects, 1):
+        offsets.append(len(result))
+        result += f"{number} 0 obj\n".encode() + object_bytes + b"\nendobj\n"
+    table = "".join(f"{offset:010d} 00000 n \n" for offset in offsets)
     tail = f"xref\n0 {len(objects) + 1}\n0000000000 65535 f \n{table}"
     tail += f"trailer\n<< /Size {len(objects) + 1} /Root 1 0 R >>\nstartxref\n{len(result)}\n%%EOF\n"
     return result + tail.encode()
@@ -151,18 +153,18 @@ def _page(board: Board, size: tuple[float, float]) -> tuple[np.ndarray, list[tup
     left, top = 0.5 * (size[0] - board.extent[0]), 0.5 * (size[1] - RULER - board.extent[1])
     boxes = _black(board) + np.array([left, top, 0.0, 0.0])
     length = 0.01 * int(100 * min(board.extent[0], 0.2) + 1e-9)
-    base, thin = size[1] - EDGE - 0.006, 0.0002
-    ticks = [[left - thin / 2, base, length + thin, thin]]
+    base, line_width = size[1] - EDGE - 0.006, 0.0002
+    ticks = [[left - line_width / 2, base, length + line_width, line_width]]
     for millimetre in range(round(1e3 * length) + 1):
-        tall = 0.004 if millimetre % 10 == 0 else 0.003 if millimetre % 5 == 0 else 0.002
-        ticks.append([left + 1e-3 * millimetre - thin / 2, base - tall, thin, tall])
+        tick_height = 0.004 if millimetre % 10 == 0 else 0.003 if millimetre % 5 == 0 else 0.002
+        ticks.append([left + 1e-3 * millimetre - line_width / 2, base - tick_height, line_width, tick_height])
     advice = f"{board.words}, {board.dictionary}: print at 100 %, measure, put it into board.toml"
-    words = [
+    texts = [
         (left, base + 0.0035, "0"),
         (left + length - 0.006, base + 0.0035, f"{1e3 * length:.0f} mm"),
         (left + 0.008, base + 0.0035, advice),
     ]
-    return np.concatenate([boxes, ticks]), words
+    return np.concatenate([boxes, ticks]), texts
 
 
 def make(
@@ -194,25 +196,31 @@ def make(
     min_square = 1.0  # side of a square [mm]
     if square < min_square:
         raise UsageError(f"--square {square:g}: a square of {square:g} mm cannot be printed; --square is in mm")
-    usual, share, across = USUAL[kind]
-    between = (share * square if marker is None else marker) / 1e3
-    stated = {"kind": kind, "columns": columns or across, "rows": rows, "square": square / 1e3, "marker": between}
-    made = parse(Board, stated | {"dictionary": words or usual}, "impossible board")
-    if (count := len(corners(made))) < MIN_CORNERS:
-        raise UsageError(f"a {made.words} has {count} corners, an image needs {MIN_CORNERS}: take more squares")
-    size = page_size(made, (paper or "").lower())
-    there = out / BOARD
-    if not overwrite and there.exists() and not _as_printed(out):
+    default_dictionary, share, default_columns = USUAL[kind]
+    marker_size = (share * square if marker is None else marker) / 1e3
+    table = {
+        "kind": kind,
+        "columns": columns or default_columns,
+        "rows": rows,
+        "square": square / 1e3,
+        "marker": marker_size,
+    }
+    board = parse(Board, table | {"dictionary": words or default_dictionary}, "impossible board")
+    if (count := len(corners(board))) < MIN_CORNERS:
+        raise UsageError(f"a {board.words} has {count} corners, an image needs {MIN_CORNERS}: take more squares")
+    size = page_size(board, (paper or "").lower())
+    board_file = out / BOARD
+    if not overwrite and board_file.exists() and not _as_printed(out):
         raise UsageError(
-            f"{there} was changed after printing (measured squares?) or describes another board; nothing was written. "
-            "Take another folder (--out), or give --overwrite"
+            f"{board_file} was changed after printing (measured squares?) or describes another board; nothing was "
+            "written. Take another folder (--out), or give --overwrite"
         )
-    files.write(out / "board.pdf", pdf(made, size))
-    files.write(out / "board.svg", svg(made, size))
-    write_board(made, out / BOARD)
-    wide, high = (round(1e3 * length) for length in size)
+    files.write(out / "board.pdf", pdf(board, size))
+    files.write(out / "board.svg", svg(board, size))
+    write_board(board, out / BOARD)
+    width, height = (round(1e3 * length) for length in size)
     return [
-        f"{made.words}, {len(corners(made))} corners, on a page of {wide} x {high} mm: {out / 'board.pdf'}",
+        f"{board.words}, {len(corners(board))} corners, on a page of {width} x {height} mm: {out / 'board.pdf'}",
         "print it at 100 % (not fitted to the page), check the ruler, glue it onto glass or aluminium; then measure "
         f"several squares together and put the size of one into {out / BOARD}: the robot's lengths get their "
         "scale from it",
@@ -222,11 +230,11 @@ def make(
 def _as_printed(out: Path) -> bool:
     """Return whether a folder's ``board.toml`` is unchanged since `make` wrote it with ``board.svg``."""
     try:
-        found, drawn = read_board(out), (out / "board.svg").read_bytes()
+        board, drawn = read_board(out), (out / "board.svg").read_bytes()
         sizes = []
         for paper in ("", *PAPERS):
             with suppress(UsageError):  # a paper that it does not fit onto
-                sizes.append(page_size(found, paper))
-        return any(svg(found, size).encode() == drawn for size in dict.fromkeys(sizes))
+                sizes.append(page_size(board, paper))
+        return any(svg(board, size).encode() == drawn for size in dict.fromkeys(sizes))
     except (OSError, ValueError, CalibError):
         return False

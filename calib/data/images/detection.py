@@ -38,20 +38,22 @@ def detect(image: np.ndarray, board: Board, thorough: bool = True) -> Detection:
     factor = min(1.0, np.sqrt(max_pixels / image.size))
     coarse = image if factor == 1.0 else cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     scale = np.array(image.shape[::-1]) / np.array(coarse.shape[::-1])
-    ids, found = _coarse(coarse, board)
+    ids, pixels = _coarse(coarse, board)
     if len(ids) < MIN_CORNERS and factor < 1.0:
-        ids, found, scale = *_coarse(image, board), np.ones(2)
-    found = (found + 0.5) * scale - 0.5
-    none = Detection(np.full((len(table), 2), np.nan), np.full(len(table), np.nan))
+        ids, pixels, scale = *_coarse(image, board), np.ones(2)
+    pixels = (pixels + 0.5) * scale - 0.5
+    no_detection = Detection(np.full((len(table), 2), np.nan), np.full(len(table), np.nan))
     if len(ids) < min(MIN_CORNERS, len(table)):
-        return replace(none, problem=_absent(image, coarse, board, len(ids), thorough))
-    ids, found, spacing = _consistent(ids, found, table, board)
-    ids, found = _refined(image, board, ids, found, spacing)
+        return replace(no_detection, problem=_absent(image, coarse, board, len(ids), thorough))
+    ids, pixels, spacing = _consistent(ids, pixels, table, board)
+    ids, pixels = _refined(image, board, ids, pixels, spacing)
     if len(ids) < min(MIN_CORNERS, len(table)):
-        return replace(none, problem=f"only {len(ids)} of {len(table)} corners are sharp enough: blurred, or too small")
-    sigma, edge, motion = _quality(image, found, FLOOR[board.kind], spacing)
-    pixel, sigmas = none.pixel.copy(), none.sigma.copy()
-    pixel[ids], sigmas[ids] = found, sigma
+        return replace(
+            no_detection, problem=f"only {len(ids)} of {len(table)} corners are sharp enough: blurred, or too small"
+        )
+    sigma, edge, motion = _quality(image, pixels, FLOOR[board.kind], spacing)
+    pixel, sigmas = no_detection.pixel.copy(), no_detection.sigma.copy()
+    pixel[ids], sigmas[ids] = pixels, sigma
     problem = ""
     if edge > BLURRED:
         cause = "the arm was still moving" if motion > MOVED else "out of focus, or the arm was still moving"
@@ -66,99 +68,105 @@ def _coarse(image: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray]:
     nothing = np.zeros(0, dtype=int), np.zeros((0, 2))
     if board.kind == "chessboard":
         inner = board.columns - 1, board.rows - 1
-        done, found = cv2.findChessboardCornersSB(image, inner, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
+        done, pixels = cv2.findChessboardCornersSB(image, inner, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
         if not done:
             return nothing
-        return np.arange(inner[0] * inner[1]), _upright(image, found.reshape(-1, 2), board)
+        return np.arange(inner[0] * inner[1]), _upright(image, pixels.reshape(-1, 2), board)
     if board.kind == "charuco":
         with quiet():
-            found, ids, _, _ = cv2.aruco.CharucoDetector(charuco(board)).detectBoard(image)
-        return nothing if ids is None else (ids.ravel(), np.asarray(found).reshape(-1, 2))
+            pixels, ids, _, _ = cv2.aruco.CharucoDetector(charuco(board)).detectBoard(image)
+        return nothing if ids is None else (ids.ravel(), np.asarray(pixels).reshape(-1, 2))
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    found, ids, _ = cv2.aruco.ArucoDetector(dictionary(board.dictionary), parameters).detectMarkers(image)
+    pixels, ids, _ = cv2.aruco.ArucoDetector(dictionary(board.dictionary), parameters).detectMarkers(image)
     if ids is None:
         return nothing
-    known = [(int(tag), place.reshape(4, 2)) for tag, place in zip(ids.ravel(), found) if tag < board.tags]
-    if not known:
+    tags = [
+        (int(tag), corners_of_tag.reshape(4, 2)) for tag, corners_of_tag in zip(ids.ravel(), pixels) if tag < board.tags
+    ]
+    if not tags:
         return nothing
-    return np.concatenate([4 * tag + np.arange(4) for tag, _ in known]), np.concatenate([each for _, each in known])
+    return np.concatenate([4 * tag + np.arange(4) for tag, _ in tags]), np.concatenate(
+        [corners_of_tag for _, corners_of_tag in tags]
+    )
 
 
-def _upright(image: np.ndarray, found: np.ndarray, board: Board) -> np.ndarray:
+def _upright(image: np.ndarray, pixels: np.ndarray, board: Board) -> np.ndarray:
     """Return a chessboard's corners, reordered to begin at the upper left black square."""
-    inner = found.reshape(board.rows - 1, board.columns - 1, 2)
+    inner = pixels.reshape(board.rows - 1, board.columns - 1, 2)
 
     def level(a: np.ndarray, b: np.ndarray) -> float:
         x, y = np.clip(np.round(0.5 * (a + b)).astype(int), 0, np.array(image.shape[::-1]) - 1)
         return float(image[y, x])
 
     # the square inside the first four corners has the colour of the upper left one
-    return found if level(inner[0, 0], inner[1, 1]) < level(inner[-1, -1], inner[-2, -2]) else found[::-1]
+    return pixels if level(inner[0, 0], inner[1, 1]) < level(inner[-1, -1], inner[-2, -2]) else pixels[::-1]
 
 
 def _consistent(
-    ids: np.ndarray, found: np.ndarray, table: np.ndarray, board: Board
+    ids: np.ndarray, pixels: np.ndarray, table: np.ndarray, board: Board
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the corners consistent with a plane, and the side of a square [px]."""
-    plane = cv2.findHomography(table[ids, :2], found, cv2.RANSAC, 8.0)[0]
+    plane = cv2.findHomography(table[ids, :2], pixels, cv2.RANSAC, 8.0)[0]
     if plane is None:
-        return ids[:0], found[:0], 1.0
+        return ids[:0], pixels[:0], 1.0
     mapped = cv2.perspectiveTransform(table[ids, None, :2].astype(np.float64), plane)[:, 0]
-    beside = cv2.perspectiveTransform((table[ids, None, :2] + [board.square, 0.0]).astype(np.float64), plane)[:, 0]
+    right = cv2.perspectiveTransform((table[ids, None, :2] + [board.square, 0.0]).astype(np.float64), plane)[:, 0]
     below = cv2.perspectiveTransform((table[ids, None, :2] + [0.0, board.square]).astype(np.float64), plane)[:, 0]
-    sides = np.stack([np.linalg.norm(each - mapped, axis=1) for each in (beside, below)])
-    good = np.linalg.norm(mapped - found, axis=1) < 0.5 * sides.min(axis=0)
-    return ids[good], found[good], float(np.percentile(sides.min(axis=0), 20))
+    sides = np.stack([np.linalg.norm(neighbours - mapped, axis=1) for neighbours in (right, below)])
+    consistent = np.linalg.norm(mapped - pixels, axis=1) < 0.5 * sides.min(axis=0)
+    return ids[consistent], pixels[consistent], float(np.percentile(sides.min(axis=0), 20))
 
 
 def _refined(
-    image: np.ndarray, board: Board, ids: np.ndarray, found: np.ndarray, spacing: float
+    image: np.ndarray, board: Board, ids: np.ndarray, pixels: np.ndarray, spacing: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the corners refined to sub-pixels; corners at the image's edge or without convergence are dropped."""
     free = {"charuco": 0.5 * (1.0 - board.marker / board.square), "chessboard": 0.3, "apriltag": 0.09}[board.kind]
     half = int(np.clip(free * spacing, 2, 12))
-    inside = ((found > half + 2) & (found < np.array(image.shape[::-1]) - half - 3)).all(axis=1)
-    ids, found = ids[inside], found[inside]
+    interior = ((pixels > half + 2) & (pixels < np.array(image.shape[::-1]) - half - 3)).all(axis=1)
+    ids, pixels = ids[interior], pixels[interior]
     if not len(ids):
-        return ids, found
+        return ids, pixels
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
-    start = found.astype(np.float32).reshape(-1, 1, 2)
+    start = pixels.astype(np.float32).reshape(-1, 1, 2)
     better = cv2.cornerSubPix(image, start.copy(), (half, half), (-1, -1), criteria).reshape(-1, 2)
-    near = np.linalg.norm(better - found, axis=1) < max(2.0, 0.1 * spacing)
-    return ids[near], better[near].astype(float)
+    converged = np.linalg.norm(better - pixels, axis=1) < max(2.0, 0.1 * spacing)
+    return ids[converged], better[converged].astype(float)
 
 
-def _quality(image: np.ndarray, found: np.ndarray, floor: float, spacing: float) -> tuple[np.ndarray, float, float]:
+def _quality(image: np.ndarray, pixels: np.ndarray, floor: float, spacing: float) -> tuple[np.ndarray, float, float]:
     """Return each corner's σ (n,) [px], the median edge width [px], and its ratio between the two directions."""
     max_half_width = 9  # half width of the patches that quality is measured in [px]
     half = int(np.clip(0.15 * spacing, 3, max_half_width))
     offsets = np.arange(-half, half + 1)
-    middle = np.round(found).astype(int)
+    middle = np.round(pixels).astype(int)
     rows = np.clip(middle[:, 1, None] + offsets, 0, image.shape[0] - 1)
     columns = np.clip(middle[:, 0, None] + offsets, 0, image.shape[1] - 1)
     patch = image[rows[:, :, None], columns[:, None, :]].astype(float)
-    down, across = np.gradient(patch, axis=(1, 2))
+    vertical, horizontal = np.gradient(patch, axis=(1, 2))
     flat = patch.reshape(len(patch), -1)
     contrast = np.percentile(flat, 95, axis=1) - np.percentile(flat, 5, axis=1)
     second = patch[:, :, 2:] - 2 * patch[:, :, 1:-1] + patch[:, :, :-2]
     noise = max(float(np.percentile(np.abs(second), 30)) / (0.3853 * np.sqrt(6.0)), 0.3)  # 30 %: where nothing is
-    tensor = np.stack([(across**2).sum((1, 2)), (across * down).sum((1, 2)), (down**2).sum((1, 2))], axis=1)
+    tensor = np.stack(
+        [(horizontal**2).sum((1, 2)), (horizontal * vertical).sum((1, 2)), (vertical**2).sum((1, 2))], axis=1
+    )
     determinant = np.maximum(tensor[:, 0] * tensor[:, 2] - tensor[:, 1] ** 2, 1e-9)
     bound = noise * np.sqrt(0.5 * (tensor[:, 0] + tensor[:, 2]) / determinant)
-    widths = np.array([_widths(g, h, c) for g, h, c in zip(across, down, contrast)])
+    widths = np.array([_widths(g, h, c) for g, h, c in zip(horizontal, vertical, contrast)])
     return np.hypot(floor, bound), float(np.median(widths)), float(np.median(widths.max(1) / widths.min(1)))
 
 
-def _widths(across: np.ndarray, down: np.ndarray, contrast: float) -> tuple[float, float]:
+def _widths(horizontal: np.ndarray, vertical: np.ndarray, contrast: float) -> tuple[float, float]:
     """Return the widths [px] of the two edges crossing in a patch: contrast divided by each steepest gradient."""
-    size = np.hypot(across, down)
+    size = np.hypot(horizontal, vertical)
     best = np.unravel_index(int(np.argmax(size)), size.shape)
-    normal = np.array([across[best], down[best]]) / max(float(size[best]), 1e-9)
-    aside = np.abs(across * normal[0] + down * normal[1]) < 0.7 * size
-    other = float(np.percentile(size[aside], 98)) if aside.any() else float(size[best])
-    own = float(np.percentile(size[~aside], 98))
-    return contrast / max(own, 1e-3), contrast / max(other, 1e-3)
+    normal = np.array([horizontal[best], vertical[best]]) / max(float(size[best]), 1e-9)
+    is_across = np.abs(horizontal * normal[0] + vertical * normal[1]) < 0.7 * size
+    cross_gradient = float(np.percentile(size[is_across], 98)) if is_across.any() else float(size[best])
+    main_gradient = float(np.percentile(size[~is_across], 98))
+    return contrast / max(main_gradient, 1e-3), contrast / max(cross_gradient, 1e-3)
 
 
 def _absent(image: np.ndarray, coarse: np.ndarray, board: Board, count: int, thorough: bool) -> str:
@@ -173,13 +181,14 @@ def _absent(image: np.ndarray, coarse: np.ndarray, board: Board, count: int, tho
         if len(_coarse(np.ascontiguousarray(coarse[:, ::-1]), board)[0]) >= MIN_CORNERS:
             return "the board is seen mirrored: is the image flipped, or seen in a mirror? Save it unflipped"
         if board.kind != "chessboard":
-            if (seen := _markers(coarse, board.dictionary)) >= MIN_MARKERS:
+            marker_count = _markers(coarse, board.dictionary)
+            if marker_count >= MIN_MARKERS:
                 return (
-                    f"{seen} markers of {board.dictionary} are seen, but not where board.toml has them: are kind, "
-                    "columns and rows (squares, not inner corners) those of the print?"
+                    f"{marker_count} markers of {board.dictionary} are seen, but not where board.toml has them: are "
+                    "kind, columns and rows (squares, not inner corners) those of the print?"
                 )
-            if other := _other_dictionary(coarse, board):
-                return f"no markers of {board.dictionary}, but some of {other}: state it in board.toml"
+            if other_name := _other_dictionary(coarse, board):
+                return f"no markers of {board.dictionary}, but some of {other_name}: state it in board.toml"
     width = _sharpest(coarse)
     if width > 3.5:
         return f"no board found; the image's sharpest edges are {width:.0f} px wide: out of focus, or still moving"
@@ -188,10 +197,10 @@ def _absent(image: np.ndarray, coarse: np.ndarray, board: Board, count: int, tho
 
 def _other_dictionary(image: np.ndarray, board: Board) -> str:
     """Return the name of the dictionary with the most detected markers; "" if hardly any are detected."""
-    own = board.dictionary.split("_")[0]
-    others = [each for each in DICTIONARIES if each.endswith("_100") or each.startswith("apriltag_36h11")]
-    counts = {each: _markers(image, each) for each in others if each.split("_")[0] != own}
-    best = max(counts, key=lambda each: counts[each])
+    family = board.dictionary.split("_")[0]
+    candidates = [name for name in DICTIONARIES if name.endswith("_100") or name.startswith("apriltag_36h11")]
+    counts = {name: _markers(image, name) for name in candidates if name.split("_")[0] != family}
+    best = max(counts, key=lambda name: counts[name])
     return best if counts[best] >= MIN_MARKERS else ""
 
 
@@ -204,9 +213,9 @@ def _markers(image: np.ndarray, name: str) -> int:
 def _sharpest(image: np.ndarray) -> float:
     """Return the width of the sharpest edges of an image [px]: its contrast over its steepest gradients."""
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 0.8)
-    across, down = cv2.Sobel(smooth, cv2.CV_32F, 1, 0) / 8.0, cv2.Sobel(smooth, cv2.CV_32F, 0, 1) / 8.0
+    horizontal, vertical = cv2.Sobel(smooth, cv2.CV_32F, 1, 0) / 8.0, cv2.Sobel(smooth, cv2.CV_32F, 0, 1) / 8.0
     low, high = np.percentile(smooth, [1, 99.5])
-    return float((high - low) / max(float(np.percentile(np.hypot(across, down), 99.9)), 1e-3))
+    return float((high - low) / max(float(np.percentile(np.hypot(horizontal, vertical), 99.9)), 1e-3))
 
 
 def detected(
@@ -219,26 +228,26 @@ def detected(
 
     Images of another size than most are of no use: a camera's lens is that of one size.
     """
-    result, sizes, useless = dict[str, Detection](), dict[str, tuple[int, int]](), 0
+    result, sizes, failures = dict[str, Detection](), dict[str, tuple[int, int]](), 0
     blank = np.full((len(corners(board)), 2), np.nan)
     max_examined = 3  # useless images that are looked into for the reason, unless it is found
-    for number, (name, each) in enumerate(images):
+    for number, (name, source) in enumerate(images):
         if progress:
             progress(number, count, name)
         try:
-            image = read_image(each) if isinstance(each, Path) else each
+            image = read_image(source) if isinstance(source, Path) else source
         except MeasurementError as error:
-            result[name] = Detection(blank, blank[:, 0], str(error).removeprefix(f"{each}: "))
+            result[name] = Detection(blank, blank[:, 0], str(error).removeprefix(f"{source}: "))
             continue
         sizes[name] = image.shape[1], image.shape[0]
-        result[name] = detect(image, board, thorough=useless < max_examined)
-        useless += result[name].problem.startswith("no board found")
+        result[name] = detect(image, board, thorough=failures < max_examined)
+        failures += result[name].problem.startswith("no board found")
     if not sizes:
         return Found(result)
-    usual = Counter(sizes.values()).most_common(1)[0][0]
+    usual_size = Counter(sizes.values()).most_common(1)[0][0]
     for name, size in sizes.items():
-        if size != usual:
-            turned = "; did a program rotate it?" if size == usual[::-1] else ""
-            words = f"{size[0]} x {size[1]} pixels, where most are {usual[0]} x {usual[1]}{turned}"
-            result[name] = Detection(blank, blank[:, 0], words)
-    return Found(result, usual)
+        if size != usual_size:
+            hint = "; did a program rotate it?" if size == usual_size[::-1] else ""
+            problem = f"{size[0]} x {size[1]} pixels, where most are {usual_size[0]} x {usual_size[1]}{hint}"
+            result[name] = Detection(blank, blank[:, 0], problem)
+    return Found(result, usual_size)

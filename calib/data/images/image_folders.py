@@ -33,7 +33,10 @@ from calib.data.poses.fit_options import FileOptions
 from calib.data.schema import Joints
 from calib.errors import CalibError, MeasurementError, UsageError, counted, listing, require
 
-MEASURED = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?![\w.]*_)")  # a number, no part of a name
+# A number that is no part of a name.
+MEASURED = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?![\w.]*_)")
+# Usable images below which a folder is refused.
+MIN_IMAGES = 3
 Progress = Callable[[int, int, str], None]
 
 
@@ -55,30 +58,35 @@ def read_images(
     Raises:
         MeasurementError: where a file is missing or cannot be, or no three images are of use.
     """
-    path, robot, options = Path(path), Joints.of(joints), options or FileOptions()
+    path = Path(path)
+    robot = Joints.of(joints)
+    options = options or FileOptions()
     board = read_own_board(path)
     table = joint_table(path)
     sheet = Sheet(table, options)
     q, columns = sheet.joints(robot.names)
     notes = list(plausible.check_joints(q, sheet, columns, robot))
-    found = find_corners(path, board, table.texts("image"), progress)
     names = table.texts("image")
-    rows, said = _usable(names, found, path)
-    notes += said
-    lens, known = _own_lens(path, found.size, options)
-    detected = [found.images[names[row]] for row in rows]
+    detection = find_corners(path, board, names, progress)
+    rows, detection_notes = _usable(names, detection, path)
+    notes += detection_notes
+    lens, lens_stated = _own_lens(path, detection.size, options)
+    usable = [detection.images[names[row]] for row in rows]
+    size = detection.size
+    if not size[0]:
+        size = lens.size if lens else (0, 0)
     return Pixels(
         q[rows],
         columns,
-        np.array([one.pixel for one in detected]),
+        np.array([image.pixel for image in usable]),
         board,
         lens,
         mounting=options.camera.mounting.replace("auto", ""),
-        sigma=np.array([one.sigma for one in detected]),
+        sigma=np.array([image.sigma for image in usable]),
         names=tuple(names),
-        size=found.size if found.size[0] else (lens.size if lens else (0, 0)),
-        known=known,
-        free=_free(options, known),
+        size=size,
+        known=lens_stated,
+        free=_free(options, lens_stated),
         model=options.camera.model,
         tool_names=(options.tool,),
         station=options.station or path.name,
@@ -94,20 +102,20 @@ def read_own_board(path: Path) -> Board:
     Raises:
         MeasurementError: where there is none.
     """
-    words = f"has no {BOARD}, which describes the board: copy the one that calib board wrote into it"
-    require((path / BOARD).is_file(), words, MeasurementError, path)
+    message = f"has no {BOARD}, which describes the board: copy the one that calib board wrote into it"
+    require((path / BOARD).is_file(), message, MeasurementError, path)
     return read_board(path)
 
 
 def joint_table(path: Path) -> Table:
     """Return the table of the folder's ``joints.csv``."""
-    place = path / JOINTS
-    words = f"has no {JOINTS}: a table of image, q1 [deg] ... is needed, one row per image with its joint values"
-    require(place.is_file(), words, MeasurementError, path)
-    table = read_table(place)
-    names = table.texts("image")
-    if twice := [name for name, count in Counter(names).items() if count > 1]:
-        raise MeasurementError(f"'{twice[0]}' occurs {names.count(twice[0])} times", place, column="image")
+    file = path / JOINTS
+    message = f"has no {JOINTS}: a table of image, q1 [deg] ... is needed, one row per image with its joint values"
+    require(file.is_file(), message, MeasurementError, path)
+    table = read_table(file)
+    for name, count in Counter(table.texts("image")).items():
+        if count > 1:
+            raise MeasurementError(f"'{name}' occurs {count} times", file, column="image")
     return table
 
 
@@ -123,40 +131,43 @@ def find_corners(path: Path, board: Board, names: Sequence[str], progress: Progr
     stored = path / CORNERS
     images = [path / name for name in names if (path / name).is_file()]
     if stored.is_file():
-        newest = max((each.stat().st_mtime for each in (*images, path / BOARD)), default=0.0)
-        kept = read_corners(stored, board)
-        if stored.stat().st_mtime >= newest and {each.name for each in images} <= set(kept.images):
-            return kept
+        newest = max(file.stat().st_mtime for file in (*images, path / BOARD))
+        detection = read_corners(stored, board)
+        all_stored = {image.name for image in images} <= set(detection.images)
+        if all_stored and stored.stat().st_mtime >= newest:
+            return detection
     if not images:
-        missing = f"'{names[0]}' and the others" if len(names) > 1 else f"'{names[0]}'" if names else "images"
+        missing = "images"
+        if names:
+            missing = f"'{names[0]}' and the others" if len(names) > 1 else f"'{names[0]}'"
         raise MeasurementError(f"none of the images named in {JOINTS} exists ({missing})", path)
-    from calib.data.images.detection import detected  # loads OpenCV: only where images are looked at
+    # Loads OpenCV: only where images are looked at.
+    from calib.data.images.detection import detected
 
-    found = detected(((each.name, each) for each in images), board, len(images), progress)
-    with suppress(CalibError):  # a folder that cannot be written into is read all the same
-        write_corners(stored, found)
-    return found
+    detection = detected(((image.name, image) for image in images), board, len(images), progress)
+    # A folder that cannot be written into is read all the same.
+    with suppress(CalibError):
+        write_corners(stored, detection)
+    return detection
 
 
-def _usable(names: Sequence[str], found: Found, path: Path, min_images: int = 3) -> tuple[np.ndarray, list[str]]:
-    """Return the table's rows whose images are usable, and sentences on the others.
-
-    `min_images`: usable images below which a folder is refused.
-    """
-    missing = [name for name in names if name not in found.images]
-    problems = {name: found.images[name].problem for name in names if name in found.images}
+def _usable(names: Sequence[str], detection: Found, path: Path) -> tuple[np.ndarray, list[str]]:
+    """Return the table's rows whose images are usable, and sentences on the others."""
+    missing = [name for name in names if name not in detection.images]
+    problems = {name: detection.images[name].problem for name in names if name in detection.images}
     rows = np.array([k for k, name in enumerate(names) if problems.get(name) == ""], dtype=int)
     notes = []
     if missing:
         notes.append(f"{len(missing)} of {len(names)} rows have no image: {listing(missing, 5)}")
-    if extra := sorted(set(found.images) - set(names)):
+    extra = sorted(set(detection.images) - set(names))
+    if extra:
         notes.append(f"{len(extra)} images have no row in {JOINTS}: {listing(extra, 5)}")
     notes += problem_words(problems)
-    if len(rows) < min_images:
-        why = "; ".join(notes) or "there are no more rows"
+    if len(rows) < MIN_IMAGES:
+        reasons = "; ".join(notes) or "there are no more rows"
         raise MeasurementError(
             f"{counted(len(rows), 'usable image')}: a calibration takes 20 to 40 from all "
-            f"around, at least {min_images} ({why})",
+            f"around, at least {MIN_IMAGES} ({reasons})",
             path,
         )
     return rows, notes
@@ -169,36 +180,39 @@ def problem_words(problems: Mapping[str, str]) -> list[str]:
         if problem:
             reasons.setdefault(MEASURED.sub("#", problem), []).append(name)
     result = []
-    for reason, own in reasons.items():
-        for each in zip(*(MEASURED.findall(problems[name]) for name in own)):
-            low, high = min(each, key=float), max(each, key=float)
-            reason = reason.replace("#", low if low == high else f"{low} to {high}", 1)
-        result.append(f"{len(own)} image{'s are' if len(own) > 1 else ' is'} not usable ({reason}): {listing(own, 5)}")
+    for reason, names in reasons.items():
+        numbers = [MEASURED.findall(problems[name]) for name in names]
+        for numerals in zip(*numbers):
+            low, high = min(numerals, key=float), max(numerals, key=float)
+            number_range = low if low == high else f"{low} to {high}"
+            reason = reason.replace("#", number_range, 1)
+        images = "images are" if len(names) > 1 else "image is"
+        result.append(f"{len(names)} {images} not usable ({reason}): {listing(names, 5)}")
     return result
 
 
 def _own_lens(path: Path, size: tuple[int, int], options: FileOptions) -> tuple[Lens | None, bool]:
     """Return the folder's lens and whether it was given; None if the lens must be estimated from the images."""
-    place = path / LENS
-    if not place.is_file():
+    file = path / LENS
+    if not file.is_file():
         if options.camera.intrinsics == "given":
             raise MeasurementError(f"has no {LENS}, required by intrinsics = 'given'", path)
         return None, False
-    lens = read_lens(place)
+    lens = read_lens(file)
     if size[0] and lens.size != size:
         raise MeasurementError(
-            f"is for images of {lens.size[0]} x {lens.size[1]} pixels, the images here have {size[0]} x {size[1]}",
-            place,
+            f"is for images of {lens.size[0]} x {lens.size[1]} pixels, the images here have {size[0]} x {size[1]}", file
         )
     return lens, True
 
 
-def _free(options: FileOptions, known: bool) -> tuple[str, ...]:
+def _free(options: FileOptions, lens_stated: bool) -> tuple[str, ...]:
     """Return the names of the lens and board parameters that the options ask to fit."""
-    camera, result = options.camera, list[str]()
-    if camera.intrinsics == "fit" or (camera.intrinsics == "auto" and not known):
-        own = {"pinhole": ("k1", "k2", "p1", "p2"), "fisheye": ("k1", "k2", "k3", "k4")}[camera.model]
-        result += ["fx", "fy", "cx", "cy", *own]
+    camera = options.camera
+    result: list[str] = []
+    if camera.intrinsics == "fit" or (camera.intrinsics == "auto" and not lens_stated):
+        distortion = {"pinhole": ("k1", "k2", "p1", "p2"), "fisheye": ("k1", "k2", "k3", "k4")}
+        result += ["fx", "fy", "cx", "cy", *distortion[camera.model]]
     if "scale" in camera.board:
         result.append("scale")
     if "bend" in camera.board:
@@ -209,9 +223,12 @@ def _free(options: FileOptions, known: bool) -> tuple[str, ...]:
 def look(folder: Path, show: Callable[[str], None]) -> list[str]:
     """Return a summary of the corner detection in a folder of images, as sentences."""
     board = read_own_board(folder)
-    names = joint_table(folder).texts("image") if (folder / JOINTS).exists() else _images(folder)
-    found = find_corners(folder, board, names, lambda done, total, name: show(f"{done} of {total}: {name}"))
-    return detection_summary(found, board, names)
+    if (folder / JOINTS).exists():
+        names = joint_table(folder).texts("image")
+    else:
+        names = _images(folder)
+    detection = find_corners(folder, board, names, lambda done, total, name: show(f"{done} of {total}: {name}"))
+    return detection_summary(detection, board, names)
 
 
 def _images(folder: Path) -> list[str]:
@@ -222,24 +239,27 @@ def _images(folder: Path) -> list[str]:
     return names
 
 
-def detection_summary(found: Found, board: Board, names: Iterable[str]) -> list[str]:
+def detection_summary(detection: Found, board: Board, names: Iterable[str]) -> list[str]:
     """Return sentences on detected corners: how many images are usable, why others are not, what they cover.
 
     Raises:
         MeasurementError: where none is of use, with the reasons.
     """
-    kept = [one for one in found.images.values() if not one.problem]
+    usable = [image for image in detection.images.values() if not image.problem]
     total = len(corners(board))
-    problems = problem_words({name: one.problem for name, one in found.images.items()})
-    if not kept:
-        raise MeasurementError("; ".join([f"none of {len(list(names))} images is usable ({board.words})", *problems]))
-    seen = np.array([one.seen.sum() for one in kept])
-    sigma = float(np.nanmedian(np.concatenate([one.sigma[one.seen] for one in kept])))
-    edge = float(np.nanmedian([one.edge for one in kept]))
+    count = len(list(names))
+    problems = problem_words({name: image.problem for name, image in detection.images.items()})
+    if not usable:
+        raise MeasurementError("; ".join([f"none of {count} images is usable ({board.words})", *problems]))
+    corner_counts = np.array([image.seen.sum() for image in usable])
+    sigma = float(np.nanmedian(np.concatenate([image.sigma[image.seen] for image in usable])))
+    edge = float(np.nanmedian([image.edge for image in usable]))
+    quality = f"each to about {sigma:.2f} px; edges {edge:.1f} px wide"
     lines = [
-        f"{len(kept)} of {len(list(names))} images are usable ({board.words})",
-        f"{seen.mean():.1f} of {total} corners per image, each to about {sigma:.2f} px; edges {edge:.1f} px wide",
+        f"{len(usable)} of {count} images are usable ({board.words})",
+        f"{corner_counts.mean():.1f} of {total} corners per image, {quality}",
     ]
-    if found.size[0]:
-        lines.append(coverage_words(np.concatenate([one.pixel[one.seen] for one in kept]), found.size))
+    if detection.size[0]:
+        pixels = np.concatenate([image.pixel[image.seen] for image in usable])
+        lines.append(coverage_words(pixels, detection.size))
     return [*lines, *problems]

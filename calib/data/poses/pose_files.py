@@ -358,9 +358,9 @@ def _position(sheet: Sheet, names: Sequence[str], gaps: bool) -> np.ndarray:
 def _sigma(sheet: Sheet, layout: Layout, visible: np.ndarray) -> np.ndarray | None:
     """Return sigmas (m, targets, 3) [m] from the columns, else from the options, else None."""
     options = sheet.options.sigma
-    if not layout.sigmas and options.position is None:
-        return None
     if not layout.sigmas:
+        if options.position is None:
+            return None
         return np.tile(options.position, (*visible.shape, 1))
     stack = []
     for k, names in enumerate(layout.sigmas):

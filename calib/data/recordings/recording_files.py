@@ -57,7 +57,7 @@ def read_log(path: Path, joints: Joints | None, options: RecordingOptions, ends:
     table.check(headings, headings)
 
     kind = "current" if "current" in columns_of else "torque"
-    series: dict[str, np.ndarray] = {}
+    series: dict[str, Any] = {}
     for name, columns in columns_of.items():
         if name != "t":
             values = [_values(table, column, name, options) for column in columns]

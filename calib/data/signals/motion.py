@@ -234,7 +234,7 @@ def make_motion(
         raise filtering.too_short(int(mask.sum()), decimator)
 
     rows = _span(mask)
-    series: dict[str, np.ndarray] = {}
+    series: dict[str, Any] = {}
     for name, values in sampled.series.items():
         if name != "q":
             series["v_measured" if name == "v" else name] = read_only(values[rows])

@@ -11,6 +11,7 @@ tendons that tie joints of the arm.
 """
 
 from importlib import import_module
+from itertools import chain, combinations_with_replacement
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -20,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.errors import RobotError, refuse_robot
 from calib.robot.formats.urdf_tree import UNLIMITED
-from calib.robot.formats.urdf_write import add_joint, numbers_text, xml_text
+from calib.robot.formats.urdf_write import MOMENTS, add_joint, numbers_text, xml_text
 from calib.transforms import from_quaternion, invert, pose
 
 WORLD = "world"
@@ -38,8 +39,8 @@ def convert(path: str) -> str:
     try:
         mujoco: Any = import_module("mujoco")
     except ImportError:
-        words = "an MJCF file is read by MuJoCo: pip install mujoco (or 'armature-calib[mujoco]')"
-        raise RobotError(f"{path}: {words}") from None
+        advice = "an MJCF file is read by MuJoCo: pip install mujoco (or 'armature-calib[mujoco]')"
+        raise RobotError(f"{path}: {advice}") from None
     try:
         spec = mujoco.MjSpec.from_file(path)
         model = _compiled(spec)
@@ -53,13 +54,14 @@ def _compiled(spec: Any) -> Any:
     try:
         return spec.compile()
     except ValueError as error:
-        if not any(words in str(error) for words in ("opening file", "open file", "resource")):
+        if not any(phrase in str(error) for phrase in ("opening file", "open file", "resource")):
             raise
-    for shape in [one for one in spec.geoms if one.meshname]:
-        spec.delete(shape)
+    for shape in list(spec.geoms):
+        if shape.meshname:
+            spec.delete(shape)
     unused = (spec.meshes, spec.materials, spec.textures, spec.hfields, spec.skins, spec.keys, spec.pairs, spec.sensors)
-    for each in [one for kind in unused for one in kind]:
-        spec.delete(each)
+    for element in list(chain.from_iterable(unused)):
+        spec.delete(element)
     return spec.compile()
 
 
@@ -77,14 +79,16 @@ class _Tree:
         ET.SubElement(self.root, "link", name=WORLD)
         for k in range(1, self.model.nbody):
             self._add_body(k)
-        taken = {*self.bodies}
         for k in range(self.model.nsite):
             name = self.model.site(k).name
-            if name:
-                name = f"{name}_site" if name in taken else name
-                placed = _pose(self.model.site_pos[k], self.model.site_quat[k])
-                ET.SubElement(self.root, "link", name=name)
-                add_joint(self.root, f"{name}_fixed", "fixed", self.bodies[self.model.site_bodyid[k]], name, placed)
+            if not name:
+                continue
+            if name in self.bodies:
+                name = f"{name}_site"
+            body = self.bodies[self.model.site_bodyid[k]]
+            T_body_site = _pose(self.model.site_pos[k], self.model.site_quat[k])
+            ET.SubElement(self.root, "link", name=name)
+            add_joint(self.root, f"{name}_fixed", "fixed", body, name, T_body_site)
         return xml_text(self.root)
 
     def _add_body(self, k: int) -> None:
@@ -106,70 +110,84 @@ class _Tree:
             parent, placed = child, invert(shift)
         if parent != name:
             add_joint(self.root, f"{name}_fixed", "fixed", parent, name, placed)
-        link, turn = ET.SubElement(self.root, "link", name=name), _pose(model.body_ipos[k], model.body_iquat[k])
+        link = ET.SubElement(self.root, "link", name=name)
+        T_link_inertia = _pose(model.body_ipos[k], model.body_iquat[k])
         inertial = ET.SubElement(link, "inertial")
-        ET.SubElement(inertial, "origin", xyz=numbers_text(turn[:3, 3]), rpy="0 0 0")
+        ET.SubElement(inertial, "origin", xyz=numbers_text(T_link_inertia[:3, 3]), rpy="0 0 0")
         ET.SubElement(inertial, "mass", value=repr(float(model.body_mass[k])))
-        moments = (turn[:3, :3] * model.body_inertia[k]) @ turn[:3, :3].T
-        ET.SubElement(
-            inertial,
-            "inertia",
-            {f"i{'xyz'[a]}{'xyz'[b]}": repr(float(moments[a, b])) for a in range(3) for b in range(a, 3)},
-        )
+        rotation = T_link_inertia[:3, :3]
+        inertia = (rotation * model.body_inertia[k]) @ rotation.T
+        attributes: dict[str, str] = {}
+        for key, (a, b) in zip(MOMENTS, combinations_with_replacement(range(3), 2)):
+            attributes[key] = repr(float(inertia[a, b]))
+        ET.SubElement(inertial, "inertia", attributes)
 
     def _add_joint(self, j: int, parent: str, child: str, placed: np.ndarray) -> None:
         model, name, kinds = self.model, self.joints[j], self.mj.mjtJoint
         kind = kinds(int(model.jnt_type[j]))
         if kind not in (kinds.mjJNT_HINGE, kinds.mjJNT_SLIDE):
-            found = "free" if kind == kinds.mjJNT_FREE else "ball"
+            free_or_ball = "free" if kind == kinds.mjJNT_FREE else "ball"
             advice = "an arm has hinges and slides; give the robot's own file, not a scene with it"
-            refuse_robot(self.where, f"body '{self.bodies[model.jnt_bodyid[j]]}' has a {found} joint; {advice}")
-        slides, axis, ref = kind == kinds.mjJNT_SLIDE, model.jnt_axis[j], model.qpos0[model.jnt_qposadr[j]]
-        back = pose(position=-ref * axis) if slides else pose(Rotation.from_rotvec(-ref * axis))
+            refuse_robot(self.where, f"body '{self.bodies[model.jnt_bodyid[j]]}' has a {free_or_ball} joint; {advice}")
+        slides = kind == kinds.mjJNT_SLIDE
         limited = bool(model.jnt_limited[j])
-        kind = "prismatic" if slides else "revolute" if limited else "continuous"
-        joint, dof = add_joint(self.root, name, kind, parent, child, placed @ back), model.jnt_dofadr[j]
+        axis = model.jnt_axis[j]
+        # Back from the reference position, at which MuJoCo's frames stand.
+        displacement = -model.qpos0[model.jnt_qposadr[j]] * axis
+        if slides:
+            urdf_kind = "prismatic"
+            motion = pose(position=displacement)
+        else:
+            urdf_kind = "revolute" if limited else "continuous"
+            motion = pose(Rotation.from_rotvec(displacement))
+        joint = add_joint(self.root, name, urdf_kind, parent, child, placed @ motion)
         ET.SubElement(joint, "axis", xyz=numbers_text(axis))
         limits = {"effort": repr(self.efforts.get(j, UNLIMITED)), "velocity": repr(UNLIMITED)}
         if limited or slides:
             low, high = model.jnt_range[j] if limited else (-UNLIMITED, UNLIMITED)
             limits |= {"lower": repr(float(low)), "upper": repr(float(high))}
         ET.SubElement(joint, "limit", limits)
-        damping, friction = (repr(float(one[dof])) for one in (model.dof_damping, model.dof_frictionloss))
+        dof = model.jnt_dofadr[j]
+        damping = repr(float(model.dof_damping[dof]))
+        friction = repr(float(model.dof_frictionloss[dof]))
         ET.SubElement(joint, "dynamics", damping=damping, friction=friction)
         if j in self.leaders:
             ET.SubElement(joint, "mimic", self.leaders[j])
 
     def _efforts(self) -> dict[int, float]:
         """Return the largest force or torque of each joint's actuators with a limit [N m or N]."""
-        model, found = self.model, {}
+        model = self.model
+        efforts = {}
         for k in range(model.nu):
             if model.actuator_trntype[k] == int(self.mj.mjtTrn.mjTRN_JOINT) and model.actuator_forcelimited[k]:
-                most = np.abs(model.actuator_forcerange[k]).max() * abs(model.actuator_gear[k, 0])
-                found[int(model.actuator_trnid[k, 0])] = float(most)
-        return found
+                effort = np.abs(model.actuator_forcerange[k]).max() * abs(model.actuator_gear[k, 0])
+                efforts[int(model.actuator_trnid[k, 0])] = float(effort)
+        return efforts
 
     def _leaders(self) -> dict[int, dict[str, str]]:
         """Return the <mimic> of each joint that an equality ties to another; refuse what closes a loop."""
-        model, kinds, found = self.model, self.mj.mjtEq, {}
+        model = self.model
+        mimics: dict[int, dict[str, str]] = {}
+        tied: set[int] = set()
         for k in range(model.neq):
             name = model.equality(k).name or f"number {k + 1}"
-            one, two = (int(each) for each in (model.eq_obj1id[k], model.eq_obj2id[k]))
-            if model.eq_type[k] != int(kinds.mjEQ_JOINT) or two < 0:
+            follower, leader = int(model.eq_obj1id[k]), int(model.eq_obj2id[k])
+            if model.eq_type[k] != int(self.mj.mjtEq.mjEQ_JOINT) or leader < 0:
                 refuse_robot(self.where, f"equality '{name}' closes a loop; describe such a robot as a parallel one")
             offset, ratio, *higher = model.eq_data[k, :5]
             if any(higher):
                 refuse_robot(
-                    self.where, f"equality '{name}' of '{self.joints[one]}' is no straight line; edit polycoef"
+                    self.where, f"equality '{name}' of '{self.joints[follower]}' is no straight line; edit polycoef"
                 )
-            start, lead = (model.qpos0[model.jnt_qposadr[joint]] for joint in (one, two))
-            shift = repr(float(start + offset - ratio * lead))
-            found[one] = {"joint": self.joints[two], "multiplier": repr(float(ratio)), "offset": shift}
-        tied = {*found, *(self.joints.index(each["joint"]) for each in found.values())}
+            follower_reference = model.qpos0[model.jnt_qposadr[follower]]
+            leader_reference = model.qpos0[model.jnt_qposadr[leader]]
+            urdf_offset = repr(float(follower_reference + offset - ratio * leader_reference))
+            mimics[follower] = {"joint": self.joints[leader], "multiplier": repr(float(ratio)), "offset": urdf_offset}
+            tied |= {follower, leader}
         for k in range(model.nwrap):
             if model.wrap_type[k] != int(self.mj.mjtWrap.mjWRAP_JOINT) or int(model.wrap_objid[k]) not in tied:
                 refuse_robot(self.where, "a tendon moves it, which a serial arm does not have; take it out of the file")
-        return found
+        return mimics
 
 
 def _pose(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:

@@ -46,31 +46,31 @@ def convert(path: str) -> str:
     Raises:
         RobotError: for a file that is none, without a type, or with one that cannot be the file's.
     """
-    file, given = split(path)
+    file, arguments = split(path)
     table = tomllib.loads(shipped_text("calib.robot.descriptions", "universal_robots.toml"))
-    words = f'{file}: say of which type the arm is, in quotes: "{file} {TYPE}:=ur5e" (one of {", ".join(table)})'
-    require({*given} == {TYPE}, words, RobotError)
-    kind = one_of(given[TYPE], table, f"{file}: {TYPE}", RobotError)
+    message = f'{file}: say of which type the arm is, in quotes: "{file} {TYPE}:=ur5e" (one of {", ".join(table)})'
+    require({*arguments} == {TYPE}, message, RobotError)
+    kind = one_of(arguments[TYPE], table, f"{file}: {TYPE}", RobotError)
     nominal, deltas = _nominal(**table[kind]), _deltas(file)
-    frames, plain = _frames(nominal + deltas), _frames(nominal)
-    placed = np.array([_beside(axis, near) for axis, near in zip(frames[:6], plain)])
-    away = float(np.linalg.norm(placed[:, :3, 3] - plain[:6, :3, 3], axis=1).max())
-    if away > FARTHEST:
+    frames, nominal_frames = _frames(nominal + deltas), _frames(nominal)
+    axis_frames = np.array([_beside(axis, near) for axis, near in zip(frames[:6], nominal_frames)])
+    deviation = float(np.linalg.norm(axis_frames[:, :3, 3] - nominal_frames[:6, :3, 3], axis=1).max())
+    if deviation > FARTHEST:
         refuse_robot(
-            file, f"with it the axes of a {kind} are up to {1e3 * away:.0f} mm from their places: another {TYPE}?"
+            file, f"with it the axes of a {kind} are up to {1e3 * deviation:.0f} mm from their places: another {TYPE}?"
         )
     root = ET.Element("robot", name=kind)
     ET.SubElement(root, "link", name="base")
-    parent, before = "base", np.eye(4)
-    for name, frame in zip(JOINTS, placed):
-        joint = add_joint(root, f"{name}_joint", "revolute", parent, f"{name}_link", invert(before) @ frame)
+    parent, previous_frame = "base", np.eye(4)
+    for name, frame in zip(JOINTS, axis_frames):
+        joint = add_joint(root, f"{name}_joint", "revolute", parent, f"{name}_link", invert(previous_frame) @ frame)
         ET.SubElement(root, "link", name=f"{name}_link")
         ET.SubElement(joint, "axis", xyz="0 0 1")
-        turn, free = repr(2.0 * np.pi), repr(UNLIMITED)
-        ET.SubElement(joint, "limit", lower=f"-{turn}", upper=turn, effort=free, velocity=free)
-        parent, before = f"{name}_link", frame
+        turn, unlimited = repr(2.0 * np.pi), repr(UNLIMITED)
+        ET.SubElement(joint, "limit", lower=f"-{turn}", upper=turn, effort=unlimited, velocity=unlimited)
+        parent, previous_frame = f"{name}_link", frame
     ET.SubElement(root, "link", name="tool0")
-    add_joint(root, "flange", "fixed", parent, "tool0", invert(before) @ frames[6])
+    add_joint(root, "flange", "fixed", parent, "tool0", invert(previous_frame) @ frames[6])
     return xml_text(root)
 
 
@@ -85,14 +85,14 @@ def _deltas(path: str) -> np.ndarray:
     """Return the deltas (6, 4) of θ, a, d, α in a file."""
     with refused_as(RobotError, (OSError, UnicodeDecodeError), f"{path}: cannot be read: {{}}"):
         content = Path(path).read_text(encoding="utf-8")
-    found = []
+    rows = []
     for key in KEYS:
         match = re.search(rf"^\s*delta_{key}\s*=\s*\[([^\]]*)\]", content, re.M)
         values = match[1].split(",") if match else []
-        words = f"{path}: is no calibration.conf of a UR: expected delta_{key} = [six numbers], found {len(values)}"
-        require(len(values) == 6, words, RobotError)
-        found.append([number(value.strip(), f"{path}: delta_{key}", error=RobotError) for value in values])
-    result = np.array(found).T
+        message = f"{path}: is no calibration.conf of a UR: expected delta_{key} = [six numbers], found {len(values)}"
+        require(len(values) == 6, message, RobotError)
+        rows.append([number(value.strip(), f"{path}: delta_{key}", error=RobotError) for value in values])
+    result = np.array(rows).T
     require(np.isfinite(result).all(), f"{path}: expected finite numbers", RobotError)
     return result
 
@@ -101,17 +101,17 @@ def _frames(table: np.ndarray) -> np.ndarray:
     """Return the frames (7, 4, 4) of the six axes and of the flange, at q = 0, of a table (6, 4) of θ, a, d, α."""
     result = [np.eye(4)]
     for theta, a, d, alpha in table:
-        around, across = (Rotation.from_euler(axis, angle) for axis, angle in (("z", theta), ("x", alpha)))
-        result.append(result[-1] @ pose(around, [0.0, 0.0, d]) @ pose(across, [a, 0.0, 0.0]))
+        rotation_z, rotation_x = (Rotation.from_euler(axis, angle) for axis, angle in (("z", theta), ("x", alpha)))
+        result.append(result[-1] @ pose(rotation_z, [0.0, 0.0, d]) @ pose(rotation_x, [a, 0.0, 0.0]))
     return np.array(result)
 
 
-def _beside(axis: np.ndarray, near: np.ndarray) -> np.ndarray:
+def _beside(axis: np.ndarray, nominal: np.ndarray) -> np.ndarray:
     """Return the frame (4, 4) on an axis, the z of the first frame, that is next to the second."""
     z, start = axis[:3, 2], axis[:3, 3]
-    place = start + z * (z @ (near[:3, 3] - start))
-    x = near[:3, 0] - z * (z @ near[:3, 0])
+    position = start + z * (z @ (nominal[:3, 3] - start))
+    x = nominal[:3, 0] - z * (z @ nominal[:3, 0])
     x = x / np.linalg.norm(x)
     result = np.eye(4)
-    result[:3] = np.column_stack([x, np.cross(z, x), z, place])
+    result[:3] = np.column_stack([x, np.cross(z, x), z, position])
     return result

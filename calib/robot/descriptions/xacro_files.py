@@ -20,6 +20,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, suppress
 from importlib import import_module
 from io import StringIO
+from itertools import chain
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -30,31 +31,38 @@ from calib.robot.collision import PACKAGE_PATH, package_folders
 
 _ARGUMENTS = re.compile(r"(?:(?<=\.xacro)|(?<=\.conf))\s+(?=\w+:=)")
 _MISSING = re.compile(r"Undefined substitution argument (\w+)")
-MAX_ABOVE = 4  # folders above the file in which packages are looked for (our choice)
+# Folders above the file in which packages are looked for (our choice).
+MAX_ABOVE = 4
 
 
 def split(path: str) -> tuple[str, dict[str, str]]:
     """Return the file and the xacro arguments of what a person gives as a robot: ``arm.urdf.xacro name:=value``."""
-    file, *rest = _ARGUMENTS.split(path, maxsplit=1)
-    words = shlex.split(rest[0]) if rest else []
-    if odd := [word for word in words if ":=" not in word]:
-        refuse_robot(file, f"'{odd[0]}' is no xacro argument; write name:=value, values with blanks in quotes")
-    return file, {name: value for name, _, value in (word.partition(":=") for word in words)}
+    file, *arguments_text = _ARGUMENTS.split(path, maxsplit=1)
+    arguments: dict[str, str] = {}
+    if arguments_text:
+        for argument in shlex.split(arguments_text[0]):
+            name, separator, value = argument.partition(":=")
+            if not separator:
+                refuse_robot(
+                    file, f"'{argument}' is no xacro argument; write name:=value, values with blanks in quotes"
+                )
+            arguments[name] = value
+    return file, arguments
 
 
 class _Arguments(dict[str, str]):
     """Arguments that know which of them were declared: xacro ignores others without a word."""
 
-    def __init__(self, given: dict[str, str]) -> None:
-        super().__init__(given)
-        self.asked: set[object] = set()
+    def __init__(self, arguments: dict[str, str]) -> None:
+        super().__init__(arguments)
+        self.declared: set[object] = set()
 
     def __contains__(self, name: object) -> bool:
-        self.asked.add(name)
+        self.declared.add(name)
         return super().__contains__(name)
 
     def __getitem__(self, name: str) -> str:
-        self.asked.add(name)
+        self.declared.add(name)
         return super().__getitem__(name)
 
 
@@ -66,33 +74,38 @@ def expand(path: str) -> str:
     """
     xacro: Any = import_module("xacro")
 
-    file, given = split(path)
-    arguments = _Arguments(given)
+    file, stated_arguments = split(path)
+    arguments = _Arguments(stated_arguments)
     try:
-        with _packages_for(Path(file)), redirect_stderr(StringIO()):  # its warnings of style
-            found = xacro.process_file(file, mappings=arguments).toprettyxml(indent="  ")
+        # Its warnings of style are not shown.
+        with _packages_for(Path(file)), redirect_stderr(StringIO()):
+            urdf_text = xacro.process_file(file, mappings=arguments).toprettyxml(indent="  ")
     except RecursionError:
-        words = "a macro that calls itself, or a file that includes itself"
-        raise RobotError(f"{_place(xacro, file)}: nested without end: {words}") from None
+        reason = "a macro that calls itself, or a file that includes itself"
+        raise RobotError(f"{_location(xacro, file)}: nested without end: {reason}") from None
     except Exception as error:  # whatever xacro, its expressions and parsers raise
-        inner: Any = error
-        while not isinstance(inner, RobotError) and (cause := getattr(inner, "exc", None)) is not None:
-            inner = cause
-        if isinstance(inner, RobotError):
-            raise inner from None
-        words = " ".join(str(error).split()) or repr(error)
-        hint = f"; say it behind the file: {named[1]}:=…" if (named := _MISSING.search(words)) else ""
-        raise RobotError(f"{_place(xacro, file)}: xacro: {words}{hint}") from error
-    if unknown := [name for name in given if name not in arguments.asked]:
-        known = [str(name) for name in arguments.asked]
-        there = f"it has {', '.join(sorted(known))}" if known else "it has none"
-        refuse_robot(file, f"there is no xacro argument '{unknown[0]}'{suggestion(unknown[0], known)}; {there}")
-    return found
+        cause: Any = error
+        while cause is not None and not isinstance(cause, RobotError):
+            cause = getattr(cause, "exc", None)
+        if cause is not None:
+            raise cause from None
+        reason = " ".join(str(error).split()) or repr(error)
+        missing = _MISSING.search(reason)
+        hint = f"; say it behind the file: {missing[1]}:=…" if missing else ""
+        raise RobotError(f"{_location(xacro, file)}: xacro: {reason}{hint}") from error
+    declared = sorted(str(name) for name in arguments.declared)
+    for name in stated_arguments:
+        if name not in arguments.declared:
+            choices = f"it has {', '.join(declared)}" if declared else "it has none"
+            refuse_robot(file, f"there is no xacro argument '{name}'{suggestion(name, declared)}; {choices}")
+    return urdf_text
 
 
-def _place(xacro: Any, file: str) -> str:
-    inner = [name for name in xacro.filestack or () if name]
-    return file if not inner or inner[-1] == file else f"{inner[-1]}, included by {file}"
+def _location(xacro: Any, file: str) -> str:
+    open_files = [name for name in xacro.filestack or () if name]
+    if not open_files or open_files[-1] == file:
+        return file
+    return f"{open_files[-1]}, included by {file}"
 
 
 @contextmanager
@@ -112,8 +125,9 @@ def package_folder(name: str, file: Path) -> Path:
     Raises:
         RobotError: saying how to give its folder.
     """
-    above = file.resolve().parents
-    for folder in (*above, *(one for each in (*above[:MAX_ABOVE], *package_folders()) for one in _packages_in(each))):
+    parents = file.resolve().parents
+    packages = map(_packages_in, (*parents[:MAX_ABOVE], *package_folders()))
+    for folder in chain(parents, chain.from_iterable(packages)):
         if name in (folder.name, _name_in(folder / "package.xml")):
             return folder
     refuse_robot(
@@ -125,8 +139,8 @@ def package_folder(name: str, file: Path) -> Path:
 
 def _packages_in(folder: Path) -> Iterator[Path]:
     with suppress(OSError):
-        yield from sorted(one for one in folder.iterdir() if one.is_dir())
-    yield from sorted(one.parent for one in folder.glob("*/*/package.xml"))
+        yield from sorted(path for path in folder.iterdir() if path.is_dir())
+    yield from sorted(path.parent for path in folder.glob("*/*/package.xml"))
 
 
 def _name_in(package: Path) -> str:
