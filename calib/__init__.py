@@ -28,17 +28,17 @@ if TYPE_CHECKING:
     from calib.api.kinematic import GeometryFit, PoseSelection, fit_geometry, select_poses
     from calib.api.motions import ExcitationDesign, MotionPlan, design_excitation, plan_motion
     from calib.api.reading import load, read_poses, read_recording
+    from calib.apps.compensation.api import JointCommands, compensate
+    from calib.apps.fleet.fleet import run_sessions
     from calib.apps.joining.joining import join
+    from calib.apps.monitoring.comparison.robot_change import diff
+    from calib.apps.registration.api import base, hand_eye, tool
     from calib.errors import CalibError
     from calib.identification.identify_options import IdentifySettings
     from calib.procedure.excitation.settings import ExcitationSettings, PlanSettings
     from calib.procedure.kinematic_stage.settings import FitSettings, SelectionSettings
     from calib.procedure.session.commands import new_session
     from calib.robot.calibrated import CalibratedChain
-    from calib.rooms.compensation.api import JointCommands, compensate
-    from calib.rooms.fleet.fleet import run_sessions
-    from calib.rooms.over_time.comparison.robot_change import diff
-    from calib.rooms.placements.api import base, hand_eye, tool
 
 # what `import calib` offers, and where it lives: loaded when first asked for, so that `calib --help` starts at once
 _HOMES = {
@@ -48,12 +48,12 @@ _HOMES = {
     "api.dynamic": ("identify_dynamics", "methods", "DynamicsModel"),
     "api.exporting": ("validate", "export"),
     "procedure.session.commands": ("new_session",),
-    "rooms.fleet.fleet": ("run_sessions",),
+    "apps.fleet.fleet": ("run_sessions",),
     "robot.calibrated": ("CalibratedChain",),
-    "rooms.compensation.api": ("compensate", "JointCommands"),
+    "apps.compensation.api": ("compensate", "JointCommands"),
     "apps.joining.joining": ("join",),
-    "rooms.over_time.comparison.robot_change": ("diff",),
-    "rooms.placements.api": ("tool", "base", "hand_eye"),
+    "apps.monitoring.comparison.robot_change": ("diff",),
+    "apps.registration.api": ("tool", "base", "hand_eye"),
     "procedure.kinematic_stage.settings": ("SelectionSettings", "FitSettings"),
     "procedure.excitation.settings": ("ExcitationSettings", "PlanSettings"),
     "identification.identify_options": ("IdentifySettings",),

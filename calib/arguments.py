@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache, wraps
-from inspect import Signature, isgenerator, signature
+from inspect import Parameter, Signature, isgenerator, signature
 from numbers import Integral, Real
 from pathlib import Path
 from types import NoneType, UnionType
@@ -26,7 +26,7 @@ _WORDS = {
 _TABLE = "found a DataFrame: write it by frame.to_csv('table.csv', index=False) and give that file"
 
 
-def checked(given: C) -> C:
+def checked(target: C) -> C:
     """Return a function or settings class that raises an error for arguments of a type other than annotated.
 
     A function runs with one thread of BLAS, `calib.workers.threads`; one that takes `progress` shows it in notebooks,
@@ -38,11 +38,12 @@ def checked(given: C) -> C:
     Raises:
         UsageError: when called: ``fit_geometry: settings: expected FitSettings or None, found 0.25``.
     """
-    function: Any = given
-    if not isinstance(given, type):
+    function: Any = target
+    if not isinstance(target, type):
         return _checked(function)
-    function.__init__, function.__pydantic_config__ = _read_by_type(function), {"extra": "forbid"}
-    return given
+    function.__init__ = _read_by_type(function)
+    function.__pydantic_config__ = {"extra": "forbid"}
+    return target
 
 
 def _read_by_type(kind: Any) -> Any:
@@ -55,21 +56,24 @@ def _read_by_type(kind: Any) -> Any:
 
         with quiet():
             bound = _bound(signature(init), kind.__name__, (self, *args), kwargs)
-            given = {key: plain_values(value) for key, value in bound.items() if key != "self"}
-            vars(self).update(vars(parse(kind, given, kind.__name__)) if given else {})
-            if not given:
+            values = {key: plain_values(value) for key, value in bound.items() if key != "self"}
+            if not values:
                 init(self)
+                return
+            parsed = parse(kind, values, kind.__name__)
+            # The dataclass may be frozen.
+            self.__dict__.update(parsed.__dict__)
 
     return call
 
 
-def _bound(wanted: Signature, name: str, args: tuple, kwargs: dict[str, Any]) -> dict[str, Any]:
+def _bound(function_signature: Signature, name: str, args: tuple, kwargs: dict[str, Any]) -> dict[str, Any]:
     from calib.errors import UsageError
 
     try:
-        return wanted.bind(*args, **kwargs).arguments
-    except TypeError as wrong:
-        raise UsageError(f"{name}: {wrong}") from None
+        return function_signature.bind(*args, **kwargs).arguments
+    except TypeError as error:
+        raise UsageError(f"{name}: {error}") from None
 
 
 def _checked(function: Callable[..., Any]) -> Any:
@@ -91,53 +95,61 @@ def _checked(function: Callable[..., Any]) -> Any:
 
 
 @contextmanager
-def _reporter(wanted: Signature, given: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+def _reporter(function_signature: Signature, arguments: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
     """Yield a notebook's reporter as an argument for a function that takes one and was given none; otherwise {}."""
     notebook = sys.modules.get("IPython")
-    wants = "progress" in wanted.parameters and given.get("progress") is None
-    if not wants or notebook is None or not hasattr(notebook.get_ipython(), "kernel"):
+    lacks_reporter = "progress" in function_signature.parameters and arguments.get("progress") is None
+    if not lacks_reporter or notebook is None or not hasattr(notebook.get_ipython(), "kernel"):
         yield {}
         return
     line = notebook.display.display({"text/plain": ""}, raw=True, display_id=True)
+
+    def show(message: str) -> None:
+        line.update({"text/plain": message}, raw=True)
+
     try:
-        yield {"progress": lambda words: line.update({"text/plain": words}, raw=True)}
+        yield {"progress": show}
     finally:
         line.update({}, raw=True)
 
 
-def _refuse_other_types(name: str, wanted: Signature, hints: dict[str, Any], args: tuple, kwargs: dict) -> None:
+def _refuse_other_types(
+    name: str, function_signature: Signature, hints: dict[str, Any], args: tuple, kwargs: dict
+) -> None:
     from calib.config_types import shown
     from calib.errors import UsageError
 
-    for argument, value in _bound(wanted, name, args, kwargs).items():
-        variadic = wanted.parameters[argument].kind in (2, 4)  # *args, **kwargs
-        if argument in hints and not variadic and not _fits(value, hints[argument]):
-            found = _TABLE if hasattr(value, "to_csv") else f"found {shown(value)}"
-            raise UsageError(f"{name}: {argument}: expected {_words(hints[argument])}, {found}")
+    for argument, value in _bound(function_signature, name, args, kwargs).items():
+        kind = function_signature.parameters[argument].kind
+        is_variadic = kind in (Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD)
+        if argument in hints and not is_variadic and not _fits(value, hints[argument]):
+            content = _TABLE if hasattr(value, "to_csv") else f"found {shown(value)}"
+            raise UsageError(f"{name}: {argument}: expected {_words(hints[argument])}, {content}")
 
 
 def _fits(value: Any, hint: Any) -> bool:
     """Return whether a value matches an annotated type; an annotation that states no type matches every value."""
     kind, inner = get_origin(hint), get_args(hint)
     if kind in (Union, UnionType):
-        return any(_fits(value, one) for one in inner)
+        return any(_fits(value, alternative) for alternative in inner)
     if kind is Literal:
         return value in inner
     if kind is tuple or kind is Sequence:
-        array = hasattr(value, "__array__") and getattr(value, "ndim", 0) > 0 and not hasattr(value, "columns")
-        if isinstance(value, (str, bytes)) or not (array or isinstance(value, Sequence)):
+        is_array = hasattr(value, "__array__") and getattr(value, "ndim", 0) > 0 and not hasattr(value, "columns")
+        if isinstance(value, (str, bytes)) or not (is_array or isinstance(value, Sequence)):
             return False
-        fixed = kind is tuple and inner[-1] is not ...
-        return (not fixed or len(value) == len(inner)) and all(
-            _fits(one, inner[k if fixed else 0]) for k, one in enumerate(value)
-        )
+        if kind is Sequence or inner[-1] is ...:
+            return all(_fits(item, inner[0]) for item in value)
+        return len(value) == len(inner) and all(map(_fits, value, inner))
     if kind is Mapping or kind is Callable:
         return isinstance(value, kind)
     if hint is bool:
         return isinstance(value, bool) or getattr(getattr(value, "dtype", None), "kind", "") == "b"
     if hint in (int, float) and isinstance(value, bool):
         return False
-    return isinstance(value, _PLAIN.get(hint, (hint,))) if isinstance(hint, type) else True
+    if not isinstance(hint, type):
+        return True
+    return isinstance(value, _PLAIN.get(hint, (hint,)))
 
 
 def _words(hint: Any) -> str:

@@ -16,9 +16,9 @@ from pathlib import Path
 from calib import files
 from calib.errors import CalibError, brief
 
+# Exit code of an internal error.
 CODE = 4
-"""Exit code of an internal error."""
-# where a report goes; README says the same and, once there is a public address, Issues of [project.urls]
+# Where a report goes; README says the same and, once there is a public address, Issues of [project.urls].
 TRACKER = "the issue tracker of the repository you cloned (git remote -v)"
 PACKAGES = ("armature-calib", "numpy", "scipy", "numba", "pin", "pydantic", "typer", "matplotlib", "clarabel")
 
@@ -33,21 +33,23 @@ def report(error: BaseException, command: Sequence[str], folder: Path | None = N
     """
     name = f"calib-bug-{datetime.now():%Y%m%d-%H%M%S}-{id(error) % 9973}.txt"
     content = "\n".join([f"calib {shlex.join(command)}", *_head(), "", *traceback.format_exception(error)])
-    said = f"internal error: {type(error).__name__}: {brief(error)}"
-    for place in (Path() if folder is None else folder, Path(tempfile.gettempdir())):
+    message = f"internal error: {type(error).__name__}: {brief(error)}"
+    if folder is None:
+        folder = Path()
+    for target in (folder, Path(tempfile.gettempdir())):
         try:
-            path = files.write(place / name, content)
+            path = files.write(target / name, content)
         except CalibError:
             continue
-        return f"{said}; a bug report was written: {path}. Check the input, then send it to {TRACKER}."
-    return f"{said}; `calib --debug` shows the place. Please check the input, too."
+        return f"{message}; a bug report was written: {path}. Check the input, then send it to {TRACKER}."
+    return f"{message}; `calib --debug` shows the place. Please check the input, too."
 
 
 def _head() -> list[str]:
-    found = [f"for {TRACKER}", f"Python {platform.python_version()}, {platform.platform()}"]
+    lines = [f"for {TRACKER}", f"Python {platform.python_version()}, {platform.platform()}"]
     for name in PACKAGES:
         try:
-            found.append(f"{name} {metadata.version(name)}")
+            lines.append(f"{name} {metadata.version(name)}")
         except metadata.PackageNotFoundError:
-            found.append(f"{name} is not installed")
-    return found
+            lines.append(f"{name} is not installed")
+    return lines

@@ -8,13 +8,14 @@ best change counts.
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from calib.errors import Finding, finding
 
-MAX_APART = 1.2  # what another change leaves, over what the best one leaves, up to which nobody can tell (our choice)
+# Ratio of the residuals of two changes up to which nobody can tell which of them it is (our choice).
+MAX_RIVAL_RATIO = 1.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +60,10 @@ class Explanation:
     @property
     def joints(self) -> tuple[int, ...]:
         """Joints of all changes of the same kind as the first; a single change keeps their order."""
-        of_kind = [one.joints for one in self.changes if one.code == self.code]
-        return of_kind[0] if len(of_kind) == 1 else tuple(sorted({joint for joints in of_kind for joint in joints}))
+        of_kind = [change.joints for change in self.changes if change.code == self.code]
+        if len(of_kind) == 1:
+            return of_kind[0]
+        return tuple(sorted(set().union(*of_kind)))
 
     @property
     def factor(self) -> float:
@@ -70,9 +73,14 @@ class Explanation:
     def finding(self, names: Sequence[str], **values: Any) -> Finding:
         """Return the finding on these changes, with joint names and other values."""
         joints = [names[j] for j in self.joints]
-        rival = self.rival and " at ".join([self.rival.code, *(names[j] for j in self.rival.joints[:1])])
-        places = {"joint": joints[0], "other": joints[-1]} if joints else {}
-        return finding(self.code, joints=joints, **places, rival=rival, **self.changes[0].values, **values)
+        details: dict[str, Any] = {"joints": joints}
+        if joints:
+            details |= {"joint": joints[0], "other": joints[-1]}
+        rival = None
+        if self.rival is not None:
+            rival_joint = [names[j] for j in self.rival.joints[:1]]
+            rival = " at ".join([self.rival.code, *rival_joint])
+        return finding(self.code, **details, rival=rival, **self.changes[0].values, **values)
 
 
 def best_changes(
@@ -91,25 +99,40 @@ def best_changes(
         at_least: data → a lower bound of `left` that is quickly known; spares changes that cannot count.
         max_changes: to make.
     """
-    rest, made, rival = list(table), [], None
-    before = now = left(data)
-    while rest and len(made) < max_changes:
-        tried = []
-        for change in rest:
+    candidates = list(table)
+    changes: list[Change] = []
+    rival = None
+    residual_before = residual = left(data)
+    while candidates and len(changes) < max_changes:
+        significant: list[_Trial] = []
+        for change in candidates:
             changed = change.make(data)
-            if at_least is None or _share(at_least(changed), now) < change.max_left:
-                after = left(changed)
-                tried.append((_share(after, now), change, after))
-        counts = sorted((one for one in tried if one[0] < one[1].max_left), key=lambda one: one[0])
-        if not counts:
+            if at_least is None or _share(at_least(changed), residual) < change.max_left:
+                residual_after = left(changed)
+                share = _share(residual_after, residual)
+                if share < change.max_left:
+                    significant.append(_Trial(share, change, residual_after))
+        if not significant:
             break
-        share, best, now = counts[0]
-        data = best.make(data)
-        near = [change for other, change, _ in counts[1:] if other < MAX_APART * share]
-        rival = near[0] if near and not made else None
-        made.append(best)
-        rest.remove(best)
-    return Explanation(tuple(made), before, now, rival) if made else None
+        significant.sort(key=lambda trial: trial.share)
+        best = significant[0]
+        rivals = [trial.change for trial in significant[1:] if trial.share < MAX_RIVAL_RATIO * best.share]
+        rival = rivals[0] if rivals and not changes else None
+        data = best.change.make(data)
+        residual = best.residual
+        changes.append(best.change)
+        candidates.remove(best.change)
+    if not changes:
+        return None
+    return Explanation(tuple(changes), residual_before, residual, rival)
+
+
+class _Trial(NamedTuple):
+    """A change of columns that was tried: share of the rms residual that remains, and mean squared residuals (k,)."""
+
+    share: float
+    change: Change
+    residual: np.ndarray
 
 
 def reversal(n: int, joint: int) -> np.ndarray:
@@ -122,23 +145,23 @@ def standing(n: int, joint: int) -> np.ndarray:
     return np.diag(np.where(np.arange(n) == joint, 0.0, 1.0))
 
 
-def exchange(n: int, one: int, other: int) -> np.ndarray:
+def exchange(n: int, first: int, second: int) -> np.ndarray:
     """Return the matrix (n, n) that exchanges two of n columns."""
     order = np.arange(n)
-    order[[one, other]] = other, one
+    order[[first, second]] = second, first
     return np.eye(n)[order]
 
 
-def coupling(n: int, joint: int, other: int, way: float) -> np.ndarray:
-    """Return the matrix (n, n) that adds one of n columns, times `way`, to another (coupled joints)."""
+def coupling(n: int, joint: int, source: int, factor: float) -> np.ndarray:
+    """Return the matrix (n, n) that adds one of n columns, times `factor`, to another (coupled joints)."""
     matrix = np.eye(n)
-    matrix[joint, other] = way
+    matrix[joint, source] = factor
     return matrix
 
 
 def couplings(n: int) -> list[tuple[int, int, float]]:
     """Return the joints whose values may be relative to the previous joint: joint, previous joint, +1 or -1."""
-    return [(joint, joint - 1, way) for joint in range(1, n) for way in (1.0, -1.0)]
+    return [(joint, joint - 1, factor) for joint in range(1, n) for factor in (1.0, -1.0)]
 
 
 def assigned(cost: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

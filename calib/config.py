@@ -20,9 +20,13 @@ from calib.config_types import UNKNOWN, Hidden, shown
 from calib.errors import CalibError, UsageError, suggestion
 
 T = TypeVar("T")
-Tables = str | Path | Mapping[str, Any]  # a TOML file, or what stands in one
+# A TOML file, or its content.
+Tables = str | Path | Mapping[str, Any]
+# Levels of tables in tables, and bytes of a file (our choices).
 MAX_LEVELS = 32
-_PLAIN = {  # pydantic's words
+MAX_BYTES = 8_000_000
+# Expected types, by pydantic's names of errors.
+_PLAIN = {
     "float": "a number",
     "int": "a whole number",
     "string": "a text",
@@ -31,7 +35,8 @@ _PLAIN = {  # pydantic's words
     "too_short": "at least one number",
 }
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
-_ENTRY = re.compile(r"^ {4}(\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", re.M)  # of a docstring: names, and what they are
+# Entry of a docstring: names, and their description.
+_ENTRY = re.compile(r"^ {4}(\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", re.M)
 
 
 def read_toml(path: str | Path, error: type[CalibError] = UsageError) -> dict[str, Any]:
@@ -43,45 +48,46 @@ def read_toml(path: str | Path, error: type[CalibError] = UsageError) -> dict[st
     """
     from calib.files import check_regular
 
-    max_bytes = 8_000_000  # bytes of a file, and levels of tables in tables (our choices)
     try:
         check_regular(path, streams=True)
         with open(path, "rb") as file:
-            data = file.read(max_bytes + 1)
-        if len(data) > max_bytes:
-            raise error(f"{path}: is larger than {max_bytes / 1e6:g} MB: is it the right file?")
-        found = tomllib.loads(data.decode("utf-8-sig"))
-    except OSError as wrong:
-        raise error(f"{path}: cannot be read: {wrong.strerror or wrong}") from wrong
+            data = file.read(MAX_BYTES + 1)
+        if len(data) > MAX_BYTES:
+            raise error(f"{path}: is larger than {MAX_BYTES / 1e6:g} MB: is it the right file?")
+        tables = tomllib.loads(data.decode("utf-8-sig"))
+    except OSError as cause:
+        raise error(f"{path}: cannot be read: {cause.strerror or cause}") from cause
     except RecursionError:
         raise error(f"{path}: is nested too deeply: more than {MAX_LEVELS} levels") from None
-    except ValueError as wrong:  # of tomllib, of the decoder, of a number with thousands of digits, of a name with NUL
-        words = "a whole number with thousands of digits" if "digits" in str(wrong) else wrong
-        raise error(f"{path}: is not a TOML file: {words}") from wrong
-    _check_size(found, str(path), error)
-    return found
+    except ValueError as cause:  # of tomllib, of the decoder, of a number with thousands of digits, of a name with NUL
+        reason = "a whole number with thousands of digits" if "digits" in str(cause) else cause
+        raise error(f"{path}: is not a TOML file: {reason}") from cause
+    _check_size(tables, str(path), error)
+    return tables
 
 
-def _check_size(found: Any, place: str, error: type[CalibError]) -> None:
+def _check_size(tables: Any, where: str, error: type[CalibError]) -> None:
     """Raise an error for tables nested too deeply and for integers of more than 64 bits."""
-    ahead: list[tuple[tuple[Any, ...], Any]] = [((), found)]
-    while ahead:
-        loc, value = ahead.pop()
+    todo: list[tuple[tuple[Any, ...], Any]] = [((), tables)]
+    while todo:
+        loc, value = todo.pop()
         if len(loc) > MAX_LEVELS:
-            raise error(f"{place}: {located(loc[:3])}: is nested too deeply: more than {MAX_LEVELS} levels")
+            raise error(f"{where}: {located(loc[:3])}: is nested too deeply: more than {MAX_LEVELS} levels")
         if isinstance(value, int) and not -(2**63) <= value < 2**63:
-            raise error(f"{place}: {located(loc)}: a whole number of more than 64 bits: {shown(value)}")
-        inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-        ahead += [((*loc, key), item) for key, item in inner]
+            raise error(f"{where}: {located(loc)}: a whole number of more than 64 bits: {shown(value)}")
+        if isinstance(value, dict):
+            todo += [((*loc, key), item) for key, item in value.items()]
+        elif isinstance(value, list):
+            todo += [((*loc, index), item) for index, item in enumerate(value)]
 
 
-def parse(kind: type[T], found: Any, place: str, error: type[CalibError] = UsageError) -> T:
+def parse(kind: type[T], table: Any, where: str, error: type[CalibError] = UsageError) -> T:
     """Return a parsed table as a checked instance of the dataclass `kind`.
 
     Args:
         kind: a dataclass under `strict`.
-        found: the table, lists and tables in it as tomllib makes them.
-        place: names it in complaints.
+        table: lists and tables in it as tomllib makes them.
+        where: names it in complaints.
         error: the class of complaints.
 
     Raises:
@@ -90,22 +96,24 @@ def parse(kind: type[T], found: Any, place: str, error: type[CalibError] = Usage
     from pydantic import ValidationError
 
     try:
-        return _adapter(kind).validate_python(found)
-    except ValidationError as wrong:
-        raise error(_complaint(wrong.errors(include_url=False), kind, place)) from None
+        return _adapter(kind).validate_python(table)
+    except ValidationError as validation_error:
+        raise error(_complaint(validation_error.errors(include_url=False), kind, where)) from None
 
 
-def read(kind: type[T], given: Tables | None, name: str, others: Collection[str] = ()) -> tuple[T, str]:
+def read(kind: type[T], source: Tables | None, name: str, foreign_tables: Collection[str] = ()) -> tuple[T, str]:
     """Return the parsed content of a TOML file or of its tables in memory, and its name for messages.
 
     Args:
-        name: in place of a file's; others: tables that another reader takes.
+        name: in place of a file's.
+        foreign_tables: names of tables that another reader takes.
     """
-    if given is None or isinstance(given, Mapping):
-        table, place = plain_values(given or {}), name
+    if source is None or isinstance(source, Mapping):
+        tables, where = plain_values(source or {}), name
     else:
-        table, place = read_toml(given), str(given)
-    return parse(kind, {key: value for key, value in table.items() if key not in others}, place), place
+        tables, where = read_toml(source), str(source)
+    own_tables = {key: value for key, value in tables.items() if key not in foreign_tables}
+    return parse(kind, own_tables, where), where
 
 
 def plain_values(value: Any) -> Any:
@@ -113,8 +121,10 @@ def plain_values(value: Any) -> Any:
     if hasattr(value, "tolist"):
         return value.tolist()
     if isinstance(value, Mapping):
-        return {key: plain_values(one) for key, one in value.items()}
-    return [plain_values(one) for one in value] if isinstance(value, (list, tuple)) else value
+        return {key: plain_values(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain_values(item) for item in value]
+    return value
 
 
 def strict(kind: type[T]) -> type[T]:
@@ -134,23 +144,29 @@ def schema(kind: type, title: str) -> dict[str, Any]:
     """Return the JSON schema (draft 2020-12) of files for the dataclass `kind`."""
     from pydantic.json_schema import GenerateJsonSchema
 
-    found = _adapter(kind).json_schema()
-    return {"$schema": GenerateJsonSchema.schema_dialect, **_for_toml(found), "title": title}
+    json_schema = _adapter(kind).json_schema()
+    return {"$schema": GenerateJsonSchema.schema_dialect, **_for_toml(json_schema), "title": title}
 
 
-def _for_toml(found: Any) -> Any:
+def _for_toml(json_schema: Any) -> Any:
     """Return a schema without nulls (TOML has none), hidden fields and redundant titles."""
-    if isinstance(found, list):
-        return [_for_toml(item) for item in found]
-    if not isinstance(found, dict):
-        return found
-    result, words = {}, found.get("description")
-    about = _entries(words) if isinstance(words, str) else {}
-    for key, value in found.items():
+    if isinstance(json_schema, list):
+        return [_for_toml(item) for item in json_schema]
+    if not isinstance(json_schema, dict):
+        return json_schema
+    result: dict[str, Any] = {}
+    description = json_schema.get("description")
+    descriptions = _entries(description) if isinstance(description, str) else {}
+    for key, value in json_schema.items():
         if key in ("properties", "$defs"):
-            said = {name: {"description": about[name]} for name in about if key == "properties"}
-            known = {name: item for name, item in value.items() if item.get("not") != {}}
-            result[key] = {name: _for_toml(item) | said.get(name, {}) for name, item in known.items()}
+            result[key] = {}
+            for name, item in value.items():
+                # A hidden field.
+                if item.get("not") == {}:
+                    continue
+                result[key][name] = _for_toml(item)
+                if key == "properties" and name in descriptions:
+                    result[key][name] |= {"description": descriptions[name]}
         elif key == "description" and isinstance(value, str):
             result[key] = value.partition("\n\nAttributes:")[0]
         elif key == "default" and value not in (None, [None]):  # None of a list: infinity, which JSON does not have
@@ -158,7 +174,11 @@ def _for_toml(found: Any) -> Any:
         elif key not in ("title", "default"):
             result[key] = _for_toml(value)
     choices = [item for item in result.pop("anyOf", ()) if item != {"type": "null"}]
-    return {**choices[0], **result} if len(choices) == 1 else {**({"anyOf": choices} if choices else {}), **result}
+    if len(choices) == 1:
+        return {**choices[0], **result}
+    if choices:
+        return {"anyOf": choices, **result}
+    return result
 
 
 def inherited(table: Mapping[str, Any], kind: type) -> dict[str, Any]:
@@ -171,55 +191,61 @@ def inherited(table: Mapping[str, Any], kind: type) -> dict[str, Any]:
     files = table.get("files")
     if not isinstance(files, Mapping):
         return dict(table)
-    every = {key: table[key] for key in _keys(kind) if key in table}
+    common = {key: table[key] for key in _keys(kind) if key in table}
 
-    def filled(own: Any) -> Any:
-        if not isinstance(own, Mapping):
-            return own
-        both = [key for key in own if isinstance(own[key], Mapping) and isinstance(every.get(key), Mapping)]
-        return {**every, **own, **{key: {**every[key], **own[key]} for key in both}}
+    def filled(file_table: Any) -> Any:
+        if not isinstance(file_table, Mapping):
+            return file_table
+        result = {**common, **file_table}
+        for key, value in file_table.items():
+            if isinstance(value, Mapping) and isinstance(common.get(key), Mapping):
+                result[key] = {**common[key], **value}
+        return result
 
-    return {**table, "files": {name: filled(own) for name, own in files.items()}}
+    return {**table, "files": {name: filled(file_table) for name, file_table in files.items()}}
 
 
 def own_table(files: Mapping[str, T], path: str | Path) -> T | None:
     """Return the table in `files` whose name is the end of the file's path; None if there is no such table."""
     parts = Path(path).parts
-    for name, own in files.items():
-        wanted = Path(name).parts
-        if parts[-len(wanted) :] == wanted:
-            return own
+    for name, table in files.items():
+        name_parts = Path(name).parts
+        if parts[-len(name_parts) :] == name_parts:
+            return table
     return None
 
 
-def described(given: Any) -> dict[str, str]:
+def described(source: Any) -> dict[str, str]:
     """Return the description of each argument or attribute from the docstrings of a function or class."""
-    found: dict[str, str] = {}
-    for one in reversed(getattr(given, "__mro__", (given,))):
-        found |= _entries(one.__doc__ or "")
-    return found
+    descriptions: dict[str, str] = {}
+    for base in reversed(getattr(source, "__mro__", (source,))):
+        descriptions |= _entries(base.__doc__ or "")
+    return descriptions
 
 
 def _entries(docstring: str) -> dict[str, str]:
     """Return names and descriptions under ``Args:`` or ``Attributes:``, without code marks."""
     parts = re.split("^(?:Args|Attributes):$", cleandoc(docstring), maxsplit=1, flags=re.M)
-    return {
-        name: " ".join(words.replace("``", "").split()).removesuffix(".")
-        for names, words in (_ENTRY.findall(parts[1]) if len(parts) > 1 else ())
-        for name in names.split(", ")
-    }
+    if len(parts) == 1:
+        return {}
+    descriptions: dict[str, str] = {}
+    for names, text in _ENTRY.findall(parts[1]):
+        description = " ".join(text.replace("``", "").split()).removesuffix(".")
+        for name in names.split(", "):
+            descriptions[name] = description
+    return descriptions
 
 
 # ---- complaints -----------------------------------------------------------------------------------------------------
 
 
 def check_keys(
-    found: Mapping[str, Any], keys: Collection[str], place: str, error: type[CalibError] = UsageError
+    table: Mapping[str, Any], keys: Collection[str], where: str, error: type[CalibError] = UsageError
 ) -> None:
     """Raise an error for a key that is not in `keys`; its message suggests the most similar key."""
-    for key in found:
+    for key in table:
         if key not in keys:
-            raise error(f"{place}: {_no_key(key, keys)}")
+            raise error(f"{where}: {_no_key(key, keys)}")
 
 
 def located(loc: Sequence[Any]) -> str:
@@ -227,45 +253,66 @@ def located(loc: Sequence[Any]) -> str:
     result = ""
     for k, part in enumerate(loc):
         if isinstance(part, int):
-            result = f"[[{result}]] number {part + 1}" if k + 1 < len(loc) or k == 1 else result
+            if k + 1 < len(loc) or k == 1:
+                result = f"[[{result}]] number {part + 1}"
             continue
         name = part if _BARE.fullmatch(part) else f'"{part}"'
-        result = f"{result}{', ' if result.endswith(tuple('0123456789')) and k > 1 else '.' if result else ''}{name}"
+        if not result:
+            result = name
+        elif k > 1 and result[-1] in "0123456789":
+            result = f"{result}, {name}"
+        else:
+            result = f"{result}.{name}"
     return result
 
 
 def _no_key(key: str, keys: Collection[str]) -> str:
-    there = f"the keys are {', '.join(sorted(keys))}" if keys else "there are none"
-    return f"there is no key '{key}'{suggestion(key, keys)}; {there}"
+    choices = f"the keys are {', '.join(sorted(keys))}" if keys else "there are none"
+    return f"there is no key '{key}'{suggestion(key, keys)}; {choices}"
 
 
-def _complaint(errors: list[Any], kind: type, place: str) -> str:
+def _complaint(errors: list[Any], kind: type, source: str) -> str:
     """Return the message for pydantic's first error; an unknown key takes precedence over a missing one."""
-    first = next((one for one in errors if one["type"] == UNKNOWN), errors[0])
-    loc, name, found = tuple(first["loc"]), first["type"], first["input"]
-    if name in ("missing", "too_long") and (count := _fixed_length(kind, loc, name)):
-        at = loc[:-1] if name == "missing" else loc
-        words = f"a list of {count} values" if count > 1 else "a list of one value"
-        return f"{': '.join(filter(None, (place, located(at))))}: expected {words}, found {shown(found)}"
-    table = _type_at(kind, loc[:-1]) if name in (UNKNOWN, "missing") else None
-    at = loc if table is None else loc[:-1]
-    while (
-        at and isinstance(at[-1], int) and name not in (UNKNOWN, "missing", "dataclass_type")
-    ):  # one of several values
-        at = at[:-1]
-    where = ": ".join(filter(None, (place, located(at))))
-    if name == UNKNOWN and len(loc) == 3 and loc[0] == "files" and isinstance(found, dict) and "." not in loc[1]:
-        return f'{where}: the dot needs quotes: [files."{loc[1]}.{loc[2]}"]'
-    if name == UNKNOWN:
-        return f"{where}: {_no_key(str(loc[-1]), _keys(table))}"
-    if name == "missing":
-        return f"{where}: there is no '{loc[-1]}'{_needed(table)}"
+    unknown = [error for error in errors if error["type"] == UNKNOWN]
+    first = unknown[0] if unknown else errors[0]
+    loc, name, value = tuple(first["loc"]), first["type"], first["input"]
+
+    def message(location: Sequence[Any], text: str) -> str:
+        where = ": ".join(filter(None, (source, located(location))))
+        return f"{where}: {text}"
+
+    if name in ("missing", "too_long"):
+        count = _fixed_length(kind, loc, name)
+        if count:
+            list_location = loc[:-1] if name == "missing" else loc
+            expected = f"a list of {count} values" if count > 1 else "a list of one value"
+            return message(list_location, f"expected {expected}, found {shown(value)}")
+    if name in (UNKNOWN, "missing"):
+        table_location = loc[:-1]
+        table = _type_at(kind, table_location)
+        # A dot in a file's name makes a table in a table of it.
+        is_unquoted = len(loc) == 3 and loc[0] == "files" and isinstance(value, dict) and "." not in loc[1]
+        if name == UNKNOWN and is_unquoted:
+            return message(table_location, f'the dot needs quotes: [files."{loc[1]}.{loc[2]}"]')
+        if name == UNKNOWN:
+            return message(table_location, _no_key(str(loc[-1]), _keys(table)))
+        return message(table_location, f"there is no '{loc[-1]}'{_needed(table)}")
+    location = loc
+    if name != "dataclass_type":
+        location = _without_index(loc)
     if name == "value_error":
-        return f"{where}: {first['ctx']['error']}"
-    words = _PLAIN.get(name, _PLAIN.get(name.split("_")[0], "a table"))
+        return message(location, str(first["ctx"]["error"]))
+    expected = _PLAIN.get(name, _PLAIN.get(name.split("_")[0], "a table"))
     if name == "tuple_type" and is_dataclass(_type_at(kind, (*loc, 0))):
-        words = f"a list of tables, [[{loc[-1]}]]"
-    return f"{where}: expected {words}, found {shown(found)}"
+        expected = f"a list of tables, [[{loc[-1]}]]"
+    return message(location, f"expected {expected}, found {shown(value)}")
+
+
+def _without_index(loc: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Return the location of the list of values that holds the value at a location."""
+    while loc and isinstance(loc[-1], int):
+        loc = loc[:-1]
+    return loc
 
 
 def _fixed_length(kind: Any, loc: Sequence[Any], name: str) -> int:
@@ -276,9 +323,9 @@ def _fixed_length(kind: Any, loc: Sequence[Any], name: str) -> int:
     """
     if name == "missing" and not isinstance(loc[-1], int):
         return 0
-    listed = _type_at(kind, loc[:-1] if name == "missing" else loc)
-    values = get_args(listed) if get_origin(listed) is tuple else ()
-    return 0 if Ellipsis in values else len(values)
+    list_type = _type_at(kind, loc[:-1] if name == "missing" else loc)
+    value_types = get_args(list_type) if get_origin(list_type) is tuple else ()
+    return 0 if Ellipsis in value_types else len(value_types)
 
 
 def _keys(kind: Any) -> list[str]:
@@ -290,14 +337,18 @@ def _keys(kind: Any) -> list[str]:
 def _needed(kind: Any) -> str:
     from dataclasses import MISSING
 
-    needed = [f.name for f in fields(kind) if f.default is MISSING and f.default_factory is MISSING]
+    needed = [field.name for field in fields(kind) if field.default is MISSING and field.default_factory is MISSING]
     return f"; needed are {', '.join(needed)}" if len(needed) > 1 else ""
 
 
 def _type_at(kind: Any, loc: Sequence[Any]) -> Any:
     """Return the dataclass that describes the table at a location."""
     for part in loc:
-        kind = get_type_hints(kind)[part] if is_dataclass(kind) else get_args(kind)[-1 if isinstance(part, str) else 0]
+        if is_dataclass(kind):
+            kind = get_type_hints(kind)[part]
+        else:
+            # The values of a mapping, the items of a list.
+            kind = get_args(kind)[-1 if isinstance(part, str) else 0]
         while get_origin(kind) is not None and type(None) in get_args(kind):
             kind = get_args(kind)[0]
     return kind

@@ -19,7 +19,10 @@ from typing import Annotated, Any, get_args
 from calib.errors import CalibError, UsageError, suggestion
 from calib.units import QUANTITIES
 
-UNKNOWN = "unexpected_keyword_argument"  # as pydantic calls it
+# Pydantic's name of the error.
+UNKNOWN = "unexpected_keyword_argument"
+# Signs of an expression (our choice).
+MAX_LETTERS = 200
 _BINARY = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv}
 _NAMES = {"pi": math.pi, "inf": math.inf}
 
@@ -89,14 +92,17 @@ def _number(value: Any, quantity: str) -> float:
     return result
 
 
-def _expression(text: str, quantity: str, max_letters: int = 200) -> float:
-    # max_letters: signs of an expression (our choice)
-    if len(text) > max_letters or "_" in text:  # Python would read 0_5 as 5
+def _expression(text: str, quantity: str) -> float:
+    # Python would read 0_5 as 5.
+    if len(text) > MAX_LETTERS or "_" in text:
         raise ValueError(text)
-    text, factor = text.strip(), 1.0
-    for unit, size in sorted(QUANTITIES.get(quantity, {}).items(), key=lambda item: -len(item[0])):
+    text = text.strip()
+    factor = 1.0
+    factors = QUANTITIES.get(quantity, {})
+    for unit in sorted(factors, key=len, reverse=True):
         if text.endswith(unit):
-            text, factor = text.removesuffix(unit).strip(), size
+            text = text.removesuffix(unit).strip()
+            factor = factors[unit]
             break
     return evaluated(ast.parse(text, mode="eval").body) * factor
 
@@ -130,8 +136,10 @@ def evaluated(node: ast.expr, names: Mapping[str, Any] = _NAMES, operations: Map
 
 def _float(value: Any) -> float:
     """Return a number of TOML as a float; NaN for anything else."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return math.nan
     try:
-        return float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else math.nan
+        return float(value)
     except OverflowError:
         return math.nan
 
@@ -186,26 +194,26 @@ class Real(_Read):
     words: str = ""
 
     def read(self, value: Any) -> float:
-        found = _number(value, self.quantity) if self.quantity and isinstance(value, str) else _float(value)
-        if self.zero and found == 0.0:
-            return found
-        if expected := self._expected(found):
+        result = _number(value, self.quantity) if self.quantity and isinstance(value, str) else _float(value)
+        if self.zero and result == 0.0:
+            return result
+        if expected := self._expected(result):
             raise _Refused(self.words or expected, value)
-        return found
+        return result
 
-    def _expected(self, found: float) -> str:
+    def _expected(self, value: float) -> str:
         """Return a description of the expected number if it is out of bounds; empty otherwise."""
-        finite = math.isfinite(found) or (self.infinite and not math.isnan(found))
-        if not finite or (self.above is not None and found <= self.above):
+        finite = math.isfinite(value) or (self.infinite and not math.isnan(value))
+        if not finite or (self.above is not None and value <= self.above):
             return "a number" if self.above is None else f"a number above {self.above:g}"
-        if self.above is None and self.least is not None and found < self.least:
+        if self.above is None and self.least is not None and value < self.least:
             return f"{self.least:g} or more"
-        if (self.least is None or found >= self.least) and (self.most is None or found <= self.most):
+        if (self.least is None or value >= self.least) and (self.most is None or value <= self.most):
             return ""
         hint = " (are these mm, or degrees?)" if self.unit in ("m", "rad") else ""
         low = "" if self.least is None else f"at least {self.least:g} and "
-        most = math.inf if self.most is None else self.most
-        return f"a number{self.unit and f' [{self.unit}]'}, {low}at most {most:g}{hint}"
+        upper = math.inf if self.most is None else self.most
+        return f"a number{self.unit and f' [{self.unit}]'}, {low}at most {upper:g}{hint}"
 
     @property
     def json(self) -> Mapping[str, Any]:
@@ -214,8 +222,8 @@ class Real(_Read):
             bounds = {"minimum": 0.0, "maximum": self.most}
         elif self.least is not None:
             del bounds["exclusiveMinimum"]
-        found = {"type": "number", **{key: value for key, value in bounds.items() if value is not None}}
-        return {"anyOf": [found, {"type": "string"}]} if self.quantity else found
+        number_schema = {"type": "number", **{key: value for key, value in bounds.items() if value is not None}}
+        return {"anyOf": [number_schema, {"type": "string"}]} if self.quantity else number_schema
 
 
 @dataclass(frozen=True)
@@ -260,7 +268,9 @@ class OneOf(_Read):
     @property
     def words(self) -> str:
         """The texts as a list for messages; empty if they belong to a module loaded later."""
-        return "" if isinstance(self.allowed, str) else " or ".join((", ".join(self.allowed[:-1]), self.allowed[-1]))
+        if isinstance(self.allowed, str):
+            return ""
+        return f"{', '.join(self.allowed[:-1])} or {self.allowed[-1]}"
 
     def read(self, value: Any) -> str:
         if isinstance(value, str) and value in self.names:
@@ -292,15 +302,15 @@ class Expect:
         return core.no_info_wrap_validator_function(read, _unconverted(handler(source)))
 
 
-def _unconverted(one: Any) -> Any:
+def _unconverted(inner_schema: Any) -> Any:
     """Return pydantic's strict schema of a number, text, flag or list of them; nan and infinity are refused."""
-    if one["type"] in ("int", "float", "str", "bool"):
-        one["strict"] = True
-    if one["type"] == "float":
-        one.setdefault("allow_inf_nan", False)
-    if one["type"] == "tuple":
-        one["items_schema"] = [_unconverted(item) for item in one["items_schema"]]
-    return one
+    if inner_schema["type"] in ("int", "float", "str", "bool"):
+        inner_schema["strict"] = True
+    if inner_schema["type"] == "float":
+        inner_schema.setdefault("allow_inf_nan", False)
+    if inner_schema["type"] == "tuple":
+        inner_schema["items_schema"] = [_unconverted(item) for item in inner_schema["items_schema"]]
+    return inner_schema
 
 
 @dataclass(frozen=True)

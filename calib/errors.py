@@ -22,7 +22,13 @@ from typing import TYPE_CHECKING, Any, NoReturn
 if TYPE_CHECKING:
     import numpy as np
 
-NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)  # of a write, whatever the file
+# Errors of a write, whatever the file.
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
+# Share of common letters from which on a name is suggested.
+SIMILAR = 0.6
+# Exit codes of wrong input, and of data that determine no result.
+USAGE_CODE = 2
+NO_RESULT_CODE = 3
 
 
 @dataclass(frozen=True)
@@ -85,10 +91,16 @@ class MeasurementError(CalibError):
 
     def __init__(self, message: str, file: str | Path | None = None, row: int | None = None, column: str | None = None):
         self.file, self.row, self.column = file, row, column
-        place = [str(file)] if file else []
-        place += [] if row is None else [f"row {row}"]
-        place += [f"column '{column}'"] if column else []
-        super().__init__(f"{', '.join(place)}: {message}" if place else message)
+        location = []
+        if file:
+            location.append(str(file))
+        if row is not None:
+            location.append(f"row {row}")
+        if column:
+            location.append(f"column '{column}'")
+        if location:
+            message = f"{', '.join(location)}: {message}"
+        super().__init__(message)
 
 
 class Unidentifiable(CalibError):
@@ -147,73 +159,88 @@ def require(holds: object, message: str, kind: type[Exception] = CalibError, *de
         raise kind(message, *details)
 
 
-def refuse_robot(place: object, words: str) -> NoReturn:
-    """Raise `RobotError` for an error in a robot's description; `place` is a file, a line, a joint or a row."""
-    raise RobotError(f"{place}: {words}")
+def refuse_robot(where: object, message: str) -> NoReturn:
+    """Raise `RobotError` for an error in a robot's description; `where` is a file, a line, a joint or a row."""
+    raise RobotError(f"{where}: {message}")
 
 
-def refuse_data(file: str | Path, words: str, column: str | None = None, row: int | None = None) -> NoReturn:
+def refuse_data(file: str | Path, message: str, column: str | None = None, row: int | None = None) -> NoReturn:
     """Raise `MeasurementError` for a file or block of measured data, with its column or row (from 1)."""
-    raise MeasurementError(words, file, row, column)
+    raise MeasurementError(message, file, row, column)
 
 
-def refuse_option(place: object, words: str) -> NoReturn:
-    """Raise `UsageError` for an option, a command or an options file; `place` names it."""
-    raise UsageError(f"{place}: {words}")
+def refuse_option(where: object, message: str) -> NoReturn:
+    """Raise `UsageError` for an option, a command or an options file; `where` names it."""
+    raise UsageError(f"{where}: {message}")
 
 
-def one_of(word: Any, words: Collection[str], what: str, kind: type[Exception] = CalibError, *details: Any) -> Any:
-    """Return `word` if it is among `words`, else raise ``what 'word' is not one of ... (did you mean ...?)``."""
-    if word not in words:
-        raise kind(f"{what} '{word}' is not one of {', '.join(words)}{suggestion(str(word), words)}", *details)
-    return word
+def one_of(name: Any, choices: Collection[str], role: str, kind: type[Exception] = CalibError, *details: Any) -> Any:
+    """Return `name` if it is among `choices`, else raise ``role 'name' is not one of ... (did you mean ...?)``."""
+    if name not in choices:
+        raise kind(f"{role} '{name}' is not one of {', '.join(choices)}{suggestion(str(name), choices)}", *details)
+    return name
 
 
 @contextmanager
 def refused_as(
-    kind: type[Exception], kinds: type[BaseException] | tuple[type[BaseException], ...], words: str, *details: Any
+    kind: type[Exception], kinds: type[BaseException] | tuple[type[BaseException], ...], message: str, *details: Any
 ) -> Iterator[None]:
-    """Convert exceptions of `kinds` in the block to `kind(words, *details)`; ``{}`` in `words`: the original message.
+    """Convert exceptions of `kinds` in the block to `kind(message, *details)`; ``{}`` in it: the original message.
 
-    An error of the operating system says its reason without the file's name, which `details` or `words` have.
+    An error of the operating system says its reason without the file's name, which `details` or `message` have.
     """
     try:
         yield
     except kinds as error:
-        if kinds is Exception and isinstance(error, CalibError):  # said by ourselves
+        # Of all exceptions, those of this toolkit have their message already.
+        if kinds is Exception and isinstance(error, CalibError):
             raise
-        said = getattr(error, "strerror", None) or (brief(error) if kinds is Exception else error)
-        said = f"no entry {error}" if isinstance(error, KeyError) else said
-        raise kind(words.replace("{}", str(said)), *details) from error
+        reason = getattr(error, "strerror", None)
+        if isinstance(error, KeyError):
+            reason = f"no entry {error}"
+        elif not reason and kinds is Exception:
+            reason = brief(error)
+        elif not reason:
+            reason = str(error)
+        raise kind(message.replace("{}", str(reason)), *details) from error
 
 
-def command_line(*words: object, program: str = "calib") -> str:
+def command_line(*arguments: object, program: str = "calib") -> str:
     """Return a command quoted for a shell: ``calib next 'cell 7'``."""
-    return shlex.join([program, *map(str, words)])
+    return shlex.join([program, *map(str, arguments)])
 
 
-def brief(error: BaseException, most: int = 200) -> str:
-    """Return an error's message in one line of at most `most` characters."""
-    words = " ".join(str(error).split())
-    return words if len(words) <= most else f"{words[:most]}…"
+def brief(error: BaseException, max_length: int = 200) -> str:
+    """Return an error's message in one line of at most `max_length` characters."""
+    message = " ".join(str(error).split())
+    if len(message) <= max_length:
+        return message
+    return f"{message[:max_length]}…"
 
 
-def suggestion(word: str, words: Collection[str]) -> str:
-    """Return `` (did you mean '...'?)`` with the most similar of `words`, or ""."""
-    lower = {str(other).lower(): other for other in words}
-    close = difflib.get_close_matches(word.lower(), lower, 1, 0.6)
-    return f" (did you mean '{lower[close[0]]}'?)" if close else ""
+def suggestion(name: str, choices: Collection[str]) -> str:
+    """Return `` (did you mean '...'?)`` with the most similar of `choices`, or ""."""
+    by_lower_case = {str(choice).lower(): choice for choice in choices}
+    similar = difflib.get_close_matches(name.lower(), by_lower_case, 1, SIMILAR)
+    if not similar:
+        return ""
+    return f" (did you mean '{by_lower_case[similar[0]]}'?)"
 
 
-def listing(names: Iterable[object], most: int = 12) -> str:
-    """Return the first `most` names separated by commas, and the number of further ones."""
-    words = [str(name) for name in names]
-    return ", ".join(words[:most]) + (f" and {len(words) - most} more" if len(words) > most else "")
+def listing(names: Iterable[object], max_names: int = 12) -> str:
+    """Return the first `max_names` names separated by commas, and the number of further ones."""
+    texts = [str(name) for name in names]
+    result = ", ".join(texts[:max_names])
+    if len(texts) > max_names:
+        result += f" and {len(texts) - max_names} more"
+    return result
 
 
 def counted(number: int, noun: str, plural: str = "") -> str:
     """Return a count with its noun, as ``1 pose`` or ``3 poses``; `plural` if it is not noun + s."""
-    return f"{number} {noun if number == 1 else plural or f'{noun}s'}"
+    if number != 1:
+        noun = plural or f"{noun}s"
+    return f"{number} {noun}"
 
 
 @contextmanager
@@ -225,27 +252,34 @@ def as_ours() -> Iterator[None]:
         code = exit_code(error)
         if code is None:
             raise
-        raise (Unidentifiable if code == 3 else UsageError)(str(error)) from error
+        if code == NO_RESULT_CODE:
+            raise Unidentifiable(str(error)) from error
+        raise UsageError(str(error)) from error
 
 
-def complaint(error: Exception, words: Iterable[str] = ()) -> tuple[str, int] | None:
+def complaint(error: Exception, arguments: Iterable[str] = ()) -> tuple[str, int] | None:
     """Return message and exit code of an expected error; None for an internal error.
 
     Expected are this toolkit's errors, the operating system's for a named file or a full disk, and lack of memory.
 
     Args:
-        words: of the command; the largest file among them is named where memory is lacking.
+        arguments: of the command; the largest file among them is named where memory is lacking.
     """
-    if (code := exit_code(error)) is not None:
+    code = exit_code(error)
+    if code is not None:
         return str(error), code
-    if lack := _lack_of_memory(error):
-        files = filter(os.path.isfile, (word.partition("@")[0] for word in words))
-        said = filter(None, [max(files, key=os.path.getsize, default=""), "not enough memory", brief(lack)])
+    memory_error = _lack_of_memory(error)
+    if memory_error:
+        names = [argument.partition("@")[0] for argument in arguments]
+        largest = max(filter(os.path.isfile, names), key=os.path.getsize, default="")
+        message = ": ".join(filter(None, [largest, "not enough memory", brief(memory_error)]))
         remedy = "of a long recording use fewer samples ([recording] samples = 100000 in the options); otherwise check"
-        return f"{': '.join(said)}; {remedy} whether a number or a file is larger than intended", 2
+        return f"{message}; {remedy} whether a number or a file is larger than intended", USAGE_CODE
     if isinstance(error, OSError) and (error.filename is not None or error.errno in NO_ROOM):
-        place = "" if error.filename is None else f"{error.filename}: "
-        return f"{place}{error.strerror or error}", 2
+        reason = str(error.strerror or error)
+        if error.filename is not None:
+            reason = f"{error.filename}: {reason}"
+        return reason, USAGE_CODE
     return None
 
 
@@ -268,17 +302,19 @@ def quiet() -> Iterator[None]:
     with warnings.catch_warnings(record=True, action="ignore") as caught:
         warnings.simplefilter("always", CalibWarning)
         yield
-    for one in caught:
-        warnings.warn(one.message, stacklevel=4)  # here, contextlib, what `quiet` is around, whoever called that
+    # Levels: here, contextlib, what `quiet` is around, whoever called that.
+    for warning in caught:
+        warnings.warn(warning.message, stacklevel=4)
 
 
 def exit_code(error: Exception) -> int | None:
     """Return the exit code of this toolkit's errors: 3 if not identifiable or not converged, else 2; else None."""
     if isinstance(error, (NotConverged, Unidentifiable)):
-        return 3
+        return NO_RESULT_CODE
     if isinstance(error, CalibError):
-        return 2
-    module = sys.modules.get("poses.errors")
+        return USAGE_CODE
+    module = sys.modules.get("calib.poses.errors")
     if module is not None and isinstance(error, module.NotIdentifiable):
-        return 3
-    return 2 if type(error).__module__.split(".")[0] in ("poses", "trajectories") else None
+        return NO_RESULT_CODE
+    package = type(error).__module__
+    return USAGE_CODE if package.startswith(("calib.poses.", "calib.trajectories.")) else None

@@ -21,21 +21,17 @@ from typing import Any, Generic, TypeVar
 
 from calib.errors import CalibError, UsageError, suggestion
 
-HOSTS = ("calib", "calib.apps", "calib.rooms")
+HOSTS = ("calib", "calib.apps")
 POINTS = (
     "commands",
     "descriptions",
-    "drive_gains",
     "exports",
-    "library",
+    "formats",
     "optics",
     "planned_poses",
     "recordings",
     "robots",
-    "schemas",
-    "stages",
     "steps",
-    "topics",
     "write_program",
 )
 T = TypeVar("T")

@@ -28,9 +28,15 @@ from calib.records import plain, shielded
 if TYPE_CHECKING:  # the commands' help is written without loading it
     import numpy as np
 
-MAKER = "armature-calib"  # by which figures and recordings are known as ours
+# By which figures and recordings are known as ours.
+MAKER = "armature-calib"
+# SHA-256 of the results in a folder, by name, as they were written.
+RESULTS = ".armature-calib.json"
+# Rows that are written at a time: of tables of anything, and of numbers.
+TABLE_CHUNK = 1000
+NUMBERS_CHUNK = 10_000
+
 Results = Sequence[tuple[Path, Sequence[str]]]
-RESULTS = ".armature-calib.json"  # SHA-256 of the results in a folder, by name, as they were written
 _staged: ContextVar[list[tuple[str, Path]] | None] = ContextVar("staged", default=None)
 
 
@@ -63,11 +69,13 @@ def results(targets: Results, inputs: Iterable[str | Path | None] = (), overwrit
         yield
         for folder in {target.parent for target, _ in targets}:
             staged = {path: Path(temporary) for temporary, path in _staged.get() or ()}
-            now = {path.name: staged.get(path, path) for path, _ in targets if path.parent == folder}
-            made = {name: fingerprint(path) for name, path in now.items() if path.exists()}
-            write(
-                folder / RESULTS, json.dumps(_written(staged.get(folder / RESULTS, folder / RESULTS)) | made, indent=2)
-            )
+            register = folder / RESULTS
+            fingerprints = _written(staged.get(register, register))
+            for path, _ in targets:
+                current_path = staged.get(path, path)
+                if path.parent == folder and current_path.exists():
+                    fingerprints[path.name] = fingerprint(current_path)
+            write(register, json.dumps(fingerprints, indent=2))
 
 
 def check_results(targets: Results, inputs: Iterable[str | Path | None] = (), overwrite: bool = False) -> None:
@@ -84,10 +92,11 @@ def check_results(targets: Results, inputs: Iterable[str | Path | None] = (), ov
     inputs = tuple(inputs)
     for number, (target, suffixes) in enumerate(targets):
         check_target(target, inputs, suffixes)
-        if any(same_file(target, other) for other, _ in targets[:number]):
+        if any(same_file(target, earlier) for earlier, _ in targets[:number]):
             raise UsageError(f"{target} would be written twice; give each file its own name")
-        known = _written(target.parent / RESULTS).get(target.name)
-        if not overwrite and target.exists() and target.stat().st_size and fingerprint(target) != known:
+        if overwrite or not target.exists() or not target.stat().st_size:
+            continue
+        if fingerprint(target) != _written(target.parent / RESULTS).get(target.name):
             raise UsageError(
                 f"{target} exists, and was not written by an earlier run or has changed since; nothing was changed. "
                 "Write elsewhere, or use --overwrite (in Python overwrite=True)"
@@ -96,10 +105,10 @@ def check_results(targets: Results, inputs: Iterable[str | Path | None] = (), ov
 
 def _written(path: Path) -> dict[str, str]:
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return content if isinstance(content, dict) else {}
 
 
 @contextmanager
@@ -145,8 +154,6 @@ def write(path: str | Path, content: str | bytes | Iterable[str]) -> Path:
         CalibError: where the folder is missing, read-only or full; nothing is left behind.
     """
     path = Path(path)
-    whole = isinstance(content, (str, bytes))
-    parts = (part.encode() if isinstance(part, str) else part for part in ([content] if whole else content))
     temporary = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -154,11 +161,12 @@ def write(path: str | Path, content: str | bytes | Iterable[str]) -> Path:
         prefix, suffix = staged_name(path)
         handle, temporary = tempfile.mkstemp(suffix, prefix, path.parent)
         with os.fdopen(handle, "wb") as file:
-            file.writelines(parts)
+            file.writelines(_encoded(content))
             file.flush()
             os.fsync(file.fileno())
         os.chmod(temporary, 0o666 & ~umask())
-        if (staged := _staged.get()) is not None:
+        staged = _staged.get()
+        if staged is not None:
             staged.append((temporary, path))
         else:
             os.replace(temporary, path)
@@ -172,6 +180,17 @@ def write(path: str | Path, content: str | bytes | Iterable[str]) -> Path:
     return path
 
 
+def _encoded(content: str | bytes | Iterable[str]) -> Iterator[bytes]:
+    """Yield the bytes of a file's content, whole or in parts."""
+    if isinstance(content, bytes):
+        yield content
+    elif isinstance(content, str):
+        yield content.encode()
+    else:
+        for part in content:
+            yield part.encode() if isinstance(part, str) else part
+
+
 def staged_name(path: Path) -> tuple[str, str]:
     """Return prefix and suffix of the temporary file for `path`: the prefix contains the process id."""
     return f".{path.name}.{os.getpid()}.", ".part"
@@ -181,19 +200,19 @@ def clear_leftovers(path: Path) -> None:
     """Remove temporary files of `path` from killed processes; those of running processes stay."""
     pattern = re.compile(rf"\.{re.escape(path.name)}\.(\d+)\.[^.]+\.part")
     for name in os.listdir(path.parent):
-        found = pattern.fullmatch(name)
-        if found and not _alive(int(found[1])):
-            left = path.parent / name
-            if left.is_dir():
-                shutil.rmtree(left, ignore_errors=True)
+        match = pattern.fullmatch(name)
+        if match and not _alive(int(match[1])):
+            leftover = path.parent / name
+            if leftover.is_dir():
+                shutil.rmtree(leftover, ignore_errors=True)
             else:
-                left.unlink(missing_ok=True)
+                leftover.unlink(missing_ok=True)
 
 
 def in_use(path: Path) -> bool:
     """Return whether a temporary file or folder (`staged_name`) belongs to a running process."""
-    found = re.fullmatch(r"\..*\.(\d+)\.[^.]+\.part", path.name)
-    return found is not None and _alive(int(found[1]))
+    match = re.fullmatch(r"\..*\.(\d+)\.[^.]+\.part", path.name)
+    return match is not None and _alive(int(match[1]))
 
 
 def _alive(process: int) -> bool:
@@ -230,7 +249,10 @@ def check_writable(folder: Path, target: Path | None = None) -> None:
     Raises:
         UsageError: with the target, the folder and the reason.
     """
-    nearest = next(one for one in (folder, *folder.absolute().parents) if _reached(one))
+    nearest = folder
+    for nearest in (folder, *folder.absolute().parents):
+        if _reached(nearest):
+            break
     try:
         with tempfile.TemporaryFile(dir=nearest):
             pass
@@ -248,10 +270,12 @@ def _reached(path: Path) -> bool:
     try:
         path.stat()
     except (OSError, ValueError) as error:
-        if isinstance(error, FileNotFoundError) and not path.is_symlink():
-            return False
-        why = "a link to nowhere" if isinstance(error, FileNotFoundError) else getattr(error, "strerror", None) or error
-        raise UsageError(f"{str(path)[:200]} cannot be written: {why}; choose another (--out)") from error
+        reason = getattr(error, "strerror", None) or error
+        if isinstance(error, FileNotFoundError):
+            if not path.is_symlink():
+                return False
+            reason = "a link to nowhere"
+        raise UsageError(f"{str(path)[:200]} cannot be written: {reason}; choose another (--out)") from error
     return True
 
 
@@ -266,16 +290,28 @@ def check_not_input(targets: Iterable[Path], inputs: Iterable[str | Path | None]
     Raises:
         UsageError: with the file that is both.
     """
-    read = (one for path in inputs if path is not None for one in (path, str(path).rpartition("@")[0] or path))
-    known = [path for path in map(Path, read) if os.path.exists(path)]  # False for names that no file can have
+    existing: list[Path] = []
+    for path in inputs:
+        if path is None:
+            continue
+        for name in (path, str(path).rpartition("@")[0] or path):
+            candidate = Path(name)
+            # False for names that no file can have.
+            if os.path.exists(candidate):
+                existing.append(candidate)
+    if not existing:
+        return
     for target in targets:
-        if known and (place := target.resolve()).exists() and any(place.samefile(path) for path in known):
+        resolved = target.resolve()
+        if resolved.exists() and any(resolved.samefile(path) for path in existing):
             raise UsageError(f"{target} is an input and would be overwritten; write elsewhere (--out)")
 
 
-def same_file(one: Path, other: Path) -> bool:
+def same_file(first: Path, second: Path) -> bool:
     """Return whether two paths name the same file, also on file systems that ignore case."""
-    return one.resolve() == other.resolve() or (one.exists() and other.exists() and one.samefile(other))
+    if first.resolve() == second.resolve():
+        return True
+    return first.exists() and second.exists() and first.samefile(second)
 
 
 def check_regular(path: str | Path, streams: bool = False) -> None:
@@ -291,15 +327,15 @@ def check_regular(path: str | Path, streams: bool = False) -> None:
     if str(path).encode(errors="ignore").decode() != str(path):
         raise OSError(errno.EILSEQ, "its name is not UTF-8: rename the file", str(path))
     mode = os.stat(path).st_mode
-    handed = streams and str(path).startswith(("/dev/fd/", "/dev/stdin", "/proc/self/fd/"))
-    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode) or handed or str(path) == os.devnull):
+    is_stream = streams and str(path).startswith(("/dev/fd/", "/dev/stdin", "/proc/self/fd/"))
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode) or is_stream or str(path) == os.devnull):
         raise OSError(errno.EINVAL, "is a pipe or a device, not a file: write its content to a file first", str(path))
 
 
 def fingerprint(path: Path) -> str:
     """Return the SHA-256 of a file in hex; the file is read again only if it changed."""
-    found = path.stat()
-    return _digest(path.absolute(), found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns)
+    status = path.stat()
+    return _digest(path.absolute(), status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns)
 
 
 @lru_cache(maxsize=1024)
@@ -321,25 +357,25 @@ def write_json(path: str | Path, value: Any) -> Path:
     try:
         content = json.dumps(value, indent=2, allow_nan=False)
     except ValueError as error:
-        place = next(_not_finite(value, ""), "") or "somewhere"
+        key = next(_not_finite(value, ""), "") or "somewhere"
         raise CalibError(
-            f"{path} was not written: {place} is not a finite number. The "
+            f"{path} was not written: {key} is not a finite number. The "
             "measurements are too few, too similar, or do not belong to this robot. Measure more poses, or ask "
             "for a simpler model"
         ) from error
     return write(path, content + "\n")
 
 
-def _not_finite(value: Any, place: str) -> Iterator[str]:
+def _not_finite(value: Any, path: str) -> Iterator[str]:
     """Yield the paths of numbers that are not finite, as ``fit.nominal.position_mm.rms``."""
     if isinstance(value, Mapping):
         for key, item in value.items():
-            yield from _not_finite(item, f"{place}.{key}" if place else str(key))
+            yield from _not_finite(item, f"{path}.{key}" if path else str(key))
     elif isinstance(value, (list, tuple)):
         for number, item in enumerate(value):
-            yield from _not_finite(item, f"{place}[{number}]")
+            yield from _not_finite(item, f"{path}[{number}]")
     elif isinstance(value, float) and not math.isfinite(value):
-        yield place
+        yield path
 
 
 def write_table(
@@ -352,12 +388,14 @@ def write_table(
     take for a formula (``=1+1``) gets an apostrophe before it (`calib.records.shielded`).
     """
 
-    def parts(many: int = 1000) -> Iterator[str]:
+    def parts() -> Iterator[str]:
         yield remarks(notes) + _headed(header).getvalue()
-        left = iter(rows)
-        while some := list(islice(left, many)):
+        remaining = iter(rows)
+        while chunk := list(islice(remaining, TABLE_CHUNK)):
             text = io.StringIO()
-            csv.writer(text, lineterminator="\n").writerows([_cell(cell) for cell in row] for row in some)
+            writer = csv.writer(text, lineterminator="\n")
+            for row in chunk:
+                writer.writerow(map(_cell, row))
             yield text.getvalue()
 
     return write(path, parts())
@@ -373,15 +411,16 @@ def write_numbers(
     """
     line = ",".join(["%.12g"] * values.shape[1]) + "\n"
 
-    def parts(many: int = 10_000) -> Iterator[str]:
+    def parts() -> Iterator[str]:
         yield remarks(notes) + _headed(header).getvalue()
-        for start in range(0, len(values), many):
-            some, text = values[start : start + many], io.StringIO()
+        for start in range(0, len(values), NUMBERS_CHUNK):
+            chunk = values[start : start + NUMBERS_CHUNK]
+            text = io.StringIO()
             if names:
-                for name, row in zip(names[start:], some.tolist()):
+                for name, row in zip(names[start:], chunk.tolist()):
                     text.write(f"{_quoted(name)},{line % tuple(row)}")
             else:
-                text.write((line * len(some)) % tuple(some.ravel().tolist()))
+                text.write((line * len(chunk)) % tuple(chunk.ravel().tolist()))
             yield text.getvalue()
 
     return write(path, parts())

@@ -40,7 +40,7 @@ class InFolder:
 
 
 def check_target(
-    out: Path, ours: Collection[str], marks: Collection[str], what: str, inputs: Iterable[str | Path | None] = ()
+    out: Path, ours: Collection[str], marks: Collection[str], kind: str, inputs: Iterable[str | Path | None] = ()
 ) -> None:
     """Raise an error, before any work is done, for a folder that cannot be written or contains other files.
 
@@ -58,18 +58,23 @@ def check_target(
         raise UsageError(f"{out} is a file; results go into a folder (--out)")
     files.check_writable(out)
     files.check_not_input([out, *(out / name for name in ours)], inputs)
-    if other := files_of(out, {METRICS, SESSION} - set(ours)):
-        raise UsageError(f"{out} contains {other[0]} of another result or session; choose another folder (--out)")
+    foreign = files_of(out, {METRICS, SESSION} - set(ours))
+    if foreign:
+        raise UsageError(f"{out} contains {foreign[0]} of another result or session; choose another folder (--out)")
     present = files_of(out, ours)
     if present and not all((out / name).exists() for name in marks):
-        raise UsageError(f"{out} contains {', '.join(present)}, not from an earlier {what}; choose another (--out)")
+        raise UsageError(f"{out} contains {', '.join(present)}, not from an earlier {kind}; choose another (--out)")
 
 
 def files_of(folder: Path, ours: Collection[str]) -> list[str]:
     """Return the file names in a folder that match `ours` (names or patterns); empty if the folder is missing."""
     if not folder.is_dir():
         return []
-    return sorted(name for name in os.listdir(folder) if any(fnmatchcase(name, one) for one in ours))
+
+    def matches(name: str) -> bool:
+        return any(fnmatchcase(name, pattern) for pattern in ours)
+
+    return sorted(filter(matches, os.listdir(folder)))
 
 
 def write_staged(out: Path, ours: Collection[str], write: Callable[[Path], object]) -> Path:
@@ -81,9 +86,10 @@ def write_staged(out: Path, ours: Collection[str], write: Callable[[Path], objec
     Raises:
         UsageError: where the disk refuses.
     """
-    given = out
+    requested = out
     try:
-        out = out.resolve()  # ``.`` and ``..`` have no name to stage under
+        # ``.`` and ``..`` have no name to stage under.
+        out = out.resolve()
         out.parent.mkdir(parents=True, exist_ok=True)
         files.clear_leftovers(out)
         prefix, suffix = files.staged_name(out)
@@ -99,13 +105,13 @@ def write_staged(out: Path, ours: Collection[str], write: Callable[[Path], objec
         else:
             os.replace(staging, out)
     except CalibError as error:  # names the folder that was filled, not the one that was asked for
-        error.args = tuple(str(words).replace(str(staging), str(given)) for words in error.args)
+        error.args = tuple(str(argument).replace(str(staging), str(requested)) for argument in error.args)
         raise
     except OSError as error:
-        raise UsageError(f"cannot write {given}: {error.strerror or error}; nothing was changed there") from error
+        raise UsageError(f"cannot write {requested}: {error.strerror or error}; nothing was changed there") from error
     finally:
         shutil.rmtree(staging, ignore_errors=True)
-    return given
+    return requested
 
 
 def _move_files(staging: Path, out: Path, ours: Collection[str]) -> None:
@@ -156,13 +162,15 @@ def read_covariance(path: Path) -> tuple[tuple[str, ...], np.ndarray]:
     Raises:
         RobotError: where it is missing or damaged.
     """
-    path = path / COVARIANCE if path.is_dir() else path
+    if path.is_dir():
+        path = path / COVARIANCE
     with refused_as(RobotError, (OSError, UnicodeDecodeError, ValueError), f"{path} cannot be read ({{}}); {AGAIN}"):
         with path.open(encoding="utf-8", newline="") as file:
             header, *rows = list(csv.reader(file)) or [[]]
         matrix = np.array([row[1:] for row in rows], dtype=float)
     names = tuple(map(plain_text, header[1:]))
-    if tuple(plain_text(row[0]) for row in rows if row) != names or matrix.shape != (len(names), len(names)):
+    row_names = tuple(plain_text(row[0]) for row in rows if row)
+    if row_names != names or matrix.shape != (len(names), len(names)):
         refuse_robot(path, f"parameter names of rows and columns differ; {AGAIN}")
     require(np.isfinite(matrix).all(), f"{path}: not a table of finite numbers; {AGAIN}", RobotError)
     return names, matrix

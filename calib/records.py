@@ -26,7 +26,8 @@ from calib.errors import CalibError, UsageError
 from calib.units import is_number
 
 T = TypeVar("T")
-_FORMULA = ("=", "+", "-", "@", "\t", "\r", "'")  # what a spreadsheet's formula begins with, and our own mark
+# What a spreadsheet's formula begins with, and our own mark.
+_FORMULA = ("=", "+", "-", "@", "\t", "\r", "'")
 
 
 def shielded(text: str) -> str:
@@ -56,23 +57,31 @@ def read_rows(kind: type[T], path: Path) -> tuple[T, ...]:
     """
     with path.open(newline="", encoding="utf-8") as file:
         rows = csv.DictReader(file)
-        rows.fieldnames = [name.partition(" [")[0] for name in rows.fieldnames or ()]  # without units
-        missing = vars(kind)["_field_defaults"].keys() - set(rows.fieldnames)
+        # Without units.
+        columns = [name.partition(" [")[0] for name in rows.fieldnames or ()]
+        rows.fieldnames = columns
+        optional_columns: Mapping[str, Any] = kind._field_defaults  # type: ignore[attr-defined]  # of named tuples
+        missing = optional_columns.keys() - set(columns)
         hints = {name: hint for name, hint in get_type_hints(kind).items() if name not in missing}
-        return tuple(kind(**{name: _cell(hint, row, name, str(path)) for name, hint in hints.items()}) for row in rows)
+        result = []
+        for row in rows:
+            cells = {name: _cell(hint, row, name, str(path)) for name, hint in hints.items()}
+            result.append(kind(**cells))
+        return tuple(result)
 
 
-def _cell(hint: Any, row: Mapping[str, str], name: str, place: str) -> Any:
+def _cell(hint: Any, row: Mapping[str, str], name: str, where: str) -> Any:
     text = row.get(name)
-    wanted = [one for one in get_args(hint) or (hint,) if one is not types.NoneType]
     if text is None:
-        raise ValueError(f"{place}: column {name} is missing")
-    if not text and wanted[0] is not str and len(get_args(hint)) > len(wanted):
+        raise ValueError(f"{where}: column {name} is missing")
+    kinds = [kind for kind in get_args(hint) or (hint,) if kind is not types.NoneType]
+    allows_none = len(get_args(hint)) > len(kinds)
+    if not text and allows_none and kinds[0] is not str:
         return None
     try:
-        return wanted[0](plain_text(text))
+        return kinds[0](plain_text(text))
     except ValueError as error:
-        raise ValueError(f"{place}: {name}: {error}") from error
+        raise ValueError(f"{where}: {name}: {error}") from error
 
 
 def read_json(
@@ -88,14 +97,18 @@ def read_json(
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        return read_record(kind, content if current is None else current(content))
+        if current is not None:
+            content = current(content)
+        return read_record(kind, content)
     except (OSError, ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
         raise UsageError(f"{path} cannot be read ({error}); {advice}") from error
 
 
 def read_lines(path: Path) -> list[str]:
     """Return the lines of a text file, empty if it is missing; invalid characters are replaced."""
-    return path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []
+    if not path.exists():
+        return []
+    return path.read_text(encoding="utf-8", errors="replace").splitlines()
 
 
 @dataclass(frozen=True)
@@ -112,8 +125,8 @@ class _Null:
             return core_schema.no_info_plain_validator_function(self._filled)
         return core_schema.no_info_before_validator_function(lambda x: self.value if x is None else x, handler(source))
 
-    def _filled(self, found: Any) -> np.ndarray:
-        values = np.array(found, dtype=float)
+    def _filled(self, content: Any) -> np.ndarray:
+        values = np.array(content, dtype=float)
         return frozen(np.where(np.isnan(values), self.value, values))
 
 
@@ -136,41 +149,48 @@ def plain(value: Any, null: bool = False) -> Any:
         null: whether null stands for a number that is not finite; of an array it does.
     """
     if is_dataclass(value) and not isinstance(value, type):
-        return {name: plain(getattr(value, name), own) for name, own in _keys(type(value)).items()}
+        return {name: plain(getattr(value, name), nullable) for name, nullable in _keys(type(value)).items()}
     if isinstance(value, Mapping):
         return {str(key): plain(item, null) for key, item in value.items()}
     if isinstance(value, np.ndarray):
-        lost = ~np.isfinite(value) if value.dtype.kind == "f" else False
-        return np.ma.masked_array(value, lost).tolist()
+        not_finite = ~np.isfinite(value) if value.dtype.kind == "f" else False
+        return np.ma.masked_array(value, not_finite).tolist()
     if isinstance(value, list | tuple | set | frozenset):
         return [plain(item, null) for item in value]
     if isinstance(value, float) and null and not math.isfinite(value):
         return None
-    return value.item() if isinstance(value, np.generic) else str(value) if isinstance(value, Path) else value
+    if isinstance(value, np.generic):
+        return value.item()
+    return str(value) if isinstance(value, Path) else value
 
 
 @cache
 def _keys(kind: type) -> dict[str, bool]:
     """Return, for each field and stored property of a record type, whether null in JSON means NaN."""
     hints = get_type_hints(kind, include_extras=True)
-    computed = [name for one in kind.__mro__ for name, item in vars(one).items() if isinstance(item, stored)]
-    return {one.name: _nullable(hints[one.name]) for one in fields(kind)} | dict.fromkeys(computed, True)
+    keys = {field.name: _nullable(hints[field.name]) for field in fields(kind)}
+    for base in kind.__mro__:
+        for name, item in base.__dict__.items():
+            if isinstance(item, stored):
+                keys[name] = True
+    return keys
 
 
 def _nullable(hint: Any) -> bool:
-    return any(isinstance(one, _Null) for one in getattr(hint, "__metadata__", ())) or any(
-        _nullable(one) for one in get_args(hint)
-    )
+    metadata = getattr(hint, "__metadata__", ())
+    if any(isinstance(item, _Null) for item in metadata):
+        return True
+    return any(_nullable(inner) for inner in get_args(hint))
 
 
-def read_record(kind: type[T], content: Any, place: str = "") -> T:
+def read_record(kind: type[T], content: Any, where: str = "") -> T:
     """Return plain JSON `content` as a value of the record type `kind`.
 
     Keys that a record does not name are left out, so that a newer version may write more; a field with a default may be
     missing.
 
     Args:
-        place: what `content` is, for messages.
+        where: what `content` is, for messages.
 
     Raises:
         ValueError: where something else stands there, or nothing, with its place.
@@ -181,10 +201,11 @@ def read_record(kind: type[T], content: Any, place: str = "") -> T:
         return _adapter(kind).validate_json(json.dumps(plain(content)), strict=True)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"])
-        raise ValueError(
-            f"{f'{place}{where}'.lstrip('.') or 'the content'}: {first['msg']}, found {first['input']!r:.60}"
-        ) from None
+        location = where
+        for part in first["loc"]:
+            location += f"[{part}]" if isinstance(part, int) else f".{part}"
+        location = location.lstrip(".") or "the content"
+        raise ValueError(f"{location}: {first['msg']}, found {first['input']!r:.60}") from None
 
 
 @cache
@@ -194,9 +215,9 @@ def _adapter(kind: Any) -> Any:
     return TypeAdapter(kind)
 
 
-def evenly(count: int, most: int) -> np.ndarray:
-    """Return rows (m,) of `count`, spread evenly from the first to the last: all, or `most` of them."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
+def evenly(count: int, max_rows: int) -> np.ndarray:
+    """Return rows (m,) of `count`, spread evenly from the first to the last: all, or `max_rows` of them."""
+    return np.unique(np.linspace(0, count - 1, min(count, max_rows)).astype(int))
 
 
 def frozen(values: ArrayLike, dtype: type = float) -> np.ndarray:
@@ -210,14 +231,23 @@ def read_only(values: np.ndarray) -> np.ndarray:
     return values
 
 
+def as_subclass(record: Any, kind: type[T]) -> T:
+    """Return a record as an instance of a subclass of its type that adds methods, but no fields."""
+    if not issubclass(kind, type(record)):
+        raise TypeError(f"{kind.__name__} is no subclass of {type(record).__name__}")
+    values = {field.name: getattr(record, field.name) for field in fields(record)}
+    return kind(**values)
+
+
 class Frozen:
     """Base of dataclasses whose fields annotated ``np.ndarray`` become read-only copies (floats or booleans)."""
 
     def __post_init__(self) -> None:
-        for one in fields(self):  # type: ignore[arg-type]
-            if one.type in (np.ndarray, "np.ndarray"):
-                value = np.asarray(getattr(self, one.name))
-                object.__setattr__(self, one.name, frozen(value, bool if value.dtype == bool else float))
+        for field in fields(self):  # type: ignore[arg-type]
+            if field.type in (np.ndarray, "np.ndarray"):
+                value = np.asarray(getattr(self, field.name))
+                kind = bool if value.dtype == bool else float
+                object.__setattr__(self, field.name, frozen(value, kind))
 
 
 def shaped(values: ArrayLike, shape: tuple[int | None, ...], name: str) -> np.ndarray:
@@ -227,10 +257,13 @@ def shaped(values: ArrayLike, shape: tuple[int | None, ...], name: str) -> np.nd
         CalibError: with the expected and the found shape, or the index of the first value that is not finite.
     """
     array = np.asarray(values, dtype=float)
-    if array.ndim != len(shape) or any(want is not None and want != got for want, got in zip(shape, array.shape)):
-        expected = "(" + ", ".join("any" if want is None else str(want) for want in shape) + ")"
-        raise CalibError(f"{name}: expected an array of shape {expected}, found {array.shape}")
+    fits = array.ndim == len(shape)
+    for length, expected_length in zip(array.shape, shape):
+        fits = fits and expected_length in (None, length)
+    if not fits:
+        lengths = ["any" if length is None else str(length) for length in shape]
+        raise CalibError(f"{name}: expected an array of shape ({', '.join(lengths)}), found {array.shape}")
     if not np.isfinite(array).all():
-        where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
-        raise CalibError(f"{name}: value at index {where} is not finite ({array[where]})")
+        index = tuple(np.argwhere(~np.isfinite(array))[0].tolist())
+        raise CalibError(f"{name}: value at index {index} is not finite ({array[index]})")
     return array

@@ -60,33 +60,44 @@ def small(value: float, unit: str, digits: int = 3) -> str:
 
 def motion_units(kinds: Iterable[str]) -> tuple[str, str, str, str]:
     """Return the SI units of position, velocity, acceleration and torque of joints of these kinds."""
-    found = set(kinds)
-    first = "rad" if "prismatic" not in found else "m" if found == {"prismatic"} else "rad, m"
-    torque = {"rad": TORQUE, "m": "N"}.get(first, f"{TORQUE}, N")
-    return first, f"{first}/s", f"{first}/s²", torque
+    distinct_kinds = set(kinds)
+    if "prismatic" not in distinct_kinds:
+        position, torque = "rad", TORQUE
+    elif distinct_kinds == {"prismatic"}:
+        position, torque = "m", "N"
+    else:
+        position, torque = "rad, m", f"{TORQUE}, N"
+    return position, f"{position}/s", f"{position}/s²", torque
 
 
-def headings(what: str, joints: Sequence[Any]) -> list[str]:
+def headings(series: str, joints: Sequence[Any]) -> list[str]:
     """Return the headers of joints' columns in a table of motion: ``q_joint1 [rad]``, v_, a_, current_, torques."""
-    place = {"q": 0, "q_link": 0, "v": 1, "a": 2, "current": 4}.get(what, 3)
-    units = [(*motion_units([one.kind]), "A")[place].replace("²", "^2") for one in joints]
-    return [f"{what}_{one.name} [{unit}]" for one, unit in zip(joints, units)]
+    result = []
+    for joint in joints:
+        position, velocity, acceleration, torque = motion_units([joint.kind])
+        units = {"q": position, "q_link": position, "v": velocity, "a": acceleration, "current": "A"}
+        unit = units.get(series, torque).replace("²", "^2")
+        result.append(f"{series}_{joint.name} [{unit}]")
+    return result
 
 
 def without_gains(unit: str) -> str:
     """Return a description of the torque unit `unit` ("A of joint 2") of a model identified from currents."""
-    scaled = unit.removeprefix("A of ")
-    return f"in amperes, {f'scaled to {scaled}, ' if scaled != unit else ''}because no drive gains are known"
+    reference = unit.removeprefix("A of ")
+    scale = f"scaled to {reference}, " if reference != unit else ""
+    return f"in amperes, {scale}because no drive gains are known"
 
 
-def per_ampere(own: str, unit: str) -> str:
+def per_ampere(parameter_unit: str, unit: str) -> str:
     """Return a parameter's unit in a model whose torques are in `unit`: if amperes, each is divided by a gain [N m/A].
 
     ``N m s/rad`` becomes ``A s/rad``, ``kg m²`` becomes ``kg m² A/(N m)``.
     """
     if unit == TORQUE:
-        return own
-    return own.replace(TORQUE, "A") if TORQUE in own else f"{own} A/({TORQUE})"
+        return parameter_unit
+    if TORQUE in parameter_unit:
+        return parameter_unit.replace(TORQUE, "A")
+    return f"{parameter_unit} A/({TORQUE})"
 
 
 def plain_number(text: str) -> float:

@@ -13,9 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import calib
-import poses
-import trajectories
-from calib import cli
+from calib import cli, poses, trajectories
 from calib.data.poses import columns
 from calib.data.recordings.recording_options import SCALES, SYNONYMS
 from calib.data.schema import Column
@@ -306,7 +304,7 @@ def _arms() -> Iterator[tuple[str, Any]]:
 
 
 def api() -> dict[str, str]:
-    """Return the pages of the Python API: `import calib`, and the modules of `poses` and `trajectories`."""
+    """Return the pages of the Python API: `import calib`, and the modules of `calib.poses` and `calib.trajectories`."""
     given = [(name, getattr(calib, name)) for name in calib.__all__]
     parts = ["calib\n=====", ".. automodule:: calib\n   :no-members:"]
     for title, members in (
@@ -317,7 +315,7 @@ def api() -> dict[str, str]:
         parts.append(f"{title}\n{'-' * len(title)}")
         parts += [_documented(f"calib.{name}", getattr(calib, name)) for name in members]
     return {"api-calib.rst": "\n\n".join(parts) + "\n"} | {
-        f"api-{package.__name__}.rst": _package(package) for package in (poses, trajectories)
+        f"api-{package.__name__.removeprefix('calib.')}.rst": _package(package) for package in (poses, trajectories)
     }
 
 

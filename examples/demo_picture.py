@@ -14,9 +14,9 @@ from pathlib import Path
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
+from calib.apps.cell_demo import demo
+from calib.apps.cell_demo.summary import PICTURE, position_errors, torque_error
 from calib.procedure.export.delivery import prediction
-from calib.rooms.cells import demo
-from calib.rooms.cells.summary import PICTURE, position_errors, torque_error
 from calib.workers.threads import one_blas_thread
 
 KEPT = Path(__file__).with_name("demo.png")

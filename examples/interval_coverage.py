@@ -33,11 +33,11 @@ from calib.procedure.dynamic_stage.inputs import gather as gather_logs
 from calib.procedure.kinematic_stage.inputs import gather
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.robot.calibrated import as_calibrated
-from calib.rooms.cells.known_robots import random_fourier
-from calib.rooms.cells.truth import true_base
-from calib.rooms.cells.unmodelled import TorqueErrors
-from calib.rooms.cells.virtual_arm import MovingArm, moving_arm, record
-from calib.rooms.cells.virtual_cells import virtual_cell
+from calib.simulation.known_robots import random_fourier
+from calib.simulation.truth import true_base
+from calib.simulation.unmodelled import TorqueErrors
+from calib.simulation.virtual_arm import MovingArm, moving_arm, record
+from calib.simulation.virtual_cells import virtual_cell
 
 DATA = Path(os.environ.get("CALIB_DATA", "../shared/data"))
 UR10, UR5, MOTOMAN = DATA / "ur10_ipa", DATA / "ur5_gts3800", DATA / "motoman_leica"

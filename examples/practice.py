@@ -14,6 +14,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 import calib
+from calib.apps.cell_demo import demo
 from calib.data.poses.pose_lists import read_poses
 from calib.data.schema import Joints
 from calib.dynamics.bodies import bodies_of
@@ -21,14 +22,14 @@ from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.pseudo_inertia import ball, from_standard, to_standard
 from calib.files import write_numbers
 from calib.identification.prior import rods
+from calib.parallel.mechanism.closure import closed
+from calib.parallel.mechanism.geometric_fit import changed, loop_parameters
+from calib.parallel.mechanism.parallel_model import PlatformRegressor, make_parallel_model
+from calib.parallel.robots import find
 from calib.procedure.excitation import coefficients
-from calib.rooms.cells import camera_cell, cell, demo, virtual_arm, virtual_cells
-from calib.rooms.cells.cell import write_log, write_measured
-from calib.rooms.cells.known_robots import random_fourier
-from calib.rooms.parallel.mechanism.closure import closed
-from calib.rooms.parallel.mechanism.geometric_fit import changed, loop_parameters
-from calib.rooms.parallel.mechanism.parallel_model import PlatformRegressor, make_parallel_model
-from calib.rooms.parallel.robots import find
+from calib.simulation import camera_cell, cell, virtual_arm, virtual_cells
+from calib.simulation.cell import write_log, write_measured
+from calib.simulation.known_robots import random_fourier
 
 NEAR = np.array([0.3, -1.2, 1.6, -1.1, -1.4, 0.5])  # where the UR5 works [rad]
 TAUGHT = NEAR + np.random.default_rng(3).uniform(-0.4, 0.4, (50, 6))

@@ -36,8 +36,8 @@ from calib.identification.identify_options import IdentifyOptions, parse_options
 from calib.identification.rows import Case, observe
 from calib.procedure.dynamic_stage import inputs as recordings
 from calib.records import frozen
-from trajectories.basis import SampledMotion
-from trajectories.fourier import fourier_family
+from calib.trajectories.basis import SampledMotion
+from calib.trajectories.fourier import fourier_family
 
 DATA = Path(os.environ.get("CALIB_DATA", "../shared/data"))
 UR10E = {"gains": [14.87, 13.26, 11.13, 10.62, 11.03, 11.47]}

@@ -4,12 +4,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from poses.indices import Index, index_of_singular_values, log_slope
+from calib.poses.indices import Index, index_of_singular_values, log_slope
 
 
 def exchanged_by_index(
     jacobians: np.ndarray,
-    known: np.ndarray,
+    known_information: np.ndarray,
     members: tuple[int, ...],
     index: Index,
     report: Callable[[tuple[int, ...], float], None] | None = None,
@@ -37,18 +37,18 @@ def exchanged_by_index(
         The members, and their merit log O (−log cond; O1 without 1/√m).
     """
     chosen = list(members)
-    matrix = known + _gram(jacobians[chosen])
+    matrix = known_information + _gram(jacobians[chosen])
     best = float(merits(matrix[None], index)[0])
     for _ in range(sweeps):
         before = best
-        for place in range(len(chosen)):
-            thinned = matrix - _gram(jacobians[chosen[place]][None])
+        for position in range(len(chosen)):
+            thinned = matrix - _gram(jacobians[chosen[position]][None])
             trials = _screened(jacobians, matrix, chosen, index, screen)
-            found = merits(thinned + jacobians[trials].transpose(0, 2, 1) @ jacobians[trials], index)
-            if found.max() > best + 1e-9:
-                best = float(found.max())
-                chosen[place] = int(trials[found.argmax()])
-                matrix = known + _gram(jacobians[chosen])
+            trial_merits = merits(thinned + jacobians[trials].transpose(0, 2, 1) @ jacobians[trials], index)
+            if trial_merits.max() > best + 1e-9:
+                best = float(trial_merits.max())
+                chosen[position] = int(trials[trial_merits.argmax()])
+                matrix = known_information + _gram(jacobians[chosen])
                 if report:
                     report(tuple(chosen), best)
         if best <= before + 1e-9:

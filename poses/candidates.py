@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from poses.errors import BadInput, NothingFeasible, require
+from calib.poses.errors import BadInput, NothingFeasible, require
 
 
 def draw_candidates(
@@ -15,7 +15,7 @@ def draw_candidates(
     feasible: Callable[[np.ndarray], np.ndarray] | None = None,
     *,
     seed: int | np.random.Generator = 0,
-    most: int | None = None,
+    max_draws: int | None = None,
     block: int = 2048,
 ) -> np.ndarray:
     """Draw feasible poses from a scrambled Sobol sequence (Sobol 1967; Owen 1998), block by block.
@@ -25,35 +25,40 @@ def draw_candidates(
         count: feasible poses wanted, N.
         feasible: predicate (m, n) -> (m,) bool; None accepts all.
         seed: integer or generator; the same seed gives the same poses.
-        most: poses drawn at most; default 200 N, at least 100 000.
+        max_draws: poses drawn at most; default 200 N, at least 100 000.
         block: poses per call of the predicate.
 
     Returns:
         (N, n) joint values, in the order of the sequence.
 
     Raises:
-        NothingFeasible: where `most` draws hold fewer than N feasible poses; the message gives their share.
+        NothingFeasible: where `max_draws` draws hold fewer than N feasible poses; the message gives their share.
     """
-    from scipy.stats import qmc  # slow to load
+    # slow to load
+    from scipy.stats import qmc
 
-    low, high = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
+    low = np.asarray(lower, dtype=float)
+    high = np.asarray(upper, dtype=float)
     if low.ndim != 1 or low.shape != high.shape or not (low < high).all():
         raise BadInput(f"limits: expected two (n,) arrays with lower < upper, found {low} and {high}")
     require(count >= 1, f"count = {count}: ask for at least one candidate")
-    most = max(200 * count, 100_000) if most is None else most
+    max_draws = max(200 * count, 100_000) if max_draws is None else max_draws
     block = 1 << max(int(block - 1).bit_length(), 0)  # Sobol points keep their balance in powers of two
     sequence = qmc.Sobol(len(low), scramble=True, rng=np.random.default_rng(seed))
-    kept, found, drawn = list[np.ndarray](), 0, 0
-    while found < count and drawn < most:
+    blocks, count_found, drawn = list[np.ndarray](), 0, 0
+    while count_found < count and drawn < max_draws:
         q = low + (high - low) * sequence.random(block)
         drawn += block
-        kept.append(q if feasible is None else q[np.asarray(feasible(q), dtype=bool)])
-        found += len(kept[-1])
-    if found < count:
+        if feasible is not None:
+            q = q[np.asarray(feasible(q), dtype=bool)]
+        blocks.append(q)
+        count_found += len(q)
+    if count_found < count:
+        share = 100 * count_found / drawn
         raise NothingFeasible(
-            f"{found} of {drawn} random poses are feasible ({100 * found / drawn:.3g} %), {count} are needed: "
+            f"{count_found} of {drawn} random poses are feasible ({share:.3g} %), {count} are needed: "
             "loosen the narrowest constraint, check its frames, or ask for fewer",
-            found,
+            count_found,
             drawn,
         )
-    return np.concatenate(kept)[:count]
+    return np.concatenate(blocks)[:count]

@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike
 
-from poses.space import PoseConstraint
+from calib.poses.space import PoseConstraint
 
 Tool = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 ToolJacobian = Callable[[np.ndarray], np.ndarray]
@@ -20,33 +20,54 @@ ToolJacobian = Callable[[np.ndarray], np.ndarray]
 
 def height(tool: Tool, lowest: float, highest: float = np.inf, jacobian: ToolJacobian | None = None) -> PoseConstraint:
     """Keep the tool point's height within lowest ≤ z ≤ highest [m]."""
-    limits = tuple((sign, bound) for sign, bound in ((-1.0, lowest), (1.0, highest)) if np.isfinite(bound))
-    slope = None if jacobian is None else partial(_height_gradient, jacobian, limits)
+    limits = _finite_limits(lowest, highest)
+    slope = None
+    if jacobian is not None:
+        slope = partial(_height_gradient, jacobian, limits)
     return PoseConstraint("height", partial(_height, tool, limits), slope)
 
 
-def axis_distance(tool: Tool, least: float, jacobian: ToolJacobian | None = None) -> PoseConstraint:
-    """Keep d_xy = √(x² + y²) ≥ least [m], in the smooth form least² − x² − y² ≤ 0."""
-    slope = None if jacobian is None else partial(_axis_gradient, tool, jacobian)
-    return PoseConstraint("distance from the axis", partial(_axis, tool, least), slope)
+def _finite_limits(lower: float, upper: float) -> tuple[tuple[float, float], ...]:
+    """Return sign and bound of each finite limit, so that sign · (value − bound) ≤ 0 keeps it."""
+    limits = []
+    if np.isfinite(lower):
+        limits.append((-1.0, lower))
+    if np.isfinite(upper):
+        limits.append((1.0, upper))
+    return tuple(limits)
+
+
+def axis_distance(tool: Tool, min_distance: float, jacobian: ToolJacobian | None = None) -> PoseConstraint:
+    """Keep d_xy = √(x² + y²) ≥ min_distance [m], in the smooth form min_distance² − x² − y² ≤ 0."""
+    slope = None
+    if jacobian is not None:
+        slope = partial(_axis_gradient, tool, jacobian)
+    return PoseConstraint("distance from the axis", partial(_axis, tool, min_distance), slope)
 
 
 def reach(
-    tool: Tool, most: float, centre: ArrayLike = (0, 0, 0), jacobian: ToolJacobian | None = None
+    tool: Tool, max_distance: float, centre: ArrayLike = (0, 0, 0), jacobian: ToolJacobian | None = None
 ) -> PoseConstraint:
-    """Keep the tool's point within `most` [m] of a centre (3,) [m]: ‖x − c‖² − most² ≤ 0."""
+    """Keep the tool's point within `max_distance` [m] of a centre (3,) [m]: ‖x − c‖² − max_distance² ≤ 0."""
     point = np.asarray(centre, dtype=float)
-    slope = None if jacobian is None else partial(_reach_gradient, tool, jacobian, point)
-    return PoseConstraint("reach", partial(_reach, tool, most, point), slope)
+    slope = None
+    if jacobian is not None:
+        slope = partial(_reach_gradient, tool, jacobian, point)
+    return PoseConstraint("reach", partial(_reach, tool, max_distance, point), slope)
 
 
 def distance(
-    tool: Tool, least: float, most: float, centre: ArrayLike, jacobian: ToolJacobian | None = None
+    tool: Tool, min_distance: float, max_distance: float, centre: ArrayLike, jacobian: ToolJacobian | None = None
 ) -> PoseConstraint:
-    """Keep the tool's point from `least` to `most` [m] away from a place (3,) [m]: an instrument's range."""
+    """Keep the tool's point within an instrument's range, `min_distance` to `max_distance` [m] from a point (3,) [m].
+
+    Not smooth at that point itself.
+    """
     point = np.asarray(centre, dtype=float)
-    limits = tuple((sign, bound) for sign, bound in ((-1.0, least), (1.0, most)) if np.isfinite(bound))
-    slope = None if jacobian is None else partial(_distance_gradient, tool, jacobian, limits, point)
+    limits = _finite_limits(min_distance, max_distance)
+    slope = None
+    if jacobian is not None:
+        slope = partial(_distance_gradient, tool, jacobian, limits, point)
     return PoseConstraint("range of the instrument", partial(_distance, tool, limits, point), slope)
 
 
@@ -69,7 +90,9 @@ def orientation(
         jacobian: for the exact gradient.
     """
     stand = np.asarray(camera, dtype=float)
-    slope = None if jacobian is None else partial(_orientation_gradient, tool, jacobian, stand)
+    slope = None
+    if jacobian is not None:
+        slope = partial(_orientation_gradient, tool, jacobian, stand)
     return PoseConstraint("orientation", partial(_orientation, tool, stand, roll, pitch), slope)
 
 
@@ -85,9 +108,12 @@ def line_of_sight(
         half_angle: of the cone [rad] (a retroreflector accepts about 0.5 rad).
         jacobian: for the exact gradient.
     """
-    station, facing = np.asarray(instrument, dtype=float), np.asarray(axis, dtype=float)
+    station = np.asarray(instrument, dtype=float)
+    facing = np.asarray(axis, dtype=float)
     facing = facing / np.linalg.norm(facing)
-    slope = None if jacobian is None else partial(_sight_gradient, tool, jacobian, station, facing)
+    slope = None
+    if jacobian is not None:
+        slope = partial(_sight_gradient, tool, jacobian, station, facing)
     return PoseConstraint("line of sight", partial(_sight, tool, station, facing, half_angle), slope)
 
 
@@ -101,38 +127,41 @@ def _height_gradient(jacobian, limits, q):
     return np.stack([sign * row for sign, _ in limits], axis=1)
 
 
-def _axis(tool, least, q):
+def _axis(tool, min_distance, q):
     x = tool(q)[1]
-    return least**2 - (x[:, :2] ** 2).sum(1, keepdims=True)
+    return min_distance**2 - (x[:, :2] ** 2).sum(1, keepdims=True)
 
 
 def _axis_gradient(tool, jacobian, q):
-    return -2 * np.einsum("mi,min->mn", tool(q)[1][:, :2], jacobian(q)[:, :2])[:, None]
+    _, position = tool(q)
+    return -2 * np.einsum("mi,min->mn", position[:, :2], jacobian(q)[:, :2])[:, None]
 
 
-def _reach(tool, most, centre, q):
-    return ((tool(q)[1] - centre) ** 2).sum(1, keepdims=True) - most**2
+def _reach(tool, max_distance, centre, q):
+    return ((tool(q)[1] - centre) ** 2).sum(1, keepdims=True) - max_distance**2
 
 
 def _reach_gradient(tool, jacobian, centre, q):
-    return 2 * np.einsum("mi,min->mn", tool(q)[1] - centre, jacobian(q)[:, :3])[:, None]
+    _, position = tool(q)
+    return 2 * np.einsum("mi,min->mn", position - centre, jacobian(q)[:, :3])[:, None]
 
 
 def _distance(tool, limits, centre, q):
-    away = np.linalg.norm(tool(q)[1] - centre, axis=1)
-    return np.stack([sign * (away - bound) for sign, bound in limits], axis=1)
+    length = np.linalg.norm(tool(q)[1] - centre, axis=1)
+    return np.stack([sign * (length - bound) for sign, bound in limits], axis=1)
 
 
 def _distance_gradient(tool, jacobian, limits, centre, q):
-    away = tool(q)[1] - centre
-    row = np.einsum("mi,min->mn", away / np.linalg.norm(away, axis=1, keepdims=True), jacobian(q)[:, :3])
+    from_centre = tool(q)[1] - centre
+    direction = from_centre / np.linalg.norm(from_centre, axis=1, keepdims=True)
+    row = np.einsum("mi,min->mn", direction, jacobian(q)[:, :3])
     return np.stack([sign * row for sign, _ in limits], axis=1)
 
 
 def _orientation(tool, camera, roll, pitch, q):
-    seen = camera.T @ tool(q)[0]
-    phi = np.arctan2(seen[:, 2, 1], seen[:, 2, 2])
-    theta = np.arcsin(np.clip(-seen[:, 2, 0], -1, 1))
+    in_camera = camera.T @ tool(q)[0]
+    phi = np.arctan2(in_camera[:, 2, 1], in_camera[:, 2, 2])
+    theta = np.arcsin(np.clip(-in_camera[:, 2, 0], -1, 1))
     return np.stack([roll[0] - phi, phi - roll[1], pitch[0] - theta, theta - pitch[1]], axis=1)
 
 
@@ -147,17 +176,20 @@ def _orientation_gradient(tool, jacobian, camera, q):
 
 def _sight(tool, station, facing, half_angle, q):
     rotation, x = tool(q)
-    away = station - x
-    u = away / np.linalg.norm(away, axis=1, keepdims=True)
+    to_station = station - x
+    u = to_station / np.linalg.norm(to_station, axis=1, keepdims=True)
     return np.cos(half_angle) - ((rotation @ facing) * u).sum(1, keepdims=True)
 
 
 def _sight_gradient(tool, jacobian, station, facing, q):
-    rotation, x = tool(q)
-    away, face = station - x, rotation @ facing
-    length = np.linalg.norm(away, axis=1, keepdims=True)
-    u = away / length
-    across = (face - (face * u).sum(1, keepdims=True) * u) / length  # ∂(face·u)/∂x = −across; ∂/∂ω = face × u
+    rotation, position = tool(q)
+    face = rotation @ facing
+    to_station = station - position
+    length = np.linalg.norm(to_station, axis=1, keepdims=True)
+    u = to_station / length
+    # ∂(face·u)/∂x = −across; ∂/∂ω = face × u
+    across = (face - (face * u).sum(1, keepdims=True) * u) / length
     slope = jacobian(q)
-    moved = np.einsum("mi,min->mn", across, slope[:, :3])
-    return (moved - np.einsum("mi,min->mn", np.cross(face, u), slope[:, 3:]))[:, None]
+    by_position = np.einsum("mi,min->mn", across, slope[:, :3])
+    by_rotation = np.einsum("mi,min->mn", np.cross(face, u), slope[:, 3:])
+    return (by_position - by_rotation)[:, None]

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from poses.information import Candidates, log_det, prepared
+from calib.poses.information import Candidates, log_det, prepared
 
 
 @dataclass(frozen=True)
@@ -79,22 +79,23 @@ def bound(
 
 def relaxed(candidates: Candidates, m: int, *, capped: bool = True, tolerance: float = 1e-3, rounds: int = 12) -> Bound:
     """Return the solved relaxation over prepared candidates; see `bound`."""
-    z, known = candidates.z, candidates.known
+    z, known_information = candidates.z, candidates.known
     count, _, p = z.shape
     cap = 1.0 if capped else float(m)
-    x, scores = _warm(z, known, m, cap)
-    best = _certify(z, known, x, m, capped)
-    active, iterations = _largest(scores, min(count, max(2 * m, 3 * p) + p)), 0
+    x, scores = _warm(z, known_information, m, cap)
+    best = _certify(z, known_information, x, m, capped)
+    active = _largest(scores, min(count, max(2 * m, 3 * p) + p))
+    iterations = 0
     for _ in range(rounds):
         if best.log_upper - best.logdet <= p * np.log1p(tolerance):
             break
-        weights, price, steps = _interior(z[active], known, x[active], m, cap, tolerance)
+        weights, price, steps = _interior(z[active], known_information, x[active], m, cap, tolerance)
         iterations += steps
         x = np.zeros(count)
         x[active] = weights
-        now = _certify(z, known, x, m, capped)
-        best = _tighter(best, now)
-        active = _priced(now.scores, x, active, price, 2 * p)
+        certified = _certify(z, known_information, x, m, capped)
+        best = _tighter(best, certified)
+        active = _priced(certified.scores, x, active, price, 2 * p)
     gap = float(np.expm1((best.log_upper - best.logdet) / p))
     log_upper = best.log_upper + candidates.shift
     logdet = best.logdet + candidates.shift
@@ -106,47 +107,55 @@ def certificate(candidates: Candidates, x: np.ndarray, m: int, capped: bool = Tr
     return _certify(candidates.z, candidates.known, x, m, capped).log_upper + candidates.shift
 
 
-def information_of(z: np.ndarray, known: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return M = known + Σ x_i z_iᵀz_i (p, p) from z (N, rows, p) and weights x (N,)."""
+def information_of(z: np.ndarray, known_information: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return M = M_known + Σ x_i z_iᵀz_i (p, p) from z (N, rows, p) and weights x (N,)."""
     chosen = np.flatnonzero(x)
     rows = z[chosen].reshape(-1, z.shape[2])
-    return known + rows.T @ (rows * np.repeat(x[chosen], z.shape[1])[:, None])
+    return known_information + rows.T @ (rows * np.repeat(x[chosen], z.shape[1])[:, None])
 
 
 def scores_of(z: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     """Return the scores d_i = tr(z_i M⁻¹ z_iᵀ) (N,) of candidates."""
     root = np.linalg.inv(np.linalg.cholesky(matrix))
     spread = z.reshape(-1, z.shape[2]) @ root.T
-    return np.einsum("ij,ij->i", *(2 * (spread.reshape(len(z), -1),)))
+    spread = spread.reshape(len(z), -1)
+    return np.einsum("ij,ij->i", spread, spread)
 
 
-def _certify(z: np.ndarray, known: np.ndarray, x: np.ndarray, m: int, capped: bool) -> _Certified:
-    matrix = information_of(z, known, x)
+def _certify(z: np.ndarray, known_information: np.ndarray, x: np.ndarray, m: int, capped: bool) -> _Certified:
+    matrix = information_of(z, known_information, x)
     logdet, p = float(log_det(matrix)), len(matrix)
     if not np.isfinite(logdet) or np.linalg.eigvalsh(matrix)[0] <= 1e-12 * np.trace(matrix):
         return _Certified(x, np.einsum("nrp,nrp->n", z, z), -np.inf, np.inf)
     scores = scores_of(z, matrix)
-    top = np.partition(scores, len(scores) - m)[-m:].sum() if capped else m * scores.max()
-    total = float(np.trace(np.linalg.solve(matrix, known)) + top)
+    top = m * scores.max()
+    if capped:
+        top = np.partition(scores, len(scores) - m)[-m:].sum()
+    total = float(np.trace(np.linalg.solve(matrix, known_information)) + top)
     return _Certified(x, scores, logdet, logdet + p * float(np.log(total / p)))
 
 
-def _tighter(one: _Certified, other: _Certified) -> _Certified:
+def _tighter(first: _Certified, second: _Certified) -> _Certified:
     """Return the better weights of two, and the tighter bound of two."""
-    upper = min(one.log_upper, other.log_upper)
-    better = other if other.logdet >= one.logdet else one
+    upper = min(first.log_upper, second.log_upper)
+    better = second if second.logdet >= first.logdet else first
     return _Certified(better.x, better.scores, better.logdet, upper)
 
 
-def _warm(z: np.ndarray, known: np.ndarray, m: int, cap: float, steps: int = 6) -> tuple[np.ndarray, np.ndarray]:
+def _warm(
+    z: np.ndarray, known_information: np.ndarray, m: int, cap: float, steps: int = 6
+) -> tuple[np.ndarray, np.ndarray]:
     """Return initial weights by a few multiplicative steps, and their scores."""
     x = np.full(len(z), m / len(z))
-    scores = scores_of(z, information_of(z, known, x))
-    for _ in range(steps if len(z) * cap > m else 0):  # with no choice left x = 1 is the answer
+    scores = scores_of(z, information_of(z, known_information, x))
+    if len(z) * cap <= m:
+        # with no choice left x = 1 is the answer
+        return x, scores
+    for _ in range(steps):
         x = x * scores**1.5
         for _ in range(3):
             x = np.minimum(x * (m / x.sum()), cap)
-        scores = scores_of(z, information_of(z, known, x))
+        scores = scores_of(z, information_of(z, known_information, x))
     return x, scores
 
 
@@ -155,19 +164,26 @@ def _largest(values: np.ndarray, count: int) -> np.ndarray:
     return np.sort(np.argpartition(values, len(values) - count)[-count:])
 
 
-def _priced(scores: np.ndarray, x: np.ndarray, active: np.ndarray, price: float, most: int) -> np.ndarray:
+def _priced(scores: np.ndarray, x: np.ndarray, active: np.ndarray, price: float, max_count: int) -> np.ndarray:
     """Return the next active set: candidates with weight or near the price, and the worst violators."""
     keep = active[(x[active] > 1e-4) | (scores[active] > 0.9 * price)]
-    if len(keep) < x.sum() + 2:  # all at the cap: leave the interior point room to move
+    if len(keep) < x.sum() + 2:
+        # all at the cap: leave the interior point room to move
         keep = active
-    outside = scores.copy()
-    outside[keep] = -np.inf
-    wanted = min(most, int((outside > price).sum()))
-    return np.sort(np.concatenate([keep, _largest(outside, wanted)])) if wanted else keep
+    candidates = scores.copy()
+    candidates[keep] = -np.inf
+    count = min(max_count, int((candidates > price).sum()))
+    return np.sort(np.concatenate([keep, _largest(candidates, count)])) if count else keep
 
 
 def _interior(
-    z: np.ndarray, known: np.ndarray, x: np.ndarray, m: int, cap: float, tolerance: float, most: int = 30
+    z: np.ndarray,
+    known_information: np.ndarray,
+    x: np.ndarray,
+    m: int,
+    cap: float,
+    tolerance: float,
+    max_steps: int = 30,
 ) -> tuple[np.ndarray, float, int]:
     """Return optimal weights (K,) over few candidates, the price λ of the sum, and the steps taken.
 
@@ -179,24 +195,30 @@ def _interior(
     x = 0.9 * np.clip(x * (m / max(x.sum(), 1e-12)), 0.0, cap) + 0.1 * (m / count)
     x = np.minimum(x, 0.95 * cap + 0.05 * m / count)
     tau = 0.1 * p / count
-    u, v, price = tau / x, tau / (cap - x), 0.0
-    for step in range(1, most + 1):
-        scores, curvature = _newton_terms(z, information_of(z, known, x))
+    u = tau / x
+    v = tau / (cap - x)
+    price = 0.0
+    for step in range(1, max_steps + 1):
+        scores, curvature = _newton_terms(z, information_of(z, known_information, x))
         slack = cap - x
         hessian = curvature + np.diag(u / x + v / slack)
         right = scores + tau / x - tau / slack
         solved = np.linalg.solve(hessian, np.stack([right, np.ones(count)], axis=1))
         price = float((solved[:, 0].sum() - (m - x.sum())) / solved[:, 1].sum())
         dx = solved[:, 0] - price * solved[:, 1]
-        du, dv = tau / x - u - u / x * dx, tau / slack - v + v / slack * dx
+        du = tau / x - u - u / x * dx
+        dv = tau / slack - v + v / slack * dx
         primal = min(1.0, 0.99 * _longest(x, dx), 0.99 * _longest(slack, -dx))
         dual = min(1.0, 0.99 * _longest(u, du), 0.99 * _longest(v, dv))
-        x, u, v = x + primal * dx, u + dual * du, v + dual * dv
+        x = x + primal * dx
+        u = u + dual * du
+        v = v + dual * dv
         complementarity = float(x @ u + (cap - x) @ v)
         if complementarity < 0.3 * p * tolerance and abs(x.sum() - m) < 1e-9 * m and primal > 0.5:
             return x, price, step
-        tau = 0.1 * complementarity / (2 * count) if min(primal, dual) > 0.5 else 0.5 * complementarity / (2 * count)
-    return x * (m / x.sum()), price, most
+        factor = 0.1 if min(primal, dual) > 0.5 else 0.5
+        tau = factor * complementarity / (2 * count)
+    return x * (m / x.sum()), price, max_steps
 
 
 def _newton_terms(z: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -205,12 +227,15 @@ def _newton_terms(z: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.nda
     root = np.linalg.inv(np.linalg.cholesky(matrix))
     spread = (z.reshape(-1, p) @ root.T).reshape(count, rows, p)
     inner = np.einsum("nrp,nrq->npq", spread, spread, optimize=True).reshape(count, -1)
-    upper = np.triu_indices(p)
-    packed = inner.reshape(count, p, p)[:, upper[0], upper[1]] * np.where(upper[0] == upper[1], 1.0, np.sqrt(2.0))
+    i, j = np.triu_indices(p)
+    weights = np.where(i == j, 1.0, np.sqrt(2.0))
+    packed = inner.reshape(count, p, p)[:, i, j] * weights
     return np.einsum("nrp,nrp->n", spread, spread), packed @ packed.T
 
 
 def _longest(value: np.ndarray, step: np.ndarray) -> float:
     """Return the largest t with value + t step ≥ 0."""
     falling = step < 0
-    return float((-value[falling] / step[falling]).min()) if falling.any() else np.inf
+    if not falling.any():
+        return np.inf
+    return float((-value[falling] / step[falling]).min())

@@ -11,10 +11,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from poses.information import log_det
+from calib.poses.information import log_det
 
-"""Information added to every design, relative to the unit mean information of one candidate, so that sets without
-full rank can be compared: our choice; values reported to the user never contain it."""
+# information added to every design, relative to the unit mean information of one candidate, so that sets without full
+# rank can be compared (our choice); values reported to the user never contain it
+RIDGE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -48,13 +49,12 @@ def design_of(pool: Pool, members: tuple[int, ...]) -> Design:
     """Return the design of given members, recomputed (this removes rounding errors of many updates)."""
     p = pool.z.shape[2]
     rows = pool.z[list(members)].reshape(-1, p)
-    ridge = 1e-6
-    matrix = pool.known + ridge * np.eye(p) + rows.T @ rows
+    matrix = pool.known + RIDGE * np.eye(p) + rows.T @ rows
     root = np.linalg.inv(np.linalg.cholesky(matrix))
     spread = (pool.z.reshape(-1, p) @ root.T).reshape(len(pool.z), -1)
-    taken = np.zeros(len(pool.z), dtype=bool)
-    taken[list(members)] = True
-    return Design(members, root.T @ root, np.einsum("ij,ij->i", spread, spread), float(log_det(matrix)), taken)
+    is_member = np.zeros(len(pool.z), dtype=bool)
+    is_member[list(members)] = True
+    return Design(members, root.T @ root, np.einsum("ij,ij->i", spread, spread), float(log_det(matrix)), is_member)
 
 
 def with_added(pool: Pool, design: Design, i: int) -> Design:
@@ -82,18 +82,18 @@ def best_addition(pool: Pool, design: Design, above: float = -np.inf, first: int
     """
     rows = pool.z.shape[1]
     scores = np.where(design.taken, -np.inf, design.scores)
-    found, gain = -1, above
-    least = rows * np.expm1(max(above, 0.0) / rows)
+    best, gain = -1, above
+    min_score = rows * np.expm1(max(above, 0.0) / rows)
     while True:
-        possible = np.flatnonzero(scores > least)
+        possible = np.flatnonzero(scores > min_score)
         if not len(possible):
-            return found, gain
+            return best, gain
         batch = possible[np.argsort(-scores[possible], kind="stable")[:first]]
         gains = gains_of(pool, design, batch, 1.0)
         if gains.max() > gain:
-            found, gain = int(batch[gains.argmax()]), float(gains.max())
+            best, gain = int(batch[gains.argmax()]), float(gains.max())
         scores[batch] = -np.inf
-        least = rows * np.expm1(max(gain, 0.0) / rows)
+        min_score = rows * np.expm1(max(gain, 0.0) / rows)
         first *= 4
 
 
@@ -104,9 +104,9 @@ def best_removal(pool: Pool, design: Design) -> tuple[int, float]:
     return int(members[gains.argmax()]), float(gains.max())
 
 
-def gains_of(pool: Pool, design: Design, which: np.ndarray, sign: float) -> np.ndarray:
+def gains_of(pool: Pool, design: Design, candidates: np.ndarray, sign: float) -> np.ndarray:
     """Return log det(I ± z_i C z_iᵀ) of some candidates (K,)."""
-    z = pool.z[which]
+    z = pool.z[candidates]
     blocks = (z @ design.inverse) @ z.transpose(0, 2, 1)
     return log_det(np.eye(z.shape[1]) + sign * blocks)
 
@@ -119,9 +119,9 @@ def _changed(pool: Pool, design: Design, i: int, sign: float) -> Design:
     root = np.linalg.cholesky((block + block.T) / 2)
     half = np.linalg.solve(root, zc)
     spread = (pool.z.reshape(-1, p) @ half.T).reshape(count, -1)
-    taken = design.taken.copy()
-    taken[i] = sign > 0
+    is_member = design.taken.copy()
+    is_member[i] = sign > 0
     members = (*design.members, i) if sign > 0 else tuple(k for k in design.members if k != i)
     scores = np.maximum(design.scores - sign * np.einsum("ij,ij->i", spread, spread), 0.0)
     logdet = design.logdet + 2.0 * float(np.log(np.diag(root)).sum())
-    return Design(members, design.inverse - sign * (half.T @ half), scores, logdet, taken)
+    return Design(members, design.inverse - sign * (half.T @ half), scores, logdet, is_member)

@@ -5,13 +5,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from poses.design import Design, Pool, best_addition, best_removal, design_of, with_added, with_removed
+from calib.poses.design import Design, Pool, best_addition, best_removal, design_of, with_added, with_removed
 
+# called with each design of the requested size that is better than all before
 Report = Callable[[Design], None]
-"""Called with each design of the requested size that is better than all before."""
 
+# smallest gain of log det that counts (our choice)
 TOLERANCE = 1e-9
-"""Smallest gain of log det that counts: our choice."""
 
 
 def greedy(pool: Pool, m: int) -> Design:
@@ -39,9 +39,9 @@ def exchanged(pool: Pool, design: Design, report: Report | None = None, sweeps: 
         for member in design.members:
             thinned = with_removed(pool, design, member)
             drop = thinned.logdet - design.logdet
-            other, gain = best_addition(pool, thinned, above=-drop + TOLERANCE)
-            if other >= 0 and gain + drop > TOLERANCE:
-                design = with_added(pool, thinned, other)
+            candidate, gain = best_addition(pool, thinned, above=-drop + TOLERANCE)
+            if candidate >= 0 and gain + drop > TOLERANCE:
+                design = with_added(pool, thinned, candidate)
                 if report:
                     report(design)
         design = design_of(pool, design.members)
@@ -69,14 +69,14 @@ def detmax(pool: Pool, design: Design, report: Report | None = None, *, longest:
     fruitless, over = 0, {True: False, False: False}
     upwards = True
     while fruitless < failures and not all(over.values()):
-        back, seen = _excursion(pool, design, upwards, longest, failed)
+        back, passed = _excursion(pool, design, upwards, longest, failed)
         if back is not None and back.logdet > design.logdet + TOLERANCE:
             design = exchanged(pool, design_of(pool, back.members), sweeps=1)
             failed, fruitless, over = set(), 0, {True: False, False: False}
             if report:
                 report(design)
             continue
-        failed |= seen
+        failed |= passed
         over[upwards] = back is None
         fruitless, upwards = fruitless + 1, not upwards
     return design
@@ -132,17 +132,17 @@ def _excursion(
     pool: Pool, start: Design, upwards: bool, longest: int, failed: set[frozenset[int]]
 ) -> tuple[Design | None, set[frozenset[int]]]:
     """Return the design at the end of one excursion (None if it went too far), and the designs passed."""
-    m, seen, design, larger = len(start.members), set[frozenset[int]](), start, upwards
+    m, passed, design, larger = len(start.members), set[frozenset[int]](), start, upwards
     while True:
         size = len(design.members) + (1 if larger else -1)
         if abs(size - m) > longest or size < 1 or size > len(pool.z):
-            return None, seen
+            return None, passed
         design = _step(pool, design, larger)
         if size == m:
-            return design, seen
+            return design, passed
         key = frozenset(design.members)
-        outwards = key in failed or key in seen  # the second clause is ours: without it an excursion can circle
-        seen.add(key)
+        outwards = key in failed or key in passed  # the second clause is ours: without it an excursion can circle
+        passed.add(key)
         larger = (size > m) == outwards
 
 

@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import solve_triangular
 
-from poses.errors import BadInput, NotIdentifiable, TooFewCandidates, require
+from calib.poses.errors import BadInput, NotIdentifiable, TooFewCandidates, require
 
-"""Smallest accepted ratio of singular values of the column-scaled candidates: our choice (Gram matrices see 1e-8)."""
+# smallest accepted ratio of singular values of the column-scaled candidates (our choice; Gram matrices see 1e-8)
+RANK_TOLERANCE = 1e-7
 
 
 @dataclass(frozen=True)
@@ -76,9 +77,14 @@ def prepared(jacobians: ArrayLike, m: int, existing: ArrayLike | None = None) ->
     mean = (gram + past / count) / np.outer(scale, scale)
     _check_rank(mean)
     transform = solve_triangular(np.linalg.cholesky(mean).T, np.eye(p)) / scale[:, None]
-    known = transform.T @ past @ transform
+    known_information = transform.T @ past @ transform
     z = (stacked @ transform).reshape(array.shape)
-    return Candidates(z, (known + known.T) / 2, transform, -2.0 * float(np.log(np.abs(np.diag(transform))).sum()))
+    return Candidates(
+        z,
+        (known_information + known_information.T) / 2,
+        transform,
+        -2.0 * float(np.log(np.abs(np.diag(transform))).sum()),
+    )
 
 
 def log_det(matrices: np.ndarray) -> np.ndarray:
@@ -101,7 +107,8 @@ def _check_counts(count: int, rows: int, p: int, m: int, measured: int) -> None:
 
 
 def _check_columns(scale: np.ndarray) -> None:
-    dead = np.flatnonzero(scale <= 1e-13 * scale.max())  # scaled up, a column of rounding errors would look healthy
+    # scaled up, a column of rounding errors would look healthy
+    dead = np.flatnonzero(scale <= 1e-13 * scale.max())
     if len(dead):
         raise NotIdentifiable(
             f"columns {dead.tolist()} of the Jacobians are zero (to rounding) in every candidate: these parameters do "
@@ -109,9 +116,9 @@ def _check_columns(scale: np.ndarray) -> None:
         )
 
 
-def _check_rank(mean: np.ndarray, rank_tolerance: float = 1e-7) -> None:
+def _check_rank(mean: np.ndarray) -> None:
     s = np.sqrt(np.maximum(np.linalg.eigvalsh(mean)[::-1], 0.0))
-    rank = int((s > rank_tolerance * s[0]).sum())
+    rank = int((s > RANK_TOLERANCE * s[0]).sum())
     if rank < len(s):
         raise NotIdentifiable(
             f"all candidates together have rank {rank} for {len(s)} parameters (smallest singular value ratio "

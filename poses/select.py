@@ -8,20 +8,20 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from poses.by_index import exchanged_by_index, merits
-from poses.candidates import draw_candidates
-from poses.continuous.global_local import mlsl_search
-from poses.continuous.local import Improved, improved
-from poses.continuous.multistart import multistart_search, random_starts
-from poses.continuous.tabu import DEFAULT_RULE, TabuRule, tabu_search
-from poses.convex import Bound, relaxed
-from poses.design import Design, Pool, design_of
-from poses.errors import BadInput, NotIdentifiable
-from poses.exchange import detmax, exchanged, greedy, kicked
-from poses.indices import Index, merit, observability
-from poses.information import Candidates, checked, log_det, prepared
-from poses.space import SearchSpace, is_feasible
-from poses.whole_space import Ceiling, bound_over_space
+from calib.poses.by_index import exchanged_by_index, merits
+from calib.poses.candidates import draw_candidates
+from calib.poses.continuous.global_local import mlsl_search
+from calib.poses.continuous.local import Improved, improved
+from calib.poses.continuous.multistart import multistart_search, random_starts
+from calib.poses.continuous.tabu import DEFAULT_RULE, TabuRule, tabu_search
+from calib.poses.convex import Bound, relaxed
+from calib.poses.design import Design, Pool, design_of
+from calib.poses.errors import BadInput, NotIdentifiable
+from calib.poses.exchange import detmax, exchanged, greedy, kicked
+from calib.poses.indices import Index, merit, observability
+from calib.poses.information import Candidates, checked, log_det, prepared
+from calib.poses.space import SearchSpace, is_feasible
+from calib.poses.whole_space import Ceiling, bound_over_space
 
 Method = Literal["detmax", "polish", "local", "multistart", "mlsl", "tabu"]
 Progress = Callable[[int, int, str], None]
@@ -42,7 +42,7 @@ class SearchSettings:
         evaluations: largest number of evaluations of one local search.
         rule: settings of the tabu search.
         seconds: processor time after which the search stops; bounds and baseline not counted.
-        climbs: local searches for poses that exceed the bound, see `poses.whole_space`; 0: the bound covers the
+        climbs: local searches for poses that exceed the bound, see `calib.poses.whole_space`; 0: the bound covers the
             candidates and the chosen poses only.
     """
 
@@ -152,12 +152,12 @@ def select_poses(
     """Return m poses that make the parameters as observable as possible.
 
     * ``detmax`` chooses among the candidates: rounded relaxation and greedy start, pair exchange, DETMAX excursions,
-      kicks (`poses.exchange`); other indices than O1 go on from there by `poses.by_index`.
-    * ``polish`` moves all joint values of that set at once (`poses.continuous.local`).
+      kicks (`calib.poses.exchange`); other indices than O1 go on from there by `calib.poses.by_index`.
+    * ``polish`` moves all joint values of that set at once (`calib.poses.continuous.local`).
     * ``local`` does so from one random set of the candidates, ``multistart`` from `starts` of them
-      (`poses.continuous.multistart`): the study's deterministic search and its remedy.
-    * ``mlsl`` looks for the best start everywhere, by NLopt's MLSL (`poses.continuous.global_local`).
-    * ``tabu`` is IMHATR, the two-stage meta-heuristic (`poses.continuous.tabu`).
+      (`calib.poses.continuous.multistart`): the study's deterministic search and its remedy.
+    * ``mlsl`` looks for the best start everywhere, by NLopt's MLSL (`calib.poses.continuous.global_local`).
+    * ``tabu`` is IMHATR, the two-stage meta-heuristic (`calib.poses.continuous.tabu`).
 
     Args:
         jacobians: (N, rows, p) whitened observation Jacobians of the candidates in base columns; None takes them at q,
@@ -215,13 +215,13 @@ def random_baseline(
     """
     generator = np.random.default_rng(seed)
     count, _, p = jacobians.shape
-    known = np.zeros((p, p)) if existing is None else existing.reshape(-1, p).T @ existing.reshape(-1, p)
+    known_information = np.zeros((p, p)) if existing is None else existing.reshape(-1, p).T @ existing.reshape(-1, p)
     best, best_set = -np.inf, np.arange(m)
     chunk = max(1, 2_000_000 // (m * jacobians.shape[1] * p))
     for first in range(0, sets, chunk):
         drawn = np.array([generator.choice(count, m, replace=False) for _ in range(min(chunk, sets - first))])
         rows = jacobians[drawn].reshape(len(drawn), -1, p)
-        matrices = known + rows.transpose(0, 2, 1) @ rows
+        matrices = known_information + rows.transpose(0, 2, 1) @ rows
         values = log_det(matrices) if index == "O1" else merits(matrices, index)
         if values.max() > best:
             best, best_set = float(values.max()), drawn[values.argmax()]
@@ -247,7 +247,7 @@ def _candidates(
 def _exchange(task: _Request) -> _Chosen:
     """Choose poses among the candidates; after Ctrl-C return the best so far."""
     candidates, m, p = task.candidates, task.m, task.jacobians.shape[2]
-    whole = Pool(candidates.z, candidates.known)
+    all_candidates = Pool(candidates.z, candidates.known)
     # Candidates of small score at the relaxed optimum are hardly ever chosen: search the promising ones (1000 at least,
     # our choice), and polish among all at the end.
     short = np.sort(np.argsort(-task.bound.scores, kind="stable")[: max(1000, 15 * m)])
@@ -272,11 +272,11 @@ def _exchange(task: _Request) -> _Chosen:
         stage(3, "DETMAX excursions and kicks")
         design = detmax(pool, max(designs, key=lambda d: d.logdet), keep)
         # Kicks are skipped where the certificate leaves less than half a percent to win.
-        left = (task.bound.log_upper - candidates.shift - design.logdet) / p
+        remaining = (task.bound.log_upper - candidates.shift - design.logdet) / p
         design = kicked(
             pool,
             design,
-            task.settings.kicks if left > 0.005 else 0,
+            task.settings.kicks if remaining > 0.005 else 0,
             task.seed,
             keep,
             weights=weights,
@@ -284,7 +284,9 @@ def _exchange(task: _Request) -> _Chosen:
         )
         keep(design)
         stage(4, "exchange among all candidates")
-        polished = exchanged(whole, design_of(whole, best[-1][0]), lambda d: keep(d, np.arange(len(candidates.z))))
+        polished = exchanged(
+            all_candidates, design_of(all_candidates, best[-1][0]), lambda d: keep(d, np.arange(len(candidates.z)))
+        )
         keep(polished, np.arange(len(candidates.z)))
     except KeyboardInterrupt:
         if not best:
@@ -302,12 +304,14 @@ def _by_index(task: _Request, members: tuple[int, ...]) -> _Chosen:
     """Improve the D-optimal set by exchanges for another index."""
     p = task.jacobians.shape[2]
     past = np.zeros((0, p)) if task.before is None else task.before.reshape(-1, p)
-    known = past.T @ past
+    known_information = past.T @ past
     rows = np.concatenate([past, task.jacobians[list(members)].reshape(-1, p)])
     best = [(members, merit(rows, task.index)[0])]
     interrupted = False
     try:
-        exchanged_by_index(task.jacobians, known, members, task.index, lambda found, value: best.append((found, value)))
+        exchanged_by_index(
+            task.jacobians, known_information, members, task.index, lambda found, value: best.append((found, value))
+        )
     except KeyboardInterrupt:
         interrupted = True
     return _Chosen(best[-1][0], None, tuple(value for _, value in best), len(best), interrupted)
@@ -321,9 +325,11 @@ def _polished(task: _Request) -> _Chosen:
         return chosen
     space, joints = _movable(task)
     start = joints[sorted(chosen.members or ())]
-    left = task.settings.seconds - (time.process_time() - began)
+    remaining = task.settings.seconds - (time.process_time() - began)
     task.progress(0, 1, "local search")
-    return _of(improved(space, start, task.index, task.before, evaluations=task.settings.evaluations, seconds=left))
+    return _of(
+        improved(space, start, task.index, task.before, evaluations=task.settings.evaluations, seconds=remaining)
+    )
 
 
 def _multistart(task: _Request, starts: int) -> _Chosen:
@@ -435,8 +441,8 @@ def _ceiling(task: _Request, q: np.ndarray | None, climbs: int) -> Ceiling:
     def report(number: int, gap: float) -> None:
         task.progress(number, number + 1, f"bound over all feasible poses, loose by {100 * gap:.2g} %")
 
-    both = np.concatenate([joints, q])
-    return bound_over_space(space, both, task.m, task.before, climbs=climbs, seed=task.seed, report=report)
+    all_poses = np.concatenate([joints, q])
+    return bound_over_space(space, all_poses, task.m, task.before, climbs=climbs, seed=task.seed, report=report)
 
 
 def _value(jacobians: np.ndarray, existing: np.ndarray | None, index: Index) -> float:

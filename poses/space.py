@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from poses.errors import BadInput
+from calib.poses.errors import BadInput
 
 STEP = 1e-5
 """Step of central differences [rad or m]: our choice; truncation and rounding both cost about 1e-10 of the values."""
@@ -98,7 +98,7 @@ def central_difference(function: Callable[[np.ndarray], np.ndarray], q: np.ndarr
     """Return ∂f_i/∂q_ik (m, n, ...) of a function (m, n) -> (m, ...) with independent poses, in one batch."""
     m, n = q.shape
     steps = STEP * np.eye(n)
-    both = np.concatenate([q[:, None] + steps, q[:, None] - steps], axis=1).reshape(-1, n)
-    values = np.asarray(function(both), dtype=float)
+    displaced = np.concatenate([q[:, None] + steps, q[:, None] - steps], axis=1).reshape(-1, n)
+    values = np.asarray(function(displaced), dtype=float)
     values = values.reshape(m, 2, n, *values.shape[1:])
     return (values[:, 0] - values[:, 1]) / (2 * STEP)

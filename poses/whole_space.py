@@ -1,6 +1,7 @@
 """An upper bound over all poses within limits and constraints, not only over the candidates.
 
-The relaxation of `poses.convex`, with poses allowed to repeat, over all feasible poses: a design is a measure ξ of mass
+The relaxation of `calib.poses.convex`, with poses allowed to repeat, over all feasible poses: a design is a measure ξ
+of mass
 m. By the general equivalence theorem (Kiefer & Wolfowitz 1960), for any M = M_known + ∫ JᵀJ dξ ≻ 0 and any m poses
 
     det M(q_1 ... q_m)^(1/p)  ≤  det M^(1/p) · (tr(M⁻¹ M_known) + m max_q d(q)) / p,    d(q) = tr(J(q) M⁻¹ J(q)ᵀ),
@@ -19,14 +20,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from poses.candidates import draw_candidates
-from poses.continuous.local import climb, restored
-from poses.convex import information_of, relaxed, scores_of
-from poses.information import log_det, prepared
-from poses.space import SearchSpace, is_feasible, product
+from calib.poses.candidates import draw_candidates
+from calib.poses.continuous.local import climb, restored
+from calib.poses.convex import information_of, relaxed, scores_of
+from calib.poses.information import log_det, prepared
+from calib.poses.space import SearchSpace, is_feasible, product
 
+# poses optimised together: few for a fast SLSQP, many for an efficient Jacobian (our choice)
 BLOCK = 8
-"""Poses optimised together: few for a fast SLSQP, many for an efficient Jacobian. Our choice."""
+# poses that differ by less in all joints are one start [rad or m] (our choice)
+MIN_DIFFERENCE = 0.1
 
 
 @dataclass(frozen=True)
@@ -77,36 +80,44 @@ def bound_over_space(
         report: called with each round's number and the gap.
     """
     generator = np.random.default_rng([seed, 5])
-    jacobians, tried, excess, spent = np.asarray(space.jacobian(q), dtype=float), 0, 0.0, 0
+    jacobians, climbs_of_round, excess, spent = np.asarray(space.jacobian(q), dtype=float), 0, 0.0, 0
     p = jacobians.shape[2]
     for number in range(max(rounds, 1)):
         candidates = prepared(jacobians, m, existing)
         weights = relaxed(candidates, m, capped=False, tolerance=0.1 * tolerance).weights
         matrix = information_of(candidates.z, candidates.known, weights)
         scores = scores_of(candidates.z, matrix)
-        known = float(np.trace(np.linalg.solve(matrix, candidates.known)))
+        known_trace = float(np.trace(np.linalg.solve(matrix, candidates.known)))
         logdet, highest = float(log_det(matrix)) + candidates.shift, float(scores.max())
         if not climbs:
             break
         root = candidates.transform @ np.linalg.inv(np.linalg.cholesky(matrix)).T
-        tried = BLOCK if number < rounds - 1 and tried < climbs and (number == 0 or excess > tolerance) else climbs
-        starts = _starts(space, q, scores, tried, generator)
-        found, steps = _climbed(space, starts, root)
+        climbs_of_round = (
+            BLOCK
+            if number < rounds - 1 and climbs_of_round < climbs and (number == 0 or excess > tolerance)
+            else climbs
+        )
+        starts = _starts(space, q, scores, climbs_of_round, generator)
+        maxima, steps = _climbed(space, starts, root)
         spent += steps
-        heights = scores_of(np.asarray(space.jacobian(found), dtype=float) @ root, np.eye(p)) if len(found) else scores
+        heights = (
+            scores_of(np.asarray(space.jacobian(maxima), dtype=float) @ root, np.eye(p)) if len(maxima) else scores
+        )
         excess = max(float(heights.max()) / highest - 1.0, 0.0)
         highest = max(highest, float(heights.max()))
         if report:
-            report(number, (known + m * highest) / p - 1.0)
-        if excess <= tolerance and tried == climbs:
+            report(number, (known_trace + m * highest) / p - 1.0)
+        if excess <= tolerance and climbs_of_round == climbs:
             break
-        if len(found):
-            better = found[heights > float(scores.max()) * (1.0 + 0.1 * tolerance)]
+        if len(maxima):
+            better = maxima[heights > float(scores.max()) * (1.0 + 0.1 * tolerance)]
             q = np.concatenate([q, _apart(better)])
             jacobians = np.concatenate([jacobians, np.asarray(space.jacobian(q[len(jacobians) :]), dtype=float)])
-    total = known + m * highest
+    total = known_trace + m * highest
     upper = float(np.exp(logdet / p)) * total / p
-    return Ceiling(upper, total / p - 1.0, tried if climbs else 0, excess, q[weights[: len(q)].nonzero()[0]], spent)
+    return Ceiling(
+        upper, total / p - 1.0, climbs_of_round if climbs else 0, excess, q[weights[: len(q)].nonzero()[0]], spent
+    )
 
 
 def _climbed(space: SearchSpace, starts: np.ndarray, root: np.ndarray) -> tuple[np.ndarray, int]:
@@ -125,8 +136,8 @@ def _climbed(space: SearchSpace, starts: np.ndarray, root: np.ndarray) -> tuple[
             raise KeyboardInterrupt
         ends.append(restored(space, end))
         spent += steps * len(block)
-    found = np.concatenate(ends)
-    return found[is_feasible(space, found)], spent
+    maxima = np.concatenate(ends)
+    return maxima[is_feasible(space, maxima)], spent
 
 
 def _starts(
@@ -134,19 +145,21 @@ def _starts(
 ) -> np.ndarray:
     """Return start poses: half with the highest d, pairwise distinct, and half at random."""
     ranked = _apart(q[np.argsort(-scores, kind="stable")[: 20 * count]])[: count - count // 2]
-    rest = count - len(ranked)
+    random_count = count - len(ranked)
     return np.concatenate(
         [
             ranked,
-            draw_candidates(space.lower, space.upper, rest, lambda x: is_feasible(space, x), seed=generator, block=256),
+            draw_candidates(
+                space.lower, space.upper, random_count, lambda x: is_feasible(space, x), seed=generator, block=256
+            ),
         ]
     )
 
 
-def _apart(q: np.ndarray, least: float = 0.1) -> np.ndarray:
-    """Return the poses that differ pairwise by at least `least` [rad or m] in some joint; our choice."""
-    kept = np.zeros((0, q.shape[1]))
+def _apart(q: np.ndarray) -> np.ndarray:
+    """Return the poses that differ pairwise by at least `MIN_DIFFERENCE` in some joint."""
+    distinct = np.zeros((0, q.shape[1]))
     for pose in q:
-        if not len(kept) or (np.abs(kept - pose).max(1) > least).all():
-            kept = np.concatenate([kept, pose[None]])
-    return kept
+        if not len(distinct) or (np.abs(distinct - pose).max(1) > MIN_DIFFERENCE).all():
+            distinct = np.concatenate([distinct, pose[None]])
+    return distinct

@@ -17,14 +17,14 @@ SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob
 
 # heavy dependency -> the only modules that may import it (a trailing dot: all of that package)
 HOMES = {
-    "pinocchio": ["calib.robot.collision", "calib.robot.formats.simulators", "calib.rooms.parallel.export"],
+    "pinocchio": ["calib.robot.collision", "calib.robot.formats.simulators", "calib.parallel.export"],
     "coal": ["calib.robot.collision"],
     "numba": [
         "calib.dynamics.gradient_kernels",
         "calib.dynamics.kernels",
         "calib.dynamics.shape_kernels",
-        "calib.rooms.parallel.mechanism.closure_kernels",
-        "calib.rooms.parallel.mechanism.simulation_kernels",
+        "calib.parallel.mechanism.closure_kernels",
+        "calib.parallel.mechanism.simulation_kernels",
         "calib.robot.capsule_kernels",
         "calib.identification.closed_loop.loop_kernels",
         "calib.identification.survey.tangent_kernels",
@@ -35,37 +35,38 @@ HOMES = {
         "calib.data.images.images",
         "calib.data.images.board_and_lens",
         "calib.data.images.board_print",
-        "calib.rooms.cells.rendered_camera",
+        "calib.simulation.rendered_camera",
     ],
     "ruamel": ["calib.data.images.lens", "calib.procedure.measuring.moveit"],
     "mcap": ["calib.data."],
     "rosbags": ["calib.data.recordings.bags", "calib.data.images."],
     "pandas": ["calib.api.rendering"],
-    "starlette": ["calib.rooms.serve.pages"],
-    "uvicorn": ["calib.rooms.serve.commands"],
-    "python_multipart": ["calib.rooms.serve.uploads"],
-    "rerun": ["calib.rooms.viewer.viewer"],
-    "nlopt": ["poses.", "trajectories."],
-    "toppra": ["trajectories."],
-    "ruckig": ["trajectories."],
+    "starlette": ["calib.apps.serve.pages"],
+    "uvicorn": ["calib.apps.serve.commands"],
+    "python_multipart": ["calib.apps.serve.uploads"],
+    "rerun": ["calib.apps.viewer.viewer"],
+    "nlopt": ["calib.poses.", "calib.trajectories."],
+    "toppra": ["calib.trajectories."],
+    "ruckig": ["calib.trajectories."],
     "clarabel": ["calib.estimation."],
     "cvxpy": [],  # the tests' independent solver
-    "matplotlib": ["calib.procedure.", "calib.api.", "calib.rooms.", "calib.apps."],
+    "matplotlib": ["calib.procedure.", "calib.api.", "calib.apps."],
     "jinja2": ["calib.procedure.report.templates", "calib.apps.controller_programs.program"],
     "typst": ["calib.procedure.report.certificate.rendering"],
     "dask": ["calib.workers.cluster"],
     "distributed": ["calib.workers.cluster"],
-    "fsspec": ["calib.rooms.fleet.stores"],
+    "fsspec": ["calib.apps.fleet.stores"],
     "cloudpickle": ["calib.workers.cluster"],
     "threadpoolctl": ["calib.workers.threads"],
-    "typer": ["calib.cli", "calib.cli.", "calib.rooms.", "calib.apps."],
+    "typer": ["calib.cli", "calib.cli.", "calib.apps."],
     "click": ["calib.cli", "calib.cli."],
-    "rich": ["calib.cli", "calib.cli.", "calib.api.rendering", "calib.procedure.", "calib.rooms.", "calib.apps."],
+    "rich": ["calib.cli", "calib.cli.", "calib.api.rendering", "calib.procedure.", "calib.apps."],
 }
 
 
 def module_of(path: Path) -> str:
-    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+    name = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+    return name if path.is_relative_to(ROOT / "calib") else f"calib.{name}"
 
 
 def imports(path: Path) -> Iterator[tuple[str, int]]:
@@ -95,7 +96,7 @@ def statements(above: ast.AST) -> Iterator[ast.AST]:
 
 
 def test_the_contracts_are_kept():
-    """Layers, rooms and the absence of circles, as ``[tool.importlinter]`` in pyproject.toml states them."""
+    """Layers and the absence of circles, as ``[tool.importlinter]`` in pyproject.toml states them."""
     code = "from importlinter.cli import lint_imports_command as lint; lint(['--no-cache', '--no-logo'])"
     result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert result.returncode == 0, result.stdout
@@ -130,16 +131,16 @@ def test_the_walker_sees_every_form_of_import():
     } <= names
 
 
-def test_no_core_module_names_a_room():
+def test_no_core_module_names_an_application():
     """Except the list of what `import calib` offers, whose entries are loaded when first used."""
-    upper = [path for folder in ("rooms", "apps") for path in (ROOT / "calib" / folder).rglob("*.py")]
+    upper = [path for folder in ("parallel", "apps") for path in (ROOT / "calib" / folder).rglob("*.py")]
     core = [path for path in SOURCES if path not in upper and path != ROOT / "calib/__init__.py"]
-    named = re.compile(r"(import|from) calib\.(rooms|apps)")
+    named = re.compile(r"(import|from) calib\.(parallel|apps)")
     assert [path for path in core if named.search(path.read_text(encoding="utf-8"))] == []
 
 
-def test_the_rooms_can_be_shut(monkeypatch):
-    """Without any room the core's commands, methods and formats are there; what a room offers is asked for by name.
+def test_applications_can_be_removed(monkeypatch):
+    """Without any application the core's commands, methods and formats are there; what they offer is asked for by name.
 
     What an instrument measures is fitted.
     """
@@ -150,7 +151,7 @@ def test_the_rooms_can_be_shut(monkeypatch):
     assert extensions.Point("commands", "").all() == []
     with pytest.raises(UsageError):
         extensions.Point("optics", "").one()
-    code = "import sys; sys.modules['calib.rooms'] = sys.modules['calib.apps'] = None; "
+    code = "import sys; sys.modules['calib.apps'] = None; "
     code += "import calib; from calib.cli import run; "
     code += "from calib.data.poses.measurements import PoseMeasurements as Measured; import numpy as np; "
     code += "rng = np.random.default_rng(0); q = rng.uniform(-1, 1, (40, 6)); robot = calib.load('tx40'); "

@@ -41,22 +41,23 @@ def test_every_offer_loads():
 def test_every_point_is_declared_once_with_its_type():
     sources = [path.read_text(encoding="utf-8") for path in (ROOT / "calib").rglob("*.py")]
     declared = [match for source in sources for match in DECLARED.finditer(source)]
-    assert Counter(match["name"] for match in declared) == Counter(POINTS)
+    assert Counter(match["name"] for match in declared) == Counter(POINTS) and len(POINTS) <= 10
+    assert [source for source in sources if "Point[Any]" in source] == []
 
 
 def test_a_misspelt_point_is_told(add):
     add("extra", "OFFERS = {'comands': 'commands:app'}")
     words = r"calib\.apps\.extra: OFFERS: there is no extension point 'comands' \(did you mean 'commands'\?\)"
     with pytest.raises(UsageError, match=words):
-        Point("topics", "").all()
-    with pytest.raises(ValueError, match="did you mean 'topics'"):
-        Point("topic", "")
+        Point("formats", "").all()
+    with pytest.raises(ValueError, match="did you mean 'formats'"):
+        Point("format", "")
 
 
 def test_a_misspelt_name_is_told(add):
-    add("extra", "OFFERS = {'topics': ':TOPIC'}\nTOPICS = {}")
-    with pytest.raises(UsageError, match=r"extra: OFFERS: :TOPIC: there is no 'TOPIC' \(did you mean 'TOPICS'\?\)"):
-        Point("topics", "").all()
+    add("extra", "OFFERS = {'formats': ':FORMAT'}\nFORMATS = {}")
+    with pytest.raises(UsageError, match=r"extra: OFFERS: :FORMAT: there is no 'FORMAT' \(did you mean 'FORMATS'\?\)"):
+        Point("formats", "").all()
 
 
 def test_an_extension_that_raises_is_told(add):

@@ -12,19 +12,19 @@ import pytest
 
 import calib
 from calib import cli
+from calib.apps.compensation import joint_commands
+from calib.apps.viewer import scene, viewer
 from calib.config import parse, strict
 from calib.data.poses.fit_options import FitOptions
 from calib.dynamics.torque_rows import POWER
 from calib.errors import UsageError
+from calib.parallel.mechanism.closure import closed
+from calib.parallel.mechanism.geometric_fit import changed, loop_parameters
+from calib.parallel.robots import find
 from calib.procedure.kinematic_stage.folder import FitFolder
 from calib.robot import calibrated, description
 from calib.robot.chain import random_joints
 from calib.robot.library import load
-from calib.rooms.compensation import joint_commands
-from calib.rooms.parallel.mechanism.closure import closed
-from calib.rooms.parallel.mechanism.geometric_fit import changed, loop_parameters
-from calib.rooms.parallel.robots import find
-from calib.rooms.viewer import scene, viewer
 
 SIGMA = 2e-5  # of the instrument [m]
 KINDS = ("distance", "bar", "plane", "sockets")

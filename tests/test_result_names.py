@@ -9,7 +9,10 @@ from types import CodeType
 
 import pytest
 
+from calib import result_kinds
+
 SOURCES = sorted((Path(__file__).parents[1] / "calib").rglob("*.py"))
+KINDS = "result_kinds.py"  # recognises folders by names whose homes stand above it
 RESULTS = (
     "metrics.json", "estimate.csv", "covariance.csv", "chain_covariance.csv", "information.csv", "instrumental.csv",
     "dynamics.json", "drive_gains.csv", "errors.csv", "rows.json", "trajectory.toml", "front.csv", "rehearsal.csv",
@@ -45,10 +48,19 @@ def texts(value: object) -> Iterator[str]:
 def test_a_results_name_has_one_home() -> None:
     homes: dict[str, list[str]] = defaultdict(list)
     for source in SOURCES:
+        if source.name == KINDS:
+            continue
         for name in paths(source) & set(RESULTS):
             homes[name].append(str(source.relative_to(SOURCES[0].parent)))
     assert {name: where for name, where in homes.items() if len(where) > 1} == {}
     assert set(homes) == set(RESULTS)
+
+
+def test_folders_are_recognised_by_names_that_are_written() -> None:
+    homes = set().union(*(paths(source) for source in SOURCES if source.name != KINDS))
+    for kind in result_kinds.KINDS:
+        for marks in kind.marks:
+            assert set(marks) <= homes
 
 
 @pytest.mark.parametrize("text", ["5-validation/metrics.json", "/metrics.json", "metrics.json"])

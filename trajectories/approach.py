@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from trajectories.errors import BadInput, require
-from trajectories.setpoints import Setpoints
+from calib.trajectories.errors import BadInput, require
+from calib.trajectories.setpoints import Setpoints
 
 KINDS: tuple[str, ...] = ("velocity", "acceleration", "jerk")
 
@@ -36,10 +36,10 @@ def straight_approach(
     if np.array_equal(start, goal):
         still = np.zeros((1, len(start)))
         return Setpoints(rate, start[None, :].copy(), still, still.copy())
-    found = _trajectory(start, goal, bounds)
-    count = max(math.ceil(found.duration * rate - 1e-9), 1)
-    stretch = count / rate / found.duration
-    rows = [found.at_time(min(t, found.duration)) for t in np.arange(count + 1) / rate / stretch]
+    approach = _trajectory(start, goal, bounds)
+    count = max(math.ceil(approach.duration * rate - 1e-9), 1)
+    stretch = count / rate / approach.duration
+    rows = [approach.at_time(min(t, approach.duration)) for t in np.arange(count + 1) / rate / stretch]
     q, v, a = (np.array([row[order] for row in rows]) for order in range(3))
     q[[0, -1]], v[[0, -1]] = (start, goal), 0.0
     return Setpoints(rate, q, v / stretch, a / stretch**2)
@@ -48,14 +48,14 @@ def straight_approach(
 def _trajectory(start: np.ndarray, goal: np.ndarray, bounds: dict[str, np.ndarray]) -> Any:
     import ruckig
 
-    given = ruckig.InputParameter(len(start))
-    given.current_position, given.target_position = start.tolist(), goal.tolist()
-    given.max_velocity, given.max_acceleration, given.max_jerk = (bounds[kind].tolist() for kind in KINDS)
-    given.synchronization = ruckig.Synchronization.Phase
+    request = ruckig.InputParameter(len(start))
+    request.current_position, request.target_position = start.tolist(), goal.tolist()
+    request.max_velocity, request.max_acceleration, request.max_jerk = (bounds[kind].tolist() for kind in KINDS)
+    request.synchronization = ruckig.Synchronization.Phase
     result = ruckig.Trajectory(len(start))
-    said = ruckig.Ruckig(len(start)).calculate(given, result)
-    if said not in (ruckig.Result.Working, ruckig.Result.Finished):
-        raise BadInput(f"no approach was found ({said}): check for tiny or huge limits")
+    result_code = ruckig.Ruckig(len(start)).calculate(request, result)
+    if result_code not in (ruckig.Result.Working, ruckig.Result.Finished):
+        raise BadInput(f"no approach was found ({result_code}): check for tiny or huge limits")
     return result
 
 

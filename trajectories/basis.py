@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 from scipy.linalg import null_space
 
-from trajectories.errors import BadInput
+from calib.trajectories.errors import BadInput
 
 ORDERS = ("position", "velocity", "acceleration", "jerk")
 
@@ -84,22 +84,24 @@ class Basis:
         spread = np.zeros(self.used.shape)
         spread[self.used] = x
         n, _, count, c = self.tables.shape
-        moved = (self.tables.reshape(n, 4 * count, c) @ spread[:, :, None]).reshape(n, 4, count)
-        return SampledMotion(self.times, *(self.offsets + moved.transpose(1, 2, 0)))
+        displacement = (self.tables.reshape(n, 4 * count, c) @ spread[:, :, None]).reshape(n, 4, count)
+        return SampledMotion(self.times, *(self.offsets + displacement.transpose(1, 2, 0)))
 
     def nearest(self, q: np.ndarray) -> np.ndarray:
         """Return the variables (p,) whose positions come nearest to q (N, n): least squares over the times."""
-        found = np.zeros(self.used.shape)
-        for j, used in enumerate(self.used):
-            found[j, used] = np.linalg.lstsq(self.tables[j, 0][:, used], q[:, j] - self.offsets[0, :, j], rcond=None)[0]
-        return found[self.used]
+        variables = np.zeros(self.used.shape)
+        for j, exists in enumerate(self.used):
+            variables[j, exists] = np.linalg.lstsq(
+                self.tables[j, 0][:, exists], q[:, j] - self.offsets[0, :, j], rcond=None
+            )[0]
+        return variables[self.used]
 
     def adjoint(self, slopes: np.ndarray) -> np.ndarray:
         """Return gradients (m, p) in x of m functions, from their gradients (m, 4, N, n) in q, v, a, jerk."""
         m, _, count, n = slopes.shape
         flat = slopes.transpose(3, 0, 1, 2).reshape(n, m, 4 * count)
-        found = flat @ self.tables.reshape(n, 4 * count, -1)
-        return found.transpose(1, 0, 2)[:, self.used]
+        gradients = flat @ self.tables.reshape(n, 4 * count, -1)
+        return gradients.transpose(1, 0, 2)[:, self.used]
 
 
 class Family(Protocol):
@@ -146,26 +148,39 @@ def holding(
     Raises:
         BadInput: for a joint that is not there, a value that is none, or one that the start contradicts.
     """
-    found, first = list(counts), [None if start is None else float(start[j]) for j in range(len(counts))]
+    values = list(counts)
+    first: list[float | None] = [None] * len(counts)
+    if start is not None:
+        first = [float(start[j]) for j in range(len(counts))]
     for j, value in (held or {}).items():
-        if not 0 <= j < len(found) or not np.isfinite(value):
-            raise BadInput(f"joint {j + 1} of {len(found)} cannot be held at {value:g}")
+        if not 0 <= j < len(values) or not np.isfinite(value):
+            raise BadInput(f"joint {j + 1} of {len(values)} cannot be held at {value:g}")
         if start is not None and start[j] != value:
             raise BadInput(f"joint {j + 1} is held at {value:g}, but the motion starts from {start[j]:g}")
-        found[j], first[j] = none, float(value)
-    return tuple(found), first
+        values[j], first[j] = none, float(value)
+    return tuple(values), first
 
 
 def assemble(times: np.ndarray, tables: Sequence[np.ndarray], freedoms: Sequence[Freedom]) -> Basis:
     """Return the basis from the joints' coefficient tables (4, N, C_j) and equations."""
-    n, widest = len(tables), max(max(f.null.shape[1] for f in freedoms), 1)
+    n = len(tables)
+    widest = max(1, *(free.null.shape[1] for free in freedoms))
     offsets = np.zeros((4, len(times), n))
-    stacked, used = np.zeros((n, 4, len(times), widest)), np.zeros((n, widest), dtype=bool)
+    stacked = np.zeros((n, 4, len(times), widest))
+    used = np.zeros((n, widest), dtype=bool)
     for j, (table, free) in enumerate(zip(tables, freedoms, strict=True)):
+        width = free.null.shape[1]
         offsets[:, :, j] = table @ free.particular
-        stacked[j, :, :, : free.null.shape[1]] = table @ free.null
-        used[j, : free.null.shape[1]] = True
+        stacked[j, :, :, :width] = table @ free.null
+        used[j, :width] = True
     return Basis(np.asarray(times, dtype=float), offsets, stacked, used)
+
+
+def counts_of_joints(counts: int | Sequence[int], joints: int | None) -> tuple[int, ...]:
+    """Return the count of each joint, of one number for all of them or one for each."""
+    if isinstance(counts, Sequence | np.ndarray):
+        return tuple(int(count) for count in counts)
+    return (int(counts),) * (joints or 0)
 
 
 def joined(freedoms: Sequence[Freedom], x: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -176,7 +191,10 @@ def joined(freedoms: Sequence[Freedom], x: np.ndarray) -> tuple[np.ndarray, ...]
 
 def projected(freedoms: Sequence[Freedom], coefficients: Sequence[np.ndarray]) -> np.ndarray:
     """Return the variables whose coefficients are nearest to the given ones."""
-    return np.concatenate([f.null.T @ (np.asarray(c) - f.particular) for f, c in zip(freedoms, coefficients)])
+    variables = []
+    for free, values in zip(freedoms, coefficients):
+        variables.append(free.null.T @ (np.asarray(values) - free.particular))
+    return np.concatenate(variables)
 
 
 def sample_times(period: float, count: int, shift: float = 0.0) -> np.ndarray:
@@ -192,9 +210,9 @@ def aligned_period(period: float, rate: float) -> int:
     """
     count = period * rate
     if not np.isfinite(count) or count < 1 or abs(count - round(count)) > 1e-6:
-        near = max(1, round(count)) / rate if np.isfinite(count) else float("nan")
+        nearest = max(1, round(count)) / rate if np.isfinite(count) else float("nan")
         raise BadInput(
             f"a period of {period:g} s is {count:g} samples at {rate:g} Hz, not a whole number: periods could not be "
-            f"averaged sample by sample; take {near:.12g} s"
+            f"averaged sample by sample; take {nearest:.12g} s"
         )
     return round(count)

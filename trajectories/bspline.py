@@ -1,4 +1,4 @@
-"""Periodic B-splines, with the interface of `trajectories.fourier`.
+"""Periodic B-splines, with the interface of `calib.trajectories.fourier`.
 
 q_j(t) = Σ_{i=1}^{C} c_ji B_i(t),    uniform knots over one period, B_i periodic of a stated degree (5: smooth jerk)
 """
@@ -9,8 +9,18 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import BSpline as ScipyBSpline
 
-from trajectories.basis import Basis, Freedom, aligned_period, assemble, freedom, holding, joined, projected
-from trajectories.errors import BadInput, require
+from calib.trajectories.basis import (
+    Basis,
+    Freedom,
+    aligned_period,
+    assemble,
+    counts_of_joints,
+    freedom,
+    holding,
+    joined,
+    projected,
+)
+from calib.trajectories.errors import BadInput, require
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +45,8 @@ class BSpline:
 
     def basis(self, times: np.ndarray) -> Basis:
         """Return the family at times (N,) [s]."""
-        return assemble(times, [_table(times, self.period, c, self.degree) for c in self.counts], self.freedoms)
+        tables = [_table(times, self.period, count, self.degree) for count in self.counts]
+        return assemble(times, tables, self.freedoms)
 
     def coefficients(self, x: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return the control points (C,) of every joint [rad or m]."""
@@ -53,8 +64,9 @@ class BSpline:
                 result[:, j] = points[0] if order == 0 else 0.0
                 continue
             knots = self.period / count * np.arange(-self.degree, count + self.degree + 1)
-            whole = ScipyBSpline(knots, np.concatenate([points, points[: self.degree]]), self.degree)
-            result[:, j] = whole(np.mod(times, self.period), nu=order)
+            periodic_points = np.concatenate([points, points[: self.degree]])
+            spline = ScipyBSpline(knots, periodic_points, self.degree)
+            result[:, j] = spline(np.mod(times, self.period), nu=order)
         return result
 
     def largest(self, x: np.ndarray, order: int) -> np.ndarray:
@@ -72,7 +84,10 @@ class BSpline:
 
     def random(self, rng: np.random.Generator, centre: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
         """Return variables of a random motion about a centre (n,) with control points spread by amplitude (n,)."""
-        return self.variables([m + s * rng.normal(size=c) for c, m, s in zip(self.counts, centre, amplitude)])
+        points = []
+        for count, middle, size in zip(self.counts, centre, amplitude):
+            points.append(middle + size * rng.normal(size=count))
+        return self.variables(points)
 
 
 def bspline_family(
@@ -90,9 +105,9 @@ def bspline_family(
 
     Args:
         degree: 5 or more, so that the jerk has no kinks.
-        period, joints, rest, start, held, rate: as of `trajectories.fourier.fourier_family`.
+        period, joints, rest, start, held, rate: as of `calib.trajectories.fourier.fourier_family`.
     """
-    counts = tuple(int(k) for k in (np.full(joints or 0, points) if np.ndim(points) == 0 else points))  # type: ignore[arg-type]
+    counts = counts_of_joints(points, joints)
     if not counts or any(c != 1 and c <= degree for c in counts) or max(counts) == 1:
         raise BadInput(f"control points {points} for {joints} joints: expected more than the degree {degree} (or 1)")
     require(degree >= 5, f"degree {degree}: expected 5 or more (below, the jerk is not bounded between samples)")
@@ -102,9 +117,15 @@ def bspline_family(
     freedoms = []
     counts, begin = holding(counts, 1, start, held)
     for count, first in zip(counts, begin):
+        orders: list[int] = []
+        values: list[float] = []
+        if first is not None:
+            orders.append(0)
+            values.append(first)
+        if rest and count > 1:
+            orders += [1, 2]
+            values += [0.0, 0.0]
         at_start = _table(np.zeros(1), period, count, degree)[:, 0]
-        orders = [0] * (first is not None) + ([1, 2] if rest and count > 1 else [])
-        values = ([] if first is None else [first]) + [0.0] * (2 if rest and count > 1 else 0)
         freedoms.append(freedom(at_start[orders], np.array(values)))
     return BSpline(float(period), counts, degree, tuple(freedoms))
 
@@ -116,9 +137,9 @@ def _table(times: np.ndarray, period: float, count: int, degree: int) -> np.ndar
         result[0] = 1.0
         return result
     knots = period / count * np.arange(-degree, count + degree + 1)
-    where = np.mod(times, period)
-    full = ScipyBSpline(knots, np.eye(count + degree), degree)
+    phases = np.mod(times, period)
+    splines = ScipyBSpline(knots, np.eye(count + degree), degree)
     for order in range(4):
-        values = full.derivative(order)(where) if order else full(where)
+        values = splines.derivative(order)(phases) if order else splines(phases)
         np.add.at(result[order].T, np.arange(count + degree) % count, values.T)
     return result

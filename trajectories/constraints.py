@@ -7,7 +7,7 @@ function,
 
     c_r = (1/ρ) log Σ_{i, k in r} exp(ρ g_ik / scale_k)  ≥  max g / scale      (Kreisselmeier & Steinhauser 1979)
 
-so a feasible c means feasible samples; what happens between the samples is `trajectories.design.verify`'s.
+so a feasible c means feasible samples; what happens between the samples is `calib.trajectories.design.verify`'s.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,8 +16,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from trajectories.basis import ORDERS, SampledMotion
-from trajectories.errors import BadInput, require
+from calib.trajectories.basis import ORDERS, SampledMotion
+from calib.trajectories.errors import BadInput, require
 
 Regressor = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 Slopes = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -186,10 +186,10 @@ class TorqueLimit(TwoSided):
         G = signed[:, :, None] * self.parameters
         if self.covariance is not None:
             Y = self.regressor(motion.q, motion.v, motion.a)[:, self.joints]
-            seen = Y @ self.covariance
-            spread = np.sqrt(np.maximum(np.einsum("njb,njb->nj", seen, Y), 1e-30))
-            both = self.deviations * (weights[:, :k] + weights[:, k:]) / spread
-            G[:, self.joints] += both[:, :, None] * seen
+            spread_rows = Y @ self.covariance
+            spread = np.sqrt(np.maximum(np.einsum("njb,njb->nj", spread_rows, Y), 1e-30))
+            factor = self.deviations * (weights[:, :k] + weights[:, k:]) / spread
+            G[:, self.joints] += factor[:, :, None] * spread_rows
         result[:3] = self.product(motion.q, motion.v, motion.a, G)
         return result
 
@@ -204,7 +204,7 @@ def box_limits(
 ) -> tuple[BoxLimit, ...]:
     """Return the limits of position (lower, upper) and of the moduli of velocity, acceleration and jerk, each (n,)."""
     units = UNITS if not linear or not all(linear) else ("m", "m/s", "m/s²", "m/s³")
-    found = [BoxLimit(0, lower, upper, units[0])]
+    limits = [BoxLimit(0, lower, upper, units[0])]
     for order, bound in enumerate((velocity, acceleration, jerk), 1):
         if bound is None:
             continue
@@ -215,8 +215,8 @@ def box_limits(
                 f"{ORDERS[order]} limit of joint {j + 1} is {sizes[j]:g}: it must be above zero; a joint that may "
                 "not move is locked with 0 harmonics"
             )
-        found.append(BoxLimit(order, -sizes, sizes, units[order]))
-    return tuple(limit for limit in found if len(limit.joints))
+        limits.append(BoxLimit(order, -sizes, sizes, units[order]))
+    return tuple(limit for limit in limits if len(limit.joints))
 
 
 class Smoothed(NamedTuple):
@@ -256,9 +256,9 @@ def smoothed(
     """
     scaled = constraint.values(motion) / constraint.scale + tightening
     groups, count = constraint.groups, int(constraint.groups.max()) + 1
-    own = groups == np.arange(count)[:, None]  # (r, k)
-    top = np.array([scaled[:, columns].max() for columns in own])
+    in_group = groups == np.arange(count)[:, None]  # (r, k)
+    top = np.array([scaled[:, columns].max() for columns in in_group])
     shares = np.exp(sharpness * (scaled - top[groups]))
-    total = own @ shares.sum(axis=0)
+    total = in_group @ shares.sum(axis=0)
     shares /= total[groups]
-    return Smoothed(constraint, top + np.log(total) / sharpness, float(top.max()), shares, own)
+    return Smoothed(constraint, top + np.log(total) / sharpness, float(top.max()), shares, in_group)

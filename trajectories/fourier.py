@@ -10,8 +10,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trajectories.basis import Basis, Freedom, aligned_period, assemble, freedom, holding, joined, projected
-from trajectories.errors import BadInput, require
+from calib.trajectories.basis import (
+    Basis,
+    Freedom,
+    aligned_period,
+    assemble,
+    counts_of_joints,
+    freedom,
+    holding,
+    joined,
+    projected,
+)
+from calib.trajectories.errors import BadInput, require
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +102,7 @@ def fourier_family(
     Raises:
         BadInput: for a period that is not positive, frequencies beyond the resonance, samples that do not fit.
     """
-    counts = tuple(int(k) for k in (np.full(joints or 0, harmonics) if np.ndim(harmonics) == 0 else harmonics))  # type: ignore[arg-type]
+    counts = counts_of_joints(harmonics, joints)
     if not counts or min(counts) < 0 or max(counts) < 1:
         raise BadInput(f"harmonics {harmonics} for {joints} joints: expected whole numbers, one of them above 0")
     if rest and 1 in counts:
@@ -100,11 +110,12 @@ def fourier_family(
     _check_frequencies(counts, period, resonance)
     if rate is not None:
         aligned_period(period, rate)
-    first = None if start is None else np.asarray(start, dtype=float)
-    if first is not None and (first.shape != (len(counts),) or not np.isfinite(first).all()):
-        raise BadInput(f"start: expected {len(counts)} finite joint values, found {start}")
-    counts, begin = holding(counts, 0, first, held)
-    freedoms = [_freedom(count, period, rest, begin[j]) for j, count in enumerate(counts)]
+    if start is not None:
+        start = np.asarray(start, dtype=float)
+        if start.shape != (len(counts),) or not np.isfinite(start).all():
+            raise BadInput(f"start: expected {len(counts)} finite joint values, found {start}")
+    counts, begin = holding(counts, 0, start, held)
+    freedoms = [_freedom(count, period, rest, first) for count, first in zip(counts, begin)]
     return Fourier(float(period), counts, tuple(freedoms))
 
 
@@ -112,10 +123,12 @@ def _table(times: np.ndarray, period: float, count: int) -> np.ndarray:
     """Return the derivatives (4, N, 1 + 2 count) of q, v, a, jerk with respect to q0, a, b."""
     rates = 2 * np.pi / period * np.arange(1, count + 1)
     angle = np.outer(times, rates)
-    sine, cosine = np.sin(angle), np.cos(angle)
+    sine = np.sin(angle)
+    cosine = np.cos(angle)
     result = np.zeros((4, len(times), 1 + 2 * count))
     result[0, :, 0] = 1.0
-    for order, (by_a, by_b) in enumerate(((sine, cosine), (cosine, -sine), (-sine, -cosine), (-cosine, sine))):
+    derivatives = ((sine, cosine), (cosine, -sine), (-sine, -cosine), (-cosine, sine))
+    for order, (by_a, by_b) in enumerate(derivatives):
         result[order, :, 1 : 1 + count] = by_a * rates**order
         result[order, :, 1 + count :] = by_b * rates**order
     return result
@@ -123,15 +136,18 @@ def _table(times: np.ndarray, period: float, count: int) -> np.ndarray:
 
 def evaluate(coefficients: Sequence[np.ndarray], period: float, times: np.ndarray, order: int = 0) -> np.ndarray:
     """Return d^r q / dt^r (N, n) directly from eq. 23, independent of tables and null spaces."""
-    most = max(len(c) // 2 for c in coefficients)
-    rates = 2 * np.pi / period * np.arange(1, most + 1)
-    angle = np.outer(times, rates) + order * np.pi / 2  # each derivative turns sine and cosine by π/2
-    sine, cosine = rates**order * np.sin(angle), rates**order * np.cos(angle)
+    max_order = max(len(c) // 2 for c in coefficients)
+    rates = 2 * np.pi / period * np.arange(1, max_order + 1)
+    # each derivative turns sine and cosine by π/2
+    angle = np.outer(times, rates) + order * np.pi / 2
+    sine = rates**order * np.sin(angle)
+    cosine = rates**order * np.cos(angle)
     result = np.zeros((len(times), len(coefficients)))
     for j, c in enumerate(coefficients):
         count = len(c) // 2
         result[:, j] = sine[:, :count] @ c[1 : 1 + count] + cosine[:, :count] @ c[1 + count :]
-        result[:, j] += c[0] if order == 0 else 0.0
+        if order == 0:
+            result[:, j] += c[0]
     return result
 
 
@@ -151,9 +167,9 @@ def _check_frequencies(counts: Sequence[int], period: float, resonance: float | 
     require(np.isfinite(period) and period > 0, f"period {period} s: expected a positive number")
     top = max(counts) * 2 * np.pi / period
     if resonance is not None and not top < resonance:
-        least = 2 * np.pi * max(counts) / resonance
+        min_period = 2 * np.pi * max(counts) / resonance
         raise BadInput(
             f"the highest frequency, {max(counts)} · 2π/{period:g} s = {top:.4g} rad/s, is not below the resonance at "
             f"{resonance:.4g} rad/s: it would excite unmodelled dynamics; take fewer harmonics or a period "
-            f"above {least:.4g} s"
+            f"above {min_period:.4g} s"
         )

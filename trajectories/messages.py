@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from trajectories.errors import BadInput, require
-from trajectories.setpoints import Setpoints
+from calib.trajectories.errors import BadInput, require
+from calib.trajectories.setpoints import Setpoints
 
 DIGITS = 9  # after the point: 1e-9 rad, and whole nanoseconds
 
@@ -41,30 +41,39 @@ def to_json(message: dict[str, Any]) -> str:
 def to_yaml(message: dict[str, Any]) -> str:
     """Return the message as YAML; numbers always with a decimal point, since YAML 1.1 reads 1e-05 as text."""
     stamp = message["header"]["stamp"]
+    names = ", ".join(json.dumps(name) for name in message["joint_names"])
     lines = [
         "header:",
         f"  stamp: {{sec: {stamp['sec']}, nanosec: {stamp['nanosec']}}}",
         f"  frame_id: {json.dumps(message['header']['frame_id'])}",
-        f"joint_names: [{', '.join(json.dumps(name) for name in message['joint_names'])}]",
+        f"joint_names: [{names}]",
         "points:",
     ]
     for point in message["points"]:
         for key, values in point.items():
             lead = "- " if key == "positions" else "  "
             if key == "time_from_start":
-                lines.append(f"{lead}{key}: {{sec: {values['sec']}, nanosec: {values['nanosec']}}}")
+                text = f"{{sec: {values['sec']}, nanosec: {values['nanosec']}}}"
             else:
-                lines.append(f"{lead}{key}: [{', '.join(f'{x:.{DIGITS}f}' for x in values)}]")
+                numbers = ", ".join(f"{value:.{DIGITS}f}" for value in values)
+                text = f"[{numbers}]"
+            lines.append(f"{lead}{key}: {text}")
     return "\n".join(lines) + "\n"
 
 
 def _point(track: Setpoints, k: int) -> dict[str, Any]:
     nanoseconds = round(k / track.rate * 1e9)
-    efforts = track.tau[k] if track.tau is not None else []
+    effort = []
+    if track.tau is not None:
+        effort = _rounded(track.tau[k])
     return {
-        "positions": [round(float(x), DIGITS) for x in track.q[k]],
-        "velocities": [round(float(x), DIGITS) for x in track.v[k]],
-        "accelerations": [round(float(x), DIGITS) for x in track.a[k]],
-        "effort": [round(float(x), DIGITS) for x in efforts],
+        "positions": _rounded(track.q[k]),
+        "velocities": _rounded(track.v[k]),
+        "accelerations": _rounded(track.a[k]),
+        "effort": effort,
         "time_from_start": {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9},
     }
+
+
+def _rounded(values: np.ndarray) -> list[float]:
+    return [round(float(value), DIGITS) for value in values]

@@ -1,6 +1,7 @@
 """Constraints on the arm's place: positions of the tool and of named points, and distances between bodies.
 
-Places and distances come from callables with derivative products; see `trajectories.constraints` for what a constraint
+Places and distances come from callables with derivative products; see `calib.trajectories.constraints` for what a
+constraint
 has.
 """
 
@@ -9,7 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trajectories.basis import SampledMotion
+from calib.trajectories.basis import SampledMotion
+
+# [m] by which a limit on the distance from the axis is divided at least
+MIN_RADIUS = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,20 +57,26 @@ class Workspace:
 
     def values(self, motion: SampledMotion) -> np.ndarray:
         x = self.points(motion.q)
-        found = []
+        height = x[..., 2]
+        values = []
         if self.radius is not None:
-            found.append((self.radius**2 - (x[..., :2] ** 2).sum(-1)) / (2 * max(self.radius, 1e-3)))
-        found += [self.lowest - x[..., 2]] if self.lowest is not None else []
-        found += [x[..., 2] - self.highest] if self.highest is not None else []
-        return np.concatenate(found, axis=1)
+            shortfall = self.radius**2 - (x[..., :2] ** 2).sum(-1)
+            values.append(shortfall / (2 * max(self.radius, MIN_RADIUS)))
+        if self.lowest is not None:
+            values.append(self.lowest - height)
+        if self.highest is not None:
+            values.append(height - self.highest)
+        return np.concatenate(values, axis=1)
 
     def slopes(self, motion: SampledMotion, weights: np.ndarray) -> np.ndarray:
-        x, k = self.points(motion.q), len(self.names)
+        x = self.points(motion.q)
         G = np.zeros_like(x)
+        none = np.zeros(len(self.names))
         parts = dict(zip(self._kinds, np.split(weights, len(self._kinds), axis=1)))
         if self.radius is not None:
-            G[..., :2] -= parts["distance from the axis"][..., None] * x[..., :2] / max(self.radius, 1e-3)
-        G[..., 2] += parts.get("highest", np.zeros(k)) - parts.get("lowest", np.zeros(k))
+            by_radius = parts["distance from the axis"][..., None]
+            G[..., :2] -= by_radius * x[..., :2] / max(self.radius, MIN_RADIUS)
+        G[..., 2] += parts.get("highest", none) - parts.get("lowest", none)
         result = np.zeros((4, *motion.q.shape))
         result[0] = self.product(motion.q, G)
         return result
@@ -102,6 +112,8 @@ class Clearance:
 
     def slopes(self, motion: SampledMotion, weights: np.ndarray) -> np.ndarray:
         result = np.zeros((4, *motion.q.shape))
-        _, rows, back = np.unique(motion.times, return_index=True, return_inverse=True)  # each pair asks for its own
-        result[0] = -np.einsum("mk,mkn->mn", weights, self.gradients(motion.q[rows])[back])
+        # each pair asks for its own
+        _, rows, row_of_time = np.unique(motion.times, return_index=True, return_inverse=True)
+        gradients = self.gradients(motion.q[rows])[row_of_time]
+        result[0] = -np.einsum("mk,mkn->mn", weights, gradients)
         return result

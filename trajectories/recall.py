@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.fft import next_fast_len
 
-from trajectories.errors import BadInput, require
+from calib.trajectories.errors import BadInput, require
 
 LIKENESS = 0.9  # share of the reference's variance that a found period explains at least (our choice)
 
@@ -92,11 +92,11 @@ def find_periods(recorded: np.ndarray, reference: np.ndarray, skip: int = 0, lik
     return Recalled(run[0], len(r), len(run), tuple(float(similarity[k]) for k in run), _lag(similarity, best))
 
 
-def average(values: np.ndarray, found: Recalled) -> Averaged:
+def average(values: np.ndarray, mean: Recalled) -> Averaged:
     """Return mean and variance of signals (N, k) over the complete periods of a recording (at least two)."""
-    require(found.periods >= 2, "one period has no variance: record two or more")
-    parts = np.asarray(values, dtype=float)[found.rows].reshape(found.periods, found.period, -1)
-    return Averaged(parts.mean(axis=0), parts.var(axis=0, ddof=1), found.periods)
+    require(mean.periods >= 2, "one period has no variance: record two or more")
+    parts = np.asarray(values, dtype=float)[mean.rows].reshape(mean.periods, mean.period, -1)
+    return Averaged(parts.mean(axis=0), parts.var(axis=0, ddof=1), mean.periods)
 
 
 def _likeness(q: np.ndarray, r: np.ndarray) -> np.ndarray:
@@ -104,9 +104,9 @@ def _likeness(q: np.ndarray, r: np.ndarray) -> np.ndarray:
     centre = r.mean(axis=0)
     q, r = q - centre, r - centre
     energy = np.concatenate([[0.0], np.cumsum((q**2).sum(axis=1))])
-    inside = energy[len(r) :] - energy[: -len(r)]
+    overlap = energy[len(r) :] - energy[: -len(r)]
     crossed = sum(sliding_products(q[:, j], r[:, j]) for j in range(q.shape[1]))
-    return 1.0 - (inside + (r**2).sum() - 2 * crossed) / max((r**2).sum(), 1e-300)
+    return 1.0 - (overlap + (r**2).sum() - 2 * crossed) / max((r**2).sum(), 1e-300)
 
 
 def sliding_products(x: np.ndarray, r: np.ndarray) -> np.ndarray:
@@ -130,6 +130,6 @@ def _lag(similarity: np.ndarray, best: int) -> float:
     """Return the peak of the parabola through the best match and its neighbours, relative to the match."""
     if not 0 < best < len(similarity) - 1:
         return 0.0
-    before, here, after = similarity[best - 1 : best + 2]
-    bend = before - 2 * here + after
+    before, lag_index, after = similarity[best - 1 : best + 2]
+    bend = before - 2 * lag_index + after
     return 0.0 if bend >= 0 else float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5))

@@ -8,7 +8,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from trajectories.errors import BadInput, require
+from calib.trajectories.errors import BadInput, require
+
+# of a joint [rad or m] at a seam between two tracks
+MAX_JUMP = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,24 +57,36 @@ def joined(tracks: Sequence[Setpoints]) -> Setpoints:
     Raises:
         BadInput: for other rates, or a jump of position or speed at a seam, with its joint and size.
     """
-    first, rate = tracks[0], tracks[0].rate
-    max_jump = 1e-6  # of a joint [rad or m] at a seam between two tracks
-    for k, (one, two) in enumerate(pairwise(tracks)):
-        if two.rate != rate:
-            raise BadInput(f"motions {k + 1} and {k + 2} are at {one.rate:g} and {two.rate:g} Hz: use one rate for all")
-        for what, end, start in (("position", one.q[-1], two.q[0]), ("speed", one.v[-1], two.v[0])):
-            jump = np.abs(start - end)
-            if jump.max() > max_jump * (1 if what == "position" else rate):
-                j = int(jump.argmax())
-                raise BadInput(
-                    f"motion {k + 2} begins {jump[j]:.3g} away from motion {k + 1}'s end ({what} of joint {j + 1}): "
-                    "insert an approach between them"
-                )
-    rows = [slice(None)] + [slice(1, None)] * (len(tracks) - 1)
-    parts = {key: np.vstack([getattr(t, key)[r] for t, r in zip(tracks, rows)]) for key in ("q", "v", "a")}
-    torques = [t.tau for t in tracks]
-    tau = None if any(x is None for x in torques) else np.vstack([x[r] for x, r in zip(torques, rows) if x is not None])
-    return Setpoints(first.rate, **parts, tau=tau)
+    rate = tracks[0].rate
+    for k, (track, following) in enumerate(pairwise(tracks)):
+        if following.rate != rate:
+            raise BadInput(
+                f"motions {k + 1} and {k + 2} are at {track.rate:g} and {following.rate:g} Hz: use one rate for all"
+            )
+        _check_seam(k, "position", track.q[-1], following.q[0], MAX_JUMP)
+        _check_seam(k, "speed", track.v[-1], following.v[0], MAX_JUMP * rate)
+    q, v, a, tau = [], [], [], []
+    for k, track in enumerate(tracks):
+        # the first sample of a track is the last one of the track before
+        rows = slice(min(k, 1), None)
+        q.append(track.q[rows])
+        v.append(track.v[rows])
+        a.append(track.a[rows])
+        if track.tau is not None:
+            tau.append(track.tau[rows])
+    torques = np.vstack(tau) if len(tau) == len(tracks) else None
+    return Setpoints(rate, np.vstack(q), np.vstack(v), np.vstack(a), torques)
+
+
+def _check_seam(k: int, quantity: str, end: np.ndarray, start: np.ndarray, max_jump: float) -> None:
+    """Refuse a jump between the end of motion k and the start of the next one."""
+    jump = np.abs(start - end)
+    if jump.max() > max_jump:
+        j = int(jump.argmax())
+        raise BadInput(
+            f"motion {k + 2} begins {jump[j]:.3g} away from motion {k + 1}'s end ({quantity} of joint {j + 1}): "
+            "insert an approach between them"
+        )
 
 
 def slowed(track: Setpoints, factor: float) -> Setpoints:
@@ -85,13 +100,17 @@ def slowed(track: Setpoints, factor: float) -> Setpoints:
     require(np.isfinite(factor) and factor >= 1, f"rehearsal factor {factor:g}: expected 1 or more")
     if factor == 1:
         return track
-    count = round((len(track) - 1) * factor)
-    factor = count / (len(track) - 1)
-    place = np.minimum(np.arange(count + 1) / factor, len(track) - 1)
-    k = np.minimum(place.astype(int), len(track) - 2)
-    x, step = (place - k)[:, None], 1 / track.rate
-    q0, q1, v0, v1 = track.q[k], track.q[k + 1], step * track.v[k], step * track.v[k + 1]
-    bend, twist = 3 * (q1 - q0) - 2 * v0 - v1, 2 * (q0 - q1) + v0 + v1
+    last = len(track) - 1
+    count = round(last * factor)
+    factor = count / last
+    position = np.minimum(np.arange(count + 1) / factor, last)
+    k = np.minimum(position.astype(int), last - 1)
+    x = (position - k)[:, None]
+    step = 1 / track.rate
+    q0, q1 = track.q[k], track.q[k + 1]
+    v0, v1 = step * track.v[k], step * track.v[k + 1]
+    bend = 3 * (q1 - q0) - 2 * v0 - v1
+    twist = 2 * (q0 - q1) + v0 + v1
     q = q0 + x * (v0 + x * (bend + x * twist))
     v = (v0 + x * (2 * bend + 3 * x * twist)) * track.rate
     a = track.a[k] * (1 - x) + track.a[k + 1] * x

@@ -2,21 +2,24 @@
 
 import numpy as np
 
-from trajectories.errors import BadInput
+from calib.trajectories.errors import BadInput
+
+# starts of a tour that may begin anywhere, about (our choice)
+STARTS = 12
 
 
-def move_times(one: np.ndarray, two: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray) -> np.ndarray:
+def move_times(start: np.ndarray, end: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray) -> np.ndarray:
     """Return the durations (...) [s] of straight joint moves from rest to rest: trapezoids, all joints in proportion.
 
     A joint that goes by d takes d/v + v/a where it reaches its speed (d ≥ v²/a), else 2 √(d/a); the slowest one rules.
 
     Args:
-        one, two: (..., n) joint values [rad or m].
+        start, end: (..., n) joint values [rad or m].
         velocity, acceleration: (n,) largest moduli, above zero.
     """
-    way = np.abs(two - one)
-    full = way >= velocity**2 / acceleration
-    times = np.where(full, way / velocity + velocity / acceleration, 2.0 * np.sqrt(way / acceleration))
+    distance = np.abs(end - start)
+    full = distance >= velocity**2 / acceleration
+    times = np.where(full, distance / velocity + velocity / acceleration, 2.0 * np.sqrt(distance / acceleration))
     return times.max(axis=-1)
 
 
@@ -38,34 +41,53 @@ def tour(times: np.ndarray, first: int | None = None) -> np.ndarray:
         raise BadInput(f"times: expected a symmetric (m, m) matrix of finite numbers, found shape {cost.shape}")
     count = len(cost)
     if count < 3:
-        return np.arange(count) if not first else np.arange(count)[::-1]
+        order = np.arange(count)
+        return order[::-1] if first else order
     # A place that costs nothing to go to closes the tour, so that its two neighbours are the free ends.
     closed = np.zeros((count + 1, count + 1))
     closed[:count, :count] = cost
+    starts = list(range(0, count, max(1, count // STARTS)))
     if first is not None:
+        starts = [first]
         closed[count, :count] = closed[:count, count] = cost.sum() + 1.0
         closed[count, first] = closed[first, count] = 0.0
         closed[count, :count] = np.minimum(closed[count, :count], cost.sum() + 1.0)
-    starts = [first] if first is not None else range(0, count, max(1, count // 12))
-    tours = (_improved(np.array([*_nearest_first(cost, start), count]), closed) for start in starts)
-    best = min(tours, key=lambda order: closed[order, np.roll(order, -1)].sum())
+    best = None
+    shortest = np.inf
+    for start in starts:
+        order = _improved(np.array([*_nearest_first(cost, start), count]), closed)
+        length = closed[order, np.roll(order, -1)].sum()
+        if length < shortest:
+            best = order
+            shortest = length
+    assert best is not None
     order = np.roll(best, -int(np.argmax(best == count)))[1:]
-    return order if first is None or order[0] == first else order[::-1]
+    if first is not None and order[0] != first:
+        return order[::-1]
+    return order
 
 
 def _nearest_first(cost: np.ndarray, start: int) -> list[int]:
-    left, order = set(range(len(cost))) - {start}, [start]
-    while left:
-        order.append(min(left, key=lambda place: (cost[order[-1], place], place)))
-        left.remove(order[-1])
+    """Return the tour that goes from each place to the nearest one not yet visited."""
+    order = [start]
+    unvisited = set(range(len(cost))) - {start}
+    while unvisited:
+        last = order[-1]
+        nearest = min(unvisited, key=lambda stop: (cost[last, stop], stop))
+        order.append(nearest)
+        unvisited.remove(nearest)
     return order
 
 
 def _improved(order: np.ndarray, cost: np.ndarray) -> np.ndarray:
     """Return a closed tour that no reversal or relocation shortens, by repeating the move that saves most."""
-    while (shorter := _reversed(order, cost)) is not None or (shorter := _relocated(order, cost)) is not None:
+    while True:
+        shorter = _reversed(order, cost)
+        if shorter is None:
+            shorter = _relocated(order, cost)
+        if shorter is None:
+            return order
         order = shorter
-    return order
 
 
 def _reversed(order: np.ndarray, cost: np.ndarray) -> np.ndarray | None:
@@ -87,15 +109,15 @@ def _relocated(order: np.ndarray, cost: np.ndarray) -> np.ndarray | None:
     for size in range(1, min(3, count - 2) + 1):
         before, last, behind = np.roll(order, 1), np.roll(order, 1 - size), np.roll(order, -size)
         saved = cost[before, order] + cost[last, behind] - cost[before, behind]
-        own = (np.arange(count) - np.arange(count)[:, None] + 1) % count <= size  # edges at the part itself
-        for turned, (one, two) in enumerate(((order, last), (last, order))):
-            gains = saved[:, None] + edge - cost[one[:, None], order] - cost[two[:, None], after]
-            gains[own] = 0.0
+        inside = (np.arange(count) - np.arange(count)[:, None] + 1) % count <= size  # edges at the part itself
+        for turned, (first, second) in enumerate(((order, last), (last, order))):
+            gains = saved[:, None] + edge - cost[first[:, None], order] - cost[second[:, None], after]
+            gains[inside] = 0.0
             i, k = divmod(int(gains.argmax()), count)
             best = max(best, (float(gains[i, k]), size, i, (k - i - size) % count, bool(turned)))
     _, size, i, k, turned = best
     if not size:
         return None
-    own = np.roll(order, -i)
-    part, rest = own[:size], own[size:]
-    return np.concatenate([rest[: k + 1], part[::-1] if turned else part, rest[k + 1 :]])
+    inside = np.roll(order, -i)
+    part, remaining = inside[:size], inside[size:]
+    return np.concatenate([remaining[: k + 1], part[::-1] if turned else part, remaining[k + 1 :]])

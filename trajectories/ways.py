@@ -11,8 +11,13 @@ import numpy as np
 
 Clear = Callable[[np.ndarray], np.ndarray]
 
-"""Largest step of a tree in one joint, as a share of its unit (see `Room`). Our choice."""
-"""Share of random places near the middle between the ends. Our choice."""
+# largest step of a tree in one joint, as a share of its unit (see `Room`; our choice)
+MAX_STEP = 0.5
+# share of random places near the middle between the ends (our choice)
+MIDDLE_SHARE = 0.1
+# attempts to remove a detour, and length that a straight move must have at most, relative to the detour
+SHORTENINGS = 60
+MAX_SHORTENED = 0.98
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,14 +38,14 @@ class Room:
     unit: np.ndarray
 
 
-def straight_is_clear(room: Room, one: np.ndarray, two: np.ndarray) -> bool:
+def straight_is_clear(room: Room, start: np.ndarray, end: np.ndarray) -> bool:
     """Return whether the straight move between two places (n,) is clear; eight places on it are checked first."""
-    count = max(int(np.ceil((np.abs(two - one) / room.spacing).sum())), 1)
+    count = max(int(np.ceil((np.abs(end - start) / room.spacing).sum())), 1)
     share = np.arange(1, count) / count
     if not len(share):
         return True
     for part in (share[len(share) // 16 :: max(len(share) // 8, 1)], share):
-        if not room.clear(one + part[:, None] * (two - one)).all():
+        if not room.clear(start + part[:, None] * (end - start)).all():
             return False
     return True
 
@@ -58,65 +63,70 @@ def way(room: Room, start: np.ndarray, goal: np.ndarray, seed: int = 0, most: in
         return np.array([start, goal])
     generator = np.random.default_rng(seed)
     trees = [([start], [-1]), ([goal], [-1])]
-    goal_share = 0.1
     for number in range(most):
-        if generator.random() < goal_share:
+        if generator.random() < MIDDLE_SHARE:
             aim = (start + goal) / 2 + generator.normal(size=len(start)) * room.unit
         else:
             aim = generator.uniform(room.lower, room.upper)
-        one, two = trees[number % 2], trees[1 - number % 2]
-        new = _grown(room, one, np.clip(aim, room.lower, room.upper))
-        if new is None:
+        tree = trees[number % 2]
+        opposite = trees[1 - number % 2]
+        leaf = _grown(room, tree, np.clip(aim, room.lower, room.upper))
+        if leaf is None:
             continue
-        while (other := _grown(room, two, one[0][new])) is not None:
-            if np.array_equal(two[0][other], one[0][new]):
-                parts = [_branch(*one, new), _branch(*two, other)]
+        node = tree[0][leaf]
+        opposite_leaf = _grown(room, opposite, node)
+        while opposite_leaf is not None:
+            if np.array_equal(opposite[0][opposite_leaf], node):
+                branches = [_branch(*tree, leaf), _branch(*opposite, opposite_leaf)]
                 if number % 2:
-                    parts.reverse()
-                return _shortened(room, np.array(parts[0][::-1] + parts[1][1:]), generator)
+                    branches.reverse()
+                return _shortened(room, np.array(branches[0][::-1] + branches[1][1:]), generator)
+            opposite_leaf = _grown(room, opposite, node)
     return None
 
 
-def _grown(room: Room, tree: tuple[list[np.ndarray], list[int]], aim: np.ndarray, max_step: float = 0.5) -> int | None:
+def _grown(room: Room, tree: tuple[list[np.ndarray], list[int]], aim: np.ndarray) -> int | None:
     """Extend a tree by one step towards a place; return the new node's number, None if the step is not clear."""
     nodes, parents = tree
-    away = (aim - np.array(nodes)) / room.unit
-    near = int(np.linalg.norm(away, axis=1).argmin())
-    largest = float(np.abs(away[near]).max())
-    new = aim if largest <= max_step else nodes[near] + (aim - nodes[near]) * (max_step / largest)
-    if not room.clear(new[None])[0] or not straight_is_clear(room, nodes[near], new):
+    steps = (aim - np.array(nodes)) / room.unit
+    nearest = int(np.linalg.norm(steps, axis=1).argmin())
+    largest = float(np.abs(steps[nearest]).max())
+    node = aim
+    if largest > MAX_STEP:
+        node = nodes[nearest] + (aim - nodes[nearest]) * (MAX_STEP / largest)
+    if not room.clear(node[None])[0] or not straight_is_clear(room, nodes[nearest], node):
         return None
-    nodes.append(new)
-    parents.append(near)
+    nodes.append(node)
+    parents.append(nearest)
     return len(nodes) - 1
 
 
 def _branch(nodes: list[np.ndarray], parents: list[int], leaf: int) -> list[np.ndarray]:
     """Return the nodes from a leaf to the root."""
-    found = []
+    branch = []
     while leaf >= 0:
-        found.append(nodes[leaf])
+        branch.append(nodes[leaf])
         leaf = parents[leaf]
-    return found
+    return branch
 
 
-def _shortened(room: Room, places: np.ndarray, generator: np.random.Generator, tries: int = 60) -> np.ndarray:
+def _shortened(room: Room, places: np.ndarray, generator: np.random.Generator) -> np.ndarray:
     """Return a way with detours removed by straight moves between its places and points on its lines."""
-    for _ in range(tries):
+    for _ in range(SHORTENINGS):
         if len(places) < 3:
             break
         i, j = np.sort(generator.choice(len(places), 2, replace=False))
         if j - i > 1 and straight_is_clear(room, places[i], places[j]):
             places = np.concatenate([places[: i + 1], places[j:]])
             continue
-        i, j = np.sort(generator.choice(len(places) - 1, 2, replace=False)) if len(places) > 2 else (0, 0)
-        if i == j:
+        i, j = np.sort(generator.choice(len(places) - 1, 2, replace=False))
+        start = places[i] + generator.random() * (places[i + 1] - places[i])
+        end = places[j] + generator.random() * (places[j + 1] - places[j])
+        if not straight_is_clear(room, start, end):
             continue
-        one, two = (places[k] + generator.random() * (places[k + 1] - places[k]) for k in (i, j))
-        if straight_is_clear(room, one, two) and _length(room, one, two) < 0.98 * (
-            _length(room, one, *places[i + 1 : j + 1], two)
-        ):
-            places = np.concatenate([places[: i + 1], [one, two], places[j + 1 :]])
+        detour = _length(room, start, *places[i + 1 : j + 1], end)
+        if _length(room, start, end) < MAX_SHORTENED * detour:
+            places = np.concatenate([places[: i + 1], [start, end], places[j + 1 :]])
     return places
 
 

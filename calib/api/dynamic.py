@@ -21,7 +21,7 @@ from calib.identification.registry import METHODS
 from calib.procedure.dynamic_stage import folder, identify, inputs, metrics
 from calib.procedure.excitation import coefficients
 from calib.procedure.robot_kinds import Mechanism, stage_of
-from calib.records import plain
+from calib.records import as_subclass, plain
 from calib.robot.calibrated import CalibratedChain
 from calib.workers.threads import one_blas_thread
 
@@ -43,15 +43,14 @@ class DynamicsModel(Drawn, Judged, identify.IdentificationOutcome):
     @property
     def residuals(self) -> Any:
         """Measured minus predicted torques of every recording, fitted or unseen, as a pandas DataFrame."""
-        inputs, titles = self.inputs, self.found.settings.torque_rows.titles(self.inputs.chain.joint_names)
-        rows = (
-            (case.name, t, *row)
-            for case in (*inputs.cases, *inputs.unseen)
-            for t, row in zip(case.motion.t, case.target - self.predictions[case.name])
-        )
-        return data_frame(
-            rows, ["file", "t [s]", *(f"{each} [{unit}]" for each, unit in zip(titles, inputs.row_units))]
-        )
+        titles = self.found.settings.torque_rows.titles(self.inputs.chain.joint_names)
+        header = ["file", "t [s]"]
+        header += [f"{title} [{unit}]" for title, unit in zip(titles, self.inputs.row_units)]
+        rows = []
+        for case in (*self.inputs.cases, *self.inputs.unseen):
+            residuals = case.target - self.predictions[case.name]
+            rows += [(case.name, t, *row) for t, row in zip(case.motion.t, residuals)]
+        return data_frame(rows, header)
 
     @property
     def robot(self) -> CalibratedChain:
@@ -61,14 +60,18 @@ class DynamicsModel(Drawn, Judged, identify.IdentificationOutcome):
     @property
     def estimate(self) -> Estimate:
         """The base parameters with their covariance, including the geometry's contribution if known."""
-        found, carried = self.found.fitted.estimate, self.carried
-        return found if carried is None else replace(found, covariance=carried.covariance)
+        estimate = self.found.fitted.estimate
+        if self.carried is None:
+            return estimate
+        return replace(estimate, covariance=self.carried.covariance)
 
     @one_blas_thread()
     def torques(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the torques (N, rows) [N m or N] of a motion q, v, a (N, n) [rad or m, and per s, s²]."""
         dynamics = self.found.dynamics
-        q, v, a = (np.asarray(x, dtype=float) for x in (q, v, a))
+        q = np.asarray(q, dtype=float)
+        v = np.asarray(v, dtype=float)
+        a = np.asarray(a, dtype=float)
         return dynamics.model.torque(dynamics.values, q, v, a)
 
     @one_blas_thread()
@@ -80,10 +83,12 @@ class DynamicsModel(Drawn, Judged, identify.IdentificationOutcome):
         Raises:
             UsageError: for a model of too short a recording to estimate errors from.
         """
-        expected = self.errors
-        if expected is None:
+        if self.errors is None:
             raise UsageError("torque errors cannot be estimated, since the recording is too short: record longer")
-        return expected.sigma(self.found.dynamics, *(np.asarray(x, dtype=float) for x in (q, v, a)))
+        q = np.asarray(q, dtype=float)
+        v = np.asarray(v, dtype=float)
+        a = np.asarray(a, dtype=float)
+        return self.errors.sigma(self.found.dynamics, q, v, a)
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
@@ -104,9 +109,10 @@ class DynamicsModel(Drawn, Judged, identify.IdentificationOutcome):
 
     def to_dataframe(self) -> Any:
         """Return the base parameters as a pandas DataFrame: name, unit, value, sigma (NaN: constraint active)."""
-        found, held = self.estimate, metrics.on_bounds(self.found)
-        sigma = np.where(np.isin(self.found.names, held), np.nan, found.sigma)
-        rows = zip(found.names, found.units, found.values.tolist(), sigma.tolist())
+        estimate = self.estimate
+        on_bounds = np.isin(self.found.names, metrics.on_bounds(self.found))
+        sigma = np.where(on_bounds, np.nan, estimate.sigma)
+        rows = zip(estimate.names, estimate.units, estimate.values.tolist(), sigma.tolist())
         return data_frame(rows, ["name", "unit", "value", "sigma"])
 
     def section(self) -> Section:
@@ -177,14 +183,17 @@ def identify_dynamics(
         "settings and options were both given, but contain the same keys: give only one of them",
         UsageError,
     )
-    chosen = options if isinstance(options, IdentifyOptions) else read_options(optional(options))
-    chosen = chosen if settings is None else options_of(settings)
+    if settings is not None:
+        options = options_of(settings)
+    elif not isinstance(options, IdentifyOptions):
+        options = read_options(optional(options))
     designed = [] if excitation is None else [coefficients.read(Path(excitation))]
-    if (stage := stage_of(robot, "identify", base, tip)) is not None:
+    stage = stage_of(robot, "identify", base, tip)
+    if stage is not None:
         return stage.run(
             listed(recordings),
             listed(validate),
-            options=chosen,
+            options=options,
             method=method,
             friction=friction,
             seed=seed,
@@ -192,11 +201,11 @@ def identify_dynamics(
             on_read=on_read,
             progress=progress,
         )
-    given = inputs.gather(
+    identification_inputs = inputs.gather(
         cast(Any, robot),
         listed(recordings),
         listed(validate),
-        options=chosen,
+        options=options,
         method=method,
         friction=friction,
         base=base,
@@ -206,5 +215,5 @@ def identify_dynamics(
         progress=progress,
     )
     if on_read is not None:
-        on_read(given)
-    return DynamicsModel(**vars(identify.run(given, progress)))
+        on_read(identification_inputs)
+    return as_subclass(identify.run(identification_inputs, progress), DynamicsModel)

@@ -46,13 +46,14 @@ def validate(
     Raises:
         MeasurementError: for files that cannot be right, naming row and column.
     """
-    given = listed(unseen)
-    require(given, "validate: unseen is empty; give poses or recordings to validate on", UsageError)
+    sources = listed(unseen)
+    require(sources, "validate: unseen is empty; give poses or recordings to validate on", UsageError)
     if isinstance(result, GeometryFit):
-        return arm_fit.assessed(result, measured.with_unseen(result.inputs, given, result.options, result.settings))
+        fit_inputs = measured.with_unseen(result.inputs, sources, result.options, result.settings)
+        return arm_fit.assessed(result, fit_inputs)
     if not isinstance(result, DynamicsModel):
-        return result.with_unseen(given)
-    return arm_identify.assessed(result, result.inputs.with_unseen(given))
+        return result.with_unseen(sources)
+    return arm_identify.assessed(result, result.inputs.with_unseen(sources))
 
 
 @checked
@@ -92,35 +93,34 @@ def export(
         RobotError: where a file does not read back as the robot; it is not written.
     """
     into = Path(into)
-    with saved(result) as place:
-        if (stage := stage_of(place, "export")) is not None:
+    with saved(result) as folder:
+        stage = stage_of(folder, "export")
+        if stage is not None:
             require(not ros2, f"ros2 {ros2}: a package is written of serial arms only", UsageError)
-            return stage.run(place, into, urdf=urdf, prior=prior)
+            return stage.run(folder, into, urdf=urdf, prior=prior)
         source = optional(urdf)
-        if is_identified(place):
-            wanted = delivery.Export(source, identified=place, prior=prior)
+        if is_identified(folder):
+            order = delivery.Export(source, identified=folder, prior=prior)
         else:
-            wanted = delivery.Export(source or _source_of(place), place)
+            order = delivery.Export(source or _source_of(folder), folder)
         if ros2:
-            wanted = replace(wanted, remark=delivery.verdicts(place).of("urdf", dynamics=True).remark)
-            own = {"moveit": [*map(Path, moveit)], "control": control, "overwrite": overwrite}
+            remark = delivery.verdicts(folder).of("urdf", dynamics=True).remark
+            order = replace(order, remark=remark)
+            moveit_paths = [*map(Path, moveit)]
             from calib.procedure.export.ros2_package import write_package
 
-            return write_package(wanted, ros2, into, **own)
-        delivery.check_into(wanted, into, place)
-        lines = delivery.deliver(wanted, into)
-        judged = delivery.mark(into, delivery.verdicts(place))
-    for words in judged:
-        warnings.warn(words, CalibWarning, stacklevel=3)
-    return (*judged, *lines)
+            return write_package(order, ros2, into, moveit=moveit_paths, control=control, overwrite=overwrite)
+        delivery.check_into(order, into, folder)
+        lines = delivery.deliver(order, into)
+        verdict_lines = delivery.mark(into, delivery.verdicts(folder))
+    for line in verdict_lines:
+        warnings.warn(line, CalibWarning, stacklevel=3)
+    return (*verdict_lines, *lines)
 
 
-def _source_of(place: Path) -> Path:
+def _source_of(folder: Path) -> Path:
     """Return the path of the robot description that a fit was made from."""
-    source = geometry.read(place).source
-    with refused_as(
-        UsageError,
-        RobotError,
-        f"{place} was fitted from {source}, which is missing: give the robot's URDF (argument urdf)",
-    ):
+    source = geometry.read(folder).source
+    message = f"{folder} was fitted from {source}, which is missing: give the robot's URDF (argument urdf)"
+    with refused_as(UsageError, RobotError, message):
         return resolve(source)

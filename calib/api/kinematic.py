@@ -25,7 +25,7 @@ from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSetti
 from calib.procedure.measuring import prediction
 from calib.procedure.measuring.run import write_run
 from calib.procedure.robot_kinds import Mechanism, stage_of
-from calib.records import plain, shaped
+from calib.records import as_subclass, plain, shaped
 from calib.robot.calibrated import CalibratedChain
 from calib.workers.threads import one_blas_thread
 
@@ -57,10 +57,11 @@ class PoseSelection(Drawn, selection.Chosen):
         from calib.procedure.report.style import save
 
         path = Path(path)
-        beside = selection.beside_poses(path, plots)
+        figure_paths = selection.beside_poses(path, plots)
         with files.results(selection.targets(path, plots), overwrite=overwrite):
-            for name, figure in self.plot().items() if plots else ():
-                save(figure, beside[name])
+            if plots:
+                for name, figure in self.plot().items():
+                    save(figure, figure_paths[name])
             return selection.write(self, path)
 
     @checked
@@ -76,14 +77,16 @@ class PoseSelection(Drawn, selection.Chosen):
         """
         from calib.procedure.report.geometry_figures import outlook_figure, predicted_map
 
-        look = self.outlook
-        curve = [(float(one.poses), 1e3 * one.rms) for one in look.others]
-        own = (float(look.poses.poses), 1e3 * look.poses.rms)
-        charts = {
-            "predicted": lambda: predicted_map(look.poses.points, look.poses.spread),
-            "outlook": lambda: outlook_figure(curve, own, "poses", "σ of the tool's position [mm]"),
-        }
-        return {name: charts[name]() for name in self.figures}
+        result: dict[str, Chart] = {}
+        for name in self.figures:
+            if name == "predicted":
+                selected = self.outlook.poses
+                result[name] = predicted_map(selected.points, selected.spread)
+            else:
+                curve = [(float(forecast.poses), 1e3 * forecast.rms) for forecast in self.outlook.others]
+                point = (float(self.outlook.poses.poses), 1e3 * self.outlook.poses.rms)
+                result[name] = outlook_figure(curve, point, "poses", "σ of the tool's position [mm]")
+        return result
 
     def to_dict(self) -> dict[str, Any]:
         """Return the results of the selection: index, its value, that of random sets, efficiency, seconds, notes."""
@@ -91,14 +94,17 @@ class PoseSelection(Drawn, selection.Chosen):
 
     def to_dataframe(self) -> Any:
         """Return the joint values as a pandas DataFrame, a row per pose."""
-        return data_frame(self.q.tolist(), [f"{joint.name} [{joint.unit}]" for joint in self.chain.joints])
+        header = [f"{joint.name} [{joint.unit}]" for joint in self.chain.joints]
+        return data_frame(self.q.tolist(), header)
 
     def __repr__(self) -> str:
         return f"<PoseSelection: {len(self.q)} poses of {self.chain.name}>"
 
     def __str__(self) -> str:
-        lines = [f"{words:38} {number}" for words, number in selection.table(self)]
-        return "\n".join([*lines, *self.kept(), *(f"note: {note}" for note in self.notes)])
+        lines = [f"{label:38} {number}" for label, number in selection.table(self)]
+        lines += self.kept()
+        lines += [f"note: {note}" for note in self.notes]
+        return "\n".join(lines)
 
 
 class PredictedPoses(NamedTuple):
@@ -139,11 +145,13 @@ class GeometryFit(Drawn, Judged, fit.Outcome):
             q: (m, n) joint values [rad or m].
             tool: which of the fit's tools.
         """
-        found, poses = self.selection.fit, self._poses(q)
-        sigma = pose_sigmas(found.cell, poses, found.free, found.estimate.covariance, -1, tool)
+        geometry = self.selection.fit
+        poses = self._poses(q)
+        sigma = pose_sigmas(geometry.cell, poses, geometry.free, geometry.estimate.covariance, -1, tool)
         if self.expected is not None:
             sigma[:, 0] = self.expected.position_sigma(poses, -1, tool)
-        return PredictedPoses(self.robot.forward(poses.q, poses.torque) @ found.cell.tools[tool], sigma)
+        tool_poses = self.robot.forward(poses.q, poses.torque) @ geometry.cell.tools[tool]
+        return PredictedPoses(tool_poses, sigma)
 
     @one_blas_thread()
     def position_sigma(self, q: Any, tool: int = 0) -> np.ndarray:
@@ -181,7 +189,8 @@ class GeometryFit(Drawn, Judged, fit.Outcome):
         from calib.procedure.report import geometry_figures
         from calib.procedure.report.fit_report import collect
 
-        return {name: chart for name, (chart, _) in geometry_figures.captioned(collect(self)).items()}
+        captioned = geometry_figures.captioned(collect(self))
+        return {name: chart for name, (chart, _) in captioned.items()}
 
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics as in ``metrics.json``."""
@@ -237,7 +246,12 @@ def select_poses(
     from calib.workers import workers as opened
 
     stage_of(robot, "choosing poses")
-    say, lost = progress or (lambda words: None), []
+    lost_workers: list[Any] = []
+
+    def show(done: int, total: int, task: str) -> None:
+        if progress is not None:
+            progress(f"{task} ({done} of {total})")
+
     with as_ours(), opened(workers) as crew:
         chosen = selection.choose(
             robot,
@@ -247,10 +261,11 @@ def select_poses(
             existing=optional(existing),
             base=base,
             tip=tip,
-            map=crew.map_without(lost),
-            progress=lambda done, total, what: say(f"{what} ({done} of {total})"),
+            map=crew.map_without(lost_workers),
+            progress=show,
         )
-    return PoseSelection(**vars(replace(chosen, notes=(*chosen.notes, *map(str, lost)))))
+    chosen = replace(chosen, notes=(*chosen.notes, *map(str, lost_workers)))
+    return as_subclass(chosen, PoseSelection)
 
 
 @checked
@@ -286,17 +301,24 @@ def fit_geometry(
         Unidentifiable: where no parameter is identifiable.
         NotConverged: where the fit did not come to an end.
     """
-    chosen = options if isinstance(options, FitOptions) else read_options(optional(options))
-    expected = poses.prediction if isinstance(poses, PoseSelection) else poses and prediction.read(Path(poses))
-    if (stage := stage_of(robot, "fit", base, tip)) is not None:
+    if not isinstance(options, FitOptions):
+        options = read_options(optional(options))
+    expected = None
+    if isinstance(poses, PoseSelection):
+        expected = poses.prediction
+    elif poses:
+        expected = prediction.read(Path(poses))
+    stage = stage_of(robot, "fit", base, tip)
+    if stage is not None:
         return stage.run(
-            listed(measured), listed(validate), settings=settings, options=chosen, poses=poses, progress=progress
+            listed(measured), listed(validate), settings=settings, options=options, poses=poses, progress=progress
         )
     if progress is not None:
         progress("reading")
-    given = inputs.gather(
-        cast(Any, robot), listed(measured), listed(validate), options=chosen, settings=settings, base=base, tip=tip
+    fit_inputs = inputs.gather(
+        cast(Any, robot), listed(measured), listed(validate), options=options, settings=settings, base=base, tip=tip
     )
     if on_read is not None:
-        on_read(given)
-    return GeometryFit(**vars(fit.run(given, chosen, settings, progress, expected or None)))
+        on_read(fit_inputs)
+    outcome = fit.run(fit_inputs, options, settings, progress, expected or None)
+    return as_subclass(outcome, GeometryFit)

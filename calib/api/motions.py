@@ -19,8 +19,9 @@ from calib.identification.identify_options import IdentifyOptions, IdentifySetti
 from calib.procedure.excitation import design, folder, planning
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, DEFAULT_PLAN, ExcitationSettings, PlanSettings
 from calib.procedure.robot_kinds import Mechanism, MechanismResult, stage_of
+from calib.records import as_subclass
 from calib.robot.calibrated import CalibratedChain
-from trajectories.setpoints import Setpoints
+from calib.trajectories.setpoints import Setpoints
 
 if TYPE_CHECKING:
     from calib.procedure.report.charts import Chart
@@ -50,7 +51,8 @@ class ExcitationDesign(Drawn, design.Designed):
         """Write the result folder, as `calib excite --out` does: trajectory.csv, ROS 2 messages, metrics, figures."""
         from calib.procedure.report import motion_figures
 
-        return folder.write_design(self, Path(out), motion_figures.write_design if plots else None)
+        write_figures = motion_figures.write_design if plots else None
+        return folder.write_design(self, Path(out), write_figures)
 
     def charts(self) -> dict[str, Chart]:
         """Return what the figures show: motion, tool path, search, front."""
@@ -88,7 +90,8 @@ class MotionPlan(Drawn, planning.Planned):
         """Write the result folder, as `calib plan --out` does."""
         from calib.procedure.report import motion_figures
 
-        return folder.write_plan(self, Path(out), motion_figures.write_plan if plots else None)
+        write_figures = motion_figures.write_plan if plots else None
+        return folder.write_plan(self, Path(out), write_figures)
 
     def charts(self) -> dict[str, Chart]:
         """Return what the figures show: motion and speed profile."""
@@ -108,7 +111,9 @@ class MotionPlan(Drawn, planning.Planned):
 
 
 def _read(options: IdentifySettings | str | Path) -> IdentifyOptions:
-    return options_of(options) if isinstance(options, IdentifySettings) else read_options(options)
+    if isinstance(options, IdentifySettings):
+        return options_of(options)
+    return read_options(options)
 
 
 @checked
@@ -146,28 +151,37 @@ def design_excitation(
     """
     from calib.workers import workers as opened
 
-    lost, stage = [], stage_of(robot, "excite", base, tip)
+    lost_workers: list[Any] = []
+    stage = stage_of(robot, "excite", base, tip)
     with as_ours(), ExitStack() as stack:
-        place = None if model is None else stack.enter_context(saved(model))
-        before = None if after is None else stack.enter_context(saved(after))
+        model_folder = None if model is None else stack.enter_context(saved(model))
+        previous_folder = None if after is None else stack.enter_context(saved(after))
         crew = stack.enter_context(opened(workers))
         if stage is not None:
             return stage.run(
-                settings, model=place, limits=limits, options=options, after=after, map=crew.map, progress=progress
+                settings,
+                model=model_folder,
+                limits=limits,
+                options=options,
+                after=after,
+                map=crew.map,
+                progress=progress,
             )
+        identify_settings = None if options is None else _read(options).settings
         designed = design.excite(
             cast(Any, robot),
             settings,
-            model=place,
+            model=model_folder,
             limits=optional(limits),
             base=base,
             tip=tip,
-            options=None if options is None else _read(options).settings,
-            after=before,
-            map=crew.map_without(lost),
+            options=identify_settings,
+            after=previous_folder,
+            map=crew.map_without(lost_workers),
             progress=progress,
         )
-    return ExcitationDesign(**vars(replace(designed, notes=(*designed.notes, *map(str, lost)))))
+    designed = replace(designed, notes=(*designed.notes, *map(str, lost_workers)))
+    return as_subclass(designed, ExcitationDesign)
 
 
 @checked
@@ -201,12 +215,12 @@ def plan_motion(
     """
     stage = stage_of(robot, "plan", base, tip)
     with as_ours(), ExitStack() as stack:
-        place = None if model is None else stack.enter_context(saved(model))
+        model_folder = None if model is None else stack.enter_context(saved(model))
         if stage is not None:
             return stage.run(
                 optional(waypoints),
                 settings,
-                model=place,
+                model=model_folder,
                 limits=optional(limits),
                 drives=optional(drives),
                 progress=progress,
@@ -215,11 +229,11 @@ def plan_motion(
             cast(Any, robot),
             optional(waypoints),
             settings,
-            model=place,
+            model=model_folder,
             limits=optional(limits),
             drives=optional(drives),
             base=base,
             tip=tip,
             progress=progress,
         )
-    return MotionPlan(**vars(planned))
+    return as_subclass(planned, MotionPlan)

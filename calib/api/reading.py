@@ -56,9 +56,11 @@ def read_poses(
     Raises:
         MeasurementError: naming file, row, column and the likely cause.
     """
-    chosen = options if isinstance(options, FitOptions) else read_options(optional(options))
+    if not isinstance(options, FitOptions):
+        options = read_options(optional(options))
     stage_of(robot, "calib.read_poses")
-    return tuple(inputs.read_file(Path(path), _loaded(robot).complete, chosen))
+    blocks = inputs.read_file(Path(path), _loaded(robot).complete, options)
+    return tuple(blocks)
 
 
 @checked
@@ -75,10 +77,14 @@ def read_recording(
     Raises:
         MeasurementError: naming file, row, column and the likely cause.
     """
-    from calib.procedure.robot_kinds import joints_of  # the dynamics' modules: none of the geometry's
+    # The dynamics' modules: none of the geometry's.
+    from calib.procedure.robot_kinds import joints_of
 
-    found = mechanism(robot)
-    chain = _loaded(cast(Any, robot)).chain if found is None else found.chain
+    parallel_robot = mechanism(robot)
+    if parallel_robot is None:
+        chain = _loaded(cast(Any, robot)).chain
+    else:
+        chain = parallel_robot.chain
     return read_file(path, joints_of(chain), options or RecordingOptions())
 
 

@@ -24,18 +24,23 @@ if TYPE_CHECKING:
     from calib.procedure.report.page import Section
 
 Progress = Callable[[str], None]
+# Letters of a line of text.
+WIDTH = 120
 
 
-def listed(given: object | Sequence[object]) -> list:
+def listed(value: object | Sequence[object]) -> list:
     """Return a single value as a list of one, and nested sequences as a flat list."""
-    if isinstance(given, (str, Path)) or not isinstance(given, Sequence):
-        return [given]
-    return [one for each in given for one in listed(each)]
+    if isinstance(value, (str, Path)) or not isinstance(value, Sequence):
+        return [value]
+    result = []
+    for item in value:
+        result += listed(item)
+    return result
 
 
-def optional(given: Any) -> Any:
+def optional(value: Any) -> Any:
     """Return a text as a path, and any other value unchanged."""
-    return Path(given) if isinstance(given, str) else given
+    return Path(value) if isinstance(value, str) else value
 
 
 @contextmanager
@@ -44,11 +49,8 @@ def saved(result: Any) -> Iterator[Path]:
     if isinstance(result, (str, Path)):
         yield Path(result)
     else:
-        with TemporaryDirectory() as place:
-            yield result.save(Path(place) / "result", plots=False)
-
-
-WIDTH = 120
+        with TemporaryDirectory() as folder:
+            yield result.save(Path(folder) / "result", plots=False)
 
 
 def as_text(renderables: Iterable[Any]) -> str:
@@ -56,8 +58,8 @@ def as_text(renderables: Iterable[Any]) -> str:
     from rich.console import Console
 
     console = Console(file=io.StringIO(), width=WIDTH, highlight=False, color_system=None, force_jupyter=False)
-    for each in renderables:
-        console.print(each, soft_wrap=True)
+    for renderable in renderables:
+        console.print(renderable, soft_wrap=True)
     return console.file.getvalue().rstrip()  # type: ignore[attr-defined]
 
 
@@ -89,10 +91,11 @@ class Drawn(Shown, ABC):
         """Return one of the figures, or all of them by name."""
         from calib.procedure.report import charts
 
-        found = self.charts()
+        charts_by_name = self.charts()
         if name is None:
-            return {each: charts.figure(chart) for each, chart in found.items()}
-        return charts.figure(found[one_of(name, found, "plot", UsageError)])
+            return {title: charts.figure(chart) for title, chart in charts_by_name.items()}
+        one_of(name, charts_by_name, "plot", UsageError)
+        return charts.figure(charts_by_name[name])
 
 
 class Judged(Shown, ABC):
@@ -124,8 +127,12 @@ class Judged(Shown, ABC):
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, str]:
         """Return the page in a frame of its own, so that its style does not become the notebook's."""
-        page, frame = self._repr_html_(), '<iframe srcdoc="{}" style="width: 100%; height: 60em; border: 0"></iframe>'
-        return super()._repr_mimebundle_() | ({"text/html": frame.format(escape(page))} if page else {})
+        bundle = super()._repr_mimebundle_()
+        page = self._repr_html_()
+        if page:
+            frame = f'<iframe srcdoc="{escape(page)}" style="width: 100%; height: 60em; border: 0"></iframe>'
+            bundle["text/html"] = frame
+        return bundle
 
 
 def data_frame(rows: Iterable[Any], columns: Sequence[str]) -> Any:
@@ -134,7 +141,7 @@ def data_frame(rows: Iterable[Any], columns: Sequence[str]) -> Any:
     Raises:
         UsageError: where pandas is not installed.
     """
-    words = "data frames need pandas: pip install 'armature-calib[pandas]'; to_dict() and save() do without"
-    with refused_as(UsageError, ImportError, words):
+    message = "data frames need pandas: pip install 'armature-calib[pandas]'; to_dict() and save() do without"
+    with refused_as(UsageError, ImportError, message):
         from pandas import DataFrame  # pyright: ignore[reportMissingImports]
     return DataFrame(list(rows), columns=list(columns))

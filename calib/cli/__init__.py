@@ -23,8 +23,8 @@ from calib.workers.threads import limit_process
 
 COMMANDS: Point[typer.Typer] = Point("commands", "commands of calib, one Typer application")
 
-# a command makes a million objects as it loads and hardly a cycle: walking all of them again and again for garbage was
-# 6 % of its time (numbers of new objects, of young and of middle-aged collections; Python's own are 700, 10, 10)
+# A command makes a million objects as it loads and hardly a cycle: walking all of them again and again for garbage was
+# 6 % of its time (numbers of new objects, of young and of middle-aged collections; Python's own are 700, 10, 10).
 GARBAGE = (20_000, 10, 10)
 
 EXIT_CODES = (
@@ -33,7 +33,11 @@ EXIT_CODES = (
 )
 BEGIN = "Begin with calib demo; at a robot with calib new CELL, then calib next CELL. calib COMMAND --help: an example."
 INTERRUPTED = "interrupted; no incomplete files were left"
-RESUMED = ("next", "redo", "demo", "study")  # keep what they have done; every other command starts over
+# These commands keep what they have done; every other one starts over.
+RESUMED = ("next", "redo", "demo", "study")
+# Exit code of an interrupted command, and of one whose output nobody reads, as a shell says of SIGPIPE.
+INTERRUPTED_CODE = 130
+BROKEN_PIPE_CODE = 141
 
 app = typer.Typer(
     cls=Group,
@@ -49,8 +53,8 @@ _USAGE: Any = typer.BadParameter.__mro__[2]  # ClickException, of the click that
 codecs.register_error("spelt", spelt)
 
 
-def _show_version(wanted: bool) -> None:
-    if wanted:
+def _show_version(is_on: bool) -> None:
+    if is_on:
         print(f"calib {calib.__version__}")
         raise typer.Exit
 
@@ -66,19 +70,23 @@ def options(
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit with one of the codes above."""
+    owns_process = arguments is None
     gc.set_threshold(*GARBAGE)
-    if arguments is None:  # the process is this command's
+    if owns_process:
         limit_process()
-    if not os.environ.get("CALIB_DEBUG"):  # what numpy and others say to programmers helps nobody at a cell
+    # What numpy and others say to programmers helps nobody at a cell.
+    if not os.environ.get("CALIB_DEBUG"):
         warnings.filterwarnings("ignore")
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="spelt")
     try:
         code = run(arguments)
-    except KeyboardInterrupt:  # one more, while the first was being seen to
-        code = 130
-    if arguments is None:  # the process is this command's: a third would end as a signal what is over but for the exit
+    except KeyboardInterrupt:
+        # A second one, while the first was being handled.
+        code = INTERRUPTED_CODE
+    # A third would end as a signal what is over but for the exit.
+    if owns_process:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     sys.exit(code)
 
@@ -93,38 +101,43 @@ def command_tree() -> Any:
 
 def run(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit code; errors become one message on stderr."""
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    for before, word in zip(["calib", *given], given):
-        if word.encode(errors="ignore").decode() != word or not word:
-            what = "is not UTF-8; rename the file" if word else "is empty; leave the option out, or give it a value"
-            return _complain(f"the argument after {before} {what}", 2)
+    if arguments is None:
+        arguments = sys.argv[1:]
+    arguments = list(arguments)
+    for before, argument in zip(["calib", *arguments], arguments):
+        if not argument:
+            return _complain(f"the argument after {before} is empty; leave the option out, or give it a value", 2)
+        if argument.encode(errors="ignore").decode() != argument:
+            return _complain(f"the argument after {before} is not UTF-8; rename the file", 2)
     try:
-        code = int(command_tree()(args=_spread(given), prog_name="calib", standalone_mode=False) or 0)
-        return _interrupted(given) if code == 130 else code  # Typer turns Ctrl-C into this code
+        code = int(command_tree()(args=_spread(arguments), prog_name="calib", standalone_mode=False) or 0)
+        # Typer turns Ctrl-C into this code.
+        return _interrupted(arguments) if code == INTERRUPTED_CODE else code
     except typer.Exit as stop:
         return stop.exit_code
     except _USAGE as error:
         error.show()
         return 2
     except (KeyboardInterrupt, typer.Abort):
-        return _interrupted(given)
+        return _interrupted(arguments)
     except SystemExit as stop:  # Typer's: completion is done, or whoever read the output has gone
-        return 141 if stop.code else 0  # as a shell says of SIGPIPE
+        return BROKEN_PIPE_CODE if stop.code else 0
     except Exception as error:
         if os.environ.get("CALIB_DEBUG"):
             raise
-        return _failed(error, given)
+        return _failed(error, arguments)
 
 
-def _failed(error: Exception, given: list[str]) -> int:
+def _failed(error: Exception, arguments: list[str]) -> int:
     """Print the error, and return its exit code."""
     from calib import bug_reports
     from calib.errors import complaint
 
-    if (foreseen := complaint(error, given)) is not None:
-        return _complain(*foreseen)
-
-    return _complain(bug_reports.report(error, given), bug_reports.CODE)
+    expected = complaint(error, arguments)
+    if expected is not None:
+        message, code = expected
+        return _complain(message, code)
+    return _complain(bug_reports.report(error, arguments), bug_reports.CODE)
 
 
 def _spread(arguments: list[str]) -> list[str]:
@@ -132,31 +145,36 @@ def _spread(arguments: list[str]) -> list[str]:
 
     Only where ROBOT and MEASURED have come before: what follows --validate then cannot be one of them.
     """
-    command = next((word for word in arguments[:2] if word in ("fit", "identify", "compare")), None)
-    if command is None:
+    commands = [argument for argument in arguments[:2] if argument in ("fit", "identify", "compare")]
+    if not commands:
         return arguments
-    known = [*command_tree().params, *command_tree().commands[command].params]
-    flags = [name for one in known if getattr(one, "is_flag", False) for name in (*one.opts, *one.secondary_opts)]
+    flags: list[str] = []
+    for parameter in (*command_tree().params, *command_tree().commands[commands[0]].params):
+        if getattr(parameter, "is_flag", False):
+            flags += [*parameter.opts, *parameter.secondary_opts]
     result: list[str] = []
-    option, positionals, spreading = "", 0, False
-    for word in arguments:
-        if word.startswith("--") or word in flags:
-            option = "" if word in (*flags, "--help") or "=" in word else word
+    option, positional_count, spreading = "", 0, False
+    for argument in arguments:
+        if argument.startswith("--") or argument in flags:
+            takes_value = argument not in (*flags, "--help") and "=" not in argument
+            option = argument if takes_value else ""
             spreading = False
         elif option:
-            spreading = option == "--validate" and positionals > 2  # the command itself, ROBOT, MEASURED
+            # The command itself, ROBOT and MEASURED have come.
+            spreading = option == "--validate" and positional_count > 2
             option = ""
         elif spreading:
             result.append("--validate")
         else:
-            positionals += 1
-        result.append(word)
+            positional_count += 1
+        result.append(argument)
     return result
 
 
-def _interrupted(given: list[str]) -> int:
-    resumed = bool(set(RESUMED) & set(given[:2]))
-    return _complain(f"{INTERRUPTED}; the same command {'goes on from here' if resumed else 'starts over'}", 130)
+def _interrupted(arguments: list[str]) -> int:
+    resumes = bool(set(RESUMED) & set(arguments[:2]))
+    outcome = "goes on from here" if resumes else "starts over"
+    return _complain(f"{INTERRUPTED}; the same command {outcome}", INTERRUPTED_CODE)
 
 
 def _complain(message: str, code: int) -> int:

@@ -7,32 +7,38 @@ from typing import Annotated
 import typer
 
 from calib.config_types import OneOf
-from calib.extensions import Point
-
-LIBRARY: Point[Path] = Point("library", "folders of robots that go by a name")
 
 
 def robots(incomplete: str) -> Iterator[str]:
     """Yield the library's robots that begin with what is typed, and then files and folders that do, too."""
-    folders = (Path(__file__).parents[1] / "robot" / "library", *LIBRARY.all())
-    names = sorted(path.stem for folder in folders for path in folder.glob(f"{incomplete}*.toml"))
-    known = [name for name in names if not name.endswith("_truth")]
-    yield from known
-    yield from (path.name for path in Path().glob(f"{incomplete}*") if known)  # of files alone the shell knows more
+    from calib.procedure.robot_kinds import ROBOTS
+
+    folders = [Path(__file__).parents[1] / "robot" / "library"]
+    folders += [kind.LIBRARY for kind in ROBOTS.all()]
+    names: list[str] = []
+    for folder in folders:
+        names += [path.stem for path in folder.glob(f"{incomplete}*.toml")]
+    robot_names = [name for name in sorted(names) if not name.endswith("_truth")]
+    yield from robot_names
+    # Of files alone the shell knows more.
+    if robot_names:
+        for path in Path().glob(f"{incomplete}*"):
+            yield path.name
 
 
 def topics() -> list[tuple[str, str]]:
     """Return the topics of `calib formats` with their descriptions."""
     from calib.procedure.formats import TOPICS
 
-    return [(name, words) for name, (words, _) in TOPICS.items()]
+    return [(name, description) for name, (description, _) in TOPICS.items()]
 
 
 def codes() -> list[str]:
     """Return the findings' codes, and the terms in one word, that `calib explain` knows."""
     from calib.procedure.findings import catalogue, glossary
 
-    return [*catalogue(), *(term for term in glossary() if " " not in term)]
+    terms = [term for term in glossary() if " " not in term]
+    return [*catalogue(), *terms]
 
 
 def completion(allowed: OneOf) -> Callable[[], list[str]]:

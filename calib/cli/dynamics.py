@@ -76,9 +76,9 @@ def recall(folder: Path, log: str, out: Out, skip: int = 0, overwrite: bool = Fa
     from calib.procedure.excitation import coefficients
 
     with results([(out, coefficients.SUFFIXES)], coefficients.inputs(folder, log), overwrite):
-        found = coefficients.find(folder, log, skip)
-        coefficients.write(found, out)
-    say_written(coefficients.lines(found), out)
+        period = coefficients.find(folder, log, skip)
+        coefficients.write(period, out)
+    say_written(coefficients.lines(period), out)
 
 
 @command(app, "Dynamics", "identify")
@@ -116,12 +116,12 @@ def identify_dynamics(
 
     check_destination("identify", robot, out, [options, *recordings, *(validate or [])])
 
-    def read(given: Any) -> None:
-        check_destination("identify", robot, out, [given.source, given.source.parent])
-        say(*read_lines(given))
+    def read(inputs: Any) -> None:
+        check_destination("identify", robot, out, [inputs.source, inputs.source.parent])
+        say(*read_lines(inputs))
 
     with progress() as show:
-        found = identified(
+        result = identified(
             robot,
             recordings,
             validate=validate or (),
@@ -136,14 +136,14 @@ def identify_dynamics(
             progress=show,
         )
         show("writing")
-        found.save(out, plots=plots)
-    compared = []
+        result.save(out, plots=plots)
+    comparison = []
     if excitation is not None:
         from calib.procedure.excitation import prediction  # slow to load
 
         if (excitation / prediction.NAME).is_file():
-            compared = [prediction.compared_with_identification(excitation, found)]
-    say_written([*found.renderables(), *compared], out, found.verdict.level)
+            comparison = [prediction.compared_with_identification(excitation, result)]
+    say_written([*result.renderables(), *comparison], out, result.verdict.level)
 
 
 @command(app, "Motion")

@@ -49,11 +49,15 @@ def select(
     from calib.procedure.measuring.constraints_file import beside
     from calib.procedure.robot_kinds import stage_of
 
-    named = beside(constraints).values() if constraints and constraints.suffix == ".toml" else ()
+    sources: list[Any] = [robot, existing, constraints]
+    if constraints and constraints.suffix == ".toml":
+        sources += beside(constraints).values()
     stage_of(robot, "choosing poses")
     load_robot(robot, existing, FitOptions(), base, tip)
-    written = [*selection.targets(out, plots), *([(run, (".csv",))] if run else [])]
-    check_results(written, [robot, existing, constraints, *named], overwrite)
+    targets = selection.targets(out, plots)
+    if run:
+        targets = [*targets, (run, (".csv",))]
+    check_results(targets, sources, overwrite)
     with progress() as show:
         chosen = select_poses(
             robot,
@@ -74,7 +78,8 @@ def select(
     if run:
         say(f"the run: {run}; calib view {run} --robot {robot}")
     say(str(chosen))
-    if predictions := selection.beside_poses(out, plots, chosen):
+    predictions = selection.beside_poses(out, plots, chosen)
+    if predictions:
         say(f"predictions: {', '.join(str(path) for path in predictions.values())}")
     say(f"{m} poses, for an instrument that measures the {settings.kind} (--kind), written to {out}")
 
@@ -113,12 +118,12 @@ def fit(
 
     check_destination("fit", robot, out, [options, *measured, *(validate or [])])
 
-    def read(given: Any) -> None:
-        check_destination("fit", robot, out, [given.source])
-        say(*read_lines(given))
+    def read(inputs: Any) -> None:
+        check_destination("fit", robot, out, [inputs.source])
+        say(*read_lines(inputs))
 
     with progress() as show:
-        found = fit_geometry(
+        result = fit_geometry(
             robot,
             measured,
             settings,
@@ -131,8 +136,8 @@ def fit(
             progress=show,
         )
         show("writing")
-        found.save(out, plots=plots)
-    say_written(found.renderables(), out, found.verdict.level)
+        result.save(out, plots=plots)
+    say_written(result.renderables(), out, result.verdict.level)
 
 
 @command(app, "Files and studies")
@@ -199,27 +204,30 @@ def export(
             )
         say_written(lines, target / ros2, delivery.verdicts(folder).level)
         return
-    words = "nothing to write: give --urdf SOURCE.urdf --out FILE.urdf, --ur-kinematics, --offsets, --ros2 or --into"
-    require((urdf is None) == (out is None) and (urdf or ur_kinematics or offsets), words, UsageError)
-    form = delivery.CORRECTED_URDF if for_corrections else delivery.URDF
-    asked = [
-        (form, out, (".urdf",)),
+    message = "nothing to write: give --urdf SOURCE.urdf --out FILE.urdf, --ur-kinematics, --offsets, --ros2 or --into"
+    require((urdf is None) == (out is None) and (urdf or ur_kinematics or offsets), message, UsageError)
+    urdf_form = delivery.CORRECTED_URDF if for_corrections else delivery.URDF
+    targets: list[tuple[Path, tuple[str, ...]]] = []
+    paths: dict[str, Path] = {}
+    for form, path, suffixes in (
+        (urdf_form, out, (".urdf",)),
         (delivery.UR_KINEMATICS, ur_kinematics, (".yaml", ".yml")),
         (delivery.OFFSETS, offsets, (".csv",)),
-    ]
-    targets = [(path, suffixes) for _, path, suffixes in asked if path]
-    own = delivery.verdicts(folder).of("corrections" if for_corrections else "urdf", dynamics=True)
-    found = geometry.read(folder)
+    ):
+        if path:
+            targets.append((path, suffixes))
+            paths[form] = path
+    verdict = delivery.verdicts(folder).of("corrections" if for_corrections else "urdf", dynamics=True)
+    fitted_robot = geometry.read(folder)
     with results(targets, [urdf, *geometry.results(folder)], overwrite):
-        lines = delivery.deliver_single(
-            delivery.Export(urdf, folder, remark=own.remark), {name: path for name, path, _ in asked if path}
-        )
+        lines = delivery.deliver_single(delivery.Export(urdf, folder, remark=verdict.remark), paths)
     say(*lines)
-    if found.corrections is not None:
+    if fitted_robot.corrections is not None:
         say(f"note: these files do not include the corrections (joint_corrections.csv in {folder})")
-    if own.level:
-        say(str(own))
+    if verdict.level:
+        say(str(verdict))
     if urdf and is_identified(folder):
-        whole = command_line("export", folder, "--urdf", urdf, "--into", "FOLDER")
-        say(f"note: {out} has the calibrated geometry with the masses of {urdf}; {whole} writes the identified ones")
-    exit_failed(own.level)
+        full_export = command_line("export", folder, "--urdf", urdf, "--into", "FOLDER")
+        masses = f"the calibrated geometry with the masses of {urdf}"
+        say(f"note: {out} has {masses}; {full_export} writes the identified ones")
+    exit_failed(verdict.level)

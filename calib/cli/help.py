@@ -8,9 +8,12 @@ from typing import Any, get_args, get_origin
 from typer.core import TyperCommand, TyperGroup
 
 _ClickCommand: Any = TyperCommand.__mro__[1]  # of the click that this typer uses (or brings)
-GROUPS = ("Start", "Geometry", "Dynamics", "Motion", "Files and studies")  # in the order of the list of commands
-MAX_COLUMN = 30  # letters of the left column; a third of narrower terminals
-MAX_CHOICES = 25  # letters of choices that stand in place of a type word
+# In the order of the list of commands.
+GROUPS = ("Start", "Geometry", "Dynamics", "Motion", "Files and studies")
+# Letters of the left column; a third of narrower terminals.
+MAX_COLUMN = 30
+# Letters of choices that stand in place of a type word.
+MAX_CHOICES = 25
 _SPELT = {"·": " ", "×": "x", "±": "+-", "→": "->", "–": "-", "≤": "<=", "≥": ">=", "½": "1/2", "µ": "u", "°": "deg"}
 _WORDS = {int: "N", float: "NUMBER", Path: "PATH"}
 
@@ -21,10 +24,15 @@ def type_word(kind: Any, choices: tuple[str, ...] | str = ()) -> str | None:
     Args:
         choices: the allowed texts; or where they are to be found, for a module that is loaded late.
     """
-    inner = get_args(kind)[0] if get_origin(kind) is list else kind
-    if isinstance(choices, tuple) and 0 < len(named := "|".join(choices)) <= MAX_CHOICES:
-        return named
-    return None if inner is bool else "NAME" if choices else _WORDS.get(inner, "TEXT")
+    if get_origin(kind) is list:
+        kind = get_args(kind)[0]
+    if choices and isinstance(choices, tuple):
+        alternatives = "|".join(choices)
+        if len(alternatives) <= MAX_CHOICES:
+            return alternatives
+    if kind is bool:
+        return None
+    return "NAME" if choices else _WORDS.get(kind, "TEXT")
 
 
 class _Spelt(_ClickCommand):
@@ -43,9 +51,13 @@ class Command(_Spelt, TyperCommand):
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         for title, kind in (("Arguments", "argument"), ("Options", "option")):
-            found = [one.get_help_record(ctx) for one in self.get_params(ctx) if one.param_type_name == kind]
-            cells = [(name.partition(" <")[0], words) for name, words in filter(None, found)]
-            if rows := [(name, words.replace("x>=", "at least ")) for name, words in cells]:
+            rows = []
+            for parameter in self.get_params(ctx):
+                record = parameter.get_help_record(ctx) if parameter.param_type_name == kind else None
+                if record is not None:
+                    name, description = record
+                    rows.append((name.partition(" <")[0], description.replace("x>=", "at least ")))
+            if rows:
                 with formatter.section(title):
                     formatter.write_dl(rows, col_max=min(MAX_COLUMN, formatter.width // 3))
 
@@ -55,9 +67,9 @@ class Group(_Spelt, TyperGroup):
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         groups: dict[str, list[tuple[str, str]]] = {title: [] for title in GROUPS}
-        for name, one in self.commands.items():
-            words = one.get_short_help_str(limit=200)
-            groups[str(one.rich_help_panel)].append((name, words))  # type: ignore[attr-defined]
+        for name, command in self.commands.items():
+            group = str(command.rich_help_panel)  # type: ignore[attr-defined]
+            groups[group].append((name, command.get_short_help_str(limit=200)))
         for title, rows in groups.items():
             with formatter.section(title):
                 formatter.write_dl(rows)
@@ -65,12 +77,18 @@ class Group(_Spelt, TyperGroup):
 
 def spelt(error: Any) -> tuple[str, int]:
     """Return letters that an encoding lacks in ASCII (sigma, ^2, ...), or by their number; see `codecs`."""
-    return "".join(map(_in_ascii, error.object[error.start : error.end])), error.end
+    letters = error.object[error.start : error.end]
+    return "".join(map(_in_ascii, letters)), error.end
 
 
 def _in_ascii(letter: str) -> str:
-    name, plain = unicodedata.name(letter, ""), unicodedata.normalize("NFKD", letter)
+    name = unicodedata.name(letter, "")
     if name.startswith("GREEK") and "LETTER" in name:
         return name.partition("LETTER ")[2].partition(" ")[0].lower()
-    known = _SPELT.get(letter) or ("^" * name.startswith("SUPERSCRIPT") + plain).encode("ascii", "ignore").decode()
-    return known or letter.encode("ascii", "backslashreplace").decode()
+    if letter in _SPELT:
+        return _SPELT[letter]
+    plain = unicodedata.normalize("NFKD", letter)
+    if name.startswith("SUPERSCRIPT"):
+        plain = f"^{plain}"
+    in_ascii = plain.encode("ascii", "ignore").decode()
+    return in_ascii or letter.encode("ascii", "backslashreplace").decode()

@@ -19,7 +19,7 @@ Folder = Annotated[Path, typer.Argument(help="the session's folder")]
 @command(app, "Start")
 def new(
     folder: Folder,
-    given: Answers,
+    answers: Answers,
     dynamics_only: bool = False,
     poses: Annotated[int, typer.Option(min=1)] = 40,
     validation: Annotated[int, typer.Option(min=0)] = 20,
@@ -45,35 +45,37 @@ def new(
     from calib.procedure.session.questions import checked
 
     if dynamics_only:
-        words = f"--dynamics-only needs no instrument, but --instrument is {given.instrument}: leave one of them out"
-        require(given.instrument in (None, "none"), words, UsageError)
-        given = replace(given, instrument="none")
-    if given.robot is None or given.instrument is None:
-        given = _asked(given)
-    made = new_session(
-        folder, poses=poses, validation=validation, base=base or "", tip=tip or "", seed=seed, **checked(given)
+        message = (
+            f"--dynamics-only needs no instrument, but --instrument is {answers.instrument}: leave one of them out"
+        )
+        require(answers.instrument in (None, "none"), message, UsageError)
+        answers = replace(answers, instrument="none")
+    if answers.robot is None or answers.instrument is None:
+        answers = _completed(answers)
+    session_folder = new_session(
+        folder, poses=poses, validation=validation, base=base or "", tip=tip or "", seed=seed, **checked(answers)
     )
-    say(f"made {made}; next: {command_line('next', made)}")
+    say(f"made {session_folder}; next: {command_line('next', session_folder)}")
 
 
-def _asked(given: Answers) -> Answers:
+def _completed(answers: Answers) -> Answers:
     """Return the answers completed by questions at a terminal."""
     import sys
 
     from calib.procedure.session.questions import QUESTIONS, with_answer
 
     if not sys.stdin.isatty():
-        missing = "--robot" if given.robot is None else "--instrument"
+        missing = "--robot" if answers.robot is None else "--instrument"
         raise UsageError(f"{missing} is missing; at a terminal, `calib new` asks for it")
     for question in QUESTIONS:
-        while question.open(given):
+        while question.open(answers):
             answer = typer.prompt(question.words, default=question.default, show_default=bool(question.default))
             try:
-                given = with_answer(given, question, answer.strip())
+                answers = with_answer(answers, question, answer.strip())
                 break
             except CalibError as error:
                 typer.echo(f"  {error}")
-    return given
+    return answers
 
 
 @command(app, "Files and studies", listing=True)
@@ -92,8 +94,10 @@ def formats(topic: Annotated[str | None, typer.Argument(autocompletion=topics)] 
 
     if schema:
         print(documents.json_schema(topic or ""), end="")
+    elif topic:
+        print(documents.describe(topic))
     else:
-        print(documents.describe(topic) if topic else "\n".join(documents.overview()))
+        print("\n".join(documents.overview()))
 
 
 @command(app, "Files and studies", listing=True)
@@ -107,7 +111,10 @@ def explain(code: Annotated[str | None, typer.Argument(autocompletion=codes)] = 
     """
     from calib.procedure import findings
 
-    print(findings.explain(code) if code else "\n".join([*findings.catalogue(), *findings.glossary()]))
+    if code:
+        print(findings.explain(code))
+    else:
+        print("\n".join([*findings.catalogue(), *findings.glossary()]))
 
 
 @command(app, "Start", "next")
@@ -143,11 +150,13 @@ def status(folder: Folder) -> None:
     say(*commands.noted(folder))
 
 
-def _go_on(folder: Path, command: str, again: str = "", plots: bool = True) -> None:
+def _go_on(folder: Path, command: str, step: str = "", plots: bool = True) -> None:
     from calib.procedure.session import commands
 
-    typed = command_line(command, folder, *([again] if again else []))
+    arguments: list[object] = [command, folder]
+    if step:
+        arguments.append(step)
     with reporting() as (say, progress):
-        stop = commands.go_on(folder, say, progress, typed, again, plots)
+        stop = commands.go_on(folder, say, progress, command_line(*arguments), step, plots)
     say(*stop.lines)
     exit_failed(stop.verdict)

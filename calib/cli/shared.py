@@ -41,7 +41,8 @@ def check_destination(verb: str, robot: object, out: Path, inputs: Sequence[str 
     """
     from calib.procedure.robot_kinds import stage_of
 
-    if (stage := stage_of(robot, verb)) is not None:
+    stage = stage_of(robot, verb)
+    if stage is not None:
         check = stage.check
     elif verb == "fit":
         from calib.procedure.kinematic_stage.folder import check_fit_target as check
@@ -54,9 +55,11 @@ def check_destination(verb: str, robot: object, out: Path, inputs: Sequence[str 
     check(out, inputs)
 
 
-PIPED = 160  # columns of tables that no terminal bounds
-MAX_LINES = 25  # that a command prints without -v, warnings and verdicts not counted
-MAX_LAST_LINES = 9  # of these the ones it ends with
+# Columns of tables that no terminal bounds.
+PIPED = 160
+# Lines that a command prints without -v, warnings and verdicts not counted, and of these the ones it ends with.
+MAX_LINES = 25
+MAX_LAST_LINES = 9
 
 Out = Annotated[Path, typer.Option()]
 Seed = Annotated[int, typer.Option(min=0, help="reproduces everything random")]
@@ -66,8 +69,9 @@ def make_console(**options: Any) -> Any:
     from rich.console import Console
 
     stream = sys.stderr if options.get("stderr") else sys.stdout
+    # Rich takes 80, and cuts the files' names.
     if not stream.isatty() and "COLUMNS" not in os.environ:
-        options.setdefault("width", PIPED)  # rich takes 80, and cuts the files' names
+        options.setdefault("width", PIPED)
     return Console(highlight=False, **options)
 
 
@@ -75,14 +79,18 @@ class _Output:
     """Output of a command: all lines with -v, otherwise at most `MAX_LINES`, without indented lines and tables."""
 
     def __init__(self, verbose: bool) -> None:
-        self.verbose, self.printed, self.left_out = verbose, 0, 0
-        self.last: list[Any] = []  # what is printed at the end, with its console
+        self.verbose = verbose
+        self.printed = 0
+        self.left_out = 0
+        # Lines that may be printed at the end: each with its console, and whether it has to be.
+        self.last: list[tuple[Any, Any, bool]] = []
 
     def show(self, line: Any, console: Any, result: bool) -> None:
-        words = " " if hasattr(line, "add_column") else str(line)
-        if self.verbose or result or re.match(r"\s*(verdict|warning)\b", words):
+        is_table = hasattr(line, "add_column")
+        text = " " if is_table else str(line)
+        if self.verbose or result or re.match(r"\s*(verdict|warning)\b", text):
             self.last.append((line, console, True))
-        elif words.startswith(" "):
+        elif text.startswith(" "):
             self.left_out += getattr(line, "row_count", 1)
         else:
             self.printed += 1
@@ -90,8 +98,10 @@ class _Output:
         if self.printed <= MAX_LINES - MAX_LAST_LINES:
             self.flush()
         elif self.printed > MAX_LINES:
-            self.last.remove(next(one for one in self.last if not one[2]))
-            self.printed, self.left_out = self.printed - 1, self.left_out + 1
+            droppable = [index for index, (_, _, required) in enumerate(self.last) if not required]
+            del self.last[droppable[0]]
+            self.printed -= 1
+            self.left_out += 1
 
     def flush(self) -> None:
         for line, console, _ in self.last:
@@ -115,10 +125,10 @@ class _Logged(logging.Handler):
         self.printed: set[str] = set()
 
     def emit(self, record: logging.LogRecord) -> None:
-        words = record.getMessage()
-        if words not in self.printed:
-            self.printed.add(words)
-            say(words)
+        message = record.getMessage()
+        if message not in self.printed:
+            self.printed.add(message)
+            say(message)
 
 
 @contextmanager
@@ -127,14 +137,17 @@ def printing(verbose: bool) -> Iterator[None]:
 
     What the package logs is printed among them.
     """
-    output, log, logged = _Output(verbose), logging.getLogger("calib"), _Logged()
-    token, level = _OUTPUT.set(output), log.level
-    log.addHandler(logged)
+    output = _Output(verbose)
+    log = logging.getLogger("calib")
+    handler = _Logged()
+    token = _OUTPUT.set(output)
+    level = log.level
+    log.addHandler(handler)
     log.setLevel(logging.INFO)
     try:
         yield
     finally:
-        log.removeHandler(logged)
+        log.removeHandler(handler)
         log.setLevel(level)
         _OUTPUT.reset(token)
         output.end()
@@ -142,7 +155,8 @@ def printing(verbose: bool) -> Iterator[None]:
 
 def say(*lines: Any, console: Any = None, result: bool = False) -> None:
     """Print texts and rich renderables; those given as a `result` are always printed in full."""
-    console, output = console or make_console(), _OUTPUT.get() or _Output(verbose=True)
+    console = console or make_console()
+    output = _OUTPUT.get() or _Output(verbose=True)
     for line in lines:
         output.show(line, console, result)
 
@@ -169,19 +183,25 @@ def progress(console: Any = None) -> Iterator[Any]:
     from rich.markup import escape
 
     console = console or make_console(stderr=True)
-    with console.status("", spinner="dots" if console.encoding.startswith("utf") else "line") as status:
-        yield lambda words: status.update(escape(str(words)))
+    spinner = "dots" if console.encoding.startswith("utf") else "line"
+    with console.status("", spinner=spinner) as status:
+
+        def show(message: object) -> None:
+            status.update(escape(str(message)))
+
+        yield show
 
 
-def _now_and_then(every: float) -> Callable[[str], None]:
-    """Return a function that prints a message on stderr, at most once in the given seconds."""
-    due = time.monotonic() + every
+def _now_and_then(period: float) -> Callable[[str], None]:
+    """Return a function that prints a message on stderr, at most once in a period [s]."""
+    due = time.monotonic() + period
 
-    def say_if_due(words: str) -> None:
+    def say_if_due(message: str) -> None:
         nonlocal due
-        if (now := time.monotonic()) >= due:
-            due = now + every
-            print(words, file=sys.stderr, flush=True)
+        time_now = time.monotonic()
+        if time_now >= due:
+            due = time_now + period
+            print(message, file=sys.stderr, flush=True)
 
     return say_if_due
 
@@ -207,8 +227,8 @@ def numbers(text: str, count: int, option: str) -> list[float]:
         values = [plain_number(part) for part in text.split(",")]
     except ValueError:
         values = []
-    words = f"{option} {text}: expected {count} finite numbers separated by commas"
-    require(len(values) == count and all(map(isfinite, values)), words, UsageError)
+    message = f"{option} {text}: expected {count} finite numbers separated by commas"
+    require(len(values) == count and all(map(isfinite, values)), message, UsageError)
     return values
 
 
@@ -240,86 +260,116 @@ def command(app: typer.Typer, group: str, name: str | None = None, listing: bool
     """
 
     def add(function: F) -> F:
-        hints, about = get_type_hints(function, include_extras=True), described(Common) | described(function)
-        own, made = signature(function).parameters, list[Parameter]()
-        settings = {key: hint for key, hint in hints.items() if key in own and is_dataclass(hint)}
-        for key, one in own.items():
+        hints = get_type_hints(function, include_extras=True)
+        descriptions = described(Common) | described(function)
+        parameters = signature(function).parameters
+        settings = {key: hint for key, hint in hints.items() if key in parameters and is_dataclass(hint)}
+        options: list[Parameter] = []
+        for key, parameter in parameters.items():
             if key in settings:
-                made += [option for option in _options(settings[key]) if option.name not in own]
-            else:
-                names = (f"--{key.replace('_', '-')}",) if one.default is False else ()
-                annotation = _with_help(one, hints[key], about.get(key, ""), names)
-                made.append(one.replace(annotation=annotation, kind=Parameter.KEYWORD_ONLY))
-
+                options += [option for option in _options(settings[key]) if option.name not in parameters]
+            elif listing or key != "verbose":
+                names = (f"--{key.replace('_', '-')}",) if parameter.default is False else ()
+                annotation = _with_help(parameter, hints[key], descriptions.get(key, ""), names)
+                options.append(parameter.replace(annotation=annotation, kind=Parameter.KEYWORD_ONLY))
         if not listing:
             verbose = Parameter("verbose", Parameter.KEYWORD_ONLY, default=False)
-            words = _with_help(verbose, bool, about["verbose"], ("-v", "--verbose"))
-            made = [*(one for one in made if one.name != "verbose"), verbose.replace(annotation=words)]
+            annotation = _with_help(verbose, bool, descriptions["verbose"], ("-v", "--verbose"))
+            options = [option for option in options if option.name != "verbose"]
+            options.append(verbose.replace(annotation=annotation))
 
         @wraps(function)
-        def call(**given: Any) -> Any:
+        def call(**values: Any) -> Any:
             try:
-                built = {key: _built(kind, given) for key, kind in settings.items()}
-                with printing(given.get("verbose", True)):
-                    return function(**built, **{key: value for key, value in given.items() if key in own})
-            except UsageError as wrong:
-                wrong.args = (_as_typed(str(wrong), made),)
+                arguments = {key: _built(kind, values) for key, kind in settings.items()}
+                with printing(values.get("verbose", True)):
+                    arguments |= {key: value for key, value in values.items() if key in parameters}
+                    return function(**arguments)
+            except UsageError as error:
+                error.args = (_as_typed(str(error), options),)
                 raise
 
-        call.__signature__ = signature(function).replace(parameters=made)  # type: ignore[attr-defined]
+        call.__signature__ = signature(function).replace(parameters=options)  # type: ignore[attr-defined]
         call.__annotations__ = {}
-        words = cleandoc(function.__doc__ or "").partition("\n\nArgs:\n")[0]
-        app.command(name, cls=Command, help=words, rich_help_panel=group)(call)
+        help_text = cleandoc(function.__doc__ or "").partition("\n\nArgs:\n")[0]
+        app.command(name, cls=Command, help=help_text, rich_help_panel=group)(call)
         return function
 
     return add
 
 
-def _with_help(parameter: Parameter, hint: Any, words: str, names: Sequence[str]) -> Any:
+def _with_help(parameter: Parameter, hint: Any, description: str, names: Sequence[str]) -> Any:
     """Return an annotation with help and type word of the parameter's option or argument, and metadata for Typer."""
     kind, *metadata = get_args(hint) if get_origin(hint) is Annotated else (hint,)
-    option = next((copy(one) for one in metadata if isinstance(one, ParameterInfo)), None)
-    option = option or (typer.Argument() if parameter.default is Parameter.empty else typer.Option(*names))
-    option.help, named = option.help or words, isinstance(option, ArgumentInfo)
-    option.metavar = option.metavar or (parameter.name.upper() if named else type_word(_plain(kind)[0]))
+    stated = [item for item in metadata if isinstance(item, ParameterInfo)]
+    if stated:
+        option: Any = copy(stated[0])
+    elif parameter.default is Parameter.empty:
+        option = typer.Argument()
+    else:
+        option = typer.Option(*names)
+    option.help = option.help or description
+    if not option.metavar:
+        is_argument = isinstance(option, ArgumentInfo)
+        option.metavar = parameter.name.upper() if is_argument else type_word(_plain(kind)[0])
     return Annotated[kind, option]
 
 
 def _options(kind: Any) -> Iterator[Parameter]:
     """Yield the options of a settings dataclass, including nested settings."""
-    hints, about = get_type_hints(kind, include_extras=True), described(kind)
+    hints = get_type_hints(kind, include_extras=True)
+    descriptions = described(kind)
     for field in fields(kind):
         if is_dataclass(hints[field.name]):
             yield from _options(hints[field.name])
             continue
         plain, metadata = _plain(hints[field.name])
-        typed = next((one for one in metadata if isinstance(one, Typed)), Typed())
-        allowed = next((one for one in metadata if isinstance(one, OneOf)), OneOf(()))
+        typed = _typed(metadata)
+        choices = OneOf(())
+        for item in metadata:
+            if isinstance(item, OneOf):
+                choices = item
+                break
         names = [typed.name] if typed.name else []
-        word = typed.unit.upper() or type_word(plain, allowed.allowed)
-        words = [about.get(field.name, ""), allowed.words if word == "NAME" else ""]
+        metavar = typed.unit.upper() or type_word(plain, choices.allowed)
+        help_texts = [descriptions.get(field.name, "")]
+        if metavar == "NAME":
+            help_texts.append(choices.words)
         if get_origin(plain) is tuple:
             names = names or [f"--{field.name.removesuffix('s')}"]
-            word = "NUMBERS" if _plain(get_args(plain)[0])[0] is not str else "TEXT"
+            metavar = "TEXT" if _plain(get_args(plain)[0])[0] is str else "NUMBERS"
             plain = list[str] if _is_repeated(plain) else str
         elif typed.unit:
             plain = str
-        complete = completion(allowed) if allowed.allowed else None
-        option = typer.Option(*names, help="; ".join(filter(None, words)), metavar=word, autocompletion=complete)
+        complete = completion(choices) if choices.allowed else None
+        help_text = "; ".join(filter(None, help_texts))
+        option = typer.Option(*names, help=help_text, metavar=metavar, autocompletion=complete)
         default = field.default if isinstance(field.default, int | float | str) else None
-        annotation = Annotated[plain if default is not None else plain | None, option]
-        yield Parameter(field.name, Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+        value_type = plain | None if default is None else plain
+        yield Parameter(field.name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[value_type, option])
+
+
+def _typed(metadata: Sequence[Any]) -> Typed:
+    """Return how a setting is typed on the command line."""
+    for item in metadata:
+        if isinstance(item, Typed):
+            return item
+    return Typed()
 
 
 def _as_typed(message: str, options: Sequence[Parameter]) -> str:
     """Return an error message in which the option it begins with (``sigmas: …``, ``lock joint9: …``) has dashes."""
-    name, rest = re.fullmatch(r"((?:\w+(?=:| \S+: ))?)(.*)", message, re.S).groups()  # type: ignore[union-attr]
-    for one in options:
-        option = one.annotation.__metadata__[0]
-        names = [name for name in (option.default, *(option.param_decls or ())) if str(name).startswith("--")]
-        typed = names[0].partition("/")[0] if names else f"--{one.name.replace('_', '-')}"
-        if isinstance(option, OptionInfo) and name in (one.name, typed[2:]):
-            return f"{typed}{rest}"
+    match = re.match(r"\w+(?=:| \S+: )", message)
+    if match is None:
+        return message
+    name, remainder = match[0], message[match.end() :]
+    for parameter in options:
+        option = parameter.annotation.__metadata__[0]
+        declarations = (option.default, *(option.param_decls or ()))
+        flags = [flag for flag in declarations if str(flag).startswith("--")]
+        flag = flags[0].partition("/")[0] if flags else f"--{parameter.name.replace('_', '-')}"
+        if isinstance(option, OptionInfo) and name in (parameter.name, flag[2:]):
+            return f"{flag}{remainder}"
     return message
 
 
@@ -329,7 +379,8 @@ def _plain(hint: Any) -> tuple[Any, tuple[Any, ...]]:
         plain, metadata = _plain(get_args(hint)[0])
         return plain, (*metadata, *hint.__metadata__)
     if get_origin(hint) in (Union, UnionType):
-        return _plain(next(one for one in get_args(hint) if one is not NoneType))
+        kinds = [kind for kind in get_args(hint) if kind is not NoneType]
+        return _plain(kinds[0])
     return hint, ()
 
 
@@ -339,23 +390,27 @@ def _is_repeated(plain: Any) -> bool:
     return last is ... and _plain(first)[0] is not float
 
 
-def _built(kind: Any, given: dict[str, Any]) -> Any:
+def _built(kind: Any, values: dict[str, Any]) -> Any:
     """Return settings from the values of the command line; missing values take the defaults."""
-    chosen = _chosen(kind, given)
+    chosen = _chosen(kind, values)
+    if not chosen:
+        return kind()
     try:
-        return parse(kind, chosen, "") if chosen else kind()
-    except UsageError as wrong:
-        wrong.args = (re.sub(r"^(\w+\.)+", "", str(wrong)),)  # nested settings are options like the others
+        return parse(kind, chosen, "")
+    except UsageError as error:
+        # Nested settings are options like the others.
+        error.args = (re.sub(r"^(\w+\.)+", "", str(error)),)
         raise
 
 
-def _chosen(kind: Any, given: dict[str, Any]) -> dict[str, Any]:
-    result, hints = {}, get_type_hints(kind, include_extras=True)
+def _chosen(kind: Any, values: dict[str, Any]) -> dict[str, Any]:
+    result = {}
+    hints = get_type_hints(kind, include_extras=True)
     for field in fields(kind):
         if is_dataclass(hints[field.name]):
-            value = _chosen(hints[field.name], given)
+            value = _chosen(hints[field.name], values)
         else:
-            value = given.get(field.name)
+            value = values.get(field.name)
         if value not in (None, field.default, [], {}):
             result[field.name] = _read(hints[field.name], value)
     return result
@@ -364,11 +419,11 @@ def _chosen(kind: Any, given: dict[str, Any]) -> dict[str, Any]:
 def _read(hint: Any, value: Any) -> Any:
     """Return a value as in an option file: comma-separated texts as lists, numbers with their unit."""
     plain, metadata = _plain(hint)
-    typed = next((one for one in metadata if isinstance(one, Typed)), Typed())
-    if typed.unit:
-        return f"{value} {typed.unit}"
+    unit = _typed(metadata).unit
+    if unit:
+        return f"{value} {unit}"
     if get_origin(plain) is not tuple:
         return value
     if isinstance(value, str):
         return value.split(",")
-    return [_read(get_args(plain)[0], one) for one in value]
+    return [_read(get_args(plain)[0], item) for item in value]

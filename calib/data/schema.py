@@ -61,9 +61,9 @@ class Joints:
     effort: np.ndarray = None  # type: ignore[assignment]  # set below
 
     @staticmethod
-    def of(given: Joints | Sequence[str]) -> Joints:
+    def of(joints: Joints | Sequence[str]) -> Joints:
         """Return the joints; from names alone, revolute joints without limits."""
-        return given if isinstance(given, Joints) else Joints(tuple(given))
+        return joints if isinstance(joints, Joints) else Joints(tuple(joints))
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -71,9 +71,10 @@ class Joints:
         object.__setattr__(self, "kinds", tuple(self.kinds) or ("revolute",) * n)
         for name in ("lower", "upper", "effort"):
             value = getattr(self, name)
-            object.__setattr__(self, name, frozen(np.full(n, np.nan) if value is None else value))
-            if getattr(self, name).shape != (n,):
-                refuse_option(name, f"expected {n} values, one per joint, found {getattr(self, name).shape}")
+            values = frozen(np.full(n, np.nan) if value is None else value)
+            object.__setattr__(self, name, values)
+            if values.shape != (n,):
+                refuse_option(name, f"expected {n} values, one per joint, found {values.shape}")
 
 
 class Rows(Protocol):
@@ -105,7 +106,7 @@ def refuse(source: Rows, bad: np.ndarray, columns: Sequence[str], says: Callable
     if not np.any(bad):
         return
     bad = np.reshape(bad, (len(bad), -1))
-    row, column = (int(i) for i in np.argwhere(bad)[0])
+    row, column = np.argwhere(bad)[0].tolist()
     message = says(row, column) + more_rows(source, bad, columns)
     raise MeasurementError(message, source.file, int(source.rows[row]), columns[column])
 
@@ -115,11 +116,16 @@ def more_rows(source: Rows, bad: np.ndarray, columns: Sequence[str]) -> str:
 
     Where not all rows of a file were read, the words say of how many.
     """
-    others = int(bad.any(axis=1).sum()) - 1
-    read = "" if np.ptp(source.rows) + 1 == len(bad) else f" of the {len(bad)} read"
-    each = listing(f"{count} in {name}" for name, count in zip(columns, bad.sum(axis=0)) if count)
-    of_each = f"; of all, {each}" if bad.shape[1] > 1 else ""
-    return f" (and in {counted(others, 'more row')}{read}{of_each})" if others else ""
+    count = int(bad.any(axis=1).sum()) - 1
+    if not count:
+        return ""
+    all_read = np.ptp(source.rows) + 1 == len(bad)
+    extent = "" if all_read else f" of the {len(bad)} read"
+    by_column = ""
+    if bad.shape[1] > 1:
+        counts = zip(columns, bad.sum(axis=0))
+        by_column = "; of all, " + listing(f"{bad_rows} in {name}" for name, bad_rows in counts if bad_rows)
+    return f" (and in {counted(count, 'more row')}{extent}{by_column})"
 
 
 @dataclass(frozen=True)
@@ -153,11 +159,10 @@ class Column:
         refuse(source, np.abs(values) > self.most, columns, other_unit)
         if self.positive:
             low, high = BOUNDS.min_sigma, BOUNDS.max_length
-            within = f"expected {low:g} to {high:g}, in SI: is the unit right?"
+            advice = f"expected {low:g} to {high:g}, in SI: is the unit right?"
             refuse(source, values <= 0.0, columns, lambda row, k: f"found {values[row, k]:g}: {self.positive}")
-            refuse(
-                source, (values < low) | (values > high), columns, lambda row, k: f"found {values[row, k]:g}: {within}"
-            )
+            unlikely = (values < low) | (values > high)
+            refuse(source, unlikely, columns, lambda row, k: f"found {values[row, k]:g}: {advice}")
         return values
 
 
@@ -168,8 +173,8 @@ def joint_unit(kind: str) -> tuple[str, str, float]:
 
 def max_travel(kinds: Sequence[str]) -> np.ndarray:
     """Return the largest plausible values (n,) [rad or m] of joints of these types without known limits."""
-    most = {"prismatic": BOUNDS.max_length, "continuous": math.inf}
-    return np.array([most.get(kind, BOUNDS.max_turn) for kind in kinds])
+    travel_of = {"prismatic": BOUNDS.max_length, "continuous": math.inf}
+    return np.array([travel_of.get(kind, BOUNDS.max_turn) for kind in kinds])
 
 
 def check_travel(
@@ -188,8 +193,8 @@ def check_travel(
     """
 
     def says(row: int, j: int) -> str:
-        unit, other, _ = joint_unit(kinds[j])
-        travel = "cannot be the travel" if kinds[j] == "prismatic" else "is more than a turn"
-        return f"{q[row, j]:g} {unit} {travel} of {joints[j]}: {advice(j, other)}"
+        unit, mistaken_unit, _ = joint_unit(kinds[j])
+        fault = "cannot be the travel" if kinds[j] == "prismatic" else "is more than a turn"
+        return f"{q[row, j]:g} {unit} {fault} of {joints[j]}: {advice(j, mistaken_unit)}"
 
     refuse(source, np.abs(q) > most, columns, says)

@@ -23,8 +23,15 @@ from calib.estimation.triangles import continued, retriangulate
 from calib.records import frozen, shaped
 
 SAMPLES = 500
-MIN_COEFFICIENT = 1e-4  # coefficients below are not printed: on a calibrated geometry nearly all are there, and small
-BLOCK = 1024  # samples per factorisation: bounds the memory, and keeps it in the processor's cache
+"""Random states over which columns are compared."""
+MIN_COEFFICIENT = 1e-4
+"""Coefficients below are not printed: on a calibrated geometry nearly all are nonzero, and small."""
+BLOCK = 1024
+"""Samples per factorisation: bounds the memory, and keeps it in the processor's cache."""
+ROUNDING = 1e-11
+"""Coefficients below this part of the largest of their column are rounding."""
+MIN_INDEPENDENT = 1e-4
+"""Part of a column of unit norm that no other one explains, at least (our choice)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,21 +57,24 @@ class Base:
 
     @property
     def b(self) -> int:
+        """Number of base parameters."""
         return self.split.rank
 
     @property
     def kept(self) -> np.ndarray:
+        """Columns (b,) of the model that the base parameters are of."""
         return self.split.kept
 
     @property
     def without_effect(self) -> tuple[str, ...]:
-        return tuple(self.standard[k] for k in self.split.without_effect)
+        """Names of the standard parameters that act on no torque."""
+        return tuple(self.standard[column] for column in self.split.without_effect)
 
     @property
     def regrouped(self) -> tuple[str, ...]:
         """Names of the standard parameters regrouped into others."""
-        silent = set(self.split.without_effect.tolist())
-        return tuple(self.standard[k] for k in self.split.dropped if k not in silent)
+        without_effect = set(self.split.without_effect.tolist())
+        return tuple(self.standard[column] for column in self.split.dropped if column not in without_effect)
 
     @property
     def transform(self) -> np.ndarray:
@@ -77,14 +87,16 @@ class Base:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the b parameters, with R if others are regrouped into them by at least `MIN_COEFFICIENT`."""
-        return tuple(
-            self.standard[k] + ("R" if (np.abs(row) >= MIN_COEFFICIENT).any() else "")
-            for k, row in zip(self.kept, self.split.coefficients)
-        )
+        names = []
+        for column, coefficients in zip(self.kept, self.split.coefficients):
+            regrouped = (np.abs(coefficients) >= MIN_COEFFICIENT).any()
+            names.append(self.standard[column] + ("R" if regrouped else ""))
+        return tuple(names)
 
     @property
     def units(self) -> tuple[str, ...]:
-        return tuple(self.standard_units[k] for k in self.kept)
+        """Units of the b parameters."""
+        return tuple(self.standard_units[column] for column in self.kept)
 
     def to_standard(self, values: np.ndarray) -> np.ndarray:
         """Return standard parameters (p,) with the same torques: base values for the kept ones, zero for the others."""
@@ -105,10 +117,12 @@ class BaseModel:
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Names of the b parameters."""
         return self.base.names
 
     @property
     def units(self) -> tuple[str, ...]:
+        """Units of the b parameters."""
         return self.base.units
 
     def regressor(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
@@ -152,6 +166,7 @@ def find(
     """Return the base parameters of a model: independent columns of its regressor.
 
     Args:
+        model: linear in its parameters.
         samples: states to compare columns over; default `random_samples`. With recorded motion: the parameters that
             this motion identifies.
         loads: the load cases stacked, each as `carried` of the regressor; default with all payloads and without, if
@@ -159,13 +174,16 @@ def find(
         tolerance: minimum part of a column of unit norm that is independent of the columns before.
         nominal: the same model on the geometry that columns are chosen on; None: `model`.
     """
-    samples = random_samples(model) if samples is None else samples
+    if samples is None:
+        samples = random_samples(model)
     if nominal is not None:
         return regroup(find(nominal, samples, loads, tolerance), model, samples, loads)
-    cases = model.load_cases() if loads is None else loads
-    factor = r_factor(model, samples, cases)
-    split = _clean(split_columns(factor, [np.array([k]) for k in model.preference()], tolerance))
-    return _describe(model, split, factor, len(cases) * len(samples.q))
+    if loads is None:
+        loads = model.load_cases()
+    factor = r_factor(model, samples, loads)
+    candidates = [np.array([column]) for column in model.preference()]
+    split = _clean(split_columns(factor, candidates, tolerance))
+    return _describe(model, split, factor, len(loads) * len(samples.q))
 
 
 def regroup(base: Base, model: RegressorModel, samples: States | None = None, loads: Loads | None = None) -> Base:
@@ -175,20 +193,23 @@ def regroup(base: Base, model: RegressorModel, samples: States | None = None, lo
     calibrated one a small one) take part; the singular values are those of the new geometry.
     """
     _require_same(base, model)
-    samples = random_samples(model) if samples is None else samples
-    cases = model.load_cases() if loads is None else loads
-    factor = r_factor(model, samples, cases)
-    kept, dropped = base.split.kept, base.split.dropped
-    silent, scale = _norms(factor)
-    scaled = np.where(silent, 0.0, factor / scale)
-    found = np.linalg.lstsq(scaled[:, kept], scaled[:, dropped], rcond=None)[0]
+    if samples is None:
+        samples = random_samples(model)
+    if loads is None:
+        loads = model.load_cases()
+    factor = r_factor(model, samples, loads)
+    kept = base.split.kept
+    dropped = base.split.dropped
+    without_effect, scale = _norms(factor)
+    scaled = np.where(without_effect, 0.0, factor / scale)
+    coefficients = np.linalg.lstsq(scaled[:, kept], scaled[:, dropped], rcond=None)[0]
     split = replace(
         base.split,
-        coefficients=frozen(found * scale[dropped] / scale[kept][:, None]),
-        without_effect=frozen(np.flatnonzero(silent), int),
+        coefficients=frozen(coefficients * scale[dropped] / scale[kept][:, None]),
+        without_effect=frozen(np.flatnonzero(without_effect), int),
         singular_values=frozen(np.linalg.svd(scaled, compute_uv=False)),
     )
-    return _describe(model, _clean(split), factor, len(cases) * len(samples.q))
+    return _describe(model, _clean(split), factor, len(loads) * len(samples.q))
 
 
 def r_factor(model: RegressorModel, samples: States, loads: Loads = (None,)) -> np.ndarray:
@@ -198,89 +219,107 @@ def r_factor(model: RegressorModel, samples: States, loads: Loads = (None,)) -> 
     before it), then all are stacked: memory is bounded by a block, whatever the number of samples.
     """
     p = model.p
-    states = friction_states(model, samples.q) if samples.states is None else samples.states
+    states = samples.states
+    if states is None:
+        states = friction_states(model, samples.q)
     triangles = np.zeros((model.rows, p, p))
     for start in range(0, len(samples.q), BLOCK):
         part = slice(start, start + BLOCK)
+        q = samples.q[part]
+        v = samples.v[part]
+        a = samples.a[part]
+        load = None if samples.load is None else samples.load[part]
         for carried in loads:
-            load = None if samples.load is None else samples.load[part]
-            block = model.regressor(samples.q[part], samples.v[part], samples.a[part], load, carried, states[:, part])
+            regressor = model.regressor(q, v, a, load, carried, states[:, part])
             for row in range(model.rows):
-                triangles[row] = _updated(triangles[row], block.transpose(2, 1, 0)[:, row])
+                triangles[row] = _updated(triangles[row], regressor.transpose(2, 1, 0)[:, row])
     return retriangulate(triangles.reshape(-1, p))
 
 
 def expressions(base: Base) -> tuple[str, ...]:
     """Return the base parameters as sums of standard ones, e.g. ``ZZ1R = ZZ1 + YY2``, without small coefficients."""
     lines = []
-    for name, k, row in zip(base.names, base.kept, base.split.coefficients):
-        text = base.standard[k]
-        for coefficient, index in zip(row, base.split.dropped):
+    for name, column, row in zip(base.names, base.kept, base.split.coefficients):
+        text = base.standard[column]
+        for coefficient, dropped in zip(row, base.split.dropped):
             if abs(coefficient) < MIN_COEFFICIENT:
                 continue
-            size = f"{float(f'{abs(coefficient):.12g}'):.5g}"  # ties must not hang on the last bit
+            sign = "-" if coefficient < 0 else "+"
+            # Rounded twice, so that ties do not depend on the last bit.
+            rounded = float(f"{abs(coefficient):.12g}")
+            size = f"{rounded:.5g}"
             factor = "" if size == "1" else f"{size} "
-            text += f" {'-' if coefficient < 0 else '+'} {factor}{base.standard[index]}"
+            text += f" {sign} {factor}{base.standard[dropped]}"
         lines.append(f"{name} = {text}")
     return tuple(lines)
 
 
 def standard_name(name: str, standard: Collection[str]) -> str:
     """Return the standard parameter of a base parameter's name in a file: ``ZZ1`` for ``ZZ1R``."""
-    return name[:-1] if name.endswith("R") and name not in standard and name[:-1] in standard else name
+    if name.endswith("R") and name not in standard and name[:-1] in standard:
+        return name[:-1]
+    return name
 
 
-def places(own: Sequence[str], names: Sequence[str], standard: Collection[str]) -> list[int] | None:
-    """Return where each base parameter of `own` stands among others' names; None if one does not.
+def places(parameters: Sequence[str], names: Sequence[str], standard: Collection[str]) -> list[int] | None:
+    """Return where each of some base `parameters` stands among others' names; None if one does not.
 
     What is regrouped into it, and so the R of its name, may differ by another geometry or by joint corrections.
     """
-    there = {standard_name(name, standard): k for k, name in enumerate(names)}
-    wanted = [standard_name(name, standard) for name in own]
-    return [there[name] for name in wanted] if set(wanted) <= set(there) else None
+    index_of = {standard_name(name, standard): index for index, name in enumerate(names)}
+    standard_names = [standard_name(name, standard) for name in parameters]
+    if not set(standard_names) <= set(index_of):
+        return None
+    return [index_of[name] for name in standard_names]
 
 
 def _updated(triangle: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Return the R factor of [R factor; columnsᵀ] (p, p); columns (p, N)."""
-    live = np.flatnonzero(columns.any(axis=1) | triangle.any(axis=0))
+    nonzero = np.flatnonzero(columns.any(axis=1) | triangle.any(axis=0))
+    count = len(nonzero)
     result = np.zeros_like(triangle)
-    if len(live):  # live[i] >= i: what stood in other columns is upper triangular in these
-        result[: len(live), live] = continued(triangle[: len(live), live], columns[live].T)
+    if count:
+        # nonzero[i] >= i: what stood in other columns is upper triangular in these.
+        result[:count, nonzero] = continued(triangle[:count, nonzero], columns[nonzero].T)
     return result
 
 
-def _clean(split: ColumnSplit, rounding: float = 1e-11) -> ColumnSplit:
-    """Return the split with rounding errors in the coefficients set to zero.
-
-    `rounding`: coefficients below this part of the largest of their column are rounding.
-    """
+def _clean(split: ColumnSplit) -> ColumnSplit:
+    """Return the split with rounding errors in the coefficients set to zero."""
     coefficients = np.array(split.coefficients)
     size = np.abs(coefficients).max(axis=0, initial=0.0)
-    coefficients[np.abs(coefficients) <= rounding * size] = 0.0
+    coefficients[np.abs(coefficients) <= ROUNDING * size] = 0.0
     coefficients[:, np.isin(split.dropped, split.without_effect)] = 0.0
-    near = np.abs(coefficients - np.round(coefficients)) <= rounding
-    return replace(split, coefficients=frozen(np.where(near, np.round(coefficients), coefficients)))
+    rounded = np.round(coefficients)
+    is_integer = np.abs(coefficients - rounded) <= ROUNDING
+    return replace(split, coefficients=frozen(np.where(is_integer, rounded, coefficients)))
 
 
 def _norms(factor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the mask of columns without effect, and the norms of all columns (1 for those without effect)."""
     norms = np.linalg.norm(factor, axis=0)
-    silent = norms <= 1e-12 * norms.max(initial=0.0)
-    return silent, np.where(silent, 1.0, norms)
+    without_effect = norms <= 1e-12 * norms.max(initial=0.0)
+    return without_effect, np.where(without_effect, 1.0, norms)
 
 
 def _describe(model: RegressorModel, split: ColumnSplit, factor: np.ndarray, samples: int) -> Base:
     """Return the base with the remainder ‖W_d - W_k K‖ of each dropped column, relative and as rms torque."""
-    silent, scale = _norms(factor)
-    rest = np.linalg.norm(factor[:, split.dropped] - factor[:, split.kept] @ split.coefficients, axis=0)
-    rest[silent[split.dropped]] = 0.0
-    lost = rest / np.sqrt(samples * model.rows)
+    without_effect, scale = _norms(factor)
+    residual = factor[:, split.dropped] - factor[:, split.kept] @ split.coefficients
+    remainder = np.linalg.norm(residual, axis=0)
+    remainder[without_effect[split.dropped]] = 0.0
     return Base(
-        model.torque_rows.name, model.names, model.units, split, frozen(rest / scale[split.dropped]), frozen(lost)
+        rows=model.torque_rows.name,
+        standard=model.names,
+        standard_units=model.units,
+        split=split,
+        remainder=frozen(remainder / scale[split.dropped]),
+        lost=frozen(remainder / np.sqrt(samples * model.rows)),
     )
 
 
 def _require_same(base: Base, model: RegressorModel) -> None:
+    """Raise an error for base parameters of another model."""
     if (base.rows, base.standard) != (model.torque_rows.name, model.names):
         raise CalibError("the base parameters belong to another model: rows or parameter names differ")
 
@@ -291,14 +330,21 @@ def information(
     """Return the information Σ ωᵀω (b, b) of a motion with regressors ω.
 
     Args:
-        model: with b columns; q, v, a: (N, n) [rad or m, and per s, per s²].
+        model: with b columns.
+        q, v, a: (N, n) [rad or m, and per s, per s²].
         sigmas: (rows,) by which the rows of ω are divided; None: 1.
     """
-    total = np.zeros((len(model.names),) * 2)
+    b = len(model.names)
+    total = np.zeros((b, b))
     for start in range(0, len(q), BLOCK):
-        part = (np.ascontiguousarray(x[start : start + BLOCK]) for x in (q, v, a))
-        W = model.regressor(*part) / (1.0 if sigmas is None else sigmas[:, None])
-        rows = W.reshape(-1, W.shape[-1])
+        part = slice(start, start + BLOCK)
+        q_part = np.ascontiguousarray(q[part])
+        v_part = np.ascontiguousarray(v[part])
+        a_part = np.ascontiguousarray(a[part])
+        regressor = model.regressor(q_part, v_part, a_part)
+        if sigmas is not None:
+            regressor = regressor / sigmas[:, None]
+        rows = regressor.reshape(-1, b)
         total += rows.T @ rows
     return total
 
@@ -321,14 +367,21 @@ def columns_at_rest(
         unused: torque rows that do not count; default those of the resting joints.
     """
     states = random_samples(model.model, lower=lower, upper=upper)
-    q, v, a = (np.array(x) for x in (states.q, states.v, states.a))
-    for j, value in resting.items():
-        q[:, j], v[:, j], a[:, j] = q[0, j] if value is None else value, 0.0, 0.0
-    Y = model.regressor(q, v, a)
-    Y[:, list(resting) if unused is None else unused] = 0.0
-    rows = Y.reshape(-1, Y.shape[-1])
+    q = np.array(states.q)
+    v = np.array(states.v)
+    a = np.array(states.a)
+    for joint, position in resting.items():
+        q[:, joint] = q[0, joint] if position is None else position
+        v[:, joint] = 0.0
+        a[:, joint] = 0.0
+    regressor = model.regressor(q, v, a)
+    if unused is None:
+        unused = list(resting)
+    regressor[:, unused] = 0.0
+    rows = regressor.reshape(-1, regressor.shape[-1])
     if known is not None:
-        values, V = np.linalg.eigh(known)
-        rows = np.concatenate([rows, np.sqrt(np.maximum(values, 0.0))[:, None] * V.T])
-    min_independent = 1e-4  # of a column at unit norm that no other one explains (our choice)
-    return np.asarray(split_columns(rows, [np.array([k]) for k in range(rows.shape[1])], min_independent).kept)
+        eigenvalues, vectors = np.linalg.eigh(known)
+        root = np.sqrt(np.maximum(eigenvalues, 0.0))[:, None] * vectors.T
+        rows = np.concatenate([rows, root])
+    candidates = [np.array([column]) for column in range(rows.shape[1])]
+    return np.asarray(split_columns(rows, candidates, MIN_INDEPENDENT).kept)

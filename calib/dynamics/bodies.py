@@ -10,6 +10,7 @@ without a coordinate is fixed to its parent (a payload).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 
@@ -19,6 +20,12 @@ from calib.errors import RobotError
 from calib.records import frozen, shaped
 from calib.robot.chain import AXES, Chain, check_gravity
 from calib.transforms import pose
+
+PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+"""Rows and columns of the moments of inertia in `STANDARD`."""
+_TURNS = ((1, 2, 0), (2, 0, 1), (0, 1, 2))
+"""Which axes of a body's frame are x, y, z of the kernels' frame, by moving axis."""
+
 
 FIXED, REVOLUTE, PRISMATIC = 0, 1, 2
 STANDARD = ("XX", "XY", "XZ", "YY", "YZ", "ZZ", "MX", "MY", "MZ", "M")
@@ -60,10 +67,12 @@ class Bodies:
 
     @property
     def count(self) -> int:
+        """Number of bodies."""
         return len(self.parents)
 
     @property
     def n(self) -> int:
+        """Number of coordinates."""
         return self.paths.shape[1]
 
     @property
@@ -73,6 +82,7 @@ class Bodies:
 
     @property
     def units(self) -> tuple[str, ...]:
+        """Units of the 10·B standard parameters."""
         return UNITS * self.count
 
     def with_gravity(self, gravity: np.ndarray) -> Bodies:
@@ -89,54 +99,62 @@ def bodies_of(chain: Chain) -> Bodies:
 
     Body j is numbered like its joint, from 1; a follower of joint 2 is ``2b``, the next one ``2c``.
     """
-    first = set(chain.moving.tolist())
-    pending, placements = np.eye(4), []
+    joint_elements = set(chain.moving.tolist())
+    placement = np.eye(4)
+    placements = []
     labels: list[str] = []
     for k, element in enumerate(chain.elements):
-        pending = pending if element.placement is None else pending @ element.placement
-        pending = pending @ _elementary(element.axis, element.sign * element.value)
+        if element.placement is not None:
+            placement = placement @ element.placement
+        placement = placement @ _elementary(element.axis, element.sign * element.value)
         if element.joint is not None:
-            placements.append(pending)
-            pending = np.eye(4)
-            number = str(element.joint + 1)
-            taken = sum(label.rstrip("bcdefgh") == number for label in labels)
-            labels.append(number if k in first else number + "abcdefgh"[taken])
-    moved = [chain.elements[k] for k in chain.driven]
-    return _assemble(
-        labels,
-        range(-1, len(moved) - 1),
-        [REVOLUTE if element.axis[0] == "r" else PRISMATIC for element in moved],
-        [AXES.index(element.axis) % 3 for element in moved],
-        [element.sign * element.ratio for element in moved],
-        [element.joint or 0 for element in moved],
-        placements,
-        chain.gravity,
-        chain.n,
-    )
+            placements.append(placement)
+            placement = np.eye(4)
+            label = str(element.joint + 1)
+            if k not in joint_elements:
+                count = sum(previous.rstrip("bcdefgh") == label for previous in labels)
+                label += "abcdefgh"[count]
+            labels.append(label)
+    kinds = []
+    axes = []
+    scales = []
+    coordinates = []
+    for k in chain.driven:
+        element = chain.elements[k]
+        kinds.append(REVOLUTE if element.axis[0] == "r" else PRISMATIC)
+        axes.append(AXES.index(element.axis) % 3)
+        scales.append(element.sign * element.ratio)
+        coordinates.append(element.joint or 0)
+    parents = range(-1, len(kinds) - 1)
+    return _assemble(labels, parents, kinds, axes, scales, coordinates, placements, chain.gravity, chain.n)
 
 
 def with_payload(bodies: Bodies, placement: np.ndarray, label: str | None = None, on: int = -1) -> Bodies:
     """Return the bodies with a payload added, fixed to body `on` (default the last).
 
     Args:
+        bodies: of the robot.
         placement: (4, 4), the frame of the payload's parameters in the frame of the body it is fixed to; `Chain.tail`
             for the tip of a chain.
         label: default the number after the last joint's, so 8 on an arm of seven joints.
+        on: index of the body; negative ones count from the last.
     """
     parent = range(bodies.count)[on]
-    label = str(bodies.n + 1) if label is None else label
+    if label is None:
+        label = str(bodies.n + 1)
     if label in bodies.labels:
         raise RobotError(f"a body '{label}' exists already; give the payload another label")
+    placement = shaped(placement, (4, 4), "payload placement")
     return _assemble(
-        [*bodies.labels, label],
-        [*bodies.parents, parent],
-        [*bodies.kinds, FIXED],
-        [*bodies.axes, 2],
-        [*bodies.scales, 0.0],
-        [*bodies.coordinates, -1],
-        [*bodies.placements, shaped(placement, (4, 4), "payload placement")],
-        bodies.gravity,
-        bodies.n,
+        labels=[*bodies.labels, label],
+        parents=[*bodies.parents, parent],
+        kinds=[*bodies.kinds, FIXED],
+        axes=[*bodies.axes, 2],
+        scales=[*bodies.scales, 0.0],
+        coordinates=[*bodies.coordinates, -1],
+        placements=[*bodies.placements, placement],
+        gravity=bodies.gravity,
+        n=bodies.n,
     )
 
 
@@ -156,32 +174,60 @@ def standard_parameters(chain: Chain) -> np.ndarray:
     return result.ravel()
 
 
-@lru_cache(maxsize=1024)  # chains differ from their neighbours by one element
+# Chains differ from their neighbours by one element.
+@lru_cache(maxsize=1024)
 def _elementary(axis: str, amount: float) -> np.ndarray:
     """Return the constant transform of an element (4, 4), exp(axis · amount)."""
-    result, along = np.eye(4), AXES.index(axis) % 3
+    transform = np.eye(4)
+    along = AXES.index(axis) % 3
     if axis[0] == "t":
-        result[along, 3] = amount
-    else:
-        one, two = (along + 1) % 3, (along + 2) % 3
-        result[one, one] = result[two, two] = np.cos(amount)
-        result[two, one], result[one, two] = np.sin(amount), -np.sin(amount)
-    return frozen(result)
+        transform[along, 3] = amount
+        return frozen(transform)
+    first = (along + 1) % 3
+    second = (along + 2) % 3
+    transform[first, first] = np.cos(amount)
+    transform[second, second] = np.cos(amount)
+    transform[second, first] = np.sin(amount)
+    transform[first, second] = -np.sin(amount)
+    return frozen(transform)
 
 
-def _assemble(labels, parents, kinds, axes, scales, coordinates, placements, gravity, n) -> Bodies:
+def _assemble(
+    labels: Sequence[str],
+    parents: Sequence[int],
+    kinds: Sequence[int],
+    axes: Sequence[int],
+    scales: Sequence[float],
+    coordinates: Sequence[int],
+    placements: Sequence[np.ndarray],
+    gravity: np.ndarray,
+    n: int,
+) -> Bodies:
     """Return the bodies with frozen arrays and the list of coordinates that move each body."""
-    paths = np.full((len(labels), n), -1)
-    depths = np.zeros(len(labels), dtype=int)
-    for i, (parent, coordinate) in enumerate(zip(parents, coordinates)):
-        path = [] if parent < 0 else paths[parent, : depths[parent]].tolist()
+    count = len(labels)
+    paths = np.full((count, n), -1)
+    depths = np.zeros(count, dtype=int)
+    for body, (parent, coordinate) in enumerate(zip(parents, coordinates)):
+        path = []
+        if parent >= 0:
+            path = paths[parent, : depths[parent]].tolist()
         if coordinate >= 0 and coordinate not in path:
             path.append(coordinate)
-        paths[i, : len(path)], depths[i] = path, len(path)
-    parents, upright = list(parents), np.array(_upright(parents, axes, placements))
-    constants = np.zeros((len(labels) + 1, 13))
-    constants[:-1, :12], constants[:-1, 12] = upright[:, :3].reshape(-1, 12), scales
+        paths[body, : len(path)] = path
+        depths[body] = len(path)
+
+    # Placements between frames with axes relabelled so that the joint axis is z.
+    constants = np.zeros((count + 1, 13))
+    for body, (parent, axis) in enumerate(zip(parents, axes)):
+        turn_before = np.eye(4)
+        if parent >= 0:
+            turn_before = upright_turn(axes[parent]).T
+        upright = turn_before @ placements[body] @ upright_turn(axis)
+        constants[body, :12] = upright[:3].ravel()
+    constants[:-1, 12] = scales
     constants[-1, :3] = gravity
+    links = np.column_stack([parents, kinds, coordinates, depths, paths])
+    order = [_kernel_order(axis) for axis in axes]
     return Bodies(
         labels=tuple(labels),
         parents=frozen(parents, np.int64),
@@ -192,28 +238,25 @@ def _assemble(labels, parents, kinds, axes, scales, coordinates, placements, gra
         placements=frozen(placements),
         gravity=frozen(gravity),
         paths=frozen(paths, np.int64),
-        links=frozen(np.column_stack([parents, kinds, coordinates, depths, paths]), np.int64),
+        links=frozen(links, np.int64),
         constants=frozen(constants),
-        order=frozen([_PERMUTED[axis] for axis in axes], np.int64),
+        order=frozen(order, np.int64),
     )
 
 
-PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-_TURNS = ((1, 2, 0), (2, 0, 1), (0, 1, 2))  # which old axes are the new x, y, z, by moving axis
-_PERMUTED = tuple(
-    [PAIRS.index((min(turn[r], turn[s]), max(turn[r], turn[s]))) for r, s in PAIRS] + [6 + r for r in turn] + [9]
-    for turn in _TURNS
-)
+@cache
+def _kernel_order(axis: int) -> tuple[int, ...]:
+    """Return the indices (10,) in `STANDARD` of the parameters in the kernels' frame, by moving axis."""
+    turn = _TURNS[axis]
+    order = []
+    for row, column in PAIRS:
+        first, second = sorted((turn[row], turn[column]))
+        order.append(PAIRS.index((first, second)))
+    order += [6 + turn[0], 6 + turn[1], 6 + turn[2], 9]
+    return tuple(order)
 
 
 @cache
 def upright_turn(axis: int) -> np.ndarray:
     """Return the rotation (4, 4) from a body's frame to the kernels', with the joint axis (0, 1, 2: x, y, z) as z."""
     return frozen(pose(np.eye(3)[:, _TURNS[axis]]))
-
-
-def _upright(parents, axes, placements) -> list[np.ndarray]:
-    """Return the placements between frames with axes relabelled so that the joint axis is z."""
-    turns = [upright_turn(axis) for axis in axes]
-    before = [np.eye(4) if parent < 0 else turns[parent].T for parent in parents]
-    return [first @ placement @ turn for first, placement, turn in zip(before, placements, turns)]

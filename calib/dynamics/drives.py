@@ -44,25 +44,27 @@ class DriveTerm:
 
     def __post_init__(self) -> None:
         one_of(self.shape, SHAPES, f"term '{self.name}': shape")
-        wanted = SHAPES[self.shape].settings
-        if wanted[:1] == ("edge",) and len(self.settings) == len(wanted) - 1:
+        names = SHAPES[self.shape].settings
+        if names[:1] == ("edge",) and len(self.settings) == len(names) - 1:
             object.__setattr__(self, "settings", (math.inf, *self.settings))
-        if len(self.settings) != len(wanted):
+        if len(self.settings) != len(names):
             raise CalibError(
-                f"term '{self.name}': shape '{self.shape}' needs ({', '.join(wanted)}), not {self.settings}"
+                f"term '{self.name}': shape '{self.shape}' needs ({', '.join(names)}), not {self.settings}"
             )
         require(self.side in ("link", "motor"), f"term '{self.name}': side '{self.side}', expected 'link' or 'motor'")
 
     @property
     def form(self) -> Shape:
+        """Properties of its shape."""
         return SHAPES[self.shape]
 
     @property
     def joint(self) -> int | None:
         """Joint whose motion a single-joint term depends on; None for a coupling of joints."""
-        if len(self.acts) != 1 or self.acts[0][1] != ((self.acts[0][0], 1.0),):
+        if len(self.acts) != 1:
             return None
-        return self.acts[0][0]
+        row, motion = self.acts[0]
+        return row if motion == ((row, 1.0),) else None
 
     @property
     def nonnegative(self) -> bool:
@@ -71,6 +73,7 @@ class DriveTerm:
 
     @property
     def unit(self) -> str:
+        """Unit of its parameter."""
         return self.form.unit_linear if self.linear else self.form.unit
 
     def acting(self, motions: Sequence[np.ndarray | None], states: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
@@ -81,35 +84,45 @@ class DriveTerm:
             states: (s, N) of this term alone, see `friction_states`.
         """
         for k, (row, motion) in enumerate(self.acts):
-            seen = _join(self, motion, motions, states[k] if self.form.remembers else None)
-            yield row, self.values(seen)
+            state = states[k] if self.form.remembers else None
+            yield row, self.values(_join(self, motion, motions, state))
 
-    def values(self, seen: Joined) -> np.ndarray:
+    def values(self, joined: Joined) -> np.ndarray:
         """Return the term's column (N,) for a motion, per unit of the parameter."""
-        if self.shape in ("acceleration", "velocity"):
-            return seen.a if self.shape == "acceleration" else seen.v
-        found = self._evaluated(seen, 1)[0]
-        return found * np.abs(seen.load) if self.form.loaded and seen.load is not None else found
+        if self.shape == "acceleration":
+            return joined.a
+        if self.shape == "velocity":
+            return joined.v
+        values = self._evaluated(joined, 1)[0]
+        if self.form.loaded and joined.load is not None:
+            return values * np.abs(joined.load)
+        return values
 
-    def slopes(self, seen: Joined) -> tuple[np.ndarray, np.ndarray, float]:
+    def slopes(self, joined: Joined) -> tuple[np.ndarray, np.ndarray, float]:
         """Return the derivatives of the column with respect to position and velocity (N,), and to acceleration."""
-        _, by_x, by_v = self._evaluated(seen, 3)
+        _, by_x, by_v = self._evaluated(joined, 3)
         return by_x, by_v, float(self.shape == "acceleration")
 
-    def _evaluated(self, seen: Joined, rows: int) -> np.ndarray:
+    def _evaluated(self, joined: Joined, rows: int) -> np.ndarray:
         """Return the value (1, N), or the value with its derivatives with respect to position and velocity (3, N)."""
         from calib.dynamics import shape_kernels
 
-        acts, out = np.zeros((1, 8)), np.empty((rows, len(seen.v)))
+        acts = np.zeros((1, 8))
         acts[0, 1 : 1 + len(self.settings)] = self.settings
-        x, v, state = map(np.ascontiguousarray, (seen.x, seen.v, seen.v if seen.state is None else seen.state))
-        shape_kernels.fill(getattr(shape_kernels, self.shape.upper()), acts, x, v, state, out)
+        x = np.ascontiguousarray(joined.x)
+        v = np.ascontiguousarray(joined.v)
+        state = v if joined.state is None else np.ascontiguousarray(joined.state)
+        out = np.empty((rows, len(joined.v)))
+        code = getattr(shape_kernels, self.shape.upper())
+        shape_kernels.fill(code, acts, x, v, state, out)
         return out
 
 
 def term(name: str, shape: str, joint: int, *settings: float, side: str = "motor", linear: bool = False) -> DriveTerm:
     """Return a drive term of one joint that depends on that joint's motion."""
-    return DriveTerm(name, shape, ((joint, ((joint, 1.0),)),), tuple(map(float, settings)), side, linear)
+    motion = ((joint, 1.0),)
+    numbers = tuple(float(setting) for setting in settings)
+    return DriveTerm(name, shape, ((joint, motion),), numbers, side, linear)
 
 
 def standard(
@@ -122,26 +135,31 @@ def standard(
         v0: smoothing of the Coulomb sign [rad/s or m/s], one or per joint.
         linear: which joints are prismatic.
     """
-    known = STANDARD | LINK_SIDE | MOTOR_SIDE
+    shapes = STANDARD | LINK_SIDE | MOTOR_SIDE
     smoothing = np.broadcast_to(np.asarray(v0, dtype=float), (len(sets),))
-    result = []
+    if linear is None:
+        linear = [False] * len(sets)
+    terms = []
     for joint, names in enumerate(sets):
         for name in names.split():
-            require(name in known, f"joint {joint + 1}: drive term '{name}' is none of {', '.join(known)}")
-            settings = (smoothing[joint],) if known[name] == "sign" else ()
+            require(name in shapes, f"joint {joint + 1}: drive term '{name}' is none of {', '.join(shapes)}")
+            shape = shapes[name]
+            settings = (smoothing[joint],) if shape == "sign" else ()
             side = "link" if name in LINK_SIDE else "motor"
-            is_linear = bool(linear[joint]) if linear is not None else False
-            result.append(term(f"{name}{joint + 1}", known[name], joint, *settings, side=side, linear=is_linear))
-    return tuple(result)
+            label = f"{name}{joint + 1}"
+            terms.append(term(label, shape, joint, *settings, side=side, linear=bool(linear[joint])))
+    return tuple(terms)
 
 
 def without_effect(label: str) -> tuple[DriveTerm, ...]:
     """Return the seven drive parameters of a fixed body: the papers count them, they move nothing."""
-    named = {"Ia": "acceleration"} | LINK_SIDE | MOTOR_SIDE
-    return tuple(
-        DriveTerm(name + label, shape, (), (V0,) if shape == "sign" else (), "link" if name in LINK_SIDE else "motor")
-        for name, shape in named.items()
-    )
+    shapes = {"Ia": "acceleration"} | LINK_SIDE | MOTOR_SIDE
+    terms = []
+    for name, shape in shapes.items():
+        settings = (V0,) if shape == "sign" else ()
+        side = "link" if name in LINK_SIDE else "motor"
+        terms.append(DriveTerm(name + label, shape, (), settings, side))
+    return tuple(terms)
 
 
 def coupled(
@@ -153,9 +171,12 @@ def coupled(
 
     for a weight of 1 (Gautier & Janot's TX40 model; the joints' own Ia Fv Fc hold the rest); of -1: the difference.
     """
-    label = str(second + 1) if label is None else label
+    if label is None:
+        label = str(second + 1)
     crossed = ((first, ((second, weight),)), (second, ((first, weight),)))
-    total = ((first, ((first, 1.0), (second, weight))), (second, ((first, weight), (second, 1.0))))
+    first_total = ((first, 1.0), (second, weight))
+    second_total = ((first, weight), (second, 1.0))
+    total = ((first, first_total), (second, second_total))
     return (
         DriveTerm(f"Iam{label}", "acceleration", crossed),
         DriveTerm(f"Fvm{label}", "velocity", crossed),
@@ -167,21 +188,25 @@ def fill(terms: Sequence[DriveTerm], out: np.ndarray, motions: Sequence[np.ndarr
     """Write the columns of terms into out (k, n, N), which must be zero.
 
     Args:
+        terms: k of them.
+        out: (k, n, N).
         motions: q, v, a, load, each (n, N), load None if unknown.
         states: (s, N), see `friction_states`.
     """
-    state = 0
-    for column, one in zip(out, terms, strict=True):
-        own = len(one.acts) if one.form.remembers else 0
-        for row, values in one.acting(motions, states[state : state + own]):
+    first = 0
+    for column, term in zip(out, terms, strict=True):
+        count = len(term.acts) if term.form.remembers else 0
+        for row, values in term.acting(motions, states[first : first + count]):
             column[row] += values
-        state += own
+        first += count
 
 
 def fill_energies(terms: Sequence[DriveTerm], out: np.ndarray, v: np.ndarray) -> None:
     """Write the kinetic energies ½ Σ weight v_row v_joint of acceleration terms into out (k, N), given v (n, N)."""
-    for column, one in zip(out, terms, strict=True):
-        for row, motion in one.acts if one.shape == "acceleration" else ():
+    for column, term in zip(out, terms, strict=True):
+        if term.shape != "acceleration":
+            continue
+        for row, motion in term.acts:
             for joint, weight in motion:
                 column += 0.5 * weight * v[row] * v[joint]
 
@@ -190,13 +215,14 @@ def slopes(
     terms: Sequence[DriveTerm], motions: Sequence[np.ndarray], weights: np.ndarray, out: Sequence[np.ndarray]
 ) -> None:
     """Add the gradients of Σ weights · columns, weights (k, n, N), with respect to q, v and a to `out`, (n, N) each."""
-    for weight, one in zip(weights, terms, strict=True):
-        require(one.form.slopes, f"term '{one.name}' ({one.shape}) depends on past motion or torques: no derivatives")
-        for row, motion in one.acts:
-            parts = one.slopes(_join(one, motion, [*motions, None], None))
-            for target, part in zip(out, parts):
-                for joint, share in motion:
-                    target[joint] += share * weight[row] * part
+    for term_weights, term in zip(weights, terms, strict=True):
+        message = f"term '{term.name}' ({term.shape}) depends on past motion or torques: no derivatives"
+        require(term.form.slopes, message)
+        for row, motion in term.acts:
+            derivatives = term.slopes(_join(term, motion, [*motions, None], None))
+            for gradient, derivative in zip(out, derivatives):
+                for joint, weight in motion:
+                    gradient[joint] += weight * term_weights[row] * derivative
 
 
 def friction_states(terms: Sequence[DriveTerm], q: np.ndarray) -> np.ndarray:
@@ -209,29 +235,50 @@ def friction_states(terms: Sequence[DriveTerm], q: np.ndarray) -> np.ndarray:
     """
     from calib.dynamics import kernels
 
-    found = []
-    for one in terms:
-        for _, motion in one.acts if one.form.remembers else ():
-            found.append(kernels.stop(sum((w * q[j] for j, w in motion), np.zeros(q.shape[1])), one.settings[0]))
-    return np.array(found).reshape(len(found), q.shape[1])
+    count = q.shape[1]
+    states = []
+    for term in terms:
+        if not term.form.remembers:
+            continue
+        width = term.settings[0]
+        for _, motion in term.acts:
+            x = np.zeros(count)
+            for joint, weight in motion:
+                x = x + weight * q[joint]
+            states.append(kernels.stop(x, width))
+    return np.array(states).reshape(len(states), count)
 
 
-def _join(one: DriveTerm, motion: Motion, motions: Sequence[np.ndarray | None], state: np.ndarray | None) -> Joined:
+def _join(term: DriveTerm, motion: Motion, motions: Sequence[np.ndarray | None], state: np.ndarray | None) -> Joined:
     """Return the motion of a term: weighted sums of q, v, a and load."""
-    if one.form.loaded and motions[3] is None:
-        raise CalibError(f"term '{one.name}' needs the transmitted torque; give load (N, n), measured or predicted")
-    if len(motion) == 1 and motion[0][1] == 1.0:
-        x, v, a, load = (None if m is None else m[motion[0][0]] for m in motions)
-    else:
-        x, v, a, load = (None if m is None else sum(w * m[j] for j, w in motion) for m in motions)
-    return Joined(x, v, a, load, state)  # type: ignore[arg-type]
+    if term.form.loaded and motions[3] is None:
+        raise CalibError(f"term '{term.name}' needs the transmitted torque; give load (N, n), measured or predicted")
+    q, v, a, load = motions
+    assert q is not None and v is not None and a is not None
+    joined_load = None if load is None else _weighted(motion, load)
+    return Joined(_weighted(motion, q), _weighted(motion, v), _weighted(motion, a), joined_load, state)
 
 
-def offered(step: str, joint: int, seen: JointRange, linear: bool = False) -> tuple[DriveTerm, ...]:
+def _weighted(motion: Motion, series: np.ndarray) -> np.ndarray:
+    """Return the weighted sum (N,) of the joints' series (n, N); that of a single joint as it is, not a copy."""
+    if len(motion) == 1:
+        joint, weight = motion[0]
+        if weight == 1.0:
+            return series[joint]
+    total = np.zeros(series.shape[1])
+    for joint, weight in motion:
+        total = total + weight * series[joint]
+    return total
+
+
+def offered(step: str, joint: int, joint_range: JointRange, linear: bool = False) -> tuple[DriveTerm, ...]:
     """Return the candidate terms of one joint in a step of the friction ladder, scaled by the joint's motion."""
-    found = [
-        (number, term(f"{one.label}{joint + 1}{end}", one.shape, joint, *settings, side=one.side, linear=linear))
-        for one in STEPS[step]
-        for number, (end, settings) in enumerate(one.settings(seen).items())
-    ]
-    return tuple(one for _, one in sorted(found, key=lambda pair: pair[0]))
+    numbered = []
+    for offer in STEPS[step]:
+        for number, (end, settings) in enumerate(offer.settings(joint_range).items()):
+            name = f"{offer.label}{joint + 1}{end}"
+            candidate = term(name, offer.shape, joint, *settings, side=offer.side, linear=linear)
+            numbered.append((number, candidate))
+    # The first terms of all offers, then their second ones.
+    numbered.sort(key=lambda pair: pair[0])
+    return tuple(candidate for _, candidate in numbered)

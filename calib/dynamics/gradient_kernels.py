@@ -38,19 +38,29 @@ def _share(links, order, i, weights, motion, twists, slopes, bars):
 
     ``slopes`` (B + 1, 9) belongs to w, dw, a; ``bars`` (B + 1, n, 6) to the twists.
     """
-    h, own = i + 1, order[i]
-    w, e, a = three(motion, h, 0), three(motion, h, 3), three(motion, h, 6)
-    twist, bar = twists[h], bars[h]
+    h = i + 1
+    index = order[i]
+    w = three(motion, h, 0)
+    e = three(motion, h, 3)
+    a = three(motion, h, 6)
+    twist = twists[h]
+    bar = bars[h]
     for k in range(links[i, DEPTH]):
         j = links[i, PATH + k]
-        u, s, g = three(twist, j, 0), three(twist, j, 3), weights[j, 10 * i : 10 * i + 10]
-        J = g[own[0]], g[own[1]], g[own[2]], g[own[3]], g[own[4]], g[own[5]]
-        m, mass = (g[own[6]], g[own[7]], g[own[8]]), g[own[9]]
+        u = three(twist, j, 0)
+        s = three(twist, j, 3)
+        g = weights[j, 10 * i : 10 * i + 10]
+        J = g[index[0]], g[index[1]], g[index[2]], g[index[3]], g[index[4]], g[index[5]]
+        m = g[index[6]], g[index[7]], g[index[8]]
+        mass = g[index[9]]
         p = inertia_times(J, w)
-        increase(bar, j, 0, add(add(inertia_times(J, e), cross(w, p)), cross(m, a)))
-        increase(bar, j, 3, add(add(scaled(mass, a), cross(e, m)), cross(w, cross(w, m))))
+        moment = add(add(inertia_times(J, e), cross(w, p)), cross(m, a))
+        force = add(add(scaled(mass, a), cross(e, m)), cross(w, cross(w, m)))
+        increase(bar, j, 0, moment)
+        increase(bar, j, 3, force)
         turning = add(cross(p, u), inertia_times(J, cross(u, w)))
-        increase(slopes, h, 0, add(turning, add(cross(cross(w, m), s), cross(m, cross(s, w)))))
+        shifting = add(cross(cross(w, m), s), cross(m, cross(s, w)))
+        increase(slopes, h, 0, add(turning, shifting))
         increase(slopes, h, 3, add(inertia_times(J, u), cross(m, s)))
         increase(slopes, h, 6, add(scaled(mass, s), cross(u, m)))
 
@@ -75,40 +85,60 @@ def _unjoint(links, i, rate, motion, slopes):
 @njit(**OPTIONS)
 def _unadvance(links, i, rate, frames, motion, slopes):
     """Propagate body i's motion derivatives to its parent; return the derivative with respect to the joint position."""
-    p, h = links[i, PARENT] + 1, i + 1
+    p = links[i, PARENT] + 1
+    h = i + 1
     by_amount = 0.0
-    if links[i, KIND] == REVOLUTE:  # d(Rᵀ x)/dθ = -z × Rᵀ x, of the rotated parts of w, dw, a alone
-        vx, vy = motion[h, 0], motion[h, 1]
+    if links[i, KIND] == REVOLUTE:
+        # d(Rᵀ x)/dθ = -z × Rᵀ x, of the rotated parts of w, dw, a alone.
+        vx = motion[h, 0]
+        vy = motion[h, 1]
         by_amount += slopes[h, 0] * vy - slopes[h, 1] * vx
-        by_amount += slopes[h, 3] * (motion[h, 4] + vx * rate) - slopes[h, 4] * (motion[h, 3] - vy * rate)
+        ex = motion[h, 3] - vy * rate
+        ey = motion[h, 4] + vx * rate
+        by_amount += slopes[h, 3] * ey - slopes[h, 4] * ex
         by_amount += slopes[h, 6] * motion[h, 7] - slopes[h, 7] * motion[h, 6]
-    g, w, x = turned(frames, i, three(slopes, h, 6)), three(motion, p, 0), three(frames, i, 9)
+    g = turned(frames, i, three(slopes, h, 6))
+    w = three(motion, p, 0)
+    x = three(frames, i, 9)
     across = cross(w, g)
     turning = add(cross(cross(w, x), g), cross(across, x))
-    increase(slopes, p, 0, add(turned(frames, i, three(slopes, h, 0)), turning))
-    increase(slopes, p, 3, add(turned(frames, i, three(slopes, h, 3)), cross(x, g)))
+    by_w = turned(frames, i, three(slopes, h, 0))
+    by_e = turned(frames, i, three(slopes, h, 3))
+    increase(slopes, p, 0, add(by_w, turning))
+    increase(slopes, p, 3, add(by_e, cross(x, g)))
     increase(slopes, p, 6, g)
-    if links[i, KIND] > REVOLUTE:  # the slope by the shift, along z
+    if links[i, KIND] > REVOLUTE:
+        # The slope by the shift, along z.
         shift = frames[i, 2], frames[i, 5], frames[i, 8]
-        by_amount += dot(shift, add(cross(g, three(motion, p, 3)), cross(w, across)))
+        by_shift = add(cross(g, three(motion, p, 3)), cross(w, across))
+        by_amount += dot(shift, by_shift)
     return by_amount
 
 
 @njit(**OPTIONS)
 def _uncarry(links, i, frames, twists, bars):
     """Propagate body i's twist derivatives to its parent; return the derivative with respect to the joint position."""
-    p, by_amount = links[i, PARENT], 0.0
-    twist, bar, twist_up, bar_up = twists[i + 1], bars[i + 1], twists[p + 1], bars[p + 1]
+    p = links[i, PARENT]
+    by_amount = 0.0
+    twist = twists[i + 1]
+    bar = bars[i + 1]
+    twist_up = twists[p + 1]
+    bar_up = bars[p + 1]
     for k in range(links[p, DEPTH] if p >= 0 else 0):
         j = links[p, PATH + k]
-        b, c = three(bar, j, 0), three(bar, j, 3)
+        b = three(bar, j, 0)
+        c = three(bar, j, 3)
         s = turned(frames, i, c)
-        increase(bar_up, j, 0, add(turned(frames, i, b), cross(three(frames, i, 9), s)))
+        lever = three(frames, i, 9)
+        increase(bar_up, j, 0, add(turned(frames, i, b), cross(lever, s)))
         increase(bar_up, j, 3, s)
         if links[i, KIND] == REVOLUTE:
-            by_amount += cross(b, three(twist, j, 0))[2] + cross(c, three(twist, j, 3))[2]
+            by_turn = cross(b, three(twist, j, 0))
+            by_lever = cross(c, three(twist, j, 3))
+            by_amount += by_turn[2] + by_lever[2]
         elif links[i, KIND] != FIXED:
-            by_amount += dot((frames[i, 2], frames[i, 5], frames[i, 8]), cross(s, three(twist_up, j, 0)))
+            shift = frames[i, 2], frames[i, 5], frames[i, 8]
+            by_amount += dot(shift, cross(s, three(twist_up, j, 0)))
     return by_amount
 
 
@@ -116,7 +146,8 @@ def _uncarry(links, i, frames, twists, bars):
 def _back(links, hung, constants, v, frames, motion, twists, slopes, bars, gq, gv, ga):
     """Add one sample's derivatives to gq, gv, ga (n,), from the last body on; `hung`: links that carry the twists."""
     for i in range(len(frames) - 1, -1, -1):
-        c, scale = links[i, COORDINATE], constants[i, SCALE]
+        c = links[i, COORDINATE]
+        scale = constants[i, SCALE]
         rate = scale * v[c]
         by_rate, by_change = _unjoint(links, i, rate, motion, slopes)
         by_amount = _unadvance(links, i, rate, frames, motion, slopes)
@@ -133,16 +164,21 @@ def regressor_gradient(links, constants, order, amount, cosine, sine, v, a, weig
 
     Reverse differentiation of the regressor, by hand: one forward pass, one pass back, O(n B) per sample.
     """
-    bodies, n = amount.shape[1], v.shape[1]
-    frames, motion, twists = np.empty((bodies, 12)), np.zeros((bodies + 1, 9)), np.zeros((bodies + 1, n, 6))
-    slopes, bars = np.zeros((bodies + 1, 9)), np.zeros((bodies + 1, n, 6))
+    bodies = amount.shape[1]
+    n = v.shape[1]
+    frames = np.empty((bodies, 12))
+    motion = np.zeros((bodies + 1, 9))
+    twists = np.zeros((bodies + 1, n, 6))
+    slopes = np.zeros((bodies + 1, 9))
+    bars = np.zeros((bodies + 1, n, 6))
     for r in range(3):
         motion[0, 6 + r] = -constants[bodies, r]
     for sample in range(v.shape[0]):
         slopes[:] = 0.0
         bars[:] = 0.0
         for i in range(bodies):
-            c, scale = links[i, COORDINATE], constants[i, SCALE]
+            c = links[i, COORDINATE]
+            scale = constants[i, SCALE]
             place(links, constants, i, amount[sample, i], cosine[sample, i], sine[sample, i], frames)
             advance(links, i, scale * v[sample, c], scale * a[sample, c], frames, motion)
             carry(links, constants, i, frames, twists)
@@ -155,7 +191,9 @@ def regressor_gradient(links, constants, order, amount, cosine, sine, v, a, weig
 def hung_on_one(links: np.ndarray) -> np.ndarray:
     """Return links (B, 4 + n) with all bodies on one virtual joint without coordinate, for `torque_gradient`."""
     chain = links.copy()
-    chain[:, DEPTH], chain[:, PATH], chain[:, COORDINATE] = 1, 0, -1
+    chain[:, DEPTH] = 1
+    chain[:, PATH] = 0
+    chain[:, COORDINATE] = -1
     return frozen(chain, np.int64)
 
 
@@ -168,15 +206,19 @@ def torque_gradient(links, chain, constants, order, amount, cosine, sine, v, a, 
     (1, 10 B).
     """
     bodies = amount.shape[1]
-    frames, motion, twists = np.empty((bodies, 12)), np.zeros((bodies + 1, 9)), np.zeros((bodies + 1, 1, 6))
-    slopes, bars = np.zeros((bodies + 1, 9)), np.zeros((bodies + 1, 1, 6))
+    frames = np.empty((bodies, 12))
+    motion = np.zeros((bodies + 1, 9))
+    twists = np.zeros((bodies + 1, 1, 6))
+    slopes = np.zeros((bodies + 1, 9))
+    bars = np.zeros((bodies + 1, 1, 6))
     for r in range(3):
         motion[0, 6 + r] = -constants[bodies, r]
     for sample in range(v.shape[0]):
         slopes[:] = 0.0
         bars[:] = 0.0
         for i in range(bodies):
-            c, scale = links[i, COORDINATE], constants[i, SCALE]
+            c = links[i, COORDINATE]
+            scale = constants[i, SCALE]
             place(links, constants, i, amount[sample, i], cosine[sample, i], sine[sample, i], frames)
             advance(links, i, scale * v[sample, c], scale * a[sample, c], frames, motion)
             twists[i + 1] = 0.0

@@ -23,7 +23,8 @@ from calib.errors import CalibError
 from calib.records import shaped
 from calib.robot.chain import Chain
 
-KEPT_LAST = {"revolute": (3, 8, 9), "prismatic": (0, 1, 2, 3, 4, 5)}  # YY MZ M; XX to ZZ, in frames with axis z
+KEPT_LAST = {"revolute": (3, 8, 9), "prismatic": (0, 1, 2, 3, 4, 5)}
+"""Parameters of a link that are regrouped where possible: YY MZ M; XX to ZZ, in frames with axis z."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,23 +42,29 @@ class IdentificationModel:
     torque_rows: TorqueRows = MOTOR
 
     def __post_init__(self) -> None:
-        doubled = sorted(name for name, count in Counter(self.names).items() if count > 1)
-        if doubled:
-            raise CalibError(f"parameter '{doubled[0]}' occurs twice; remove one of its terms")
-        for one in self.terms:
-            for row, motion in one.acts:
-                if not all(0 <= joint < self.n for joint in (row, *(j for j, _ in motion))):
-                    raise CalibError(f"term '{one.name}' refers to a missing joint; the robot has {self.n}")
+        repeated = sorted(name for name, count in Counter(self.names).items() if count > 1)
+        if repeated:
+            raise CalibError(f"parameter '{repeated[0]}' occurs twice; remove one of its terms")
+        for term in self.terms:
+            for row, motion in term.acts:
+                joints = [row, *(joint for joint, _ in motion)]
+                if min(joints) < 0 or max(joints) >= self.n:
+                    raise CalibError(f"term '{term.name}' refers to a missing joint; the robot has {self.n}")
 
     @property
     def n(self) -> int:
+        """Number of joints."""
         return self.bodies.n
 
     @property
     def prismatic(self) -> np.ndarray:
         """Mask (n,) of prismatic coordinates."""
-        moved = {int(c): int(kind) for c, kind in zip(self.bodies.coordinates[::-1], self.bodies.kinds[::-1])}
-        return np.array([moved.get(j) == PRISMATIC for j in range(self.n)], dtype=bool)
+        mask = np.zeros(self.n, dtype=bool)
+        # Backwards: the first body that a coordinate moves decides, not a mimic joint's.
+        for coordinate, kind in zip(self.bodies.coordinates[::-1], self.bodies.kinds[::-1]):
+            if coordinate >= 0:
+                mask[coordinate] = kind == PRISMATIC
+        return mask
 
     @property
     def inertial(self) -> int:
@@ -66,22 +73,27 @@ class IdentificationModel:
 
     @property
     def names(self) -> tuple[str, ...]:
-        return (*self.bodies.names[: self.inertial], *(one.name for one in self.columns))
+        """Names of the p parameters."""
+        term_names = [term.name for term in self.columns]
+        return (*self.bodies.names[: self.inertial], *term_names)
 
     @property
     def units(self) -> tuple[str, ...]:
-        return (*self.bodies.units[: self.inertial], *(one.unit for one in self.columns))
+        """Units of the p parameters."""
+        term_units = [term.unit for term in self.columns]
+        return (*self.bodies.units[: self.inertial], *term_units)
 
     @property
     def columns(self) -> tuple[DriveTerm, ...]:
         """Drive terms that affect these torque rows."""
-        seen = self.torque_rows.sides
-        return tuple(one for one in self.terms if one.side in seen)
+        sides = self.torque_rows.sides
+        return tuple(term for term in self.terms if term.side in sides)
 
     @property
     def sides(self) -> tuple[str, ...]:
         """Side of each column (p,) for `TorqueRows`."""
-        return (*(BODIES,) * self.inertial, *(one.side for one in self.columns))
+        term_sides = [term.side for term in self.columns]
+        return (*([BODIES] * self.inertial), *term_sides)
 
     @property
     def rows(self) -> int:
@@ -90,6 +102,7 @@ class IdentificationModel:
 
     @property
     def p(self) -> int:
+        """Number of parameters."""
         return len(self.names)
 
     def regressor(
@@ -111,16 +124,20 @@ class IdentificationModel:
             states: (s, N), of `friction_states`; None: computed, taking q for one uninterrupted record.
             link: q, v, a (N, n) of the bodies where joints deflect; None: those of the drives.
         """
-        q, v, a = (shaped(x, (len(q), self.n), name) for x, name in ((q, "q"), (v, "v"), (a, "a")))
-        loads = None if load is None else shaped(load, q.shape, "load").T
+        shape = (len(q), self.n)
+        q = shaped(q, shape, "q")
+        v = shaped(v, shape, "v")
+        a = shaped(a, shape, "a")
+        load_columns = None if load is None else shaped(load, q.shape, "load").T
         out = np.zeros((self.p, self.n * len(self.torque_rows.blocks), len(q)))
         if self.inertial:
-            moved = (q, v, a) if link is None else link
-            rigid_body.fill_regressor(self.bodies, *moved, out[: self.inertial])
+            q_link, v_link, a_link = link or (q, v, a)
+            rigid_body.fill_regressor(self.bodies, q_link, v_link, a_link, out[: self.inertial])
             self._drop_absent(out, carried)
-        motions = [np.ascontiguousarray(x.T) for x in (q, v, a)]
-        states = drives.friction_states(self.columns, motions[0]) if states is None else states
-        drives.fill(self.columns, out[self.inertial :], [*motions, loads], states)
+        motions = _columns_of(q, v, a)
+        if states is None:
+            states = drives.friction_states(self.columns, motions[0])
+        drives.fill(self.columns, out[self.inertial :], [*motions, load_columns], states)
         return self.torque_rows.observe_in_place(out, self.sides, q, v)
 
     def regressor_gradient(
@@ -129,24 +146,32 @@ class IdentificationModel:
         """Return the exact gradients of Σ weights · regressor(q, v, a) for q, v and a, (N, n) each, with all payloads.
 
         Args:
+            q, v, a: (N, n) [rad or m, and per s, per s²].
             weights: (N, rows, c).
             columns: (c,) of the regressor, which the weights are of, rising; None: all p.
         """
-        kept, sides = np.arange(self.p) if columns is None else np.asarray(columns), self.sides
-        weights = shaped(weights, (len(q), self.rows, len(kept)), "weights of the regressor")
-        weights, bodies = self.torque_rows.fold(weights, [sides[k] for k in kept]), int((kept < self.inertial).sum())
-        out = np.zeros((3, *np.shape(q)))
-        if bodies:
-            inertial = weights[:, :, :bodies]
-            if bodies < self.inertial:
-                inertial = np.zeros((len(q), self.n, self.inertial))
-                inertial[:, :, kept[:bodies]] = weights[:, :, :bodies]
-            out[:] = rigid_body.regressor_gradient(self.bodies, q, v, a, inertial)
-        motions = [np.ascontiguousarray(np.asarray(x, dtype=float).T) for x in (q, v, a)]
-        offered = self.columns
-        terms = [offered[k - self.inertial] for k in kept[bodies:]]
-        drives.slopes(terms, motions, weights[:, :, bodies:].transpose(2, 1, 0), [out[0].T, out[1].T, out[2].T])
-        return out[0], out[1], out[2]
+        if columns is None:
+            columns = np.arange(self.p)
+        columns = np.asarray(columns)
+        weights = shaped(weights, (len(q), self.rows, len(columns)), "weights of the regressor")
+        sides = self.sides
+        weights = self.torque_rows.fold(weights, [sides[column] for column in columns])
+        body_count = int((columns < self.inertial).sum())
+        gradients = np.zeros((3, *np.shape(q)))
+        if body_count:
+            body_weights = weights[:, :, :body_count]
+            if body_count < self.inertial:
+                all_weights = np.zeros((len(q), self.n, self.inertial))
+                all_weights[:, :, columns[:body_count]] = body_weights
+                body_weights = all_weights
+            gradients[:] = rigid_body.regressor_gradient(self.bodies, q, v, a, body_weights)
+        drive_terms = self.columns
+        terms = [drive_terms[column - self.inertial] for column in columns[body_count:]]
+        term_weights = weights[:, :, body_count:].transpose(2, 1, 0)
+        by_q, by_v, by_a = gradients[0], gradients[1], gradients[2]
+        motions = _columns_of(q, v, a)
+        drives.slopes(terms, motions, term_weights, [by_q.T, by_v.T, by_a.T])
+        return by_q, by_v, by_a
 
     def torque_gradient(
         self, q: np.ndarray, v: np.ndarray, a: np.ndarray, values: np.ndarray, weights: np.ndarray
@@ -154,18 +179,27 @@ class IdentificationModel:
         """Return the gradients of Σ weights · (regressor values) for q, v and a, (N, n) each, with all payloads.
 
         Args:
+            q, v, a: (N, n) [rad or m, and per s, per s²].
             values: (p,) of the parameters.
             weights: (N, rows) of the torques.
         """
-        out = np.zeros((3, *np.shape(q)))
-        of_side = {side: self.torque_rows.fold(weights[:, :, None], (side,))[:, :, 0] for side in set(self.sides)}
-        if self.inertial and values[: self.inertial].any():
-            out[:] = rigid_body.torque_gradient(self.bodies, values[: self.inertial], q, v, a, of_side[BODIES])
-        motions = [np.ascontiguousarray(np.asarray(x, dtype=float).T) for x in (q, v, a)]
-        terms = [(one, value) for one, value in zip(self.columns, values[self.inertial :]) if value]
-        share = np.array([value * of_side[one.side].T for one, value in terms])
-        drives.slopes([one for one, _ in terms], motions, share, [out[0].T, out[1].T, out[2].T])
-        return out[0], out[1], out[2]
+        side_weights = {}
+        for side in set(self.sides):
+            joint_weights = self.torque_rows.fold(weights[:, :, None], (side,))
+            side_weights[side] = joint_weights[:, :, 0]
+        gradients = np.zeros((3, *np.shape(q)))
+        body_values = values[: self.inertial]
+        if self.inertial and body_values.any():
+            gradients[:] = rigid_body.torque_gradient(self.bodies, body_values, q, v, a, side_weights[BODIES])
+        terms, term_weights = [], []
+        for term, value in zip(self.columns, values[self.inertial :]):
+            if value:
+                terms.append(term)
+                term_weights.append(value * side_weights[term.side].T)
+        by_q, by_v, by_a = gradients[0], gradients[1], gradients[2]
+        motions = _columns_of(q, v, a)
+        drives.slopes(terms, motions, np.array(term_weights), [by_q.T, by_v.T, by_a.T])
+        return by_q, by_v, by_a
 
     def acting(self) -> np.ndarray:
         """Return the mask (p, rows) of regressor entries that can differ from 0.
@@ -174,13 +208,16 @@ class IdentificationModel:
         """
         if self.torque_rows.projection is not None:
             return np.ones((self.p, self.rows), dtype=bool)
+        # What is zero at a random state is zero everywhere.
+        q, v, a = np.random.default_rng(0).uniform(0.5, 1.5, (3, 4, self.n))
         entries = np.zeros((1, self.n, self.p))
-        state = np.random.default_rng(0).uniform(0.5, 1.5, (3, 4, self.n))
-        if self.inertial:  # what is zero at a random state is zero everywhere
-            entries[0, :, : self.inertial] = (rigid_body.regressor(self.bodies, *state) != 0.0).any(axis=0)
-        for k, one in enumerate(self.columns):
-            entries[0, [row for row, _ in one.acts], self.inertial + k] = 1.0
-        return self.torque_rows.observe(entries, self.sides, *state[:2])[0].T != 0.0
+        if self.inertial:
+            regressor = rigid_body.regressor(self.bodies, q, v, a)
+            entries[0, :, : self.inertial] = (regressor != 0.0).any(axis=0)
+        for number, term in enumerate(self.columns):
+            for row, _ in term.acts:
+                entries[0, row, self.inertial + number] = 1.0
+        return self.torque_rows.observe(entries, self.sides, q, v)[0].T != 0.0
 
     def torque(
         self,
@@ -196,28 +233,41 @@ class IdentificationModel:
 
         Friction that depends on the load feels the torque that the bodies, which move as `link`, need by the model.
         """
-        moved = (q, v, a) if link is None else link
-        load = self.transmitted(values, *moved, carried) if self.inertial else None
-        states = drives.friction_states(self.columns, np.ascontiguousarray(q.T)) if states is None else states
-        parts, state = {BODIES: np.zeros(np.shape(q)) if load is None else load}, 0
-        motions = [q.T, v.T, a.T, None if load is None else load.T]
-        for one, value in zip(self.columns, values[self.inertial :]):
-            own, used = parts.setdefault(one.side, np.zeros(np.shape(q))), len(one.acts) if one.form.remembers else 0
-            for row, column in one.acting(motions, states[state : state + used]):
-                own[:, row] += value * column
-            state += used
+        load, load_columns = None, None
+        if self.inertial:
+            q_link, v_link, a_link = link or (q, v, a)
+            load = self.transmitted(values, q_link, v_link, a_link, carried)
+            load_columns = load.T
+        if states is None:
+            states = drives.friction_states(self.columns, np.ascontiguousarray(q.T))
+
+        # Torques of the joints by side; the bodies' first.
+        torques = {BODIES: np.zeros(np.shape(q)) if load is None else load}
+        motions = [q.T, v.T, a.T, load_columns]
+        first = 0
+        for term, value in zip(self.columns, values[self.inertial :]):
+            if term.side not in torques:
+                torques[term.side] = np.zeros(np.shape(q))
+            state_count = len(term.acts) if term.form.remembers else 0
+            term_states = states[first : first + state_count]
+            for row, column in term.acting(motions, term_states):
+                torques[term.side][:, row] += value * column
+            first += state_count
         result = np.zeros((len(q), self.rows))
-        for side, own in parts.items():
-            result += self.torque_rows.observe(own[:, :, None], (side,), q, v)[:, :, 0]
+        for side, joint_torques in torques.items():
+            rows = self.torque_rows.observe(joint_torques[:, :, None], (side,), q, v)
+            result += rows[:, :, 0]
         return result
 
     def transmitted(
         self, values: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray, carried: Collection[str] | None = None
     ) -> np.ndarray:
         """Return the torques (N, n) transmitted by the gears to the bodies, for load-dependent friction."""
-        present = np.ones(self.inertial) if carried is None else self.carried_columns(carried)
-        bodies = np.array(values[: self.inertial]) * present
-        return rigid_body.inverse_dynamics(self.bodies, bodies, q, v, a)
+        present = np.ones(self.inertial)
+        if carried is not None:
+            present = self.carried_columns(carried)
+        parameters = np.array(values[: self.inertial]) * present
+        return rigid_body.inverse_dynamics(self.bodies, parameters, q, v, a)
 
     def energy_columns(self, q: np.ndarray, v: np.ndarray, carried: Collection[str] | None = None) -> np.ndarray:
         """Return the energies h (N, p) per unit of each parameter, whose derivative is the power; zero for friction.
@@ -233,57 +283,76 @@ class IdentificationModel:
 
     def carried_columns(self, carried: Collection[str]) -> np.ndarray:
         """Return factors (10 B,): one for parameters of bodies present, zero for those of absent payloads."""
-        kinds = zip(self.bodies.labels, self.bodies.kinds)
-        present = [kind != FIXED or label in carried for label, kind in kinds]
+        present = []
+        for label, kind in zip(self.bodies.labels, self.bodies.kinds):
+            present.append(kind != FIXED or label in carried)
         return np.repeat(np.array(present, dtype=float), 10)
 
     def preference(self) -> np.ndarray:
         """Return the columns in order of preference: those Khalil keeps of moving links, drives, others, payloads."""
         bodies = self.bodies
-        first: list[int] = []
-        late: list[int] = []
-        fixed: list[int] = []
-        for i in range(self.inertial // 10):
-            if bodies.kinds[i] == FIXED:
-                fixed += range(10 * i, 10 * i + 10)
+        kept_first: list[int] = []
+        kept_last: list[int] = []
+        payloads: list[int] = []
+        for body in range(self.inertial // 10):
+            if bodies.kinds[body] == FIXED:
+                payloads += range(10 * body, 10 * body + 10)
                 continue
-            last = KEPT_LAST["prismatic" if bodies.kinds[i] == PRISMATIC else "revolute"]
-            for c in range(10):
-                (late if c in last else first).append(10 * i + int(bodies.order[i, c]))
-        return np.array([*first, *range(self.inertial, self.p), *late, *fixed], dtype=int)
+            kind = "prismatic" if bodies.kinds[body] == PRISMATIC else "revolute"
+            for k in range(10):
+                column = 10 * body + int(bodies.order[body, k])
+                if k in KEPT_LAST[kind]:
+                    kept_last.append(column)
+                else:
+                    kept_first.append(column)
+        return np.array([*kept_first, *range(self.inertial, self.p), *kept_last, *payloads], dtype=int)
 
     def load_cases(self) -> Loads:
         """Return the load cases: all payloads and none, or only one case without payloads in the model."""
-        return (None, ()) if self.inertial and np.any(self.bodies.kinds == FIXED) else (None,)
+        if self.inertial and np.any(self.bodies.kinds == FIXED):
+            return (None, ())
+        return (None,)
 
     def sample(
         self, count: int, rng: np.random.Generator, lower: np.ndarray | None = None, upper: np.ndarray | None = None
     ) -> States:
         """Return random states: q uniform within its limits (default ±π), v, a uniform within ±3 per s and per s²."""
-        low = np.full(self.n, -np.pi) if lower is None else lower
-        q = rng.uniform(low, np.full(self.n, np.pi) if upper is None else upper, (count, self.n))
+        if lower is None:
+            lower = np.full(self.n, -np.pi)
+        if upper is None:
+            upper = np.full(self.n, np.pi)
+        q = rng.uniform(lower, upper, (count, self.n))
         v, a, load = rng.uniform(-3.0, 3.0, (3, count, self.n))
-        remembering = sum(len(one.acts) for one in self.columns if one.form.remembers)
-        return States(q, v, a, load, rng.uniform(-1.0, 1.0, (remembering, count)))
+        state_count = sum(len(term.acts) for term in self.columns if term.form.remembers)
+        return States(q, v, a, load, rng.uniform(-1.0, 1.0, (state_count, count)))
 
     def _drop_absent(self, out: np.ndarray, carried: Collection[str] | None) -> None:
         """Set the columns of absent payloads to zero."""
         if carried is None:
             return
-        payloads = {label for label, c in zip(self.bodies.labels, self.bodies.coordinates) if c < 0}
-        if unknown := sorted(set(carried) - payloads):
+        payloads = set()
+        for label, coordinate in zip(self.bodies.labels, self.bodies.coordinates):
+            if coordinate < 0:
+                payloads.add(label)
+        unknown = sorted(set(carried) - payloads)
+        if unknown:
             raise CalibError(f"no payload '{unknown[0]}' in the model; it has {', '.join(sorted(payloads)) or 'none'}")
         for label in payloads - set(carried):
-            index = self.bodies.labels.index(label)
-            out[10 * index : 10 * index + 10] = 0.0
+            first = 10 * self.bodies.labels.index(label)
+            out[first : first + 10] = 0.0
 
     def with_load(self) -> tuple[str, ...]:
         """Return the names of the terms that depend on `load`."""
-        return tuple(one.name for one in self.columns if one.form.loaded)
+        return tuple(term.name for term in self.columns if term.form.loaded)
 
     def with_terms(self, *terms: DriveTerm) -> IdentificationModel:
         """Return the model with more drive terms appended."""
         return replace(self, terms=(*self.terms, *terms))
+
+
+def _columns_of(q: np.ndarray, v: np.ndarray, a: np.ndarray) -> list[np.ndarray]:
+    """Return the motion of each joint (n, N), contiguous in time, from q, v and a (N, n)."""
+    return [np.ascontiguousarray(np.asarray(series, dtype=float).T) for series in (q, v, a)]
 
 
 def from_chain(
@@ -296,17 +365,20 @@ def from_chain(
     """Return the model of a chain with the same drive terms on all joints, or one set per joint.
 
     Args:
+        chain: the robot.
         sets: names out of `drives.standard`, one string for all joints or n strings.
         payload: (4, 4) frame of a payload in the last body's frame (`Chain.tail` for the tip); None for none.
+        rows: torque rows that the model explains.
         v0: smoothing of the Coulomb sign [rad/s or m/s], one or per joint.
     """
-    each = [sets] * chain.n if isinstance(sets, str) else list(sets)
-    if len(each) != chain.n:
-        raise CalibError(f"robot '{chain.name}' has {chain.n} joints, but drive terms are given for {len(each)}")
+    joint_sets = [sets] * chain.n if isinstance(sets, str) else list(sets)
+    if len(joint_sets) != chain.n:
+        raise CalibError(f"robot '{chain.name}' has {chain.n} joints, but drive terms are given for {len(joint_sets)}")
     bodies = bodies_of(chain)
-    bodies = bodies if payload is None else with_payload(bodies, payload)
+    if payload is not None:
+        bodies = with_payload(bodies, payload)
     linear = [joint.kind == "prismatic" for joint in chain.joints]
-    return IdentificationModel(bodies, drives.standard(each, v0, linear), rows)
+    return IdentificationModel(bodies, drives.standard(joint_sets, v0, linear), rows)
 
 
 def friction_states(model: RegressorModel, q: np.ndarray) -> np.ndarray:

@@ -18,10 +18,18 @@ import numpy as np
 from numba import njit
 
 FIXED, REVOLUTE = 0, 1
-PARENT, KIND, COORDINATE, DEPTH, PATH = 0, 1, 2, 3, 4  # columns of links
-SCALE = 12  # of constants, behind the placement's three rows; its last row is gravity
-L = 64  # samples side by side in the regressor: 8 to 128 measured, flat from 64 on
-ROUND = 6755399441055744.0  # 1.5 · 2^52: adding and taking off rounds to the nearest whole number
+PARENT = 0
+KIND = 1
+COORDINATE = 2
+DEPTH = 3
+PATH = 4
+"""Columns of ``links``."""
+SCALE = 12
+"""Column of ``constants``, behind the placement's three rows; its last row is gravity."""
+L = 64
+"""Samples side by side in the regressor: 8 to 128 measured, flat from 64 on."""
+ROUND = 6755399441055744.0
+"""1.5 · 2^52: adding it and subtracting it again rounds to the nearest whole number."""
 OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
 JOINED = {**OPTIONS, "forceinline": True}
 
@@ -39,10 +47,13 @@ def sincos(x):
     s = -1.66666666666666324348e-01 + z * (8.33333333332248946124e-03 + z * (-1.98412698298579493134e-04 + z * s))
     c = -2.75573143513906633035e-07 + z * (2.08757232129817482790e-09 - z * 1.13596475577881948265e-11)
     c = 4.16666666666666019037e-02 + z * (-1.38888888888741095749e-03 + z * (2.48015872894767294178e-05 + z * c))
-    s, c = r + r * z * s, 1.0 - 0.5 * z + z * z * c
-    quarter = n - 4.0 * ((0.25 * n + ROUND) - ROUND)  # -2 to 2
+    s = r + r * z * s
+    c = 1.0 - 0.5 * z + z * z * c
+    # Quarter turns, -2 to 2.
+    quarter = n - 4.0 * ((0.25 * n + ROUND) - ROUND)
     odd = quarter * quarter == 1.0
-    sine, cosine = c if odd else s, s if odd else c
+    sine = c if odd else s
+    cosine = s if odd else c
     sine = -sine if quarter < 0.0 or quarter == 2.0 else sine
     cosine = -cosine if quarter > 0.0 or quarter == -2.0 else cosine
     return sine, cosine
@@ -52,10 +63,15 @@ def sincos(x):
 def place(links, constants, i, amount, cosine, sine, frames):
     """Write the frame of body i into row i of `frames`, at joint position `amount`."""
     for r in range(3):
-        x, y, z, t = constants[i, 4 * r], constants[i, 4 * r + 1], constants[i, 4 * r + 2], constants[i, 4 * r + 3]
-        frames[i, 3 * r], frames[i, 3 * r + 1] = x, y
+        x = constants[i, 4 * r]
+        y = constants[i, 4 * r + 1]
+        z = constants[i, 4 * r + 2]
+        t = constants[i, 4 * r + 3]
+        frames[i, 3 * r] = x
+        frames[i, 3 * r + 1] = y
         if links[i, KIND] == REVOLUTE:
-            frames[i, 3 * r], frames[i, 3 * r + 1] = cosine * x + sine * y, cosine * y - sine * x
+            frames[i, 3 * r] = cosine * x + sine * y
+            frames[i, 3 * r + 1] = cosine * y - sine * x
         elif links[i, KIND] != FIXED:
             t += amount * z
         frames[i, 3 * r + 2] = z
@@ -101,45 +117,68 @@ def dot(a, b):
 @njit(**JOINED)
 def cross(a, b):
     """Return a × b."""
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+    x = a[1] * b[2] - a[2] * b[1]
+    y = a[2] * b[0] - a[0] * b[2]
+    z = a[0] * b[1] - a[1] * b[0]
+    return x, y, z
 
 
 @njit(**JOINED)
 def inertia_times(J, a):
     """Return J a, J being XX, XY, XZ, YY, YZ, ZZ."""
-    return dot((J[0], J[1], J[2]), a), dot((J[1], J[3], J[4]), a), dot((J[2], J[4], J[5]), a)
+    x = dot((J[0], J[1], J[2]), a)
+    y = dot((J[1], J[3], J[4]), a)
+    z = dot((J[2], J[4], J[5]), a)
+    return x, y, z
 
 
 @njit(**JOINED)
 def turned(frames, i, a, k=0):
     """Return R a, R being the matrix by rows in row i from column k on."""
-    return dot(three(frames, i, k), a), dot(three(frames, i, k + 3), a), dot(three(frames, i, k + 6), a)
+    x = dot(three(frames, i, k), a)
+    y = dot(three(frames, i, k + 3), a)
+    z = dot(three(frames, i, k + 6), a)
+    return x, y, z
 
 
 @njit(**JOINED)
 def turned_back(frames, i, a, k=0):
     """Return Rᵀ a."""
-    x, y = scaled(a[0], three(frames, i, k)), scaled(a[1], three(frames, i, k + 3))
-    return add(add(x, y), scaled(a[2], three(frames, i, k + 6)))
+    x = scaled(a[0], three(frames, i, k))
+    y = scaled(a[1], three(frames, i, k + 3))
+    z = scaled(a[2], three(frames, i, k + 6))
+    return add(add(x, y), z)
 
 
 @njit(**JOINED)
 def ten_columns(w, e, a, u, s):
     """Return a body's ten columns in the row of a coordinate with twist (u, s), from w, dw = e and a."""
     c = cross(u, w)
-    xx, xy, xz = u[0] * e[0] + c[0] * w[0], u[0] * e[1] + c[0] * w[1], u[0] * e[2] + c[0] * w[2]
-    yx, yy, yz = u[1] * e[0] + c[1] * w[0], u[1] * e[1] + c[1] * w[1], u[1] * e[2] + c[1] * w[2]
-    zx, zy, zz = u[2] * e[0] + c[2] * w[0], u[2] * e[1] + c[2] * w[1], u[2] * e[2] + c[2] * w[2]
-    h = add(add(cross(s, e), cross(w, cross(w, s))), cross(a, u))
+    xx = u[0] * e[0] + c[0] * w[0]
+    xy = u[0] * e[1] + c[0] * w[1]
+    xz = u[0] * e[2] + c[0] * w[2]
+    yx = u[1] * e[0] + c[1] * w[0]
+    yy = u[1] * e[1] + c[1] * w[1]
+    yz = u[1] * e[2] + c[1] * w[2]
+    zx = u[2] * e[0] + c[2] * w[0]
+    zy = u[2] * e[1] + c[2] * w[1]
+    zz = u[2] * e[2] + c[2] * w[2]
+    centripetal = cross(w, cross(w, s))
+    h = add(add(cross(s, e), centripetal), cross(a, u))
     return xx, xy + yx, xz + zx, yy, yz + zy, zz, h[0], h[1], h[2], dot(s, a)
 
 
 @njit(**OPTIONS)
 def advance(links, i, rate, change, frames, motion):
     """Write w, dw, a of body i from its parent's into row i + 1 of `motion` (B + 1, 9)."""
-    p, h = links[i, PARENT] + 1, i + 1
-    w, e, x = three(motion, p, 0), three(motion, p, 3), three(frames, i, 9)
-    a = add(add(three(motion, p, 6), cross(e, x)), cross(w, cross(w, x)))
+    p = links[i, PARENT] + 1
+    h = i + 1
+    w = three(motion, p, 0)
+    e = three(motion, p, 3)
+    x = three(frames, i, 9)
+    tangential = cross(e, x)
+    centripetal = cross(w, cross(w, x))
+    a = add(add(three(motion, p, 6), tangential), centripetal)
     write(motion, h, 0, turned_back(frames, i, w))
     write(motion, h, 3, turned_back(frames, i, e))
     write(motion, h, 6, turned_back(frames, i, a))
@@ -157,32 +196,55 @@ def advance(links, i, rate, change, frames, motion):
 @njit(**OPTIONS)
 def carry(links, constants, i, frames, twists):
     """Write the twists (u_j, s_j) of body i from its parent's into row i + 1 of `twists` (B + 1, n, 6)."""
-    p, own = links[i, PARENT], links[i, COORDINATE]
-    up, here = twists[p + 1], twists[i + 1]
-    if own >= 0:
+    p = links[i, PARENT]
+    coordinate = links[i, COORDINATE]
+    up = twists[p + 1]
+    twists_here = twists[i + 1]
+    if coordinate >= 0:
         for r in range(6):
-            here[own, r] = 0.0
+            twists_here[coordinate, r] = 0.0
     for k in range(links[p, DEPTH] if p >= 0 else 0):
         j = links[p, PATH + k]
         u = three(up, j, 0)
-        write(here, j, 0, turned_back(frames, i, u))
-        write(here, j, 3, turned_back(frames, i, add(three(up, j, 3), cross(u, three(frames, i, 9)))))
-    if own >= 0:
-        here[own, 2 if links[i, KIND] == REVOLUTE else 5] += constants[i, SCALE]
+        write(twists_here, j, 0, turned_back(frames, i, u))
+        s = add(three(up, j, 3), cross(u, three(frames, i, 9)))
+        write(twists_here, j, 3, turned_back(frames, i, s))
+    if coordinate >= 0:
+        axis = 2 if links[i, KIND] == REVOLUTE else 5
+        twists_here[coordinate, axis] += constants[i, SCALE]
 
 
 @njit(**OPTIONS)
 def _place_lanes(constants, i, joint, turn):
     """Write rotation (rows 0 to 8) and origin (9 to 11) of body i from cosine, sine and shift in `joint`."""
-    a0, a1, a2, x = constants[i, 0], constants[i, 1], constants[i, 2], constants[i, 3]
-    b0, b1, b2, y = constants[i, 4], constants[i, 5], constants[i, 6], constants[i, 7]
-    c0, c1, c2, z = constants[i, 8], constants[i, 9], constants[i, 10], constants[i, 11]
+    a0 = constants[i, 0]
+    a1 = constants[i, 1]
+    a2 = constants[i, 2]
+    x = constants[i, 3]
+    b0 = constants[i, 4]
+    b1 = constants[i, 5]
+    b2 = constants[i, 6]
+    y = constants[i, 7]
+    c0 = constants[i, 8]
+    c1 = constants[i, 9]
+    c2 = constants[i, 10]
+    z = constants[i, 11]
     for k in range(L):
-        cosine, sine, shift = joint[k], joint[L + k], joint[2 * L + k]
-        turn[k], turn[L + k], turn[2 * L + k] = cosine * a0 + sine * a1, cosine * a1 - sine * a0, a2
-        turn[3 * L + k], turn[4 * L + k], turn[5 * L + k] = cosine * b0 + sine * b1, cosine * b1 - sine * b0, b2
-        turn[6 * L + k], turn[7 * L + k], turn[8 * L + k] = cosine * c0 + sine * c1, cosine * c1 - sine * c0, c2
-        turn[9 * L + k], turn[10 * L + k], turn[11 * L + k] = x + shift * a2, y + shift * b2, z + shift * c2
+        cosine = joint[k]
+        sine = joint[L + k]
+        shift = joint[2 * L + k]
+        turn[k] = cosine * a0 + sine * a1
+        turn[L + k] = cosine * a1 - sine * a0
+        turn[2 * L + k] = a2
+        turn[3 * L + k] = cosine * b0 + sine * b1
+        turn[4 * L + k] = cosine * b1 - sine * b0
+        turn[5 * L + k] = b2
+        turn[6 * L + k] = cosine * c0 + sine * c1
+        turn[7 * L + k] = cosine * c1 - sine * c0
+        turn[8 * L + k] = c2
+        turn[9 * L + k] = x + shift * a2
+        turn[10 * L + k] = y + shift * b2
+        turn[11 * L + k] = z + shift * c2
 
 
 @njit(**JOINED)
@@ -199,40 +261,52 @@ def _write_lane(x, r, k, a):
 @njit(**JOINED)
 def _lane_back(turn, k, a):
     """Return Rᵀ a of sample k."""
-    x, y, z = scaled(a[0], _lane(turn, 0, k)), scaled(a[1], _lane(turn, 3, k)), scaled(a[2], _lane(turn, 6, k))
+    x = scaled(a[0], _lane(turn, 0, k))
+    y = scaled(a[1], _lane(turn, 3, k))
+    z = scaled(a[2], _lane(turn, 6, k))
     return add(add(x, y), z)
 
 
 @njit(**OPTIONS)
-def _advance_lanes(turning, joint, turn, up, here):
+def _advance_lanes(turning, joint, turn, up, motion_here):
     """`advance` for L samples, the joint about (turning 1) or along (turning 0) z."""
     f, g = turning, 2.0 - 2.0 * turning
     for k in range(L):
-        w, e, x = _lane(up, 0, k), _lane(up, 3, k), _lane(turn, 9, k)
-        rate, change = joint[3 * L + k], joint[4 * L + k]
-        own = _lane_back(turn, k, w)
-        across = rate * own[1], -rate * own[0], change
-        a = add(add(_lane(up, 6, k), cross(e, x)), cross(w, cross(w, x)))
-        _write_lane(here, 0, k, (own[0], own[1], own[2] + f * rate))
-        _write_lane(here, 3, k, add(_lane_back(turn, k, e), scaled(f, across)))
-        _write_lane(here, 6, k, add(_lane_back(turn, k, a), (g * across[0], g * across[1], 0.5 * g * change)))
+        w = _lane(up, 0, k)
+        e = _lane(up, 3, k)
+        x = _lane(turn, 9, k)
+        rate = joint[3 * L + k]
+        change = joint[4 * L + k]
+        w_turned = _lane_back(turn, k, w)
+        across = rate * w_turned[1], -rate * w_turned[0], change
+        tangential = cross(e, x)
+        centripetal = cross(w, cross(w, x))
+        a = add(add(_lane(up, 6, k), tangential), centripetal)
+        coriolis = (g * across[0], g * across[1], 0.5 * g * change)
+        _write_lane(motion_here, 0, k, (w_turned[0], w_turned[1], w_turned[2] + f * rate))
+        _write_lane(motion_here, 3, k, add(_lane_back(turn, k, e), scaled(f, across)))
+        _write_lane(motion_here, 6, k, add(_lane_back(turn, k, a), coriolis))
 
 
 @njit(**OPTIONS)
-def _carry_lanes(turn, up, here):
+def _carry_lanes(turn, up, twist_here):
     """`carry` of one coordinate's twist for L samples."""
     for k in range(L):
         u = _lane(up, 0, k)
-        _write_lane(here, 0, k, _lane_back(turn, k, u))
-        _write_lane(here, 3, k, _lane_back(turn, k, add(_lane(up, 3, k), cross(u, _lane(turn, 9, k)))))
+        _write_lane(twist_here, 0, k, _lane_back(turn, k, u))
+        s = add(_lane(up, 3, k), cross(u, _lane(turn, 9, k)))
+        _write_lane(twist_here, 3, k, _lane_back(turn, k, s))
 
 
 @njit(**OPTIONS)
 def _project_lanes(motion, twist, columns):
     """Write the ten columns of one body in one coordinate's row for L samples."""
     for k in range(L):
-        w, e, a = _lane(motion, 0, k), _lane(motion, 3, k), _lane(motion, 6, k)
-        u, s = _lane(twist, 0, k), _lane(twist, 3, k)
+        w = _lane(motion, 0, k)
+        e = _lane(motion, 3, k)
+        a = _lane(motion, 6, k)
+        u = _lane(twist, 0, k)
+        s = _lane(twist, 3, k)
         (
             columns[k],
             columns[L + k],
@@ -260,7 +334,8 @@ def _load_lanes(kind, scale, amount, v, a, joint):
             joint[2 * L + k] = 0.0
     else:
         for k in range(L):
-            joint[k], joint[L + k] = 1.0, 0.0
+            joint[k] = 1.0
+            joint[L + k] = 0.0
 
 
 @njit(**OPTIONS)
@@ -274,16 +349,23 @@ def regressor(links, constants, order, amount, v, a, out):
         amount: (B, N), each body's own motion, angles below 1e6.
         v, a: (n, N).
     """
-    bodies, count, n = amount.shape[0], amount.shape[1], v.shape[0]
-    joint, turn, columns = np.zeros(5 * L), np.empty(12 * L), np.empty(10 * L)
-    motion, twists = np.zeros((bodies + 1, 9 * L)), np.zeros((bodies + 1, n, 6 * L))
+    bodies = amount.shape[0]
+    count = amount.shape[1]
+    n = v.shape[0]
+    joint = np.zeros(5 * L)
+    turn = np.empty(12 * L)
+    columns = np.empty(10 * L)
+    motion = np.zeros((bodies + 1, 9 * L))
+    twists = np.zeros((bodies + 1, n, 6 * L))
     for r in range(3):
         for lane in range((6 + r) * L, (7 + r) * L):
             motion[0, lane] = -constants[bodies, r]
     for start in range(0, count, L):
         width = min(L, count - start)
         for i in range(bodies):
-            p, c, turning = links[i, PARENT], links[i, COORDINATE], 1.0 if links[i, KIND] == REVOLUTE else 0.0
+            p = links[i, PARENT]
+            c = links[i, COORDINATE]
+            turning = 1.0 if links[i, KIND] == REVOLUTE else 0.0
             end = start + width
             _load_lanes(
                 links[i, KIND], constants[i, SCALE], amount[i, start:end], v[c, start:end], a[c, start:end], joint
@@ -311,23 +393,33 @@ def regressor(links, constants, order, amount, v, a, out):
 @njit(**OPTIONS)
 def _wrench(i, parameters, motion, wrench):
     """Write force and moment of body i about its own frame's origin (row i of `wrench`, (B, 6))."""
-    w, e, a = three(motion, i + 1, 0), three(motion, i + 1, 3), three(motion, i + 1, 6)
-    own = parameters[10 * i : 10 * i + 10]
-    h = own[6], own[7], own[8]
-    write(wrench, i, 0, add(add(scaled(own[9], a), cross(e, h)), cross(w, cross(w, h))))
-    write(wrench, i, 3, add(add(inertia_times(own, e), cross(w, inertia_times(own, w))), cross(h, a)))
+    w = three(motion, i + 1, 0)
+    e = three(motion, i + 1, 3)
+    a = three(motion, i + 1, 6)
+    body = parameters[10 * i : 10 * i + 10]
+    h = body[6], body[7], body[8]
+    centripetal = cross(w, cross(w, h))
+    force = add(add(scaled(body[9], a), cross(e, h)), centripetal)
+    gyroscopic = cross(w, inertia_times(body, w))
+    moment = add(add(inertia_times(body, e), gyroscopic), cross(h, a))
+    write(wrench, i, 0, force)
+    write(wrench, i, 3, moment)
 
 
 @njit(**OPTIONS)
 def _return(links, constants, i, frames, wrench, tau):
     """Add body i's torque to tau (n,) and its wrench to the parent's."""
-    c, p = links[i, COORDINATE], links[i, PARENT]
+    c = links[i, COORDINATE]
+    p = links[i, PARENT]
     if c >= 0:
-        tau[c] += constants[i, SCALE] * wrench[i, 5 if links[i, KIND] == REVOLUTE else 2]
+        axis = 5 if links[i, KIND] == REVOLUTE else 2
+        tau[c] += constants[i, SCALE] * wrench[i, axis]
     if p >= 0:
         force = turned(frames, i, three(wrench, i, 0))
         increase(wrench, p, 0, force)
-        increase(wrench, p, 3, add(turned(frames, i, three(wrench, i, 3)), cross(three(frames, i, 9), force)))
+        moment = turned(frames, i, three(wrench, i, 3))
+        lever = three(frames, i, 9)
+        increase(wrench, p, 3, add(moment, cross(lever, force)))
 
 
 @njit(**OPTIONS)
@@ -338,15 +430,18 @@ def inverse_dynamics(links, constants, parameters, amount, cosine, sine, v, a, o
         amount, cosine, sine: (N, B), each body's own motion.
     """
     bodies = amount.shape[1]
-    frames, motion = np.empty((bodies, 12)), np.zeros((bodies + 1, 9))
-    wrench, tau = np.empty((bodies, 6)), np.empty(v.shape[1])
+    frames = np.empty((bodies, 12))
+    motion = np.zeros((bodies + 1, 9))
+    wrench = np.empty((bodies, 6))
+    tau = np.empty(v.shape[1])
     for r in range(3):
         motion[0, 6 + r] = -constants[bodies, r]
     for sample in range(v.shape[0]):
         for j in range(tau.shape[0]):
             tau[j] = 0.0
         for i in range(bodies):
-            c, scale = links[i, COORDINATE], constants[i, SCALE]
+            c = links[i, COORDINATE]
+            scale = constants[i, SCALE]
             place(links, constants, i, amount[sample, i], cosine[sample, i], sine[sample, i], frames)
             advance(links, i, scale * v[sample, c], scale * a[sample, c], frames, motion)
             _wrench(i, parameters, motion, wrench)
@@ -361,5 +456,6 @@ def stop(x, width):
     """Return the states (N,) of a stop operator driven by x (N,), unstressed at first."""
     out = np.zeros(x.shape[0])
     for k in range(1, x.shape[0]):
-        out[k] = min(1.0, max(-1.0, out[k - 1] + (x[k] - x[k - 1]) / width))
+        free = out[k - 1] + (x[k] - x[k - 1]) / width
+        out[k] = min(1.0, max(-1.0, free))
     return out

@@ -36,24 +36,31 @@ class LoadCases(BaseModel):
     @property
     def row_names(self) -> tuple[str, ...]:
         """Names of the rows: joint 1, or joint 1 with its load if there are several."""
-        names = [f"joint {j + 1}" for j in range(self.model.n)] * (self.model.rows // self.model.n)
+        n = self.model.n
+        joint_names = [f"joint {joint + 1}" for joint in range(n)] * (self.model.rows // n)
         if len(self.loads) == 1:
-            return tuple(names)
-        words = ["all payloads" if one is None else " + ".join(one) or "no payload" for one in self.loads]
-        return tuple(f"{name} ({load})" for load in words for name in names)
+            return tuple(joint_names)
+        names = []
+        for load in self.loads:
+            text = "all payloads"
+            if load is not None:
+                text = " + ".join(load) or "no payload"
+            names += [f"{name} ({text})" for name in joint_names]
+        return tuple(names)
 
-    def of_rows(self, of_joints: np.ndarray, others: float = np.inf) -> np.ndarray:
-        """Return the values of the joints (n,) at the rows of `limited`, and `others` elsewhere."""
-        result = np.full(len(self.joint_of_row), others)
-        result[self.limited] = of_joints
-        return result
+    def of_rows(self, of_joints: np.ndarray, fill: float = np.inf) -> np.ndarray:
+        """Return the values of the joints (n,) at the rows of `limited`, and `fill` elsewhere."""
+        values = np.full(len(self.joint_of_row), fill)
+        values[self.limited] = of_joints
+        return values
 
     def regressor(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the stacked base regressor (N, loads x rows per sample, b); columns of absent payloads are zero."""
-        one = super().regressor(q, v, a)
+        regressor = super().regressor(q, v, a)
         if self._plain:
-            return one
-        columns, rows = np.concatenate([one.transpose(2, 1, 0)] * len(self.loads), axis=1), self.model.rows
+            return regressor
+        rows = self.model.rows
+        columns = np.concatenate([regressor.transpose(2, 1, 0)] * len(self.loads), axis=1)
         for k, absent in enumerate(self._absent):
             columns[absent, k * rows : (k + 1) * rows] = 0.0
         return columns.transpose(2, 1, 0)
@@ -65,34 +72,44 @@ class LoadCases(BaseModel):
         if self._plain:
             return super().regressor_gradient(q, v, a, weights)
         parts = np.split(weights.transpose(2, 1, 0), len(self.loads), axis=1)
-        columns = sum(np.where(absent[:, None, None], 0.0, part) for part, absent in zip(parts, self._absent))
-        return super().regressor_gradient(q, v, a, np.transpose(columns, (2, 1, 0)))
+        total = np.zeros_like(parts[0])
+        for part, absent in zip(parts, self._absent):
+            total = total + np.where(absent[:, None, None], 0.0, part)
+        return super().regressor_gradient(q, v, a, np.transpose(total, (2, 1, 0)))
 
     def torque_gradient(
         self, q: np.ndarray, v: np.ndarray, a: np.ndarray, values: np.ndarray, weights: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the derivatives of Σ weights · regressor values by q, v, a, each (N, n); weights (N, all rows)."""
-        parts = zip(np.split(weights, len(self.loads), axis=1), self._absent)
-        own = super().torque_gradient
-        each = [own(q, v, a, np.where(absent, 0.0, values), part) for part, absent in parts]
-        by_q, by_v, by_a = (np.sum(one, axis=0) for one in zip(*each))
+        gradients = []
+        for part, absent in zip(np.split(weights, len(self.loads), axis=1), self._absent):
+            present_values = np.where(absent, 0.0, values)
+            gradients.append(super().torque_gradient(q, v, a, present_values, part))
+        by_q, by_v, by_a = (np.sum(by_load, axis=0) for by_load in zip(*gradients))
         return by_q, by_v, by_a
 
     def largest_torques(self, values: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the motor torques (N, n) of base parameters (b,), each of the load under which it is largest."""
-        torques = (self.regressor(q, v, a) @ values)[:, self.limited]  # (N, loads, n)
+        # (N, loads, n)
+        torques = (self.regressor(q, v, a) @ values)[:, self.limited]
         largest = np.abs(torques).argmax(axis=1, keepdims=True)
         return np.take_along_axis(torques, largest, axis=1)[:, 0]
 
     @property
     def _plain(self) -> bool:
+        """Whether there is one load, with all payloads."""
         return len(self.loads) == 1 and not self._absent[0].any()
 
     @cached_property
     def _absent(self) -> list[np.ndarray]:
         """Columns (b,) of each load whose payloads are absent."""
-        model, result = self.model, []
+        model = self.model
+        drives = np.ones(model.p - model.inertial)
+        absent = []
         for carried in self.loads:
-            present = np.ones(model.inertial) if carried is None else model.carried_columns(carried)
-            result.append(np.append(present, np.ones(model.p - model.inertial))[self.base.kept] == 0.0)
-        return result
+            bodies = np.ones(model.inertial)
+            if carried is not None:
+                bodies = model.carried_columns(carried)
+            present = np.append(bodies, drives)
+            absent.append(present[self.base.kept] == 0.0)
+        return absent

@@ -43,21 +43,25 @@ class PathDynamics:
     inertial: np.ndarray
 
     def __post_init__(self) -> None:
-        for key in ("parameters", "amounts", "inertial"):
-            value = np.asarray(getattr(self, key), dtype=float)
-            object.__setattr__(self, key, frozen(shaped(value, (None,), f"path dynamics, {key}")))
+        for name in ("parameters", "amounts", "inertial"):
+            values = np.asarray(getattr(self, name), dtype=float)
+            checked = shaped(values, (None,), f"path dynamics, {name}")
+            object.__setattr__(self, name, frozen(checked))
 
     @property
     def n(self) -> int:
+        """Number of joints."""
         return self.bodies.n
 
     def along(
         self, q: np.ndarray, slope: np.ndarray, curvature: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the coefficients A, B, Γ of the path dynamics, each (N, n), at Φ, Φ', Φ'' (N, n)."""
-        still = np.zeros_like(q)
-        gravity = self.rigid(q, still, still)
-        return self.rigid(q, still, slope) - gravity, self.rigid(q, slope, curvature) - gravity, gravity
+        zero = np.zeros_like(q)
+        gravity = self.rigid(q, zero, zero)
+        by_acceleration = self.rigid(q, zero, slope) - gravity
+        by_square_of_speed = self.rigid(q, slope, curvature) - gravity
+        return by_acceleration, by_square_of_speed, gravity
 
     def rigid(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the torques (N, n) without friction."""
@@ -65,66 +69,84 @@ class PathDynamics:
 
     def friction(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the friction torques (N, n); friction with hysteresis (stop operators) counts as fully stressed."""
-        rubbing = [k for k, one in enumerate(self.terms) if one.form.friction]
-        loaded = any(self.terms[k].form.loaded for k in rubbing)
-        load = rigid_body.inverse_dynamics(self.bodies, np.array(self.inertial), q, v, a) if loaded else None
-        return self._drives(rubbing, q, v, a, load)
+        terms, amounts = [], []
+        for term, amount in zip(self.terms, self.amounts):
+            if term.form.friction:
+                terms.append(term)
+                amounts.append(amount)
+        load = None
+        if any(term.form.loaded for term in terms):
+            load = rigid_body.inverse_dynamics(self.bodies, np.array(self.inertial), q, v, a)
+        return self._drives(terms, np.array(amounts), q, v, a, load)
 
     def torque(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the torques (N, n) of a motion with friction, by recursive Newton-Euler."""
         load = rigid_body.inverse_dynamics(self.bodies, np.array(self.inertial), q, v, a)
-        return load + self._drives(range(len(self.terms)), q, v, a, load)
+        return load + self._drives(self.terms, np.asarray(self.amounts), q, v, a, load)
 
-    def _drives(self, chosen: Sequence[int], q, v, a, load: np.ndarray | None) -> np.ndarray:
-        """Return the torques (N, n) of chosen drive terms."""
-        terms = [self.terms[k] for k in chosen]
-        motions = [np.ascontiguousarray(x.T) for x in (q, v, a)]
-        out = np.zeros((len(terms), self.n, len(q)))
-        drives.fill(terms, out, [*motions, None if load is None else load.T], _stressed(terms, motions[1]))
-        return np.einsum("k,kjN->Nj", self.amounts[list(chosen)], out)
+    def _drives(
+        self,
+        terms: Sequence[DriveTerm],
+        amounts: np.ndarray,
+        q: np.ndarray,
+        v: np.ndarray,
+        a: np.ndarray,
+        load: np.ndarray | None,
+    ) -> np.ndarray:
+        """Return the torques (N, n) of some drive terms with values (k,)."""
+        motions: list[np.ndarray | None] = [np.ascontiguousarray(series.T) for series in (q, v, a)]
+        motions.append(None if load is None else load.T)
+        columns = np.zeros((len(terms), self.n, len(q)))
+        drives.fill(terms, columns, motions, _stressed(terms, np.ascontiguousarray(v.T)))
+        return np.einsum("k,kjN->Nj", amounts, columns)
 
 
 def of_standard(model: IdentificationModel, values: np.ndarray) -> PathDynamics:
     """Return the path dynamics of a model with standard (or regrouped) parameters (p,), with all payloads."""
     values = shaped(values, (model.p,), "parameters of the model")
-    _require_torques(model)
-    rubbing = _is_friction(model)
-    first = model.inertial
-    without = replace(model, terms=tuple(one for one in model.columns if not one.form.friction))
+    if not model.torque_rows.has_bodies:
+        raise CalibError("rows tau - tau_l contain no bodies: no motion planning; use a model of the torques tau")
+    body_values = values[: model.inertial]
+    term_values = values[model.inertial :]
+    without_friction = []
+    rigid_values = list(body_values)
+    terms, amounts = [], []
+    for term, value in zip(model.columns, term_values):
+        if not term.form.friction:
+            without_friction.append(term)
+            rigid_values.append(value)
+        if value:
+            terms.append(_with_exact_sign(term))
+            amounts.append(value)
+    rigid_model = replace(model, terms=tuple(without_friction))
     return PathDynamics(
-        without.regressor, values[~rubbing], *_valued(model, values), model.bodies, np.array(values[:first])
+        regressor=rigid_model.regressor,
+        parameters=np.array(rigid_values),
+        terms=tuple(terms),
+        amounts=np.array(amounts, dtype=float),
+        bodies=model.bodies,
+        inertial=np.array(body_values),
     )
 
 
-def _require_torques(model: IdentificationModel) -> None:
-    if not model.torque_rows.has_bodies:
-        raise CalibError("rows tau - tau_l contain no bodies: no motion planning; use a model of the torques tau")
-
-
-def _is_friction(model: IdentificationModel) -> np.ndarray:
-    """Return the mask (p,) of friction columns."""
-    bodies = np.zeros(model.inertial, dtype=bool)
-    return np.concatenate([bodies, np.array([one.form.friction for one in model.columns], dtype=bool)])
-
-
-def _valued(model: IdentificationModel, values: np.ndarray) -> tuple[tuple[DriveTerm, ...], np.ndarray]:
-    """Return the drive terms with non-zero values, with exact Coulomb sign, and their values."""
-    found = [(one, x) for one, x in zip(model.columns, values[model.inertial :]) if x]
-    return tuple(_sharp(one) for one, _ in found), np.array([x for _, x in found], dtype=float)
-
-
-def _sharp(one: DriveTerm) -> DriveTerm:
+def _with_exact_sign(term: DriveTerm) -> DriveTerm:
     """Return the term with the exact, unsmoothed Coulomb sign: the larger torque at low speed."""
-    names = one.form.settings
-    return replace(one, settings=tuple(0.0 if name == "v0" else x for name, x in zip(names, one.settings)))
+    settings = []
+    for name, setting in zip(term.form.settings, term.settings):
+        settings.append(0.0 if name == "v0" else setting)
+    return replace(term, settings=tuple(settings))
 
 
 def _stressed(terms: Sequence[DriveTerm], v: np.ndarray) -> np.ndarray:
     """Return states (s, N) of stop operators that slide in the direction of their motion; v (n, N)."""
-    found = [
-        np.sign(sum((weight * v[j] for j, weight in motion), np.zeros(v.shape[1])))
-        for one in terms
-        if one.form.remembers
-        for _, motion in one.acts
-    ]
-    return np.array(found).reshape(len(found), v.shape[1])
+    count = v.shape[1]
+    states = []
+    for term in terms:
+        if not term.form.remembers:
+            continue
+        for _, motion in term.acts:
+            speed = np.zeros(count)
+            for joint, weight in motion:
+                speed = speed + weight * v[joint]
+            states.append(np.sign(speed))
+    return np.array(states).reshape(len(states), count)

@@ -23,8 +23,12 @@ def to_standard(pseudo: np.ndarray) -> np.ndarray:
     pseudo = np.asarray(pseudo, dtype=float)
     second = pseudo[..., :3, :3]
     trace = np.trace(second, axis1=-2, axis2=-1)
-    moments = [(trace if r == s else 0.0) - second[..., r, s] for r, s in SYMMETRIC]
-    return np.stack([*moments, *(pseudo[..., r, 3] for r in range(4))], axis=-1)
+    parameters = []
+    for row, column in SYMMETRIC:
+        diagonal = trace if row == column else 0.0
+        parameters.append(diagonal - second[..., row, column])
+    parameters += [pseudo[..., row, 3] for row in range(4)]
+    return np.stack(parameters, axis=-1)
 
 
 def margin(parameters: np.ndarray) -> float:
@@ -48,39 +52,45 @@ def divergence(pseudo: np.ndarray, reference: np.ndarray) -> float:
     Zero only at P = P₀, infinite at the boundary, independent of frame and units.
     """
     ratio = np.linalg.solve(reference, pseudo)
-    sign, size = np.linalg.slogdet(ratio)
-    return float(np.trace(ratio) - size - 4.0) if sign > 0 else np.inf
+    sign, log_det = np.linalg.slogdet(ratio)
+    if not sign > 0:
+        return np.inf
+    return float(np.trace(ratio) - log_det - 4.0)
 
 
 def ball(mass: float, radius: float, centre: np.ndarray | None = None) -> np.ndarray:
     """Return the ten parameters of a homogeneous ball [kg, m] about the link frame."""
-    x = np.zeros(3) if centre is None else np.asarray(centre, dtype=float)
+    if centre is None:
+        centre = np.zeros(3)
+    centre = np.asarray(centre, dtype=float)
     pseudo = np.empty((4, 4))
-    pseudo[:3, :3] = mass * (radius**2 / 5.0 * np.eye(3) + np.outer(x, x))
-    pseudo[:3, 3] = pseudo[3, :3] = mass * x
+    pseudo[:3, :3] = mass * (radius**2 / 5.0 * np.eye(3) + np.outer(centre, centre))
+    pseudo[:3, 3] = mass * centre
+    pseudo[3, :3] = mass * centre
     pseudo[3, 3] = mass
     return to_standard(pseudo)
 
 
 def rod(mass: float, end: np.ndarray, radius: float) -> np.ndarray:
     """Return the ten parameters of a uniform rod from the origin to `end`, with the thickness of a ball of `radius`."""
-    x = np.asarray(end, dtype=float)
-    pseudo = from_standard(ball(mass, radius, x / 2.0))
-    pseudo[:3, :3] += mass * np.outer(x, x) / 12.0
+    end = np.asarray(end, dtype=float)
+    pseudo = from_standard(ball(mass, radius, end / 2.0))
+    pseudo[:3, :3] += mass * np.outer(end, end) / 12.0
     return to_standard(pseudo)
 
 
 def _basis() -> np.ndarray:
     """Return (10, 4, 4): P of each unit parameter."""
     basis = np.zeros((10, 4, 4))
-    for k, (r, s) in enumerate(SYMMETRIC):
-        if r == s:
+    for k, (row, column) in enumerate(SYMMETRIC):
+        basis[k, row, column] -= 1.0
+        if row != column:
+            basis[k, column, row] -= 1.0
+        else:
             basis[k, :3, :3] += 0.5 * np.eye(3)
-        basis[k, r, s] -= 1.0
-        if r != s:
-            basis[k, s, r] -= 1.0
-    for r in range(3):
-        basis[6 + r, r, 3] = basis[6 + r, 3, r] = 1.0
+    for row in range(3):
+        basis[6 + row, row, 3] = 1.0
+        basis[6 + row, 3, row] = 1.0
     basis[9, 3, 3] = 1.0
     return basis
 
@@ -88,15 +98,17 @@ def _basis() -> np.ndarray:
 def _units() -> np.ndarray:
     """Return an orthonormal basis (10, 4, 4) of the symmetric matrices."""
     row, column = np.triu_indices(4)
+    entry = np.where(row == column, 1.0, np.sqrt(0.5))
     units = np.zeros((10, 4, 4))
-    units[np.arange(10), row, column] = units[np.arange(10), column, row] = np.where(row == column, 1.0, np.sqrt(0.5))
+    units[np.arange(10), row, column] = entry
+    units[np.arange(10), column, row] = entry
     return units
 
 
 BASIS, UNITS = _basis(), _units()
 
 
-def unknown_bodies(count: int, others: int) -> np.ndarray:
-    """Return P of bodies linear in unknowns (count, 4, 4, 10 count + others): ten per body in `UNITS`, then others."""
+def unknown_bodies(count: int, term_count: int) -> np.ndarray:
+    """Return P of bodies linear in unknowns (count, 4, 4, 10 count + terms): ten per body in `UNITS`, then terms."""
     bodies = np.einsum("ij,krs->irsjk", np.eye(count), UNITS).reshape(count, 4, 4, 10 * count)
-    return np.concatenate([bodies, np.zeros((count, 4, 4, others))], axis=3)
+    return np.concatenate([bodies, np.zeros((count, 4, 4, term_count))], axis=3)

@@ -10,6 +10,9 @@ import numpy as np
 from calib.dynamics.bodies import PRISMATIC, REVOLUTE, Bodies
 from calib.records import shaped
 
+MAX_ANGLE = 1e6
+"""Angle up to which the kernels' sine is accurate [rad]."""
+
 
 def regressor(bodies: Bodies, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
     """Return the regressor of the standard parameters, (N, n, 10 B).
@@ -29,10 +32,13 @@ def fill_regressor(bodies: Bodies, q: np.ndarray, v: np.ndarray, a: np.ndarray, 
     """Write the regressor into out (10 B, n or more, N), initially zero; q, v, a (N, n) must be checked."""
     from calib.dynamics import kernels
 
-    amount = q.T[bodies.coordinates] * bodies.scales[:, None]
-    if np.abs(amount).max(initial=0.0) >= 1e6:  # beyond what the kernel's sine is made for
-        amount = np.where(bodies.kinds[:, None] == REVOLUTE, np.remainder(amount, 2 * np.pi), amount)
-    v, a = np.ascontiguousarray(v.T), np.ascontiguousarray(a.T)
+    coordinates = q.T[bodies.coordinates]
+    amount = coordinates * bodies.scales[:, None]
+    if np.abs(amount).max(initial=0.0) >= MAX_ANGLE:
+        is_angle = bodies.kinds[:, None] == REVOLUTE
+        amount = np.where(is_angle, np.remainder(amount, 2 * np.pi), amount)
+    v = np.ascontiguousarray(v.T)
+    a = np.ascontiguousarray(a.T)
     kernels.regressor(bodies.links, bodies.constants, bodies.order, amount, v, a, out)
 
 
@@ -44,34 +50,47 @@ def energies(bodies: Bodies, q: np.ndarray, v: np.ndarray) -> np.ndarray:
     (Gautier 1997, with Y the regressor of the torques, so that M(q) q̇ = [Y(q, 0, q̇) - Y(q, 0, 0)] chi.)
 
     Args:
+        bodies: of the robot.
         q, v: (N, n) [rad or m, and per s].
     """
-    still = np.zeros_like(np.asarray(v, dtype=float))
-    moved = regressor(bodies.with_gravity(np.zeros(3)), q, still, v)
-    result = 0.5 * np.einsum("nj,njc->nc", v, moved)
-    for i, frame in enumerate(_frames(bodies, q)):
-        result[:, 10 * i + 6 : 10 * i + 9] -= np.einsum("nji,j->ni", frame[:, :3, :3], bodies.gravity)
-        result[:, 10 * i + 9] -= frame[:, :3, 3] @ bodies.gravity
+    zero = np.zeros_like(np.asarray(v, dtype=float))
+    weightless = bodies.with_gravity(np.zeros(3))
+    momentum = regressor(weightless, q, zero, v)
+    result = 0.5 * np.einsum("nj,njc->nc", v, momentum)
+    for body, T_base_body in enumerate(_frames(bodies, q)):
+        mass = 10 * body + 9
+        rotation = T_base_body[:, :3, :3]
+        position = T_base_body[:, :3, 3]
+        result[:, mass - 3 : mass] -= np.einsum("nji,j->ni", rotation, bodies.gravity)
+        result[:, mass] -= position @ bodies.gravity
     return result
 
 
 def _frames(bodies: Bodies, q: np.ndarray) -> np.ndarray:
     """Return the bodies' frames in the base, (B, N, 4, 4)."""
-    result = np.empty((bodies.count, len(q), 4, 4))
-    for i, parent in enumerate(bodies.parents):
-        placed = bodies.placements[i] if parent < 0 else result[parent] @ bodies.placements[i]
-        own = np.tile(np.eye(4), (len(q), 1, 1))
-        if bodies.coordinates[i] >= 0:
-            amount, axis = bodies.scales[i] * q[:, bodies.coordinates[i]], int(bodies.axes[i])
-            if bodies.kinds[i] == PRISMATIC:
-                own[:, axis, 3] = amount
+    frames = np.empty((bodies.count, len(q), 4, 4))
+    for body, parent in enumerate(bodies.parents):
+        placement = bodies.placements[body]
+        if parent >= 0:
+            placement = frames[parent] @ placement
+        motion = np.tile(np.eye(4), (len(q), 1, 1))
+        coordinate = bodies.coordinates[body]
+        if coordinate >= 0:
+            amount = bodies.scales[body] * q[:, coordinate]
+            axis = int(bodies.axes[body])
+            if bodies.kinds[body] == PRISMATIC:
+                motion[:, axis, 3] = amount
             else:
-                one, two = (axis + 1) % 3, (axis + 2) % 3
-                own[:, one, one] = own[:, two, two] = np.cos(amount)
-                own[:, two, one] = np.sin(amount)
-                own[:, one, two] = -own[:, two, one]
-        result[i] = placed @ own
-    return result
+                first = (axis + 1) % 3
+                second = (axis + 2) % 3
+                cosine = np.cos(amount)
+                sine = np.sin(amount)
+                motion[:, first, first] = cosine
+                motion[:, second, second] = cosine
+                motion[:, second, first] = sine
+                motion[:, first, second] = -sine
+        frames[body] = placement @ motion
+    return frames
 
 
 def regressor_gradient(
@@ -86,12 +105,14 @@ def regressor_gradient(
     from calib.dynamics import gradient_kernels
 
     q, v, a = _states(bodies, q=q, v=v, a=a)
-    weights = _plain(shaped(weights, (len(q), bodies.n, 10 * bodies.count), "weights of the regressor"))
-    slopes = np.zeros((3, *q.shape))
+    shape = (len(q), bodies.n, 10 * bodies.count)
+    weights = _plain(shaped(weights, shape, "weights of the regressor"))
+    amount, cosine, sine = _placed(bodies, q)
+    by_q, by_v, by_a = np.zeros(q.shape), np.zeros(q.shape), np.zeros(q.shape)
     gradient_kernels.regressor_gradient(
-        bodies.links, bodies.constants, bodies.order, *_placed(bodies, q), v, a, weights, *slopes
+        bodies.links, bodies.constants, bodies.order, amount, cosine, sine, v, a, weights, by_q, by_v, by_a
     )
-    return slopes[0], slopes[1], slopes[2]
+    return by_q, by_v, by_a
 
 
 def torque_gradient(
@@ -108,13 +129,16 @@ def torque_gradient(
 
     q, v, a = _states(bodies, q=q, v=v, a=a)
     weights = _plain(shaped(weights, q.shape, "weights of the torques"))
-    chi = _plain(shaped(parameters, (10 * bodies.count,), "standard parameters")).reshape(1, -1)
-    slopes = np.zeros((3, *q.shape))
-    links = bodies.links, gradient_kernels.hung_on_one(bodies.links)
+    chi = shaped(parameters, (10 * bodies.count,), "standard parameters")
+    chi = _plain(chi).reshape(1, -1)
+    links, constants, order = bodies.links, bodies.constants, bodies.order
+    chain = gradient_kernels.hung_on_one(links)
+    amount, cosine, sine = _placed(bodies, q)
+    by_q, by_v, by_a = np.zeros(q.shape), np.zeros(q.shape), np.zeros(q.shape)
     gradient_kernels.torque_gradient(
-        *links, bodies.constants, bodies.order, *_placed(bodies, q), v, a, chi, weights, *slopes
+        links, chain, constants, order, amount, cosine, sine, v, a, chi, weights, by_q, by_v, by_a
     )
-    return slopes[0], slopes[1], slopes[2]
+    return by_q, by_v, by_a
 
 
 def inverse_dynamics(bodies: Bodies, parameters: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
@@ -126,23 +150,29 @@ def inverse_dynamics(bodies: Bodies, parameters: np.ndarray, q: np.ndarray, v: n
     from calib.dynamics import kernels
 
     q, v, a = _states(bodies, q=q, v=v, a=a)
-    out = np.zeros_like(q)
-    kernels.inverse_dynamics(
-        bodies.links, bodies.constants, kernel_parameters(bodies, parameters), *_placed(bodies, q), v, a, out
-    )
-    return out
+    chi = kernel_parameters(bodies, parameters)
+    amount, cosine, sine = _placed(bodies, q)
+    torques = np.zeros_like(q)
+    kernels.inverse_dynamics(bodies.links, bodies.constants, chi, amount, cosine, sine, v, a, torques)
+    return torques
 
 
 def mass_matrix(bodies: Bodies, parameters: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Return the joint-space inertia matrices M(q) (N, n, n) of the bodies."""
-    q, free = np.asarray(q, dtype=float), bodies.with_gravity(np.zeros(3))
-    units = (np.broadcast_to(one, q.shape) for one in np.eye(bodies.n))
-    return np.stack([inverse_dynamics(free, parameters, q, np.zeros_like(q), one) for one in units], axis=2)
+    q = np.asarray(q, dtype=float)
+    weightless = bodies.with_gravity(np.zeros(3))
+    zero = np.zeros_like(q)
+    columns = []
+    for unit in np.eye(bodies.n):
+        acceleration = np.broadcast_to(unit, q.shape)
+        columns.append(inverse_dynamics(weightless, parameters, q, zero, acceleration))
+    return np.stack(columns, axis=2)
 
 
 def kernel_parameters(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:
     """Return standard parameters (10 B,) in the kernels' frames, whose z is the joint axis."""
-    rows = shaped(parameters, (10 * bodies.count,), "standard parameters").reshape(bodies.count, 10)
+    parameters = shaped(parameters, (10 * bodies.count,), "standard parameters")
+    rows = parameters.reshape(bodies.count, 10)
     return np.take_along_axis(rows, bodies.order, axis=1).ravel()
 
 
@@ -154,8 +184,9 @@ def _states(bodies: Bodies, **arrays: np.ndarray) -> list[np.ndarray]:
     rows: int | None = None
     checked = []
     for key, array in arrays.items():
-        checked.append(_plain(shaped(array, (rows, bodies.n), _NAMES[key])))
-        rows = len(checked[0])
+        series = shaped(array, (rows, bodies.n), _NAMES[key])
+        checked.append(_plain(series))
+        rows = len(series)
     return checked
 
 
@@ -166,5 +197,6 @@ def _plain(array: np.ndarray) -> np.ndarray:
 
 def _placed(bodies: Bodies, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return each body's joint position, its cosine and sine (N, B), vectorised by numpy."""
-    amount = q.take(bodies.coordinates, axis=1) * bodies.scales  # q[:, …] is laid out by columns
+    # Not q[:, …], which is laid out by columns.
+    amount = q.take(bodies.coordinates, axis=1) * bodies.scales
     return amount, np.cos(amount), np.sin(amount)

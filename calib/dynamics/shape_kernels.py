@@ -12,20 +12,30 @@ from calib.dynamics.kernels import JOINED, OPTIONS
 
 ACCELERATION, VELOCITY, ONE, POSITION, SIGN, DEAD, SPEED, CUBIC, ROOT = range(9)
 STRIBECK, LOAD, LOAD_VELOCITY, STOP, PRESLIDING, SINE, COSINE, SINE_BAND, COSINE_BAND = range(9, 18)
-FADE = 0.1  # [rad] over which ripple of a band fades outside the positions it was identified at
+FADE = 0.1
+"""Travel over which ripple of a band fades outside the positions it was identified at [rad]."""
 
 
 @njit(**JOINED)
 def smooth_sign(v, v0):
     """Return tanh(v / v0), set to ±1 where it differs only by rounding; the exact sign for v0 = 0."""
     if not v0 > 0.0:
-        return 1.0 if v > 0.0 else -1.0 if v < 0.0 else 0.0
+        if v > 0.0:
+            return 1.0
+        if v < 0.0:
+            return -1.0
+        return 0.0
     scaled = v / v0
-    return 1.0 if scaled > 20.0 else -1.0 if scaled < -20.0 else tanh(scaled)
+    if scaled > 20.0:
+        return 1.0
+    if scaled < -20.0:
+        return -1.0
+    return tanh(scaled)
 
 
 @njit(**JOINED)
 def _sign_slope(sign, v0):
+    """Return the derivative of `smooth_sign` by v, from its value."""
     return (1.0 - sign * sign) / v0 if v0 > 0.0 else 0.0
 
 
@@ -35,14 +45,18 @@ def _band(acts, t, x, v):
 
     It decreases to zero within `FADE` beyond the positions of the identification, lower … upper.
     """
-    left, middle, right, lower, upper = acts[t, 2], acts[t, 3], acts[t, 4], acts[t, 6], acts[t, 7]
+    left = acts[t, 2]
+    middle = acts[t, 3]
+    right = acts[t, 4]
+    lower = acts[t, 6]
+    upper = acts[t, 7]
     frequency = abs(v) * acts[t, 1] / (2.0 * pi)
     falls = 1.0 if isinf(right) else (right - frequency) / (right - middle)
     gain = min(1.0, max(0.0, min((frequency - left) / (middle - left), falls)))
     if not acts[t, 5] * v > 0.0 or gain == 0.0:
         return 0.0
-    outside = max(max(lower - x, x - upper), 0.0)
-    return gain * min(1.0, max(0.0, 1.0 - outside / FADE))
+    excess = max(max(lower - x, x - upper), 0.0)
+    return gain * min(1.0, max(0.0, 1.0 - excess / FADE))
 
 
 @njit(**OPTIONS)
@@ -55,22 +69,27 @@ def shape(code, acts, t, x, v, state):
         x, v: position and velocity [rad or m, per s].
         state: of the stop operator, see `calib.dynamics.drives.friction_states`.
     """
-    first, second, third = acts[t, 1], acts[t, 2], acts[t, 3]
+    first = acts[t, 1]
+    second = acts[t, 2]
+    third = acts[t, 3]
     if code in (SIGN, LOAD):
         sign = smooth_sign(v, first)
         return sign, 0.0, _sign_slope(sign, first)
-    if code in (SPEED, CUBIC, ROOT, LOAD_VELOCITY):  # beyond the edge of what they were identified at they stay
-        held, inside = min(first, max(-first, v)), 1.0 if abs(v) < first else 0.0
+    if code in (SPEED, CUBIC, ROOT, LOAD_VELOCITY):
+        # Beyond the edge of the speeds that they were identified at they keep their value.
+        clipped = min(first, max(-first, v))
+        within = 1.0 if abs(v) < first else 0.0
         if code == SPEED:
-            return abs(held), 0.0, inside * smooth_sign(v, 0.0)
+            return abs(clipped), 0.0, within * smooth_sign(v, 0.0)
         if code == CUBIC:
-            return held**3, 0.0, inside * 3.0 * held * held
+            return clipped**3, 0.0, within * 3.0 * clipped * clipped
         if code == LOAD_VELOCITY:
-            return held, 0.0, inside
-        size = abs(held) + second
-        return held / sqrt(size), 0.0, inside * (size - 0.5 * abs(held)) / (size * sqrt(size))
+            return clipped, 0.0, within
+        size = abs(clipped) + second
+        return clipped / sqrt(size), 0.0, within * (size - 0.5 * abs(clipped)) / (size * sqrt(size))
     if code == STRIBECK:
-        sign, ratio = smooth_sign(v, third), abs(v) / first
+        sign = smooth_sign(v, third)
+        ratio = abs(v) / first
         gain = exp(-(ratio**second))
         fall = second / first * ratio ** (second - 1.0) if ratio > 0.0 else 0.0
         return sign * gain, 0.0, gain * (_sign_slope(sign, third) - abs(sign) * fall)
@@ -80,17 +99,22 @@ def shape(code, acts, t, x, v, state):
         return state - smooth_sign(v, second), 0.0, 0.0
     if code in (SINE, COSINE):
         fading = 1.0 / (1.0 + (v / second) ** 2)
-        wave, rising = sin(first * x), first * cos(first * x)
+        wave = sin(first * x)
+        rising = first * cos(first * x)
         if code == COSINE:
-            wave, rising = cos(first * x), -first * sin(first * x)
+            wave = cos(first * x)
+            rising = -first * sin(first * x)
         return fading * wave, fading * rising, -2.0 * v / (second * second) * fading * fading * wave
     if code in (SINE_BAND, COSINE_BAND):
-        return _band(acts, t, x, v) * (sin(first * x) if code == SINE_BAND else cos(first * x)), 0.0, 0.0
+        wave = sin(first * x) if code == SINE_BAND else cos(first * x)
+        return _band(acts, t, x, v) * wave, 0.0, 0.0
     if code == DEAD:
         if not second > 0.0:
             return smooth_sign(v, 0.0) if abs(v) > first else 0.0, 0.0, 0.0
-        one, other = smooth_sign(v - first, second), smooth_sign(v + first, second)  # a ramp: no jump is integrable
-        return 0.5 * (one + other), 0.0, 0.5 * (_sign_slope(one, second) + _sign_slope(other, second))
+        # A ramp: no jump is integrable.
+        upper = smooth_sign(v - first, second)
+        lower = smooth_sign(v + first, second)
+        return 0.5 * (upper + lower), 0.0, 0.5 * (_sign_slope(upper, second) + _sign_slope(lower, second))
     if code == POSITION:
         return x, 1.0, 0.0
     if code == VELOCITY:
@@ -101,7 +125,9 @@ def shape(code, acts, t, x, v, state):
 @njit(**OPTIONS)
 def steepest(code, acts, t):
     """Return a smoothed sign's largest slope, the |v| where it occurs, its width, and the stiffness of a stop."""
-    first, second, third = acts[t, 1], acts[t, 2], acts[t, 3]
+    first = acts[t, 1]
+    second = acts[t, 2]
+    third = acts[t, 3]
     if code in (SIGN, LOAD):
         return 1.0 / first, 0.0, first, 0.0
     if code == STRIBECK:
@@ -124,4 +150,5 @@ def fill(code, acts, x, v, state, out):
         value, by_x, by_v = shape(code, acts, 0, x[k], v[k], state[k])
         out[0, k] = value
         if out.shape[0] == 3:
-            out[1, k], out[2, k] = by_x, by_v
+            out[1, k] = by_x
+            out[2, k] = by_v

@@ -19,7 +19,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-V0 = 0.01  # [rad/s or m/s], default smoothing of the Coulomb sign
+V0 = 0.01
+"""Default smoothing of the Coulomb sign [rad/s or m/s]."""
+PRESLIDING_SHARES = (0.0005, 0.002, 0.008, 0.03)
+"""Widths of candidate stop operators in units of the joint's travel (our choice)."""
+CABLE_HARMONICS = (1, 2, 3)
+"""Candidate harmonics of a cable's torque (our choice)."""
+STRIBECK_SHARES = {"": 0.05, ".2": 0.2}
+"""Candidate Stribeck speeds in units of the joint's peak speed, by the end of the term's name."""
 
 
 @dataclass(frozen=True)
@@ -115,30 +122,43 @@ class Offer(NamedTuple):
     side: str = "motor"
 
 
-def _presliding(seen: JointRange) -> dict[str, tuple[float, ...]]:
+def _presliding(joint: JointRange) -> dict[str, tuple[float, ...]]:
     """Return candidate stop operators of several widths, each z - sign(v), so that Fc stays the friction of sliding."""
-    shares = (0.0005, 0.002, 0.008, 0.03)  # of the joint's travel (our choice)
-    return {f".{k}": (share * seen.travel, seen.v0) for k, share in enumerate(shares, 1)}
+    return {f".{k}": (share * joint.travel, joint.v0) for k, share in enumerate(PRESLIDING_SHARES, 1)}
 
 
-def _cable(seen: JointRange) -> dict[str, tuple[float, ...]]:
+def _cable(joint: JointRange) -> dict[str, tuple[float, ...]]:
     """Return candidate harmonics of period 2 · travel, which represent any smooth torque of cables and hoses."""
-    return {f".{k}": (k * math.pi / seen.travel, math.inf) for k in (1, 2, 3)}  # no more (our choice)
+    return {f".{k}": (k * math.pi / joint.travel, math.inf) for k in CABLE_HARMONICS}
 
 
-def _stribeck(seen: JointRange) -> dict[str, tuple[float, ...]]:
-    return {"": (0.05 * seen.peak, 1.0, seen.v0), ".2": (0.2 * seen.peak, 1.0, seen.v0)}
+def _stribeck(joint: JointRange) -> dict[str, tuple[float, ...]]:
+    """Return candidate Stribeck torques of two speeds."""
+    return {end: (share * joint.peak, 1.0, joint.v0) for end, share in STRIBECK_SHARES.items()}
 
 
-STEPS: dict[str, tuple[Offer, ...]] = {  # in the order of the ladder
-    "load": (
-        Offer("Ft", "load", lambda seen: {"": (seen.v0,)}),
-        Offer("Fvt", "load_velocity", lambda seen: {"": (seen.edge,)}),
-    ),
+def _smoothed(joint: JointRange) -> dict[str, tuple[float, ...]]:
+    """Return one candidate with a smoothed sign."""
+    return {"": (joint.v0,)}
+
+
+def _up_to_edge(joint: JointRange) -> dict[str, tuple[float, ...]]:
+    """Return one candidate that keeps its value beyond the fastest speed."""
+    return {"": (joint.edge,)}
+
+
+def _root(joint: JointRange) -> dict[str, tuple[float, ...]]:
+    """Return one candidate that keeps its value beyond the fastest speed, smoothed at rest."""
+    return {"": (joint.edge, joint.v0)}
+
+
+STEPS: dict[str, tuple[Offer, ...]] = {
+    "load": (Offer("Ft", "load", _smoothed), Offer("Fvt", "load_velocity", _up_to_edge)),
     "presliding": (Offer("Fp", "presliding", _presliding),),
     "cable": (Offer("Cs", "sine", _cable, "link"), Offer("Cc", "cosine", _cable, "link")),
     "stribeck": (Offer("Fs", "stribeck", _stribeck),),
-    "asymmetric": (Offer("Fva", "speed", lambda seen: {"": (seen.edge,)}),),
-    "root": (Offer("Fvr", "root", lambda seen: {"": (seen.edge, seen.v0)}),),
-    "cubic": (Offer("Fvc", "cubic", lambda seen: {"": (seen.edge,)}),),
+    "asymmetric": (Offer("Fva", "speed", _up_to_edge),),
+    "root": (Offer("Fvr", "root", _root),),
+    "cubic": (Offer("Fvc", "cubic", _up_to_edge),),
 }
+"""Steps of the ladder of friction, in its order, with their candidate terms."""

@@ -20,7 +20,8 @@ import numpy as np
 
 from calib.errors import CalibError, one_of
 
-BODIES = "bodies"  # the side of a column that is a body's parameter
+BODIES = "bodies"
+"""The side of a column that is a body's parameter."""
 
 Map = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -82,6 +83,7 @@ class TorqueRows:
 
     @property
     def has_bodies(self) -> bool:
+        """Whether the rows have columns of the bodies' parameters."""
         return BODIES in self.sides
 
     @property
@@ -102,12 +104,14 @@ class TorqueRows:
     @property
     def with_motors(self) -> bool:
         """Whether the last rows are the complete motor torques, one per joint."""
-        last = self.blocks[-1]
-        return self.projection is None and last.motor == 1.0 and last.sensor == 0.0 and BODIES in last.sides
+        block = self.blocks[-1]
+        return self.projection is None and block.motor == 1.0 and block.sensor == 0.0 and BODIES in block.sides
 
     def count(self, n: int) -> int:
         """Return the rows per sample of n joints."""
-        return n * len(self.blocks) if self.projection is None else len(self.projection.labels)
+        if self.projection is not None:
+            return len(self.projection.labels)
+        return n * len(self.blocks)
 
     def of_side(self, side: str, joint: int, n: int) -> list[int]:
         """Return the rows of one of n joints affected by a drive term on the ``link`` or ``motor`` side."""
@@ -121,7 +125,7 @@ class TorqueRows:
 
     def numbered(self, n: int) -> tuple[str, ...]:
         """Return the row labels for joints numbered 1 to n."""
-        return self.labels([str(j + 1) for j in range(n)])
+        return self.labels([str(number) for number in range(1, n + 1)])
 
     def titles(self, joints: Sequence[str]) -> tuple[str, ...]:
         """Return the full names of the rows, given the joint names."""
@@ -133,7 +137,8 @@ class TorqueRows:
         """Return the unit of each row, N m or N."""
         if self.projection is not None:
             return self.projection.units
-        return tuple("N" if linear else "N m" for linear in prismatic) * len(self.blocks)
+        joint_units = ["N" if linear else "N m" for linear in prismatic]
+        return tuple(joint_units * len(self.blocks))
 
     def of_joints(self, mask: np.ndarray) -> np.ndarray:
         """Return flags of rows (N, rows) from flags of joints (N, n): those of all joints for projected rows."""
@@ -150,7 +155,7 @@ class TorqueRows:
             q, v: (N, n) of the motion.
         """
         if len(self.blocks) == 1 and set(sides) <= self.sides:
-            return torques if self.projection is None else self.projection.torques(q, v) @ torques
+            return self._projected(torques, q, v)
         samples, n, p = torques.shape
         columns = np.zeros((p, len(self.blocks) * n, samples))
         columns[:, :n] = torques.transpose(2, 1, 0)
@@ -162,16 +167,23 @@ class TorqueRows:
         The columns are overwritten, to avoid a copy of a large regressor.
         """
         n = columns.shape[1] // len(self.blocks)
+        # Backwards: the first block holds the joint torques that the others copy.
         for k in reversed(range(len(self.blocks))):
-            at = 0
-            for seen, run in groupby(side in self.blocks[k].sides for side in sides):
-                part = slice(at, at := at + len(list(run)))
-                if k and seen:
+            start = 0
+            for acts, run in groupby(side in self.blocks[k].sides for side in sides):
+                part = slice(start, start + len(list(run)))
+                start = part.stop
+                if k and acts:
                     columns[part, k * n : (k + 1) * n] = columns[part, :n]
-                elif not k and not seen:
+                elif not k and not acts:
                     columns[part, :n] = 0.0
-        stacked = columns.transpose(2, 1, 0)
-        return stacked if self.projection is None else self.projection.torques(q, v) @ stacked
+        return self._projected(columns.transpose(2, 1, 0), q, v)
+
+    def _projected(self, torques: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Return rows of the blocks (N, rows, p), projected where there is a projection."""
+        if self.projection is None:
+            return torques
+        return self.projection.torques(q, v) @ torques
 
     def fold(self, weights: np.ndarray, sides: Sequence[str]) -> np.ndarray:
         """Return the adjoint of `observe`: weights of rows (N, rows, p) as those of joint torques (N, n, p).
@@ -181,12 +193,13 @@ class TorqueRows:
         """
         if self.projection is not None:
             raise CalibError(f"rows '{self.name}' use a projection that depends on the state: no derivatives")
-        seen = [np.array([side in block.sides for side in sides], dtype=bool) for block in self.blocks]
-        if len(seen) == 1 and seen[0].all():
+        acting = [np.array([side in block.sides for side in sides], dtype=bool) for block in self.blocks]
+        if len(acting) == 1 and acting[0].all():
             return weights
         n = weights.shape[1] // len(self.blocks)
-        parts = [weights[:, k * n : (k + 1) * n] * used for k, used in enumerate(seen)]
-        return reduce(np.add, parts[::-1])  # in the weights' memory order
+        parts = [weights[:, k * n : (k + 1) * n] * mask for k, mask in enumerate(acting)]
+        # Added backwards, in the weights' memory order.
+        return reduce(np.add, parts[::-1])
 
     def target(self, motor: np.ndarray, sensor: np.ndarray | None, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Return the measured torques of the rows (N, rows).
@@ -200,23 +213,29 @@ class TorqueRows:
             raise CalibError(f"rows '{self.name}' need torques of sensors behind the gears")
         parts = []
         for block in self.blocks:
-            part = block.motor * motor if block.motor else np.zeros_like(motor)
-            parts.append(part + block.sensor * sensor if sensor is not None and block.sensor else part)
+            part = np.zeros_like(motor)
+            if block.motor:
+                part = block.motor * motor
+            if block.sensor and sensor is not None:
+                part = part + block.sensor * sensor
+            parts.append(part)
         stacked = np.hstack(parts)
         if self.projection is None:
             return stacked
-        own = self.projection.measured or self.projection.torques
-        return np.einsum("nrk,nk->nr", own(q, v), stacked)
+        projection = self.projection.measured or self.projection.torques
+        return np.einsum("nrk,nk->nr", projection(q, v), stacked)
 
     def repeated(self, n: int) -> np.ndarray:
         """Return for each row (rows,) the index of a row with the same non-zero entries, else its own index."""
         rows = np.arange(self.count(n))
-        return rows if self.projection is not None else rows % n + n * (len(self.blocks) - 1)
+        if self.projection is not None:
+            return rows
+        return rows % n + n * (len(self.blocks) - 1)
 
 
 def projected(name: str, projection: Projection, of: TorqueRows | None = None) -> TorqueRows:
     """Return torque rows that project other ones, by default those of the motors, onto fewer coordinates."""
-    return replace(MOTOR if of is None else of, name=name, projection=projection)
+    return replace(of or MOTOR, name=name, projection=projection)
 
 
 def torque_rows(name: str) -> TorqueRows:
@@ -229,7 +248,8 @@ def torque_rows(name: str) -> TorqueRows:
     return ROWS[name]
 
 
-_LINK, _MOTOR = frozenset({BODIES, "link"}), frozenset({"motor"})
+_LINK = frozenset({BODIES, "link"})
+_MOTOR = frozenset({"motor"})
 MOTOR = TorqueRows("motor", (_JointBlock("", _LINK | _MOTOR, motor=1.0),), "Ia Fv Fc off")
 LINK = TorqueRows("link", (_JointBlock("", _LINK, sensor=1.0, suffix=" sensor"),), "Fvl Fcl offl")
 BOTH = TorqueRows(
@@ -241,7 +261,8 @@ BOTH = TorqueRows(
     "Ia Fvl Fcl offl Fvm Fcm offm",
 )
 DRIVE = TorqueRows("drive", (_JointBlock("", _MOTOR, motor=1.0, sensor=-1.0),), "Ia Fvm Fcm offm")
-MODELS = {1: LINK, 2: BOTH, 3: DRIVE}  # as the 2019 paper numbers them
+MODELS = {1: LINK, 2: BOTH, 3: DRIVE}
+"""Torque rows as the 2019 paper numbers them."""
 
 
 def _power_of(q: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -251,4 +272,4 @@ def _power_of(q: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 POWER = projected("power", Projection(("power",), ("W",), _power_of))
 """One row: the power of all torques, vᵀ tau (the power identification model, Gautier 1997)."""
-ROWS = {one.name: one for one in (MOTOR, LINK, BOTH, DRIVE, POWER)}
+ROWS = {rows.name: rows for rows in (MOTOR, LINK, BOTH, DRIVE, POWER)}

@@ -116,7 +116,8 @@ def _independent(scaled: np.ndarray, groups: list[np.ndarray], silent: np.ndarra
             remainder = remainder - basis @ (basis.T @ remainder)
         # of columns of nearly equal norm the earlier enters first
         remainder = remainder * (1.0 - TIE * np.arange(len(candidates)) / len(candidates))
-        q, r, order = scipy.linalg.qr(remainder, mode="economic", pivoting=True)
+        factors = scipy.linalg.qr(remainder, mode="economic", pivoting=True)
+        q, r, order = (np.asarray(factor) for factor in factors)
         count = int(np.sum(np.abs(np.diag(r)) > tolerance))
         independent.extend(candidates[order[:count]])
         basis = np.hstack([basis, q[:, :count]])

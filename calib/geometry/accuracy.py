@@ -92,11 +92,10 @@ class Errors:
     def summary(self) -> ArmErrors:
         """Return the statistics of each kind of error in mm and deg."""
         factors = {nature: factor for nature, (factor, _) in ERRORS.items()}
-        return ArmErrors(
-            position_mm=statistics(self.position, factors["position"]),
-            orientation_deg=statistics(self.orientation, factors["orientation"]),
-            distance_mm=statistics(self.distance, factors["distance"]),
-        )
+        position = statistics(self.position, factors["position"])
+        orientation = statistics(self.orientation, factors["orientation"])
+        distance = statistics(self.distance, factors["distance"])
+        return ArmErrors(position, orientation, distance)
 
 
 def errors(cell: Installation, measured: Sequence[PoseMeasurements]) -> Errors:
@@ -112,11 +111,10 @@ def errors(cell: Installation, measured: Sequence[PoseMeasurements]) -> Errors:
             sizes[NATURE[part.label]].append(part.sizes())
         if isinstance(block.measured, Sockets) and not block.measured.links:
             sizes["distance"].append(_socket_spread(positions(cell, block), block.measured))
-    return Errors(
-        position=_concatenated(sizes["position"]),
-        orientation=_concatenated(sizes["orientation"]),
-        distance=_concatenated(sizes["distance"]),
-    )
+    position = _concatenated(sizes["position"])
+    orientation = _concatenated(sizes["orientation"])
+    distance = _concatenated(sizes["distance"])
+    return Errors(position, orientation, distance)
 
 
 def _concatenated(sizes: list[np.ndarray]) -> np.ndarray | None:
@@ -130,12 +128,10 @@ def statistics(sizes: np.ndarray | None, factor: float = 1.0) -> ErrorStatistics
     if sizes is None:
         return None
     scaled = factor * sizes
-    return ErrorStatistics(
-        mean=float(scaled.mean()),
-        rms=float(np.sqrt(np.mean(scaled**2))),
-        p95=float(np.percentile(scaled, 95)),
-        max=float(scaled.max()),
-    )
+    mean = float(scaled.mean())
+    rms = float(np.sqrt(np.mean(scaled**2)))
+    p95 = float(np.percentile(scaled, 95))
+    return ErrorStatistics(mean, rms, p95, float(scaled.max()))
 
 
 def rms_sigma(sizes: np.ndarray) -> float:

@@ -138,8 +138,10 @@ class ErrorModel:
         jacobian = project_out(jacobian, np.arange(frames))[frames:]
         values, vectors = np.linalg.eigh(self.covariance[np.ix_(stays, stays)])
         root = vectors * np.sqrt(np.clip(values, 0.0, None))
-        spread = root.T @ jacobian.reshape(len(root), 3 * len(block))
-        variance = np.sum(spread.reshape(len(root), 3, len(block)) ** 2, axis=(0, 1))
+        count = len(root)
+        spread = root.T @ jacobian.reshape(count, 3 * len(block))
+        spread = spread.reshape(count, 3, len(block))
+        variance = np.sum(spread**2, axis=(0, 1))
         radii = self.discrepancy.placed
         if radii is not None:
             sigma, radius = self._sigma_and_radius(variance, block.q, radii)
@@ -169,18 +171,25 @@ class ErrorModel:
         """Return the widening factors (m,) of intervals outside the ranges: in full beyond half the width of an end."""
         result = np.ones(len(q))
         for joint, (below, above) in enumerate(self.discrepancy.wider):
-            values = self.learnt[:, joint]
-            low, first, last, high = np.quantile(values, [0.0, END_SHARE, 1.0 - END_SHARE, 1.0])
-            ends = ((low - q[:, joint], first - low, below), (q[:, joint] - high, high - last, above))
-            for distance, width, factor in ends:
-                share = np.clip(2.0 * distance / max(width, 1e-9), 0.0, 1.0)
-                result = np.maximum(result, 1.0 + (factor - 1.0) * share)
+            levels = [0.0, END_SHARE, 1.0 - END_SHARE, 1.0]
+            low, first, last, high = np.quantile(self.learnt[:, joint], levels)
+            position = q[:, joint]
+            below_range = _widened(low - position, first - low, below)
+            above_range = _widened(position - high, high - last, above)
+            result = np.maximum(result, below_range)
+            result = np.maximum(result, above_range)
         return result
 
 
 def outside(q: np.ndarray, learnt: np.ndarray) -> np.ndarray:
     """Return a mask (m, n) of the joint values q (m, n) outside the range of the fitted poses (k, n)."""
     return np.asarray((q < learnt.min(axis=0)) | (q > learnt.max(axis=0)))
+
+
+def _widened(distance: np.ndarray, width: float, factor: float) -> np.ndarray:
+    """Return the widening (m,) of intervals at distances behind the end of a range: `factor` beyond half its width."""
+    share = np.clip(2.0 * distance / max(width, 1e-9), 0.0, 1.0)
+    return 1.0 + (factor - 1.0) * share
 
 
 def _position_part(parts: Sequence[Part]) -> Part:
@@ -233,8 +242,10 @@ def _joint_levers(chain: Chain, q: np.ndarray) -> np.ndarray:
     for joint in range(chain.n):
         change = np.zeros(chain.n)
         change[joint] = LEVER_STEP
-        motion = forward(chain, poses + change)[:, :3, 3] - forward(chain, poses - change)[:, :3, 3]
-        result[joint] = np.sqrt(np.mean(np.sum(motion**2, axis=1))) / (2.0 * LEVER_STEP)
+        ahead = forward(chain, poses + change)[:, :3, 3]
+        behind = forward(chain, poses - change)[:, :3, 3]
+        squares = np.sum((ahead - behind) ** 2, axis=1)
+        result[joint] = np.sqrt(np.mean(squares)) / (2.0 * LEVER_STEP)
     return np.maximum(result, MIN_LEVER)
 
 

@@ -20,7 +20,7 @@ an inverse, which no placement S, X brings to the arm's S A_i X.
 import math
 from collections.abc import Callable, Sequence
 from functools import singledispatch
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -36,7 +36,10 @@ from calib.robot.kinematics import forward
 from calib.transforms import from_quaternion, invert, orthonormal, pose
 from calib.units import DEG
 
-OPTICS: Point[Callable[[list[PoseMeasurements]], Any]] = Point(
+if TYPE_CHECKING:
+    from calib.data.images.optics import Optics
+
+OPTICS: "Point[Callable[[Sequence[Any]], Optics]]" = Point(
     "optics", "optics of kinds that are not the core's; loading it registers guesses and residuals"
 )
 
@@ -105,14 +108,17 @@ def misfit(arm: np.ndarray, measured: np.ndarray, station: np.ndarray, tool: np.
 
 def _differences(predicted: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the distance (m,) [m] and the angle (m,) [rad] between poses (m, 4, 4)."""
-    rotation = Rotation.from_matrix(np.swapaxes(predicted[:, :3, :3], 1, 2) @ measured[:, :3, :3])
-    distance = np.linalg.norm(predicted[:, :3, 3] - measured[:, :3, 3], axis=1)
-    return distance, rotation.magnitude()
+    predicted_transposed = np.swapaxes(predicted[:, :3, :3], 1, 2)
+    rotation = Rotation.from_matrix(predicted_transposed @ measured[:, :3, :3])
+    displacement = predicted[:, :3, 3] - measured[:, :3, 3]
+    return np.linalg.norm(displacement, axis=1), rotation.magnitude()
 
 
 def average_pose(poses: np.ndarray) -> np.ndarray:
     """Return the mean (4, 4) of poses (m, 4, 4): chordal mean of the rotations, median of the positions."""
-    return pose(orthonormal(poses[:, :3, :3].mean(axis=0)), np.median(poses[:, :3, 3], axis=0))
+    rotation = orthonormal(poses[:, :3, :3].mean(axis=0))
+    position = np.median(poses[:, :3, 3], axis=0)
+    return pose(rotation, position)
 
 
 def place_pose(arm: np.ndarray, measured: np.ndarray) -> Placements:
@@ -270,10 +276,12 @@ def install(chain: Chain, measured: Sequence[PoseMeasurements], known: Deflectio
         tool_names.update(dict.fromkeys(block.tool_names))
     if not station_names:
         station_names["station"] = None
+    placed_stations = [stations.get(name, np.eye(4)) for name in station_names]
+    placed_tools = [tools.get(name, np.eye(4)) for name in tool_names]
     return Installation(
         chain,
-        stations=np.array([stations.get(name, np.eye(4)) for name in station_names]),
-        tools=np.array([tools.get(name, np.eye(4)) for name in tool_names]),
+        stations=np.array(placed_stations),
+        tools=np.array(placed_tools),
         station_names=tuple(station_names),
         tool_names=tuple(tool_names),
         known=known or Deflection(),
@@ -319,7 +327,8 @@ def check_scale(block: PoseMeasurements, chain: Chain) -> None:
 
 def _spread(positions: np.ndarray) -> tuple[float, float]:
     """Return the standard deviation of positions (m, 3), over all axes and across their principal line [m]."""
-    sizes = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False) / np.sqrt(len(positions))
+    centred = positions - positions.mean(axis=0)
+    sizes = np.linalg.svd(centred, compute_uv=False) / np.sqrt(len(positions))
     return float(np.linalg.norm(sizes)), float(sizes[1])
 
 
@@ -432,7 +441,8 @@ def _linear_offset(rotation: np.ndarray, position: np.ndarray, measured: np.ndar
         rows[:, axis, 3 * axis : 3 * axis + 3] = measured - centre
     rows[:, :, 9:12] = np.eye(3)
     rows[:, :, 12:] = -rotation
-    return np.linalg.lstsq(rows.reshape(-1, 15), position.reshape(-1), rcond=1e-6)[0][12:]
+    solution = np.linalg.lstsq(rows.reshape(-1, 15), position.reshape(-1), rcond=1e-6)[0]
+    return solution[12:]
 
 
 def _align(points: np.ndarray, measured: np.ndarray) -> np.ndarray:

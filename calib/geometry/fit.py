@@ -165,24 +165,6 @@ def _estimated(cell: Installation, split: ColumnSplit, candidates: np.ndarray) -
     return np.union1d(np.intersect1d(effective, arm), candidates[split.kept])
 
 
-def _enough(cell: Installation, blocks: list[Block], unknowns: int, min_numbers: float = 1.5) -> None:
-    """Raise an error for fewer than `min_numbers` measured numbers per unknown: such a fit could not be checked.
-
-    `min_numbers`: measured numbers per unknown at least (our choice).
-    """
-    parts = [part for block in blocks for part in observe(cell, block, np.array([], dtype=int))]
-    numbers = sum(part.value.size - part.nuisances for part in parts)
-    if numbers < min_numbers * unknowns:
-        poses = sum(len(block.measured) for block in blocks)
-        needed = math.ceil(min_numbers * unknowns * poses / max(numbers, 1))
-        refuse_data(
-            blocks[0].measured.file,
-            f"{poses} poses are too few: {unknowns} unknowns and a check of the fit need at least {needed} poses, "
-            "the full geometry 20 to 40; measure more, or choose a smaller model ('offsets' or "
-            "'frames')",
-        )
-
-
 def _scale_reference(cell: Installation, split: ColumnSplit, candidates: np.ndarray) -> np.ndarray:
     """Return the arm's longest length and the parameters that merge with it; empty for an arm without lengths.
 

@@ -164,7 +164,9 @@ def _step_within_limits(
     """Return damped joint steps (m, n); a joint that would exceed its limit stops there, and the others compensate."""
     step = _damped(jacobian, error, damping)
     for _ in range(q.shape[1]):
-        stopped = ((q <= goal.lower) & (step < 0.0)) | ((q >= goal.upper) & (step > 0.0))
+        below = (q <= goal.lower) & (step < 0.0)
+        above = (q >= goal.upper) & (step > 0.0)
+        stopped = below | above
         if not stopped.any():
             break
         jacobian = np.where(stopped[:, None, :], 0.0, jacobian)
@@ -220,7 +222,8 @@ def held_back(goal: Goal, targets: np.ndarray, start: np.ndarray, max_change: fl
             error, jacobian = _weighted(goal, q, targets[open_rows])
             transposed = np.swapaxes(jacobian, 1, 2)
             square = transposed @ jacobian + weight**2 * np.eye(q.shape[1])
-            gradient = (transposed @ error[:, :, None])[:, :, 0] + weight**2 * (start[open_rows] - q)
+            gradient = (transposed @ error[:, :, None])[:, :, 0]
+            gradient = gradient + weight**2 * (start[open_rows] - q)
             step = np.linalg.solve(square, gradient[:, :, None])[:, :, 0]
             q = np.clip(q + step, goal.lower, goal.upper)
         within = np.abs(q - start[open_rows]).max(axis=1) <= max_change
@@ -233,6 +236,7 @@ def held_back(goal: Goal, targets: np.ndarray, start: np.ndarray, max_change: fl
 
 def conditions(goal: Goal, q: np.ndarray) -> np.ndarray:
     """Return the ratio of smallest to largest singular value of each Jacobian (m,): 0 at a singularity."""
-    jacobian = _weighted(goal, q, np.broadcast_to(np.eye(4), (len(q), 4, 4)))[1]
+    no_targets = np.broadcast_to(np.eye(4), (len(q), 4, 4))
+    _, jacobian = _weighted(goal, q, no_targets)
     values = np.linalg.svd(jacobian, compute_uv=False)
     return values[:, -1] / np.maximum(values[:, 0], 1e-300)

@@ -88,13 +88,16 @@ class Unevenness:
         # per joint, hat functions at its knots, times the root of their prior covariance
         columns = [np.ones((len(q), 1))]
         for joint in self.moving:
-            hats = [np.interp(q[:, joint], self.knots[:, joint], unit) for unit in np.eye(KNOTS)]
+            position = q[:, joint]
+            knots = self.knots[:, joint]
+            hats = [np.interp(position, knots, unit) for unit in np.eye(KNOTS)]
             columns.append(np.stack(hats, axis=1) @ root)
         self.columns = np.concatenate(columns, axis=1)
         mean = self.columns[:, 1:].mean(axis=0)
         self.columns[:, 1:] -= mean
         self.bases = [root - means for means in mean.reshape(-1, KNOTS)]
-        self.groups = np.concatenate([[-1], np.repeat(np.arange(len(self.moving)), KNOTS)])
+        group_of_knot = np.repeat(np.arange(len(self.moving)), KNOTS)
+        self.groups = np.concatenate([[-1], group_of_knot])
         least = max(MIN_SQUARE * np.median(squares), 1e-300)
         self.logs = np.log(np.maximum(squares, least))
         self.data = gram(self.logs, self.columns)
@@ -162,9 +165,10 @@ class LeftOut:
         fold = np.repeat(np.arange(len(folds)), [len(errors) for errors in folds])
         distances = rows[:, 2:4]
         joint_of_fold = np.array([-1] * len(near) + list(joints))
+        shapes = np.column_stack([rows[:, 1], np.ones(len(rows)), distances])
         return cls(
             squares=rows[:, 0],
-            shapes=np.column_stack([rows[:, 1], np.ones(len(rows)), distances]),
+            shapes=shapes,
             away=distances.sum(axis=1),
             pose=rows[:, 4].astype(int),
             fold=fold,

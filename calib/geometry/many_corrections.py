@@ -48,7 +48,8 @@ def row_statistics(
         for part, scale in zip(observe(cell, piece, grouping.observed), scales):
             m = part.value.shape[1]
             residual, matrix = part.whitened(scale[:, start : start + m])
-            columns = np.concatenate([matrix.T, residual[None]]).reshape(-1, len(part.value), m)
+            columns = np.concatenate([matrix.T, residual[None]])
+            columns = columns.reshape(-1, len(part.value), m)
             elements = columns[single:-1]
             singles = np.delete(columns, slice(single, -1), axis=0)
             flat = singles.reshape(len(singles), -1)
@@ -64,7 +65,8 @@ def row_statistics(
                     across = (bases[k] * along[j]) @ bases[j].T
                     square[np.ix_(group, second)] = across
                     square[np.ix_(second, group)] = across.T
-            yield part, Gram(square[:-1, :-1], square[:-1, -1], float(square[-1, -1]), part.value.size)
+            total = float(square[-1, -1])
+            yield part, Gram(square[:-1, :-1], square[:-1, -1], total, part.value.size)
         start += len(piece.measured)
 
 
@@ -92,12 +94,14 @@ def position_variances(
         variance = np.einsum("cim,cim->m", spread.reshape(singles.shape), singles)
         bases = [np.asarray(block.bases)[numbers] for numbers in grouping.numbers]
         for k, group in enumerate(grouping.groups):
-            across = covariance[np.ix_(group, single)] @ np.einsum("im,cim->cm", elements[k], singles)
+            by_singles = np.einsum("im,cim->cm", elements[k], singles)
+            across = covariance[np.ix_(group, single)] @ by_singles
             along = np.einsum("im,cim->cm", elements[k], elements)
             for j in range(k + 1):
                 # pairs of two groups count twice, those of one group once
                 factor = 0.5 if j == k else 1.0
-                across += factor * along[j] * (covariance[np.ix_(group, grouping.groups[j])] @ bases[j])
+                spread = covariance[np.ix_(group, grouping.groups[j])] @ bases[j]
+                across += factor * along[j] * spread
             variance += 2.0 * np.einsum("cm,cm->m", bases[k], across)
         result[rows] = np.maximum(variance, 0.0)
     return result
@@ -131,9 +135,6 @@ def _grouped(cell: Installation, free: np.ndarray) -> Grouping:
     corrected_often = elements[counts >= MANY]
     groups = [np.flatnonzero(element == number) for number in corrected_often]
     single = np.flatnonzero(~np.isin(element, corrected_often) | ~is_correction)
-    return Grouping(
-        observed=np.concatenate([free[single], corrected_often]),
-        single=single,
-        groups=groups,
-        numbers=[numbers[group] for group in groups],
-    )
+    observed = np.concatenate([free[single], corrected_often])
+    group_numbers = [numbers[group] for group in groups]
+    return Grouping(observed, single, groups, group_numbers)

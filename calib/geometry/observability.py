@@ -100,7 +100,9 @@ def _at_nominal(fit: GeometricFit) -> list[Finding]:
     spread = np.where(np.isfinite(fit.prior), fit.prior, 0.0)
     prior_sigma = np.sqrt((combinations**2) @ spread**2)
     base = fit.base
-    loose = (fit.base_sigma() > NEAR_PRIOR * prior_sigma) & np.isin(base, table.index("arm")) & (prior_sigma > 0.0)
+    in_arm = np.isin(base, table.index("arm"))
+    near_prior = fit.base_sigma() > NEAR_PRIOR * prior_sigma
+    loose = near_prior & in_arm & (prior_sigma > 0.0)
     names = [table.names[k] for k in base[loose]]
     if not names:
         return []

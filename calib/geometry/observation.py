@@ -83,12 +83,11 @@ def layout(cell: Installation) -> ParameterLayout:
     element_units = dict(zip(chain.names, chain.units))
     term_units = [element_units[term.element] + TERM_UNITS.get(term.basis, "") for term in cell.deflection.terms]
     first_of_optics = len(chain.elements) + len(frame_names)
-    return ParameterLayout(
-        names=(*chain.names, *frame_names, *cell.optics.names, *cell.deflection.names(chain)),
-        units=(*chain.units, *frame_units, *cell.optics.units, *term_units),
-        kinds=tuple(np.repeat(KINDS, layout_counts(cell)).tolist()),
-        moving=tuple((first_of_optics + cell.optics.moving).tolist()),
-    )
+    names = (*chain.names, *frame_names, *cell.optics.names, *cell.deflection.names(chain))
+    units = (*chain.units, *frame_units, *cell.optics.units, *term_units)
+    kinds = np.repeat(KINDS, layout_counts(cell))
+    moving = first_of_optics + cell.optics.moving
+    return ParameterLayout(names, units, tuple(kinds.tolist()), tuple(moving.tolist()))
 
 
 def families(cell: Installation) -> np.ndarray:
@@ -115,13 +114,10 @@ def step(cell: Installation, free: np.ndarray, change: np.ndarray) -> Installati
     instruments = cell.optics
     if optics.any():
         instruments = instruments.with_values(instruments.values + optics)
+    placed_stations = _displaced(cell.stations, stations.reshape(-1, 6))
+    placed_tools = _displaced(cell.tools, tools.reshape(-1, 6))
     return replace(
-        cell,
-        chain=chain,
-        stations=_displaced(cell.stations, stations.reshape(-1, 6)),
-        tools=_displaced(cell.tools, tools.reshape(-1, 6)),
-        deflection=deflection,
-        optics=instruments,
+        cell, chain=chain, stations=placed_stations, tools=placed_tools, deflection=deflection, optics=instruments
     )
 
 
@@ -377,6 +373,8 @@ def pose_sigmas(
         rows = np.arange(start, min(start + CHUNK, len(measured)))
         block = rows_of(cell, poses, rows)
         jacobian = target_jacobian(cell, predict(cell, block), free, station, block.tool, block.bases)
-        spread = (root.T @ jacobian.reshape(len(free), -1)).reshape(len(root), 2, 3, len(rows))
-        result.append(np.sqrt(np.sum(spread**2, axis=(0, 2))).T)
+        spread = root.T @ jacobian.reshape(len(free), -1)
+        spread = spread.reshape(len(root), 2, 3, len(rows))
+        variances = np.sum(spread**2, axis=(0, 2))
+        result.append(np.sqrt(variances).T)
     return np.concatenate(result)

@@ -442,11 +442,15 @@ class Weigher:
         dof = max(rows - len(self.free) + round(resting), 1)
         pull = self._pull(state)
         variance = max(solution.cost - float(pull @ pull), 0.0) / dof
+        names = tuple(table.names[k] for k in self.free)
+        units = tuple(table.units[k] for k in self.free)
+        values = parameter_values(state)[self.free]
+        covariance_of_fit = self._posterior(solution.factor, variance)
         estimate = Estimate(
-            names=tuple(table.names[k] for k in self.free),
-            units=tuple(table.units[k] for k in self.free),
-            values=parameter_values(state)[self.free],
-            covariance=self._posterior(solution.factor, variance),
+            names=names,
+            units=units,
+            values=values,
+            covariance=covariance_of_fit,
             residual_std=float(np.sqrt(variance)),
             dof=dof,
         )

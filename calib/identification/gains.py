@@ -179,12 +179,15 @@ def identify_gains(
         # Derivatives by the logarithms of the gains.
         by_gain = np.zeros((n, factors.shape[1], n))
         by_gain[moving, :, moving] = -torque[moving] / gains[moving, None]
-        rows = np.concatenate([columns / gains[:, None, None], by_gain, residual[:, :, None]], axis=2)
-        rows = rows / (std * np.sqrt(inflation))[:, None, None]
+        by_x = columns / gains[:, None, None]
+        rows = np.concatenate([by_x, by_gain, residual[:, :, None]], axis=2)
+        noise = std * np.sqrt(inflation)
+        rows = rows / noise[:, None, None]
         triangle = retriangulate(rows.reshape(-1, rows.shape[2]))
         upper = triangle[:-1, :-1]
         step = -np.linalg.lstsq(upper, triangle[:-1, -1], rcond=1e-12)[0]
-        x_step, gain_step = step[: len(free)], step[len(free) :]
+        x_step = step[: len(free)]
+        gain_step = step[len(free) :]
         largest = float(np.abs(gain_step).max())
         size = min(1.0, MAX_LOG_STEP / max(largest, 1e-12))
         x = x + size * x_step
@@ -299,7 +302,7 @@ def _start(columns: np.ndarray, load: np.ndarray, current: np.ndarray) -> np.nda
     for joint in range(n):
         matrix[joint, :, joint] = current[joint]
     matrix[:, :, n:] = -columns
-    solution = np.linalg.lstsq(matrix.reshape(-1, n + p), load.ravel(), rcond=1e-12)[0]
+    solution, *_ = np.linalg.lstsq(matrix.reshape(-1, n + p), load.ravel(), rcond=1e-12)
     gains = np.abs(solution[:n])
     median = float(np.median(gains))
     return np.where(gains > MIN_START * median, gains, max(median, 1e-3))
@@ -309,4 +312,5 @@ def _parameters(columns: np.ndarray, load: np.ndarray, current: np.ndarray, gain
     """Return the least-squares parameters (p,) at these gains."""
     matrix = columns / gains[:, None, None]
     target = current - load / gains[:, None]
-    return np.linalg.lstsq(matrix.reshape(-1, columns.shape[2]), target.ravel(), rcond=1e-12)[0]
+    x, *_ = np.linalg.lstsq(matrix.reshape(-1, columns.shape[2]), target.ravel(), rcond=1e-12)
+    return x

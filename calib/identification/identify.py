@@ -27,10 +27,17 @@ from calib.identification.methods.method import IdentificationProblem, Method, M
 from calib.identification.prediction import Dynamics, Model, predict
 from calib.identification.prior import TEMPERING, FirstFit, Prior, find_prior, first_fit, rods, tempered_prior
 from calib.identification.registry import METHODS, method_named
-from calib.identification.rows import Case, ObservationRows, observe, observe_terms, with_blocks
+from calib.identification.rows import Case, ObservationRows, observe, observe_terms, pool, triangulate, with_blocks
 from calib.identification.settings import IdentificationSettings, make_model, require_usable
-from calib.identification.standstill import with_standstills, with_weights
-from calib.identification.time_folds import regimes
+from calib.identification.standstill import (
+    CLEARLY_LESS,
+    LESS,
+    left_out_error,
+    with_slowness,
+    with_standstills,
+    with_weights,
+)
+from calib.identification.time_folds import estimate, regimes
 from calib.robot.calibrated import CalibratedChain, as_calibrated
 from calib.robot.chain import Chain
 
@@ -172,17 +179,31 @@ def identify_model(
     decimator = common_decimator(cases, settings)
 
     say("observation matrix")
-    rows = _observed(model, base, cases, decimator, settings, method)
+    rows_as_moving, rows = _observed(model, base, cases, decimator, settings, method)
 
     say("first fit")
     robot, source = (shape, "sizes") if cad is None else (cad, "cad")
     find = partial(find_prior, model, base, robot=robot, source=source, noise=noise, effort=effort)
-    prior = None
-    if _takes_prior(method, model, settings, source):
-        prior = find(rows)
-        rows = with_weights(rows, prior.first.rest_weights)
-        prior = tempered_prior(find, prior, rows, regimes(rows, cases, decimator))
+    takes_prior = _takes_prior(method, model, settings, source)
+    prior = find(rows) if takes_prior else None
     first = first_fit(rows, noise) if prior is None else prior.first
+    rows = with_weights(rows, first.rest_weights)
+    marks_standstills = isinstance(method, LeastSquares) and isinstance(model, IdentificationModel)
+    if any(part.standing.any() for part in rows):
+        prior_as_moving = find(rows_as_moving) if takes_prior else None
+        first_as_moving = first_fit(rows_as_moving, noise) if prior_as_moving is None else prior_as_moving.first
+        prior_rows = None if prior is None else prior.rows
+        prior_rows_as_moving = None if prior_as_moving is None else prior_as_moving.rows
+        error = left_out_error(rows, rows, first.std, first.inflation, prior_rows, settings.apart)
+        error_as_moving = left_out_error(
+            rows_as_moving, rows, first_as_moving.std, first_as_moving.inflation, prior_rows_as_moving, settings.apart
+        )
+        if error_as_moving < CLEARLY_LESS**2 * error:
+            rows, prior, first = rows_as_moving, prior_as_moving, first_as_moving
+            marks_standstills = False
+    if prior is not None:
+        prior = tempered_prior(find, prior, rows, regimes(rows, cases, decimator))
+        first = prior.first
     rows = with_weights(rows, first.rest_weights)
 
     friction, loads = _richer_friction(model, base, rows, cases, decimator, first, prior, settings, progress)
@@ -190,9 +211,23 @@ def identify_model(
     for part, case, load in zip(rows, cases, loads):
         columns = observe_terms(friction.terms, case, decimator, load, model.torque_rows)
         richer_rows.append(part.extend(friction.terms, columns))
-    if prior is not None and friction.terms:
+    groups = np.array(friction.groups, dtype=int)
+    if prior is not None and marks_standstills:
+        # richer friction explains slow motion, too: its residuals count
+        data = pool(triangulate(richer_rows), richer_rows[0].target.shape[1])
+        inflation = prior.tempering * first.inflation
+        column_groups = np.concatenate([np.full(base.b, -1), groups])
+        prior_rows = prior.widened(len(groups))
+        values, _ = estimate(data, first.std, inflation, column_groups, prior_rows)
+        weighed = with_slowness(richer_rows, cases, decimator, model.torque_rows, values)
+        error = left_out_error(richer_rows, richer_rows, first.std, inflation, prior_rows, settings.apart)
+        error_weighed = left_out_error(weighed, richer_rows, first.std, inflation, prior_rows, settings.apart)
+        if error_weighed < LESS**2 * error:
+            richer_rows = weighed
+    slow_rows_weighed = any((part.slowness < 1.0).any() for part in richer_rows)
+    if prior is not None and (friction.terms or slow_rows_weighed):
         say("sizes beside richer friction")
-        prior = find(richer_rows, groups=np.array(friction.groups), start=prior, tempering=prior.tempering)
+        prior = find(richer_rows, groups=groups, start=prior, tempering=prior.tempering)
         richer_rows = with_weights(richer_rows, prior.first.rest_weights)
 
     base_terms = [None if column < model.inertial else model.columns[column - model.inertial] for column in base.kept]
@@ -220,8 +255,8 @@ def _observed(
     decimator: Decimator,
     settings: IdentificationSettings,
     method: Method,
-) -> list[ObservationRows]:
-    """Return the rows of all cases in the base columns: time blocks numbered, standstills marked.
+) -> tuple[list[ObservationRows], list[ObservationRows]]:
+    """Return the rows of all cases in the base columns, time blocks numbered: as they are, and standstills marked.
 
     Raises:
         MeasurementError: for fewer rows than twice the base parameters.
@@ -230,6 +265,7 @@ def _observed(
     rows = with_blocks(rows, settings.folds)
     if model.torque_rows == POWER and len(cases) > 1:
         rows = [part.by_recording(number, len(cases)) for number, part in enumerate(rows)]
+    rows_as_moving = rows
     if isinstance(method, LeastSquares) and isinstance(model, IdentificationModel):
         width = np.array(per_joint(settings.v0, cases[0].motion.n, "v0"))
         rows = with_standstills(rows, cases, decimator, model, base.kept, width)
@@ -239,7 +275,7 @@ def _observed(
         "record longer, or raise the identification band ([filter] band)"
     )
     require(count >= 2 * base.b, message, MeasurementError)
-    return rows
+    return rows_as_moving, rows
 
 
 def _identified(
@@ -250,7 +286,9 @@ def _identified(
     say: Progress,
 ) -> Identification[RegressorModel]:
     """Return the identification of a problem by a method: estimate, test of its loop, ripple, essential parameters."""
-    model, base, cases = problem.model, problem.base, problem.cases
+    model = problem.model
+    base = problem.base
+    cases = problem.cases
     say("simulating the closed loop" if method.needs_controller else "estimate")
     fit = method.estimate(problem)
     values = fit.estimate.values

@@ -61,8 +61,10 @@ from calib.errors import Finding, refuse_option, require
 from calib.records import Array, Number, Unbounded, frozen, stored
 
 T = TypeVar("T")
-MAX_SHIFT_SIGMAS = 3.0  # standard deviations of a shift that does not matter, however surely it is there (our choice)
-FREQUENCY, DAMPING = 5.0, 0.7  # [Hz] and 1, of a controller that is not stated
+MAX_SHIFT_SIGMAS = 3.0
+"""Standard deviations of a shift that does not matter, however surely it is there (our choice)."""
+FREQUENCY, DAMPING = 5.0, 0.7
+"""Natural frequency [Hz] and damping of a controller that is not stated."""
 FEEDBACK, CAD, IDENTIFIED, FLOOR = "feedback", "cad", "model", "floor"  # what is fed forward; the floor: measured
 
 CONTROLLERS = ("pd", "cascade", "identify")

@@ -173,7 +173,10 @@ def score(
     """
     motion = case.motion
     moves = moving(motion) if slow is None else moving(motion, slow)
-    sums, above, explained, residuals = [], [], [], []
+    sums = []
+    above = []
+    explained = []
+    residuals = []
     for row in range(case.target.shape[1]):
         row_moves = moves[:, row % motion.n]
         row_sums, row_above, row_explained, residual = _score_row(case, np.asarray(predicted)[:, row], row, row_moves)
@@ -225,28 +228,11 @@ def _score_row(
     return np.array(sums), above, r_squared(target[valid], residual[valid]), thinned
 
 
-def _row(
-    case: Case, predicted: np.ndarray, k: int, known: np.ndarray, moves: np.ndarray
-) -> tuple[np.ndarray, float, float, np.ndarray]:
-    """Return the sums of one torque row for a score; rows are processed one by one to save memory.
-
-    Returns:
-        (4, 3) Σ (τ - τ̂)², Σ τ² and their number of all samples, raw and in the band, of moving and of standing ones;
-        `Score.above_band_percent` and `Score.r_squared` of the row; (M,) the residual in the band, thinned.
-    """
-    motion, target = case.motion, case.target[:, k]
-    low = motion.in_band(np.stack([target, predicted], axis=1))
-    residual, own = target - predicted, low[:, 0] - low[:, 1]
-    sums = [_sums(target, residual, known), _sums(low[:, 0], own, known)]
-    sums += [_sums(target, residual, known & moves), _sums(target, residual, known & ~moves)]
-    size = float(np.linalg.norm(target))
-    above = 100.0 * float(np.linalg.norm(target - low[:, 0])) / size if size > 0.0 else 0.0
-    return np.array(sums), above, r_squared(target[known], residual[known]), own[:: motion.decimator.factor]
-
-
 def _sums(target: np.ndarray, residual: np.ndarray, selected: np.ndarray) -> tuple[float, float, float]:
     """Return Σ (τ - τ̂)², Σ τ² and the number of some samples."""
-    return float(np.sum(residual[selected] ** 2)), float(np.sum(target[selected] ** 2)), float(selected.sum())
+    residual_square = float(np.sum(residual[selected] ** 2))
+    target_square = float(np.sum(target[selected] ** 2))
+    return residual_square, target_square, float(selected.sum())
 
 
 def _prediction_errors(sums: np.ndarray, apart: Sequence[int]) -> PredictionErrors:
@@ -305,6 +291,8 @@ def predict(dynamics: Dynamics[RegressorModel], case: Case) -> np.ndarray:
     result = np.empty((len(motion), model.rows))
     for start in range(0, len(motion), BLOCK):
         part = slice(start, start + BLOCK)
-        q, v, a = motion.q[part], motion.v[part], motion.a[part]
+        q = motion.q[part]
+        v = motion.v[part]
+        a = motion.a[part]
         result[part] = model.torque(dynamics.values, q, v, a, case.carried, states[:, part], **case.deflected(part))
     return result

@@ -220,7 +220,8 @@ def find_prior(
     t = np.array(sizes.centre)
     values = np.zeros(len(columns))
     if start is not None:
-        std, inflation = start.first.std, start.first.inflation
+        std = start.first.std
+        inflation = start.first.inflation
         for name, size in start.sizes.items():
             t[sizes.names.index(name)] = np.log(size)
     for _ in range(ROUNDS):
@@ -257,7 +258,8 @@ def first_fit(rows: Sequence[ObservationRows], noise: np.ndarray | None = None) 
     row_count = rows[0].target.shape[1]
     parts = divided(rows)
     rest_weights = rows[0].rest
-    std, inflation = np.ones(row_count), np.ones(row_count)
+    std = np.ones(row_count)
+    inflation = np.ones(row_count)
     values = np.zeros(parts.moving.parameters)
     for _ in range(FIRST_FIT_ROUNDS):
         data = parts.joined(rest_weights)
@@ -296,7 +298,8 @@ def weighing(
     squares = np.sum((data.factors @ np.append(values, -1.0)) ** 2, axis=1)
     freedom = np.maximum(data.rows - inflation * parameters_of_row, 0.1 * counts)
     std = np.sqrt(squares / freedom)
-    torque_rms = np.sqrt(np.sum(data.factors[:, :, -1] ** 2, axis=1) / counts)
+    torque_squares = np.sum(data.factors[:, :, -1] ** 2, axis=1)
+    torque_rms = np.sqrt(torque_squares / counts)
     std = np.maximum(std, MIN_NOISE * max(float(torque_rms.max()), 1e-300))
     return scaled(noise, std, data.rows), inflation
 

@@ -131,9 +131,11 @@ def case_names(paths: Sequence[str]) -> tuple[str, ...]:
 
 
 def _file(path: str) -> str:
+    """Return the name of a recording's file without its folder and cut."""
     from calib.data.recordings.recording import parse_cut
 
-    return parse_cut(path)[0].replace("\\", "/").rstrip("/").rsplit("/", 1)[-1]
+    file, *_ = parse_cut(path)
+    return file.replace("\\", "/").rstrip("/").rsplit("/", 1)[-1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,6 +166,7 @@ class ObservationRows:
         rate: sampling rate [Hz].
         standing: (M, rows) share of its standstill that each row is; 0 in motion.
         swing: (M, rows) range of the torque in that standstill [N m or N]; 0 in motion.
+        slowness: (M, rows) factor of each row in motion: less than 1 where its joint is slow and the model errs more.
         rest: weights of standstills.
         coulomb: (rows, p) columns that are Coulomb friction of a torque row.
     """
@@ -177,6 +180,7 @@ class ObservationRows:
     rate: float
     standing: np.ndarray
     swing: np.ndarray
+    slowness: np.ndarray
     rest: RestWeights
     coulomb: np.ndarray
 
@@ -184,7 +188,7 @@ class ObservationRows:
     def weight(self) -> np.ndarray:
         """Factor (M, rows) that rows are multiplied by in estimates: 1 in motion, less at rest, 0 where not used."""
         at_rest = np.sqrt(self._frictions * self.rest.worth)
-        return np.where(self.standing > 0.0, at_rest, 1.0) * self.present
+        return np.where(self.standing > 0.0, at_rest, self.slowness) * self.present
 
     @property
     def counted(self) -> np.ndarray:
@@ -209,6 +213,7 @@ class ObservationRows:
             present=self.present & filled,
             standing=np.repeat(self.standing, count, axis=1),
             swing=np.repeat(self.swing, count, axis=1),
+            slowness=np.repeat(self.slowness, count, axis=1),
             rest=_no_rest(count),
             coulomb=np.repeat(self.coulomb, count, axis=0),
         )
@@ -246,7 +251,8 @@ def observe(model: RegressorModel, columns: np.ndarray, case: Case, decimator: D
     source = model.torque_rows.repeated(motion.n)
     is_source = source[entry_row] == entry_row
     filtered_row, filtered_column = entry_row[is_source], entry_column[is_source]
-    copied_row, copied_column = entry_row[~is_source], entry_column[~is_source]
+    copied_row = entry_row[~is_source]
+    copied_column = entry_column[~is_source]
     model_column = columns[filtered_column]
 
     # Transposed, because readers take the columns of one row.
@@ -274,9 +280,11 @@ def observe(model: RegressorModel, columns: np.ndarray, case: Case, decimator: D
     matrix[:, copied_row, copied_column] = matrix[:, source[copied_row], copied_column]
 
     target = decimate(case.target, decimator, segment)
+    names = tuple(model.names[column] for column in columns)
+    units = tuple(model.units[column] for column in columns)
     return ObservationRows(
-        names=tuple(model.names[column] for column in columns),
-        units=tuple(model.units[column] for column in columns),
+        names=names,
+        units=units,
         matrix=matrix,
         target=target,
         present=thinned(case.present, segment, decimator),
@@ -284,6 +292,7 @@ def observe(model: RegressorModel, columns: np.ndarray, case: Case, decimator: D
         rate=motion.rate / decimator.factor,
         standing=np.zeros(target.shape),
         swing=np.zeros(target.shape),
+        slowness=np.ones(target.shape),
         rest=_no_rest(model.rows),
         coulomb=np.zeros((model.rows, len(columns)), dtype=bool),
     )
@@ -314,7 +323,8 @@ def observe_terms(
 
     One column at a time at the full rate: an hour of all friction there is would fill 15 GB.
     """
-    segment, n = case.motion.segment, case.motion.n
+    segment = case.motion.segment
+    n = case.motion.n
     sample_count = len(kept(segment, decimator))
     columns = np.zeros((sample_count, torque_rows.count(n), len(terms)))
     for k, term in enumerate(terms):
@@ -327,7 +337,8 @@ def observe_terms(
 def term_columns(term: DriveTerm, case: Case, load: np.ndarray | None = None) -> Iterator[tuple[int, np.ndarray]]:
     """Yield the torque rows that a drive term acts on, each with its column (N,) at the full rate."""
     motion = case.motion
-    motions = [motion.q.T, motion.v.T, motion.a.T, None if load is None else load.T]
+    load_of_joints = None if load is None else load.T
+    motions = [motion.q.T, motion.v.T, motion.a.T, load_of_joints]
     return term.acting(motions, segmented_states([term], case))
 
 
@@ -340,7 +351,8 @@ def segmented_states(terms: Sequence[DriveTerm], case: Case) -> np.ndarray:
 
 def segments(segment: np.ndarray) -> list[tuple[int, int]]:
     """Return (start, stop) of each run of equal numbers in an array."""
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(segment)) + 1, [len(segment)]])
+    changes = np.flatnonzero(np.diff(segment)) + 1
+    edges = np.concatenate([[0], changes, [len(segment)]])
     return list(pairwise(edges.tolist()))
 
 
@@ -359,7 +371,8 @@ def with_blocks(all_rows: Sequence[ObservationRows], count: int) -> list[Observa
             case_blocks = max(1, round(count * size / max(total, 1)))
         number = first + (np.arange(size) * case_blocks) // max(size, 1)
         cuts = np.flatnonzero(np.diff(number)) + 1
-        distance = np.abs(np.arange(size)[:, None] - cuts[None, :]).min(axis=1, initial=size)
+        distances = np.abs(np.arange(size)[:, None] - cuts[None, :])
+        distance = distances.min(axis=1, initial=size)
         numbered.append(replace(rows, block=np.where(distance <= CUT_MARGIN, -1, number)))
         first += case_blocks
     return numbered
@@ -371,7 +384,8 @@ def triangulate(all_rows: Sequence[ObservationRows]) -> Triangles:
     The last block holds the samples beside cuts. Rows of standstills have their weights.
     """
     row_count = all_rows[0].target.shape[1]
-    block_count = 1 + max((int(rows.block.max(initial=-1)) for rows in all_rows), default=-1)
+    last_blocks = [int(rows.block.max(initial=-1)) for rows in all_rows]
+    block_count = 1 + max(last_blocks, default=-1)
     result = empty(all_rows[0].names, all_rows[0].units, (block_count + 1) * row_count)
     counts = np.zeros(result.groups)
     for rows in all_rows:
@@ -379,8 +393,9 @@ def triangulate(all_rows: Sequence[ObservationRows]) -> Triangles:
         for row in range(row_count):
             present = rows.present[:, row]
             group = block[present] * row_count + row
-            matrix, target = rows.matrix[present, row], rows.target[present, row]
-            if rows.standing[:, row].any():
+            matrix = rows.matrix[present, row]
+            target = rows.target[present, row]
+            if rows.standing[:, row].any() or (rows.slowness[:, row] < 1.0).any():
                 weight = rows.weight[present, row]
                 matrix = matrix * weight[:, None]
                 target = target * weight
@@ -403,7 +418,9 @@ def pool(data: Triangles, rows: int, blocks: Sequence[int] | None = None) -> Tri
 def _regressor(model: RegressorModel, case: Case, part: slice, states: np.ndarray) -> np.ndarray:
     """Return the regressor (N_i, rows, p) at a part of the samples."""
     motion = case.motion
-    q, v, a = motion.q[part], motion.v[part], motion.a[part]
+    q = motion.q[part]
+    v = motion.v[part]
+    a = motion.a[part]
     return model.regressor(q, v, a, None, case.carried, states[:, part], **case.deflected(part))
 
 
@@ -420,7 +437,8 @@ def power_block(
     motion = case.motion
     start = max(segment.start, part.start - DIFFERENCE_REACH)
     stop = min(segment.stop, part.stop + DIFFERENCE_REACH)
-    energies = model.energy_columns(motion.q[start:stop], motion.v[start:stop], case.carried)[:, columns]
+    all_energies = model.energy_columns(motion.q[start:stop], motion.v[start:stop], case.carried)
+    energies = all_energies[:, columns]
     power = slope(energies, motion.rate)
     plain_power = np.zeros_like(energies)
     if len(energies) > 1:
@@ -428,7 +446,8 @@ def power_block(
     power = np.where(np.isfinite(power), power, plain_power)
     power = power[part.start - start :][: part.stop - part.start].T
 
-    q, v = motion.q[part], motion.v[part]
+    q = motion.q[part]
+    v = motion.v[part]
     regressor = model.regressor(q, v, np.zeros_like(v), None, case.carried, states[:, part])
     losses = regressor.transpose(2, 1, 0)[columns, 0]
     stores_energy = []

@@ -18,6 +18,10 @@ values, reach = 2 √3 √(f² + τ s²), the width of an even distribution of t
 Reversals pass through zero speed and stay rows as others: shorter than `MIN_STANDSTILL`, or, of slow motion, as often
 at one small speed as at another, where a joint that stands is slower than `MAX_MEDIAN` for half of the time. Torques of
 sensors behind the gear have no such friction.
+
+Where the drive's friction is low, or the model of the motion is wrong (a torso whose effort holds no gravity), rows at
+rest say more than this. Both treatments predict the motion of time blocks that they were not fitted to; standing rows
+count as any others where that errs less than `CLEARLY_LESS` times as much.
 """
 
 from __future__ import annotations
@@ -31,11 +35,16 @@ from calib.data.signals.filtering import Decimator, kept
 from calib.dynamics.regressor_model import RegressorModel
 from calib.dynamics.torque_rows import TorqueRows
 from calib.estimation.triangles import Triangles, absorb, empty, retriangulate
-from calib.identification.rows import Case, ObservationRows, RestWeights, segments, thinned
+from calib.identification.rows import Case, ObservationRows, RestWeights, pool, segments, thinned, triangulate
+from calib.identification.time_folds import estimate
 from calib.records import frozen
 
 MIN_STANDSTILL = 0.05  # [s] that a joint stands; shorter ones are reversals (our choice)
 MAX_MEDIAN = 0.25  # of the width of Coulomb's sign; of a speed that passes evenly through zero it is 0.5 (our choice)
+SLOW = 0.1  # of a joint's peak speed, below which its rows in motion have a variance of their own (our choice)
+MIN_SLOW = 20  # slow rows of a joint, below which their variance is not known (our choice)
+CLEARLY_LESS = 0.85  # of the error in motion on left-out time, for which standing rows count as any others (our choice)
+LESS = 0.98  # of that error, for which slow rows are weighed by their own variance (our choice)
 MIN_MOVING = 10  # rows in motion, below which a joint's standing rows count as any others: no friction is identified
 
 
@@ -205,7 +214,9 @@ def divided(all_rows: Sequence[ObservationRows]) -> DividedRows:
             share = part.standing[:, row]
             rests = part.present[:, row] & (share > 0.0)
             moves = part.present[:, row] & (share == 0.0)
-            moving = absorb(moving, part.matrix[moves, row], part.target[moves, row], row)
+            slowness = part.slowness[moves, row]
+            in_motion = part.matrix[moves, row] * slowness[:, None]
+            moving = absorb(moving, in_motion, part.target[moves, row] * slowness, row)
             matrix, target = part.matrix[rests, row], part.target[rests, row]
             ranges = share[rests] * part.swing[rests, row]
             root, wider = np.sqrt(share[rests]), np.sqrt(ranges)
@@ -223,3 +234,77 @@ def divided(all_rows: Sequence[ObservationRows]) -> DividedRows:
 def with_weights(all_rows: Sequence[ObservationRows], weights: RestWeights) -> list[ObservationRows]:
     """Return rows whose standstills have these weights."""
     return [replace(part, rest=weights) for part in all_rows]
+
+
+def with_slowness(
+    all_rows: Sequence[ObservationRows],
+    cases: Sequence[Case],
+    decimator: Decimator,
+    torque_rows: TorqueRows,
+    values: np.ndarray,
+) -> list[ObservationRows]:
+    """Return rows in which slow ones count by the variance of their own residuals, where that is the larger one.
+
+    Near a reversal friction is on its way from one sign to the other, gears wind up, and the model errs more than in
+    fast motion.
+
+    Args:
+        values: (p,) of a fit, whose residuals are taken.
+    """
+    peak = np.max([np.abs(case.motion.v).max(axis=0) for case in cases], axis=0)
+    slow_masks = []
+    squares, counts = np.zeros((2, all_rows[0].target.shape[1])), np.zeros((2, all_rows[0].target.shape[1]))
+    for part, case in zip(all_rows, cases):
+        slow = torque_rows.of_joints(np.abs(case.motion.v) < SLOW * peak)
+        slow = thinned(slow, case.motion.segment, decimator)
+        moves = part.present & (part.standing == 0.0)
+        residual = part.target - part.matrix @ values
+        for place, mask in enumerate((moves & ~slow, moves & slow)):
+            squares[place] += np.sum(residual**2 * mask, axis=0)
+            counts[place] += mask.sum(axis=0)
+        slow_masks.append(slow)
+    fast, slow = squares / np.maximum(counts, 1.0)
+    differ = (counts.min(axis=0) >= MIN_SLOW) & (slow > fast)
+    factor = np.where(differ, np.sqrt(fast / np.where(differ, slow, 1.0)), 1.0)
+    return [
+        replace(part, slowness=frozen(np.where(slow_mask, factor, 1.0)))
+        for part, slow_mask in zip(all_rows, slow_masks)
+    ]
+
+
+def left_out_error(
+    training: Sequence[ObservationRows],
+    marked: Sequence[ObservationRows],
+    std: np.ndarray,
+    inflation: np.ndarray,
+    prior: np.ndarray | None,
+    apart: Sequence[int],
+) -> float:
+    """Return Σ (τ - τ̂)² of the rows in motion, each time block predicted by a fit of the other blocks.
+
+    The sum is over torques as they are, as in the error that users read: weighed by its own residuals, a joint whose
+    torques are fitted by wrong parameters would count most.
+
+    Args:
+        training: rows with the treatment of standstills that is judged.
+        marked: the same samples with their standstills marked.
+        std, inflation: (rows,) standard deviation and variance inflation of the residuals.
+        prior: whitened rows (k, p + 1) of [W y]; None without one.
+        apart: rows in a unit of their own, which no total holds.
+    """
+    rows = training[0].target.shape[1]
+    data = triangulate(training)
+    blocks = data.groups // rows - 1  # the last one holds samples beside cuts
+    if blocks < 2:  # nothing to learn from without the only block
+        return 0.0
+    free = np.full(data.parameters, -1)
+    squares = np.zeros(rows)
+    for block in range(blocks):
+        others = [other for other in range(blocks + 1) if other != block]
+        values, _ = estimate(pool(data, rows, others), std, inflation, free, prior)
+        for part in marked:
+            moves = part.present & (part.standing == 0.0) & (part.block == block)[:, None]
+            residual = part.target - part.matrix @ values
+            squares += np.sum(residual**2 * moves, axis=0)
+    squares[list(apart)] = 0.0
+    return float(squares.sum())

@@ -46,14 +46,18 @@ def regimes(all_rows: Sequence[ObservationRows], cases: Sequence[Case], decimato
 
     Standstills belong to none: no model is judged by friction that nothing decides.
     """
-    positions, speeds, accelerations = [], [], []
+    positions = []
+    speeds = []
+    accelerations = []
     for case in cases:
         motion = case.motion
         index = kept(motion.segment, decimator)
         positions.append(motion.q[index])
         speeds.append(motion.v[index])
         accelerations.append(motion.a[index])
-    q, v, a = np.concatenate(positions), np.concatenate(speeds), np.concatenate(accelerations)
+    q = np.concatenate(positions)
+    v = np.concatenate(speeds)
+    a = np.concatenate(accelerations)
 
     row_count, p = all_rows[0].matrix.shape[1:]
     joint = np.arange(row_count) % q.shape[1]
@@ -65,7 +69,8 @@ def regimes(all_rows: Sequence[ObservationRows], cases: Sequence[Case], decimato
     low, high = np.quantile(q, [END_SHARE, 1.0 - END_SHARE], axis=0)
     fastest = np.abs(v) > np.quantile(np.abs(v), 1.0 - FAST_SHARE, axis=0)
     hardest = np.abs(a) > np.quantile(np.abs(a), 1.0 - FAST_SHARE, axis=0)
-    in_range = np.stack([fastest, hardest, q < low, q > high, v > 0.0, v < 0.0])[:, :, joint]
+    ranges = [fastest, hardest, q < low, q > high, v > 0.0, v < 0.0]
+    in_range = np.stack(ranges)[:, :, joint]
 
     range_count = len(in_range)
     squares = np.zeros((range_count, row_count, p + 1, p + 1))
@@ -74,7 +79,8 @@ def regimes(all_rows: Sequence[ObservationRows], cases: Sequence[Case], decimato
     total_counts = np.zeros(row_count)
     start = 0
     for rows in all_rows:
-        augmented = np.concatenate([rows.matrix, rows.target[:, :, None]], axis=2) * rows.weight[:, :, None]
+        augmented = np.concatenate([rows.matrix, rows.target[:, :, None]], axis=2)
+        augmented = augmented * rows.weight[:, :, None]
         part = slice(start, start + len(augmented))
         start += len(augmented)
         for row in range(row_count):
@@ -150,7 +156,8 @@ class CrossValidation:
         rounding = 1e-9 * (weight @ self.regimes.total_squares.diagonal(axis1=1, axis2=2))[index]
         result = np.zeros((len(self.regimes.squares), self.rows))
         for k, (held_out, counts) in enumerate(zip(self.regimes.squares, self.regimes.counts)):
-            training = np.tensordot(weight, self.regimes.total_squares - held_out, 1).take(index, 0).take(index, 1)
+            training = np.tensordot(weight, self.regimes.total_squares - held_out, 1)
+            training = training.take(index, 0).take(index, 1)
             # Differences of products are positive definite but for rounding.
             training.flat[:: len(index) + 1] += rounding
             training += prior_square
@@ -215,7 +222,7 @@ def estimate(
     if (group < 0).all():
         size = np.sqrt(np.sum(whitened[:, :-1] ** 2, axis=0))
         scale = np.where(size > 0.0, size, 1.0)
-        scaled_values = np.linalg.lstsq(whitened[:, :-1] / scale, whitened[:, -1], rcond=1e-10)[0]
+        scaled_values, *_ = np.linalg.lstsq(whitened[:, :-1] / scale, whitened[:, -1], rcond=1e-10)
         return scaled_values / scale, np.full(len(group), np.inf)
     row_count = int(np.sum(data.rows / inflation))
     return _regularised(whitened.T @ whitened, row_count, group, _kinds(group, data.units))
@@ -243,7 +250,8 @@ def _regularised(square: np.ndarray, rows: int, group: np.ndarray, kinds: np.nda
     scaled = square[:-1, :-1] / (scale[:, None] * scale)
     # Free columns without data stay at zero.
     scaled[np.diag_indices(len(group))] += np.where(group < 0, 1e-9 * rows, 0.0)
-    data = Gram(scaled, square[:-1, -1] / scale, float(square[-1, -1]), rows)
+    cross = square[:-1, -1] / scale
+    data = Gram(scaled, cross, float(square[-1, -1]), rows)
     fit = relevance(data, group, np.ones(len(group)), RELEVANCE_ITERATIONS)
     ridge = np.where(np.isfinite(fit.ridge), fit.ridge / scale, np.inf)
     return fit.values / scale, ridge

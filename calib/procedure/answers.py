@@ -14,14 +14,17 @@ CELL = ("instrument_at", "cone", "facing", "box", "obstacles", *CAMERA)
 Held = Annotated[float, Real(least=-3.0, most=3.0, unit="m", quantity="length")]
 Torques = Annotated[str, OneOf(("motor", "link", "both"))]
 Tolerance = Annotated[float, Real(least=0.0, quantity="1")]
-MAX_LETTERS = 200  # of one entry of a certificate
+# of one entry of a certificate
+MAX_LETTERS = 200
 
 
 def _entry(value: Any) -> Any:
     """Check an entry of a certificate (a text, number or date), and return it as a text of one line."""
     if not isinstance(value, str | int | float | date) or isinstance(value, bool):
         return value
-    line = " ".join("".join(" " if category(one) in ("Cc", "Cs") else one for one in str(value)).split())
+    # control characters and halves of surrogate pairs cannot be printed
+    printable = [" " if category(letter) in ("Cc", "Cs") else letter for letter in str(value)]
+    line = " ".join("".join(printable).split())
     if len(line) > MAX_LETTERS:
         raise ValueError(f"expected at most {MAX_LETTERS} letters, found {len(line)}")
     return line

@@ -26,10 +26,15 @@ from calib.errors import Finding, UsageError, listing, suggestion
 from calib.units import DEG
 
 RANKS = ("", "note", "marginal", "fail")
-UNITS = {"mm": 1e3, "µm": 1e6, "mrad": 1e3, "°": 1 / DEG, "%": 100.0, "ms": 1e3}  # SI -> as printed; others as they are
-PREDICTION_ONLY = "pass (prediction only)"  # of a model that predicts well and cannot be exported
-NOT_JUDGED = "not judged"  # of results for which nobody stated what is good enough
+# SI -> as printed; other units as they are
+UNITS = {"mm": 1e3, "µm": 1e6, "mrad": 1e3, "°": 1 / DEG, "%": 100.0, "ms": 1e3}
+# verdict on a model that predicts well and cannot be exported
+PREDICTION_ONLY = "pass (prediction only)"
+# verdict on results for which nobody stated what is good enough
+NOT_JUDGED = "not judged"
 LEVELS = ("pass", PREDICTION_ONLY, NOT_JUDGED, "marginal", "fail")
+# values for which an optional part of a sentence is left out
+OMITTED_VALUES = (None, "", (), [], False)
 
 
 @dataclass(frozen=True)
@@ -58,15 +63,18 @@ class Verdict:
     @classmethod
     def of(cls, figures: str, findings: Iterable[Finding] = ()) -> Verdict:
         """Return the verdict that follows from the worst finding; the reason begins with the text `figures`."""
-        worst = max(findings, key=lambda one: RANKS.index(level_of(one)), default=None)
+        worst = max(findings, key=_rank, default=None)
         if worst is None or level_of(worst) in ("", "note"):
             return cls("pass", figures)
-        reason, advice = "; ".join(filter(None, [figures, sentence(worst)])), catalogue()[worst.code].advice
-        return cls(level_of(worst), reason, worst.code, _filled(advice, worst.values))
+        parts = [part for part in (figures, sentence(worst)) if part]
+        advice = _filled(catalogue()[worst.code].advice, worst.values)
+        return cls(level_of(worst), "; ".join(parts), worst.code, advice)
 
-    def for_prediction(self, why: str) -> Verdict:
+    def for_prediction(self, reason: str) -> Verdict:
         """Return the verdict of a model that cannot be exported for the reason `why`: pass becomes prediction only."""
-        return Verdict(PREDICTION_ONLY, f"{self.reason}; {why}") if self.level == "pass" else self
+        if self.level != "pass":
+            return self
+        return Verdict(PREDICTION_ONLY, f"{self.reason}; {reason}")
 
 
 UNJUDGED = Verdict("", "judged by the session on unseen rows: see verdict.json in the session's folder")
@@ -87,29 +95,38 @@ class Verdicts:
     @property
     def level(self) -> str:
         """Worst level among the stages' verdicts; empty without stages."""
-        return max((one.level for one in self.stages.values()), key=LEVELS.index, default="")
+        stage_levels = [verdict.level for verdict in self.stages.values()]
+        return max(stage_levels, key=LEVELS.index, default="")
 
     def of(self, deliverable: str, dynamics: bool = False) -> Verdicts:
         """Return the verdicts that concern one deliverable, with or without the dynamics."""
-        own = {name: one for name, one in self.stages.items() if dynamics or name != "dynamics"}
+        stages = {name: verdict for name, verdict in self.stages.items() if dynamics or name != "dynamics"}
         if deliverable in self.deliverables:
-            own["geometry"] = self.deliverables[deliverable]
-        return Verdicts(own)
+            stages["geometry"] = self.deliverables[deliverable]
+        return Verdicts(stages)
 
     def __str__(self) -> str:
         """Return the worst verdict, with the reasons of all stages that have it."""
-        reasons = (f"{stage}: {one.reason}" for stage, one in self.stages.items() if one.level == self.level)
-        return f"verdict {self.level}: {'; '.join(reasons)}{'; do not use' if self.level == 'fail' else ''}"
+        level = self.level
+        reasons = [f"{stage}: {verdict.reason}" for stage, verdict in self.stages.items() if verdict.level == level]
+        text = f"verdict {level}: {'; '.join(reasons)}"
+        if level == "fail":
+            text += "; do not use"
+        return text
 
     def table(self) -> dict[str, Any]:
         """Return the worst verdict, and each stage's verdict and reason, as a table for JSON."""
-        stages = {stage: {"verdict": one.level, "reason": one.reason} for stage, one in self.stages.items()}
-        return {"verdict": self.level, **stages}
+        table: dict[str, Any] = {"verdict": self.level}
+        for stage, verdict in self.stages.items():
+            table[stage] = {"verdict": verdict.level, "reason": verdict.reason}
+        return table
 
     @property
     def remark(self) -> str:
         """Remark for files whose verdict is marginal or fail; else empty."""
-        return str(self) if self.level in ("marginal", "fail") else ""
+        if self.level in ("marginal", "fail"):
+            return str(self)
+        return ""
 
 
 @dataclass(frozen=True)
@@ -131,15 +148,23 @@ def catalogue() -> Mapping[str, Entry]:
     return {code: Entry(**entry) for code, entry in tomllib.loads(text).items()}
 
 
-def level_of(one: Finding) -> str:
+def level_of(finding: Finding) -> str:
     """Return the level of a finding (one of `RANKS`) from the catalogue's limits; an accepted finding is a note."""
-    entry = catalogue()[one.code]
-    reached = [
-        max((name for name, limit in steps.items() if one.values[value] > limit), key=RANKS.index, default="")
-        for value, steps in entry.limits.items()
-    ]
-    level = min(reached or [entry.level], key=RANKS.index)
-    return "note" if level and one.accepted else level
+    entry = catalogue()[finding.code]
+    levels = []
+    for value, limits in entry.limits.items():
+        reached = [level for level, limit in limits.items() if finding.values[value] > limit]
+        levels.append(max(reached, key=RANKS.index, default=""))
+    # the mildest of several values' levels counts
+    level = min(levels or [entry.level], key=RANKS.index)
+    if level and finding.accepted:
+        return "note"
+    return level
+
+
+def _rank(finding: Finding) -> int:
+    """Return how serious a finding is: the position of its level in `RANKS`."""
+    return RANKS.index(level_of(finding))
 
 
 def limit(code: str, value: str, level: str = "fail") -> float:
@@ -147,34 +172,46 @@ def limit(code: str, value: str, level: str = "fail") -> float:
     return catalogue()[code].limits[value][level]
 
 
-def settle(found: Iterable[Finding], accepted: Collection[str] = ()) -> tuple[Finding, ...]:
+def settle(findings: Iterable[Finding], accepted: Collection[str] = ()) -> tuple[Finding, ...]:
     """Return the findings that reach a level, worst first, with those marked that the options accept."""
-    marked = [replace(one, accepted=catalogue()[one.code].accept in accepted) for one in found]
-    return tuple(sorted(filter(level_of, marked), key=lambda one: -RANKS.index(level_of(one))))
+    marked = []
+    for finding in findings:
+        is_accepted = catalogue()[finding.code].accept in accepted
+        marked.append(replace(finding, accepted=is_accepted))
+    reaching = list(filter(level_of, marked))
+    # a reversed sort keeps the order of findings of one level
+    reaching.sort(key=_rank, reverse=True)
+    return tuple(reaching)
 
 
-def sentence(one: Finding) -> str:
+def sentence(finding: Finding) -> str:
     """Return the sentence of a finding, without advice and full stop."""
-    return _filled(catalogue()[one.code].says, one.values)
+    return _filled(catalogue()[finding.code].says, finding.values)
 
 
 class Warned(str):
     """Text of a finding that prevents the verdict pass; commands always print it."""
 
 
-def lines_of(found: Iterable[Finding]) -> list[str]:
+def lines_of(findings: Iterable[Finding]) -> list[str]:
     """Return one line for each finding: its sentence, its advice, and how to accept it."""
-    lines = [(_line(one, catalogue()[one.code]), level_of(one)) for one in found]
-    return [Warned(words) if level in LEVELS else words for words, level in lines]
+    lines = []
+    for finding in findings:
+        line = _line(finding, catalogue()[finding.code])
+        if level_of(finding) in LEVELS:
+            line = Warned(line)
+        lines.append(line)
+    return lines
 
 
-def _line(one: Finding, entry: Entry) -> str:
-    words = [sentence(one), _filled(entry.advice, one.values)]
-    if one.accepted:
-        return f"{words[0]} (accepted by the options)"
-    if entry.accept and level_of(one) != "note":
-        words.append(f'if this is intended, add accept = ["{entry.accept}"] to the options')
-    return "; ".join(filter(None, words))
+def _line(finding: Finding, entry: Entry) -> str:
+    text = sentence(finding)
+    if finding.accepted:
+        return f"{text} (accepted by the options)"
+    parts = [text, _filled(entry.advice, finding.values)]
+    if entry.accept and level_of(finding) != "note":
+        parts.append(f'if this is intended, add accept = ["{entry.accept}"] to the options')
+    return "; ".join(part for part in parts if part)
 
 
 @cache
@@ -185,12 +222,13 @@ def glossary() -> Mapping[str, str]:
 
 def levels(entry: Entry) -> str:
     """Return in words what level a finding has, and from which values on; a limit below zero is exceeded always."""
-    rules = [
-        f"{level} where {value} > {limit:g}" if limit >= 0.0 else f"{level} always"
-        for value, steps in entry.limits.items()
-        for level, limit in steps.items()
-        if limit >= 0.0 or len(entry.limits) == 1
-    ]
+    rules = []
+    for value, limits in entry.limits.items():
+        for level, limit in limits.items():
+            if limit >= 0.0:
+                rules.append(f"{level} where {value} > {limit:g}")
+            elif len(entry.limits) == 1:
+                rules.append(f"{level} always")
     return "; ".join(rules) or entry.level
 
 
@@ -201,30 +239,42 @@ def explain(code: str) -> str:
         UsageError: for a code or term that there is none of.
     """
     terms = {term.lower(): f"{term}\n  {meaning}" for term, meaning in glossary().items()}
-    if (meaning := terms.get(code.lower())) and code not in catalogue():
-        return meaning
-    if (entry := catalogue().get(code)) is None:
-        near = suggestion(code, [*catalogue(), *glossary()])
-        raise UsageError(f"no finding or term is called '{code}'{near}; `calib explain` lists all")
-    accept = f'accept = ["{entry.accept}"] in the options file lets the verdict pass' if entry.accept else ""
-    parts = (entry.says, f"level: {levels(entry)}", entry.means, f"{entry.advice}", accept)
-    return "\n".join([code, *(f"  {part}" for part in parts if part)])
+    entry = catalogue().get(code)
+    if entry is None:
+        meaning = terms.get(code.lower())
+        if meaning:
+            return meaning
+        hint = suggestion(code, [*catalogue(), *glossary()])
+        raise UsageError(f"no finding or term is called '{code}'{hint}; `calib explain` lists all")
+    parts = [entry.says, f"level: {levels(entry)}", entry.means, entry.advice]
+    if entry.accept:
+        parts.append(f'accept = ["{entry.accept}"] in the options file lets the verdict pass')
+    lines = [f"  {part}" for part in parts if part]
+    return "\n".join([code, *lines])
 
 
 def _filled(template: str, values: Mapping[str, Any]) -> str:
     """Return a template with values inserted; an optional part ``<…>`` is left out if its value is None or empty."""
 
-    def kept(part: re.Match[str]) -> str:
-        needed = [name for _, name, _, _ in Formatter().parse(part[1]) if name]
-        return "" if any(values.get(name) in (None, "", (), [], False) for name in needed) else part[1]
+    def part(match: re.Match[str]) -> str:
+        for _, name, _, _ in Formatter().parse(match[1]):
+            if name and values.get(name) in OMITTED_VALUES:
+                return ""
+        return match[1]
 
-    return _Printer().vformat(re.sub(r"<([^<>]*)>", kept, template), (), values)
+    return _Printer().vformat(re.sub(r"<([^<>]*)>", part, template), (), values)
 
 
 class _Printer(Formatter):
     def format_field(self, value: Any, format_spec: str) -> str:
         number, _, unit = format_spec.partition(" ")
         if isinstance(value, list | tuple):
-            return listing(value, int(number)) if number else listing(value)
-        printed = format(value * UNITS.get(unit, 1.0) if unit else value, number)
-        return printed + ("" if unit in ("", "°") else " ") + unit
+            if number:
+                return listing(value, int(number))
+            return listing(value)
+        if unit:
+            value = value * UNITS.get(unit, 1.0)
+        text = format(value, number)
+        if unit in ("", "°"):
+            return text + unit
+        return f"{text} {unit}"

@@ -9,9 +9,11 @@ from calib.config import schema
 from calib.errors import UsageError, one_of
 from calib.extensions import Point, merged
 
-TOPICS_OF_ROOMS: Point[Mapping[str, tuple[str, str]]] = Point("topics", "topics of `calib formats`")
-SCHEMAS_OF_ROOMS: Point[Mapping[str, tuple[str, str]]] = Point("schemas", "their JSON schemas")
+FORMATS: Point[Mapping[str, tuple[str, str, str]]] = Point(
+    "formats", "topic of `calib formats` → description, modules, dataclass of the first module's TOML file or empty"
+)
 
+# topic -> short description, and the modules whose docstrings document the topic
 TOPICS: Mapping[str, tuple[str, str]] = {
     "measurements": ("CSV files of measured poses, positions, distances", "calib.data.poses.pose_files"),
     "options": ("the TOML file of calib fit --options", "calib.data.poses.fit_options"),
@@ -62,25 +64,26 @@ TOPICS: Mapping[str, tuple[str, str]] = {
     "ros2": ("ROS 2 package of a calibrated robot, of calib export --ros2", "calib.procedure.export.ros2_package"),
     "robodk": ("CSV of RoboDK, and of three reflectors without a header", "calib.data.poses.robodk"),
     "instruments": ("text exports of trackers, CMMs and motion capture", "calib.data.poses.exports"),
-    **merged(TOPICS_OF_ROOMS),
+    **{topic: (words, modules) for topic, (words, modules, _) in merged(FORMATS).items()},
 }
-"""Topic → short description, and the modules whose docstrings document the topic."""
 
+# topic -> module and dataclass of the TOML files that people write
 SCHEMAS: Mapping[str, tuple[str, str]] = {
     "options": ("calib.data.poses.fit_options", "FitOptions"),
     "identify-options": ("calib.identification.identify_options", "IdentifySettings"),
     "constraints": ("calib.procedure.measuring.constraints_file", "ConstraintsFile"),
     "limits": ("calib.procedure.excitation.limits", "LimitsFile"),
     "session": ("calib.procedure.session.settings", "SessionSettings"),
-    **merged(SCHEMAS_OF_ROOMS),
+    **{topic: (modules.split()[0], kind) for topic, (_, modules, kind) in merged(FORMATS).items() if kind},
 }
-"""Topic → module and dataclass of the TOML files that people write."""
+# types of a JSON schema, and bounds of its numbers, in words
 _KINDS = {"string": "text", "integer": "whole number", "boolean": "true or false", "object": "table"}
+_BOUNDS = {"exclusiveMinimum": "above", "minimum": "from", "maximum": "to"}
 
 
 def overview() -> list[str]:
     """Return one line for each format: name and short description."""
-    return [f"{name:17} {words}" for name, (words, _) in TOPICS.items()]
+    return [f"{name:17} {description}" for name, (description, _) in TOPICS.items()]
 
 
 def describe(topic: str) -> str:
@@ -90,14 +93,22 @@ def describe(topic: str) -> str:
         UsageError: for an unknown topic, with the known ones.
     """
     one_of(topic, TOPICS, "format", UsageError)
-    parts = [_plain(import_module(name).__doc__ or "") for name in TOPICS[topic][1].split()]
+    _, modules = TOPICS[topic]
+    parts = [_plain(import_module(name).__doc__ or "") for name in modules.split()]
     if topic == "session":
         from calib.procedure.session.settings import example
 
         parts.append(f"session.toml, as calib new writes it:\n\n{example()}")
     elif topic in SCHEMAS:
-        lines = ("; ".join(filter(None, (f"    {a:28} {b}", c and f"default {c}", d))) for a, b, c, d in keys(topic))
-        parts.append("\n".join(["Every key, its allowed values, and its default:\n", *lines]))
+        lines = ["Every key, its allowed values, and its default:\n"]
+        for key, allowed, default, meaning in keys(topic):
+            columns = [f"    {key:28} {allowed}"]
+            if default:
+                columns.append(f"default {default}")
+            if meaning:
+                columns.append(meaning)
+            lines.append("; ".join(columns))
+        parts.append("\n".join(lines))
     return "\n\n".join(part.strip() for part in parts) + "\n"
 
 
@@ -119,36 +130,42 @@ def _schema(topic: str) -> dict[str, Any]:
 
 def keys(topic: str) -> Iterator[tuple[str, str, str, str]]:
     """Yield place (``sigma.position``), allowed values, default and meaning of each key of a kind of TOML file."""
-    found = _schema(topic)
-    return _keys(found, found.get("$defs", {}))
+    table = _schema(topic)
+    return _keys(table, table.get("$defs", {}))
 
 
-def _keys(table: Mapping[str, Any], tables: Mapping[str, Any], place: str = "") -> Iterator[tuple[str, str, str, str]]:
+def _keys(table: Mapping[str, Any], tables: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str, str, str]]:
     for key, value in table.get("properties", {}).items():
-        if key == "files":  # the same keys, for one file
+        # the same keys, for one file
+        if key == "files":
             continue
         inner = value.get("items", value.get("additionalProperties")) or value
-        named = tables.get(str(inner.get("$ref", value.get("$ref", ""))).rpartition("/")[2])
-        if named:
-            yield from _keys(named, tables, f"{place}{key}.")
+        reference = str(inner.get("$ref", value.get("$ref", "")))
+        named_table = tables.get(reference.rpartition("/")[2])
+        if named_table:
+            yield from _keys(named_table, tables, f"{prefix}{key}.")
             continue
-        default = json.dumps(value["default"]) if "default" in value else ""
-        yield place + key, _held(value), default, value.get("description", "")
+        default = ""
+        if "default" in value:
+            default = json.dumps(value["default"])
+        yield prefix + key, _allowed(value), default, value.get("description", "")
 
 
-def _held(value: Mapping[str, Any]) -> str:
+def _allowed(value: Mapping[str, Any]) -> str:
     """Return the allowed values of a key as text."""
     if "anyOf" in value:
-        return " or ".join(dict.fromkeys(map(_held, value["anyOf"])))
+        alternatives = dict.fromkeys(_allowed(alternative) for alternative in value["anyOf"])
+        return " or ".join(alternatives)
     if "enum" in value:
         return ", ".join(value["enum"])
     if "items" in value or "prefixItems" in value:
-        return f"list of: {_held(value.get('items') or value['prefixItems'][0])}"
-    bounds = {"exclusiveMinimum": "above", "minimum": "from", "maximum": "to"}
-    said = [f"{word} {value[key]:g}" for key, word in bounds.items() if key in value]
+        return f"list of: {_allowed(value.get('items') or value['prefixItems'][0])}"
     kinds = value.get("type", "value")
-    kinds = [kinds] if isinstance(kinds, str) else kinds
-    return " ".join([" or ".join(_KINDS.get(one, one) for one in kinds), *said])
+    if isinstance(kinds, str):
+        kinds = [kinds]
+    parts = [" or ".join(_KINDS.get(kind, kind) for kind in kinds)]
+    parts += [f"{bound} {value[key]:g}" for key, bound in _BOUNDS.items() if key in value]
+    return " ".join(parts)
 
 
 def _plain(text: str) -> str:

@@ -7,20 +7,43 @@ from dataclasses import dataclass, replace
 from functools import partial
 from inspect import signature
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
-import numpy as np
-
-from calib.data.schema import Joints
 from calib.errors import UsageError
-from calib.extensions import Point, merged
-from calib.procedure.findings import Verdict
-from calib.robot.chain import joint_kinds
+from calib.extensions import Point
 
-ROBOTS: Point[Callable[[object], Mechanism | None]] = Point(
-    "robots", "the robot that a person names, if it is no serial arm"
-)
-STAGES: Point[Mapping[str, Mapping[str, Stage]]] = Point("stages", "kind of robot → verb → stage")
+if TYPE_CHECKING:
+    from calib.data.schema import Joints
+    from calib.procedure.findings import Verdict
+
+
+class RobotKind(Protocol):
+    """A kind of robot that is not a serial arm, as a package or module.
+
+    Attributes:
+        KIND: `Mechanism.kind` of its robots.
+        LIBRARY: folder of those that go by a name.
+    """
+
+    KIND: str
+    LIBRARY: Path
+
+    def find(self, robot: object) -> Mechanism | None:
+        """Return the robot that a person names; None where it is none of this kind."""
+        ...
+
+    def stages(self) -> Mapping[str, Stage]:
+        """Return the implementation of each command."""
+        ...
+
+    def drive_gains(
+        self, robot: Any, cases: Sequence[Any], settings: Any, known: Mapping[str, float], reference: int | None
+    ) -> Any:
+        """Return the drive gains (`calib.identification.gains.DriveGains`) of a robot's recordings in amperes."""
+        ...
+
+
+ROBOTS: Point[RobotKind] = Point("robots", "kinds of robot other than serial arms")
 
 
 @dataclass(frozen=True)
@@ -40,7 +63,7 @@ class Stage:
 
 @runtime_checkable
 class Mechanism(Protocol):
-    """Robot that is not a serial arm, provided by a plug-in package (``robots`` of `calib.extensions`).
+    """Robot that is not a serial arm, found by a `RobotKind`.
 
     Attributes:
         kind: what it is, in words: ``parallel robot``.
@@ -91,7 +114,11 @@ def mechanism(robot: object) -> Mechanism | None:
     """
     if isinstance(robot, Mechanism):
         return robot
-    return next((found for find in ROBOTS.all() if (found := find(robot)) is not None), None)
+    for kind in ROBOTS.all():
+        machine = kind.find(robot)
+        if machine is not None:
+            return machine
+    return None
 
 
 def stage_of(robot: object, verb: str, base: str | None = None, tip: str | None = None) -> Stage | None:
@@ -103,31 +130,45 @@ def stage_of(robot: object, verb: str, base: str | None = None, tip: str | None 
     Raises:
         UsageError: for a command that this kind of robot does not support, and for links.
     """
-    found = mechanism(robot)
-    if found is None:
+    machine = mechanism(robot)
+    if machine is None:
         return None
-    stages: Mapping[str, Stage] = merged(STAGES)[found.kind]
+    stages = next(kind for kind in ROBOTS.all() if machine.kind == kind.KIND).stages()
     if verb not in stages:
-        instead = found.instead.get(verb, f"{', '.join(stages)} take it")
-        named = robot if isinstance(robot, (str, Path)) else found.source
-        raise UsageError(f"{named} is a {found.kind}, and {verb} is for serial arms only; {instead}")
-    for key, value in (("base", base), ("tip", tip)):
-        if value:
-            raise UsageError(f"{key} '{value}' is a link of a URDF; a {found.kind} has no such links")
-    return replace(stages[verb], run=partial(_run, stages[verb].run, found))
+        advice = machine.instead.get(verb, f"{', '.join(stages)} take it")
+        name = machine.source
+        if isinstance(robot, (str, Path)):
+            name = robot
+        raise UsageError(f"{name} is a {machine.kind}, and {verb} is for serial arms only; {advice}")
+    for key, link in (("base", base), ("tip", tip)):
+        if link:
+            raise UsageError(f"{key} '{link}' is a link of a URDF; a {machine.kind} has no such links")
+    stage = stages[verb]
+    return replace(stage, run=partial(_run, stage.run, machine))
 
 
-def _run(run: Callable[..., Any], found: Mechanism, *args: Any, **given: Any) -> Any:
-    """Return the result of a command; raise UsageError for an argument that is given but only serial arms have."""
-    known = signature(run).parameters
-    for key in given.keys() - known.keys():
-        if given[key] is not None:
-            instead = found.instead.get(key, "leave it out")
-            raise UsageError(f"{key} is for serial arms only, not for a {found.kind}; {instead}")
-    return run(found, *args, **{key: value for key, value in given.items() if key in known})
+def _run(run: Callable[..., Any], machine: Mechanism, *args: Any, **options: Any) -> Any:
+    """Return the result of a command; raise UsageError for an argument that is stated but only serial arms have."""
+    parameters = signature(run).parameters
+    run_options = {}
+    for key, value in options.items():
+        if key in parameters:
+            run_options[key] = value
+        elif value is not None:
+            advice = machine.instead.get(key, "leave it out")
+            raise UsageError(f"{key} is for serial arms only, not for a {machine.kind}; {advice}")
+    return run(machine, *args, **run_options)
 
 
 def joints_of(chain: Any) -> Joints:
     """Return the names and limits of the joints of an arm or mechanism, for checking measurements and recordings."""
-    limits = (np.array([getattr(joint, key) for joint in chain.joints]) for key in ("lower", "upper", "effort"))
-    return Joints(chain.joint_names, tuple(joint_kinds(chain)), *limits)
+    # slow to load, and the shell's completion asks this module for the kinds of robot
+    import numpy as np
+
+    from calib.data.schema import Joints
+    from calib.robot.chain import joint_kinds
+
+    lower = np.array([joint.lower for joint in chain.joints])
+    upper = np.array([joint.upper for joint in chain.joints])
+    effort = np.array([joint.effort for joint in chain.joints])
+    return Joints(chain.joint_names, tuple(joint_kinds(chain)), lower, upper, effort)

@@ -27,6 +27,10 @@ if TYPE_CHECKING:
     from calib.workers.processes import Crew, Stream
 
 
+# Tasks that may be ahead of the one whose turn it is, where results are wanted in order (our choice).
+MAX_AHEAD = 256
+
+
 @dataclass(frozen=True)
 class Workers:
     """Runs many tasks in parallel, created by `workers`.
@@ -65,10 +69,14 @@ class Workers:
         return partial(self._in_order, lost)
 
     def _in_order(self, lost: list[TaskLost] | None, function: Callable, *items: Iterable[Any]) -> Iterator[Any]:
-        early, turn, missing = dict[int, tuple[Any, BaseException | None]](), 0, 0
-        # tasks that may be ahead of the one whose turn it is, where results are wanted in order (our choice)
-        max_ahead = 256
-        with closing(self._stream(function, zip(*items), lambda number: number < turn + max_ahead)) as answers:
+        early: dict[int, tuple[Any, BaseException | None]] = {}
+        turn = 0
+        missing = 0
+
+        def is_near(number: int) -> bool:
+            return number < turn + MAX_AHEAD
+
+        with closing(self._stream(function, zip(*items), is_near)) as answers:
             try:
                 for number, result, error in answers:
                     early[number] = result, error
@@ -83,7 +91,10 @@ class Workers:
                         else:
                             raise error
             except KeyboardInterrupt:
-                yield from (result for _, (result, error) in sorted(early.items()) if error is None)
+                for number in sorted(early):
+                    result, error = early[number]
+                    if error is None:
+                        yield result
                 raise
         if lost and missing == turn > 0:
             raise lost[-1]
@@ -109,10 +120,10 @@ def workers(where: str | int | None = None) -> Iterator[Workers]:
         return
     from calib.workers import cluster, processes
 
-    made: AbstractContextManager[Crew] = (
+    crew_context: AbstractContextManager[Crew] = (
         cluster.dask(text) if "://" in text else closing(processes.Processes(int(text)))
     )
-    with made as crew:
+    with crew_context as crew:
         yield Workers(partial(processes.streamed, crew), here="://" not in text)
 
 

@@ -22,8 +22,9 @@ def provide() -> None:
     if not os.environ.get("NUMBA_CACHE_DIR") and not _writable(caches) and not _kernels_writable():
         with suppress(OSError):
             os.environ["NUMBA_CACHE_DIR"] = str(_temporary("numba"))
-            # read from the environment when numba is imported, which may have been before
-            if numba := sys.modules.get("numba"):
+            # Read from the environment when numba is imported, which may have been before.
+            numba = sys.modules.get("numba")
+            if numba:
                 numba.config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"]
     settings = Path(os.environ.get("XDG_CONFIG_HOME") or _home() / ".config")
     if not os.environ.get("MPLCONFIGDIR") and not (_writable(settings) and _writable(caches)):
@@ -51,8 +52,8 @@ def _kernels_writable() -> bool:
 
 def _writable(folder: Path) -> bool:
     """Return whether a folder is writable, or can be made."""
-    existing = next(part for part in (folder, *folder.parents) if part.exists())
-    return existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)
+    existing = [part for part in (folder, *folder.parents) if part.exists()]
+    return existing[0].is_dir() and os.access(existing[0], os.W_OK | os.X_OK)
 
 
 def _temporary(name: str) -> Path:

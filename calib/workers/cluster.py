@@ -33,13 +33,13 @@ class _Cluster:
 
     def _threads(self) -> int:
         """Return the number of threads of all workers, updated once a second at most; 1 without workers."""
-        now = time.monotonic()
-        if now > self.asked + 1.0:
+        time_now = time.monotonic()
+        if time_now > self.asked + 1.0:
             threads = self._said(lambda: sum(self.client.nthreads(callback_timeout=ANSWER).values()))
-            self.threads, self.asked = max(1, threads), now
+            self.threads, self.asked = max(1, threads), time_now
             if threads:
-                self.manned = now
-            elif now > self.manned + NO_WORKERS:
+                self.manned = time_now
+            elif time_now > self.manned + NO_WORKERS:
                 raise CalibError(f"the Dask scheduler at {self.address} has had no workers for {NO_WORKERS:g} s")
         return self.threads
 
@@ -49,8 +49,8 @@ class _Cluster:
         try:
             if self.client.status == "running":
                 return ask()
-        except Exception as found:  # one of many of Dask, Tornado and asyncio
-            error = found
+        except Exception as cause:  # one of many of Dask, Tornado and asyncio
+            error = cause
         raise CalibError(
             f"the Dask scheduler at {self.address} is gone, with {len(self.under_way)} tasks running; the results "
             "returned so far are valid: restart it, and repeat the command"
@@ -134,8 +134,8 @@ def dask(address: str) -> Iterator[_Cluster]:
     with refused_as(UsageError, ImportError, "a Dask scheduler needs Dask: pip install 'armature-calib[cluster]'"):
         from distributed import Client  # pyright: ignore[reportMissingImports]
     with refused_as(UsageError, (OSError, ValueError), f"no Dask scheduler answers at {address}: {{}}"):
-        with ThreadPoolExecutor(1) as aside:  # a notebook has a loop of its own
-            aside.submit(asyncio.run, _answers(address)).result()
+        with ThreadPoolExecutor(1) as executor:  # a notebook has a loop of its own
+            executor.submit(asyncio.run, _answers(address)).result()
         client: Any = Client(address, timeout=ANSWER, set_as_default=False)
     log = logging.getLogger("distributed.client")
     before = log.level

@@ -73,20 +73,20 @@ def streamed(crew: Crew, function: Callable, tasks: Iterable[tuple], near: Calla
     if not crew.busy.acquire(blocking=False):
         raise RuntimeError("these workers are busy; let one `map` or `completed` end before the next")
     upcoming, begun = enumerate(tasks), 0
-    under_way, again, found = dict[int, _Task](), deque[int](), deque[Answer]()
+    under_way, retry, answers = dict[int, _Task](), deque[int](), deque[Answer]()
     try:
         while True:
             while crew.free() > 0:
-                if again:
-                    number = again.popleft()
-                elif near(begun) and (following := next(upcoming, None)) is not None:
-                    number, arguments = following
+                if retry:
+                    number = retry.popleft()
+                elif near(begun) and (next_task := next(upcoming, None)) is not None:
+                    number, arguments = next_task
                     begun, under_way[number] = number + 1, _Task(arguments, crew.pickled((function, arguments)))
                 else:
                     break
                 crew.begin(number, under_way[number].call)
-            if found:
-                yield found.popleft()
+            if answers:
+                yield answers.popleft()
                 continue
             if not under_way:
                 return
@@ -94,14 +94,14 @@ def streamed(crew: Crew, function: Callable, tasks: Iterable[tuple], near: Calla
                 task = under_way[number]
                 task.deaths += isinstance(error, Died)
                 if isinstance(error, NotBegun) or (isinstance(error, Died) and task.deaths < crew.attempts):
-                    again.append(number)
+                    retry.append(number)
                     continue
                 del under_way[number]
                 if isinstance(error, KeyboardInterrupt):
                     raise error
-                found.append((number, result, _lost(number, task, error) if isinstance(error, Died) else error))
+                answers.append((number, result, _lost(number, task, error) if isinstance(error, Died) else error))
     except (Exception, KeyboardInterrupt) as error:
-        yield from found
+        yield from answers
         if isinstance(error, KeyboardInterrupt):
             yield from (answer for answer in crew.settled() if answer[2] is None)
         raise
@@ -111,12 +111,12 @@ def streamed(crew: Crew, function: Callable, tasks: Iterable[tuple], near: Calla
 
 
 def _lost(number: int, task: _Task, error: Died) -> TaskLost:
-    given = task.arguments[0] if len(task.arguments) == 1 else task.arguments
+    arguments = task.arguments[0] if len(task.arguments) == 1 else task.arguments
     return TaskLost(
-        f"task {number + 1} ({shortened(given)}) is lost: {error}. The usual cause is too little memory: run "
+        f"task {number + 1} ({shortened(arguments)}) is lost: {error}. The usual cause is too little memory: run "
         "fewer tasks at once",
         number,
-        given,
+        arguments,
     )
 
 
@@ -251,9 +251,9 @@ class Processes:
         """Return the answers of tasks ended by Ctrl-C; interrupt worker processes that did not receive it."""
         self.stopping = True
         for patience in (GRACE, 2 * GRACE):
-            until = time.monotonic() + patience
-            while self.working and (left := until - time.monotonic()) > 0:
-                yield from self.ended(left)
+            deadline = time.monotonic() + patience
+            while self.working and (remaining := deadline - time.monotonic()) > 0:
+                yield from self.ended(remaining)
             for process in self.working.values():
                 process.interrupt()
 
@@ -270,9 +270,9 @@ class Processes:
             self.drop()
             for process in self.all:
                 process.pipe.close()  # this ends one that waits
-            until = time.monotonic() + GRACE
+            deadline = time.monotonic() + GRACE
             for process in started:
-                process.join(max(0.0, until - time.monotonic()))
+                process.join(max(0.0, deadline - time.monotonic()))
         finally:
             for process in started:
                 process.kill()

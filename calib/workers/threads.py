@@ -15,7 +15,7 @@ from typing import Any
 
 VARIABLES = tuple(f"{name}_NUM_THREADS" for name in ("OPENBLAS", "OMP", "MKL", "BLIS"))
 
-_changing, _before, _most = Lock(), dict[Any, int](), dict[Any, int]()
+_changing, _before, _largest = Lock(), dict[Any, int](), dict[Any, int]()
 _calls = 0
 
 
@@ -75,8 +75,8 @@ def _limit() -> None:
 
     for library in _libraries():
         threads = library.num_threads
-        _most[library] = max(threads, _most.get(library, 1))
-        if threads == _most[library]:
+        _largest[library] = max(threads, _largest.get(library, 1))
+        if threads == _largest[library]:
             _before[library] = threads
     _set(dict.fromkeys(_before, 1))
 
@@ -101,5 +101,5 @@ def _libraries() -> list[Any]:
     """Return all loaded BLAS libraries: looking for them takes milliseconds, setting their threads microseconds."""
     from threadpoolctl import ThreadpoolController
 
-    found = ThreadpoolController().select(user_api="blas").lib_controllers
-    return [library for library in found if library.num_threads]
+    controllers = ThreadpoolController().select(user_api="blas").lib_controllers
+    return [library for library in controllers if library.num_threads]

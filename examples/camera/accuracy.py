@@ -42,7 +42,7 @@ from calib.geometry.first_guess import install
 from calib.geometry.fit import GeometricFit, fit
 from calib.geometry.observation import layout
 from calib.robot.chain import random_joints
-from calib.rooms.cells.camera_cell import (
+from calib.simulation.camera_cell import (
     FIVE_MEGAPIXEL,
     CameraCell,
     Views,
@@ -51,9 +51,9 @@ from calib.rooms.cells.camera_cell import (
     take_pictures,
     views,
 )
-from calib.rooms.cells.cell import Cell, SimulatedInstrument, measure
-from calib.rooms.cells.truth import position_errors
-from calib.rooms.cells.virtual_cells import rigid, virtual_cell
+from calib.simulation.cell import Cell, SimulatedInstrument, measure
+from calib.simulation.truth import position_errors
+from calib.simulation.virtual_cells import rigid, virtual_cell
 from calib.transforms import pose
 
 COUNTS = (20, 40, 80)

@@ -24,8 +24,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from calib.robot.kinematics import forward
-from calib.rooms.cells.cell import SimulatedInstrument, measure, true_poses
-from calib.rooms.cells.virtual_cells import virtual_cell
+from calib.simulation.cell import SimulatedInstrument, measure, true_poses
+from calib.simulation.virtual_cells import virtual_cell
 
 HERE = Path(__file__).parent
 TRACKER = SimulatedInstrument("laser tracker", 20e-6, None)

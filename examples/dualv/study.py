@@ -33,11 +33,11 @@ from calib.identification.identify import Identification, identify_model
 from calib.identification.prediction import predict
 from calib.identification.rows import Case, make_case
 from calib.identification.settings import IdentificationSettings
+from calib.parallel.excite import ParallelExcitation, design_parallel
+from calib.parallel.mechanism.parallel_model import make_parallel_model, rows_named
+from calib.parallel.mechanism.velocities import distributed, overconstraint
+from calib.parallel.robots import find
 from calib.procedure.excitation.settings import ExcitationSettings
-from calib.rooms.parallel.excite import ParallelExcitation, design_parallel
-from calib.rooms.parallel.mechanism.parallel_model import make_parallel_model, rows_named
-from calib.rooms.parallel.mechanism.velocities import distributed, overconstraint
-from calib.rooms.parallel.robots import find
 
 RATE, SECONDS = 1000.0, 6.0  # of a recording: Hz, s
 PAYLOAD = {"M5": 5.37, "MX5": -0.127, "ZZ5": 0.0161}  # truth: mass as weighed, the others as the papers identify them

@@ -43,10 +43,10 @@ from calib.identification.settings import IdentificationSettings, Payload, make_
 from calib.identification.uncertainty import geometry_uncertainty
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, random_joints
-from calib.rooms.cells import known_robots
-from calib.rooms.cells.cell import Cell, SimulatedInstrument, measure
-from calib.rooms.cells.known_robots import random_fourier
-from calib.rooms.cells.virtual_cells import lwr4plus_cell
+from calib.simulation import known_robots
+from calib.simulation.cell import Cell, SimulatedInstrument, measure
+from calib.simulation.known_robots import random_fourier
+from calib.simulation.virtual_cells import lwr4plus_cell
 from calib.workers import workers
 
 PAYLOAD = "8"

@@ -40,8 +40,8 @@ from calib.identification.rows import observe
 from calib.procedure.excitation import coefficients
 from calib.procedure.report.style import AFTER, INK, PAGE_WIDTH, QUIET, save, sheet, styled
 from calib.robot.chain import Chain
-from calib.rooms.cells import lwr4plus
-from calib.rooms.cells.known_robots import random_fourier
+from calib.simulation import lwr4plus
+from calib.simulation.known_robots import random_fourier
 
 REACH = 0.8 * np.deg2rad([170.0, 120.0, 170.0, 120.0, 170.0, 90.0, 170.0])
 SPEED = 0.8 * np.deg2rad([110.0, 110.0, 128.0, 128.0, 204.0, 184.0, 184.0])

@@ -61,11 +61,11 @@ from calib.procedure.excitation.settings import ExcitationSettings
 from calib.procedure.report.style import save
 from calib.robot.chain import Chain, random_joints
 from calib.robot.tables import dumps
-from calib.rooms.cells import lwr4plus
-from calib.rooms.cells.cell import measure
-from calib.rooms.cells.virtual_cells import lwr4plus_cell
+from calib.simulation import lwr4plus
+from calib.simulation.cell import measure
+from calib.simulation.virtual_cells import lwr4plus_cell
+from calib.trajectories.design.objectives import condition_numbers
 from calib.workers.threads import one_blas_thread
-from trajectories.design.objectives import condition_numbers
 
 PERIODS = (10.0, 15.0, 20.0, 25.0, 30.0)  # the paper's T0, section 4.3 [s]
 PERIOD, SECONDS, RATE = 25.0, 50.0, 1000.0  # of a trajectory and of a log [s]; of the controller [Hz]

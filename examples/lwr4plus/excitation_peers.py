@@ -49,16 +49,16 @@ from calib.procedure.excitation.settings import COARSE, DEFAULT_DESIGN, HARMONIC
 from calib.procedure.report.style import AFTER, BEFORE, INK, MARK, PAGE_WIDTH, QUIET, save, sheet, styled
 from calib.robot.chain import Chain
 from calib.robot.library import load
-from trajectories.constraints import TorqueLimit, box_limits
-from trajectories.design import search
-from trajectories.design.objectives import Excitation, condition_numbers
-from trajectories.design.optimise import design
-from trajectories.design.problem import Evaluation, ExcitationProblem, evaluate
-from trajectories.design.search import STAGES, Method, SearchResult, Stage, one_start
-from trajectories.design.starts import random_start
-from trajectories.design.verify import dense_motion, ensured
-from trajectories.fourier import fourier_family
-from trajectories.places import Workspace
+from calib.trajectories.constraints import TorqueLimit, box_limits
+from calib.trajectories.design import search
+from calib.trajectories.design.objectives import Excitation, condition_numbers
+from calib.trajectories.design.optimise import design
+from calib.trajectories.design.problem import Evaluation, ExcitationProblem, evaluate
+from calib.trajectories.design.search import STAGES, Method, SearchResult, Stage, one_start
+from calib.trajectories.design.starts import random_start
+from calib.trajectories.design.verify import dense_motion, ensured
+from calib.trajectories.fourier import fourier_family
+from calib.trajectories.places import Workspace
 
 FC = (11.9, 11.5, 8.98, 8.35, 8.31, 4.72, 6.04)  # [N m], Jubien, Gautier & Janot 2014 as quoted in public code
 FV = (14.4, 15.3, 6.55, 11.0, 4.29, 2.26, 1.6)  # [N m s/rad]

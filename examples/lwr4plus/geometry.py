@@ -27,19 +27,19 @@ from calib.geometry.first_guess import install
 from calib.geometry.fit import GeometricFit, Settings, fit, fit_with_prior, parameter_values, polish_frames
 from calib.geometry.installation import Installation, see
 from calib.geometry.observation import prepare
+from calib.poses.candidates import draw_candidates
+from calib.poses.continuous.tabu import TabuRule
+from calib.poses.indices import Index, observability
+from calib.poses.select import Method, SearchSettings, Selection, random_baseline, select_poses
+from calib.poses.space import PoseConstraint, SearchSpace, is_feasible
+from calib.poses.whole_space import bound_over_space
 from calib.robot import mdh
 from calib.robot.chain import Chain, random_joints
 from calib.robot.kinematics import jacobian, jacobian_product
-from calib.rooms.cells import lwr4plus
-from calib.rooms.cells.cell import SimulatedInstrument, measure, true_poses
-from calib.rooms.cells.virtual_cells import lwr4plus_cell, rigid
+from calib.simulation import lwr4plus
+from calib.simulation.cell import SimulatedInstrument, measure, true_poses
+from calib.simulation.virtual_cells import lwr4plus_cell, rigid
 from calib.transforms import invert
-from poses.candidates import draw_candidates
-from poses.continuous.tabu import TabuRule
-from poses.indices import Index, observability
-from poses.select import Method, SearchSettings, Selection, random_baseline, select_poses
-from poses.space import PoseConstraint, SearchSpace, is_feasible
-from poses.whole_space import bound_over_space
 
 LIMITS = np.deg2rad([170.0, 120.0, 170.0, 120.0, 170.0, 90.0, 170.0])
 DROPPED = ("alpha0", "d0", "theta7", "r7")  # the paper's four parameters that cannot be told

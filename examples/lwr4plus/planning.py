@@ -30,14 +30,14 @@ from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.path_dynamics import PathDynamics, of_standard
 from calib.robot import description, library
 from calib.robot.chain import Chain, random_joints
-from calib.rooms.cells.known_robots import truth
-from trajectories.errors import BadInput
-from trajectories.timing.limits import TimingLimits
-from trajectories.timing.path import Path as JointPath
-from trajectories.timing.path import check_within, spline
-from trajectories.timing.profile import dense
-from trajectories.timing.shape import shorten
-from trajectories.timing.time_scaling import Timing, time_optimal
+from calib.simulation.known_robots import truth
+from calib.trajectories.errors import BadInput
+from calib.trajectories.timing.limits import TimingLimits
+from calib.trajectories.timing.path import Path as JointPath
+from calib.trajectories.timing.path import check_within, spline
+from calib.trajectories.timing.profile import dense
+from calib.trajectories.timing.shape import shorten
+from calib.trajectories.timing.time_scaling import Timing, time_optimal
 
 REACH = 0.7  # of the joint limits, for waypoints
 SIGMAS = 3.0  # of the predicted torque, kept free of its limit

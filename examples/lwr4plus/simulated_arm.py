@@ -26,7 +26,7 @@ from calib.identification.closed_loop.simulation import Plant, Sensing, feed_for
 from calib.identification.loop import Controller
 from calib.identification.rows import Case, make_case, observe
 from calib.robot.chain import Chain
-from calib.rooms.cells import known_robots, lwr4plus
+from calib.simulation import known_robots, lwr4plus
 from calib.transforms import pose
 
 PAYLOAD = "8"

@@ -13,14 +13,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from calib.apps.studies.conditions import Condition, read_study
+from calib.apps.studies.experiment import Experiment, make_experiment, set_up
 from calib.data.recordings.recording import Recording
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.identification.closed_loop.simulation import Sensing, simulate
 from calib.identification.registry import method_named
 from calib.identification.rows import Case, observe
-from calib.rooms.cells import known_robots
-from calib.rooms.studies.conditions import Condition, read_study
-from calib.rooms.studies.experiment import Experiment, make_experiment, set_up
+from calib.simulation import known_robots
 
 
 def with_case(data: Experiment, case: Case) -> Experiment:

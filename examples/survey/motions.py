@@ -17,9 +17,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from calib.apps.studies.conditions import read_study
+from calib.apps.studies.experiment import make_experiment
 from calib.identification.registry import method_named
-from calib.rooms.studies.conditions import read_study
-from calib.rooms.studies.experiment import make_experiment
 
 
 def main() -> None:

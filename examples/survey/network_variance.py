@@ -14,11 +14,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from calib.apps.studies.conditions import Condition, read_study
+from calib.apps.studies.experiment import make_experiment
 from calib.identification.methods.method import Method
 from calib.identification.registry import method_named
 from calib.identification.survey.networks import ADALINE, HOPFIELD
-from calib.rooms.studies.conditions import Condition, read_study
-from calib.rooms.studies.experiment import make_experiment
 
 TRIED: dict[str, Method] = {
     "ols": method_named("ols"),

@@ -23,14 +23,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calib.apps.studies.conditions import read_study
+from calib.apps.studies.experiment import Experiment, make_experiment
 from calib.errors import CalibError
 from calib.identification.methods.least_squares import WLS
 from calib.identification.methods.method import IdentificationProblem
 from calib.identification.registry import method_named
 from calib.identification.survey.filters import _steps, _thin
 from calib.identification.survey.simulated_robot import Stepper, believed_robot, stepper
-from calib.rooms.studies.conditions import read_study
-from calib.rooms.studies.experiment import Experiment, make_experiment
 
 WAYS = {"jitter": 1.0, "shrinkage": 1.0, "tempered": 30.0}  # times the positions' noise
 SHRINK, JITTER, SPREAD, WIDTH = 0.99, 0.01, 0.05, 5.0  # of Liu & West, the survey (2), and the Kalman filters

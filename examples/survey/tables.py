@@ -16,11 +16,11 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from calib.apps.studies.conditions import Condition, read_study
+from calib.apps.studies.store import read_rows
+from calib.apps.studies.summary import ConditionSummary, MethodSummary, summarise
+from calib.apps.studies.trial import TrialRow
 from calib.identification.registry import METHODS
-from calib.rooms.studies.conditions import Condition, read_study
-from calib.rooms.studies.store import read_rows
-from calib.rooms.studies.summary import ConditionSummary, MethodSummary, summarise
-from calib.rooms.studies.trial import TrialRow
 
 HERE = Path(__file__).parent
 STUDIES = ("MCS-*", "unfiltered", "wrong-beliefs", "designed", "low-rate", "controller")

@@ -12,10 +12,10 @@ import sys
 
 import numpy as np
 
+from calib.apps.studies.conditions import read_study
+from calib.apps.studies.experiment import set_up
 from calib.identification.closed_loop.simulation import Sensing, simulate
-from calib.rooms.cells import known_robots
-from calib.rooms.studies.conditions import read_study
-from calib.rooms.studies.experiment import set_up
+from calib.simulation import known_robots
 
 
 def main() -> None:

@@ -46,8 +46,8 @@ from calib.identification.loop import Controller
 from calib.identification.methods.constraint_settings import ConstraintSettings
 from calib.identification.methods.parameter_constraints import hold, make_constraints
 from calib.identification.rows import Case, make_case, observe
-from calib.rooms.cells import known_robots
-from calib.rooms.cells.known_robots import random_fourier, trapezoidal
+from calib.simulation import known_robots
+from calib.simulation.known_robots import random_fourier, trapezoidal
 
 RATE, EVERY = 5000.0, 5
 FILTERS = FilterOptions(cutoff=50.0, band=20.0, clock="stamps")

@@ -3,7 +3,7 @@
 MLSL (Rinnooy Kan & Timmer 1987; Sobol points as in Kucherenko & Sytsko 2005) starts a local search at a sampled point
 only if no better point lies near it, so that no optimum is searched twice. NLopt's knows bounds but no constraints:
 their violation is charged quadratically. The best set is brought back onto the constraints; poses that break them even
-so, or a predicate, are those of the start. Half of the effort is for MLSL, the rest for `poses.continuous.local`.
+so, or a predicate, are those of the start. Half of the effort is for MLSL, the rest for `calib.poses.continuous.local`.
 """
 
 import time
@@ -13,9 +13,9 @@ from dataclasses import replace
 import nlopt
 import numpy as np
 
-from poses.continuous.local import FEASIBLE, SHARPNESS, Improved, improved, merit_of, restored
-from poses.indices import Index
-from poses.space import SearchSpace, constraint_gradients, constraint_values, is_feasible
+from calib.poses.continuous.local import FEASIBLE, SHARPNESS, Improved, improved, merit_of, restored
+from calib.poses.indices import Index
+from calib.poses.space import SearchSpace, constraint_gradients, constraint_values, is_feasible
 
 CHARGE = 100.0  # of the merit, per squared unit of a violated constraint (our choice)
 POINTS = 4  # sampled between local searches (our choice)
@@ -41,11 +41,11 @@ def mlsl_search(
         evaluations: most of the index, of both parts together.
         seconds: of processor time, of both parts together.
     """
-    began, spent, best, found, interrupted = time.process_time(), 0, -np.inf, start, False
-    solver, local = (nlopt.opt(one, start.size) for one in (nlopt.G_MLSL_LDS, nlopt.LD_CCSAQ))
+    began, spent, best, best_q, interrupted = time.process_time(), 0, -np.inf, start, False
+    solver, local = (nlopt.opt(algorithm, start.size) for algorithm in (nlopt.G_MLSL_LDS, nlopt.LD_CCSAQ))
 
     def charged(x: np.ndarray, slope: np.ndarray) -> float:
-        nonlocal spent, best, found, interrupted
+        nonlocal spent, best, best_q, interrupted
         spent += 1
         try:
             value, gradient = _charged(space, x.reshape(start.shape), index, existing)
@@ -56,7 +56,7 @@ def mlsl_search(
         if slope.size:
             slope[:] = -gradient.ravel()
         if value > best:
-            best, found = value, x.reshape(start.shape).copy()
+            best, best_q = value, x.reshape(start.shape).copy()
         return -value
 
     local.set_ftol_rel(1e-4)
@@ -69,11 +69,11 @@ def mlsl_search(
     solver.set_maxeval(max(1, evaluations // 2))
     with suppress(nlopt.ForcedStop, nlopt.RoundoffLimited):  # the best set stands
         solver.optimize(start.ravel())
-    found = restored(space, found)
-    bad = ~is_feasible(space, found, FEASIBLE)
-    found[bad] = start[bad]
-    left = 0.0 if interrupted else seconds - (time.process_time() - began)
-    run = improved(space, found, index, existing, evaluations=max(1, evaluations - spent), seconds=left)
+    best_q = restored(space, best_q)
+    bad = ~is_feasible(space, best_q, FEASIBLE)
+    best_q[bad] = start[bad]
+    remaining = 0.0 if interrupted else seconds - (time.process_time() - began)
+    run = improved(space, best_q, index, existing, evaluations=max(1, evaluations - spent), seconds=remaining)
     return replace(run, evaluations=spent + run.evaluations, interrupted=interrupted or run.interrupted)
 
 

@@ -1,7 +1,8 @@
 """Deterministic local search over all m · n joint values at once, under constraints, with exact gradients.
 
 Sequential quadratic programming (SLSQP, Kraft 1988, in SciPy) on a smoothed index that is sharpened stage by stage (see
-`poses.indices.merit`), each stage ended by stagnation. An iterate may leave the constraints a little, so that every
+`calib.poses.indices.merit`), each stage ended by stagnation. An iterate may leave the constraints a little, so that
+every
 stage ends with a restoration: Newton steps of least norm back onto what is violated, pose by pose. What is handed back
 is the best restored set by the index itself, unsmoothed.
 """
@@ -13,17 +14,19 @@ from functools import partial
 
 import numpy as np
 
-from poses.indices import Index, has_kinks, merit
-from poses.space import SearchSpace, constraint_gradients, constraint_values, is_feasible, product
+from calib.poses.indices import Index, has_kinks, merit
+from calib.poses.space import SearchSpace, constraint_gradients, constraint_values, is_feasible, product
 
 Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
 
-"""Above this number of variables, poses are searched in blocks, the others fixed: SLSQP's cost is cubic."""
+# above this number of variables, poses are searched in blocks, the others fixed: SLSQP's cost is cubic
+MAX_BLOCK = 300
+# the stages of a smoothed search (our choice): at the last one the smoothing costs at most log(p)/1024 of the merit
 SHARPNESS = (16.0, 64.0, 256.0, 1024.0)
-"""The stages of a smoothed search. Our choice: at the last one the smoothing costs at most log(p)/1024 of the merit."""
-"""Iterations within which a stage must improve. Our choice."""
+# iterations within which a stage must improve (our choice)
+PATIENCE = 25
+# largest accepted constraint violation in a result [unit of the constraint]
 FEASIBLE = 1e-8
-"""Largest accepted constraint violation in a result [unit of the constraint]."""
 
 
 @dataclass(frozen=True)
@@ -50,14 +53,14 @@ def merit_of(
 ) -> tuple[float, np.ndarray]:
     """Return the merit log O of poses together with those measured before, and its gradient by q.
 
-    ∂ log O/∂q_ik = Σ_rp G[i,r,p] ∂J[i,r,p]/∂q_ik with G = ∂ log O/∂W (see `poses.indices`).
+    ∂ log O/∂q_ik = Σ_rp G[i,r,p] ∂J[i,r,p]/∂q_ik with G = ∂ log O/∂W (see `calib.poses.indices`).
 
     Args:
         space: gives the Jacobian and its derivative product.
         q: (m, n) poses [rad or m].
         index: "O1" ... "O5", "cond".
         existing: (k, rows, p) Jacobians (or stacked, (k rows, p)) that count but do not move.
-        sharpness: of the smoothing, see `poses.indices.merit`.
+        sharpness: of the smoothing, see `calib.poses.indices.merit`.
 
     Returns:
         The merit and its gradient (m, n).
@@ -94,7 +97,7 @@ def improved(
         index: what to improve.
         existing: (k, rows, p) Jacobians of poses already measured.
         evaluations: most evaluations of index and gradient; a search stops by itself long before.
-        tolerance: gain of the merit over `patience` iterations to stop at; ten times that in all stages but the last.
+        tolerance: gain of the merit over `PATIENCE` iterations to stop at; ten times that in all stages but the last.
         seconds: of processor time to end after, whatever was reached by then.
         sharpness: of the stages, for indices with kinks.
         report: called with every improved merit.
@@ -102,18 +105,18 @@ def improved(
     deadline = time.process_time() + seconds
     start = np.clip(np.asarray(q, dtype=float), space.lower, space.upper)
     value = merit_of(space, start, index, existing)[0] if is_feasible(space, start, FEASIBLE).all() else -np.inf
-    found, free, spent, interrupted = start, np.ones(len(start), dtype=bool), 1, False
+    best, free, spent, interrupted = start, np.ones(len(start), dtype=bool), 1, False
     history = [value] if np.isfinite(value) else []
     for _ in range(3):
-        held = _with_rows(space, found[~free], existing)
-        run = _search(space, found[free], index, held, evaluations - spent, tolerance, sharpness, deadline)
-        trial, spent, interrupted = found.copy(), spent + run.evaluations, run.interrupted
+        fixed_rows = _with_rows(space, best[~free], existing)
+        run = _search(space, best[free], index, fixed_rows, evaluations - spent, tolerance, sharpness, deadline)
+        trial, spent, interrupted = best.copy(), spent + run.evaluations, run.interrupted
         trial[free] = run.q
         bad = ~is_feasible(space, trial, FEASIBLE)
         trial[bad] = start[bad]
-        now = merit_of(space, trial, index, existing)[0]
-        if now > value or (now == value and not bad.any()):
-            found, value = trial, now
+        trial_value = merit_of(space, trial, index, existing)[0]
+        if trial_value > value or (trial_value == value and not bad.any()):
+            best, value = trial, trial_value
             history += [h for h in run.history if max(history, default=-np.inf) < h < value] + [value]
             if report:
                 report(value)
@@ -122,7 +125,7 @@ def improved(
         free &= ~bad
         if not free.any():
             break
-    return Improved(found, value, tuple(history), spent + 1, interrupted)
+    return Improved(best, value, tuple(history), spent + 1, interrupted)
 
 
 def _objective(
@@ -146,26 +149,27 @@ def _search(
     deadline: float,
 ) -> Improved:
     """Run the stages from one start and return the best feasible set; the predicate is not checked."""
-    kept = bool(_keeps(space, start).all())
-    best, value = start, merit_of(space, start, index, existing)[0] if kept else -np.inf
-    history, spent, now, interrupted = [value], 0, start, False
+    feasible = bool(_keeps(space, start).all())
+    best, value = start, merit_of(space, start, index, existing)[0] if feasible else -np.inf
+    history, spent, iterate, interrupted = [value], 0, start, False
     stages = list(sharpness if has_kinks(index) else (np.inf,))
-    max_block = 300
-    blocks = -(-start.size // max_block)
+    blocks = -(-start.size // MAX_BLOCK)
     while stages and spent < evaluations and time.process_time() < deadline and not interrupted:
         sharp = stages.pop(0)
         for block in np.array_split(np.random.default_rng(len(history)).permutation(len(start)), blocks):
-            rest = np.setdiff1d(np.arange(len(start)), block)
-            held = _with_rows(space, now[rest], existing)
-            objective = partial(_objective, space, index, held, sharp)
+            others = np.setdiff1d(np.arange(len(start)), block)
+            fixed_rows = _with_rows(space, iterate[others], existing)
+            objective = partial(_objective, space, index, fixed_rows, sharp)
             patient = tolerance * (10 if stages else 1)
-            moved, steps, interrupted = climb(space, now[block], objective, evaluations - spent, patient, deadline)
-            now, spent = now.copy(), spent + steps
-            now[block] = moved
+            block_poses, steps, interrupted = climb(
+                space, iterate[block], objective, evaluations - spent, patient, deadline
+            )
+            iterate, spent = iterate.copy(), spent + steps
+            iterate[block] = block_poses
             if interrupted or spent >= evaluations or time.process_time() > deadline:
                 break
-        trial = restored(space, now)
-        if kept:
+        trial = restored(space, iterate)
+        if feasible:
             bad = ~_keeps(space, trial)
             trial[bad] = best[bad]
         reached, last = merit_of(space, trial, index, existing)[0], value
@@ -175,7 +179,7 @@ def _search(
         if (
             not stages and 10 * tolerance < value - last < np.inf
         ):  # blocks, and stages cut short by a failed line search
-            stages, now = [sharp], best
+            stages, iterate = [sharp], best
     return Improved(best, value, tuple(history), spent, interrupted)
 
 
@@ -187,7 +191,7 @@ def climb(
     tolerance: float,
     deadline: float = np.inf,
 ) -> tuple[np.ndarray, int, bool]:
-    """Maximise a smooth function of poses by SLSQP, until it gains less than `tolerance` over `patience` iterations.
+    """Maximise a smooth function of poses by SLSQP, until it gains less than `tolerance` over `PATIENCE` iterations.
 
     Args:
         space: limits and constraints; its Jacobian and predicate are not looked at.
@@ -215,8 +219,7 @@ def climb(
         nonlocal last
         last = x.reshape(m, n).copy()
         merits.append(latest)
-        patience = 25
-        stalled = len(merits) > patience and merits[-1] - merits[-1 - patience] < tolerance
+        stalled = len(merits) > PATIENCE and merits[-1] - merits[-1 - PATIENCE] < tolerance
         if stalled or count >= evaluations or time.process_time() > deadline:
             raise _Ended
 
@@ -229,10 +232,11 @@ def climb(
         result[np.arange(m), :, np.arange(m)] = -blocks
         return result.reshape(-1, m * n)
 
-    import scipy.optimize  # slow to load
+    # slow to load
+    import scipy.optimize
 
     bounds = list(zip(np.tile(space.lower, m), np.tile(space.upper, m), strict=True))
-    kept = [{"type": "ineq", "fun": values, "jac": slopes}] if space.constraints else []
+    constraints = [{"type": "ineq", "fun": values, "jac": slopes}] if space.constraints else []
     options = {"maxiter": evaluations, "ftol": 1e-2 * tolerance}
     try:
         run = scipy.optimize.minimize(
@@ -241,7 +245,7 @@ def climb(
             jac=True,
             method="SLSQP",
             bounds=bounds,
-            constraints=kept,
+            constraints=constraints,
             callback=accepted,
             options=options,
         )
@@ -265,11 +269,11 @@ def restored(space: SearchSpace, q: np.ndarray, steps: int = 20) -> np.ndarray:
             break
         values, slopes = constraint_values(space, q[broken]), constraint_gradients(space, q[broken])
         for pose, value, slope in zip(broken, values, slopes, strict=True):
-            near = value > -1e-6
+            binding = value > -1e-6
             free = np.ones(q.shape[1], dtype=bool)
             for _ in range(q.shape[1]):
                 step = np.zeros(q.shape[1])
-                step[free] = np.linalg.lstsq(slope[near][:, free], -value[near] - 0.05 * FEASIBLE, rcond=1e-9)[0]
+                step[free] = np.linalg.lstsq(slope[binding][:, free], -value[binding] - 0.05 * FEASIBLE, rcond=1e-9)[0]
                 out = free & ((q[pose] + step < space.lower) | (q[pose] + step > space.upper))
                 if not out.any() or out.sum() == free.sum():
                     break

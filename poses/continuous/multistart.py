@@ -6,9 +6,9 @@ from functools import partial
 
 import numpy as np
 
-from poses.continuous.local import Improved, improved
-from poses.indices import Index
-from poses.space import SearchSpace
+from calib.poses.continuous.local import Improved, improved
+from calib.poses.indices import Index
+from calib.poses.space import SearchSpace
 
 
 def random_starts(q: np.ndarray, m: int, count: int, seed: int) -> list[np.ndarray]:

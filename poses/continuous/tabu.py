@@ -18,10 +18,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from poses.candidates import draw_candidates
-from poses.continuous.local import Improved, improved
-from poses.indices import Index, merit
-from poses.space import SearchSpace, is_feasible
+from calib.poses.candidates import draw_candidates
+from calib.poses.continuous.local import Improved, improved
+from calib.poses.indices import Index, merit
+from calib.poses.space import SearchSpace, is_feasible
 
 
 @dataclass(frozen=True)
@@ -84,10 +84,10 @@ def tabu_search(
         spared, failures = set[int](), 0
         while failures < rule.patience * m and time.process_time() < deadline:
             out = _least_useful(space, np.array(chosen), index, existing, spared)
-            rest = chosen[:out] + chosen[out + 1 :]
-            pose, evaluations = _newcomer(space, rest, index, existing, generator, listed, rule)
+            remaining = chosen[:out] + chosen[out + 1 :]
+            pose, evaluations = _newcomer(space, remaining, index, existing, generator, listed, rule)
             spent += evaluations
-            value = _merit(space, np.array([*rest, pose]), index, existing)
+            value = _merit(space, np.array([*remaining, pose]), index, existing)
             if value > history[-1] + 1e-9:
                 chosen[out], spared, failures = pose, set[int](), 0
                 history.append(value)
@@ -105,7 +105,7 @@ def tabu_search(
 
 def _newcomer(
     space: SearchSpace,
-    others: list[np.ndarray],
+    poses: list[np.ndarray],
     index: Index,
     existing: np.ndarray | None,
     generator: np.random.Generator,
@@ -121,7 +121,7 @@ def _newcomer(
         return good
 
     draws = draw_candidates(space.lower, space.upper, rule.candidates, allowed, seed=generator, block=256)
-    fixed = _fixed(space, others, existing)
+    fixed = _fixed(space, poses, existing)
     jacobians = np.asarray(space.jacobian(draws), dtype=float)
     rows = fixed.reshape(-1, jacobians.shape[2]) if fixed is not None else np.zeros((0, jacobians.shape[2]))
     full = len(rows) + jacobians.shape[1] >= jacobians.shape[2]
@@ -142,8 +142,8 @@ def _spanning(rows: np.ndarray, jacobians: np.ndarray) -> np.ndarray:
     """Return log det(εI + information) (K,) of the rows after adding each Jacobian; columns are scaled by their rms."""
     scale = np.sqrt((jacobians**2).mean((0, 1)))
     scale = np.where(scale > 0, scale, 1.0)
-    z, known = jacobians / scale, rows / scale
-    matrix = known.T @ known + 1e-6 * np.eye(len(scale))
+    z, scaled_rows = jacobians / scale, rows / scale
+    matrix = scaled_rows.T @ scaled_rows + 1e-6 * np.eye(len(scale))
     return np.linalg.slogdet(matrix + z.transpose(0, 2, 1) @ z)[1]
 
 
@@ -153,19 +153,19 @@ def _least_useful(
     """Return the removable pose whose removal leaves the largest merit."""
     jacobians = np.asarray(space.jacobian(q), dtype=float)
     before = np.zeros((0, jacobians.shape[2])) if existing is None else existing.reshape(-1, jacobians.shape[2])
-    left = np.full(len(q), -np.inf)
+    merits = np.full(len(q), -np.inf)
     open_ = [i for i in range(len(q)) if i not in spared]
     for i in open_:
-        kept = np.delete(jacobians, i, axis=0).reshape(-1, jacobians.shape[2])
-        left[i] = merit(np.concatenate([before, kept]), index)[0]
-    return open_[int(left[open_].argmax())]
+        remaining = np.delete(jacobians, i, axis=0).reshape(-1, jacobians.shape[2])
+        merits[i] = merit(np.concatenate([before, remaining]), index)[0]
+    return open_[int(merits[open_].argmax())]
 
 
-def _fixed(space: SearchSpace, others: list[np.ndarray], existing: np.ndarray | None) -> np.ndarray | None:
+def _fixed(space: SearchSpace, poses: list[np.ndarray], existing: np.ndarray | None) -> np.ndarray | None:
     """Return the rows (R, p) of the other poses and of those measured before."""
-    if not others:
+    if not poses:
         return existing
-    jacobians = np.asarray(space.jacobian(np.array(others)), dtype=float)
+    jacobians = np.asarray(space.jacobian(np.array(poses)), dtype=float)
     rows = jacobians.reshape(-1, jacobians.shape[2])
     return rows if existing is None else np.concatenate([rows, existing.reshape(-1, rows.shape[1])])
 

@@ -20,8 +20,8 @@ from calib import cli
 from calib.errors import MeasurementError, UsageError
 from calib.identification.identify_options import options_of, parse_options
 from calib.robot import description
-from calib.rooms.cells.cell import measure, write_measured
-from calib.rooms.cells.virtual_cells import perturbed_cell
+from calib.simulation.cell import measure, write_measured
+from calib.simulation.virtual_cells import perturbed_cell
 
 
 @pytest.fixture(scope="module")

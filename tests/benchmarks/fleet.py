@@ -8,12 +8,12 @@ import shutil
 import time
 from pathlib import Path
 
+from calib.apps.cell_demo import demo
+from calib.apps.fleet import fleet
 from calib.procedure.session import steps
 from calib.procedure.session.commands import new_session
 from calib.procedure.session.folder import locked, open_session
-from calib.rooms.cells import demo
-from calib.rooms.cells.virtual_cells import virtual_cell
-from calib.rooms.fleet import fleet
+from calib.simulation.virtual_cells import virtual_cell
 
 ROBOTS = ("ur5", "ur10e", "panda", "tx40")
 

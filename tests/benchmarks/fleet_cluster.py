@@ -17,8 +17,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
 import dask_cluster
 
-from calib.rooms.fleet.fleet import DONE, FleetRow
-from calib.rooms.fleet.throughput import Throughput
+from calib.apps.fleet.fleet import DONE, FleetRow
+from calib.apps.fleet.throughput import Throughput
 from calib.workers import workers
 
 THREADS = 8, 32, 128, 512

@@ -17,13 +17,13 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 import calib
+from calib.apps.fleet import prior
 from calib.data.poses.fit_options import FitOptions
 from calib.data.poses.measurements import PoseMeasurements, Positions, take
 from calib.errors import CalibError
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
-from calib.rooms.fleet import prior
 
 DATA = Path(__file__).parents[3] / "shared/data"
 LINKS = "shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3"

@@ -149,7 +149,7 @@ def log(chain, samples: int):
     """Return t, q, v, a and tau of a chain of seven joints at 1 kHz, a minute of random motion over and over."""
     from calib.dynamics.bodies import bodies_of, standard_parameters
     from calib.dynamics.rigid_body import inverse_dynamics
-    from calib.rooms.cells.known_robots import random_fourier
+    from calib.simulation.known_robots import random_fourier
 
     wide = np.full(7, 1.5)
     minute = random_fourier(-wide, wide, wide, 60.0, 1000.0, 60, acceleration=6.0)
@@ -275,7 +275,7 @@ def lapack_joints(n: int) -> Callable:
 def select_candidates(count: int) -> Callable:
     import library_arm
 
-    from poses.select import select_poses
+    from calib.poses.select import select_poses
 
     jacobians = library_arm.point_jacobian(library_arm.random_poses(count, 0))
     return lambda: select_poses(jacobians, 40)

@@ -18,8 +18,8 @@ from calib.identification.closed_loop.simulation import Sensing, simulate
 from calib.identification.methods.constraint_settings import ConstraintSettings
 from calib.identification.methods.parameter_constraints import make_constraints
 from calib.identification.rows import make_case
-from calib.rooms.cells import known_robots
-from calib.rooms.cells.known_robots import random_fourier
+from calib.simulation import known_robots
+from calib.simulation.known_robots import random_fourier
 
 PLANT = known_robots.plant("tx40", coupled=True)
 MODEL = known_robots.model(PLANT)

@@ -22,12 +22,12 @@ from calib.procedure.excitation.limits import Points
 from calib.robot import library, mdh
 from calib.robot.chain import Chain
 from calib.robot.library import load
-from trajectories.constraints import TorqueLimit, box_limits
-from trajectories.design.objectives import Excitation
-from trajectories.design.problem import ExcitationProblem, evaluate
-from trajectories.design.starts import random_start
-from trajectories.fourier import fourier_family
-from trajectories.places import Workspace
+from calib.trajectories.constraints import TorqueLimit, box_limits
+from calib.trajectories.design.objectives import Excitation
+from calib.trajectories.design.problem import ExcitationProblem, evaluate
+from calib.trajectories.design.starts import random_start
+from calib.trajectories.fourier import fourier_family
+from calib.trajectories.places import Workspace
 
 CHAIN = load("lwr4plus")
 FC = (11.9, 11.5, 8.98, 8.35, 8.31, 4.72, 6.04)

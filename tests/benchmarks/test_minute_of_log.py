@@ -20,7 +20,7 @@ from calib.identification.prediction import predict, score
 from calib.identification.rows import make_case
 from calib.identification.settings import IdentificationSettings
 from calib.robot.library import load
-from calib.rooms.cells.known_robots import random_fourier
+from calib.simulation.known_robots import random_fourier
 
 CHAIN = load("lwr4plus")
 N, RATE, SECONDS = 7, 1000.0, 60.0

@@ -3,8 +3,8 @@
 import library_arm
 import pytest
 
-from poses.convex import bound
-from poses.select import select_poses
+from calib.poses.convex import bound
+from calib.poses.select import select_poses
 
 CASES = {
     "17 of 2000, pose": (2000, 17, library_arm.jacobian),

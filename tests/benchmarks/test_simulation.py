@@ -21,8 +21,8 @@ from calib.identification.closed_loop.loop_recordings import Loop
 from calib.identification.closed_loop.simulation import Plant, Sensing, forward_dynamics, simulate
 from calib.identification.rows import Case, make_case
 from calib.robot import description, library
-from calib.rooms.cells import known_robots
-from calib.rooms.cells.known_robots import random_fourier
+from calib.simulation import known_robots
+from calib.simulation.known_robots import random_fourier
 
 STATES = 20_000
 REACH = np.array([2.8, 1.8, 2.0, 3.5, 1.9, 4.0])

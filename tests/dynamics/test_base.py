@@ -15,7 +15,7 @@ from calib.dynamics.shapes import JointRange
 from calib.dynamics.torque_rows import BOTH, DRIVE, LINK, MODELS, MOTOR
 from calib.errors import CalibError
 from calib.robot.library import load
-from calib.rooms.cells import lwr4plus
+from calib.simulation import lwr4plus
 
 SENSED = "Ia Fvl Fcl offl Fvm Fcm offm"
 

@@ -8,8 +8,8 @@ import pytest
 from both_ways import go_on, session_with
 
 from calib.robot import description
-from calib.rooms.cells.cell import measure, write_measured
-from calib.rooms.cells.virtual_cells import perturbed_cell
+from calib.simulation.cell import measure, write_measured
+from calib.simulation.virtual_cells import perturbed_cell
 
 
 @pytest.fixture(scope="session")

@@ -17,8 +17,8 @@ from calib.errors import finding
 from calib.procedure.findings import sentence
 from calib.procedure.session.folder import open_session
 from calib.robot.library import load
-from calib.rooms.cells.cell import measure, write_measured
-from calib.rooms.cells.virtual_cells import perturbed_cell
+from calib.simulation.cell import measure, write_measured
+from calib.simulation.virtual_cells import perturbed_cell
 
 
 def by_command(robot: Path, out: Path, model: str, fit: Path, unseen: Path) -> Judgement:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.rooms.cells import lwr4plus
+from calib.simulation import lwr4plus
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]

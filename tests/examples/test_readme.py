@@ -15,10 +15,10 @@ from calib.procedure.robot_kinds import joints_of
 from calib.robot.chain import random_joints
 from calib.robot.formats import urdf_write
 from calib.robot.library import load
-from calib.rooms.cells.cell import measure, write_log, write_measured
-from calib.rooms.cells.known_robots import random_fourier
-from calib.rooms.cells.virtual_arm import moving_arm, record
-from calib.rooms.cells.virtual_cells import virtual_cell
+from calib.simulation.cell import measure, write_log, write_measured
+from calib.simulation.known_robots import random_fourier
+from calib.simulation.virtual_arm import moving_arm, record
+from calib.simulation.virtual_cells import virtual_cell
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 from scripts import run_here
 
-from calib.rooms.studies.conditions import read_study
-from calib.rooms.studies.store import read_rows
+from calib.apps.studies.conditions import read_study
+from calib.apps.studies.store import read_rows
 
 SURVEY = Path(__file__).parents[2] / "examples" / "survey"
 

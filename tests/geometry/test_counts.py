@@ -13,7 +13,7 @@ from calib.geometry.observation import layout, prepare
 from calib.robot import mdh
 from calib.robot.chain import Chain
 from calib.robot.formats import urdf, urdf_write
-from calib.rooms.cells import lwr4plus
+from calib.simulation import lwr4plus
 from calib.transforms import to_quaternion
 
 

@@ -14,8 +14,8 @@ from calib.geometry.installation import Installation
 from calib.geometry.left_out import LeftOut, Unevenness, unevenness
 from calib.geometry.model_choice.ladder import select_model
 from calib.robot.library import load
-from calib.rooms.cells.cell import SimulatedInstrument, measure
-from calib.rooms.cells.virtual_cells import perturbed_cell
+from calib.simulation.cell import SimulatedInstrument, measure
+from calib.simulation.virtual_cells import perturbed_cell
 
 
 def measured(seed: int, count: int, reach: float, outside: float) -> Positions:

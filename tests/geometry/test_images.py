@@ -26,10 +26,10 @@ from calib.geometry.weighing import Settings
 from calib.procedure.kinematic_stage.image_findings import image_notes
 from calib.robot.calibrated import Deflection
 from calib.robot.library import load
-from calib.rooms.cells import camera_cell as camera
-from calib.rooms.cells.cell import Cell, SimulatedInstrument, measure
-from calib.rooms.cells.truth import position_errors
-from calib.rooms.cells.virtual_cells import rigid, virtual_cell
+from calib.simulation import camera_cell as camera
+from calib.simulation.cell import Cell, SimulatedInstrument, measure
+from calib.simulation.truth import position_errors
+from calib.simulation.virtual_cells import rigid, virtual_cell
 from calib.transforms import pose
 
 FISHEYE = Lens("fisheye", np.array([900.0, 905.0, 1220.0, 1010.0, 0.05, -0.02, 0.01, 0.003]), (2448, 2048))

@@ -10,7 +10,7 @@ from calib.geometry import inverse
 from calib.geometry.inverse import Goal
 from calib.robot.kinematics import gravity_torques
 from calib.robot.library import load
-from calib.rooms.cells.virtual_cells import lwr4plus_cell, perturbed_cell, rigid
+from calib.simulation.virtual_cells import lwr4plus_cell, perturbed_cell, rigid
 
 ROBOTS = ("ur5", "lwr4plus", "tx40", "rv2sq", "panda")
 

@@ -17,8 +17,8 @@ from calib.geometry.weighing import Settings
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 from calib.robot.library import load
-from calib.rooms.cells.cell import Cell, SimulatedInstrument, measure
-from calib.rooms.cells.virtual_cells import perturbed_cell, rigid
+from calib.simulation.cell import Cell, SimulatedInstrument, measure
+from calib.simulation.virtual_cells import perturbed_cell, rigid
 
 START = np.array([0.3, -1.4, 1.6, -1.7, -1.5, 0.4])
 

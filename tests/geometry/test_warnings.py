@@ -18,8 +18,8 @@ from calib.geometry.installation import Installation, see
 from calib.geometry.observability import PLACES, unidentified
 from calib.procedure.findings import lines_of
 from calib.robot.calibrated import Deflection, Term
-from calib.rooms.cells.cell import measure as measured_by
-from calib.rooms.cells.virtual_cells import perturbed_cell
+from calib.simulation.cell import measure as measured_by
+from calib.simulation.virtual_cells import perturbed_cell
 
 SIGMA = 5e-5
 

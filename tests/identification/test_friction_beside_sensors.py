@@ -9,10 +9,10 @@ from calib.identification.identify import identify
 from calib.identification.identify_options import parse_options
 from calib.procedure.dynamic_stage.inputs import gather
 from calib.robot.calibrated import as_calibrated
-from calib.rooms.cells.known_robots import random_fourier
-from calib.rooms.cells.truth import true_base
-from calib.rooms.cells.virtual_arm import moving_arm, record
-from calib.rooms.cells.virtual_cells import virtual_cell
+from calib.simulation.known_robots import random_fourier
+from calib.simulation.truth import true_base
+from calib.simulation.virtual_arm import moving_arm, record
+from calib.simulation.virtual_cells import virtual_cell
 
 
 @pytest.mark.slow

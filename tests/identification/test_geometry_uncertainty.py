@@ -196,8 +196,8 @@ def test_a_fit_leaves_the_covariance_of_its_chain(tmp_path):
     from calib.geometry.first_guess import install
     from calib.geometry.fit import fit
     from calib.robot.chain import random_joints
-    from calib.rooms.cells.cell import measure
-    from calib.rooms.cells.virtual_cells import lwr4plus_cell
+    from calib.simulation.cell import measure
+    from calib.simulation.virtual_cells import lwr4plus_cell
 
     cell = lwr4plus_cell(hidden=0.0)
     measured: PoseMeasurements = measure(cell, random_joints(cell.nominal, 40, 1), 2)

@@ -21,8 +21,8 @@ from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.robot import calibrated
 from calib.robot.chain import random_joints
 from calib.robot.library import load_calibrated
-from calib.rooms.cells.cell import measure
-from calib.rooms.cells.virtual_cells import perturbed_cell
+from calib.simulation.cell import measure
+from calib.simulation.virtual_cells import perturbed_cell
 
 
 def geometry(model: str) -> kinematic.Outcome:

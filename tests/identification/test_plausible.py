@@ -22,7 +22,7 @@ from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.plausibility import described, findings, impossible, wrong_joints
 from calib.procedure.findings import Verdict, level_of, settle
 from calib.robot.library import load
-from calib.rooms.cells.known_robots import random_fourier
+from calib.simulation.known_robots import random_fourier
 
 NAMES = ("joint1", "joint2", "joint3")
 ARM = replace(planted.arm(), joints=tuple(replace(joint, effort=60.0) for joint in planted.arm().joints))

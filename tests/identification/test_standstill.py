@@ -7,15 +7,24 @@ import planted_motion as planted
 import pytest
 
 from calib.data.recordings.recording import Recording
+from calib.data.signals.filtering import kept
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.errors import UsageError
 from calib.identification import standstill
 from calib.identification.identify import Identification, chain_states, common_decimator, find_base, identify
 from calib.identification.identify_options import parse_options
 from calib.identification.prediction import predict, score
+from calib.identification.prior import first_fit
 from calib.identification.rows import Case, ObservationRows, make_case, observe, with_blocks
 from calib.identification.settings import IdentificationSettings, make_model
-from calib.identification.standstill import divided, standing_joints, with_standstills
+from calib.identification.standstill import (
+    divided,
+    left_out_error,
+    standing_joints,
+    with_slowness,
+    with_standstills,
+    with_weights,
+)
 from calib.identification.uncertainty.torque_errors import intervals, learn_torque_errors
 
 PLAIN = IdentificationSettings(friction="standard", essential="none")
@@ -188,3 +197,38 @@ def test_intervals_have_two_widths_and_hold_in_both():
 def test_cut_slow_is_refused_with_what_replaced_it():
     with pytest.raises(UsageError, match="cut_slow: each standstill of a joint now counts once"):
         parse_options({"cut_slow": True})
+
+
+def test_left_out_motion_does_not_ask_for_standing_rows_where_friction_holds_them():
+    case = stop_and_go(3)
+    rows = rows_of(case)
+    first = first_fit(rows)
+    rows = with_weights(rows, first.rest_weights)
+    as_moving = [replace(part, standing=np.zeros_like(part.standing)) for part in rows]
+    once = left_out_error(rows, rows, first.std, first.inflation, None, ())
+    first_as_moving = first_fit(as_moving)
+    others = left_out_error(as_moving, rows, first_as_moving.std, first_as_moving.inflation, None, ())
+    assert 0.0 < once < standstill.CLEARLY_LESS**-2 * others, "friction at rest is random here: once is right"
+    assert left_out_error(rows, rows, first.std, first.inflation, None, range(planted.N)) == 0.0, (
+        "rows that no total holds"
+    )
+
+
+def test_slow_rows_count_less_where_the_model_errs_more_there():
+    case = stop_and_go(4)
+    settings, decimator = PLAIN, common_decimator([case], PLAIN)
+    rows = rows_of(case)
+    values = first_fit(rows).values
+    speed = np.abs(case.motion.v[kept(case.motion.segment, decimator)])
+    peak = np.abs(case.motion.v).max(axis=0)
+    moves = rows[0].present & (rows[0].standing == 0.0)
+    slow = speed < standstill.SLOW * peak
+    residual = np.where(slow, 5.0, 1.0) * np.random.default_rng(0).normal(size=moves.shape)
+    part = replace(rows[0], target=rows[0].matrix @ values + residual)
+    torque_rows = make_model(planted.arm(), settings).torque_rows
+    (weighed,) = with_slowness([part], [case], decimator, torque_rows, values)
+    assert weighed.slowness.min() < 0.8
+    assert (weighed.slowness[speed > 3.0 * standstill.SLOW * peak] == 1.0).all()
+    exact = replace(rows[0], target=rows[0].matrix @ values + np.where(slow, 0.1, 1.0) * residual)
+    (alike,) = with_slowness([exact], [case], decimator, torque_rows, values)
+    assert (alike.slowness == 1.0).all(), "slow rows never count more"

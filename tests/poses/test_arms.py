@@ -10,12 +10,12 @@ from arms import motley
 from differences import check
 
 from calib.geometry.observability import observation, targets_of
+from calib.poses.candidates import draw_candidates
+from calib.poses.continuous.local import improved, merit_of
+from calib.poses.space import PoseConstraint, SearchSpace, is_feasible
 from calib.procedure.measuring.pose_limits import read_limits
 from calib.robot.chain import Chain
 from calib.robot.library import load
-from poses.candidates import draw_candidates
-from poses.continuous.local import improved, merit_of
-from poses.space import PoseConstraint, SearchSpace, is_feasible
 
 CONSTRAINTS = """
 [target]

@@ -9,14 +9,14 @@ import planar
 import pytest
 from differences import check
 
-from poses import constraints
-from poses.continuous.local import improved, merit_of
-from poses.continuous.tabu import TabuRule
-from poses.errors import BadInput
-from poses.indices import merit
-from poses.select import SearchSettings, select_poses
-from poses.space import PoseConstraint, SearchSpace, central_difference, is_feasible
-from poses.whole_space import bound_over_space
+from calib.poses import constraints
+from calib.poses.continuous.local import improved, merit_of
+from calib.poses.continuous.tabu import TabuRule
+from calib.poses.errors import BadInput
+from calib.poses.indices import merit
+from calib.poses.select import SearchSettings, select_poses
+from calib.poses.space import PoseConstraint, SearchSpace, central_difference, is_feasible
+from calib.poses.whole_space import bound_over_space
 
 SPACE = SearchSpace(planar.jacobian, planar.LOWER, planar.UPPER, planar.product)
 LOW = PoseConstraint("height", planar.height, planar.height_gradient)

@@ -7,14 +7,14 @@ import library_arm
 import numpy as np
 import pytest
 
-from poses.candidates import draw_candidates
-from poses.convex import bound, certificate
-from poses.design import Pool, best_addition, design_of, gains_of, with_added, with_removed
-from poses.errors import BadInput, NothingFeasible, NotIdentifiable, TooFewCandidates
-from poses.exchange import detmax, exchanged, greedy
-from poses.indices import observability
-from poses.information import prepared
-from poses.select import SearchSettings, random_baseline, select_poses
+from calib.poses.candidates import draw_candidates
+from calib.poses.convex import bound, certificate
+from calib.poses.design import Pool, best_addition, design_of, gains_of, with_added, with_removed
+from calib.poses.errors import BadInput, NothingFeasible, NotIdentifiable, TooFewCandidates
+from calib.poses.exchange import detmax, exchanged, greedy
+from calib.poses.indices import observability
+from calib.poses.information import prepared
+from calib.poses.select import SearchSettings, random_baseline, select_poses
 
 ARM = library_arm.jacobian(library_arm.random_poses(400, 0))
 
@@ -200,7 +200,7 @@ def test_candidates_keep_limits_and_predicate():
 
 def test_nothing_feasible_gives_the_share():
     with pytest.raises(NothingFeasible, match=r"0 of 4096 random poses are feasible \(0 %\)") as caught:
-        draw_candidates(np.zeros(3), np.ones(3), 10, lambda q: np.zeros(len(q), bool), most=4096)
+        draw_candidates(np.zeros(3), np.ones(3), 10, lambda q: np.zeros(len(q), bool), max_draws=4096)
     assert (caught.value.found, caught.value.draws) == (0, 4096)
 
 

@@ -4,8 +4,8 @@ import library_arm
 import numpy as np
 import pytest
 
-from poses.errors import BadInput
-from poses.indices import gradient, observability
+from calib.poses.errors import BadInput
+from calib.poses.indices import gradient, observability
 
 INDICES = ("O1", "O2", "O3", "O4", "O5", "cond")
 

@@ -105,7 +105,7 @@ def test_completion_loads_nothing_heavy():
     done = subprocess.run(
         [sys.executable, "-c", code], env=os.environ | _asked("calib fit ur"), capture_output=True, text=True
     )
-    assert "ur10e" in done.stdout and not {"numpy", "rich", "yaml", "calib.robot"} & set(done.stdout.split())
+    assert "ur10e" in done.stdout and not {"numpy", "rich", "yaml", "calib.robot.chain"} & set(done.stdout.split())
 
 
 def _asked(line: str) -> dict[str, str]:

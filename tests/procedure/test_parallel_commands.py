@@ -11,12 +11,12 @@ from without_figures import run
 
 import calib as api
 from calib.folders import read_covariance
+from calib.parallel.mechanism import parallel_robot
+from calib.parallel.mechanism.closure import closed
+from calib.parallel.mechanism.geometric_fit import changed, loop_parameters
+from calib.parallel.mechanism.parallel_model import PlatformRegressor, along, make_parallel_model
+from calib.parallel.robots import find
 from calib.robot import library
-from calib.rooms.parallel.mechanism import parallel_robot
-from calib.rooms.parallel.mechanism.closure import closed
-from calib.rooms.parallel.mechanism.geometric_fit import changed, loop_parameters
-from calib.rooms.parallel.mechanism.parallel_model import PlatformRegressor, along, make_parallel_model
-from calib.rooms.parallel.robots import find
 
 HEAD = "t,q1,q2,q3,q4,tau1,tau2,tau3,tau4"
 

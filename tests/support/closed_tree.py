@@ -5,7 +5,7 @@ import pinocchio as pin
 from pinocchio_model import PINOCCHIO_ORDER, to_inertia
 
 from calib.dynamics.bodies import PRISMATIC, bodies_of
-from calib.rooms.parallel.mechanism.closure import ClosedRobot, Posture
+from calib.parallel.mechanism.closure import ClosedRobot, Posture
 
 SMALL = np.array([1e-2, 0, 0, 1e-2, 0, 1e-2, 0, 0, 0, 0.1])
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from calib.robot.chain import random_joints
 from calib.robot.library import load
-from calib.rooms.cells.cell import measure, write_measured
-from calib.rooms.cells.virtual_cells import perturbed_cell
+from calib.simulation.cell import measure, write_measured
+from calib.simulation.virtual_cells import perturbed_cell
 
 CODE = """
 import json, sys

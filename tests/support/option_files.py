@@ -4,6 +4,8 @@ import tomllib
 from collections.abc import Callable
 from typing import Any
 
+from calib.apps.studies import conditions
+from calib.apps.studies.conditions import StudyFile
 from calib.config import parse
 from calib.data.poses import fit_options
 from calib.identification import identify_options
@@ -13,8 +15,6 @@ from calib.procedure.measuring import constraints_file
 from calib.procedure.measuring.constraints_file import ConstraintsFile
 from calib.procedure.session.folder import StateFile
 from calib.procedure.session.settings import SessionSettings, example
-from calib.rooms.studies import conditions
-from calib.rooms.studies.conditions import StudyFile
 
 
 def documented(module: Any) -> dict[str, Any]:

@@ -17,8 +17,8 @@ from calib.identification.model_file import to_table
 from calib.identification.prediction import Dynamics
 from calib.robot import description
 from calib.robot.library import load
-from calib.rooms.cells.known_robots import truth
-from trajectories.timing.limits import TimingLimits
+from calib.simulation.known_robots import truth
+from calib.trajectories.timing.limits import TimingLimits
 
 CHAIN = load("lwr4plus")
 WAYPOINTS = np.array(

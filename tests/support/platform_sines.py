@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 
 from calib.data.recordings.recording import Recording
-from calib.rooms.parallel.mechanism.closure import ClosedRobot
-from calib.rooms.parallel.mechanism.geometric_fit import LoopCovariance, fit_loops
-from calib.rooms.parallel.mechanism.parallel_model import PlatformRegressor, make_parallel_model
-from calib.rooms.parallel.robots import ParallelMechanism, find
+from calib.parallel.mechanism.closure import ClosedRobot
+from calib.parallel.mechanism.geometric_fit import LoopCovariance, fit_loops
+from calib.parallel.mechanism.parallel_model import PlatformRegressor, make_parallel_model
+from calib.parallel.robots import ParallelMechanism, find
 
 
 def sines(t: np.ndarray, frequencies: tuple[float, ...], size, rng: np.random.Generator) -> np.ndarray:

@@ -18,7 +18,7 @@ from calib.identification.loop import LoopSettings
 from calib.identification.methods.method import IdentificationProblem
 from calib.identification.rows import make_case, observe
 from calib.robot import mdh
-from calib.rooms.cells import known_robots
+from calib.simulation import known_robots
 
 RATE = 700.0
 ROWS = [

@@ -121,7 +121,7 @@ def step_by_step(address: str) -> int:
 
     Lines say who made them, so that a step made twice shows.
     """
-    from calib.rooms.fleet import stores
+    from calib.apps.fleet import stores
 
     with stores.held(address, lease=1.0) as folder:
         log, made = folder / "state.json", 0

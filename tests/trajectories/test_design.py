@@ -11,18 +11,18 @@ import pinocchio_model as model
 import pytest
 
 from calib.dynamics.bodies import standard_parameters
-from trajectories.bspline import bspline_family
-from trajectories.constraints import BoxLimit, TorqueLimit, box_limits
-from trajectories.design.objectives import Duration, Excitation, FrictionCoverage, TorqueSlack, condition_numbers
-from trajectories.design.optimise import design
-from trajectories.design.pareto import non_dominated, proposed_goals, sweep
-from trajectories.design.problem import AttainmentGoal, ExcitationProblem
-from trajectories.design.search import SearchResult, Stuck, one_start
-from trajectories.design.starts import random_start
-from trajectories.design.verify import dense_motion, ensured, verify_motion
-from trajectories.errors import BadInput, NotExciting, NothingFeasible
-from trajectories.fourier import fourier_family
-from trajectories.places import Clearance, Workspace
+from calib.trajectories.bspline import bspline_family
+from calib.trajectories.constraints import BoxLimit, TorqueLimit, box_limits
+from calib.trajectories.design.objectives import Duration, Excitation, FrictionCoverage, TorqueSlack, condition_numbers
+from calib.trajectories.design.optimise import design
+from calib.trajectories.design.pareto import non_dominated, proposed_goals, sweep
+from calib.trajectories.design.problem import AttainmentGoal, ExcitationProblem
+from calib.trajectories.design.search import SearchResult, Stuck, one_start
+from calib.trajectories.design.starts import random_start
+from calib.trajectories.design.verify import dense_motion, ensured, verify_motion
+from calib.trajectories.errors import BadInput, NotExciting, NothingFeasible
+from calib.trajectories.fourier import fourier_family
+from calib.trajectories.places import Clearance, Workspace
 
 BASE, CHI, CHAIN = arm.lwr()
 EFFORT = np.array([joint.effort for joint in CHAIN.joints])

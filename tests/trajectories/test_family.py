@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from differences import check
 
-from trajectories.basis import aligned_period, sample_times
-from trajectories.bspline import bspline_family
-from trajectories.errors import BadInput
-from trajectories.fourier import evaluate, fourier_family
+from calib.trajectories.basis import aligned_period, sample_times
+from calib.trajectories.bspline import bspline_family
+from calib.trajectories.errors import BadInput
+from calib.trajectories.fourier import evaluate, fourier_family
 
 FAMILIES = [
     fourier_family((3, 5, 2), 4.0),

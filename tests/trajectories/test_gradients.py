@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from differences import check
 
-from trajectories.constraints import BoxLimit, TorqueLimit, smoothed
-from trajectories.design.objectives import (  # fmt: skip
+from calib.trajectories.constraints import BoxLimit, TorqueLimit, smoothed
+from calib.trajectories.design.objectives import (  # fmt: skip
     Duration,
     Excitation,
     FrictionCoverage,
@@ -16,10 +16,10 @@ from trajectories.design.objectives import (  # fmt: skip
     condition_numbers,
     information,
 )
-from trajectories.design.problem import AttainmentGoal, ExcitationProblem, evaluate, exact_values
-from trajectories.errors import BadInput, NotExciting
-from trajectories.fourier import fourier_family
-from trajectories.places import Clearance, Workspace
+from calib.trajectories.design.problem import AttainmentGoal, ExcitationProblem, evaluate, exact_values
+from calib.trajectories.errors import BadInput, NotExciting
+from calib.trajectories.fourier import fourier_family
+from calib.trajectories.places import Clearance, Workspace
 
 BASE, CHI, CHAIN = arm.lwr(0.3)
 LIMITS = np.array([joint.effort for joint in CHAIN.joints])

@@ -5,9 +5,9 @@ from itertools import pairwise, permutations
 import numpy as np
 import pytest
 
-from trajectories.errors import BadInput
-from trajectories.tour import move_times, tour
-from trajectories.ways import Room, straight_is_clear, way
+from calib.trajectories.errors import BadInput
+from calib.trajectories.tour import move_times, tour
+from calib.trajectories.ways import Room, straight_is_clear, way
 
 
 @pytest.mark.parametrize("first", [None, 3])

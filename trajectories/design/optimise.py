@@ -1,7 +1,8 @@
 """Search for exciting motions: sequential quadratic programming from several feasible starts, gradients exact.
 
-A start is a random motion inside the joint limits (`trajectories.design.starts`); if it breaks another constraint it is
-repaired (the squared excess is minimised), then searched from (`trajectories.design.search`).
+A start is a random motion inside the joint limits (`calib.trajectories.design.starts`); if it breaks another
+constraint it is
+repaired (the squared excess is minimised), then searched from (`calib.trajectories.design.search`).
 """
 
 import time
@@ -13,11 +14,12 @@ from typing import get_args
 
 import numpy as np
 
-from trajectories.design.problem import ExcitationProblem, exact_values, stretched, unmet
-from trajectories.design.search import STAGES, Method, SearchResult, Stage, Stuck, one_start
-from trajectories.errors import BadInput, NotExciting, NothingFeasible, require
+from calib.trajectories.design.problem import ExcitationProblem, exact_values, stretched, unmet
+from calib.trajectories.design.search import STAGES, Method, SearchResult, Stage, Stuck, one_start
+from calib.trajectories.errors import BadInput, NotExciting, NothingFeasible, require
 
-KEPT = 1 / 3  # of the starts, which the last stages are for (our choice)
+# share of the starts which the last stages are for (our choice)
+KEPT = 1 / 3
 
 
 def design(
@@ -51,7 +53,8 @@ def design(
     began = time.perf_counter()
     tasks: list[int | np.ndarray] = [*guesses, *range(starts)]
     require(tasks, "no starts: ask for at least one, or give an initial guess")
-    search, polished = _Starts(problem, evaluations, method, seed, map, report, len(tasks)), list[SearchResult]()
+    search = _Starts(problem, evaluations, method, seed, map, report, len(tasks))
+    polished = list[SearchResult]()
     try:
         search.run(tasks, STAGES[:2])
         if not search.interrupted:
@@ -62,8 +65,8 @@ def design(
         search.interrupted = True
     if not search.found:
         raise _nothing(problem, search.stuck, len(tasks))
-    best = min(polished or search.found, key=lambda one: one.merit)
-    share = sum(one.feasible * one.evaluations for one in search.found) / search.spent
+    best = min(polished or search.found, key=lambda result: result.merit)
+    share = sum(result.feasible * result.evaluations for result in search.found) / search.spent
     return replace(
         best,
         evaluations=search.spent,
@@ -86,36 +89,55 @@ class _Starts:
         report: Callable[[int, int, str], None] | None,
         starts: int,
     ):
-        self.problem, self.arguments, self.map, self.report = problem, (evaluations, method, seed), map, report
-        self.found, self.stuck = list[SearchResult](), list[Stuck]()
-        self.done, self.total = 0, starts + _kept(starts)
-        self.spent, self.interrupted = 0, False
+        self.problem = problem
+        self.arguments = (evaluations, method, seed)
+        self.map = map
+        self.report = report
+        self.found = list[SearchResult]()
+        self.stuck = list[Stuck]()
+        self.done = 0
+        self.total = starts + _kept(starts)
+        self.spent = 0
+        self.interrupted = False
 
     def run(self, tasks: list[int | np.ndarray], stages: tuple[Stage, ...]) -> list[SearchResult]:
         """Run the given stages of the search for each task; return the results."""
         fresh = list[SearchResult]()
+        search = partial(one_start, self.problem, *self.arguments, stages=stages)
         # a map in other processes may still hand back what it has
-        wanted = takewhile(lambda _: not self.interrupted, tasks)
-        for run in self.map(partial(one_start, self.problem, *self.arguments, stages=stages), wanted):
-            self.spent += run.evaluations
+        open_tasks = takewhile(lambda _: not self.interrupted, tasks)
+        for result in self.map(search, open_tasks):
+            self.spent += result.evaluations
             self.done += 1
-            if isinstance(run, SearchResult):
-                fresh.append(run)
-                self.found.append(run)
-                self.interrupted |= run.interrupted
+            if isinstance(result, SearchResult):
+                fresh.append(result)
+                self.found.append(result)
+                self.interrupted |= result.interrupted
             else:
-                self.stuck.append(run)
+                self.stuck.append(result)
             if self.report:
-                best = min((one.merit for one in self.found), default=np.inf)
-                words = f"best so far {best:.4g}" if self.found else "nothing feasible yet"
-                self.report(self.done, self.total, words)
+                self.report(self.done, self.total, self._summary())
         return fresh
+
+    def _summary(self) -> str:
+        """Return the best merit so far in words."""
+        if not self.found:
+            return "nothing feasible yet"
+        best = min(result.merit for result in self.found)
+        return f"best so far {best:.4g}"
 
     def promising(self) -> list[int | np.ndarray]:
         """Return the variables of the best motions so far; infeasible ones last, by constraint violation."""
-        ranked = sorted(self.found, key=lambda one: one.merit) + sorted(self.stuck, key=lambda one: one.excess)
-        chosen = ranked[: _kept(len(ranked))]
-        return [np.append(one.x, one.factor) if self.problem.free_period else one.x for one in chosen]
+        feasible = sorted(self.found, key=lambda result: result.merit)
+        infeasible = sorted(self.stuck, key=lambda stuck: stuck.excess)
+        ranked = feasible + infeasible
+        variables: list[int | np.ndarray] = []
+        for start in ranked[: _kept(len(ranked))]:
+            x = start.x
+            if self.problem.free_period:
+                x = np.append(x, start.factor)
+            variables.append(x)
+        return variables
 
 
 def _kept(starts: int) -> int:
@@ -125,7 +147,7 @@ def _kept(starts: int) -> int:
 
 def _nothing(problem: ExcitationProblem, stuck: list[Stuck], starts: int) -> NothingFeasible:
     """Return an error that names the limiting constraint."""
-    best = min(stuck, key=lambda one: one.excess)
+    best = min(stuck, key=lambda start: start.excess)
     motion = stretched(problem.basis().motion(best.x), best.factor)
     if best.excess[0] <= 0.0 and problem.goals:
         values = exact_values(problem, motion, problem.regressor(motion.q, motion.v, motion.a))

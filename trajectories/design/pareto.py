@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from trajectories.design.objectives import Objective
-from trajectories.design.optimise import design
-from trajectories.design.problem import AttainmentGoal, ExcitationProblem, exact_values, stretched
-from trajectories.design.search import STAGES, SearchResult, one_start
+from calib.trajectories.design.objectives import Objective
+from calib.trajectories.design.optimise import design
+from calib.trajectories.design.problem import AttainmentGoal, ExcitationProblem, exact_values, stretched
+from calib.trajectories.design.search import STAGES, SearchResult, one_start
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +42,8 @@ def proposed_goals(
     """Return the optimum of each objective alone, with its motion, as initial goals (the study's advice)."""
     result = []
     for objective in objectives:
-        alone = replace(problem, objectives=((objective, 1.0),), goals=())
-        run = design(alone, starts=starts, evaluations=evaluations, seed=seed, guesses=guesses, map=map)
+        single = replace(problem, objectives=((objective, 1.0),), goals=())
+        run = design(single, starts=starts, evaluations=evaluations, seed=seed, guesses=guesses, map=map)
         result.append((float(run.values[0]), run))
     return result
 
@@ -70,37 +70,37 @@ def sweep(
         designed: another motion, which the front shall stand beside.
         evaluations: most of each search.
     """
-    known = [*ends, designed]
-    values = [_of(problem, (first, second), run) for run in known]
+    points = [*ends, designed]
+    values = [_of(problem, (first, second), run) for run in points]
     levels = np.linspace(values[0][1], values[1][1], count)[1:-1]
     for number, level in enumerate(levels, 1):
         table = np.array(values)
-        kept = np.where(table[:, 1] <= level, table[:, 0], np.inf)
+        front = np.where(table[:, 1] <= level, table[:, 0], np.inf)
         goals = (AttainmentGoal(first, float(values[0][0])), AttainmentGoal(second, float(level), 0.0))
         spot, best = replace(problem, goals=goals), None
-        for k in {int(np.argmin(kept)), int(np.argmin(np.abs(table[:, 1] - level)))}:
-            guess = np.append(known[k].x, known[k].factor) if problem.free_period else known[k].x
+        for k in {int(np.argmin(front)), int(np.argmin(np.abs(table[:, 1] - level)))}:
+            guess = np.append(points[k].x, points[k].factor) if problem.free_period else points[k].x
             run = one_start(spot, evaluations, "slsqp", 0, guess, STAGES[1:])
             if isinstance(run, SearchResult) and run.merit < (np.inf if best is None else best.merit):
                 best = run
         if best is not None:
-            known.append(best)
+            points.append(best)
             values.append(best.values)
         if report:
-            report(number, len(levels), f"{len(known) - 1} motions on the Pareto front")
+            report(number, len(levels), f"{len(points) - 1} motions on the Pareto front")
     table = np.array(values)
     return Front(
         (first.name, second.name),
         table,
-        tuple(known),
+        tuple(points),
         non_dominated(table),
-        next(k for k, run in enumerate(known) if run is designed),
+        next(k for k, run in enumerate(points) if run is designed),
     )
 
 
 def _of(problem: ExcitationProblem, objectives: Sequence[Objective], run: SearchResult) -> np.ndarray:
     """Return the objectives of a motion, not smoothed."""
-    spot = replace(problem, objectives=tuple((one, 1.0) for one in objectives), goals=())
+    spot = replace(problem, objectives=tuple((objective, 1.0) for objective in objectives), goals=())
     motion = stretched(spot.basis().motion(run.x), run.factor)
     return exact_values(spot, motion, problem.regressor(motion.q, motion.v, motion.a))
 

@@ -11,10 +11,10 @@ from functools import cached_property
 
 import numpy as np
 
-from trajectories.basis import Basis, Family, SampledMotion, sample_times
-from trajectories.constraints import MotionConstraint, Product, Regressor, Smoothed, smoothed
-from trajectories.design.objectives import Excitation, FrictionCoverage, Objective, Observed, TorqueSlack, Value
-from trajectories.errors import BadInput, require
+from calib.trajectories.basis import Basis, Family, SampledMotion, sample_times
+from calib.trajectories.constraints import MotionConstraint, Product, Regressor, Smoothed, smoothed
+from calib.trajectories.design.objectives import Excitation, FrictionCoverage, Objective, Observed, TorqueSlack, Value
+from calib.trajectories.errors import BadInput, require
 
 _Matrix = tuple[int, int, int]
 INSTANTS = 2000  # over a period at which a motion is looked at between its samples (our choice)
@@ -59,7 +59,7 @@ class ExcitationProblem:
         regressor, product: (N, n, b) of q, v, a, and its derivative product: (q, v, a, G) -> slopes of Σ G · Y.
         objectives: pairs (objective, weight) of the sum to minimise (a condition number enters by its logarithm);
             ignored where there are goals.
-        constraints: of `trajectories.constraints`.
+        constraints: of `calib.trajectories.constraints`.
         goals: of goal attainment.
         samples: instants over the period at which all is evaluated.
         stretch: (least, most) factor on the period; equal ends fix it.
@@ -135,17 +135,17 @@ class Evaluation:
     @property
     def values(self) -> np.ndarray:
         """Smoothed values (k,) of the objectives or goals."""
-        return np.array([one.value for one in self._found[0]])
+        return np.array([value.value for value in self._found[0]])
 
     @property
     def exact(self) -> np.ndarray:
         """Unsmoothed values (k,) of the objectives or goals."""
-        return np.array([one.exact for one in self._found[0]])
+        return np.array([value.exact for value in self._found[0]])
 
     @property
     def total(self) -> float:
         """The weighted sum of the smoothed objectives; 0 for problems with goals."""
-        return 0.0 if self.problem.goals else _summed(self.problem, [one.value for one in self._found[0]])[0]
+        return 0.0 if self.problem.goals else _summed(self.problem, [value.value for value in self._found[0]])[0]
 
     @property
     def slopes(self) -> np.ndarray:
@@ -163,23 +163,23 @@ class Evaluation:
 
     @cached_property
     def _found(self) -> tuple[list[Value], dict[_Matrix, Observed]]:
-        seen: dict[_Matrix, Observed] = {}
-        wanted = (_sharpened(one, self.sharpness) for one in _terms(self.problem))
-        return [_value(one, self.sampled, self.regressor, seen) for one in wanted], seen
+        observed: dict[_Matrix, Observed] = {}
+        terms = (_sharpened(term, self.sharpness) for term in _terms(self.problem))
+        return [_value(term, self.sampled, self.regressor, observed) for term in terms], observed
 
     @cached_property
     def _gradient(self) -> np.ndarray:
-        found, seen = self._found
-        shares = np.eye(len(found))
+        values, observed = self._found
+        shares = np.eye(len(values))
         if not self.problem.goals:
-            shares = _summed(self.problem, [one.value for one in found])[1]
-        slopes = [_slope(self.problem, self.sampled, self.regressor, found, share, seen) for share in shares]
-        return self._by_variables(slopes, shares @ np.array([one.by_duration for one in found]))
+            shares = _summed(self.problem, [value.value for value in values])[1]
+        slopes = [_slope(self.problem, self.sampled, self.regressor, values, share, observed) for share in shares]
+        return self._by_variables(slopes, shares @ np.array([value.by_duration for value in values]))
 
     def _by_variables(self, slopes: list[np.ndarray], by_duration: np.ndarray) -> np.ndarray:
         spread = np.zeros((len(slopes), 4, *self.motion.q.shape))
         spread[:, :, : self.problem.samples] = slopes
-        stacked = np.concatenate([spread, *(one.slopes(self.motion) for one in self.smoothed)])
+        stacked = np.concatenate([spread, *(part.slopes(self.motion) for part in self.smoothed)])
         return _by_variables(self.problem, self.basis, self.motion, stacked, self.factor, by_duration)
 
 
@@ -192,8 +192,10 @@ def evaluate(problem: ExcitationProblem, basis: Basis, y: np.ndarray, sharpness:
     """
     x, factor = (y[:-1], float(y[-1])) if problem.free_period else (y, problem.stretch[0])
     motion = stretched(basis.motion(x), factor)
-    inside = np.broadcast_to(problem.tightening, len(problem.constraints))
-    parts = tuple(smoothed(c, motion, sharpness[1], float(own)) for c, own in zip(problem.constraints, inside))
+    tightenings = np.broadcast_to(problem.tightening, len(problem.constraints))
+    parts = tuple(
+        smoothed(c, motion, sharpness[1], float(tightening)) for c, tightening in zip(problem.constraints, tightenings)
+    )
     return Evaluation(
         problem,
         basis,
@@ -209,7 +211,7 @@ def evaluate(problem: ExcitationProblem, basis: Basis, y: np.ndarray, sharpness:
 def critical_times(
     problem: ExcitationProblem,
     y: np.ndarray,
-    beyond: float,
+    min_excess: float,
     constraints: Sequence[MotionConstraint] = (),
     count: int = INSTANTS,
 ) -> np.ndarray:
@@ -217,40 +219,40 @@ def critical_times(
 
     Args:
         y: (x, factor on the period if that is free).
-        beyond: share of its scale by which a constraint has to be broken to count.
+        min_excess: share of its scale by which a constraint has to be broken to count.
         constraints: default the problem's.
         count: instants to look at.
     """
     times = sample_times(problem.family.period, count)
     x, factor = (y[:-1], float(y[-1])) if problem.free_period else (y, problem.stretch[0])
     motion = stretched(problem.family.basis(times).motion(x), factor)
-    near = np.zeros(len(times), dtype=bool)
+    is_critical = np.zeros(len(times), dtype=bool)
     near_share = 0.1  # of a constraint's scale: instants so near to what is broken are looked at besides (our choice)
-    for one in constraints or problem.constraints:
-        shares = (one.values(motion) / one.scale).max(axis=1)
-        near |= (shares > -near_share) & (shares.max() > beyond)
-    found = times[near]
+    for constraint in constraints or problem.constraints:
+        shares = (constraint.values(motion) / constraint.scale).max(axis=1)
+        is_critical |= (shares > -near_share) & (shares.max() > min_excess)
+    critical = times[is_critical]
     max_extra = 150  # instants that are added at a time
-    return found[:: -(-len(found) // max_extra) or 1]
+    return critical[:: -(-len(critical) // max_extra) or 1]
 
 
-def _value(one: Objective, motion: SampledMotion, Y: np.ndarray, seen: dict[_Matrix, Observed]) -> Value:
+def _value(objective: Objective, motion: SampledMotion, Y: np.ndarray, observed: dict[_Matrix, Observed]) -> Value:
     """Evaluate an objective; indices of one observation matrix share it."""
-    if not isinstance(one, Excitation):
-        return one.evaluate(motion, Y)
-    key = _matrix(one)
-    if key not in seen:
-        seen[key] = one.observed(Y)
-    return one.seen(seen[key])
+    if not isinstance(objective, Excitation):
+        return objective.evaluate(motion, Y)
+    key = _matrix(objective)
+    if key not in observed:
+        observed[key] = objective.observed(Y)
+    return objective.seen(observed[key])
 
 
-def _matrix(one: Excitation) -> _Matrix:
-    return id(one.sigmas), id(one.existing), id(one.columns)
+def _matrix(objective: Excitation) -> _Matrix:
+    return id(objective.sigmas), id(objective.existing), id(objective.columns)
 
 
 def _summed(problem: ExcitationProblem, values: list[float]) -> tuple[float, np.ndarray]:
     """Return the weighted sum with log condition numbers, and its gradient (1, k) in the values."""
-    logs = np.array([is_condition(one) for one, _ in problem.objectives])
+    logs = np.array([is_condition(objective) for objective, _ in problem.objectives])
     weights, sizes = np.array([weight for _, weight in problem.objectives]), np.array(values)
     sizes = np.where(logs, sizes, 1.0)
     return float(weights @ np.where(logs, np.log(sizes), values)), (weights / sizes)[None]
@@ -260,26 +262,26 @@ def _slope(
     problem: ExcitationProblem,
     motion: SampledMotion,
     Y: np.ndarray,
-    found: list[Value],
+    values: list[Value],
     shares: np.ndarray,
-    seen: dict[_Matrix, Observed],
+    observed: dict[_Matrix, Observed],
 ) -> np.ndarray:
     """Return the gradients (4, N, n) of Σ shares · objectives in q, v, a, jerk, by one derivative product."""
     result, by_regressor = np.zeros((4, *motion.q.shape)), None
     by_information: dict[_Matrix, np.ndarray] = {}
-    for one, objective, share in zip(found, _terms(problem), shares):
+    for value, objective, share in zip(values, _terms(problem), shares):
         if share == 0.0:
             continue
-        if one.by_motion is not None:
-            result += share * one.by_motion
+        if value.by_motion is not None:
+            result += share * value.by_motion
         if isinstance(objective, Excitation):
             key = _matrix(objective)
-            by_information[key] = by_information.get(key, 0.0) + share * one.by_information
-        elif isinstance(objective, TorqueSlack) and one.by_torque is not None:
+            by_information[key] = by_information.get(key, 0.0) + share * value.by_information
+        elif isinstance(objective, TorqueSlack) and value.by_torque is not None:
             state = (motion.q, motion.v, motion.a)
-            result[:3] += objective.torque_product(*state, objective.parameters, share * one.by_torque)
+            result[:3] += objective.torque_product(*state, objective.parameters, share * value.by_torque)
     for key, S in by_information.items():
-        slope = seen[key].by_regressor(S)
+        slope = observed[key].by_regressor(S)
         by_regressor = slope if by_regressor is None else by_regressor + slope
     if by_regressor is not None:
         result[:3] += problem.product(motion.q, motion.v, motion.a, by_regressor)
@@ -288,7 +290,7 @@ def _slope(
 
 def _terms(problem: ExcitationProblem) -> list[Objective]:
     """Return the objectives to evaluate: those of the goals, or those of the weighted sum."""
-    return [goal.objective for goal in problem.goals] or [one for one, _ in problem.objectives]
+    return [goal.objective for goal in problem.goals] or [objective for objective, _ in problem.objectives]
 
 
 def _sharpened(objective: Objective, p: float) -> Objective:
@@ -301,7 +303,7 @@ def is_condition(objective: Objective) -> bool:
 
 def exact_values(problem: ExcitationProblem, motion: SampledMotion, regressor: np.ndarray) -> np.ndarray:
     """Return the unsmoothed objectives of a motion (k,)."""
-    return np.array([_sharpened(one, np.inf).evaluate(motion, regressor).value for one in _terms(problem)])
+    return np.array([_sharpened(objective, np.inf).evaluate(motion, regressor).value for objective in _terms(problem)])
 
 
 def merit(problem: ExcitationProblem, values: np.ndarray) -> float:

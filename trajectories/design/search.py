@@ -15,8 +15,8 @@ import nlopt
 import numpy as np
 from scipy.optimize import minimize
 
-from trajectories.basis import Basis
-from trajectories.design.problem import (
+from calib.trajectories.basis import Basis
+from calib.trajectories.design.problem import (
     Evaluation,
     ExcitationProblem,
     critical_times,
@@ -25,8 +25,8 @@ from trajectories.design.problem import (
     merit,
     unmet,
 )
-from trajectories.design.starts import random_start, shrunk
-from trajectories.errors import NotExciting
+from calib.trajectories.design.starts import random_start, shrunk
+from calib.trajectories.errors import NotExciting
 
 Method = Literal["slsqp", "auglag", "mma", "ccsaq"]
 
@@ -143,13 +143,13 @@ def one_start(
             if number:
                 run, y = run.continued(run.reached(y), *_at_stage(problem, stage, extra))
             most = max(2, round(evaluations * stage.share))
-            for again in range(0 if stage.rough else max_retries, -1, -1):
+            for retries_left in range(0 if stage.rough else max_retries, -1, -1):
                 run.sharpness = stage.sharpness
                 y = run.solve(run.inside(y), most, method, stage.tolerance)
                 y = run.repaired(y, repair_evaluations)  # SLSQP travels outside, and may have ended there
                 deep = np.zeros(0) if run.best is None else run.broken(run.best)
                 extra = np.union1d(extra, deep)
-                if not len(deep) or not again:
+                if not len(deep) or not retries_left:
                     break
                 back = run.last_unbroken()
                 run, y = run.continued(run.reached(y), *_at_stage(problem, stage, extra))
@@ -259,32 +259,32 @@ class StartSearch:
             self.remember(np.array(y), self._evaluation)
         return self._evaluation
 
-    def remember(self, y: np.ndarray, found: Evaluation) -> None:
+    def remember(self, y: np.ndarray, evaluation: Evaluation) -> None:
         """Keep an evaluated motion if it is within the limits and the best so far, or the nearest to the limits."""
-        missed = unmet(self.problem, found.values) if self.problem.goals else None
-        lacking = (max(found.excess, 0.0), missed[0] if missed else 0.0)
+        missed = unmet(self.problem, evaluation.values) if self.problem.goals else None
+        lacking = (max(evaluation.excess, 0.0), missed[0] if missed else 0.0)
         if lacking < self.least:
             self.least, self.nearest = lacking, y
-        if found.excess > KEPT:
+        if evaluation.excess > KEPT:
             return
         self.kept += 1
-        value = merit(self.problem, found.exact)
+        value = merit(self.problem, evaluation.exact)
         if value < self.merit:
-            self.best, self.merit, self.values = y, value, found.exact
+            self.best, self.merit, self.values = y, value, evaluation.exact
             self._trail.append(y)
             self.history.append(value)
             self.times.append(time.process_time() - self.began)
 
     def inside(self, y: np.ndarray) -> np.ndarray:
         """Return a point that keeps the constraints: repaired, or of a smaller motion if that fails."""
-        found = self.repaired(y)
+        evaluation = self.repaired(y)
         max_halvings = 4  # times that a motion is halved which cannot be brought back inside
         for _ in range(max_halvings):
             if self.least[0] <= KEPT:  # some point keeps the constraints, whether or not the hard goals
                 break
             y = shrunk(self.problem, y, 0.5)
-            found = self.repaired(y)
-        return found
+            evaluation = self.repaired(y)
+        return evaluation
 
     def repaired(self, y: np.ndarray, evaluations: int = 80) -> np.ndarray:
         """Return a point that meets the constraints, or the nearest point found: min Σ max(0, c + 0.01)² by L-BFGS."""
@@ -292,10 +292,10 @@ class StartSearch:
             return y
 
         def excess(z: np.ndarray, slope: np.ndarray) -> float:
-            found = self.at(z)
-            over = np.maximum(found.constraints + 0.01, 0.0)
+            evaluation = self.at(z)
+            over = np.maximum(evaluation.constraints + 0.01, 0.0)
             if slope.size:
-                slope[:] = 2 * over @ found.rows
+                slope[:] = 2 * over @ evaluation.rows
             return float((over**2).sum())
 
         solver = nlopt.opt(nlopt.LD_LBFGS, len(y))

@@ -5,9 +5,9 @@ Also where they start again: smaller motions about a pose that keeps the limits.
 
 import numpy as np
 
-from trajectories.basis import Basis, SampledMotion
-from trajectories.constraints import BoxLimit
-from trajectories.design.problem import ExcitationProblem, stretched
+from calib.trajectories.basis import Basis, SampledMotion
+from calib.trajectories.constraints import BoxLimit
+from calib.trajectories.design.problem import ExcitationProblem, stretched
 
 
 def random_start(problem: ExcitationProblem, basis: Basis, rng: np.random.Generator) -> np.ndarray:
@@ -45,7 +45,9 @@ def shrunk(problem: ExcitationProblem, y: np.ndarray, share: float) -> np.ndarra
     path = basis.motion(y[: basis.p])
     still = np.zeros(path.q.shape)
     resting = SampledMotion(path.times, path.q, still, still, still)
-    excess = np.max([(one.values(resting) / one.scale).max(axis=1) for one in problem.constraints], axis=0)
+    excess = np.max(
+        [(constraint.values(resting) / constraint.scale).max(axis=1) for constraint in problem.constraints], axis=0
+    )
     centre = basis.nearest(np.broadcast_to(path.q[np.argmin(excess)], path.q.shape))
     return np.append(centre + share * (y[: basis.p] - centre), y[basis.p :])
 

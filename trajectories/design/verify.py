@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from trajectories.basis import Family, SampledMotion
-from trajectories.constraints import BoxLimit, MotionConstraint
-from trajectories.design.problem import ExcitationProblem, critical_times
-from trajectories.design.search import STAGES, SearchResult, one_start
-from trajectories.design.starts import shrunk
-from trajectories.errors import NothingFeasible
+from calib.trajectories.basis import Family, SampledMotion
+from calib.trajectories.constraints import BoxLimit, MotionConstraint
+from calib.trajectories.design.problem import ExcitationProblem, critical_times
+from calib.trajectories.design.search import STAGES, SearchResult, one_start
+from calib.trajectories.design.starts import shrunk
+from calib.trajectories.errors import NothingFeasible
 
 
 @dataclass(frozen=True)
@@ -57,15 +57,15 @@ class Verification:
 
     @property
     def feasible(self) -> bool:
-        return all(one.margin >= 0 for one in self.margins)
+        return all(margin.margin >= 0 for margin in self.margins)
 
     @property
     def worst(self) -> dict[str, Margin]:
         """The smallest margin of each constraint, by its name."""
         result: dict[str, Margin] = {}
-        for one in self.margins:
-            if one.name not in result or one.share < result[one.name].share:
-                result[one.name] = one
+        for margin in self.margins:
+            if margin.name not in result or margin.share < result[margin.name].share:
+                result[margin.name] = margin
         return result
 
 
@@ -87,13 +87,13 @@ def verify_motion(
     step = period / instants
     times = step * np.arange(instants + 1)
     motion = dense_motion(family, x, times, factor)
-    found = [one for constraint in constraints for one in _margins(family, x, constraint, motion, step, factor)]
-    return Verification(tuple(found), instants, (float(np.abs(motion.v[0]).max()), float(np.abs(motion.a[0]).max())))
+    margins = [margin for constraint in constraints for margin in _margins(family, x, constraint, motion, step, factor)]
+    return Verification(tuple(margins), instants, (float(np.abs(motion.v[0]).max()), float(np.abs(motion.a[0]).max())))
 
 
 def ensured(
     problem: ExcitationProblem,
-    found: SearchResult,
+    result: SearchResult,
     constraints: Sequence[MotionConstraint] | None = None,
     instants: int = 5000,
     rounds: int = 4,
@@ -110,37 +110,37 @@ def ensured(
     Raises:
         NothingFeasible: where none of that helps.
     """
-    checked, tighter, original = constraints or problem.constraints, problem, found
+    checked, tighter, original = constraints or problem.constraints, problem, result
 
     def verified(x: np.ndarray) -> Verification:
-        return verify_motion(problem.family, x, checked, factor=found.factor, instants=instants)
+        return verify_motion(problem.family, x, checked, factor=result.factor, instants=instants)
 
-    report = verified(found.x)
+    report = verified(result.x)
     max_evaluations = 240  # of a search that goes on from a motion, if all its stages are gone through
     for _ in range(rounds):
         if report.feasible:
-            return found, report
-        y = np.append(found.x, found.factor) if problem.free_period else found.x
-        lacking = np.array([max(-report.worst[one.name].share, 0.0) for one in checked])
+            return result, report
+        y = np.append(result.x, result.factor) if problem.free_period else result.x
+        lacking = np.array([max(-report.worst[margin.name].share, 0.0) for margin in checked])
         further = np.where(lacking > 0.0, np.minimum(1.2 * lacking, 0.01) + 1e-4, 0.0)  # our choice
         extra = np.union1d(tighter.extra, critical_times(problem, y, 0.0, checked, instants))
         tighter = replace(tighter, extra=extra, tightening=tighter.tightening + further)
-        again = one_start(tighter, max_evaluations, "slsqp", found.seed, y, STAGES[2:])
-        found = replace(found, evaluations=found.evaluations + again.evaluations)
-        if isinstance(again, SearchResult):
-            found = replace(
-                again,
+        continued = one_start(tighter, max_evaluations, "slsqp", result.seed, y, STAGES[2:])
+        result = replace(result, evaluations=result.evaluations + continued.evaluations)
+        if isinstance(continued, SearchResult):
+            result = replace(
+                continued,
                 history=original.history,
-                evaluations=found.evaluations,
-                seconds=found.seconds + again.seconds,
-                interrupted=found.interrupted or again.interrupted,
+                evaluations=result.evaluations,
+                seconds=result.seconds + continued.seconds,
+                interrupted=result.interrupted or continued.interrupted,
             )
-            report = verified(found.x)
+            report = verified(result.x)
     for share in 0.8 ** np.arange(21):
-        small = shrunk(problem, found.x, share)
+        small = shrunk(problem, result.x, share)
         if (proof := verified(small)).feasible:
-            return replace(found, x=small), proof
-    worst = min(report.margins, key=lambda one: one.share)
+            return replace(result, x=small), proof
+    worst = min(report.margins, key=lambda margin: margin.share)
     raise NothingFeasible(
         f"feasible at the samples, but between them the {worst.name} limit ({worst.label}) is broken by "
         f"{-worst.margin:.3g} {worst.unit} at t = {worst.time:.3g} s; widen that limit or take a longer period",

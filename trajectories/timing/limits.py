@@ -5,7 +5,7 @@ from typing import Protocol
 
 import numpy as np
 
-from trajectories.errors import BadInput
+from calib.trajectories.errors import BadInput
 
 
 class Law(Protocol):

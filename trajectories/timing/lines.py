@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from trajectories.errors import BadInput, NothingFeasible
-from trajectories.timing.path import SAME, Path, through
+from calib.trajectories.errors import BadInput, NothingFeasible
+from calib.trajectories.timing.path import SAME, Path, through
 
 SAMPLES, MAX_SAMPLES, STEPS = 41, 641, 400
 REACHED, KEPT = 1e-9, 1e-6  # [m and rad] of the pose at the samples, and between them
@@ -70,7 +70,7 @@ def line(forward: Forward, jacobian: Forward, start: np.ndarray, goal: np.ndarra
 
 def _follow(forward: Forward, jacobian: Forward, start: np.ndarray, targets: np.ndarray) -> np.ndarray:
     """Return joint values (m, n) at the targets (m, 4, 4), solved one after the other."""
-    q, found = start.copy(), [start]
+    q, profile = start.copy(), [start]
     for k, target in enumerate(targets[1:], 1):
         q, error = _reach(forward, jacobian, q, start, target)
         if not np.abs(error).max() <= REACHED:
@@ -83,11 +83,11 @@ def _follow(forward: Forward, jacobian: Forward, start: np.ndarray, targets: np.
                 short,
                 "m",
             )
-        found.append(q)
-    return np.array(found)
+        profile.append(q)
+    return np.array(profile)
 
 
-def _reach(forward: Forward, jacobian: Forward, q: np.ndarray, rest: np.ndarray, target: np.ndarray):
+def _reach(forward: Forward, jacobian: Forward, q: np.ndarray, remaining: np.ndarray, target: np.ndarray):
     """Return joint values (n,) at a target pose and the remaining error (6,)."""
     error = np.full(6, np.inf)
     max_step = 0.2  # [rad or m] of a step of any joint
@@ -96,7 +96,7 @@ def _reach(forward: Forward, jacobian: Forward, q: np.ndarray, rest: np.ndarray,
         J = jacobian(q[None])[0]
         damping = min(1e-2 * float(error @ error), 1e-2) + 1e-14
         inverse = J.T @ np.linalg.inv(J @ J.T + damping * np.eye(6))
-        pull = rest - q
+        pull = remaining - q
         step = inverse @ error + pull - inverse @ (J @ pull)
         size = np.abs(step).max()
         q = q + step * min(1.0, max_step / max(size, 1e-300))

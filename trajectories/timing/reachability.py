@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from trajectories.errors import BadInput, NothingFeasible
-from trajectories.timing.limits import Law, TimingLimits
-from trajectories.timing.path import Path
-from trajectories.timing.profile import Profile
+from calib.trajectories.errors import BadInput, NothingFeasible
+from calib.trajectories.timing.limits import Law, TimingLimits
+from calib.trajectories.timing.path import Path
+from calib.trajectories.timing.profile import Profile
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class ConstraintRows:
         s: (K + 1,) the grid.
         q, slope, curvature: (2, K, n) at both ends of the intervals.
         A, B, G: (2, K, n) the dynamics there; zero without.
-        limits: see `trajectories.timing.time_scaling.Limits`.
+        limits: see `calib.trajectories.timing.time_scaling.Limits`.
     """
 
     s: np.ndarray
@@ -91,7 +91,10 @@ class ConstraintRows:
             (self.B + friction[0], self.curvature),
             (self.G + friction[1], np.zeros_like(self.q)),
         )
-        a, b, c = (np.concatenate([one[..., pushing] / torque, two[..., turning] / bend], axis=2) for one, two in parts)
+        a, b, c = (
+            np.concatenate([torque_part[..., pushing] / torque, bend_part[..., turning] / bend], axis=2)
+            for torque_part, bend_part in parts
+        )
         return _Bounded(a, b, c, self.top(tight["velocity"]))
 
     def friction(
@@ -113,12 +116,15 @@ class ConstraintRows:
             return np.zeros_like(self.q), value.reshape(self.q.shape)
         u = np.tile(np.diff(x) / (2 * np.diff(self.s)), 2)
         max_change = 0.1  # relative, of x in two rounds, from where on the tangent is taken
-        near = np.zeros(len(x), dtype=bool) if before is None else np.abs(x - before) <= max_change * x
-        tangent = np.concatenate([near[:-1], near[1:]])
-        here = np.maximum(np.concatenate([x[:-1], x[1:]]), 2 * creep)
+        settled = np.zeros(len(x), dtype=bool) if before is None else np.abs(x - before) <= max_change * x
+        tangent = np.concatenate([settled[:-1], settled[1:]])
+        speeds = np.maximum(np.concatenate([x[:-1], x[1:]]), 2 * creep)
         difference = 1e-3  # relative, of the difference that gives a tangent
-        low, high = np.where(tangent, (1 - difference) * here, creep), np.where(tangent, (1 + difference) * here, here)
-        below, above = (self._rubbing(law, place, u) for place in (low, high))
+        low, high = (
+            np.where(tangent, (1 - difference) * speeds, creep),
+            np.where(tangent, (1 + difference) * speeds, speeds),
+        )
+        below, above = (self._rubbing(law, speed, u) for speed in (low, high))
         slope = (above - below) / (high - low)[:, None]
         return slope.reshape(self.q.shape), (below - slope * low[:, None]).reshape(self.q.shape)
 
@@ -134,9 +140,9 @@ def fastest(rows: _Bounded, s: np.ndarray) -> Profile:
     Raises:
         NothingFeasible: where no speed can be kept from some grid point on.
     """
-    most = _controllable(rows, s)
-    if not np.isfinite(most).all():
-        k = int(np.flatnonzero(~np.isfinite(most)).max())
+    controllable = _controllable(rows, s)
+    if not np.isfinite(controllable).all():
+        k = int(np.flatnonzero(~np.isfinite(controllable)).max())
         raise NothingFeasible(
             f"no motion: no speed at {s[k] / s[-1]:.0%} of the path allows a stop at its end within the limits",
             "torque",
@@ -145,7 +151,7 @@ def fastest(rows: _Bounded, s: np.ndarray) -> Profile:
         )
     x = np.zeros(len(s))
     for k, step in enumerate(np.diff(s)):
-        x[k + 1] = min(max(x[k] + 2 * step * _largest(rows, k, x[k], step), 0.0), most[k + 1])
+        x[k + 1] = min(max(x[k] + 2 * step * _largest(rows, k, x[k], step), 0.0), controllable[k + 1])
     x[-1] = 0.0
     if (x[1:-1] <= 0).any():
         k = int(np.argmax(x[1:-1] <= 0)) + 1
@@ -161,9 +167,9 @@ def fastest(rows: _Bounded, s: np.ndarray) -> Profile:
 def _largest(rows: _Bounded, k: int, x: float, step: float) -> float:
     """Return the largest u on interval k at speed x."""
     a = np.concatenate([rows.a[0, k], rows.a[1, k] + 2 * step * rows.b[1, k]])
-    rest = np.concatenate([rows.b[0, k] * x + rows.c[0, k], rows.b[1, k] * x + rows.c[1, k]])
+    constant = np.concatenate([rows.b[0, k] * x + rows.c[0, k], rows.b[1, k] * x + rows.c[1, k]])
     with np.errstate(divide="ignore", invalid="ignore"):
-        upper = np.where(a == 0, np.inf, (np.sign(a) - rest) / a)
+        upper = np.where(a == 0, np.inf, (np.sign(a) - constant) / a)
     return float(min(upper.min(initial=np.inf), (rows.top[k + 1] - x) / (2 * step)))
 
 
@@ -185,11 +191,11 @@ def _controllable(rows: _Bounded, s: np.ndarray) -> np.ndarray:
     level = quiet.level
     quiet.setLevel(logging.CRITICAL)
     try:
-        found = TOPPRA([_constraint(scaled, s)], _Interval(s), gridpoints=s, solver_wrapper="seidel")
-        most: Any = found.compute_controllable_sets(0.0, 0.0)
+        solver = TOPPRA([_constraint(scaled, s)], _Interval(s), gridpoints=s, solver_wrapper="seidel")
+        ranges: Any = solver.compute_controllable_sets(0.0, 0.0)
     finally:
         quiet.setLevel(level)
-    return unit * np.where(most[:, 0] > most[:, 1], np.nan, most[:, 1])
+    return unit * np.where(ranges[:, 0] > ranges[:, 1], np.nan, ranges[:, 1])
 
 
 class _Interval:
@@ -211,7 +217,7 @@ def _constraint(rows: _Bounded, s: np.ndarray) -> Any:
     b = np.concatenate([rows.b[0], rows.b[1]], axis=1)
     c = np.concatenate([rows.c[0], rows.c[1]], axis=1)
     m = a.shape[1]
-    both = np.concatenate([np.eye(m), -np.eye(m)])
+    signs = np.concatenate([np.eye(m), -np.eye(m)])
     limit = np.ones(2 * m)
     speeds = np.column_stack([np.zeros(len(s)), rows.top])
     last = [np.vstack([x, x[-1:]]) for x in (a, b, c)]
@@ -222,7 +228,7 @@ def _constraint(rows: _Bounded, s: np.ndarray) -> Any:
             self.identical = True
 
         def compute_constraint_params(self, path: Any, gridpoints: Any, *args: Any, **kwargs: Any) -> Any:
-            rows_given = (*last, both, limit) if m else (None,) * 5
+            rows_given = (*last, signs, limit) if m else (None,) * 5
             return (*rows_given, None, speeds)
 
     return Given()

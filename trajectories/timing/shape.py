@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trajectories.errors import BadInput, NothingFeasible
-from trajectories.timing.path import Path, checked, spline
+from calib.trajectories.errors import BadInput, NothingFeasible
+from calib.trajectories.timing.path import Path, checked, spline
 
 RATIO = 3.0  # knots lie at most this factor nearer or further apart than by chord length
 STEP = 0.3  # first step, of the range -1 to 1
@@ -54,9 +54,9 @@ def build(waypoints: np.ndarray, phi: np.ndarray, stray: float = 0.0) -> Path:
         return spline(points, factors)
     first = spline(points)
     middle = first((first.knots[:-1] + first.knots[1:]) / 2) + stray * np.reshape(phi[m - 2 :], (m - 1, n))
-    both = np.empty((2 * m - 1, n))
-    both[::2], both[1::2] = points, middle
-    return spline(both, np.repeat(factors, 2))
+    pieces = np.empty((2 * m - 1, n))
+    pieces[::2], pieces[1::2] = points, middle
+    return spline(pieces, np.repeat(factors, 2))
 
 
 def shorten(
@@ -85,15 +85,15 @@ def shorten(
     def duration(phi: np.ndarray, _: np.ndarray) -> float:
         tally[0] += 1
         try:
-            found = timer(build(waypoints, phi, stray))
+            shorter = timer(build(waypoints, phi, stray))
         except (NothingFeasible, BadInput):
             tally[1] += 1
             return 10 * before
-        if found < best[0]:
-            best[:] = [found, phi.copy()]
+        if shorter < best[0]:
+            best[:] = [shorter, phi.copy()]
         if progress is not None:
             progress(tally[0], best[0])
-        return found
+        return shorter
 
     if p:
         search = nlopt.opt(nlopt.LN_COBYLA, p)

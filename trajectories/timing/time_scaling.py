@@ -17,14 +17,21 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from trajectories.errors import BadInput, NothingFeasible
-from trajectories.timing.limits import Law, TimingLimits
-from trajectories.timing.path import Path, reversals
-from trajectories.timing.profile import Profile, Sampled, dense, moved
-from trajectories.timing.reachability import ConstraintRows, fastest
+from calib.trajectories.errors import BadInput, NothingFeasible
+from calib.trajectories.timing.limits import Law, TimingLimits
+from calib.trajectories.timing.path import Path, reversals
+from calib.trajectories.timing.profile import Profile, Sampled, dense, moved
+from calib.trajectories.timing.reachability import ConstraintRows, fastest
 
-GRID, PER_SPAN, MAX_INTERVALS = 400, 200, 2400  # intervals, in all and between two knots
-ACTIVE = 0.01  # of a limit: nearer than that it is active
+# intervals: in all, between two knots where these are many, and at most
+GRID = 400
+PER_SPAN = 200
+MAX_INTERVALS = 2400
+# of a limit: nearer than that it is active
+ACTIVE = 0.01
+# rounds of reachability, and mean relative change of x at which friction counts as settled
+MAX_ROUNDS = 25
+MAX_CHANGE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +71,9 @@ class Timing:
     @property
     def active_share(self) -> float:
         """Share of the time in which at least one limit is reached within `ACTIVE`."""
-        near = np.max([values.max(axis=1) for values in self.used.values()], axis=0) >= 1 - ACTIVE
-        return float(self.sampled.weights @ near / self.sampled.weights.sum())
+        largest = np.max([values.max(axis=1) for values in self.used.values()], axis=0)
+        weights = self.sampled.weights
+        return float(weights @ (largest >= 1 - ACTIVE) / weights.sum())
 
 
 def time_optimal(
@@ -84,32 +92,33 @@ def time_optimal(
     if law is None and np.isfinite(limits.torque).any():
         raise BadInput("torque limits need the robot's dynamics; leave them infinite, or give a model")
     s = _grid_points(path, grid)
+    intervals = len(s) - 1
     if law is not None:
         _check_holding(path, limits, law, s)
     rows = ConstraintRows.of(path, s, limits, law)
-    tight = {name: np.ones((len(s) - 1, path.n)) for name in ("velocity", "acceleration", "torque")}
+    tight = {name: np.ones((intervals, path.n)) for name in ("velocity", "acceleration", "torque")}
     history: list[float] = []
     best = last = x = before = None
     excess: dict[str, np.ndarray] = {}
-    max_rounds = 25
-    max_change = 1e-4  # mean relative change of x at which friction counts as settled
-    for _ in range(max_rounds):
+    for _ in range(MAX_ROUNDS):
         profile = _round(rows, law, x, before, tight)
-        rounded = profile if rate is None else profile.slower(_whole(profile.duration, rate))
-        sampled = dense(path, rounded, None if law is None else law.torque)
-        last = Timing(path, rounded, limits, sampled, 0, 0.0)
-        excess = {name: _per_interval(values, len(s) - 1) - 1 for name, values in _shares(sampled, limits).items()}
-        kept = all(values.max() <= 0 for values in excess.values())
-        settled = x is not None and np.abs(profile.x - x).mean() <= max_change * x.mean()
+        last = _timed(path, limits, law, _on_samples(profile, rate))
+        excess = {}
+        for name, values in _shares(last.sampled, limits).items():
+            excess[name] = _per_interval(values, intervals) - 1
+        within_limits = all(values.max() <= 0 for values in excess.values())
+        settled = x is not None and np.abs(profile.x - x).mean() <= MAX_CHANGE * x.mean()
         history.append(profile.duration)
-        x, before = profile.x, x
-        if kept and (best is None or rounded.duration < best.duration):
+        before = x
+        x = profile.x
+        if within_limits and (best is None or last.profile.duration < best.profile.duration):
             best = last
-        if settled and kept:
+        if settled and within_limits:
             break
-        if settled or len(history) > max_rounds // 2:
+        if settled or len(history) > MAX_ROUNDS // 2:
             for name, values in excess.items():
-                tight[name] = tight[name] * np.where(values > 0, 1 - 1.1 * np.clip(values, 1e-6, 0.2), 1.0)
+                narrower = 1 - 1.1 * np.clip(values, 1e-6, 0.2)
+                tight[name] = tight[name] * np.where(values > 0, narrower, 1.0)
     if best is None and last is not None:
         best = _slowed_down(last, law, rate)
     if best is None:
@@ -118,14 +127,26 @@ def time_optimal(
     return replace(best, iterations=len(history), tightened=narrowed, history=tuple(history))
 
 
+def _timed(path: Path, limits: TimingLimits, law: Law | None, profile: Profile) -> Timing:
+    """Return the timing of a profile, with its samples."""
+    torque = None
+    if law is not None:
+        torque = law.torque
+    return Timing(path, profile, limits, dense(path, profile, torque), 0, 0.0)
+
+
+def _on_samples(profile: Profile, rate: float | None) -> Profile:
+    """Return a profile that takes a whole number of samples at a rate [Hz]; None: the profile itself."""
+    if rate is None:
+        return profile
+    return profile.slower(_whole(profile.duration, rate))
+
+
 def _slowed_down(timing: Timing, law: Law | None, rate: float | None) -> Timing | None:
     """Return the timing slowed down by up to 1 % to keep the limits; None if that does not suffice."""
     for factor in 1 + 1e-5 * 2.0 ** np.arange(11):
-        profile = timing.profile.slower(factor)
-        profile = profile if rate is None else profile.slower(_whole(profile.duration, rate))
-        slower = replace(
-            timing, profile=profile, sampled=dense(timing.path, profile, None if law is None else law.torque)
-        )
+        profile = _on_samples(timing.profile.slower(factor), rate)
+        slower = _timed(timing.path, timing.limits, law, profile)
         if all(margin.min() >= 0 for margin in slower.margins.values()):
             return slower
     return None
@@ -148,13 +169,16 @@ def _round(
 
 def _shares(sampled: Sampled, limits: TimingLimits) -> dict[str, np.ndarray]:
     """Return the shares of the limits in use, (N, n) each, without kinds of limit that no joint has."""
-    found = {"velocity": sampled.v, "acceleration": sampled.a, "torque": sampled.tau}
-    sizes = {"velocity": limits.velocity, "acceleration": limits.acceleration, "torque": limits.torque}
-    return {
-        name: np.abs(values) / sizes[name]
-        for name, values in found.items()
-        if values is not None and np.isfinite(sizes[name]).any()
-    }
+    kinds = (
+        ("velocity", sampled.v, limits.velocity),
+        ("acceleration", sampled.a, limits.acceleration),
+        ("torque", sampled.tau, limits.torque),
+    )
+    shares = {}
+    for name, values, sizes in kinds:
+        if values is not None and np.isfinite(sizes).any():
+            shares[name] = np.abs(values) / sizes
+    return shares
 
 
 def _check_holding(path: Path, limits: TimingLimits, law: Law, s: np.ndarray) -> None:
@@ -165,10 +189,11 @@ def _check_holding(path: Path, limits: TimingLimits, law: Law, s: np.ndarray) ->
     q, v, _ = moved(path, s, np.full(len(s), 1e-9), np.zeros(len(s)))
     still = np.zeros_like(q)
     gravity = law.torque(q, still, still)
-    for torque, doing in ((gravity, "hold still"), (gravity + law.friction(q, v, still), "move slowly")):
+    slow = gravity + law.friction(q, v, still)
+    for torque, doing in ((gravity, "hold still"), (slow, "move slowly")):
         excess = np.abs(torque) - limits.torque
         if excess.max() > 0:
-            k, j = (int(i) for i in np.unravel_index(np.argmax(excess), excess.shape))
+            k, j = np.unravel_index(np.argmax(excess), excess.shape)
             raise NothingFeasible(
                 f"no motion: to {doing} at {s[k] / path.length:.0%} of the path, joint {j + 1} needs "
                 f"{abs(torque[k, j]):.4g} N m, its limit is {limits.torque[j]:.4g} ({excess[k, j]:.3g} short); "
@@ -185,11 +210,16 @@ def _grid_points(path: Path, count: int | None = None) -> np.ndarray:
     Args:
         count: intervals; None: `GRID`, or `PER_SPAN` between knots where these are many.
     """
-    count = count or int(np.clip(PER_SPAN * (len(path.knots) - 1), GRID, MAX_INTERVALS))
+    if not count:
+        count = int(np.clip(PER_SPAN * (len(path.knots) - 1), GRID, MAX_INTERVALS))
     even = np.linspace(0, 1, count + 1)
     s = path.length * (1 - np.cos(np.pi * even)) / 2
-    extra = np.concatenate([reversals(path, s), path.knots if len(path.knots) < count / 4 else []])
-    s = np.unique(np.concatenate([s, extra[(extra > 0) & (extra < path.length)]]))
+    extra = reversals(path, s)
+    if len(path.knots) < count / 4:
+        extra = np.concatenate([extra, path.knots])
+    interior = (extra > 0) & (extra < path.length)
+    s = np.unique(np.concatenate([s, extra[interior]]))
+    # without intervals of rounding
     s = s[np.append(True, np.diff(s) > 1e-7 * path.length)]
     return np.append(s[:-1], path.length)
 
@@ -200,8 +230,10 @@ def _whole(duration: float, rate: float) -> float:
 
 
 def _not_settled(excess: dict[str, np.ndarray]) -> NothingFeasible:
+    """Return the error on the limit that is exceeded most."""
     name = max(excess, key=lambda key: float(excess[key].max()))
-    worst, j = float(excess[name].max()), int(excess[name].max(axis=0).argmax())
+    worst = float(excess[name].max())
+    j = int(excess[name].max(axis=0).argmax())
     return NothingFeasible(
         f"the timing did not converge: the {name} of joint {j + 1} exceeds its limit by {worst:.2g} of it between grid "
         "points; try a path with gentler bends, or more grid points",

@@ -1,14 +1,16 @@
 """Robot controllers: programs of poses for them, targets inside them."""
 
-OFFERS = {"commands": "commands:app", "topics": ":TOPICS", "write_program": "program:write_program"}
-TOPICS = {
+OFFERS = {"commands": "commands:app", "formats": ":FORMATS", "write_program": "program:write_program"}
+FORMATS = {
     "programs": (
         "programs for robot controllers, of calib program",
         "calib.apps.controller_programs.program calib.apps.controller_programs.motion "
         "calib.apps.controller_programs.targets calib.controllers.table",
+        "",
     ),
     "frames": (
         "controllers' base and flange frames, of calib deliver and programs",
         "calib.apps.controller_programs.frames",
+        "",
     ),
 }

@@ -1,4 +1,6 @@
 """Measured points joined with the joints of a robot's controller: calib join."""
 
-OFFERS = {"commands": "commands:app", "planned_poses": "planned:read_planned", "topics": ":TOPICS"}
-TOPICS = {"join": ("joints and points in separate files, or two streams, for calib join", "calib.apps.joining.joining")}
+OFFERS = {"commands": "commands:app", "planned_poses": "planned:read_planned", "formats": ":FORMATS"}
+FORMATS = {
+    "join": ("joints and points in separate files, or two streams, for calib join", "calib.apps.joining.joining", "")
+}

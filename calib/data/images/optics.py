@@ -71,25 +71,34 @@ class Optics:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters: the lenses' values first, then the boards' shapes."""
-        own = [f"{name}.{value}" for name, lens in zip(self.lens_names, self.lenses) for value in lens.names]
-        return (*own, *(f"{name}.{value}" for name in self.board_names for value in SHAPE))
+        result: list[str] = []
+        for name, lens in zip(self.lens_names, self.lenses):
+            result += [f"{name}.{value}" for value in lens.names]
+        for name in self.board_names:
+            result += [f"{name}.{value}" for value in SHAPE]
+        return tuple(result)
 
     @property
     def units(self) -> tuple[str, ...]:
         """Units of the parameters."""
-        own = [unit for lens in self.lenses for unit in ("px", "px", "px", "px", *[""] * (len(lens.values) - 4))]
-        return (*own, *(UNITS * len(self.boards)))
+        result: list[str] = []
+        for lens in self.lenses:
+            result += ["px"] * 4 + [""] * (len(lens.values) - 4)
+        return (*result, *(UNITS * len(self.boards)))
 
     @property
     def values(self) -> np.ndarray:
         """Values of all parameters."""
-        own = [lens.values for lens in self.lenses] + [board.values for board in self.boards]
-        return np.concatenate([np.zeros(0), *own])
+        values = [np.zeros(0)]
+        values += [lens.values for lens in self.lenses]
+        values += [board.values for board in self.boards]
+        return np.concatenate(values)
 
     @property
     def moving(self) -> np.ndarray:
         """Indices of the parameters that may be fitted."""
-        return np.array([k for k, name in enumerate(self.names) if name in self.free], dtype=int)
+        indices = [k for k, name in enumerate(self.names) if name in self.free]
+        return np.array(indices, dtype=int)
 
     def __len__(self) -> int:
         return sum(len(lens.values) for lens in self.lenses) + len(SHAPE) * len(self.boards)
@@ -98,20 +107,21 @@ class Optics:
         """Return the optics with other parameter values; a focal length changes by at most half of its value."""
         lenses, start = [], 0
         for lens in self.lenses:
-            own = np.array(values[start : start + len(lens.values)])
-            own[:2] = np.clip(own[:2], 0.5 * lens.values[:2], 1.5 * lens.values[:2])
-            lenses.append(lens.with_values(own))
+            lens_values = np.array(values[start : start + len(lens.values)])
+            lens_values[:2] = np.clip(lens_values[:2], 0.5 * lens.values[:2], 1.5 * lens.values[:2])
+            lenses.append(lens.with_values(lens_values))
             start += len(lens.values)
         shapes = np.asarray(values[start:]).reshape(-1, len(SHAPE))
-        return replace(self, lenses=tuple(lenses), boards=tuple(BoardShape(*map(float, row)) for row in shapes))
+        boards = tuple(BoardShape(*row) for row in shapes.astype(float).tolist())
+        return replace(self, lenses=tuple(lenses), boards=boards)
 
-    def like(self, other: Optics) -> Optics:
+    def like(self, source: Optics) -> Optics:
         """Return these optics with the values of other optics (same lens model, same board), not to be fitted."""
-        known = {(lens.model, lens.size): lens for lens in reversed(other.lenses)}
-        lenses = tuple(known.get((lens.model, lens.size), lens) for lens in self.lenses)
-        shapes = {name: shape for name, shape in zip(other.board_names, other.boards)}
-        alone = other.boards[0] if len(other.boards) == 1 else BoardShape()
-        boards = tuple(shapes.get(name, alone) for name in self.board_names)
+        lens_by_kind = {(lens.model, lens.size): lens for lens in reversed(source.lenses)}
+        lenses = tuple(lens_by_kind.get((lens.model, lens.size), lens) for lens in self.lenses)
+        shapes = dict(zip(source.board_names, source.boards))
+        default_shape = source.boards[0] if len(source.boards) == 1 else BoardShape()
+        boards = tuple(shapes.get(name, default_shape) for name in self.board_names)
         return replace(self, lenses=lenses, boards=boards, free=frozenset())
 
     def view(self, measured: PoseMeasurements, free: np.ndarray) -> View | None:
@@ -125,22 +135,22 @@ class Optics:
                 f"installation, which has {', '.join(self.lens_names) or 'no camera'}",
             )
         edges = np.cumsum([0, *(len(lens.values) for lens in self.lenses)])
-        lens, board = self.lens_names.index(measured.camera), self.board_names.index(measured.target)
-        first = int(edges[-1]) + len(SHAPE) * board
-        used = np.concatenate([np.arange(edges[lens], edges[lens + 1]), np.arange(first, first + len(SHAPE))])
-        _, own, place = np.intersect1d(used, free, return_indices=True)
-        return View(self.lenses[lens], self.boards[board], own, place)
+        lens = self.lens_names.index(measured.camera)
+        board = self.board_names.index(measured.target)
+        first_of_shape = int(edges[-1]) + len(SHAPE) * board
+        lens_parameters = np.arange(edges[lens], edges[lens + 1])
+        shape_parameters = np.arange(first_of_shape, first_of_shape + len(SHAPE))
+        parameters = np.concatenate([lens_parameters, shape_parameters])
+        _, in_view, in_free = np.intersect1d(parameters, free, return_indices=True)
+        return View(self.lenses[lens], self.boards[board], in_view, in_free)
 
     def tables(self) -> dict[str, Any]:
         """Return the tables ``camera`` and ``board`` of ``robot.toml``; `read_optics` reads them."""
-        lenses, boards = zip(self.lens_names, self.lenses), zip(self.board_names, self.boards)
-        return {
-            "camera": [
-                {"name": name, "model": lens.model, "size": list(lens.size), "values": lens.values.tolist()}
-                for name, lens in lenses
-            ],
-            "board": [{"name": name, **asdict(shape)} for name, shape in boards],
-        }
+        cameras = []
+        for name, lens in zip(self.lens_names, self.lenses):
+            cameras.append({"name": name, "model": lens.model, "size": list(lens.size), "values": lens.values.tolist()})
+        boards = [{"name": name, **asdict(shape)} for name, shape in zip(self.board_names, self.boards)]
+        return {"camera": cameras, "board": boards}
 
 
 @dataclass(frozen=True)
@@ -166,12 +176,13 @@ def read_optics(cameras: Sequence[Mapping[str, Any]], boards: Sequence[Mapping[s
     Raises:
         ValueError, CalibError: for a table that is not one.
     """
-    lenses, shapes = read_record(tuple[_Camera, ...], cameras), read_record(tuple[_Board, ...], boards)
+    lenses = read_record(tuple[_Camera, ...], cameras)
+    shapes = read_record(tuple[_Board, ...], boards)
     return Optics(
-        tuple(Lens(each.model, np.array(each.values), each.size) for each in lenses),
-        tuple(each.name for each in lenses),
-        tuple(BoardShape(*each.values) for each in shapes),
-        tuple(each.name for each in shapes),
+        lenses=tuple(Lens(lens.model, np.array(lens.values), lens.size) for lens in lenses),
+        lens_names=tuple(lens.name for lens in lenses),
+        boards=tuple(BoardShape(*shape.values) for shape in shapes),
+        board_names=tuple(shape.name for shape in shapes),
     )
 
 
@@ -202,6 +213,6 @@ def shape_slopes(board: Board, shape: BoardShape, points: np.ndarray) -> tuple[n
     slope = np.zeros((len(points), 3, 4))
     slope[:, :2, 0] = points[:, :2]
     slope[:, 2, 1:] = np.stack([x * x, x * y, y * y], axis=1)
-    place = points * [shape.scale, shape.scale, 0.0]
-    place[:, 2] = slope[:, 2, 1:] @ shape.values[1:]
-    return place, slope
+    positions = points * [shape.scale, shape.scale, 0.0]
+    positions[:, 2] = slope[:, 2, 1:] @ shape.values[1:]
+    return positions, slope

@@ -22,15 +22,21 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 from calib.data.poses.columns import SUFFIXES
 from calib.data.poses.robodk import recognises
 
-HEAD = 1 << 16  # letters of a file in which its numbers begin (our choice)
-ROWS = 3  # of numbers, alike, that make a table (or as many as there are)
-BEGIN = 60  # lines, without comments, in which the numbers begin (our choice)
-STACK = 7  # rows above the numbers that may name columns
+# Letters of a file in which its numbers begin (our choice).
+HEAD = 1 << 16
+# Rows of numbers, alike, that make a table (or as many as there are).
+ROWS = 3
+# Lines, without comments, in which the numbers begin (our choice).
+BEGIN = 60
+# Rows above the numbers that may name columns.
+STACK = 7
+# Least number of numbers in a row, and least share of its cells.
+MIN_NUMBERS = 3
+MIN_NUMBER_SHARE = 0.3
 COMMENTS = ("#", "//", "%", "!")
 UNITS = {
     **dict.fromkeys(("in", "inch", "inches", '"'), "in"),
@@ -67,7 +73,7 @@ class Grid:
     @property
     def numeric(self) -> list[bool]:
         """Whether each cell of the first line of numbers is a number."""
-        return [bool(_NUMBER[self.mark].fullmatch(cell)) for cell in self.cells]
+        return _numeric(self.cells, self.mark)
 
 
 @cache
@@ -79,58 +85,120 @@ def presets() -> dict[str, dict[str, str]]:
 def translated(path: str | Path) -> Export | None:
     """Return the file at `path` as a table of the toolkit; None where it is one already, or no table of positions."""
     with open(path, "rb") as file:
-        begin = file.read(HEAD)
-        utf16 = begin[:2] in (b"\xff\xfe", b"\xfe\xff")
-        head = begin.decode("utf-16" if utf16 else "utf-8-sig", errors="replace")
+        beginning = file.read(HEAD)
+        is_utf16 = beginning[:2] in (b"\xff\xfe", b"\xfe\xff")
+        encoding = "utf-16" if is_utf16 else "utf-8-sig"
+        head = beginning.decode(encoding, errors="replace")
         lines = head.splitlines()
-        first = next((line for line in lines if line.strip()), "")
-        known: dict[str, Any] = next((each for each in presets().values() if re.match(each["head"], first)), {})
-        if (grid := _grid(lines)) is None:
+        grid = _grid(lines)
+        if grid is None:
             return None
-        preamble = lines[: grid.first]
-        names, units, said = _columns(grid)
-        stated = re.search(known["unit"], head) if "unit" in known else None
-        stated = stated or next(filter(None, map(_STATED.search, preamble)), None)
-        length = UNITS.get(stated[1].lower(), "") if stated else ""
-        plain = not known and grid.mark == "." and not utf16 and not said
-        begins = next((i for i, line in enumerate(lines) if line.strip() and not line.startswith("#")), 0)
-        if not (recognises(names) or _is_ours(names)) or (plain and begins == grid.first - 1):
+        names, units, differs = _columns(grid)
+        if not recognises(names) and not _is_ours(names):
             return None
-        text = (begin + file.read()).decode("utf-16" if utf16 else "utf-8-sig", errors="replace")
-    units = [length if not unit and re.fullmatch(r"[xyz]\d*", name) else unit for name, unit in zip(names, units)]
-    found = Export()
-    out = csv.writer(found, lineterminator="\n")
-    kept = [k for k, name in enumerate(names) if name]
-    out.writerow([f"{names[k]} [{units[k]}]" if units[k] else names[k] for k in kept])
+        preset = _preset(lines)
+        is_plain = not preset and grid.mark == "." and not is_utf16 and not differs
+        if is_plain and _first_content(lines) == grid.first - 1:
+            return None
+        text = (beginning + file.read()).decode(encoding, errors="replace")
+
+    length_unit = _length_unit(preset, head, lines[: grid.first])
+    export = Export()
+    writer = csv.writer(export, lineterminator="\n")
+    columns = [k for k, name in enumerate(names) if name]
+    header = []
+    for k in columns:
+        unit = units[k]
+        if not unit and re.fullmatch(r"[xyz]\d*", names[k]):
+            unit = length_unit
+        header.append(f"{names[k]} [{unit}]" if unit else names[k])
+    writer.writerow(header)
     for row in _rows(text.splitlines()[grid.first :], grid):
-        out.writerow([row[k] for k in kept] if len(row) == len(names) else row)
-    found.seek(0)
-    how = f"read as {known['says']}" if known else "read as an instrument's export"
-    comma = ", decimal commas" if grid.mark == "," else ""
-    found.notes = (
-        f"{how}{comma}{f', lengths in {length}' if length else ''}: columns {', '.join(filter(None, names))}",
-    )
-    return found
+        writer.writerow([row[k] for k in columns] if len(row) == len(names) else row)
+    export.seek(0)
+
+    note = f"read as {preset['says']}" if preset else "read as an instrument's export"
+    if grid.mark == ",":
+        note += ", decimal commas"
+    if length_unit:
+        note += f", lengths in {length_unit}"
+    export.notes = (f"{note}: columns {', '.join(filter(None, names))}",)
+    return export
+
+
+def _preset(lines: Sequence[str]) -> dict[str, str]:
+    """Return the known export that begins with these lines; {} where it is none."""
+    first_line = ""
+    for line in lines:
+        if line.strip():
+            first_line = line
+            break
+    for preset in presets().values():
+        if re.match(preset["head"], first_line):
+            return preset
+    return {}
+
+
+def _first_content(lines: Sequence[str]) -> int:
+    """Return the index of the first line that is neither empty nor a comment of ours; 0 without any."""
+    for index, line in enumerate(lines):
+        if line.strip() and not line.startswith("#"):
+            return index
+    return 0
+
+
+def _length_unit(preset: dict[str, str], head: str, preamble: Sequence[str]) -> str:
+    """Return the unit of lengths that a file states before its numbers; "" if it states none."""
+    if "unit" in preset:
+        match = re.search(preset["unit"], head)
+        if match:
+            return UNITS.get(match[1].lower(), "")
+    for line in preamble:
+        match = _STATED.search(line)
+        if match:
+            return UNITS.get(match[1].lower(), "")
+    return ""
 
 
 def _grid(lines: Sequence[str]) -> Grid | None:
     """Return where the numbers of a text begin, with the separator that makes most cells of a line numbers."""
-    kept = [(i, line) for i, line in enumerate(lines) if line.strip() and not line.lstrip().startswith(COMMENTS)]
-    best, most = None, 2
+    content = [(i, line) for i, line in enumerate(lines) if _is_content(line)]
+    best, best_count = None, MIN_NUMBERS - 1
     for separator in "\t;|, ":
-        cells = [(i, _split(line, separator)) for i, line in kept[:BEGIN]]
+        rows = [_split(line, separator) for _, line in content[:BEGIN]]
         for mark in ".," if separator != "," else ".":
-            counts = [sum(bool(_NUMBER[mark].fullmatch(cell)) for cell in row) for _, row in cells]
-            for k, (i, row) in enumerate(cells):
-                near = zip(cells[k : k + ROWS], counts[k:])
-                alike = all(len(other) == len(row) and count >= 3 for (_, other), count in near)
-                if alike and counts[k] >= 0.3 * len(row):
-                    if counts[k] > most:
-                        above = [other for _, other in cells[max(k - STACK, 0) : k]]
-                        wide = [(*other, *[""] * (len(row) - len(other))) for other in above if len(other) <= len(row)]
-                        best, most = Grid(separator, mark, i, tuple(row), tuple(wide)), counts[k]
-                    break
+            counts = [sum(_numeric(row, mark)) for row in rows]
+            first = _first_of_numbers(rows, counts)
+            if first is not None and counts[first] > best_count:
+                best_count = counts[first]
+                row = rows[first]
+                above = []
+                for upper_row in rows[max(first - STACK, 0) : first]:
+                    if len(upper_row) <= len(row):
+                        padding = [""] * (len(row) - len(upper_row))
+                        above.append((*upper_row, *padding))
+                best = Grid(separator, mark, content[first][0], tuple(row), tuple(above))
     return best
+
+
+def _first_of_numbers(rows: Sequence[Sequence[str]], counts: Sequence[int]) -> int | None:
+    """Return the index of the first of several rows of equal length with enough numbers; None without any."""
+    for k, row in enumerate(rows):
+        if counts[k] < MIN_NUMBER_SHARE * len(row):
+            continue
+        same_length = all(len(next_row) == len(row) for next_row in rows[k : k + ROWS])
+        if same_length and min(counts[k : k + ROWS]) >= MIN_NUMBERS:
+            return k
+    return None
+
+
+def _is_content(line: str) -> bool:
+    return bool(line.strip()) and not line.lstrip().startswith(COMMENTS)
+
+
+def _numeric(cells: Sequence[str], mark: str) -> list[bool]:
+    """Return whether each cell is a number with this decimal mark."""
+    return [bool(_NUMBER[mark].fullmatch(cell)) for cell in cells]
 
 
 def _split(line: str, separator: str) -> list[str]:
@@ -142,31 +210,44 @@ def _split(line: str, separator: str) -> list[str]:
 def _rows(lines: Sequence[str], grid: Grid) -> Iterator[list[str]]:
     """Yield the rows of numbers, with decimal points."""
     for line in lines:
-        if line.strip() and not line.lstrip().startswith(COMMENTS):
-            row = _split(line, grid.separator)
-            decimal = grid.mark == ","
-            yield [cell.replace(",", ".") if decimal and _NUMBER[","].fullmatch(cell) else cell for cell in row]
+        if not _is_content(line):
+            continue
+        row = _split(line, grid.separator)
+        if grid.mark == ",":
+            for k, is_number in enumerate(_numeric(row, ",")):
+                if is_number:
+                    row[k] = row[k].replace(",", ".")
+        yield row
 
 
 def _columns(grid: Grid) -> tuple[list[str], list[str], bool]:
     """Return our name ("": left out) and unit of each column, and whether one differs from what the file says."""
     above, width = list(grid.above), len(grid.cells)
-    under = [""] * width
+    units = [""] * width
     if above and any(above[-1]) and all(cell.lower() in UNITS for cell in above[-1] if cell):
-        under = [UNITS[cell.lower()] if cell else "" for cell in above.pop()]
-    named = above[-1] if above and sum(map(bool, above[-1])) > width / 2 else ()
-    if not named or sum(bool(_NUMBER[grid.mark].fullmatch(cell)) for cell in named) > width / 2:
-        return *_unnamed(grid), True
-    heads = [match.groups() if (match := _HEADING.match(cell)) else (cell, "") for cell in named]
-    names = [name for name, _ in heads]
-    units = [unit or UNITS.get(own.lower(), own) for unit, (_, own) in zip(under, heads)]
-    ours = names if recognises(names) or _is_ours(names) else _ours(names, above[:-1])
-    return ours, units, ours != names or units != [own for _, own in heads]
+        units = [UNITS[cell.lower()] if cell else "" for cell in above.pop()]
+    headings = above[-1] if above and sum(map(bool, above[-1])) > width / 2 else ()
+    if not headings or sum(_numeric(headings, grid.mark)) > width / 2:
+        names, units = _unnamed(grid)
+        return names, units, True
+    file_names, file_units = [], []
+    for k, heading in enumerate(headings):
+        match = _HEADING.match(heading)
+        name, unit = match.groups() if match else (heading, "")
+        file_names.append(name)
+        file_units.append(unit)
+        if not units[k]:
+            units[k] = UNITS.get(unit.lower(), unit)
+    names = file_names
+    if not recognises(file_names) and not _is_ours(file_names):
+        names = _ours(file_names, above[:-1])
+    return names, units, names != file_names or units != file_units
 
 
 def _is_ours(names: Sequence[str]) -> bool:
     """Return whether positions already have names of the toolkit."""
-    return any({f"{axis}{suffix}" for axis in "xyz"} <= set(names) for suffix in (*SUFFIXES, "1"))
+    suffixes = (*SUFFIXES, "1")
+    return any({f"x{suffix}", f"y{suffix}", f"z{suffix}"} <= set(names) for suffix in suffixes)
 
 
 def _unnamed(grid: Grid) -> tuple[list[str], list[str]]:
@@ -176,29 +257,39 @@ def _unnamed(grid: Grid) -> tuple[list[str], list[str]]:
     if not 0 < texts <= 3 or not all(numeric[texts : texts + 3]):
         return [], []
     names = [*("collection", "group", "name")[3 - texts :], "x", "y", "z"]
-    return names + [f"column {k + 1}" for k in range(len(names), len(numeric))], [""] * len(numeric)
+    names += [f"column {k + 1}" for k in range(len(names), len(numeric))]
+    return names, [""] * len(numeric)
 
 
 def _ours(names: Sequence[str], above: Sequence[Sequence[str]]) -> list[str]:
     """Return the toolkit's names of columns, from the row of names and the rows of quantities and objects above it."""
-    plain = [re.sub(r"[^a-z0-9]", "", name.lower()) for name in names]
-    turns = [any(row[k].lower() == "rotation" for row in above) for k in range(len(names))]
-    axes = [
-        name if name == "w" and turn else match[1] if (match := _AXIS.fullmatch(name)) else ""
-        for name, turn in zip(plain, turns)
-    ]
-    if not {"x", "y", "z"} <= {axis for axis, turn in zip(axes, turns) if not turn}:
-        return list(names)
-    letter = "q" if "w" in axes else "r"
-    bodies = [k for k, turn in enumerate(turns) if turn and axes[k] == "x"]
-    several = sum(axis == "x" and not turn for axis, turn in zip(axes, turns)) > 1 and len(bodies) != 1
-    result, seen = list[str](), dict[str, int]()
-    for name, short, axis, turn in zip(names, plain, axes, turns):
-        if axis and turn:
-            result.append("" if several else f"{letter}{axis}")
-        elif axis:
-            seen[axis] = seen.get(axis, 0) + 1
-            result.append(f"{axis}{seen[axis]}" if several else axis if seen[axis] == 1 else "")
+    plain_names = [re.sub(r"[^a-z0-9]", "", name.lower()) for name in names]
+    is_rotation = [any(row[k].lower() == "rotation" for row in above) for k in range(len(names))]
+    axes = []
+    for plain_name, rotation in zip(plain_names, is_rotation):
+        match = _AXIS.fullmatch(plain_name)
+        if plain_name == "w" and rotation:
+            axes.append("w")
         else:
-            result.append(short if _TURN.fullmatch(short) else name)
-    return [name if name not in result[:k] else "" for k, name in enumerate(result)]
+            axes.append(match[1] if match else "")
+    position_axes = [axis for axis, rotation in zip(axes, is_rotation) if not rotation]
+    rotation_axes = [axis for axis, rotation in zip(axes, is_rotation) if rotation]
+    if not {"x", "y", "z"} <= set(position_axes):
+        return list(names)
+
+    rotation_letter = "q" if "w" in axes else "r"
+    # Of one rigid body among markers only its own pose is read.
+    several = position_axes.count("x") > 1 and rotation_axes.count("x") != 1
+    counts: dict[str, int] = {}
+    result: list[str] = []
+    for name, plain_name, axis, rotation in zip(names, plain_names, axes, is_rotation):
+        if axis and rotation:
+            column = "" if several else f"{rotation_letter}{axis}"
+        elif axis:
+            counts[axis] = counts.get(axis, 0) + 1
+            column = f"{axis}{counts[axis]}" if several else axis
+        else:
+            column = plain_name if _TURN.fullmatch(plain_name) else name
+        # Of columns with one name the first is read.
+        result.append("" if column in result else column)
+    return result

@@ -61,7 +61,7 @@ from calib.units import ANGLES, LENGTHS
 
 FORMATS = ("csv", "robodk", "three_smr")
 AXES = ("xyz", "xzy", "yxz", "yzx", "zxy", "zyx", "zyz", "zxz")
-EULER = ("vector", "wpr", "xyz", *(f"{axes} {how}" for axes in AXES for how in ("fixed", "moving")))
+EULER = ("vector", "wpr", "xyz", *(f"{axes} {frame}" for axes in AXES for frame in ("fixed", "moving")))
 
 Metres = Annotated[float, Real(above=0, least=MIN_SIGMA, most=0.1, unit="m")]
 Radians = Annotated[float, Real(above=0, least=MIN_SIGMA, most=1.0, unit="rad")]
@@ -175,13 +175,13 @@ def read_options(path: str | Path | None = None) -> FitOptions:
 
 def parse_options(table: Mapping[str, Any], source: str = "options") -> FitOptions:
     """Return the options in a parsed TOML table; `source` names the file in messages."""
-    found = replace(parse(FitOptions, inherited(table, FileOptions), source), source=source)
-    if "free" in table and not found.free:
+    options = parse(FitOptions, inherited(table, FileOptions), source)
+    if "free" in table and not options.free:
         refuse_option(source, "free: the list is empty; remove the key to free all parameters")
-    both = set(found.fix) & set(found.free)
-    if both:
-        refuse_option(source, f"'{min(both)}' is in fix and in free; remove it from one")
-    return found
+    fixed_and_free = set(options.fix) & set(options.free)
+    if fixed_and_free:
+        refuse_option(source, f"'{min(fixed_and_free)}' is in fix and in free; remove it from one")
+    return replace(options, source=source)
 
 
 def check_files(options: FitOptions, paths: Sequence[str | Path]) -> None:

@@ -65,9 +65,11 @@ class PoseMeasurements:
         m = len(self.q)
         for name, default in _COUNTS.items():
             if name in self.per_row and getattr(self, name) is None:
-                object.__setattr__(self, name, np.arange(default, m + default) if default else np.zeros(m))
+                numbers = np.arange(default, m + default) if default else np.zeros(m)
+                object.__setattr__(self, name, numbers)
         for name in self.per_row:
-            if (value := getattr(self, name)) is None:
+            value = getattr(self, name)
+            if value is None:
                 continue
             require(len(value) == m, f"{name} has {len(value)} rows, q has {m}", MeasurementError, self.file)
             object.__setattr__(self, name, frozen(value, int if name in _COUNTS else float))
@@ -79,7 +81,7 @@ class PoseMeasurements:
         quaternion: ArrayLike | None = None,
         *,
         joint_names: Sequence[str] = (),
-        **more: Any,
+        **fields: Any,
     ) -> Positions:
         """Return measurements from arrays: positions, or poses if `quaternion` is given.
 
@@ -88,7 +90,7 @@ class PoseMeasurements:
             position: (m, 3) of the target in the instrument's frame [m].
             quaternion: (m, 4) x y z w of unit norm.
             joint_names: n names; q1 to qn by default.
-            more: other fields of `Positions` and `Poses`: ``sigma``, ``station``, ``tool_names`` ...
+            fields: other fields of `Positions` and `Poses`: ``sigma``, ``station``, ``tool_names`` ...
 
         Raises:
             MeasurementError: for arrays of other lengths than q.
@@ -96,8 +98,8 @@ class PoseMeasurements:
         values = np.atleast_2d(np.asarray(q, dtype=float))
         names = tuple(joint_names) or tuple(f"q{j + 1}" for j in range(values.shape[1]))
         if quaternion is None:
-            return Positions(values, names, np.asarray(position), **more)
-        return Poses(values, names, np.asarray(position), np.asarray(quaternion), **more)
+            return Positions(values, names, np.asarray(position), **fields)
+        return Poses(values, names, np.asarray(position), np.asarray(quaternion), **fields)
 
     def __len__(self) -> int:
         return len(self.q)
@@ -268,16 +270,19 @@ class Planes(GroupedMeasurements):
     kind: ClassVar[str] = "plane"
 
 
+# Measurement types by their names in files and options.
 KINDS: dict[str, type[PoseMeasurements]] = {
-    each.kind: each for each in (Poses, Positions, Distances, Bars, Sockets, Planes)
+    block_type.kind: block_type for block_type in (Poses, Positions, Distances, Bars, Sockets, Planes)
 }
-"""Measurement types by their names in files and options."""
 
-Measured = TypeVar("Measured", bound=PoseMeasurements)
+Block = TypeVar("Block", bound=PoseMeasurements)
 
 
-def take(measured: Measured, index: Sequence[int] | np.ndarray) -> Measured:
+def take(block: Block, index: Sequence[int] | np.ndarray) -> Block:
     """Return the rows at `index`; groups keep their numbers, so that links stay valid."""
     index = np.asarray(index)
-    picked = {name: None if (value := getattr(measured, name)) is None else value[index] for name in measured.per_row}
-    return replace(measured, **picked)
+    rows: dict[str, Any] = {}
+    for name in block.per_row:
+        values = getattr(block, name)
+        rows[name] = None if values is None else values[index]
+    return replace(block, **rows)

@@ -26,26 +26,26 @@ def check_joints(q: np.ndarray, sheet: Sheet, columns: Sequence[str], robot: Joi
         MeasurementError: for degrees under a rad header, values outside the limits, a robot that never moved.
     """
     joints, kinds, lower, upper, table = robot.names, robot.kinds, robot.lower, robot.upper, sheet.table
-    stated = [sheet.unit(column, "joints") for column in columns]
-    _check_joint_units(sheet, columns, kinds, stated)
+    units = [sheet.unit(column, "joints") for column in columns]
+    _check_joint_units(sheet, columns, kinds, units)
     if len(q) > 1 and np.ptp(q, axis=0).max() < BOUNDS.min_travel:
         message = f"all {len(q)} rows have the same joint values: one pose determines no parameter"
         refuse_data(table.file, message, columns[0], int(table.rows[-1]))
     bounded = np.isfinite(lower) & np.isfinite(upper)
 
-    def advice(j: int, other: str) -> str:
-        if stated[j] in ("", "rad", "m"):
-            return f"looks like {other}; if so, name the column '{columns[j]} [{other}]'"
-        return f"the column is read as [{stated[j]}]: is it in another unit (counts, grad), or of another joint?"
+    def advice(j: int, unit: str) -> str:
+        if units[j] in ("", "rad", "m"):
+            return f"looks like {unit}; if so, name the column '{columns[j]} [{unit}]'"
+        return f"the column is read as [{units[j]}]: is it in another unit (counts, grad), or of another joint?"
 
     def says(row: int, j: int) -> str:
-        unit, other, factor = joint_unit(kinds[j])
-        found = f"{q[row, j]:g} {unit} is outside the limits {lower[j]:g} to {upper[j]:g} {unit} of {joints[j]}"
-        inside = ~outside(q[:, j] * factor, lower[j], upper[j])
-        if stated[j] in ("", "rad", "m") and np.abs(q[:, j]).max() > BOUNDS.max_turn and inside.all():
-            return f"{found}: {advice(j, other)}"
+        unit, mistaken_unit, factor = joint_unit(kinds[j])
+        fault = f"{q[row, j]:g} {unit} is outside the limits {lower[j]:g} to {upper[j]:g} {unit} of {joints[j]}"
+        fits_other_unit = not outside(q[:, j] * factor, lower[j], upper[j]).any()
+        if units[j] in ("", "rad", "m") and np.abs(q[:, j]).max() > BOUNDS.max_turn and fits_other_unit:
+            return f"{fault}: {advice(j, mistaken_unit)}"
         return (
-            f"{found}: are joint columns swapped? If the robot reached it, correct its limits or set "
+            f"{fault}: are joint columns swapped? If the robot reached it, correct its limits or set "
             "check_limits = false in the options"
         )
 
@@ -55,14 +55,14 @@ def check_joints(q: np.ndarray, sheet: Sheet, columns: Sequence[str], robot: Joi
     free = ~bounded if sheet.options.check_limits else sliding
     check_travel(q, np.where(free, max_travel(kinds), math.inf), table, columns, joints, kinds, advice)
     notes = []
-    beyond = np.where(bounded, np.maximum(lower - q, q - upper), 0.0)
-    for j in np.flatnonzero((beyond > 0.0).any(axis=0)).tolist():
-        worst = int(np.argmax(beyond[:, j]))
-        share = f"{int((beyond[:, j] > 0.0).sum())} of {len(q)} rows"
-        where = f"most in row {table.rows[worst]}, by {beyond[worst, j]:.2g} {joint_unit(kinds[j])[0]}"
+    excess = np.where(bounded, np.maximum(lower - q, q - upper), 0.0)
+    for j in np.flatnonzero((excess > 0.0).any(axis=0)).tolist():
+        row_of_worst = int(np.argmax(excess[:, j]))
+        share = f"{int((excess[:, j] > 0.0).sum())} of {len(q)} rows"
+        where = f"most in row {table.rows[row_of_worst]}, by {excess[row_of_worst, j]:.2g} {joint_unit(kinds[j])[0]}"
         notes.append(f"{joints[j]} is outside its limits in {share}, {where}; kept")
     turning = [j for j in range(len(joints)) if not sliding[j]]
-    in_degrees = turning and all(stated[j] in ("deg", "°", "degrees") for j in turning)
+    in_degrees = turning and all(units[j] in ("deg", "°", "degrees") for j in turning)
     if in_degrees and np.abs(q[:, turning]).max() < BOUNDS.max_turn * DEG:
         notes.append("all joint values are below 6.6 deg: are they radians instead of degrees?")
     return tuple(notes)
@@ -73,9 +73,9 @@ def outside(q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
     return (q < lower - BOUNDS.limit_slack) | (q > upper + BOUNDS.limit_slack)
 
 
-def _check_joint_units(sheet: Sheet, columns: Sequence[str], kinds: Sequence[str], stated: Sequence[str]) -> None:
+def _check_joint_units(sheet: Sheet, columns: Sequence[str], kinds: Sequence[str], units: Sequence[str]) -> None:
     """Refuse a stated unit that does not suit the joint: mm for a revolute one, deg for a prismatic one."""
-    for name, kind, unit in zip(columns, kinds, stated):
+    for name, kind, unit in zip(columns, kinds, units):
         if unit and (unit.lower() in ANGLES) == (kind == "prismatic"):
             advice = "is it the right column?"
             if not sheet.table.units[sheet.table.index(name)]:
@@ -86,10 +86,10 @@ def _check_joint_units(sheet: Sheet, columns: Sequence[str], kinds: Sequence[str
 def check_block(block: PoseMeasurements, options: FileOptions, robot: Joints) -> PoseMeasurements:
     """Return measurements in memory with the notes of the checks; refuse them where a file would be refused."""
     q, joints = np.asarray(block.q), tuple(block.joint_names)
-    place = block.file or "measurements in memory"
+    where = block.file or "measurements in memory"
     message = f"q has shape {q.shape}, expected (rows, joints) with {len(joints)} joints"
-    require(len(block) and q.ndim == 2 and q.shape[1] == len(joints), message, MeasurementError, place)
-    table = Table(place, joints, ("",) * len(joints), tuple(q.T), block.rows)
+    require(len(block) and q.ndim == 2 and q.shape[1] == len(joints), message, MeasurementError, where)
+    table = Table(where, joints, ("",) * len(joints), tuple(q.T), block.rows)
     table.check(joints)
     notes = check_joints(q, Sheet(table, replace(options, units={}, columns={})), joints, replace(robot, names=joints))
     if isinstance(block, Positions):
@@ -105,19 +105,23 @@ def check_block(block: PoseMeasurements, options: FileOptions, robot: Joints) ->
 def unit_quaternions(values: np.ndarray, source: Rows, columns: Sequence[str]) -> np.ndarray:
     """Return normalised quaternions (m, 4); refuse norms that differ from 1 by more than rounding."""
     norm = np.linalg.norm(values, axis=1)
-    rest = "not 1: were columns rounded or swapped, or are they not a quaternion?"
+    advice = "not 1: were columns rounded or swapped, or are they not a quaternion?"
     refuse(
         source,
         np.abs(norm - 1) > BOUNDS.max_norm_error,
         columns,
-        lambda row, _: f"the quaternion {', '.join(columns)} has norm {norm[row]:.4g}, {rest}",
+        lambda row, _: f"the quaternion {', '.join(columns)} has norm {norm[row]:.4g}, {advice}",
     )
     return values / norm[:, None]
 
 
 def orientation(sheet: Sheet, names: Sequence[str]) -> np.ndarray:
     """Return unit quaternions (m, 4) x y z w from the columns of a quaternion, a matrix or three angles."""
-    values = sheet.numbers(names, replace(TURNS, most=math.inf) if len(names) == 3 else Column(tuple(names)))
+    column = Column(tuple(names))
+    # Angles are bounded below, unless they are a rotation vector.
+    if len(names) == 3:
+        column = replace(TURNS, most=math.inf)
+    values = sheet.numbers(names, column)
     if len(names) == 4:
         return unit_quaternions(values, sheet.table, names)
     if len(names) == 9:
@@ -129,7 +133,9 @@ def orientation(sheet: Sheet, names: Sequence[str]) -> np.ndarray:
 
 def from_angles(values: np.ndarray, euler: str) -> Rotation:
     """Return the rotations of three numbers each (m, 3) [rad], by what the options' ``euler`` says they mean."""
-    return Rotation.from_rotvec(values) if euler == "vector" else Rotation.from_euler(_axes(euler), values)
+    if euler == "vector":
+        return Rotation.from_rotvec(values)
+    return Rotation.from_euler(_axes(euler), values)
 
 
 def to_angles(turns: Rotation, euler: str) -> np.ndarray:
@@ -139,8 +145,9 @@ def to_angles(turns: Rotation, euler: str) -> np.ndarray:
 
 def _axes(euler: str) -> str:
     """Return SciPy's letters of a convention: small ones for turns about fixed axes."""
-    axes, _, how = {"wpr": "xyz fixed", "xyz": "xyz moving"}.get(euler, euler).partition(" ")
-    return axes if how == "fixed" else axes.upper()
+    convention = {"wpr": "xyz fixed", "xyz": "xyz moving"}.get(euler, euler)
+    axes, _, frame = convention.partition(" ")
+    return axes if frame == "fixed" else axes.upper()
 
 
 def _from_matrices(matrices: np.ndarray, source: Rows, columns: Sequence[str]) -> Rotation:

@@ -32,6 +32,12 @@ from calib.records import frozen
 from calib.units import DEG
 
 _POSE_MARKS = ("w", "rx", "r", "a")
+JOINT_NUMBERS = ["j1", "j2", "j3", "j4", "j5", "j6"]
+JOINT_NAMES = ["joint 1", "joint 2", "joint 3", "joint 4", "joint 5", "joint 6"]
+# Meaning of w, p, r by the options' `euler`.
+MEANINGS = {"wpr": "Rz(r) Ry(p) Rx(w)", "xyz": "Rx(w) Ry(p) Rz(r)", "vector": "a rotation vector"}
+# Largest angle [rad] read as degrees that would fit radians, with rounding.
+MAX_RADIANS_AS_DEGREES = 1.001 * np.pi * DEG
 
 Read = tuple[Table, FileOptions, tuple[str, ...]]
 
@@ -41,46 +47,55 @@ def recognises(header: Sequence[str]) -> bool:
 
     ``joint1`` in one word is a name that robots have: such a file is read by its names.
     """
-    first = [name.split("(")[0].split("[")[0].strip().lower() for name in header[:6]]
-    named = first in ([f"j{i}" for i in range(1, 7)], [f"joint {i}" for i in range(1, 7)])
-    return named and _plain(header[6] if len(header) > 6 else "") not in ("j7", "joint7")
+    names = [name.split("(")[0].split("[")[0].strip().lower() for name in header[:6]]
+    if names not in (JOINT_NUMBERS, JOINT_NAMES):
+        return False
+    has_seventh = len(header) > 6 and _plain(header[6]) in ("j7", "joint7")
+    return not has_seventh
 
 
 def read_robodk(path: str | Path, joints: int, options: FileOptions) -> Read:
     """Return RoboDK's CSV as a table for the standard reader, with the options to read it and notes."""
-    found = read_header(path)[0]
-    if not recognises(found):
-        refuse_data(path, f"is not a RoboDK file: its header begins with {', '.join(found[:7])}, not J1 to J6")
+    header = read_header(path)[0]
+    if not recognises(header):
+        refuse_data(path, f"is not a RoboDK file: its header begins with {', '.join(header[:7])}, not J1 to J6")
     require(joints == 6, f"RoboDK's format has 6 joints, the robot has {joints}", MeasurementError, path)
-    pose = len(found) == 18 or (len(found) == 12 and _plain(found[9]) in _POSE_MARKS)
-    if len(found) not in (9, 12, 18):
-        refuse_data(path, f"has {len(found)} columns; RoboDK's points have 9 or 12, its poses 12 or 18")
+    is_pose = len(header) == 18 or (len(header) == 12 and _plain(header[9]) in _POSE_MARKS)
+    if len(header) not in (9, 12, 18):
+        refuse_data(path, f"has {len(header)} columns; RoboDK's points have 9 or 12, its poses 12 or 18")
     raw = read_table(path, doubles=True)
-    measured = 12 if pose else 9
-    tcp = tuple(f"TCP {name}" for name in "xyzwpr"[: len(found) - measured])
-    names = (*found[:6], *"xyzwpr"[: measured - 6], *tcp)
-    silent = pose and not options.units.get("orientation") and not any(raw.units[9:12])
-    usual = ("deg",) * 6 + ("mm",) * 3 + ("deg" if silent else "",) * 3 + ("",) * 6
-    table = replace(raw, header=names, units=tuple(own or unit for own, unit in zip(raw.units, usual)))
+    measured_count = 12 if is_pose else 9
+    tcp = tuple(f"TCP {name}" for name in "xyzwpr"[: len(header) - measured_count])
+    names = (*header[:6], *"xyzwpr"[: measured_count - 6], *tcp)
+    angle_unit_assumed = is_pose and not options.units.get("orientation") and not any(raw.units[9:12])
+    angle_unit = "deg" if angle_unit_assumed else ""
+    default_units = ("deg",) * 6 + ("mm",) * 3 + (angle_unit,) * 3 + ("",) * 6
+    units = tuple(unit or default for unit, default in zip(raw.units, default_units))
+    table = replace(raw, header=names, units=units)
     table, notes = _with_tools(table, tcp, options)
-    columns = {**options.columns, **{f"q{i + 1}": name for i, name in enumerate(names[:6])}}
-    kind, euler = options.kind or ("pose" if pose else "position"), options.euler
-    if pose:
+
+    columns = dict(options.columns)
+    for number, name in enumerate(names[:6], 1):
+        columns[f"q{number}"] = name
+    kind = options.kind or ("pose" if is_pose else "position")
+    euler = options.euler
+    if is_pose:
         columns |= {"rx": "w", "ry": "p", "rz": "r"}
         euler = euler or "wpr"
-        meaning = {"wpr": "Rz(r) Ry(p) Rx(w)", "xyz": "Rx(w) Ry(p) Rz(r)", "vector": "a rotation vector"}
-        notes += (f"w p r are taken as {meaning.get(euler, euler)}; other conventions: euler in the options",)
-        if silent and max(np.abs(table.numbers(name, "angle")).max() for name in "wpr") < 1.001 * np.pi * DEG:
-            message = "all angles are within ±3.15: deg as in RoboDK's manual, or rad as in its macro?"
-            message += " State it: units.orientation = 'deg' or 'rad' in the options, or [deg] in the header"
-            table.fail(message, "w", 0)
-    read = f"read as RoboDK's {kind}s: joints in deg, positions in mm unless the header states other units"
-    return table, replace(options, columns=columns, kind=kind, euler=euler), (read, *notes)
+        notes += (f"w p r are taken as {MEANINGS.get(euler, euler)}; other conventions: euler in the options",)
+        if angle_unit_assumed:
+            largest = max(np.abs(table.numbers(name, "angle")).max() for name in "wpr")
+            if largest < MAX_RADIANS_AS_DEGREES:
+                message = "all angles are within ±3.15: deg as in RoboDK's manual, or rad as in its macro?"
+                message += " State it: units.orientation = 'deg' or 'rad' in the options, or [deg] in the header"
+                table.fail(message, "w", 0)
+    note = f"read as RoboDK's {kind}s: joints in deg, positions in mm unless the header states other units"
+    return table, replace(options, columns=columns, kind=kind, euler=euler), (note, *notes)
 
 
 def read_three_smr(path: str | Path, joints: int, options: FileOptions) -> Read:
     """Return the headerless CSV of three reflectors as a table, options and notes, as `read_robodk`."""
-    targets = [f"{axis}{k}" for k in (1, 2, 3) for axis in "xyz"]
+    targets = ["x1", "y1", "z1", "x2", "y2", "z2", "x3", "y3", "z3"]
     width = row_width(path)
     padding = width - 9 - joints
     if padding < 0:
@@ -89,8 +104,8 @@ def read_three_smr(path: str | Path, joints: int, options: FileOptions) -> Read:
     raw = read_table(path, header=names)
     cells = list(raw.cells)
     for k in range(0, 9, 3):
-        triple = [raw.numbers(name, gaps=True) for name in targets[k : k + 3]]
-        unseen = np.all([values == 0 for values in triple], axis=0)
+        triple = np.array([raw.numbers(name, gaps=True) for name in targets[k : k + 3]])
+        unseen = np.all(triple == 0, axis=0)
         cells[k : k + 3] = [frozen(np.where(unseen, np.nan, values)) for values in triple]
     table = replace(raw, units=("mm",) * 9 + ("",) * padding + ("deg",) * joints, cells=tuple(cells))
     return table, options, (f"read as three reflectors, {padding} columns of padding, {joints} joints",)
@@ -104,14 +119,20 @@ def _with_tools(table: Table, tcp: Sequence[str], options: FileOptions) -> tuple
     """Return the table, with a column ``tool`` and a note if its rows have different TCPs."""
     if not tcp:
         return table, ()
-    triples = [tuple(row) for row in np.round(np.stack([table.numbers(name) for name in tcp], axis=1), 3)]
-    labels = {triple: f"{options.tool} {k + 1}" for k, triple in enumerate(dict.fromkeys(triples))}
+    tcp_values = np.stack([table.numbers(name) for name in tcp], axis=1)
+    triples = [tuple(row) for row in np.round(tcp_values, 3)]
+    labels: dict[tuple[float, ...], str] = {}
+    descriptions = []
+    for triple in dict.fromkeys(triples):
+        label = f"{options.tool} {len(labels) + 1}"
+        labels[triple] = label
+        coordinates = ", ".join(f"{coordinate:g}" for coordinate in triple)
+        descriptions.append(f"{label}: {coordinates}")
     if len(labels) == 1:
         return table, ()
-    values = "; ".join(f"{label}: {', '.join(f'{value:g}' for value in triple)}" for triple, label in labels.items())
     cells = (*table.cells, np.array([labels[triple] for triple in triples], dtype=object))
     table = replace(table, header=(*table.header, "tool"), units=(*table.units, ""), cells=cells)
-    return table, (f"{len(labels)} different TCPs, read as different tools ({values})",)
+    return table, (f"{len(labels)} different TCPs, read as different tools ({'; '.join(descriptions)})",)
 
 
 FORMS: dict[str, tuple[Callable[[Sequence[str]], bool], Callable[[str | Path, int, FileOptions], Read]]] = {

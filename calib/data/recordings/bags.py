@@ -33,9 +33,11 @@ def read_bag(path: Path, joints: Joints | None, options: RecordingOptions) -> Re
             reader, (*JOINT_STATE, FRANKA_STATE), options.topic, path, "joint states", "topic = '...'", "/joint_states"
         )
         names, parts, skipped = joint_states(reader, connections, joints, path)
-    for ours, what in (("q", "positions"), ("effort", "efforts")):
-        require(parts[ours].size, f"its joint states have no {what}", MeasurementError, path)
-    notes = [f"{skipped} messages without one of the joints are not used"] if skipped else []
+    for series, quantity in (("q", "positions"), ("effort", "efforts")):
+        require(parts[series].size, f"its joint states have no {quantity}", MeasurementError, path)
+    notes = []
+    if skipped:
+        notes.append(f"{skipped} messages without one of the joints are not used")
     if not parts["header"].any():
         notes.append("message headers have no stamps; the logging times are used, which jitter more")
     return Recording(
@@ -76,17 +78,20 @@ def connections_of(
     Raises:
         MeasurementError: without such a topic, or with several of which none is asked for.
     """
-    found = sorted({c.topic for c in reader.connections if c.msgtype in kinds})
-    if not found:
-        topics = ", ".join(sorted(f"{c.topic} ({c.msgtype})" for c in reader.connections)) or "none"
-        refuse_data(path, f"has no topic of {what} ({', '.join(kinds)}); found: {topics}")
-    chosen = topic or (found[0] if len(found) == 1 else usual)
-    if chosen not in found:
-        message = f"{len(found)} topics have {what}: {', '.join(found)}; state one ({option})"
+    connections = [connection for connection in reader.connections if connection.msgtype in kinds]
+    topics = sorted({connection.topic for connection in connections})
+    if not topics:
+        all_topics = sorted(f"{connection.topic} ({connection.msgtype})" for connection in reader.connections)
+        refuse_data(path, f"has no topic of {what} ({', '.join(kinds)}); found: {', '.join(all_topics) or 'none'}")
+    chosen = topic
+    if not topic:
+        chosen = topics[0] if len(topics) == 1 else usual
+    if chosen not in topics:
+        message = f"{len(topics)} topics have {what}: {', '.join(topics)}; state one ({option})"
         if topic:
-            message = f"has no {what} on '{topic}'{suggestion(topic, found)}; found: {', '.join(found)}"
+            message = f"has no {what} on '{topic}'{suggestion(topic, topics)}; found: {', '.join(topics)}"
         refuse_data(path, message)
-    return [c for c in reader.connections if c.topic == chosen and c.msgtype in kinds]
+    return [connection for connection in connections if connection.topic == chosen]
 
 
 def joint_states(
@@ -100,22 +105,24 @@ def joint_states(
     for connection, logged, raw in reader.messages(connections=connections):
         message = reader.deserialize(raw, connection.msgtype)
         message = getattr(message, "measured_joint_state", message)
-        own = tuple(message.name)
-        names = names or own
-        if own not in order:
-            order[own] = [own.index(name) for name in names] if set(names) <= set(own) else None
-        place = order[own]
-        if place is None:
+        message_names = tuple(message.name)
+        names = names or message_names
+        if message_names not in order:
+            has_all = set(names) <= set(message_names)
+            order[message_names] = [message_names.index(name) for name in names] if has_all else None
+        index = order[message_names]
+        if index is None:
             skipped += 1
             continue
         rows["header"].append(header_stamp(message))
         rows["logged"].append(logged)
-        for ours, values in (("q", message.position), ("v", message.velocity), ("effort", message.effort)):
-            rows[ours].append(values[place] if len(values) == len(own) else None)
+        for series, values in (("q", message.position), ("v", message.velocity), ("effort", message.effort)):
+            rows[series].append(values[index] if len(values) == len(message_names) else None)
     if not rows["q"]:
         _refuse_joints(names, list(order), path)
-    found = {ours: _stack(values, ours, path) for ours, values in rows.items()}
-    return names, found | {"stamp": found["header" if found["header"].any() else "logged"]}, skipped
+    arrays = {series: _stack(values, series, path) for series, values in rows.items()}
+    arrays["stamp"] = arrays["header"] if arrays["header"].any() else arrays["logged"]
+    return names, arrays, skipped
 
 
 def header_stamp(message: Any) -> int:
@@ -123,21 +130,21 @@ def header_stamp(message: Any) -> int:
     return message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
 
 
-def _stack(values: list[Any], ours: str, path: Path) -> np.ndarray:
+def _stack(values: list[Any], series: str, path: Path) -> np.ndarray:
     """Return the rows as one array; an empty array if no message has the quantity."""
     missing = [k for k, value in enumerate(values) if value is None]
     if len(missing) == len(values):
         return np.empty((0, 0))
     if missing:
-        refuse_data(path, f"this message has no {ours}, other messages have", ours, missing[0] + 1)
+        refuse_data(path, f"this message has no {series}, other messages have", series, missing[0] + 1)
     return np.array(values)
 
 
-def _refuse_joints(names: Sequence[str], seen: Sequence[tuple[str, ...]], path: Path) -> None:
-    require(seen, "its topic of joint states has no messages", MeasurementError, path)
-    known = sorted({name for own in seen for name in own})
-    missing = [name for name in names if name not in known]
-    what = (
-        f"no joint '{missing[0]}'{suggestion(missing[0], known)}" if missing else "no message with all joints at once"
-    )
-    refuse_data(path, f"has {what}; found: {', '.join(known)}")
+def _refuse_joints(names: Sequence[str], message_names: Sequence[tuple[str, ...]], path: Path) -> None:
+    require(message_names, "its topic of joint states has no messages", MeasurementError, path)
+    bag_names = sorted(set().union(*message_names))
+    fault = "no message with all joints at once"
+    missing = [name for name in names if name not in bag_names]
+    if missing:
+        fault = f"no joint '{missing[0]}'{suggestion(missing[0], bag_names)}"
+    refuse_data(path, f"has {fault}; found: {', '.join(bag_names)}")

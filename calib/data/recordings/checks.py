@@ -90,30 +90,38 @@ def _without_absent(recording: Recording) -> Recording:
     for name in NEEDED[1:]:
         values = getattr(recording, name)
         absent[name] = [] if values is None else np.flatnonzero(np.isnan(values).all(axis=0)).tolist()
-    for name, what in (("q", "position"), ("effort", recording.kind)):
+    for name, quantity in (("q", "position"), ("effort", recording.kind)):
         if absent[name]:
             joints = ", ".join(recording.joint_names[j] for j in absent[name])
             refuse_data(
                 recording.file,
-                f"the {what} of {joints} is NaN in every row: its driver does not provide it. Identification needs "
+                f"the {quantity} of {joints} is NaN in every row: its driver does not provide it. Identification needs "
                 f"positions and torques (or currents) of all joints",
             )
     notes = []
-    for name, what in (("v", "velocities"), ("tau_link", "torques behind the gear"), ("tau_motor", "motor torques")):
+    quantities = (("v", "velocities"), ("tau_link", "torques behind the gear"), ("tau_motor", "motor torques"))
+    for name, quantity in quantities:
         if absent[name]:
             joints = ", ".join(recording.joint_names[j] for j in absent[name])
-            notes.append(f"{what} of {joints} are NaN in every row: not provided, and not used for any joint")
-    nothing = {name: None for name in absent if absent[name]}
-    return _noted(replace(recording, **nothing), *notes)
+            notes.append(f"{quantity} of {joints} are NaN in every row: not provided, and not used for any joint")
+    removed = dict.fromkeys(name for name, joints in absent.items() if joints)
+    return _noted(replace(recording, **removed), *notes)
 
 
-def _check_finite(recording: Recording, most: float = np.inf) -> None:
+def _check_finite(recording: Recording, limit: float = np.inf) -> None:
     """Refuse NaN, infinities and values beyond `most`; NaN in `q_link` means: no second encoder."""
-    series = {name: values for name in NEEDED if (values := getattr(recording, name)) is not None}
-    if (wrong := np.column_stack([~(np.abs(values) < most) for values in series.values()])).any():
-        columns = [label for name in series for label in (["t"] if name == "t" else _columns(recording, name))]
-        values, part = np.column_stack(list(series.values())), _sound_part(recording, wrong)
-        refuse(recording, wrong, columns, lambda row, k: f"found {values[row, k]:g}; cut this part out{part}")
+    series = []
+    columns: list[str] = []
+    for name in NEEDED:
+        value = getattr(recording, name)
+        if value is not None:
+            series.append(value)
+            columns += ["t"] if name == "t" else _columns(recording, name)
+    invalid = np.column_stack([~(np.abs(values) < limit) for values in series])
+    if invalid.any():
+        values = np.column_stack(series)
+        advice = _sound_part(recording, invalid)
+        refuse(recording, invalid, columns, lambda row, k: f"found {values[row, k]:g}; cut this part out{advice}")
 
 
 def _sound_part(recording: Recording, bad: np.ndarray) -> str:
@@ -129,8 +137,8 @@ def _sound_part(recording: Recording, bad: np.ndarray) -> str:
     breaks = np.flatnonzero(np.concatenate([[True], faulty, [True]]))
     longest = int(np.argmax(np.diff(breaks)))
     first, last = int(breaks[longest]), int(breaks[longest + 1]) - 2
-    words = f"; the longest part without such rows is @{recording.t[first]:.9g}:{recording.t[last]:.9g}"
-    return words if last - first >= LIMITS.min_samples else ""
+    advice = f"; the longest part without such rows is @{recording.t[first]:.9g}:{recording.t[last]:.9g}"
+    return advice if last - first >= LIMITS.min_samples else ""
 
 
 def _drop_spikes(recording: Recording, joints: Joints | None) -> Recording:
@@ -143,34 +151,36 @@ def _drop_spikes(recording: Recording, joints: Joints | None) -> Recording:
         MeasurementError: where more rows than that, up to `max_unit_share`, are beyond the limit by as much.
     """
     count = len(recording)
-    few = max(LIMITS.max_spikes, int(LIMITS.max_spike_share * count))
-    beyond = np.abs(recording.effort) > LIMITS.max_effort * _effort_limits(recording, joints)
+    max_count = max(LIMITS.max_spikes, int(LIMITS.max_spike_share * count))
+    beyond_limit = np.abs(recording.effort) > LIMITS.max_effort * _effort_limits(recording, joints)
     size = np.abs(recording.effort - np.median(recording.effort, axis=0))
-    narrow, wide = count - few - 1, count - int(LIMITS.max_unit_share * count) - 1
+    narrow, wide = count - max_count - 1, count - int(LIMITS.max_unit_share * count) - 1
     ordered = np.partition(size, (narrow, wide), axis=0)
-    usual = ordered[narrow]
-    wild = ((size > LIMITS.min_spike * usual) | ((size > LIMITS.min_spike_beyond * usual) & beyond)) & (usual > 0.0)
-    if not 0 < wild.any(axis=1).sum() <= few:
-        usual = ordered[wide]
-        wild = (size > LIMITS.min_spike * usual) & beyond
-    rows = wild.any(axis=1)
+    usual_size = ordered[narrow]
+    is_large = size > LIMITS.min_spike * usual_size
+    is_large |= (size > LIMITS.min_spike_beyond * usual_size) & beyond_limit
+    is_spike = is_large & (usual_size > 0.0)
+    if not 0 < is_spike.any(axis=1).sum() <= max_count:
+        usual_size = ordered[wide]
+        is_spike = (size > LIMITS.min_spike * usual_size) & beyond_limit
+    rows = is_spike.any(axis=1)
     if not rows.any():
         return recording
     columns, median = _columns(recording, "effort"), f"where {1 - LIMITS.max_unit_share:.0%} of the rows are within"
-    if rows.sum() > few:
+    if rows.sum() > max_count:
         refuse(
             recording,
-            wild,
+            is_spike,
             columns,
             lambda row, j: (
-                f"is {recording.effort[row, j]:.4g} at {recording.t[row]:.6g} s, {median} {usual[j]:.4g} of "
+                f"is {recording.effort[row, j]:.4g} at {recording.t[row]:.6g} s, {median} {usual_size[j]:.4g} of "
                 "its median: spikes of the log? They are too many to ignore; cut those parts out"
             ),
         )
-    row, j = np.argwhere(wild)[0]
+    row, j = np.argwhere(is_spike)[0]
     note = (
         f"row {recording.rows[row]}: the {columns[j]} is {recording.effort[row, j]:.4g} at {recording.t[row]:.6g} s"
-        f"{more_rows(recording, wild, columns)}, the other rows are within "
+        f"{more_rows(recording, is_spike, columns)}, the other rows are within "
         f"{size[~rows, j].max():.4g} of its median: taken as a spike of the log and not used"
     )
     return _noted(recording.take(~rows), note)
@@ -185,37 +195,39 @@ def _effort_limits(recording: Recording, joints: Joints | None) -> np.ndarray:
 
 def _drop_repeats(recording: Recording) -> Recording:
     """Return the recording without rows that a logger wrote twice: same stamp, same positions, same torques."""
-    same = np.diff(recording.t) == 0
-    for name in ("q", "effort"):
-        same &= (np.diff(getattr(recording, name), axis=0) == 0).all(axis=1)
-    if not same.any():
+    repeats = np.diff(recording.t) == 0
+    for values in (recording.q, recording.effort):
+        repeats &= (np.diff(values, axis=0) == 0).all(axis=1)
+    if not repeats.any():
         return recording
-    first = int(recording.rows[int(np.argmax(same)) + 1])
-    kept = recording.take(np.concatenate([[True], ~same]))
-    return _noted(kept, f"{int(same.sum())} rows repeat the row before, with its stamp (first: row {first}); not used")
+    first = int(recording.rows[int(np.argmax(repeats)) + 1])
+    remaining = recording.take(np.concatenate([[True], ~repeats]))
+    return _noted(
+        remaining, f"{int(repeats.sum())} rows repeat the row before, with its stamp (first: row {first}); not used"
+    )
 
 
 def _check_time(recording: Recording) -> None:
     """Refuse stamps (N,) [s] that do not increase, or whose step looks like another unit."""
     t = recording.t
     step = np.diff(t)
-    back, stands = np.append(False, step < 0), np.append(False, step == 0)
-    far = goes_far_back(t)
-    back = far if far.any() else back
+    goes_back, stands_still = np.append(False, step < 0), np.append(False, step == 0)
+    far_back = goes_far_back(t)
+    goes_back = far_back if far_back.any() else goes_back
     if len(step) and (step < 0).all():
         refuse_data(recording.file, "time runs backwards in every row: reverse the order of the rows")
     refuse(
         recording,
-        back,
+        goes_back,
         ["t"],
         lambda i, _: (
             f"time goes back from {t[i - 1]:.6g} s to {t[i]:.6g} s: were two logs joined, or was the clock "
-            f"set? Cut the file there{_sound_part(recording, back)}"
+            f"set? Cut the file there{_sound_part(recording, goes_back)}"
         ),
     )
     refuse(
         recording,
-        stands,
+        stands_still,
         ["t"],
         lambda i, _: (
             f"two samples have the stamp {t[i]:.6g} s but different values: is the clock too coarse? Number "
@@ -224,24 +236,23 @@ def _check_time(recording: Recording) -> None:
     )
     rate = 1 / float(np.median(step))
     if not LIMITS.min_rate <= rate <= LIMITS.max_rate:
-        units = {"ms": 1e3, "us": 1e6, "ns": 1e9}
-        likely = next(
-            (unit for unit, factor in units.items() if LIMITS.min_rate <= rate * factor <= LIMITS.max_rate), ""
-        )
-        hint = f"stamps look like {likely}; if so, state units: t = '{likely}'" if likely else "check the stamps"
+        hint = "check the stamps"
+        for unit, factor in (("ns", 1e9), ("us", 1e6), ("ms", 1e3)):
+            if LIMITS.min_rate <= rate * factor <= LIMITS.max_rate:
+                hint = f"stamps look like {unit}; if so, state units: t = '{unit}'"
         refuse_data(recording.file, f"the median step is {np.median(step):.4g} s, {rate:.3g} Hz: {hint}", "t")
 
 
 def _check_size(recording: Recording, joints: Joints | None = None) -> None:
     """Refuse positions beyond any joint's travel: degrees, millimetres, or columns of another robot."""
     kinds = joints.kinds if joints else ("revolute",) * recording.n
-    most = max_travel(kinds)
+    max_size = max_travel(kinds)
     if joints is not None:
         reach = 2 * np.maximum(np.abs(joints.lower), np.abs(joints.upper))
-        most = np.where(np.isfinite(reach), np.maximum(most, reach), most)
+        max_size = np.where(np.isfinite(reach), np.maximum(max_size, reach), max_size)
     check_travel(
         recording.q,
-        most,
+        max_size,
         recording,
         _columns(recording, "q"),
         recording.joint_names,
@@ -250,13 +261,13 @@ def _check_size(recording: Recording, joints: Joints | None = None) -> None:
     )
 
 
-def _likely_unit(recording: Recording, joint: int, other: str) -> str:
+def _likely_unit(recording: Recording, joint: int, unit: str) -> str:
     """Return advice on positions of a joint [rad or m] beyond its travel, that may be in the unit `other`."""
-    if other == "deg" and np.abs(recording.q[:, joint]).max() > LIMITS.max_degrees:
+    if unit == "deg" and np.abs(recording.q[:, joint]).max() > LIMITS.max_degrees:
         return (
             "too large for deg, too: encoder counts? Convert them to rad or deg, zero and counts per turn allowed for"
         )
-    return f"looks like {other}; if so, state the unit (header 'q{joint + 1} [{other}]', or units)"
+    return f"looks like {unit}; if so, state the unit (header 'q{joint + 1} [{unit}]', or units)"
 
 
 def _check_speed(recording: Recording) -> None:
@@ -265,13 +276,13 @@ def _check_speed(recording: Recording) -> None:
         return
     slope = np.diff(recording.q, axis=0) / np.diff(recording.t)[:, None]
     mean = (recording.v[1:] + recording.v[:-1]) / 2
-    power, own, product = (slope**2).sum(axis=0), (mean**2).sum(axis=0), (slope * mean).sum(axis=0)
+    power, mean_power, product = (slope**2).sum(axis=0), (mean**2).sum(axis=0), (slope * mean).sum(axis=0)
     ratio = product / np.maximum(power, 1e-300)
-    proportional = product > 0.9 * np.sqrt(power * own)  # a joint that hardly moves shows noise alone
+    proportional = product > 0.9 * np.sqrt(power * mean_power)  # a joint that hardly moves shows noise alone
     for j in np.flatnonzero(proportional & (np.ptp(recording.q, axis=0) > LIMITS.min_travel)):
-        for factor, wrong in ((1 / DEG, "the velocities look like deg/s"), (DEG, "the positions look like deg")):
+        for factor, cause in ((1 / DEG, "the velocities look like deg/s"), (DEG, "the positions look like deg")):
             if abs(ratio[j] / factor - 1) < 0.1:
-                message = f"v is {ratio[j]:.3g} times the slope of q: {wrong}; if so, state the unit in the header"
+                message = f"v is {ratio[j]:.3g} times the slope of q: {cause}; if so, state the unit in the header"
                 refuse_data(recording.file, message, _columns(recording, "v")[j])
 
 
@@ -280,21 +291,21 @@ def _jumps(recording: Recording, joints: Joints | None) -> list[str]:
     if len(recording) < 5:
         return []
     step = np.diff(recording.t)
-    apart = step[2:-2] < 3 * np.median(step)  # not over a gap
+    adjacent = step[2:-2] < 3 * np.median(step)  # not over a gap
     kinds = joints.kinds if joints is not None else ("revolute",) * recording.n
-    least = np.where(np.array(kinds) == "prismatic", LIMITS.max_jump / 10, LIMITS.max_jump)
+    min_jump = np.where(np.array(kinds) == "prismatic", LIMITS.max_jump / 10, LIMITS.max_jump)
     notes = []
     for j, q in enumerate(recording.q.T):
         slope = np.diff(q) / step
         low, high = np.minimum(slope[:-1], slope[1:]), np.maximum(slope[:-1], slope[1:])
         # median of two before, two after
         around = (np.maximum(low[:-3], low[3:]) + np.minimum(high[:-3], high[3:])) / 2
-        off = np.abs(slope[2:-2] - around) * step[2:-2]
-        wild = (off > least[j]) & apart
-        if not wild.any() or not (off[wild] > 20 * max(float(np.median(off)), 1e-9)).any():
+        deviation = np.abs(slope[2:-2] - around) * step[2:-2]
+        is_jump = (deviation > min_jump[j]) & adjacent
+        if not is_jump.any() or not (deviation[is_jump] > 20 * max(float(np.median(deviation)), 1e-9)).any():
             continue
-        row = int(np.argmax(off * apart))
-        size = f"{1e3 * off[row]:.3g} {'mm' if kinds[j] == 'prismatic' else 'mrad'}"
+        row = int(np.argmax(deviation * adjacent))
+        size = f"{1e3 * deviation[row]:.3g} {'mm' if kinds[j] == 'prismatic' else 'mrad'}"
         notes.append(
             f"{recording.joint_names[j]} jumps by {size} between rows {recording.rows[row + 2]} and "
             f"{recording.rows[row + 3]}: an encoder error, or two joined logs? Cut the file there"
@@ -309,16 +320,16 @@ def _columns(recording: Recording, name: str) -> list[str]:
 
 
 def _still(recording: Recording) -> list[str]:
-    still = np.ptp(recording.q, axis=0) < LIMITS.min_travel
-    if still.all():
+    stands = np.ptp(recording.q, axis=0) < LIMITS.min_travel
+    if stands.all():
         return ["no joint moves in this recording: it contains only gravity in one pose"]
     dead = np.ptp(recording.effort, axis=0) == 0
-    if (dead & ~still).any():
-        j = int(np.argmax(dead & ~still))
+    if (dead & ~stands).any():
+        j = int(np.argmax(dead & ~stands))
         message = f"is {recording.effort[0, j]:g} in all {len(recording)} rows while the joint moves: was it logged?"
         refuse_data(recording.file, message, _columns(recording, "effort")[j])
     notes = []
-    for j in np.flatnonzero(still):
+    for j in np.flatnonzero(stands):
         fixed = np.ptp(recording.q[:, j]) < BOUNDS.min_travel
         travel = "is one number" if fixed else f"moves less than {LIMITS.min_travel:g}"
         effort = f", and so is its {recording.kind}" if dead[j] else ""
@@ -335,24 +346,24 @@ def _effort_notes(recording: Recording, joints: Joints | None) -> list[str]:
     Raises:
         MeasurementError: where every joint is far beyond its limit: another unit.
     """
-    most, limit = np.abs(recording.effort).max(axis=0), _effort_limits(recording, joints)
-    known = np.isfinite(limit)
-    if not known.any():
+    peak, limit = np.abs(recording.effort).max(axis=0), _effort_limits(recording, joints)
+    is_limited = np.isfinite(limit)
+    if not is_limited.any():
         return []
-    usual = np.quantile(np.abs(recording.effort), 0.99, axis=0)  # a spike is no unit
-    if (usual > LIMITS.max_effort * limit)[known].all():
-        j = int(np.argmax(usual / limit))
+    usual_torque = np.quantile(np.abs(recording.effort), 0.99, axis=0)  # a spike is no unit
+    if (usual_torque > LIMITS.max_effort * limit)[is_limited].all():
+        j = int(np.argmax(usual_torque / limit))
         message = (
-            f"|torque| reaches {usual[j]:.4g}, the joint's limit is {limit[j]:g}; every joint exceeds "
+            f"|torque| reaches {usual_torque[j]:.4g}, the joint's limit is {limit[j]:g}; every joint exceeds "
             f"{LIMITS.max_effort:g} times its limit: N mm, or another robot? If N mm, state the unit (a header "
             "'tau_1 [Nmm]', or units: torque = 'Nmm'); if N m, correct the limits in the robot's file"
         )
         refuse_data(recording.file, message, _columns(recording, "effort")[j])
-    notes = [
-        f"{recording.joint_names[j]}: |torque| reaches {most[j]:.3g}, its limit is {limit[j]:g}: is it in another unit?"
-        for j in np.flatnonzero(most > 1.2 * limit)
-    ]
-    if (most < 0.03 * limit)[known].all():
+    notes = []
+    for j in np.flatnonzero(peak > 1.2 * limit):
+        name = recording.joint_names[j]
+        notes.append(f"{name}: |torque| reaches {peak[j]:.3g}, its limit is {limit[j]:g}: is it in another unit?")
+    if (peak < 0.03 * limit)[is_limited].all():
         notes.append(
             "no torque reaches 3 % of its joint's limit. If these are currents, set kind = 'current': their gains are "
             "then identified. If they are torques before the gear, multiply them by the gear ratio"
@@ -365,8 +376,9 @@ def _limit_notes(recording: Recording, joints: Joints | None) -> list[str]:
         return []
     notes = []
     for j, name in enumerate(recording.joint_names):
-        over = np.maximum(joints.lower[j] - recording.q[:, j], recording.q[:, j] - joints.upper[j])
-        if (worst := float(np.nanmax(over, initial=-np.inf))) > BOUNDS.limit_slack:
+        excess = np.maximum(joints.lower[j] - recording.q[:, j], recording.q[:, j] - joints.upper[j])
+        worst = float(np.nanmax(excess, initial=-np.inf))
+        if worst > BOUNDS.limit_slack:
             notes.append(f"{name} is beyond its limits by up to {worst:.2g}: are the columns in the robot's order?")
     return notes
 
@@ -379,25 +391,28 @@ def _work_notes(recording: Recording) -> list[str]:
     rows = _round_trip(recording.q) if recording.kind == "torque" else None
     if rows is None:
         return []
-    work = ((recording.effort[1:] + recording.effort[:-1]) / 2 * np.diff(recording.q, axis=0))[rows]
+    mean_effort = (recording.effort[1:] + recording.effort[:-1]) / 2
+    work = (mean_effort * np.diff(recording.q, axis=0))[rows]
     share = float(work.sum() / max(np.abs(work).sum(), 1e-300))
     if share > -0.05:
         return []
-    message = "the torques take energy out of the robot (work {:.0%} of the energy moved): is their sign reversed?"
-    return [message.format(share)]
+    return [f"the torques take energy out of the robot (work {share:.0%} of the energy moved): is their sign reversed?"]
 
 
 def _round_trip(q: np.ndarray) -> slice | None:
     """Return the steps between two distant rows of nearly equal poses; None if the motion does not return."""
-    every = max(1, len(q) // LIMITS.max_compared)
-    poses = q[::every] / np.maximum(np.ptp(q, axis=0), LIMITS.min_travel)
-    apart = np.abs(poses[:, None] - poses[None]).max(axis=2)
-    first, last = np.nonzero(apart < LIMITS.max_apart)
+    step = max(1, len(q) // LIMITS.max_compared)
+    poses = q[::step] / np.maximum(np.ptp(q, axis=0), LIMITS.min_travel)
+    distance = np.abs(poses[:, None] - poses[None]).max(axis=2)
+    first, last = np.nonzero(distance < LIMITS.max_apart)
     longest = int(np.argmax(last - first))
     if last[longest] - first[longest] < len(poses) // 2:
         return None
-    return slice(first[longest] * every, last[longest] * every)
+    return slice(first[longest] * step, last[longest] * step)
 
 
 def _noted(recording: Recording, *notes: str) -> Recording:
-    return replace(recording, notes=tuple(dict.fromkeys((*recording.notes, *notes)))) if notes else recording
+    if not notes:
+        return recording
+    unique_notes = dict.fromkeys((*recording.notes, *notes))
+    return replace(recording, notes=tuple(unique_notes))

@@ -11,6 +11,7 @@ import numpy as np
 
 MIN_ROWS = 10  # that repeat a value exactly (all below: our choice; open recordings: at most 5 at an extreme torque)
 MIN_SHARE = 0.01  # of the rows in motion, at a torque's extremes (open recordings: at most 0.001)
+REACH = 5  # rows before and behind, between which a speed is taken
 MIN_LEVELS = 20  # values of a torque, below which it is too coarse to tell a clipped one
 CROWDED = 5.0  # rows at the extreme over those at each of the values next to it
 NEXT_LEVELS = 5  # values that the extreme is compared with
@@ -82,9 +83,9 @@ def _clipped(joint: int, t: np.ndarray, q: np.ndarray, torque: np.ndarray) -> Co
     values = []
     rows = np.zeros(len(torque), dtype=bool)
     for extreme, nearby in ((0, counts[1 : NEXT_LEVELS + 1]), (-1, counts[-NEXT_LEVELS - 1 : -1])):
-        crowded = counts[extreme] >= max(MIN_ROWS, CROWDED * float(nearby.max()))
+        is_crowded = counts[extreme] >= max(MIN_ROWS, CROWDED * float(nearby.max()))
         at_extreme = moves & (torque == levels[extreme])
-        if not crowded:
+        if not is_crowded:
             continue
         slow, fast = np.quantile(speed[at_extreme], (0.1, 0.9))
         if fast - slow > MIN_SPEED_RANGE * peak:
@@ -96,14 +97,14 @@ def _clipped(joint: int, t: np.ndarray, q: np.ndarray, torque: np.ndarray) -> Co
 
 def _standing_position(joint: int, t: np.ndarray, q: np.ndarray, v: np.ndarray) -> ColumnFault | None:
     """Return a position that stands while the measured velocity changes and adds up to a motion."""
-    least = max(MIN_TRAVEL, MIN_STEPS * _resolution(q))
+    min_travel = max(MIN_TRAVEL, MIN_STEPS * _resolution(q))
     parts = []
     for first, last in _constant(q):
-        part = slice(first, last)
-        moved = _moved(t[part], v[part])
-        fast = np.sqrt(np.mean(v[part] ** 2)) > MOVING * np.abs(v).max()
-        if fast and np.ptp(v[part]) > 0.0 and moved > least + _wander(t[part], v[part]):
-            parts.append((first, last, moved))
+        rows = slice(first, last)
+        travel = _moved(t[rows], v[rows])
+        fast = np.sqrt(np.mean(v[rows] ** 2)) > MOVING * np.abs(v).max()
+        if fast and np.ptp(v[rows]) > 0.0 and travel > min_travel + _wander(t[rows], v[rows]):
+            parts.append((first, last, travel))
     return _of_parts("position", joint, t, parts)
 
 
@@ -112,27 +113,28 @@ def _standing_velocity(joint: int, t: np.ndarray, q: np.ndarray, v: np.ndarray) 
     parts = []
     for first, last in _constant(v):
         time = t[first:last] - t[first]
-        apart = float(np.ptp(q[first:last] - v[first] * time))
-        if apart > max(MIN_TRAVEL, MIN_STEPS * _resolution(v) * float(time[-1])):
-            parts.append((first, last, apart))
+        deviation = float(np.ptp(q[first:last] - v[first] * time))
+        if deviation > max(MIN_TRAVEL, MIN_STEPS * _resolution(v) * float(time[-1])):
+            parts.append((first, last, deviation))
     fault = _of_parts("velocity", joint, t, parts)
     return fault if fault is not None and fault.share < MAX_STANDING else None
 
 
 def _jumping(joint: int, t: np.ndarray, q: np.ndarray) -> ColumnFault | None:
     """Return a position that stands at once while it moves, then jumps by about what it would have moved."""
-    around = 5  # rows of the speed before and behind
     parts = []
     for first, last in _constant(q):
-        if first < around or last + around >= len(q):
+        if first < REACH or last + REACH >= len(q):
             continue
-        before = abs(q[first] - q[first - around]) / (t[first] - t[first - around])
-        behind = abs(q[last + around] - q[last]) / (t[last + around] - t[last])
-        speed, step = float(before + behind) / 2.0, abs(float(q[last] - q[last - 1]))
+        speed_before = abs(q[first] - q[first - REACH]) / (t[first] - t[first - REACH])
+        speed_behind = abs(q[last + REACH] - q[last]) / (t[last + REACH] - t[last])
+        speed = float(speed_before + speed_behind) / 2.0
+        jump = abs(float(q[last] - q[last - 1]))
         expected = speed * float(t[last] - t[first])
-        sudden = step > max(MIN_TRAVEL, JUMP * speed * float(t[last] - t[last - 1]))
-        if sudden and min(before, behind) > 0.0 and expected / ABOUT < step < expected * ABOUT:
-            parts.append((first, last, step))
+        is_sudden = jump > max(MIN_TRAVEL, JUMP * speed * float(t[last] - t[last - 1]))
+        moves = min(speed_before, speed_behind) > 0.0
+        if is_sudden and moves and expected / ABOUT < jump < expected * ABOUT:
+            parts.append((first, last, jump))
     return _of_parts("position", joint, t, parts)
 
 
@@ -164,7 +166,9 @@ def _moved(t: np.ndarray, v: np.ndarray) -> float:
     """Return the range of the integral of velocities (N,), without gaps in the log [rad or m]."""
     step = np.diff(t)
     step = np.minimum(step, 3.0 * np.median(step))
-    return float(np.ptp(np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * step)])))
+    mean_velocity = 0.5 * (v[1:] + v[:-1])
+    position = np.concatenate([[0.0], np.cumsum(mean_velocity * step)])
+    return float(np.ptp(position))
 
 
 def _wander(t: np.ndarray, v: np.ndarray) -> float:
@@ -173,8 +177,9 @@ def _wander(t: np.ndarray, v: np.ndarray) -> float:
     return MAX_WANDER * noise * float(np.median(np.diff(t))) * float(np.sqrt(len(t)))
 
 
-def _speed(t: np.ndarray, q: np.ndarray, around: int = 5) -> np.ndarray:
-    """Return the slope (N,) of positions (N,) between the rows `around` before and behind."""
+def _speed(t: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Return the slope (N,) of positions (N,) between the rows `REACH` before and behind."""
     rows = np.arange(len(t))
-    behind, before = np.minimum(rows + around, len(t) - 1), np.maximum(rows - around, 0)
+    behind = np.minimum(rows + REACH, len(t) - 1)
+    before = np.maximum(rows - REACH, 0)
     return np.asarray((q[behind] - q[before]) / (t[behind] - t[before]))

@@ -24,8 +24,10 @@ from typing import Any
 
 from calib.files import shipped_text
 
-LONGEST = 1 << 16  # letters of a line of names (our choice)
-LOOKED = 50  # rows in which a time is looked at (our choice)
+# Letters of a line of names (our choice).
+LONGEST = 1 << 16
+# Rows in which a time is looked at (our choice).
+TIME_ROWS = 50
 
 
 class Log(io.StringIO):
@@ -44,41 +46,65 @@ def translated(path: str | Path) -> Log | None:
     """Return the log at `path` as a table of the toolkit; None where it is none of the known ones."""
     with open(path, encoding="utf-8-sig", errors="replace") as file:
         head = file.readline(LONGEST)
-        known = next((each for each in logs().values() if re.search(each["header"], head)), None)
-        if known is None:
+        form = _form(head)
+        if form is None:
             return None
         body = file.read()
     separator = "," if "," in head else None
-    names = [name.strip() for name in head.strip().removeprefix("%").split(separator)]
-    times, said = known.get("seconds"), [f"read as {known['says']}"]
-    ours = [_named(name, known["columns"]) for name in names]
-    if times:
-        body, ours = _with_time(body, [names.index(name) for name in times]), ["t [s]", *ours]
-    elif known.get("whole") and not _whole(body, separator, place := ours.index("t [ms]")):
-        ours[place] = "t [s]"
-        said.append("its time is not in whole milliseconds and was taken as seconds")
-    found = Log()
-    found.write((separator or " ").join(name.replace(" [", "[") for name in ours) + "\n" + body)
-    found.seek(0)
-    found.notes = tuple(said)
-    return found
+    file_names = [name.strip() for name in head.strip().removeprefix("%").split(separator)]
+    names = [_toolkit_name(name, form["columns"]) for name in file_names]
+    notes = [f"read as {form['says']}"]
+    if form.get("seconds"):
+        body = _with_time(body, [file_names.index(name) for name in form["seconds"]])
+        names = ["t [s]", *names]
+    elif form.get("whole"):
+        time_column = names.index("t [ms]")
+        if not _is_whole(body, separator, time_column):
+            names[time_column] = "t [s]"
+            notes.append("its time is not in whole milliseconds and was taken as seconds")
+    header = (separator or " ").join(name.replace(" [", "[") for name in names)
+    log = Log()
+    log.write(f"{header}\n{body}")
+    log.seek(0)
+    log.notes = tuple(notes)
+    return log
 
 
-def _named(name: str, columns: Sequence[Sequence[str]]) -> str:
-    for pattern, own in columns:
-        if match := re.fullmatch(pattern, name):
-            return match.expand(own)
+def _form(head: str) -> dict[str, Any] | None:
+    """Return the known log with this first line; None where it is none."""
+    for form in logs().values():
+        if re.search(form["header"], head):
+            return form
+    return None
+
+
+def _toolkit_name(name: str, columns: Sequence[Sequence[str]]) -> str:
+    for pattern, template in columns:
+        match = re.fullmatch(pattern, name)
+        if match:
+            return match.expand(template)
     return name
 
 
-def _whole(body: str, separator: str | None, place: int) -> bool:
-    rows = (line.split(separator) for line in body.split("\n", LOOKED)[:LOOKED] if line.strip())
-    return all(re.fullmatch(r"\s*\d+(\.0*)?\s*", row[place]) for row in rows if len(row) > place)
+def _is_whole(body: str, separator: str | None, column: int) -> bool:
+    """Return whether a column has whole numbers in the first rows."""
+    for line in body.split("\n", TIME_ROWS)[:TIME_ROWS]:
+        row = line.split(separator) if line.strip() else []
+        if len(row) > column and not re.fullmatch(r"\s*\d+(\.0*)?\s*", row[column]):
+            return False
+    return True
 
 
-def _with_time(body: str, places: Sequence[int]) -> str:
+def _with_time(body: str, columns: Sequence[int]) -> str:
     """Return rows parted by blanks with their time since the first [s] in front, from seconds and nanoseconds."""
-    rows = [line.split() for line in body.splitlines() if line.strip() and not line.lstrip().startswith("%")]
-    stamps = [[float(row[place]) if place < len(row) else float("nan") for place in places] for row in rows]
-    first = stamps[0][0] if stamps else 0.0
-    return "\n".join(f"{second - first + 1e-9 * nano:.9f} {' '.join(row)}" for (second, nano), row in zip(stamps, rows))
+    result: list[str] = []
+    first_second = 0.0
+    for line in body.splitlines():
+        if not line.strip() or line.lstrip().startswith("%"):
+            continue
+        row = line.split()
+        seconds, nanoseconds = (float(row[column]) if column < len(row) else float("nan") for column in columns)
+        if not result:
+            first_second = seconds
+        result.append(f"{seconds - first_second + 1e-9 * nanoseconds:.9f} {' '.join(row)}")
+    return "\n".join(result)

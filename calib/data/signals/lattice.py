@@ -59,11 +59,11 @@ def find_lattice(t: np.ndarray, drift_samples: int, rounds: int = 3) -> Lattice 
 def _likeliest_period(t: np.ndarray) -> float:
     """Return the period near the median step for which short runs of stamps agree best on their phase [s]."""
     median = float(np.median(np.diff(t)))
-    some = t[: max(len(t[:MAX_TRIED]) // VOTES, 1) * VOTES]
-    runs = some.reshape(-1, min(VOTES, len(some)))
-    tried = median * (1.0 + np.linspace(-MAX_PERIOD_ERROR, MAX_PERIOD_ERROR, PERIODS))
-    agreement = [float(np.abs(_directions(runs, period).mean(axis=1)).mean()) for period in tried]
-    return float(tried[int(np.argmax(agreement))])
+    compared = t[: max(len(t[:MAX_TRIED]) // VOTES, 1) * VOTES]
+    runs = compared.reshape(-1, min(VOTES, len(compared)))
+    periods = median * (1.0 + np.linspace(-MAX_PERIOD_ERROR, MAX_PERIOD_ERROR, PERIODS))
+    agreement = [float(np.abs(_directions(runs, period).mean(axis=1)).mean()) for period in periods]
+    return float(periods[int(np.argmax(agreement))])
 
 
 def _rounded(t: np.ndarray, period: float, drift_samples: int) -> tuple[np.ndarray, float]:
@@ -71,18 +71,19 @@ def _rounded(t: np.ndarray, period: float, drift_samples: int) -> tuple[np.ndarr
     stops = np.flatnonzero(np.diff(t) > LONG_STOP * period) + 1
     steps, votes = np.zeros(len(t), dtype=int), 0.0
     for start, end in pairwise([0, *stops.tolist(), len(t)]):
-        own = t[start:end]
-        directions = _directions(own, period)
-        along, across = (uniform_filter1d(part(directions), drift_samples) for part in (np.real, np.imag))
-        mean = along + 1j * across
+        stamps = t[start:end]
+        directions = _directions(stamps, period)
+        real = uniform_filter1d(np.real(directions), drift_samples)
+        imaginary = uniform_filter1d(np.imag(directions), drift_samples)
+        mean = real + 1j * imaginary
         drift = np.unwrap(np.angle(mean)) / (2.0 * np.pi)
-        exact = (own - own[0]) / period - (drift - drift[0])
+        exact = (stamps - stamps[0]) / period - (drift - drift[0])
         # steps rise: what is left after one per sample does not fall, and rounding keeps the nearest such numbers
-        lost = isotonic_regression(exact - np.arange(len(own))).x
-        steps[start:end] = np.arange(len(own)) + np.round(lost).astype(int)
+        lost = isotonic_regression(exact - np.arange(len(stamps))).x
+        steps[start:end] = np.arange(len(stamps)) + np.round(lost).astype(int)
         # the stop before it, in whole steps
         if start:
-            steps[start:end] += steps[start - 1] + round((own[0] - t[start - 1]) / period) - steps[start]
+            steps[start:end] += steps[start - 1] + round((stamps[0] - t[start - 1]) / period) - steps[start]
         votes += float(np.abs(mean).sum())
     return steps, votes / len(t)
 

@@ -83,9 +83,10 @@ def joint_range(fit: GeometricFit, nominal: Installation) -> JointRange:
         postures[:, stood] = np.median(q, axis=0)[stood]
         sigma = float(np.sqrt(np.mean(sigma_at(fit.cell, fit, postures) ** 2)))
         nominal_error = _nominal_error(fit, nominal, postures)
+    units = tuple(joint.unit for joint in chain.joints)
     return JointRange(
         joints=chain.joint_names,
-        units=tuple(joint.unit for joint in chain.joints),
+        units=units,
         lower=tuple(low.tolist()),
         upper=tuple(high.tolist()),
         shares=tuple(shares.tolist()),

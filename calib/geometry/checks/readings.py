@@ -61,12 +61,15 @@ def _copied_targets(block: Positions) -> list[Finding]:
         if len(equal) < MIN_COPIES or second in copied:
             continue
         copied.add(second)
+        rows = []
+        if len(equal) < len(common):
+            rows = [str(row) for row in equal]
         values = {
             "name": block.tool_names[second],
             "other": block.tool_names[first],
             "count": len(equal),
             "of": len(common),
-            "rows": [] if len(equal) == len(common) else [str(row) for row in equal],
+            "rows": rows,
         }
         findings.append(finding("target-copied", file=_name(block), share=len(equal) / len(common), **values))
     return findings
@@ -89,12 +92,9 @@ def _stale(nominal: Installation, block: Positions, copied: set[str]) -> list[Fi
             if distance < MIN_APART:
                 continue
             reading = block.position[rows_of_reading[0]]
-            values = {
-                "name": name,
-                "rows": [str(row) for row in block.rows[rows_of_reading]],
-                "value": [f"{1e3 * axis:.6g}" for axis in reading],
-                "apart": distance,
-            }
+            numbers_of_rows = [str(row) for row in block.rows[rows_of_reading]]
+            reading_mm = [f"{1e3 * axis:.6g}" for axis in reading]
+            values = {"name": name, "rows": numbers_of_rows, "value": reading_mm, "apart": distance}
             findings.append(finding("reading-repeated", file=_name(block), **values))
     return findings
 

@@ -88,12 +88,10 @@ class Rows:
     def with_columns(self, columns: np.ndarray) -> "Rows":
         """Return the rows with further columns (m, d, k), of what changed."""
         count = columns.shape[2]
-        return replace(
-            self,
-            matrix=np.concatenate([self.matrix, columns], axis=2),
-            precision=np.append(self.precision, np.full(count, CHANGED**-2.0)),
-            pull=np.append(self.pull, np.zeros(count)),
-        )
+        matrix = np.concatenate([self.matrix, columns], axis=2)
+        precision = np.append(self.precision, np.full(count, CHANGED**-2.0))
+        pull = np.append(self.pull, np.zeros(count))
+        return replace(self, matrix=matrix, precision=precision, pull=pull)
 
     def normal(self) -> np.ndarray:
         """Return the matrix of the normal equations (f, f), the prior included."""
@@ -110,7 +108,8 @@ class Rows:
     def solve(self) -> np.ndarray:
         """Return the penalised least-squares estimate (f,)."""
         flat = self.matrix.reshape(-1, self.matrix.shape[2])
-        return scipy.linalg.solve(self.normal(), flat.T @ self.residual.ravel() + self.pull, assume_a="pos")
+        right = flat.T @ self.residual.ravel() + self.pull
+        return scipy.linalg.solve(self.normal(), right, assume_a="pos")
 
     def position_rms(self, residuals: np.ndarray) -> float:
         """Return the rms of position residuals [m] of whitened ones (m, d)."""
@@ -324,11 +323,10 @@ def _changes(rows: Rows, residuals: np.ndarray, subjects: Sequence[Subject], ord
             shape[rank[cut:]] = 1.0
             between = float(sorted_order[cut - 1]), float(sorted_order[cut])
             yield Change(subject, shape, between, float(gains[best]))
-        gain = _gains(
-            np.tensordot(ramp, score, 1)[None],
-            np.tensordot(ramp**2, square, 1)[None],
-            np.tensordot(ramp, shared, 1)[None],
-        )
+        ramp_score = np.tensordot(ramp, score, 1)[None]
+        ramp_square = np.tensordot(ramp**2, square, 1)[None]
+        ramp_shared = np.tensordot(ramp, shared, 1)[None]
+        gain = _gains(ramp_score, ramp_square, ramp_shared)
         yield Change(subject, ramp, None, float(gain[0]))
 
 
@@ -340,7 +338,8 @@ def _sums_behind(terms: np.ndarray, rank: np.ndarray, cuts: np.ndarray) -> np.nd
 
 def _gains(score: np.ndarray, square: np.ndarray, shared: np.ndarray) -> np.ndarray:
     """Return gᵀ S⁻¹ g (c,) of sums over rows: g (c, k), Σ HᵀH (c, k, k), Σ HᵀQ (c, k, f)."""
-    matrix = square - shared @ shared.transpose(0, 2, 1) + CHANGED**-2.0 * np.eye(score.shape[1])
+    prior = CHANGED**-2.0 * np.eye(score.shape[1])
+    matrix = square - shared @ shared.transpose(0, 2, 1) + prior
     solution = np.linalg.solve(matrix, score[:, :, None])
     return np.einsum("ck,ck->c", score, solution[:, :, 0])
 

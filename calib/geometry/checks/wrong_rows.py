@@ -50,7 +50,8 @@ def least_error(nominal: Installation, blocks: Blocks) -> np.ndarray:
 def _columns(nominal: Installation, block: Positions) -> np.ndarray:
     """Return the columns (m, 13) of R, t and 1 of a block's rows."""
     tip = forward(nominal.chain, block.q)
-    return np.column_stack([tip[:, :3, :3].reshape(-1, 9), tip[:, :3, 3], np.ones(len(tip))])
+    rotation = tip[:, :3, :3].reshape(-1, 9)
+    return np.column_stack([rotation, tip[:, :3, 3], np.ones(len(tip))])
 
 
 def _unexplained(columns: np.ndarray, position: np.ndarray) -> np.ndarray:

@@ -88,7 +88,8 @@ class UnseenErrors:
     @property
     def rms(self) -> float:
         """Root mean square of the error's norm over all rows [m]."""
-        return float(np.sqrt(max(self.squares.sum(), 0.0) / max(self.rows.sum(), 1)))
+        mean_square = max(self.squares.sum(), 0.0) / max(self.rows.sum(), 1)
+        return float(np.sqrt(mean_square))
 
     def wins(self, errors: UnseenErrors) -> bool:
         """Return whether the error is smaller than `errors` in at least half of the folds."""
@@ -209,11 +210,16 @@ def fold_statistics(
     rigid = len(fit.free)
     groups = term_groups(terms)
     sizes = term_sizes(terms)
-    coordinates = condensed(
-        lambda columns: sum(share.gram.square[np.ix_(columns, columns)] * share.whitening for share in all_shares),
-        np.concatenate([np.full(rigid, -1), groups]).astype(int),
-        np.concatenate([np.ones(rigid), sizes]),
-    )
+
+    def square(columns: np.ndarray) -> np.ndarray:
+        result = np.zeros((len(columns), len(columns)))
+        for share in all_shares:
+            result += share.gram.square[np.ix_(columns, columns)] * share.whitening
+        return result
+
+    all_groups = np.concatenate([np.full(rigid, -1), groups]).astype(int)
+    all_sizes = np.concatenate([np.ones(rigid), sizes])
+    coordinates = condensed(square, all_groups, all_sizes)
     metric_sums = []
     whitened_sums = []
     for shares in held_out_shares:

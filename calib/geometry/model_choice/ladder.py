@@ -412,14 +412,11 @@ class _Climber:
         geometry_prior = rigid.prior
         if geometry_prior is None:
             geometry_prior = np.full(len(rigid.free), np.inf)
-        result = fit_with_prior(
-            cell,
-            prepare(cell, self.measured),
-            np.concatenate([rigid.free, layout(cell).index("deflection")]),
-            np.concatenate([geometry_prior, ridges[alive]]),
-            settings=self.settings,
-            nominal=replace(cell, chain=reference),
-        )
+        blocks = prepare(cell, self.measured)
+        free = np.concatenate([rigid.free, layout(cell).index("deflection")])
+        prior = np.concatenate([geometry_prior, ridges[alive]])
+        nominal = replace(cell, chain=reference)
+        result = fit_with_prior(cell, blocks, free, prior, settings=self.settings, nominal=nominal)
         return replace(result, start=rigid.start, split=rigid.split, candidates=rigid.candidates)
 
     def _terms(self, effect: str) -> list[Term]:

@@ -119,7 +119,10 @@ def gravity_of(motions: Sequence[MotionSamples], chain: Chain, newtons: bool = T
             # Masses are positive: the expected torques' sign decides between both.
             ambiguous = not np.isfinite(factors).any()
             if not ambiguous and np.nanmedian(factors) < 0.0:
-                direction, gravity, after, factors = -direction, -gravity, opposite, -factors
+                direction = -direction
+                gravity = -gravity
+                after = opposite
+                factors = -factors
     # Outweighed: the whole torque varies less than gravity's alone would.
     certain = np.isfinite(factors) & (np.abs(factors) + 2.0 * sigmas < MAX_FACTOR) & outweighed
     absent = _without_gravity(sums, gravity, after, np.flatnonzero(certain).tolist())
@@ -334,7 +337,8 @@ def _gravity_factors(
     and that of its drive. NaN where no gravity torque is expected, or motion and friction look like it.
     """
     n = chain.n
-    factors, sigmas = np.full(n, np.nan), np.full(n, np.nan)
+    factors = np.full(n, np.nan)
+    sigmas = np.full(n, np.nan)
     has_masses = chain.inertias is not None and bool(chain.inertias[:, 9].any())
     if has_masses:
         reference = standard_parameters(chain)
@@ -353,7 +357,8 @@ def _gravity_factors(
         heavy = motion.bodies.with_gravity(gravity)
         of_motion.append(inverse_dynamics(weightless, reference, motion.q, motion.v, motion.a))
         of_gravity.append(inverse_dynamics(heavy, reference, motion.q, zero, zero))
-    expected, inertia = np.concatenate(of_gravity), np.concatenate(of_motion)
+    expected = np.concatenate(of_gravity)
+    inertia = np.concatenate(of_motion)
     torque = np.concatenate([motion.torque for motion in motions])
     drives = np.concatenate([drive_columns(motion.v, motion.a) for motion in motions])
     size = expected.std(axis=0)
@@ -375,7 +380,9 @@ def _gravity_factors(
 
 def _inertia_factor(motions: Sequence[MotionSamples], reference: np.ndarray) -> float:
     """Return the robot's inertias over those of bodies (10 B,), whatever gravity is; NaN where motion does not tell."""
-    moving, free, torque = [], [], []
+    moving = []
+    free = []
+    torque = []
     for motion in motions:
         columns = _columns(motion)
         moving.append(columns[:, :, : len(reference)] @ reference)

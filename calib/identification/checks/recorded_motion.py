@@ -1,6 +1,7 @@
 """Checks of a recording against the designed motion and the robot's nominal masses.
 
-Everything is looked at on a coarse common grid; `trajectories.recall` finds the motion and its repetitions. What quick
+Everything is looked at on a coarse common grid; `calib.trajectories.recall` finds the motion and its repetitions. What
+quick
 looks at torques share stands here, too: a few samples of a recording, and how much columns explain of its torques.
 """
 
@@ -17,8 +18,8 @@ from calib.dynamics.bodies import Bodies, bodies_of, standard_parameters
 from calib.dynamics.rigid_body import inverse_dynamics, regressor
 from calib.identification.rows import Case, segments
 from calib.robot.chain import Chain
-from trajectories.errors import BadInput
-from trajectories.recall import Recalled, find_periods, sliding_products
+from calib.trajectories.errors import BadInput
+from calib.trajectories.recall import Recalled, find_periods, sliding_products
 
 EDGE_TIME = 0.25
 """Time before and after the motion that is kept for the filters' borders [s]."""
@@ -232,7 +233,9 @@ def share_of_nominal(
     grid = _coarse(t)
     torque = _smooth(_sampled(t, effort, grid))
     positions = _sampled(t, q, grid)
-    q, v, a = _smooth(positions, 0), _smooth(positions, 1), _smooth(positions, 2)
+    q = _smooth(positions, 0)
+    v = _smooth(positions, 1)
+    a = _smooth(positions, 2)
     bodies = bodies_under(chain, gravity)
     parameters = standard_parameters(chain)
     rigid = inverse_dynamics(bodies, parameters, q, v, a)

@@ -254,7 +254,9 @@ def _unexplained_by_masses(samples: MotionSamples, masses: np.ndarray) -> np.nda
     Each torque is that of gravity and that of motion, by the robot's masses, each times a factor, its own drive and
     those of the joints beside it: wrists are coupled by their gears, which an exchange would seem to explain.
     """
-    q, v, a = samples.q, samples.v, samples.a
+    q = samples.q
+    v = samples.v
+    a = samples.a
     of_gravity = inverse_dynamics(samples.bodies, masses, q, np.zeros_like(v), np.zeros_like(a))
     of_motion = inverse_dynamics(samples.bodies, masses, q, v, a) - of_gravity
     drives = drive_columns(v, a)

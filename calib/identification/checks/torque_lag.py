@@ -94,7 +94,10 @@ def lag_of(samples: MotionSamples, rate: float) -> Lag | None:
     middle = count // 2
     first = _Rows.of(columns[:, :middle], torque[:, :, :middle])
     second = _Rows.of(columns[:, middle:], torque[:, :, middle:])
-    total = _Rows(columns, torque, first.square + second.square, first.cross + second.cross, first.power + second.power)
+    square = first.square + second.square
+    cross = first.cross + second.cross
+    power = first.power + second.power
+    total = _Rows(columns, torque, square, cross, power)
     lag = _lag_in(total)
     half_lags = [_lag_in(first), _lag_in(second)]
     difference = abs(half_lags[0].seconds - half_lags[1].seconds) / 2.0
@@ -158,15 +161,18 @@ def _lag_in(rows: _Rows) -> Lag:
         residual = fit.residual(np.full(n, fit.common.argmin()))
         fit = _Fit(rows, fit.weight / np.maximum(residual.std(axis=1), 1e-12))
     best = int(fit.common.argmin())
+    between_steps = STEP * _parabola_minimum(fit.common, best)
+    ratio = fit.common[RECORDED] / max(fit.common[best], 1e-300)
     separate = fit.separate_lags(np.full(n, best))
+    gains = [fit.gain(separate, joint, best) for joint in range(n)]
     return Lag(
-        seconds=float(SHIFTS[best] + STEP * _parabola_minimum(fit.common, best)),
+        seconds=float(SHIFTS[best] + between_steps),
         sigma=float(np.hypot(fit.sigma(best), LAG_SIGMA)),
         before=fit.unexplained_share(np.full(n, RECORDED), spread),
         after=fit.unexplained_share(np.full(n, best), spread),
-        factor=float(np.sqrt(fit.common[RECORDED] / max(fit.common[best], 1e-300))),
+        factor=float(np.sqrt(ratio)),
         own=SHIFTS[separate],
-        gains=np.array([fit.gain(separate, joint, best) for joint in range(n)]),
+        gains=np.array(gains),
         joint=None,
     )
 
@@ -197,7 +203,8 @@ class _Fit:
     def residual(self, lags: np.ndarray) -> np.ndarray:
         """Return the residuals (n, m) of the weighted torques at the joints' lags (n,), indices of `SHIFTS`."""
         joints = np.arange(len(lags))
-        return self._unexplained(self.rows.torque[joints, lags], self.parts[joints, lags].sum(axis=0))
+        projection = self.parts[joints, lags].sum(axis=0)
+        return self._unexplained(self.rows.torque[joints, lags], projection)
 
     def _unexplained(self, torque: np.ndarray, parts: np.ndarray) -> np.ndarray:
         """Return torques (n, m) without their projections (k,), weighted."""
@@ -243,7 +250,8 @@ class _Fit:
         votes = (self.residual(np.full(len(slope), inner)) * slope).sum(axis=1)
         power = float((slope**2).sum())
         correction = len(votes) / max(len(votes) - 1, 1)
-        return float(np.sqrt(correction * ((votes - votes.mean()) ** 2).sum()) / max(power, 1e-300))
+        square = ((votes - votes.mean()) ** 2).sum()
+        return float(np.sqrt(correction * square) / max(power, 1e-300))
 
 
 def _turning(samples: MotionSamples, rate: float) -> list[np.ndarray]:

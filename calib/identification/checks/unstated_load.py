@@ -83,7 +83,8 @@ def unstated_load(samples: Mapping[str, MotionSamples]) -> UnstatedLoad | None:
         # Of two recordings either one explains the other's load by a negative one.
         best = 1 - best
     fit = loaded[best]
-    before, after = _size(unloaded.residuals), sizes[best]
+    before = _size(unloaded.residuals)
+    after = sizes[best]
     mass = float(fit.values[MASS])
     reach = float(np.linalg.norm(fit.values[FIRST_MOMENT])) / max(abs(mass), 1e-12)
     explained = after < MAX_LEFT * before and after < MAX_BEYOND * _size(separate)
@@ -117,7 +118,8 @@ def _rows(motion: MotionSamples) -> np.ndarray:
 
 def _fit(rows: Sequence[np.ndarray], loaded: int | None) -> _Fit:
     """Return the fit of recordings with the same bodies, and a load on the last one of recording `loaded`."""
-    n, size = rows[0].shape[1], rows[0].shape[2] - 1
+    n = rows[0].shape[1]
+    size = rows[0].shape[2] - 1
     last_body = slice(size - n - BODY, size - n)
     matrices, targets = [], []
     for index, part in enumerate(rows):
@@ -125,7 +127,9 @@ def _fit(rows: Sequence[np.ndarray], loaded: int | None) -> _Fit:
         matrices.append(np.concatenate([part[:, :, :-1], load], axis=2))
         targets.append(part[:, :, -1])
     residuals = targets
-    bodies, values, sigma = np.zeros(size), np.zeros(BODY), np.inf
+    bodies = np.zeros(size)
+    values = np.zeros(BODY)
+    sigma = np.inf
     for _ in range(ROUNDS):
         weight = 1.0 / np.maximum(_mean_squares(residuals), 1e-300)
         square = np.zeros((size + BODY, size + BODY))
@@ -136,7 +140,8 @@ def _fit(rows: Sequence[np.ndarray], loaded: int | None) -> _Fit:
         inverse = _inverse(square)
         solution = inverse @ product
         residuals = [target - matrix @ solution for matrix, target in zip(matrices, targets)]
-        bodies, values = solution[:-BODY], solution[-BODY:]
+        bodies = solution[:-BODY]
+        values = solution[-BODY:]
         # 1 where the rows identify the mass by itself, less where only sums with others.
         identified = float(inverse[MASS - BODY] @ square[:, MASS - BODY])
         sigma = np.inf
@@ -148,7 +153,9 @@ def _fit(rows: Sequence[np.ndarray], loaded: int | None) -> _Fit:
 
 def _scaled(rows: Sequence[np.ndarray], recording: int) -> list[np.ndarray]:
     """Return the residuals where the joints' torques of one recording are too large by factors, and none is loaded."""
-    before, part, after = rows[:recording], rows[recording], rows[recording + 1 :]
+    before = rows[:recording]
+    part = rows[recording]
+    after = rows[recording + 1 :]
     torque = part[:, :, -1]
     fit = _fit([*before, *after], None)
     residuals = []

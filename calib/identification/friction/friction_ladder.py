@@ -308,7 +308,8 @@ class _Bench:
         terms: tuple[str, ...] = (),
     ) -> FrictionTrial:
         """Return the result of a step from its columns, its squared errors, and the joints at which it is kept."""
-        blocks, rows = self.validation.blocks, self.validation.rows
+        blocks = self.validation.blocks
+        rows = self.validation.rows
         squares = (self.validation.data.factors[:, :, -1] ** 2).sum(axis=1).reshape(-1, rows)
         # Σ τ² per row over the blocks that are held out.
         size = squares[:blocks].sum(axis=0)
@@ -417,7 +418,10 @@ def _couplings(candidates: FrictionCandidates) -> list[DriveTerm]:
 
 def _sampled(candidates: FrictionCandidates) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]]:
     """Return about `COUPLING_ROWS` rows, weighed, (M, n, b) and (M, n), their weights, and q, v, a (n, M)."""
-    matrices, targets, weights, motions = [], [], [], []
+    matrices = []
+    targets = []
+    weights = []
+    motions = []
     for rows, case in zip(candidates.rows, candidates.cases):
         motion = case.motion
         index = kept(motion.segment, candidates.decimator)
@@ -427,7 +431,9 @@ def _sampled(candidates: FrictionCandidates) -> tuple[np.ndarray, np.ndarray, np
         weights.append(rows.weight[used])
         states = np.stack([motion.q[index], motion.v[index], motion.a[index]])
         motions.append(states[:, used])
-    matrix, target, weight = np.concatenate(matrices), np.concatenate(targets), np.concatenate(weights)
+    matrix = np.concatenate(matrices)
+    target = np.concatenate(targets)
+    weight = np.concatenate(weights)
     step = max(1, len(target) // COUPLING_ROWS)
     q, v, a = np.concatenate(motions, axis=1)[:, ::step]
     return matrix[::step], target[::step], weight[::step], [q.T, v.T, a.T]

@@ -67,7 +67,8 @@ SKIPPED_START = 0.5
 """Time excluded at the beginning of a recording, where the robot starts [s]."""
 
 
-Wave = tuple[int, int]  # joint whose gear turns, order per turn of it
+Wave = tuple[int, int]
+"""Joint whose gear turns, and order per turn of it."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +129,9 @@ def find_all(cases: Sequence[Case], residuals: Sequence[np.ndarray]) -> list[Rip
         residuals: per case (N, n), torque not explained at the full rate; what is slow in it is taken off here.
     """
     step = max(1, sum(len(case.motion) for case in cases) // MAX_SAMPLES)
-    case_blocks, positions, speeds = [], [], []
+    case_blocks = []
+    positions = []
+    speeds = []
     for case, numbers in zip(cases, _blocks(cases)):
         motion = case.motion
         valid = motion.weight[::step] > 0.5
@@ -237,7 +240,8 @@ def _terms(
     for gear, order in waves:
         lower, upper = -np.inf, np.inf
         if track is not None:
-            lower, upper = track.q[:, gear].min(), track.q[:, gear].max()
+            lower = track.q[:, gear].min()
+            upper = track.q[:, gear].max()
         label = f"{joint + 1}"
         if gear != joint:
             label = f"{joint + 1}q{gear + 1}"
@@ -273,7 +277,8 @@ class _WaveCrossValidation:
 
     def explained_share(self, waves: Sequence[Wave], nodes: tuple[float, ...]) -> tuple[float, float]:
         """Return the explained share of the power on held-out blocks, and the best ridge."""
-        matrix, residual = self.columns(waves, nodes), self.residual
+        matrix = self.columns(waves, nodes)
+        residual = self.residual
         squares = np.array([matrix[block].T @ matrix[block] for block in self._blocks])
         crosses = np.array([matrix[block].T @ residual[block] for block in self._blocks])
         square = np.sum(squares, axis=0)
@@ -302,14 +307,16 @@ class _WaveCrossValidation:
 def _columns(track: GearTravel, wave: Wave, nodes: Sequence[float]) -> np.ndarray:
     """Return the regressor columns (N, k) of a wave along a track, in the order of `_terms`."""
     gear = wave[0]
-    q, v = track.q[:, gear], track.v[:, gear]
+    q = track.q[:, gear]
+    v = track.v[:, gear]
     motion = Joined(q, v, np.zeros_like(q))
     return np.stack([term.values(motion) for term in _terms(gear, (wave,), nodes, None)], axis=1)
 
 
 def coherence(track: GearTravel, gear: int, residual: np.ndarray) -> np.ndarray:
     """Return the coherence S(k) of a gear's integer orders k = 0, 1, ..., (cells / 2 + 1,); see the module."""
-    q, v = track.q[:, gear], track.v[:, gear]
+    q = track.q[:, gear]
+    v = track.v[:, gear]
     speed = np.abs(v)
     edges = np.quantile(speed, np.linspace(0.1, 1.0, SPEED_BINS + 1))[:-1]
     direction = np.where(v > 0.0, 1, -1)

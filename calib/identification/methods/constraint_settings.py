@@ -16,10 +16,12 @@ from calib.errors import Finding
 from calib.estimation.linear import LinearFit
 from calib.records import Number
 
-POSTURES = 50  # at which M(q) must be positive definite (our choice)
+POSTURES = 50
+"""Postures at which M(q) must be positive definite (our choice)."""
 
 
 def _in_order(value: Any) -> Any:
+    """Refuse a lower bound above the upper."""
     match value:
         case [int() | float() as low, int() | float() as high] if low > high:
             raise ValueError(f"the lower bound {low:g} is above the upper {high:g}")
@@ -40,11 +42,15 @@ class WeightedSum:
     @property
     def limits(self) -> tuple[float, float]:
         """Lower and upper bound of the sum; infinite if not stated."""
-        low, high = (self.least, self.most) if self.equal is None else (self.equal, self.equal)
-        return -np.inf if low is None else low, np.inf if high is None else high
+        if self.equal is not None:
+            return self.equal, self.equal
+        lower = -np.inf if self.least is None else self.least
+        upper = np.inf if self.most is None else self.most
+        return lower, upper
 
 
-_Json = partial(Checked, lambda value: value)  # what a file's schema says of a key that Python may fill with a function
+_Json = partial(Checked, lambda value: value)
+"""JSON schema, in a file, of a key that Python may fill with a function."""
 
 
 @strict

@@ -93,7 +93,8 @@ def _regularised(
     finite = np.isfinite(np.diag(covariance))
     root = np.linalg.cholesky(covariance[np.ix_(finite, finite)])
     whitened = np.zeros((len(root), len(ridges)))
-    whitened[:, np.flatnonzero(finite)] = scipy.linalg.solve_triangular(root, np.eye(len(root)), lower=True)
+    inverse = scipy.linalg.solve_triangular(root, np.eye(len(root)), lower=True)
+    whitened[:, np.flatnonzero(finite)] = inverse
     return fit, covariance, whitened
 
 
@@ -106,7 +107,9 @@ def _settled(problem: IdentificationProblem, prior: Prior) -> tuple[LinearFit, n
     """
     pooled = problem.pooled
     base_count = problem.base.b
-    std, inflation, tempering = prior.first.std, prior.first.inflation, prior.tempering
+    std = prior.first.std
+    inflation = prior.first.inflation
+    tempering = prior.tempering
     fit, covariance, prior_rows = _regularised(problem, prior, std, inflation, tempering)
     for _ in range(SETTLING_ROUNDS):
         estimated = fit.estimate
@@ -124,8 +127,10 @@ def _settled(problem: IdentificationProblem, prior: Prior) -> tuple[LinearFit, n
 def _braking(problem: IdentificationProblem, free: np.ndarray, std: np.ndarray, prior_rows: np.ndarray) -> np.ndarray:
     """Return the estimate (p,) with dissipative friction, except at joints where the data contradict it."""
     terms, pooled = problem.terms, problem.pooled
-    fastest = np.max([np.abs(case.motion.v).max(axis=0) for case in problem.cases], axis=0)
-    factor = retriangulate(np.vstack([combine(pooled, std), np.pad(prior_rows, ((0, 0), (0, 1)))]))
+    speeds = [np.abs(case.motion.v).max(axis=0) for case in problem.cases]
+    fastest = np.max(speeds, axis=0)
+    augmented_prior = np.pad(prior_rows, ((0, 0), (0, 1)))
+    factor = retriangulate(np.vstack([combine(pooled, std), augmented_prior]))
     values = bounded(factor, braking(terms, fastest))
     contradicted = _driving(problem, free)
     if contradicted.any():

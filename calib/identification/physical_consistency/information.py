@@ -59,7 +59,8 @@ class Information(Frozen):
     @property
     def best(self) -> float:
         """The minimum of ‖R β - z‖² over all β, physically inconsistent ones included."""
-        matrix, target = self.factor[:, :-1], self.factor[:, -1]
+        matrix = self.factor[:, :-1]
+        target = self.factor[:, -1]
         unit = np.linalg.norm(matrix, axis=0)
         scaled = matrix / np.where(unit > 0.0, unit, 1.0)
         solution = np.linalg.lstsq(scaled, target, rcond=1e-12)[0]

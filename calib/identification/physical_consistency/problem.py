@@ -148,7 +148,8 @@ def make_problem(information: Information, references: PriorBodies) -> BodyCost:
     """Return the cost function of an identified model; prior sizes of drive terms come from the recorded torque."""
     model = information.dynamics.model
     inertial = 10 * model.bodies.count
-    matrix, target = information.factor[:, :-1], information.factor[:, -1]
+    matrix = information.factor[:, :-1]
+    target = information.factor[:, -1]
     columns = matrix @ information.transform
     norms = np.linalg.norm(columns, axis=0)
     # The median, not the largest: a term that was switched off is pinned to zero.

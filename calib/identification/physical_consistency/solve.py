@@ -177,7 +177,8 @@ def find_possible(information: Information, weight: float | None = None, prior: 
     choices = [(references, make_problem(information, references)) for references in priors]
 
     # Distance of the nearest consistent robot: of the first and the last choice, whose coordinates differ most.
-    nearest_distance, nearest_problem = np.inf, choices[0][1]
+    nearest_distance = np.inf
+    nearest_problem = choices[0][1]
     for _, problem in choices[:: max(len(choices) - 1, 1)]:
         distance = information.distance(nearest(problem))
         if distance < nearest_distance:
@@ -192,7 +193,9 @@ def find_possible(information: Information, weight: float | None = None, prior: 
         candidate for references, problem in choices for candidate in _candidates(references, problem, weight, doubt)
     ]
     best = max(candidates, key=lambda candidate: candidate.evidence)
-    gamma, problem, values = best.gamma, best.problem, best.values
+    gamma = best.gamma
+    problem = best.problem
+    values = best.values
     euclidean = prior == "euclidean"
     if euclidean:
         values = nearest(problem, pull=gamma)
@@ -305,7 +308,8 @@ def cost(problem: BodyCost, gamma: float, values: np.ndarray) -> float:
 
 def derivatives(problem: BodyCost, gamma: float, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return gradient (p,) and Hessian (p, p) of the cost."""
-    columns, target = problem.factor[:, :-1], problem.factor[:, -1]
+    columns = problem.factor[:, :-1]
+    target = problem.factor[:, -1]
     slope = columns.T @ (columns @ values - target)
     curvature = columns.T @ columns
     pseudo = pseudo_inertia.from_standard(_bodies(problem, values))
@@ -320,7 +324,8 @@ def derivatives(problem: BodyCost, gamma: float, values: np.ndarray) -> tuple[np
     half = 0.5 * problem.lift * DRIVE
     for term in np.flatnonzero(problem.sizes > 0.0):
         k = 10 * problem.bodies + term
-        x, size = values[k], problem.sizes[term]
+        x = values[k]
+        size = problem.sizes[term]
         if problem.positive[term]:
             slope[k] += half * (1.0 / size - 1.0 / x)
             curvature[k, k] += half / x**2

@@ -96,7 +96,8 @@ def estimator(identification: Identification[Any]) -> _Estimator:
         return _Estimator(deviation, np.zeros((0, p)), np.zeros(p))
     deviation = deviation * np.sqrt(fitted.inflation)
     factors = (fitted.pooled.factors / deviation[:, None, None]).reshape(-1, p + 1)
-    matrix, target = factors[:, :p], factors[:, p]
+    matrix = factors[:, :p]
+    target = factors[:, p]
     values = fitted.estimate.values
     pull = matrix.T @ (matrix @ values - target) + prior_rows.T @ (prior_rows @ values)
     return _Estimator(deviation, prior_rows, pull)
@@ -141,13 +142,15 @@ def cut(rows: ObservationRows, part: slice) -> ObservationRows:
         block=rows.block[part],
         standing=rows.standing[part],
         swing=rows.swing[part],
+        slowness=rows.slowness[part],
     )
 
 
 def inverted(upper: np.ndarray) -> np.ndarray:
     """Return the inverse of an upper triangular matrix (p, p) whose columns have different units."""
     unit = np.linalg.norm(upper, axis=0)
-    return np.asarray(scipy.linalg.solve_triangular(upper / unit, np.eye(len(unit)))) / unit[:, None]
+    inverse = np.asarray(scipy.linalg.solve_triangular(upper / unit, np.eye(len(unit))))
+    return inverse / unit[:, None]
 
 
 def stacked(rows: ObservationRows) -> np.ndarray:
@@ -309,7 +312,10 @@ def solve_sensitivity(
         recordings = tuple((case, rows, None) for rows, case in zip(identification.rows, cases))
 
     # Whitened columns, changes of the residuals and instruments of all pieces.
-    matrices, row_weights, changes, instruments = [], [], [], []
+    matrices = []
+    row_weights = []
+    changes = []
+    instruments = []
     pull: np.ndarray | float = 0.0
     present_rows = 0
     for case, rows, instrument in recordings:
@@ -337,11 +343,13 @@ def solve_sensitivity(
         augmented = np.hstack([np.concatenate(instruments), matrix, change])
         factor = retriangulate(augmented * scale[:, None])[:p, p:]
         unit = np.linalg.norm(factor[:, :p], axis=0)
-        slopes = -np.linalg.solve(factor[:, :p] / unit, factor[:, p:]) / unit[:, None]
+        scaled_slopes = -np.linalg.solve(factor[:, :p] / unit, factor[:, p:])
+        slopes = scaled_slopes / unit[:, None]
     else:
         # The prior counts as much beside the pieces as it did beside all rows.
         share = float(np.count_nonzero(scale) / present_rows)
-        prior_rows = np.sqrt(share) * np.pad(weighting.beforehand, ((0, 0), (0, change.shape[1])))
+        padding = ((0, 0), (0, change.shape[1]))
+        prior_rows = np.sqrt(share) * np.pad(weighting.beforehand, padding)
         whitened = np.hstack([matrix, change]) * scale[:, None]
         factor = retriangulate(np.vstack([prior_rows, whitened]))
         inverse = inverted(factor[:p, :p])

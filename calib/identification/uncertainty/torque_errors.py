@@ -39,7 +39,7 @@ from calib.identification.loop import per_joint
 from calib.identification.prediction import Dynamics, IntervalCoverage
 from calib.identification.rows import Case, pool, segmented_states, triangulate
 from calib.records import evenly
-from trajectories.timing.profile import Sampled
+from calib.trajectories.timing.profile import Sampled
 
 BLOCK = 4000
 """Samples whose regressor is held in memory at a time."""
@@ -341,8 +341,8 @@ class TorqueIntervals:
     def ways(self, joints: Sequence[str]) -> list[str]:
         """Return texts on how the motion leaves the training range: by q, v or a, and at which of the named joints."""
         texts = []
-        for text, by_joint in zip(EXTRAPOLATIONS, self.extrapolated.any(axis=1)):
-            names = [name for name, extrapolated in zip(joints, by_joint.tolist()) if extrapolated]
+        for text, by_joint in zip(EXTRAPOLATIONS, np.any(self.extrapolated, axis=1).tolist()):
+            names = [name for name, extrapolated in zip(joints, by_joint) if extrapolated]
             if names:
                 texts.append(f"{text} {', '.join(names)}")
         return texts
@@ -492,11 +492,19 @@ def _collect_samples(identification: Identification, cases: Sequence[Case]) -> _
     """Return motion and residuals of all recordings at their decimated samples."""
     dynamics = identification.dynamics
     decimator = common_decimator(cases, identification.settings)
-    states, torques, errors, matrices, blocks, trajectories, trajectory_blocks = [], [], [], [], [], [], []
+    states = []
+    torques = []
+    errors = []
+    matrices = []
+    blocks = []
+    trajectories = []
+    trajectory_blocks = []
     for case, rows in zip(cases, identification.rows):
         motion = case.motion
         index = kept(motion.segment, decimator)
-        q, v, a = motion.q[index], motion.v[index], motion.a[index]
+        q = motion.q[index]
+        v = motion.v[index]
+        a = motion.a[index]
         memory = segmented_states(dynamics.model.columns, case)[:, index]
         torque = np.asarray(case.target[index])
         error = torque - dynamics.model.torque(dynamics.values, q, v, a, case.carried, memory)
@@ -561,7 +569,8 @@ def _estimate(identification: Identification, data: Triangles, blocks: Sequence[
     """Return the values (p,) estimated from some time blocks, and a root (p, k) of their covariance."""
     fitted = identification.fitted
     base_count = identification.base.b
-    group = np.concatenate([np.full(base_count, -1), np.asarray(identification.friction.groups, dtype=int)])
+    friction_group = np.asarray(identification.friction.groups, dtype=int)
+    group = np.concatenate([np.full(base_count, -1), friction_group])
     prior_rows, tempered_rows = None, None
     if identification.prior is not None:
         prior_rows = identification.prior.widened(len(group) - base_count)
@@ -573,10 +582,12 @@ def _estimate(identification: Identification, data: Triangles, blocks: Sequence[
     # The covariance of the columns that no ridge has switched off, inverted in units of a diagonal of 1.
     active = np.flatnonzero(ridges > 0.0)
     weight = 1.0 / (fitted.std * np.sqrt(fitted.inflation))
-    whitened = (pooled.factors[:, :, :-1] * weight[:, None, None]).reshape(-1, len(group))
+    whitened = pooled.factors[:, :, :-1] * weight[:, None, None]
+    whitened = whitened.reshape(-1, len(group))
     if prior_rows is not None:
         whitened = np.vstack([whitened, prior_rows[:, :-1]])
-    information = (whitened.T @ whitened)[np.ix_(active, active)] + np.diag(ridges[active] ** -2.0)
+    square = whitened.T @ whitened
+    information = square[np.ix_(active, active)] + np.diag(ridges[active] ** -2.0)
     unit = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     eigenvalues, vectors = np.linalg.eigh(information * np.outer(unit, unit))
     root = np.zeros((len(group), len(active)))
@@ -682,13 +693,13 @@ def _variance_weights(folds: Sequence[_HeldOut], run_count: int) -> np.ndarray:
         other_squares = squares[other_rows, thinned].ravel()
         other_terms = terms[other_rows, thinned].reshape(-1, 3)
         other_counts = BORROWED / run_count * counts[other_rows, thinned].ravel()
-        scale = np.array([max(float(terms[row, :, 0].mean()), 1e-300), 1.0, 1.0])
-        row_weights = variance_weights(
-            np.concatenate([squares[row], other_squares, expected_squares]),
-            np.concatenate([terms[row], other_terms, expected_terms]) / scale,
-            np.full(3, 1.0 / 3.0),
-            np.concatenate([counts[row], other_counts, expected_counts]),
-        )
+        mean_term = float(terms[row, :, 0].mean())
+        scale = np.array([max(mean_term, 1e-300), 1.0, 1.0])
+        all_squares = np.concatenate([squares[row], other_squares, expected_squares])
+        all_terms = np.concatenate([terms[row], other_terms, expected_terms])
+        all_counts = np.concatenate([counts[row], other_counts, expected_counts])
+        equal = np.full(3, 1.0 / 3.0)
+        row_weights = variance_weights(all_squares, all_terms / scale, equal, all_counts)
         weights[row] = row_weights / scale * [1.0, mean_square[row], mean_square[row]]
     return weights
 

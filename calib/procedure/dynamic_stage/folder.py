@@ -13,6 +13,7 @@ from calib import files, folders
 from calib.data.csv_table import read_table
 from calib.dynamics.base import expressions
 from calib.identification.gains import GainRecord
+from calib.identification.identify import Identification
 from calib.identification.model_file import MODEL, read_dynamics, to_table
 from calib.identification.physical_consistency import information
 from calib.identification.prediction import Dynamics
@@ -27,6 +28,9 @@ from calib.procedure.robot_kinds import Mechanism
 from calib.records import plain, read_json
 from calib.robot import calibrated
 from calib.units import headings, per_ampere
+
+# of torques_1.csv [Hz]
+TORQUE_RATE = 100.0
 
 INSTRUMENTAL = "instrumental.csv"
 OURS = (
@@ -51,7 +55,6 @@ OURS = (
     *(f"plot_{name}.png" for name in ("geometries", "geometry_effects")),
 )
 """Files of an earlier identification that a new one replaces."""
-TORQUE_RATE = 100.0  # of torques_1.csv [Hz]
 INSTRUMENTAL_HEADER = ("name", "unit", "instrumental", "sigma", "least_squares", "shift_sigma", "explained_percent")
 HEADER = ("name", "expression", "unit", "value", "sigma", "rsd [%]", "essential", "sigma_torque", "sigma_geometry")
 
@@ -110,9 +113,13 @@ class IdentificationFolder:
 
     def errors(self) -> TorqueErrorModel | None:
         """Read the model's expected torque errors; None if they are unknown."""
-        stated = self.findings().errors
-        found = None if stated is None else read_uncertainty(self.path, self.dynamics(), ())
-        return stated and found and TorqueErrorModel(found.columns, found.covariance, stated)
+        discrepancy = self.findings().errors
+        if discrepancy is None:
+            return None
+        uncertainty = read_uncertainty(self.path, self.dynamics(), ())
+        if uncertainty is None:
+            return None
+        return TorqueErrorModel(uncertainty.columns, uncertainty.covariance, discrepancy)
 
 
 @dataclass(frozen=True)
@@ -123,12 +130,12 @@ class UnseenFolder:
 
     report = folders.InFolder(folders.REPORT)  # scores, verdict, and curves for the certificate
 
-    def write(self, inputs: IdentificationInputs, found: Assessment) -> None:
+    def write(self, inputs: IdentificationInputs, assessment: Assessment) -> None:
         """Write a table of torques per unseen recording, and the report."""
         for number, case in enumerate(inputs.unseen, 1):
-            predicted, expected = found.predictions[case.name], found.intervals.get(case.name)
-            _write_torques(inputs, case, predicted, expected, self.path / f"torques_{number}.csv")
-        files.write_json(self.report, UnseenReport.of(inputs, found))
+            predicted, intervals = assessment.predictions[case.name], assessment.intervals.get(case.name)
+            _write_torques(inputs, case, predicted, intervals, self.path / f"torques_{number}.csv")
+        files.write_json(self.report, UnseenReport.of(inputs, assessment))
 
     def read(self) -> UnseenReport:
         """Read the report."""
@@ -163,30 +170,36 @@ def write_folder(
 
 
 def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
-    inputs, found = outcome.inputs, outcome.found
-    if isinstance(inputs.robot, Mechanism):
-        inputs.robot.write(folder)
+    """Write all files of an identification but its figures and pages."""
+    inputs, identification = outcome.inputs, outcome.found
+    robot = inputs.robot
+    if isinstance(robot, Mechanism):
+        robot.write(folder)
     else:
-        robot = replace(inputs.robot, nominal=inputs.robot.nominal or inputs.chain, source=str(inputs.source))
-        calibrated.write(folder, robot, comment=f"identified from {inputs.source}")
+        described = replace(robot, nominal=robot.nominal or inputs.chain, source=str(inputs.source))
+        calibrated.write(folder, described, comment=f"identified from {inputs.source}")
+
     files.write_table(folder / folders.ESTIMATE, HEADER, _estimate_rows(outcome))
-    estimate = found.fitted.estimate
-    covariance = estimate.covariance if outcome.carried is None else outcome.carried.covariance
-    folders.write_covariance(folder / folders.COVARIANCE, found.names, covariance)
+    covariance = identification.fitted.estimate.covariance
+    if outcome.carried is not None:
+        covariance = outcome.carried.covariance
+    folders.write_covariance(folder / folders.COVARIANCE, identification.names, covariance)
     geometry_tables.write(outcome, folder)
-    if found.loop.table:
-        files.write_table(folder / INSTRUMENTAL, INSTRUMENTAL_HEADER, found.loop.table)
-    held = found.fitted.held
+    if identification.loop.table:
+        files.write_table(folder / INSTRUMENTAL, INSTRUMENTAL_HEADER, identification.loop.table)
+    # without a prior and constraints, estimate and covariance say it all
+    held = identification.fitted.held
     binding = held is not None and (held.binding or held.postures)
-    if found.prior is not None or binding:  # else estimate and covariance say it all
-        information.write(found, folder)
+    if identification.prior is not None or binding:
+        information.write(identification, folder)
+
     first = (*inputs.unseen, *inputs.cases)[0]
-    expected = outcome.intervals.get(first.name)
-    _write_torques(inputs, first, outcome.predictions[first.name], expected, folder / "torques_1.csv")
+    intervals = outcome.intervals.get(first.name)
+    _write_torques(inputs, first, outcome.predictions[first.name], intervals, folder / "torques_1.csv")
     gains = inputs.gains and GainRecord.of(inputs.gains, inputs.unit)
-    made = inputs.robot.model_table if isinstance(inputs.robot, Mechanism) else to_table
-    table = made(found.dynamics, found.base, inputs.unit) | {"drive_gains": gains}
-    files.write_json(folder / MODEL, table)
+    model_table = robot.model_table if isinstance(robot, Mechanism) else to_table
+    table = model_table(identification.dynamics, identification.base, inputs.unit)
+    files.write_json(folder / MODEL, table | {"drive_gains": gains})
     if gains is not None:
         header = ("joint", f"gain [{gains.unit}]", f"sigma [{gains.unit}]", "told")
         rows = zip(inputs.chain.joint_names, plain(gains.values), plain(gains.sigma), gains.told)
@@ -195,7 +208,7 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
 
 
 def _write_torques(
-    inputs: IdentificationInputs, case: Case, predicted: np.ndarray, expected: TorqueIntervals | None, path: Path
+    inputs: IdentificationInputs, case: Case, predicted: np.ndarray, intervals: TorqueIntervals | None, path: Path
 ) -> Path:
     """Write measured and predicted torques (N, rows) of a recording and its joints (N, n), at about `TORQUE_RATE`.
 
@@ -205,23 +218,33 @@ def _write_torques(
     motion = case.motion
     rows = np.arange(0, len(motion), max(1, round(motion.rate / TORQUE_RATE)))
     columns = {"measured": case.target[rows], "predicted": predicted[rows], "q": motion.q[rows]}
-    if expected is not None:
-        near = np.searchsorted(expected.index, rows)
-        columns |= {"sigma": expected.sigma[near], "extrapolated": expected.beyond[near]}
+    if intervals is not None:
+        nearest = np.searchsorted(intervals.index, rows)
+        columns |= {"sigma": intervals.sigma[nearest], "extrapolated": intervals.beyond[nearest]}
     if not case.carried:
         columns |= {"v": motion.v[rows], "a": motion.a[rows]}
-    names, titles = ["t [s]"], inputs.options.settings.torque_rows.titles(inputs.chain.joint_names)
-    for what, one in columns.items():
-        torques = [f"{what}_{title} [{unit}]" for title, unit in zip(titles, inputs.row_units)]
-        names += [what] if one.ndim == 1 else headings(what, inputs.chain.joints) if what in "qva" else torques
+
+    titles = inputs.options.settings.torque_rows.titles(inputs.chain.joint_names)
+    names = ["t [s]"]
+    for quantity, values in columns.items():
+        if values.ndim == 1:
+            names.append(quantity)
+        elif quantity in ("q", "v", "a"):
+            names += headings(quantity, inputs.chain.joints)
+        else:
+            names += [f"{quantity}_{title} [{unit}]" for title, unit in zip(titles, inputs.row_units)]
     return files.write_numbers(path, names, np.column_stack([motion.t[rows], *columns.values()]))
 
 
 def read_torques(path: Path) -> dict[str, np.ndarray]:
     """Read the table of `_write_torques`: measured, predicted (N, rows) and q, v, a (N, n); empty without v and a."""
     table = read_table(path)
-    found = {name: table.block(name) for name in ("measured", "predicted", "q", "v", "a")}
-    return {name: one for name, one in found.items() if one is not None} if found["v"] is not None else {}
+    blocks = {}
+    for name in ("measured", "predicted", "q", "v", "a"):
+        block = table.block(name)
+        if block is not None:
+            blocks[name] = block
+    return blocks if "v" in blocks else {}
 
 
 def _estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:
@@ -230,25 +253,45 @@ def _estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:
     σ is the total; the geometry's part is left out where the geometry is taken as exact. Terms that the evidence
     switched off, and parameters that a constraint holds, have no σ: nobody measured them.
     """
-    found, carried = outcome.found, outcome.carried
-    estimate = found.fitted.estimate
-    words = [line.split(" = ", 1)[1] for line in expressions(found.base)]
-    held = on_bounds(found)
-    off = (*found.friction.off, *held)
-    words += [
-        f"{one.shape}, switched off: not measured" if one.name in off else one.shape for one in found.friction.terms
-    ]
-    words = [f"{own}, on its bound: no sigma" if name in held else own for name, own in zip(found.names, words)]
-    sigmas = estimate.sigma if carried is None else carried.sigma
-    part = np.full(len(sigmas), np.nan) if carried is None or carried.geometry is None else carried.sigma_geometry
+    identification, carried = outcome.found, outcome.carried
+    estimate = identification.fitted.estimate
+    held = on_bounds(identification)
+    unmeasured = (*identification.friction.off, *held)
+    contents = _expressions(identification, unmeasured, held)
+
+    sigma, sigma_geometry = estimate.sigma, np.full(len(estimate.values), np.nan)
+    if carried is not None:
+        sigma = carried.sigma
+        if carried.geometry is not None:
+            sigma_geometry = carried.sigma_geometry
     with np.errstate(divide="ignore", invalid="ignore"):
-        relative = 100.0 * sigmas / np.abs(estimate.values)
-    relative = np.where(np.isfinite(relative), relative, np.nan)
-    unmeasured = np.isin(found.names, off)
-    sigma, rsd, noise, part = (np.where(unmeasured, np.nan, own) for own in (sigmas, relative, estimate.sigma, part))
-    essential = {}
-    if found.elimination is not None:
-        essential = dict(zip(found.elimination.essential.estimate.names, found.elimination.essential.estimate.values))
-    units = (per_ampere(unit, outcome.inputs.unit) for unit in estimate.units)
-    kept = map(essential.get, estimate.names)
-    return list(zip(found.names, words, units, estimate.values, sigma, rsd, kept, noise, part))
+        rsd = 100.0 * sigma / np.abs(estimate.values)
+    is_unmeasured = np.isin(identification.names, unmeasured)
+    rsd = np.where(np.isfinite(rsd) & ~is_unmeasured, rsd, np.nan)
+    sigma = np.where(is_unmeasured, np.nan, sigma)
+    sigma_torque = np.where(is_unmeasured, np.nan, estimate.sigma)
+    sigma_geometry = np.where(is_unmeasured, np.nan, sigma_geometry)
+
+    essential: dict[str, float] = {}
+    if identification.elimination is not None:
+        remaining = identification.elimination.essential.estimate
+        essential = dict(zip(remaining.names, remaining.values))
+    rows = []
+    for k, name in enumerate(identification.names):
+        unit = per_ampere(estimate.units[k], outcome.inputs.unit)
+        value_essential = essential.get(estimate.names[k])
+        sigmas = sigma_torque[k], sigma_geometry[k]
+        rows.append((name, contents[k], unit, estimate.values[k], sigma[k], rsd[k], value_essential, *sigmas))
+    return rows
+
+
+def _expressions(identification: Identification, unmeasured: Sequence[str], held: Sequence[str]) -> list[str]:
+    """Return for each parameter what it holds: the standard parameters, or the shape of a drive term."""
+    lines = [line.split(" = ", 1)[1] for line in expressions(identification.base)]
+    for term in identification.friction.terms:
+        remark = ", switched off: not measured" if term.name in unmeasured else ""
+        lines.append(f"{term.shape}{remark}")
+    for k, name in enumerate(identification.names):
+        if name in held:
+            lines[k] += ", on its bound: no sigma"
+    return lines

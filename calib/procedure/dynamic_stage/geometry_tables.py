@@ -32,9 +32,13 @@ from calib.identification.uncertainty.geometry_uncertainty import (
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.records import Number
 
+# a shift, in σ_torque, that raises a σ by more than `NOTHING`
+MIN_SHIFT = float(np.sqrt((1.0 + NOTHING) ** 2 - 1.0))
+# changes between the geometries that metrics.json lists
+MAX_CHANGES = 5
+
 EFFECTS, SENSITIVITY, GEOMETRIES = "geometry_effects.csv", "sensitivity.csv", "geometries.csv"
 TORQUE_COVARIANCE = "covariance_torque.csv"
-MIN_SHIFT = float(np.sqrt((1.0 + NOTHING) ** 2 - 1.0))  # a shift, in σ_torque, that raises a σ by more than `NOTHING`
 
 
 @dataclass(frozen=True)
@@ -111,8 +115,8 @@ def write(outcome: IdentificationOutcome, folder: Path) -> None:
     carried = outcome.carried
     if carried is None:
         return
-    rows = ([name, *row] for name, row in zip(carried.names, carried.sensitivity))
     header = [f"{name} [{unit}]" for name, unit in zip(carried.elements, carried.units)]
+    rows = [[name, *row] for name, row in zip(carried.names, carried.sensitivity)]
     files.write_table(folder / SENSITIVITY, ("name", *header), rows)
     files.write_table(folder / EFFECTS, GeometricEffect._fields, effects(carried))
     write_covariance(folder / TORQUE_COVARIANCE, carried.names, carried.torque)
@@ -123,10 +127,11 @@ def write(outcome: IdentificationOutcome, folder: Path) -> None:
 
 def _ranking(carried: GeometryUncertainty) -> np.ndarray:
     """Return the elements' indices, sorted by the largest shift that one σ causes; elements without σ last."""
-    known = np.isfinite(carried.deviations)
-    unit = _per_sigma(carried).max(axis=0, initial=0.0)
-    size = np.where(known, unit * np.where(known, carried.deviations, 0.0), unit)
-    return np.lexsort((-size, ~known))
+    has_sigma = np.isfinite(carried.deviations)
+    shift_per_unit = _per_sigma(carried).max(axis=0, initial=0.0)
+    deviations = np.where(has_sigma, carried.deviations, 0.0)
+    size = np.where(has_sigma, shift_per_unit * deviations, shift_per_unit)
+    return np.lexsort((-size, ~has_sigma))
 
 
 def effects(carried: GeometryUncertainty) -> list[GeometricEffect]:
@@ -137,59 +142,80 @@ def effects(carried: GeometryUncertainty) -> list[GeometricEffect]:
     torque_rms_left: after the parameters have been estimated anew. An element matters where it alone raises some σ by
     more than 1 %; without a σ nothing can be said.
     """
-    found, units = [], _per_sigma(carried)
+    rows = []
+    shifts_per_unit = _per_sigma(carried)
     for rank, k in enumerate(_ranking(carried), start=1):
-        per_unit, sigma = units[:, k], carried.deviations[k]
-        worst, shifts = int(np.argmax(per_unit)), per_unit * sigma
-        known = bool(np.isfinite(sigma))
-        found.append(
+        per_unit, sigma = shifts_per_unit[:, k], carried.deviations[k]
+        shifts = per_unit * sigma
+        worst = int(np.argmax(per_unit))
+        matters, count = "", None
+        if np.isfinite(sigma):
+            matters = "yes" if shifts.max() > MIN_SHIFT else "no"
+            count = int((shifts > MIN_SHIFT).sum())
+        rows.append(
             GeometricEffect(
-                rank,
-                carried.elements[k],
-                carried.units[k],
-                float(sigma),
-                ("yes" if shifts.max() > MIN_SHIFT else "no") if known else "",
-                carried.names[worst] if per_unit[worst] > 0.0 else "",
-                shifts[worst],
-                int((shifts > MIN_SHIFT).sum()) if known else None,
-                float(carried.felt[k] * sigma),
-                float(carried.left[k] * sigma),
-                1e-3 * per_unit[worst],
+                rank=rank,
+                element=carried.elements[k],
+                unit=carried.units[k],
+                sigma=float(sigma),
+                matters=matters,
+                parameter=carried.names[worst] if per_unit[worst] > 0.0 else "",
+                shift_sigma=shifts[worst],
+                parameters_moved=count,
+                torque_rms=float(carried.felt[k] * sigma),
+                torque_rms_left=float(carried.left[k] * sigma),
+                shift_sigma_per_milli=1e-3 * per_unit[worst],
             )
         )
-    return found
+    return rows
 
 
-def _geometries(found: GeometryComparison, essential: Sequence[str]) -> Iterator[TwoGeometries]:
+def _geometries(comparison: GeometryComparison, essential: Sequence[str]) -> Iterator[TwoGeometries]:
     """Yield the rows of ``geometries.csv``: each parameter on the nominal and on the calibrated geometry."""
-    (nominal, calibrated), (s_nominal, s_calibrated) = found.values, found.sigma
-    relative = np.where(np.isfinite(found.relative), found.relative, np.nan)
-    kept = ("yes" if name in essential else "no" for name in found.names)
-    columns = nominal, s_nominal, calibrated, s_calibrated, relative, found.difference, kept
-    return (TwoGeometries(*row) for row in zip(found.names, found.units, *columns))
+    nominal, calibrated = comparison.values
+    sigma_nominal, sigma_calibrated = comparison.sigma
+    relative = np.where(np.isfinite(comparison.relative), comparison.relative, np.nan)
+    for k, (name, unit) in enumerate(zip(comparison.names, comparison.units)):
+        yield TwoGeometries(
+            name=name,
+            unit=unit,
+            nominal=nominal[k],
+            sigma_nominal=sigma_nominal[k],
+            calibrated=calibrated[k],
+            sigma_calibrated=sigma_calibrated[k],
+            relative_percent=relative[k],
+            sigma_difference=comparison.difference[k],
+            essential="yes" if name in essential else "no",
+        )
 
 
 def _essential_names(outcome: IdentificationOutcome) -> tuple[str, ...]:
     """Return the names of the essential parameters; all names if none were removed."""
-    found = outcome.found
-    if found.elimination is None:
-        return found.names
-    own = dict(zip(found.elimination.base.estimate.names, found.names))
-    return tuple(own[name] for name in found.elimination.essential.estimate.names)
+    identification = outcome.found
+    if identification.elimination is None:
+        return identification.names
+    elimination = identification.elimination
+    printed = dict(zip(elimination.base.estimate.names, identification.names))
+    return tuple(printed[name] for name in elimination.essential.estimate.names)
 
 
-def metrics(carried: GeometryUncertainty, compared: GeometryComparison | None) -> GeometryMetrics:
+def metrics(carried: GeometryUncertainty, comparison: GeometryComparison | None) -> GeometryMetrics:
     """Return the metrics of the geometry's uncertainty in the estimate."""
     growth = carried.sigma / np.where(carried.sigma_torque > 0.0, carried.sigma_torque, 1.0)
     return GeometryMetrics(
-        carried.geometry is not None,
-        summary(carried),
-        tuple(name for name, yes in zip(carried.names, carried.changed) if yes),
-        _tilt(carried),
-        tuple(name for name, yes in zip(carried.names, carried.dominated) if yes),
-        float(growth.max(initial=1.0)),
-        () if compared is None else _largest(compared),
+        propagated=carried.geometry is not None,
+        summary=summary(carried),
+        changed=_marked(carried.names, carried.changed),
+        moved_by_1_mrad_of_tilt=_tilt(carried),
+        geometry_exceeds_torque=_marked(carried.names, carried.dominated),
+        largest_growth_of_sigma=float(growth.max(initial=1.0)),
+        largest_changes_from_nominal=() if comparison is None else _largest(comparison),
     )
+
+
+def _marked(names: Sequence[str], mask: np.ndarray) -> tuple[str, ...]:
+    """Return the names (p,) at which a mask (p,) is true."""
+    return tuple(name for name, marked in zip(names, mask) if marked)
 
 
 def summary(carried: GeometryUncertainty) -> str:
@@ -200,12 +226,16 @@ def summary(carried: GeometryUncertainty) -> str:
             "geometry (give the folder of a fit)"
         )
     count, p = int(carried.changed.sum()), len(carried.names)
+    limit = f"{100 * NOTHING:g} %"
     if count == 0:
-        return f"the geometry's uncertainty changes no sigma by more than {100 * NOTHING:g} %: no propagation needed"
-    over = [name for name, yes in zip(carried.names, carried.dominated) if yes]
-    more = f"; for {len(over)} it contributes more than torque noise: {', '.join(over)}" if over else ""
-    rest = f" and leaves {p - count} unchanged" if count < p else ""
-    return f"the geometry's uncertainty raises {count} of {p} sigmas by more than {100 * NOTHING:g} %{rest}{more}"
+        return f"the geometry's uncertainty changes no sigma by more than {limit}: no propagation needed"
+    sentence = f"the geometry's uncertainty raises {count} of {p} sigmas by more than {limit}"
+    if count < p:
+        sentence += f" and leaves {p - count} unchanged"
+    dominated = _marked(carried.names, carried.dominated)
+    if dominated:
+        sentence += f"; for {len(dominated)} it contributes more than torque noise: {', '.join(dominated)}"
+    return sentence
 
 
 def _tilt(carried: GeometryUncertainty) -> TiltEffect:
@@ -221,8 +251,11 @@ def _per_sigma(carried: GeometryUncertainty) -> np.ndarray:
     return np.divide(np.abs(carried.sensitivity), sigma, out=np.zeros(carried.sensitivity.shape), where=sigma > 0.0)
 
 
-def _largest(compared: GeometryComparison) -> tuple[ParameterChange, ...]:
+def _largest(comparison: GeometryComparison) -> tuple[ParameterChange, ...]:
     """Return the five parameters that differ most between the geometries, with the differences in total σ and [%]."""
-    size = (compared.values[0] - compared.values[1]) / np.where(compared.sigma[1] > 0.0, compared.sigma[1], np.inf)
-    worst = np.argsort(-np.abs(size))[:5]
-    return tuple(ParameterChange(compared.names[k], float(size[k]), float(compared.relative[k])) for k in worst)
+    nominal, calibrated = comparison.values
+    _, sigma = comparison.sigma
+    size = (nominal - calibrated) / np.where(sigma > 0.0, sigma, np.inf)
+    names, relative = comparison.names, comparison.relative
+    largest = np.argsort(-np.abs(size))[:MAX_CHANGES]
+    return tuple(ParameterChange(names[k], float(size[k]), float(relative[k])) for k in largest)

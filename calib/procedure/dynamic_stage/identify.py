@@ -23,12 +23,13 @@ from calib.identification.uncertainty import geometry_uncertainty, torque_errors
 from calib.procedure.dynamic_stage import plain, plausibility
 from calib.procedure.dynamic_stage import verdict as judging
 from calib.procedure.dynamic_stage.hypotheses import gravity_hypotheses
-from calib.procedure.dynamic_stage.inputs import IdentificationInputs, Progress
+from calib.procedure.dynamic_stage.inputs import IdentificationInputs, Progress, silent
 from calib.procedure.findings import Verdict, lines_of
 from calib.procedure.robot_kinds import stage_of
 from calib.units import TORQUE, without_gains
 
-REPEAT = 0.5  # share of states met in training from which on a validation file proves nothing (our choice)
+# share of states met in training from which on a validation file proves nothing (our choice)
+REPEAT = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +79,7 @@ class Errors:
     @property
     def proofs(self) -> dict[str, Score]:
         """Scores on unseen recordings by name, without repeats of the training motion."""
-        return {name: one for name, one in self.validation.items() if one.evidence}
+        return {name: score for name, score in self.validation.items() if score.evidence}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -104,25 +105,32 @@ class Assessment(Errors):
 
 def repeated_motion(cases: Sequence[Case], unseen: Sequence[Case]) -> dict[str, float]:
     """Return, for each unseen recording that repeats training motion, the share of its states found in the training."""
-    shares = {case.name: max(repeats(own.motion, case.motion) for own in cases) for case in unseen}
-    return {name: share for name, share in shares.items() if share >= REPEAT}
+    repeated = {}
+    for case in unseen:
+        share = max(repeats(training.motion, case.motion) for training in cases)
+        if share >= REPEAT:
+            repeated[case.name] = share
+    return repeated
 
 
 def overlaps(cases: Sequence[Case], unseen: Sequence[Case]) -> list[Finding]:
     """Return the findings on samples that are both unseen and training data."""
-    found = []
-    for case, own in product(unseen, cases):
-        first, last = max(case.motion.t[0], own.motion.t[0]), min(case.motion.t[-1], own.motion.t[-1])
-        if own.motion.file and realpath(case.motion.file) == realpath(own.motion.file) and first < last:
-            found.append(finding("unseen-overlaps", file=case.name, training=own.name, first=first, last=last))
-    return found
+    findings = []
+    for case, training in product(unseen, cases):
+        if not training.motion.file or realpath(case.motion.file) != realpath(training.motion.file):
+            continue
+        first = max(case.motion.t[0], training.motion.t[0])
+        last = min(case.motion.t[-1], training.motion.t[-1])
+        if first < last:
+            findings.append(finding("unseen-overlaps", file=case.name, training=training.name, first=first, last=last))
+    return findings
 
 
 def errors_of(
     inputs: IdentificationInputs,
     dynamics: Dynamics[Any],
     errors: torque_errors.TorqueErrorModel | None = None,
-    say: Progress = lambda words: None,
+    say: Progress = silent,
 ) -> Errors:
     """Return the predictions of every recording by a model, and their errors.
 
@@ -134,20 +142,25 @@ def errors_of(
         say(f"predicting {case.name}")
         predictions[case.name] = predict(dynamics, case)
         scores[case.name] = score(case, predictions[case.name], inputs.options.slow, inputs.currents.own)
-    expected: dict[str, torque_errors.TorqueIntervals] = {}
+    intervals: dict[str, torque_errors.TorqueIntervals] = {}
     if errors is not None:
         for case in inputs.unseen or inputs.cases[:1]:
             say(f"estimating the errors of {case.name}")
-            expected[case.name] = torque_errors.intervals(errors, dynamics, case, predictions[case.name])
+            intervals[case.name] = torque_errors.intervals(errors, dynamics, case, predictions[case.name])
     repeated = repeated_motion(inputs.cases, inputs.unseen)
-    stated = {name: one.coverage() for name, one in expected.items()}
-    validation = {
-        case.name: replace(scores[case.name], evidence=case.name not in repeated, interval95=stated.get(case.name))
-        for case in inputs.unseen
-    }
-    fit = {case.name: scores[case.name] for case in inputs.cases}
-    excitation = {case.name: report_excitation(case.motion) for case in inputs.cases}
-    return Errors(fit, validation, predictions, repeated, excitation, expected)
+    validation = {}
+    for case in inputs.unseen:
+        coverage = intervals[case.name].coverage() if case.name in intervals else None
+        evidence = case.name not in repeated
+        validation[case.name] = replace(scores[case.name], evidence=evidence, interval95=coverage)
+    return Errors(
+        fit={case.name: scores[case.name] for case in inputs.cases},
+        validation=validation,
+        predictions=predictions,
+        repeated=repeated,
+        excitation={case.name: report_excitation(case.motion) for case in inputs.cases},
+        intervals=intervals,
+    )
 
 
 def assess(
@@ -167,64 +180,72 @@ def assess(
         errors: what errors its torques are expected to have.
         wrong: joints that friction drives, where that is known already (`friction.passivity.driven`).
     """
-    say = progress or (lambda words: None)
-    wrong = driven(dynamics, inputs.cases) if wrong is None else wrong
-    found = errors_of(inputs, dynamics, errors, say)
+    say = progress or silent
+    if wrong is None:
+        wrong = driven(dynamics, inputs.cases)
+    scored = errors_of(inputs, dynamics, errors, say)
+
     say("judging")
     labels = inputs.options.settings.torque_rows.numbered(inputs.chain.n)
-    odd = plausibility.implausible(inputs, findings.contradiction, findings.unlike)
-    figures, rules = judging.judge(found.fit, found.proofs, found.repeated, found.excitation, labels)
-    if drives := judging.friction_drives(joint + 1 for joint in wrong):
+    implausible = plausibility.implausible(inputs, findings.contradiction, findings.unlike)
+    figures, rules = judging.judge(scored.fit, scored.proofs, scored.repeated, scored.excitation, labels)
+    drives = judging.friction_drives(joint + 1 for joint in wrong)
+    if drives:
         figures, rules = "", drives
     nominal = plain.nominal_values(inputs.chain, dynamics) if inputs.unit == TORQUE else None
-    beside = plain.references(
+    references = plain.references(
         inputs.unseen,
-        found.validation,
+        scored.validation,
         dynamics,
         np.array(findings.plain),
         nominal,
         inputs.options.slow,
         inputs.currents.own,
     )
-    rules += plain.worse_than_plain({name: one for name, one in beside.items() if name in found.proofs})
-    rules += judging.too_narrow(
-        {name: found.intervals[name] for name in found.proofs if name in found.intervals}, labels
-    )
-    verdict = judging.with_duration(
-        judging.with_prior(Verdict.of(figures, [*odd, *rules]), findings.rests), found.excitation
-    )
+    proofs = scored.proofs
+    rules += plain.worse_than_plain({name: shares for name, shares in references.items() if name in proofs})
+    of_proofs = {name: scored.intervals[name] for name in proofs if name in scored.intervals}
+    rules += judging.too_narrow(of_proofs, labels)
+    verdict = Verdict.of(figures, [*implausible, *rules])
+    verdict = judging.with_prior(verdict, findings.rests)
+    verdict = judging.with_duration(verdict, scored.excitation)
+
     say("simulating tracking with the model as feedforward")
-    relative = inputs.unit != TORQUE
-    amperes = [finding("torques-relative", unit=without_gains(inputs.unit))] if relative else []
     replays, failure = {}, ""
-    if inputs.replayed and not relative:
+    amperes: list[Finding] = []
+    if inputs.unit != TORQUE:
+        amperes.append(finding("torques-relative", unit=without_gains(inputs.unit)))
+        verdict = verdict.for_prediction(f"torques are {without_gains(inputs.unit)}")
+        failure = lines_of(amperes)[0]
+    elif inputs.replayed:
         from calib.procedure.dynamic_stage.replay import track
 
-        replays, failure = track(inputs, dynamics, found.predictions, findings.controller)
-    if any(one.inertia_added.any() for one in replays.values()):
-        use = lines_of([finding("prediction-not-simulation")])
-        verdict = replace(verdict, reason="; ".join([verdict.reason, *use]))
-    if relative:
-        verdict, failure = verdict.for_prediction(f"torques are {without_gains(inputs.unit)}"), lines_of(amperes)[0]
-    noticed = (
-        *amperes,
-        *odd,
-        *rules,
-        *overlaps(inputs.cases, inputs.unseen),
-        *(one for case in (*inputs.cases, *inputs.unseen) for one in judging.beyond(case, inputs.chain)),
-        *judging.motion_findings(found.validation, found.repeated),
-        *(one for case in inputs.unseen for one in judging.extrapolates(case.name, found.intervals.get(case.name))),
-        *findings.noticed,
-    )
-    said = dict.fromkeys((*lines_of(noticed), *judging.excitation_notes(found.excitation), *findings.notes))
+        replays, failure = track(inputs, dynamics, scored.predictions, findings.controller)
+    if any(replay.inertia_added.any() for replay in replays.values()):
+        remarks = lines_of([finding("prediction-not-simulation")])
+        verdict = replace(verdict, reason="; ".join([verdict.reason, *remarks]))
+
+    noticed = [*amperes, *implausible, *rules, *overlaps(inputs.cases, inputs.unseen)]
+    for case in (*inputs.cases, *inputs.unseen):
+        noticed += judging.beyond(case, inputs.chain)
+    noticed += judging.motion_findings(scored.validation, scored.repeated)
+    for case in inputs.unseen:
+        noticed += judging.extrapolates(case.name, scored.intervals.get(case.name))
+    noticed += findings.noticed
+    warnings = dict.fromkeys((*lines_of(noticed), *judging.excitation_notes(scored.excitation), *findings.notes))
     return Assessment(
-        **vars(found),
+        fit=scored.fit,
+        validation=scored.validation,
+        predictions=scored.predictions,
+        repeated=scored.repeated,
+        excitation=scored.excitation,
+        intervals=scored.intervals,
         verdict=verdict,
-        warnings=tuple(said),
-        noticed=noticed,
+        warnings=tuple(warnings),
+        noticed=tuple(noticed),
         tracking=replays,
         tracking_failure=failure,
-        references=beside,
+        references=references,
     )
 
 
@@ -274,24 +295,35 @@ def judged(
     Raises:
         MeasurementError: where friction would drive most joints.
     """
-    say = progress or (lambda words: None)
-    wrong = driven(found.dynamics, inputs.cases)  # refused before hours go into the geometry's share
+    say = progress or silent
+    # refused before hours go into the geometry's share
+    wrong = driven(found.dynamics, inputs.cases)
     carried, geometries = _carry(inputs, found, say)
     say("errors on held-out time")
     errors = torque_errors.learn_torque_errors(found, inputs.cases, carried.covariance)
     findings = ModelFindings(
-        judging.resting_parameters(found),
-        (),
-        judging.model_findings(inputs.cases, found),
-        found.loop.controller,
-        errors and errors.discrepancy,
-        contradiction(found, inputs.chain) if inputs.unit == TORQUE else None,
-        found.loop.disagreement,
-        tuple(plain.plain_values(found).tolist()),
+        rests=judging.resting_parameters(found),
+        noticed=judging.model_findings(inputs.cases, found),
+        controller=found.loop.controller,
+        errors=errors and errors.discrepancy,
+        contradiction=contradiction(found, inputs.chain) if inputs.unit == TORQUE else None,
+        unlike=found.loop.disagreement,
+        plain=tuple(plain.plain_values(found).tolist()),
     )
-    result = assess(inputs, found.dynamics, findings, errors, wrong, progress=say)
+    assessment = assess(inputs, found.dynamics, findings, errors, wrong, progress=say)
     return IdentificationOutcome(
-        **vars(result),
+        fit=assessment.fit,
+        validation=assessment.validation,
+        predictions=assessment.predictions,
+        repeated=assessment.repeated,
+        excitation=assessment.excitation,
+        intervals=assessment.intervals,
+        verdict=assessment.verdict,
+        warnings=assessment.warnings,
+        noticed=assessment.noticed,
+        tracking=assessment.tracking,
+        tracking_failure=assessment.tracking_failure,
+        references=assessment.references,
         inputs=inputs,
         found=found,
         findings=findings,
@@ -304,19 +336,35 @@ def judged(
 
 def assessed(outcome: T, inputs: IdentificationInputs) -> T:
     """Return an outcome with a new verdict on the unseen recordings of `inputs`; nothing is identified."""
-    if (stage := stage_of(inputs.robot, "identify")) is not None and stage.judge is not None:
-        result = stage.judge(inputs, outcome.found, outcome.findings)
+    stage = stage_of(inputs.robot, "identify")
+    if stage is not None and stage.judge is not None:
+        assessment = stage.judge(inputs, outcome.found, outcome.findings)
     else:
-        result = assess(inputs, outcome.found.dynamics, outcome.findings, outcome.errors)
-    return replace(outcome, inputs=inputs, **vars(result))
+        assessment = assess(inputs, outcome.found.dynamics, outcome.findings, outcome.errors)
+    return replace(
+        outcome,
+        inputs=inputs,
+        fit=assessment.fit,
+        validation=assessment.validation,
+        predictions=assessment.predictions,
+        repeated=assessment.repeated,
+        excitation=assessment.excitation,
+        intervals=assessment.intervals,
+        verdict=assessment.verdict,
+        warnings=assessment.warnings,
+        noticed=assessment.noticed,
+        tracking=assessment.tracking,
+        tracking_failure=assessment.tracking_failure,
+        references=assessment.references,
+    )
 
 
 def _carry(
-    inputs: IdentificationInputs, found: Identification, say: Progress
+    inputs: IdentificationInputs, identification: Identification, say: Progress
 ) -> tuple[geometry_uncertainty.GeometryUncertainty, geometry_uncertainty.GeometryComparison | None]:
     """Return the effect of the geometry's uncertainty on the estimate, and the comparison with the nominal geometry."""
-    carried = geometry_uncertainty.propagate(found, inputs.robot, inputs.cases, say)
+    carried = geometry_uncertainty.propagate(identification, inputs.robot, inputs.cases, say)
     if inputs.robot.nominal is None or not inputs.robot.moved:
         return carried, None
     say("identification on the nominal geometry")
-    return carried, geometry_uncertainty.compare(found, carried, inputs.robot.nominal, inputs.cases)
+    return carried, geometry_uncertainty.compare(identification, carried, inputs.robot.nominal, inputs.cases)

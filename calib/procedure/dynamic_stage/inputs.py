@@ -34,9 +34,18 @@ from calib.robot.description import remarks
 from calib.robot.library import load_calibrated, resolve
 from calib.units import TORQUE
 
-LOST = 0.05  # of a recording may fall to the windows of the parallel decimation (our choice)
-QUIET = 0.02  # noise of the accelerations that is no matter, of their rms (our choice)
-WINDOW = 18  # samples per decimation factor that one window needs
+# of a recording may fall to the windows of the parallel decimation (our choice)
+LOST = 0.05
+# noise of the accelerations that is no matter, of their rms (our choice)
+QUIET = 0.02
+# samples per decimation factor that one window needs
+WINDOW = 18
+# of the sampling rate: highest identification band, and highest cutoff of positions
+MAX_BAND = 0.45
+MAX_CUTOFF = 0.4
+# range of positions from which on a joint moves [rad or m]
+MIN_RANGE = 1e-3
+
 
 Progress = Callable[[str], None]
 
@@ -77,8 +86,8 @@ class IdentificationInputs:
         rows = self.options.settings.torque_rows.units([joint.kind == "prismatic" for joint in self.chain.joints])
         if self.unit == TORQUE:
             return tuple(rows)
-        own = self.currents.own
-        return tuple(f"A of joint {k + 1}" if k in own else self.unit for k in range(len(rows)))
+        in_amperes = self.currents.own
+        return tuple(f"A of joint {k + 1}" if k in in_amperes else self.unit for k in range(len(rows)))
 
     @property
     def gains(self) -> DriveGains | None:
@@ -96,12 +105,14 @@ class IdentificationInputs:
         Args:
             validate: paths, each with a cut if wanted, or recordings in memory.
         """
-        paths = [_path(each) for each in validate]
-        names = case_names([*(case.name for case in (*self.cases, *self.unseen)), *paths])[-len(paths) :]
-        cases, notes = [], []
-        for name, path, each in zip(names, paths, validate):
-            joints = joints_of(self.chain)
-            motion = read_motion(each, joints, self.options.file_settings(path), self.cases[0].motion)
+        joints = joints_of(self.chain)
+        paths = [_path(recording) for recording in validate]
+        earlier_names = [case.name for case in (*self.cases, *self.unseen)]
+        names = case_names([*earlier_names, *paths])[-len(paths) :]
+        cases = []
+        notes = []
+        for name, path, recording in zip(names, paths, validate):
+            motion = read_motion(recording, joints, self.options.file_settings(path), self.cases[0].motion)
             cases.append(_read_case(path, name, motion, self.options, self.currents, self.robot))
             notes += [f"{name}: {note}" for note in motion.notes]
         return replace(self, unseen=(*self.unseen, *cases), notes=(*self.notes, *notes))
@@ -132,50 +143,77 @@ def gather(
         seed: for everything random.
         designed: motions of which a recording without a reference contains one, for options with a [loop].
     """
-    say = progress or (lambda words: None)
     options = _with_choices(options or IdentifyOptions(), method, friction, seed)
     if not recordings:
         raise UsageError("no recording given")
-    given = [*recordings, *validate]
-    paths = [_path(each) for each in given]
-    if not isinstance(robot, Mechanism):  # whose outcome may be judged on more files later, named in the same options
+    sources = [*recordings, *validate]
+    paths = [_path(recording) for recording in sources]
+    # a mechanism's outcome may be judged on more files later, named in the same options
+    if not isinstance(robot, Mechanism):
         _check_files(options, paths)
-    known = load_calibrated(robot, base, tip) if isinstance(robot, (str, Path)) else robot
-    source = resolve(robot) if isinstance(robot, (str, Path)) else Path(known.source or known.chain.name)
-    chain, arm = known.chain, isinstance(known, CalibratedChain)
+    if isinstance(robot, (str, Path)):
+        described, source = load_calibrated(robot, base, tip), resolve(robot)
+    else:
+        described, source = robot, Path(robot.source or robot.chain.name)
+    chain = described.chain
     joints = joints_of(chain)
     if options.settings.loop is not None:
         options.settings.loop.check_lengths(chain.n)
+
+    notes: list[str] = []
+    if isinstance(described, CalibratedChain):
+        notes += remarks(chain, bodies=False)
     names = case_names(paths)
     motions: list[Motion] = []
-    for name, path, each in zip(names, paths, given):
-        say(f"reading {name}")
-        like = motions[0] if len(motions) >= len(recordings) else None
-        motion = read_motion(each, joints, options.file_settings(path), like)
-        motions.append(_referred(motion, each, joints, options, designed) if like is None else motion)
-    notes = [
-        *(remarks(chain, bodies=False) if arm else ()),
-        *(f"{name}: {note}" for name, motion in zip(names, motions) for note in motion.notes),
-    ]
+    for name, path, recording in zip(names, paths, sources):
+        if progress is not None:
+            progress(f"reading {name}")
+        file_options = options.file_settings(path)
+        if len(motions) < len(recordings):
+            motion = read_motion(recording, joints, file_options)
+            motion = _referred(motion, recording, joints, options, designed)
+        else:
+            # unseen recordings are judged in the band of the first training recording
+            motion = read_motion(recording, joints, file_options, motions[0])
+        motions.append(motion)
+        notes += [f"{name}: {note}" for note in motion.notes]
+
     count = len(recordings)
-    found = find_gains(chain, options, dict(zip(paths, motions)), paths[:count], say)
-    options = found.options
-    cases = [_read_case(path, name, motion, options, found, known) for name, path, motion in zip(names, paths, motions)]
+    gains = find_gains(chain, options, dict(zip(paths, motions)), paths[:count], progress or silent)
+    options = gains.options
+    cases = []
+    for name, path, motion in zip(names, paths, motions):
+        cases.append(_read_case(path, name, motion, options, gains, described))
     _check_payloads(cases[:count], cases[count:], options.settings)
-    if isinstance(known, CalibratedChain) and known.corrections is not None:
-        far = [np.abs(case.link[0] - case.motion.q).max() for case in cases if case.link is not None]
-        known = known if far else known.without_corrections()
-        how = f"move the links by up to {1e3 * max(far):.3g} mrad or mm" if far else "take no part: the links are rigid"
-        notes.append(f"joint corrections of the geometric fit {how}")
+    if isinstance(described, CalibratedChain) and described.corrections is not None:
+        shifts = [np.abs(case.link[0] - case.motion.q).max() for case in cases if case.link is not None]
+        if shifts:
+            effect = f"move the links by up to {1e3 * max(shifts):.3g} mrad or mm"
+        else:
+            effect = "take no part: the links are rigid"
+            described = described.without_corrections()
+        notes.append(f"joint corrections of the geometric fit {effect}")
     return IdentificationInputs(
-        known, source, tuple(cases[:count]), tuple(cases[count:]), options, (*notes, *found.notes), found
+        robot=described,
+        source=source,
+        cases=tuple(cases[:count]),
+        unseen=tuple(cases[count:]),
+        options=options,
+        notes=(*notes, *gains.notes),
+        currents=gains,
     )
+
+
+def silent(words: str) -> None:
+    """Show no progress."""
 
 
 def _check_payloads(cases: Sequence[Case], unseen: Sequence[Case], settings: IdentificationSettings) -> None:
     """Refuse an unseen recording with a payload that is neither in the training recordings nor in the options."""
-    known = {*settings.payload_values, *(label for label, load in settings.payloads.items() if load.parameters)}
-    known.update(label for case in cases for label in case.carried)
+    known = set(settings.payload_values)
+    known.update(label for label, load in settings.payloads.items() if load.parameters)
+    for case in cases:
+        known.update(case.carried)
     for case in unseen:
         for label in set(case.carried) - known:
             raise UsageError(
@@ -184,22 +222,34 @@ def _check_payloads(cases: Sequence[Case], unseen: Sequence[Case], settings: Ide
             )
 
 
-def _path(each: str | Path | Recording) -> str:
+def _path(recording: str | Path | Recording) -> str:
     """Return the path of a recording; in memory, its file and time span (so that two cuts of a file differ)."""
-    if not isinstance(each, Recording):
-        return str(each)
-    file, t = each.file or "recording", each.t[np.isfinite(each.t)]
-    return f"{file}@{t.min():.6g}:{t.max():.6g}" if len(t) > 1 else file  # what they must be is checked later
+    if not isinstance(recording, Recording):
+        return str(recording)
+    file = recording.file or "recording"
+    # what times must be is checked later
+    t = recording.t[np.isfinite(recording.t)]
+    if len(t) < 2:
+        return file
+    return f"{file}@{t.min():.6g}:{t.max():.6g}"
 
 
 def _with_choices(options: IdentifyOptions, method: str | None, friction: str | None, seed: int) -> IdentifyOptions:
     """Return the options with the command's method, friction model and seed; refuse unknown names."""
-    given = {key: value for key, value in (("method", method), ("friction", friction)) if value is not None}
-    for key, value in given.items():
-        allowed = tuple(METHODS) if key == "method" else NAMES
-        if value not in allowed:
-            raise UsageError(f"--{key} {value}: expected {', '.join(allowed)}{suggestion(value, allowed)}")
-    return replace(options, settings=replace(options.settings, seed=seed, **given))
+    choices: dict[str, Any] = {"seed": seed}
+    if method is not None:
+        _check_choice("method", method, tuple(METHODS))
+        choices["method"] = method
+    if friction is not None:
+        _check_choice("friction", friction, NAMES)
+        choices["friction"] = friction
+    return replace(options, settings=replace(options.settings, **choices))
+
+
+def _check_choice(option: str, value: str, allowed: Sequence[str]) -> None:
+    """Refuse a value that an option of the command does not allow."""
+    if value not in allowed:
+        raise UsageError(f"--{option} {value}: expected {', '.join(allowed)}{suggestion(value, allowed)}")
 
 
 def _read_case(path: str, name: str, motion: Motion, options: IdentifyOptions, found: FoundGains, robot: Any) -> Case:
@@ -222,35 +272,43 @@ def read_motion(
     Args:
         given: a path, with a cut if wanted, or the recording.
         chain: the robot, or its joints.
+        own: the options for its file.
         like: a motion whose identification band it is judged in, where the options state none; how far its own
             positions need filtering, it says itself.
     """
     joints = chain if isinstance(chain, Joints) else joints_of(chain)
     if isinstance(given, Recording):
-        some = in_pieces(given, own.recording.samples)
-        recording = check_recording(earlier(some, own.recording.lag), joints)
+        pieces = in_pieces(given, own.recording.samples)
+        recording = check_recording(earlier(pieces, own.recording.lag), joints)
     else:
         recording = read_recording(given, joints, own.recording)
     sampled = resample(recording, own.filter.clock, own.filter.gap)
-    if like is not None and own.filter.band is None and like.band * np.median(np.diff(recording.t)) < 0.4:
-        banded = replace(own.filter, band=like.band * (1.0 - 1e-9))
-        motion = make_motion(recording, banded, sampled)
-        return motion if own.filter.cutoff is not None else _sharper(recording, motion, banded, sampled)
-    motion = make_motion(recording, own.filter, sampled)
+
+    options = own.filter
+    same_band = like is not None and own.filter.band is None
+    if like is not None and same_band and like.band * np.median(np.diff(recording.t)) < MAX_CUTOFF:
+        options = replace(own.filter, band=like.band * (1.0 - 1e-9))
+    motion = make_motion(recording, options, sampled)
     if own.filter.cutoff is None:
-        motion = _sharper(recording, motion, own.filter, sampled)
-    widest = LOST * len(motion) / WINDOW  # decimation factor
-    if own.filter.band is not None or motion.decimator.factor <= max(widest, 1.0):
+        motion = _sharper(recording, motion, options, sampled)
+    # windows of the decimation take too much of the ends of a short recording
+    max_factor = LOST * len(motion) / WINDOW
+    if options.band is not None or motion.decimator.factor <= max(max_factor, 1.0):
         return motion
-    band = SHARE * motion.rate / (2 * max(1, int(widest)))
-    same = replace(own.filter, cutoff=_joints(motion.cutoff), velocity_cutoff=_joints(motion.velocity_cutoff))
-    wider = make_motion(recording, replace(same, band=min(band, 0.45 * motion.rate)), sampled, motion.cutoffs)
+    band = SHARE * motion.rate / (2 * max(1, int(max_factor)))
+    wider_options = replace(
+        own.filter,
+        cutoff=_joints(motion.cutoff),
+        velocity_cutoff=_joints(motion.velocity_cutoff),
+        band=min(band, MAX_BAND * motion.rate),
+    )
+    wider = make_motion(recording, wider_options, sampled, motion.cutoffs)
     note = f"f_p = {wider.band:.3g} Hz instead, so that decimation does not remove the ends of a short recording"
     return replace(wider, notes=(*motion.notes, note))
 
 
 def _joints(values: np.ndarray) -> tuple[float, ...]:
-    return tuple(float(one) for one in values)
+    return tuple(map(float, values))
 
 
 def _sharper(recording: Recording, motion: Motion, options: FilterOptions, sampled: Resampled) -> Motion:
@@ -258,62 +316,78 @@ def _sharper(recording: Recording, motion: Motion, options: FilterOptions, sampl
 
     f_q is doubled where noise stays below `QUIET` of every moving joint's rms acceleration (our choice).
     """
-    size = np.sqrt(np.mean(motion.a**2, axis=0))
-    moves = np.ptp(motion.q, axis=0) > 1e-3
+    rms = np.sqrt(np.mean(motion.a**2, axis=0))
+    moves = np.ptp(motion.q, axis=0) > MIN_RANGE
     cutoff = float(motion.cutoff.max())
-    f = 2.0 * cutoff
-    noise = motion.cutoffs.acceleration_noise(f, motion.rate)
-    if f > 0.4 * motion.rate or not moves.any() or not (noise < QUIET * size)[moves].all():
+    doubled = 2.0 * cutoff
+    noise = motion.cutoffs.acceleration_noise(doubled, motion.rate)
+    if doubled > MAX_CUTOFF * motion.rate or not moves.any() or not (noise < QUIET * rms)[moves].all():
         return motion
-    borders = 2.0 / cutoff if options.borders is None else options.borders  # no samples that the wider band would add
-    same = replace(options, velocity_cutoff=_joints(motion.velocity_cutoff), borders=borders)
-    sharper = make_motion(recording, replace(same, cutoff=f), sampled, motion.cutoffs)
-    note = f"f_q = {f:.3g} Hz instead: the position noise is low enough"
+    # no samples that the wider band would add
+    borders = 2.0 / cutoff if options.borders is None else options.borders
+    sharper_options = replace(options, velocity_cutoff=_joints(motion.velocity_cutoff), borders=borders, cutoff=doubled)
+    sharper = make_motion(recording, sharper_options, sampled, motion.cutoffs)
+    note = f"f_q = {doubled:.3g} Hz instead: the position noise is low enough"
     return replace(sharper, notes=(*motion.notes, note))
 
 
 def _referred(
     motion: Motion,
-    given: str | Path | Recording,
+    recording: str | Path | Recording,
     joints: Joints,
     options: IdentifyOptions,
     designed: Sequence[DesignedMotion],
 ) -> Motion:
     """Return the motion with its reference: of a file that the options name, its own, or a designed motion."""
-    own, loop = options.file_settings(_path(given)), options.settings.loop
+    file_options, loop = options.file_settings(_path(recording)), options.settings.loop
     if loop is None:
         return motion
-    if named := own.reference or loop.reference * (loop.reference != "recording"):
-        beside = Path(options.source).parent / named
-        return with_reference(motion, beside if beside.exists() else Path(named), joints, own.recording)
-    return _with_design(motion, given, joints, own, designed) if designed and motion.q_ref is None else motion
+    reference = file_options.reference
+    if not reference and loop.reference != "recording":
+        reference = loop.reference
+    if reference:
+        beside = Path(options.source).parent / reference
+        path = beside if beside.exists() else Path(reference)
+        return with_reference(motion, path, joints, file_options.recording)
+    if designed and motion.q_ref is None:
+        return _with_design(motion, recording, joints, file_options, designed)
+    return motion
 
 
 def _with_design(
-    motion: Motion, given: str | Path | Recording, joints: Joints, own: FileSettings, designed: Sequence[DesignedMotion]
+    motion: Motion,
+    source: str | Path | Recording,
+    joints: Joints,
+    options: FileSettings,
+    designed: Sequence[DesignedMotion],
 ) -> Motion:
     """Return the part of a motion in which whole periods of a designed motion were played, with it as the reference.
 
     They are looked for in the whole file: a cut may contain less than a period.
     """
-    options = replace(own.recording, samples=None)
-    whole = given if isinstance(given, Recording) else read_recording(parse_cut(str(given))[0], joints, options)
+    recording = source
+    if not isinstance(recording, Recording):
+        file = parse_cut(str(source))[0]
+        recording = read_recording(file, joints, replace(options.recording, samples=None))
     for design in designed:
-        if (found := locate(whole, design)) is None:
+        located = locate(recording, design)
+        if located is None:
             continue
-        part = slice(*np.searchsorted(motion.t, [found.began, found.began + found.periods * design.period]))
-        if part.start < part.stop:
-            q_ref = frozen(design.orders(motion.t[part] - found.began)[0])
-            return replace(motion.part(part), q_ref=q_ref, located=found.began)
+        span = [located.began, located.began + located.periods * design.period]
+        start, stop = np.searchsorted(motion.t, span)
+        if start < stop:
+            part = slice(start, stop)
+            q_ref = frozen(design.orders(motion.t[part] - located.began)[0])
+            return replace(motion.part(part), q_ref=q_ref, located=located.began)
     refuse_data(motion.file, "has no reference positions (q_ref), and contains none of the designed motions whole")
 
 
 def _check_files(options: IdentifyOptions, paths: Sequence[str]) -> None:
     """Refuse a [files] table that names none of the recordings."""
-    plain = [Path(parse_cut(str(path))[0]) for path in paths]
+    files = [Path(parse_cut(str(path))[0]) for path in paths]
+    file_names = [file.name for file in files]
     for name in options.files:
-        wanted = Path(name).parts
-        if not any(path.parts[-len(wanted) :] == wanted for path in plain):
-            shown = [path.name for path in plain]
-            message = f'{options.source}: files."{name}" names none of the recordings{suggestion(name, shown)}'
-            raise UsageError(f"{message}: {', '.join(shown)}")
+        parts = Path(name).parts
+        if not any(file.parts[-len(parts) :] == parts for file in files):
+            message = f'{options.source}: files."{name}" names none of the recordings{suggestion(name, file_names)}'
+            raise UsageError(f"{message}: {', '.join(file_names)}")

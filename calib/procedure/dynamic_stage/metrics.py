@@ -31,8 +31,12 @@ from calib.procedure.dynamic_stage.plain import PlainReferences
 from calib.records import Array, Number, Unbounded, evenly
 from calib.units import TORQUE
 
-SCHEMA, UNSEEN_SCHEMA = 3, 2  # of metrics.json, and of unseen/report.json
-MAX_POINTS = 600  # samples per curve of the certificate (our choice)
+# of metrics.json, and of unseen/report.json
+SCHEMA, UNSEEN_SCHEMA = 3, 2
+# samples per curve of the certificate (our choice)
+MAX_POINTS = 600
+# share of a parameter's sigma without constraints below which a constraint holds it
+BOUND_SIGMA = 1e-9
 
 
 @dataclass(frozen=True)
@@ -68,7 +72,8 @@ class FilterMetrics:
     cutoff: Array
     band: float
     decimation: int
-    velocity_cutoff: Array | None = None  # of 0.1: the same
+    # of 0.1: the same
+    velocity_cutoff: Array | None = None
 
     @classmethod
     def of(cls, motion: Motion) -> FilterMetrics:
@@ -111,11 +116,20 @@ class JudgedMetrics:
     references: Mapping[str, PlainReferences] = field(default_factory=dict)
 
 
-def _judged(found: Assessment) -> dict[str, Any]:
+def _judged(assessment: Assessment) -> dict[str, Any]:
     """Return the entries of an assessment common to both records, without the names of the rows."""
-    same = ("warnings", "noticed", "validation", "tracking", "tracking_failure", "references")
-    judged = dict(zip(("verdict", "reason", "code", "advice"), vars(found.verdict).values()))
-    return judged | {name: getattr(found, name) for name in same}
+    return {
+        "verdict": assessment.verdict.level,
+        "reason": assessment.verdict.reason,
+        "code": assessment.verdict.code,
+        "advice": assessment.verdict.advice,
+        "warnings": assessment.warnings,
+        "noticed": assessment.noticed,
+        "validation": assessment.validation,
+        "tracking": assessment.tracking,
+        "tracking_failure": assessment.tracking_failure,
+        "references": assessment.references,
+    }
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -146,56 +160,67 @@ class ModelMetrics(JudgedMetrics):
     schema: int = SCHEMA
 
 
-def on_bounds(found: Identification) -> tuple[str, ...]:
+def on_bounds(identification: Identification) -> tuple[str, ...]:
     """Return the parameters fixed by a constraint at its bound: the data do not identify them, and they have no σ.
 
     The covariance takes the constraint as an equality: its zeros there are what the other parameters' σ rest on.
     """
-    if found.fitted.held is None:
+    held = identification.fitted.held
+    if held is None:
         return ()
-    free = found.fitted.held.free.estimate.sigma
-    return tuple(name for name, own, data in zip(found.names, found.fitted.estimate.sigma, free) if own <= 1e-9 * data)
+    names = []
+    sigmas, free_sigmas = identification.fitted.estimate.sigma, held.free.estimate.sigma
+    for name, sigma, free_sigma in zip(identification.names, sigmas, free_sigmas):
+        if sigma <= BOUND_SIGMA * free_sigma:
+            names.append(name)
+    return tuple(names)
 
 
 def metrics(outcome: IdentificationOutcome) -> ModelMetrics:
     """Return the content of ``metrics.json`` for an identification."""
-    found, inputs, held = outcome.found, outcome.inputs, outcome.found.fitted.held
-    base, count = found.base, found.base.b + len(found.friction.terms)
-    kept = count if found.elimination is None else len(found.elimination.kept)
+    identification, inputs = outcome.found, outcome.inputs
+    base, held = identification.base, identification.fitted.held
+    count = base.b + len(identification.friction.terms)
+    essential, steps = count, ()
+    if identification.elimination is not None:
+        essential, steps = len(identification.elimination.kept), identification.elimination.steps
+    method = identification.fitted.method
+    filters = {case.name: FilterMetrics.of(case.motion) for case in (*inputs.cases, *inputs.unseen)}
     return ModelMetrics(
         **_judged(outcome),
-        rows=found.settings.torque_rows.numbered(inputs.chain.n),
+        rows=identification.settings.torque_rows.numbered(inputs.chain.n),
         identification=outcome.fit,
-        parameters=ParameterCounts(len(base.standard), count, kept),
+        parameters=ParameterCounts(len(base.standard), count, essential),
         counts=ColumnCounts(len(base.without_effect), len(base.regrouped)),
-        condition_number=ConditionNumber(*found.condition),
-        friction=found.friction.chosen,
-        method=found.fitted.method,
-        method_assumes=METHODS[found.fitted.method].assumes,
-        ladder=found.friction.steps,
-        ripple=tuple(one.found for one in found.ripples),
-        elimination=() if found.elimination is None else found.elimination.steps,
+        condition_number=ConditionNumber(*identification.condition),
+        friction=identification.friction.chosen,
+        method=method,
+        method_assumes=METHODS[method].assumes,
+        ladder=identification.friction.steps,
+        ripple=tuple(ripple.found for ripple in identification.ripples),
+        elimination=steps,
         unit=inputs.unit,
-        switched_off=found.friction.off,
+        switched_off=identification.friction.off,
         drive_gains=inputs.gains and GainRecord.of(inputs.gains, inputs.unit),
-        loop=found.loop.metrics,
+        loop=identification.loop.metrics,
         constraints=held and ConstraintMetrics(held.names, held.binding, held.postures),
-        filters={case.name: FilterMetrics.of(case.motion) for case in (*inputs.cases, *inputs.unseen)},
+        filters=filters,
         geometry=outcome.carried and geometry_tables.metrics(outcome.carried, outcome.geometries),
         repeated=outcome.repeated,
         findings=outcome.findings,
-        error_density=_error_density(found, inputs.cases),
+        error_density=_error_density(identification, inputs.cases),
         seed=outcome.seed,
     )
 
 
-def _error_density(found: Identification, cases: Sequence[Case]) -> np.ndarray:
+def _error_density(identification: Identification, cases: Sequence[Case]) -> np.ndarray:
     """Return the errors' density (rows,) [N² m² s or N² s]: a motion's information is ∫ ωᵀω / density dt.
 
     It is their variance over the independent rows per second.
     """
-    per_second = sum(len(rows.target) for rows in found.rows) / sum(case.duration for case in cases)
-    return found.fitted.std**2 * found.fitted.inflation / per_second
+    count = sum(len(rows.target) for rows in identification.rows)
+    per_second = count / sum(case.duration for case in cases)
+    return identification.fitted.std**2 * identification.fitted.inflation / per_second
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,13 +244,16 @@ class TorqueCurves:
         """Return the curves of a case and its prediction (N, rows)."""
         motion, measured = case.motion, np.asarray(case.target)
         picked = evenly(len(measured), MAX_POINTS)
-        low, other = (_five_digits(motion.in_band(one)[picked].T) for one in (measured, predicted))
+        measured_in_band = _five_digits(motion.in_band(measured)[picked].T)
+        predicted_in_band = _five_digits(motion.in_band(predicted)[picked].T)
         sigma = relative_error_sigma(measured[picked].T, predicted[picked].T)
-        return cls(case.name, np.round(motion.t[picked], 4), low, other, motion.band, sigma)
+        t = np.round(motion.t[picked], 4)
+        return cls(case.name, t, measured_in_band, predicted_in_band, motion.band, sigma)
 
 
 def _five_digits(values: np.ndarray) -> np.ndarray:
-    return np.array([float(f"{x:.5g}") for x in values.ravel()]).reshape(values.shape)
+    rounded = [float(f"{x:.5g}") for x in values.ravel()]
+    return np.array(rounded).reshape(values.shape)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -247,17 +275,22 @@ class UnseenReport(JudgedMetrics):
     schema: int = UNSEEN_SCHEMA
 
     @classmethod
-    def of(cls, inputs: IdentificationInputs, found: Assessment) -> UnseenReport:
+    def of(cls, inputs: IdentificationInputs, assessment: Assessment) -> UnseenReport:
         """Return the report of an assessment."""
-        rows = inputs.options.settings.torque_rows.titles(inputs.chain.joint_names)
-        curves = (TorqueCurves.of(case, found.predictions[case.name]) for case in (inputs.unseen or inputs.cases))
-        known = inputs.options.settings.torque_rows.projection is None and inputs.unit == TORQUE
-        limits = np.resize([joint.effort if known else np.inf for joint in inputs.chain.joints], len(rows))
+        torque_rows = inputs.options.settings.torque_rows
+        rows = torque_rows.titles(inputs.chain.joint_names)
+        cases = inputs.unseen or inputs.cases
+        curves = [TorqueCurves.of(case, assessment.predictions[case.name]) for case in cases]
+        # the description limits the torques of joints [N m or N], not those of other rows
+        efforts = [np.inf] * len(inputs.chain.joints)
+        if torque_rows.projection is None and inputs.unit == TORQUE:
+            efforts = [joint.effort for joint in inputs.chain.joints]
+        limits = np.resize(efforts, len(rows))
         return cls(
-            **_judged(found),
+            **_judged(assessment),
             rows=tuple(rows),
             units=tuple(inputs.row_units),
-            fit=found.fit,
+            fit=assessment.fit,
             curves=tuple(curves),
             limits=limits,
             robot=inputs.chain.name,
@@ -266,7 +299,7 @@ class UnseenReport(JudgedMetrics):
     @property
     def proofs(self) -> dict[str, Score]:
         """Scores on unseen recordings by name, without repeats of the training motion."""
-        return {name: one for name, one in self.validation.items() if one.evidence}
+        return {name: score for name, score in self.validation.items() if score.evidence}
 
 
 # ---- folders of earlier versions ------------------------------------------------------------------------------------
@@ -279,40 +312,49 @@ def with_current_keys(content: Mapping[str, Any]) -> dict[str, Any]:
     """Return the content of an earlier version's ``metrics.json`` or ``unseen/report.json`` with today's keys."""
     if content.get("schema", UNSEEN_SCHEMA - 1) >= UNSEEN_SCHEMA:
         return dict(content)
-    found = dict(content)
+    result = dict(content)
     for group in ("identification", "fit", "validation"):
-        found[group] = {name: _score(one) for name, one in found.get(group, {}).items()}
-    for name, lags in found.pop("autocorrelation", {}).items():
-        for sets in (found["fit"], found["validation"]):
-            for row, white in enumerate(sets.get(name, {}).get("whiteness", ())):
-                if white is not None:
-                    white |= {"acf": lags["values"][row], "bound": lags["bound"][row]}
-    tracking = found.get("tracking") or {}
-    found["tracking_failure"] = tracking.get("failure", "")
-    found["tracking"] = {} if found["tracking_failure"] else {name: _replay(one) for name, one in tracking.items()}
-    if "elimination" in found:
+        result[group] = {name: _score(score) for name, score in result.get(group, {}).items()}
+    # autocorrelations stood apart
+    for name, lags in result.pop("autocorrelation", {}).items():
+        for scores in (result["fit"], result["validation"]):
+            for row, whiteness in enumerate(scores.get(name, {}).get("whiteness", ())):
+                if whiteness is not None:
+                    whiteness |= {"acf": lags["values"][row], "bound": lags["bound"][row]}
+    tracking = result.get("tracking") or {}
+    result["tracking_failure"] = tracking.get("failure", "")
+    result["tracking"] = {}
+    if not result["tracking_failure"]:
+        result["tracking"] = {name: _replay(replay) for name, replay in tracking.items()}
+    if "elimination" in result:
         missing = dict.fromkeys(_STEP) | {"residual_std": 0.0, "listed": False}
-        found["elimination"] = [missing | one for one in found["elimination"]]
-        if loop := found.get("loop"):
+        result["elimination"] = [missing | step for step in result["elimination"]]
+        loop = result.get("loop")
+        if loop:
             test = loop.get("durbin_wu_hausman")
-            test = test and test | {"statistic": test["f"]}
-            found["loop"] = loop | {"durbin_wu_hausman": test, "controller": None}
-    if held := found.get("constraints"):
-        found["constraints"] = held | {"binding": [one | {"sigma": one["free_sigma"]} for one in held["binding"]]}
-    return found
+            if test:
+                test = test | {"statistic": test["f"]}
+            result["loop"] = loop | {"durbin_wu_hausman": test, "controller": None}
+    constraints = result.get("constraints")
+    if constraints:
+        binding = [bound | {"sigma": bound["free_sigma"]} for bound in constraints["binding"]]
+        result["constraints"] = constraints | {"binding": binding}
+    return result
 
 
-def _score(one: Mapping[str, Any]) -> dict[str, Any]:
+def _score(score: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a score of an earlier version with today's keys."""
     missing = {"acf": [], **dict.fromkeys(_WHITENESS)}
-    white = [each and missing | each for each in one["whiteness"]]
-    return {"rate": None, "r_squared": [], "motion_share": 1.0} | dict(one) | {"whiteness": white}
+    rows = [whiteness and missing | whiteness for whiteness in score["whiteness"]]
+    return {"rate": None, "r_squared": [], "motion_share": 1.0} | dict(score) | {"whiteness": rows}
 
 
-def _replay(one: Mapping[str, Any]) -> dict[str, Any]:
-    control = one["controller"]
-    rows = {"share": [1.0] * len(control["kp"]), "windup": [None] * len(control["kp"])} if "kp" in control else {}
-    return (
-        {"name": "", "seconds": 0.0, "terms_left_out": []}
-        | dict(one)
-        | {"stated": control["stated"], "controller": {**control, **rows} if rows else None}
-    )
+def _replay(replay: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a replay of an earlier version with today's keys."""
+    stored = replay["controller"]
+    controller = None
+    if "kp" in stored:
+        count = len(stored["kp"])
+        controller = {**stored, "share": [1.0] * count, "windup": [None] * count}
+    missing = {"name": "", "seconds": 0.0, "terms_left_out": []}
+    return missing | dict(replay) | {"stated": stored["stated"], "controller": controller}

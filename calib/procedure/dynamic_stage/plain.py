@@ -25,8 +25,12 @@ from calib.procedure.findings import settle
 from calib.records import Number, frozen
 from calib.robot.chain import Chain
 
-RANK = 1e-2  # singular values of unit-norm columns below this share of the largest are not identified (our choice)
-ROUNDS = 3  # of weighing joints by their residuals
+# singular values of unit-norm columns below this share of the largest are not identified (our choice)
+RANK = 1e-2
+# of weighing joints by their residuals
+ROUNDS = 3
+# parameters of a rigid body
+BODY_PARAMETERS = 10
 
 
 @dataclass(frozen=True)
@@ -44,23 +48,24 @@ class PlainReferences:
     nominal: Number
 
 
-def plain_values(found: Identification[Any]) -> np.ndarray:
+def plain_values(identification: Identification[Any]) -> np.ndarray:
     """Return the parameters (p,) of the identified model by plain weighted least squares.
 
     Terms beyond the standard model are zero; a payload that no training recording carries keeps its known parameters.
     """
-    own = np.arange(found.base.b)
-    data = pool(triangulate(found.rows), found.rows[0].target.shape[1]).select(own)
-    result = np.zeros(len(found.dynamics.values))
-    standard = found.base.to_standard(truncated(data))
+    base, dynamics = identification.base, identification.dynamics
+    torque_rows = identification.rows[0].target.shape[1]
+    data = pool(triangulate(identification.rows), torque_rows).select(np.arange(base.b))
+    standard = base.to_standard(truncated(data))
+    result = np.zeros(len(dynamics.values))
     result[: len(standard)] = standard
     estimated = np.zeros(len(result), dtype=bool)
-    estimated[found.base.kept] = True
-    if hasattr(found.dynamics.model, "bodies"):
-        for number, label in enumerate(found.dynamics.model.bodies.labels):
-            first = slice(10 * number, 10 * number + 10)
-            if label in found.settings.payloads and not estimated[first].any():
-                result[first] = found.dynamics.values[first]
+    estimated[base.kept] = True
+    if hasattr(dynamics.model, "bodies"):
+        for number, label in enumerate(dynamics.model.bodies.labels):
+            body = slice(BODY_PARAMETERS * number, BODY_PARAMETERS * (number + 1))
+            if label in identification.settings.payloads and not estimated[body].any():
+                result[body] = dynamics.values[body]
     return frozen(result)
 
 
@@ -73,9 +78,11 @@ def truncated(data: Triangles) -> np.ndarray:
     weight, values = np.ones(data.groups), np.zeros(data.parameters)
     for _ in range(ROUNDS):
         stacked = (data.factors * weight[:, None, None]).reshape(-1, data.parameters + 1)
-        norms = np.linalg.norm(stacked[:, :-1], axis=0)
+        columns, target = stacked[:, :-1], stacked[:, -1]
+        norms = np.linalg.norm(columns, axis=0)
         scale = np.where(norms > 0.0, norms, 1.0)
-        values = np.linalg.lstsq(stacked[:, :-1] / scale, stacked[:, -1], rcond=RANK)[0] / scale
+        scaled_values, *_ = np.linalg.lstsq(columns / scale, target, rcond=RANK)
+        values = scaled_values / scale
         std = np.sqrt(data.residual_squares(values) / np.maximum(data.rows, 1))
         weight = 1.0 / np.maximum(std, 1e-9 * max(float(std.max()), 1e-300))
     return values
@@ -115,13 +122,15 @@ def references(
     """
     result = {}
     for case in cases:
-        scored = scores[case.name]
-        errors = [np.nan, np.nan]
-        for place, values in enumerate((plain, nominal)):
+        score = scores[case.name]
+        errors = []
+        for values in (plain, nominal):
+            error = np.nan
             if values is not None and len(values) == len(dynamics.values):
                 predicted = predict(Dynamics(dynamics.model, values), case)
-                errors[place] = _unexplained(case, predicted, scored.stands, slow, apart)
-        result[case.name] = PlainReferences(scored.judged.total, *errors)
+                error = _unexplained(case, predicted, score.stands, slow, apart)
+            errors.append(error)
+        result[case.name] = PlainReferences(score.judged.total, *errors)
     return result
 
 
@@ -130,22 +139,28 @@ def _unexplained(
 ) -> float:
     """Return 100 ‖τ - τ̂‖ / ‖τ‖ [%] of a case, of joints in motion alone if asked."""
     motion = case.motion
-    used = np.repeat(motion.weight[:, None] > 0.5, case.target.shape[1], axis=1)
+    rows = case.target.shape[1]
+    counted = np.repeat(motion.weight[:, None] > 0.5, rows, axis=1)
     if in_motion:
         moves = moving(motion) if slow is None else moving(motion, slow)
-        used &= moves[:, np.arange(case.target.shape[1]) % motion.n]
-    used[:, list(apart)] = False
-    left, size = float(np.sum((case.target - predicted)[used] ** 2)), float(np.sum(case.target[used] ** 2))
-    return 100.0 * float(np.sqrt(left / size)) if size > 0.0 else np.nan
+        counted &= moves[:, np.arange(rows) % motion.n]
+    counted[:, list(apart)] = False
+    residual_squares = float(np.sum((case.target - predicted)[counted] ** 2))
+    squares = float(np.sum(case.target[counted] ** 2))
+    return 100.0 * float(np.sqrt(residual_squares / squares)) if squares > 0.0 else np.nan
 
 
-def worse_than_plain(beside: Mapping[str, PlainReferences]) -> list[Finding]:
+def worse_than_plain(errors_by_file: Mapping[str, PlainReferences]) -> list[Finding]:
     """Return the finding on the held-out recording where plain least squares beats the model most, if it does."""
-    known = {name: one for name, one in beside.items() if np.isfinite(one.plain) and one.plain > 0.0}
-    if not known:
+    ratios = {}
+    for name, errors in errors_by_file.items():
+        if np.isfinite(errors.plain) and errors.plain > 0.0:
+            ratios[name] = errors.delivered / errors.plain
+    if not ratios:
         return []
-    name = max(known, key=lambda key: known[key].delivered / known[key].plain)
-    worst = known[name]
-    times = worst.delivered / worst.plain
-    one = finding("torque-worse-than-plain", file=name, times=times, delivered=worst.delivered, plain=worst.plain)
-    return list(settle([one]))
+    name = max(ratios, key=ratios.__getitem__)
+    worst = errors_by_file[name]
+    candidate = finding(
+        "torque-worse-than-plain", file=name, times=ratios[name], delivered=worst.delivered, plain=worst.plain
+    )
+    return list(settle([candidate]))

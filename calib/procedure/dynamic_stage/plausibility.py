@@ -4,11 +4,11 @@ The limits and sentences stand there. A finding that makes the numbers of a mode
 holds it at marginal, until the options' ``accept`` says that it is intended.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from calib.column_changes import Explanation
+from calib.column_changes import Change, Explanation
 from calib.data.recordings.checks import LIMITS as RECORDED
 from calib.errors import Finding, finding
 from calib.identification.checks.recording_sizes import FOLLOWS, ClockRatio, RecordingSizes, compare_sizes, signs_of
@@ -23,6 +23,16 @@ from calib.robot.chain import Chain
 from calib.robot.description import impossible_bodies
 from calib.units import TORQUE
 
+# of the velocities over the differentiated positions: at a joint, at all joints alike, and in sigmas (our choice)
+MIN_SPEED_ERROR = 0.05
+MIN_COMMON_SPEED_ERROR = 0.02
+MIN_SPEED_SIGMAS = 5.0
+# relative sigma of a robot's inertias over masses from its lengths (our choice)
+RODS_SIGMA = 0.17
+# of the loop's factors at the joints: spread below which they are one, and distance from 1 that counts (our choice)
+MAX_FACTOR_SPREAD = 0.1
+MIN_FACTOR_ERROR = 0.1
+
 
 def implausible(
     inputs: IdentificationInputs, impossible_by: Contradiction | None, loop: LoopDisagreement | None
@@ -34,46 +44,64 @@ def implausible(
         loop: disagreement of recorded torques with an estimate that relies on the stated loop.
     """
     chain, gravity = inputs.chain, inputs.options.settings.gravity
+    cases = [*inputs.cases, *inputs.unseen]
     hypotheses = gravity_hypotheses(inputs)
     if hypotheses is not None and hypotheses.direction is not None:
         # columns that seem exchanged or coupled under a wrong gravity need not be
         x, y, z = hypotheses.direction.tolist()
         gravity = (x, y, z)
     sizes = [compare_sizes(case, chain, gravity, inputs.unit == TORQUE) for case in inputs.cases]
-    signs = {case.name: signs_of(case, chain, gravity) for case in (*inputs.cases, *inputs.unseen)}
-    found = [
-        *gravity_findings(hypotheses, chain.joint_names),
-        *load_findings(inputs, gravity),
-        *standing_columns([*inputs.cases, *inputs.unseen], chain.joint_names),
-        *findings(sizes, chain.joint_names),
-        *impossible(impossible_by),
-        *another_loop(loop),
-        *described(chain),
-    ]
+    signs = {case.name: signs_of(case, chain, gravity) for case in cases}
+    result = gravity_findings(hypotheses, chain.joint_names)
+    result += load_findings(inputs, gravity)
+    result += standing_columns(cases, chain.joint_names)
+    result += findings(sizes, chain.joint_names)
+    result += impossible(impossible_by)
+    result += another_loop(loop)
+    result += described(chain)
     for label, load in inputs.options.settings.payloads.items():
         if not load.parameters and not any(label in case.carried for case in inputs.cases):
-            found.append(finding("payload-never", label=label))
-    return settle([*found, *wrong_joints(signs, chain.joint_names)], inputs.options.accept)
+            result.append(finding("payload-never", label=label))
+    result += wrong_joints(signs, chain.joint_names)
+    return settle(result, inputs.options.accept)
 
 
 def findings(sizes: Sequence[RecordingSizes], joints: Sequence[str]) -> list[Finding]:
     """Return the findings on implausible recordings."""
-    found: list[Finding] = []
-    for each in sizes:
-        speed = list(_speed(each, joints))
-        found += [*_limits(each, joints), *_masses(each, joints), *speed]
-        found += [] if speed else _clock(each.name, each.clock)
-        found += [*_unlike(each, joints), *_lag(each.name, each.lag, joints)]
-        if (other := each.other) is not None:
-            sizes_left = dict(factor=other.factor, gain=1.0 - other.factor, explained=1.0 - max(other.after))
-            found.append(other.finding(joints, file=each.name, **sizes_left))
-        found += [finding("position-jump", file=each.name, jump=words) for words in each.jumps]
-    return [one for one in found if level_of(one)]
+    result: list[Finding] = []
+    for recording in sizes:
+        result += _limits(recording, joints)
+        result += _masses(recording, joints)
+        speed = list(_speed(recording, joints))
+        result += speed
+        # velocities that disagree with the positions say the same of the clock
+        if not speed:
+            result += _clock(recording.name, recording.clock)
+        result += _unlike(recording, joints)
+        result += _lag(recording.name, recording.lag, joints)
+        change = recording.other
+        if change is not None:
+            result.append(
+                change.finding(
+                    joints,
+                    file=recording.name,
+                    factor=change.factor,
+                    gain=1.0 - change.factor,
+                    explained=1.0 - max(change.after),
+                )
+            )
+        result += [finding("position-jump", file=recording.name, jump=jump) for jump in recording.jumps]
+    return _of_some_level(result)
+
+
+def _of_some_level(candidates: Iterable[Finding]) -> list[Finding]:
+    """Return the findings that reach a level of the catalogue."""
+    return [candidate for candidate in candidates if level_of(candidate)]
 
 
 def standing_columns(cases: Sequence[Case], joints: Sequence[str]) -> list[Finding]:
     """Return the findings on clipped torques, and on positions and velocities that stand while their joint moves."""
-    found = []
+    result = []
     for case in cases:
         clipped, values = [], []
         for fault in case.motion.faults:
@@ -83,103 +111,117 @@ def standing_columns(cases: Sequence[Case], joints: Sequence[str]) -> list[Findi
                 clipped.append(joint)
                 values.append(f"{extremes} in {fault.share:.0%} of its motion")
                 continue
-            span = {"file": case.name, "joint": joint, "start": fault.start, "stop": fault.stop, "share": fault.share}
-            if fault.kind == "velocity":
-                found.append(finding("velocity-stands", missed=fault.missed, **span))
-            else:
-                found.append(finding("encoder-stands", missed=fault.missed, **span))
+            code = "velocity-stands" if fault.kind == "velocity" else "encoder-stands"
+            result.append(
+                finding(
+                    code,
+                    missed=fault.missed,
+                    file=case.name,
+                    joint=joint,
+                    start=fault.start,
+                    stop=fault.stop,
+                    share=fault.share,
+                )
+            )
         if clipped:
-            found.append(finding("torque-clipped", file=case.name, joints=clipped, values=values))
-    return [one for one in found if level_of(one)]
+            result.append(finding("torque-clipped", file=case.name, joints=clipped, values=values))
+    return _of_some_level(result)
 
 
-def wrong_joints(found: Mapping[str, Explanation | None], joints: Sequence[str]) -> list[Finding]:
+def wrong_joints(explanations: Mapping[str, Explanation | None], joints: Sequence[str]) -> list[Finding]:
     """Return the findings on joints, by name, with a reversed sign or an angle relative to another joint."""
-    wrong = []
-    for name, each in found.items():
-        if each is None:
+    result = []
+    for name, explanation in explanations.items():
+        if explanation is None:
             continue
-        concerned = sorted({change.joints[0] for change in each.changes})
-        for change in sorted(each.changes, key=lambda one: one.joints):
+        changed = sorted({change.joints[0] for change in explanation.changes})
+        for change in sorted(explanation.changes, key=_joints_of_change):
             j, k = change.joints[0], change.joints[-1]
-            wrong.append(
+            result.append(
                 finding(
                     change.code,
                     file=name,
                     joint=joints[j],
                     other=joints[k],
                     **change.values,
-                    before=np.sqrt(each.before[j]),
-                    after=np.sqrt(each.after[j]),
-                    gain=1.0 - each.factor,
-                    factor=each.factor,
-                    explained=1.0 - max(each.after[concerned]),
+                    before=np.sqrt(explanation.before[j]),
+                    after=np.sqrt(explanation.after[j]),
+                    gain=1.0 - explanation.factor,
+                    factor=explanation.factor,
+                    explained=1.0 - max(explanation.after[changed]),
                 )
             )
-    return [one for one in wrong if level_of(one)]
+    return _of_some_level(result)
 
 
-def impossible(found: Contradiction | None) -> list[Finding]:
+def _joints_of_change(change: Change) -> Sequence[int]:
+    return change.joints
+
+
+def impossible(contradiction: Contradiction | None) -> list[Finding]:
     """Return the finding that an estimate is far from every physically consistent robot."""
-    if found is None:
+    if contradiction is None:
         return []
-    one = finding(
+    candidate = finding(
         "no-possible-robot",
-        distance=found.distance,
-        allowed=found.allowed,
-        unexplained=found.unexplained,
-        times=found.distance / found.allowed,
+        distance=contradiction.distance,
+        allowed=contradiction.allowed,
+        unexplained=contradiction.unexplained,
+        times=contradiction.distance / contradiction.allowed,
     )
-    return [one] if level_of(one) else []
+    return _of_some_level([candidate])
 
 
 def described(chain: Chain) -> list[Finding]:
     """Return the finding on physically inconsistent bodies in the robot's description."""
-    wrong = impossible_bodies(chain)
-    return [finding("inconsistent-bodies", bodies=wrong)] if wrong else []
+    bodies = impossible_bodies(chain)
+    return [finding("inconsistent-bodies", bodies=bodies)] if bodies else []
 
 
-def another_loop(found: LoopDisagreement | None) -> list[Finding]:
+def another_loop(disagreement: LoopDisagreement | None) -> list[Finding]:
     """Return the finding that recorded torques contradict an estimate based on the given control loop."""
-    if found is None:
+    if disagreement is None:
         return []
-
-    def shown(numbers: Sequence[float]) -> list[str]:
-        return [f"{x:.3g}" for x in numbers]
-
-    times, median = np.array(found.factor), float(np.median(found.factor))
-    scaled = bool(np.ptp(times) < 0.1 * abs(median) and abs(median - 1.0) > 0.1)
-    by_joint = not scaled and bool(np.any(np.abs(times - 1.0) > 0.1))
+    factors, median = np.array(disagreement.factor), float(np.median(disagreement.factor))
+    # one factor at all joints, or one at each, or else another velocity
+    scaled = bool(np.ptp(factors) < MAX_FACTOR_SPREAD * abs(median) and abs(median - 1.0) > MIN_FACTOR_ERROR)
+    by_joint = not scaled and bool(np.any(np.abs(factors - 1.0) > MIN_FACTOR_ERROR))
     return [
         finding(
             "loop-refuted",
-            method=found.method,
-            other=found.beside,
-            parameter=found.parameter,
-            sigmas=found.sigmas,
-            worst=max(found.left),
-            left=shown(found.left),
-            other_left=shown(found.beside_left),
+            method=disagreement.method,
+            other=disagreement.beside,
+            parameter=disagreement.parameter,
+            sigmas=disagreement.sigmas,
+            worst=max(disagreement.left),
+            left=_three_digits(disagreement.left),
+            other_left=_three_digits(disagreement.beside_left),
             times=median if scaled else None,
-            factors=shown(found.factor) if by_joint else (),
+            factors=_three_digits(disagreement.factor) if by_joint else (),
             velocity="" if scaled or by_joint else "reference_velocity",
         )
     ]
 
 
-def _masses(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
+def _three_digits(numbers: Sequence[float]) -> list[str]:
+    return [f"{number:.3g}" for number in numbers]
+
+
+def _masses(recording: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
     """Yield findings on the signs and sizes of torques compared with the robot's masses."""
-    share = each.masses
-    sure = np.flatnonzero(np.isfinite(share)).tolist()
-    if not sure:
+    share = recording.masses
+    determined = np.flatnonzero(np.isfinite(share)).tolist()
+    if not determined:
         return
-    if against := [joints[j] for j in sure if share[j] < 0.0]:
-        yield finding("torques-against-masses", file=each.name, joints=against)
+    against = [joints[j] for j in determined if share[j] < 0.0]
+    if against:
+        yield finding("torques-against-masses", file=recording.name, joints=against)
         return
-    shares = [f"{joints[j]} {share[j]:.2g}" for j in sure]
-    all_off = finding("torques-unlike-masses", file=each.name, times=_off(np.median(share[sure])), shares=shares)
-    one_off = finding("torque-of-joint-unlike-masses", file=each.name, times=_off(share[sure]), shares=shares)
-    yield all_off if level_of(all_off) else one_off
+    shares = [f"{joints[j]} {share[j]:.2g}" for j in determined]
+    common, largest = _off(np.median(share[determined])), _off(share[determined])
+    of_all = finding("torques-unlike-masses", file=recording.name, times=common, shares=shares)
+    of_joint = finding("torque-of-joint-unlike-masses", file=recording.name, times=largest, shares=shares)
+    yield of_all if level_of(of_all) else of_joint
 
 
 def _off(ratio: np.ndarray | np.floating) -> float:
@@ -188,79 +230,86 @@ def _off(ratio: np.ndarray | np.floating) -> float:
     return float(np.maximum(sizes, 1.0 / sizes).max())
 
 
-def _limits(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
+def _limits(recording: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
     """Yield findings on torques a thousand times too large or too small for the joints' limits: another unit."""
-    known = np.isfinite(each.limits)
+    known = np.isfinite(recording.limits)
     if not known.any():
         return
-    largest = float(each.limits[known].max())
+    largest = float(recording.limits[known].max())
 
-    def beyond(times: float, digits: int) -> list[str]:
-        far = np.flatnonzero(known & (each.limits > times)).tolist()
-        return [f"{joints[j]} {each.limits[j]:.{digits}g}" for j in far]
+    def above(times: float, digits: int) -> list[str]:
+        rows = np.flatnonzero(known & (recording.limits > times)).tolist()
+        return [f"{joints[j]} {recording.limits[j]:.{digits}g}" for j in rows]
 
-    if far := beyond(RECORDED.max_effort, 3):
-        yield finding("torques-in-another-unit", file=each.name, joints=far)
-    else:
-        over = beyond(limit("torques-beyond-limits", "times", "marginal"), 2)
-        yield finding("torques-beyond-limits", file=each.name, joints=over, times=largest)
-        yield finding("torques-below-limits", file=each.name, share=largest, short=1.0 / max(largest, 1e-300))
+    in_another_unit = above(RECORDED.max_effort, 3)
+    if in_another_unit:
+        yield finding("torques-in-another-unit", file=recording.name, joints=in_another_unit)
+        return
+    over = above(limit("torques-beyond-limits", "times", "marginal"), 2)
+    yield finding("torques-beyond-limits", file=recording.name, joints=over, times=largest)
+    yield finding("torques-below-limits", file=recording.name, share=largest, short=1.0 / max(largest, 1e-300))
 
 
-def _speed(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
+def _speed(recording: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
     """Compare measured velocities with the differentiated positions."""
-    min_off, min_common_off, min_sigmas = 0.05, 0.02, 5.0  # at a joint; at all joints alike (our choice)
-    ratio = each.speed
+    ratio = recording.speed
     known = np.flatnonzero(np.isfinite(ratio))
-    usual = float(np.median(ratio[known])) if len(known) else 1.0
-    alike = len(known) > 1 and np.ptp(ratio[known]) < min_common_off * usual
-    least = min_common_off if alike else np.maximum(min_off, min_sigmas * each.speed_sigma)
-    off = np.flatnonzero(np.abs(np.nan_to_num(ratio, nan=1.0) - 1.0) > least).tolist()
-    if not off:
+    median = float(np.median(ratio[known])) if len(known) else 1.0
+    alike = len(known) > 1 and np.ptp(ratio[known]) < MIN_COMMON_SPEED_ERROR * median
+    threshold = MIN_COMMON_SPEED_ERROR
+    if not alike:
+        threshold = np.maximum(MIN_SPEED_ERROR, MIN_SPEED_SIGMAS * recording.speed_sigma)
+    wrong = np.flatnonzero(np.abs(np.nan_to_num(ratio, nan=1.0) - 1.0) > threshold).tolist()
+    if not wrong:
         return
     if not alike:
-        named = [f"{joints[j]} ({ratio[j]:.3g})" for j in off]
-        yield finding("velocities-unlike-positions", file=each.name, joints=named, times=_off(ratio[off]))
+        names = [f"{joints[j]} ({ratio[j]:.3g})" for j in wrong]
+        yield finding("velocities-unlike-positions", file=recording.name, joints=names, times=_off(ratio[wrong]))
         return
-    clock = each.clock
+    clock = recording.clock
     yield finding(
         "velocities-scaled",
-        file=each.name,
-        factor=usual,
-        times=_off(ratio[off]),
-        rate=each.rate,
-        counted=usual * each.rate,
-        size=max(usual, 1.0 / usual),
-        way="large" if usual > 1.0 else "small",
-        against=_against(clock, usual),
+        file=recording.name,
+        factor=median,
+        times=_off(ratio[wrong]),
+        rate=recording.rate,
+        counted=median * recording.rate,
+        size=max(median, 1.0 / median),
+        way="large" if median > 1.0 else "small",
+        against=_against(clock, median),
         ratio=clock and clock.ratio,
         sigma=clock and clock.relative_sigma,
     )
 
 
-def _against(clock: ClockRatio | None, usual: float) -> str:
+def _against(clock: ClockRatio | None, speed_ratio: float) -> str:
     """Return ``stamps`` or ``velocities``: whichever disagrees with the ratio of inertias to masses; "" if neither."""
     if clock is None:
         return ""
-    rods_sigma = 0.17  # relative, of a robot's inertias over masses from its lengths (our choice)
-    stamps_off, velocities_off = abs(float(np.log(clock.ratio))), abs(float(np.log(clock.ratio / usual**2)))
-    if abs(stamps_off - velocities_off) < 2.0 * np.hypot(rods_sigma, clock.relative_sigma):
+    stamps_error = abs(float(np.log(clock.ratio)))
+    velocities_error = abs(float(np.log(clock.ratio / speed_ratio**2)))
+    if abs(stamps_error - velocities_error) < 2.0 * np.hypot(RODS_SIGMA, clock.relative_sigma):
         return ""
-    return "stamps" if velocities_off < stamps_off else "velocities"
+    return "stamps" if velocities_error < stamps_error else "velocities"
 
 
-def _unlike(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
+def _unlike(recording: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
     """Yield the finding on joints whose measured velocities do not match the positions."""
-    backwards = [joints[j] for j in np.flatnonzero(each.follows < -FOLLOWS).tolist()]
-    others = [joints[j] for j in np.flatnonzero(np.abs(each.follows) <= FOLLOWS).tolist()]
-    if backwards or others:
-        clock = "these velocities" if each.counted else "the stamps"
+    backwards = [joints[j] for j in np.flatnonzero(recording.follows < -FOLLOWS).tolist()]
+    unrelated = [joints[j] for j in np.flatnonzero(np.abs(recording.follows) <= FOLLOWS).tolist()]
+    if backwards or unrelated:
         yield finding(
-            "velocities-astray", file=each.name, backwards=backwards, others=others, counted=each.counted, clock=clock
+            "velocities-astray",
+            file=recording.name,
+            backwards=backwards,
+            others=unrelated,
+            counted=recording.counted,
+            clock="these velocities" if recording.counted else "the stamps",
         )
 
 
 def _lag(name: str, lag: Lag | None, joints: Sequence[str]) -> Iterator[Finding]:
+    """Yield the findings on torques that are late at all joints, and at one joint."""
     if lag is None:
         return
     if lag.certain:
@@ -269,34 +318,41 @@ def _lag(name: str, lag: Lag | None, joints: Sequence[str]) -> Iterator[Finding]
             file=name,
             by=abs(lag.seconds),
             sigma=lag.sigma,
-            way=_way(lag.seconds),
+            way=_direction(lag.seconds),
             lag=lag.seconds,
             before=lag.before,
             after=lag.after,
             times=lag.factor,
         )
-    if (j := lag.joint) is not None:
-        apart = float(lag.own[j] - lag.seconds)
+    j = lag.joint
+    if j is not None:
+        difference = float(lag.own[j] - lag.seconds)
         yield finding(
-            "joint-late", file=name, joint=joints[j], by=abs(apart), way=_way(apart), times=float(lag.gains[j])
+            "joint-late",
+            file=name,
+            joint=joints[j],
+            by=abs(difference),
+            way=_direction(difference),
+            times=float(lag.gains[j]),
         )
 
 
-def _way(seconds: float) -> str:
+def _direction(seconds: float) -> str:
     return "later" if seconds > 0 else "earlier"
 
 
-def _clock(name: str, found: ClockRatio | None) -> Iterator[Finding]:
-    if found is None:
+def _clock(name: str, clock: ClockRatio | None) -> Iterator[Finding]:
+    """Yield the finding on stamps that contradict the ratio of inertias to masses."""
+    if clock is None:
         return
-    times = _off(np.float64(found.ratio))
+    times = _off(np.float64(clock.ratio))
     yield finding(
         "clock-off",
         file=name,
-        ratio=found.ratio,
-        sigma=found.relative_sigma,
+        ratio=clock.ratio,
+        sigma=clock.relative_sigma,
         times=times,
-        surely=times * float(np.exp(-2.0 * found.relative_sigma)),
-        stamps=max(found.clock, 1.0 / found.clock),
-        way="large" if found.clock > 1.0 else "small",
+        surely=times * float(np.exp(-2.0 * clock.relative_sigma)),
+        stamps=max(clock.clock, 1.0 / clock.clock),
+        way="large" if clock.clock > 1.0 else "small",
     )

@@ -39,6 +39,17 @@ from calib.identification.rows import Case, segments
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.robot.chain import Chain
 
+# [s] of a recording that are replayed
+MAX_SECONDS = 20.0
+# recordings that are replayed
+MAX_REPLAYS = 3
+# least eigenvalue of a physically consistent robot's inertia, scaled by its diagonal
+MIN_EIGENVALUE = 0.05
+# [kg m² or kg] least inertia of a joint
+MIN_INERTIA = 1e-3
+# of a sign, in Fc h / inertia: Runge and Kutta's bound in 64 steps at `MIN_EIGENVALUE` is 0.11
+MIN_SMOOTHING = 0.25
+
 
 def replay(
     chain: Chain,
@@ -65,95 +76,92 @@ def replay(
     require(model.torque_rows.with_motors, f"rows '{model.torque_rows.name}' do not contain the whole motor torque")
     part = _stretch(case)
     motion = case.motion
-    robot, left_out = _robot(dynamics, case)
-    reference, every = _reference(take(case, part), rate)
-    robot, added = _possible(robot, reference)
-    if controller is None:
-        control = _default(robot, reference)
-    else:
-        control = replace(controller, ahead=None)
-    sampled = np.arange(part.stop - part.start)
+    robot, omitted = _robot(dynamics, case)
+    reference, periods = _reference(take(case, part), rate)
+    robot, inertia_added = _with_inertia(robot, reference)
+    feedback = _default(robot, reference) if controller is None else replace(controller, ahead=None)
+    samples = np.arange(part.stop - part.start)
 
-    def controlled(torque: np.ndarray) -> np.ndarray:
-        spline = CubicSpline(sampled, torque[part, -n:])
-        return spline(np.arange(len(reference.t)) / every)
+    def at_control_rate(torque: np.ndarray) -> np.ndarray:
+        spline = CubicSpline(samples, torque[part, -n:])
+        return spline(np.arange(len(reference.t)) / periods)
 
-    measured = controlled(np.asarray(case.target))
-    ahead: dict[str, np.ndarray | None] = {FEEDBACK: None}
+    measured = at_control_rate(np.asarray(case.target))
+    feedforwards: dict[str, np.ndarray | None] = {FEEDBACK: None}
     if chain.inertias is not None:
+        bodies = standard_parameters(chain)
         values = np.zeros(model.inertial)
-        parameters = standard_parameters(chain)
-        values[: len(parameters)] = parameters
-        ahead[CAD] = feed_forward(Plant(model.bodies, (), values), reference)
-    ahead |= {IDENTIFIED: controlled(predicted), FLOOR: measured}
-    push = feed_forward(robot, reference) - measured
-    rms = {name: tracking_error(robot, control, reference, push_, push) for name, push_ in ahead.items()}
+        values[: len(bodies)] = bodies
+        feedforwards[CAD] = feed_forward(Plant(model.bodies, (), values), reference)
+    feedforwards[IDENTIFIED] = at_control_rate(predicted)
+    feedforwards[FLOOR] = measured
+    disturbance = feed_forward(robot, reference) - measured
+    rms = {}
+    for name, feedforward in feedforwards.items():
+        rms[name] = tracking_error(robot, feedback, reference, feedforward, disturbance)
     seconds = float(motion.t[part.stop - 1] - motion.t[part.start])
-    return Replay(case.name, seconds, control, controller is not None, left_out, added, rms)
+    return Replay(case.name, seconds, feedback, controller is not None, omitted, inertia_added, rms)
 
 
-def _stretch(case: Case, max_seconds: float = 20.0) -> slice:
-    """Return the slice of the longest part without gaps, cut to `max_seconds`.
-
-    `max_seconds`: [s] of a recording that are replayed.
-    """
+def _stretch(case: Case) -> slice:
+    """Return the slice of the longest part without gaps, cut to `MAX_SECONDS`."""
     first, last = max(segments(case.motion.segment), key=lambda ends: ends[1] - ends[0])
-    return slice(first, min(last, first + int(max_seconds * case.motion.rate)))
+    return slice(first, min(last, first + int(MAX_SECONDS * case.motion.rate)))
 
 
 def _robot(dynamics: Dynamics, case: Case) -> tuple[Plant, tuple[str, ...]]:
     """Return the model as a robot with the case's payloads, and the names of terms that cannot be simulated."""
     model = dynamics.model
-    bodies = model.inertial
-    simulated = [column.form.of_velocity or column.shape == "acceleration" for column in model.columns]
-    columns = np.flatnonzero(simulated)
-    terms = tuple(replace(model.columns[k], side="motor") for k in columns)
-    values = dynamics.values[:bodies] * model.carried_columns(case.carried)
-    left_out = tuple(column.name for column, is_simulated in zip(model.columns, simulated) if not is_simulated)
-    return Plant(model.bodies, terms, np.concatenate([values, dynamics.values[bodies:][columns]])), left_out
+    bodies, drives = dynamics.values[: model.inertial], dynamics.values[model.inertial :]
+    terms, values, omitted = [], [], []
+    for term, value in zip(model.columns, drives):
+        if term.form.of_velocity or term.shape == "acceleration":
+            terms.append(replace(term, side="motor"))
+            values.append(value)
+        else:
+            omitted.append(term.name)
+    parameters = np.concatenate([bodies * model.carried_columns(case.carried), np.array(values)])
+    return Plant(model.bodies, tuple(terms), parameters), tuple(omitted)
 
 
 def _reference(part: Case, rate: float | None) -> tuple[Reference, float]:
     """Return the recorded motion as a reference at the control rate, and the control periods per sample."""
     motion = part.motion
-    every = periods_per_sample(motion, rate)
+    periods = periods_per_sample(motion, rate)
     samples = np.arange(len(motion))
-    indices = np.arange(int((len(motion) - 1) * every + 1e-9) + 1) / every
-    series = [CubicSpline(samples, x)(indices) for x in (motion.q, motion.v, motion.a)]
-    return Reference(indices / motion.rate, *series), every
+    # the control instants, in samples
+    instants = np.arange(int((len(motion) - 1) * periods + 1e-9) + 1) / periods
+    q, v, a = (CubicSpline(samples, series)(instants) for series in (motion.q, motion.v, motion.a))
+    return Reference(instants / motion.rate, q, v, a), periods
 
 
-def _possible(robot: Plant, reference: Reference, min_eigenvalue: float = 0.05) -> tuple[Plant, np.ndarray]:
+def _with_inertia(robot: Plant, reference: Reference) -> tuple[Plant, np.ndarray]:
     """Return the robot with motor inertia added until M(q) is positive definite, and the added inertia (n,).
 
-    The least eigenvalue of its inertia matrix along the reference, scaled by its diagonal, becomes `min_eigenvalue`.
-
-    `min_eigenvalue`: least eigenvalue of a possible robot's inertia, scaled by its diagonal.
+    The least eigenvalue of its inertia matrix along the reference, scaled by its diagonal, becomes `MIN_EIGENVALUE`.
     """
-    bodies = robot.bodies
-    first = robot.inertial
     inertia = robot.inertia(reference.q[::50])
-    # [kg m² or kg] least inertia of a joint
-    min_inertia = 1e-3
-    size = np.maximum(np.abs(np.einsum("kii->i", inertia)) / len(inertia), min_inertia)
-    minimum = float(np.linalg.eigvalsh(inertia / np.sqrt(np.outer(size, size)))[:, 0].min())
-    added = max(0.0, min_eigenvalue - minimum) * size
-    softer = tuple(_softer(term, value, size, reference) for term, value in zip(robot.terms, robot.parameters[first:]))
-    robot = replace(robot, terms=softer)
+    diagonal = np.abs(np.einsum("kii->i", inertia)) / len(inertia)
+    size = np.maximum(diagonal, MIN_INERTIA)
+    eigenvalues = np.linalg.eigvalsh(inertia / np.sqrt(np.outer(size, size)))
+    smallest = float(eigenvalues[:, 0].min())
+    added = max(0.0, MIN_EIGENVALUE - smallest) * size
+    drives = robot.parameters[robot.inertial :]
+    smoothed = [_smoothed(term, value, size, reference) for term, value in zip(robot.terms, drives)]
+    robot = replace(robot, terms=tuple(smoothed))
     if not added.any():
         return robot, added
-    extra = tuple(replace(column, name=f"added {column.name}") for column in standard(["Ia"] * bodies.n))
-    return Plant(bodies, (*robot.terms, *extra), np.concatenate([robot.parameters, added])), added
+    motors = [replace(term, name=f"added {term.name}") for term in standard(["Ia"] * robot.bodies.n)]
+    return Plant(robot.bodies, (*robot.terms, *motors), np.concatenate([robot.parameters, added])), added
 
 
-def _softer(term: DriveTerm, value: float, size: np.ndarray, reference: Reference) -> DriveTerm:
+def _smoothed(term: DriveTerm, value: float, size: np.ndarray, reference: Reference) -> DriveTerm:
     """Return a drive term whose sign function is smooth enough to integrate at this control period."""
     if "v0" not in term.form.settings:
         return term
-    # of a sign, in Fc h / inertia: Runge and Kutta's bound in 64 steps at `min_eigenvalue` is 0.11
-    min_smoothing = 0.25
-    minimum = min_smoothing * abs(value) * reference.period / size[term.acts[0][0]]
-    return replace(term, settings=(*term.settings[:-1], max(term.settings[-1], minimum)))
+    min_v0 = MIN_SMOOTHING * abs(value) * reference.period / size[term.acts[0][0]]
+    *settings, v0 = term.settings
+    return replace(term, settings=(*settings, max(v0, min_v0)))
 
 
 def _default(robot: Plant, reference: Reference) -> Controller:
@@ -176,16 +184,15 @@ def track(
     """
     chain = inputs.chain
     loop = inputs.options.settings.loop
-    max_replays = 3
-    chosen = inputs.unseen[:max_replays] or inputs.cases[:1]
+    unseen = bool(inputs.unseen)
+    replays = {}
     try:
         if loop is None or loop.controller != "identify":
             controller = loop and stated_controller(loop, chain.n)
-        if controller is None or loop is None:
-            rate = None
-        else:
-            rate = loop.rate
-        replays = (replay(chain, dynamics, case, predictions[case.name], controller, rate) for case in chosen)
-        return {replay.name: replace(replay, unseen=bool(inputs.unseen)) for replay in replays}, ""
+        rate = None if controller is None or loop is None else loop.rate
+        for case in inputs.unseen[:MAX_REPLAYS] or inputs.cases[:1]:
+            simulated = replay(chain, dynamics, case, predictions[case.name], controller, rate)
+            replays[simulated.name] = replace(simulated, unseen=unseen)
     except CalibError as error:
         return {}, str(error)
+    return replays, ""

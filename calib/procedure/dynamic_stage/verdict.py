@@ -21,12 +21,25 @@ from calib.identification.uncertainty.torque_errors import COVERED, TorqueInterv
 from calib.procedure.findings import Verdict, limit, lines_of, sentence, settle
 from calib.robot.chain import Chain
 
-BEYOND = 0.05  # of a joint's range by which a recording may leave it: encoders and limits of a CAD are not exact
-MOVES = 0.1  # share of moving rows below which a recording is no motion
-BEND = 1e-4  # rms of link minus motor position that shows elasticity [rad or m]
-SURELY = 2.0  # sigmas below zero from which on a drive's inertia or friction is called negative
+# of a joint's range by which a recording may leave it: encoders and limits of a CAD are not exact
+BEYOND = 0.05
+# share of moving rows below which a recording is no motion
+MOVES = 0.1
+# rms of link minus motor position that shows elasticity [rad or m]
+BEND = 1e-4
+# sigmas below zero from which on a drive's inertia or friction is called negative
+SURELY = 2.0
 # neighbouring rows that count as one from which on a residual is unmodelled dynamics, not noise
 MAX_CORRELATED_ROWS = 3.0
+# of all training files together [s] (our choice)
+MIN_MOTION = 3.0
+# share of the greatest joint's rms torque from which on a joint's torque matters
+MATTERS = 0.1
+# of the errors within intervals that state 0.95, of all joints and of one: it may be missed twice as often (our choice)
+MIN_COVERED = 0.93
+MIN_COVERED_AT_JOINT = 0.90
+# sigmas of chance by which a coverage may be lower
+CHANCE_SIGMAS = 3.0
 
 
 @dataclass(frozen=True)
@@ -70,44 +83,47 @@ def judge(
         rows: what the torque rows are called, see `calib.dynamics.torque_rows.TorqueRows.numbered`; default 1, 2, ...
         coordinate: what such a row belongs to, in a word.
     """
-    moves = {name: scored for name, scored in validation.items() if scored.motion_share >= MOVES}
-    own = max((found.judged.total for found in fit.values()), default=np.nan)
-    learnt = max((found.filtered.total for found in fit.values()), default=np.nan)
-    training = finding("training-torque-unexplained", share=learnt, poor=limit("training-torque-unexplained", "share"))
-    joints = _joints(moves or fit, rows, coordinate)
-    if not moves:
-        why = "validation-repeats" if repeated else "robot-stands" if validation else "no-unseen-motion"
-        return sentence(finding("training-torque-error", own=own)), [*settle([training]), finding(why), *joints]
-    name = max(moves, key=lambda key: moves[key].judged.total)
-    worst, at_rest = moves[name].judged.total, moves[name].at_rest
-    totals = [
-        *([finding("motion-poor")] if excitation and all(report.poor for report in excitation.values()) else []),
-        finding(
-            "torque-unexplained",
-            share=worst,
-            good=limit("torque-unexplained", "share", "marginal"),
-            poor=limit("torque-unexplained", "share"),
-        ),
-        training,
-        finding(
-            "no-torque-transfer", times=worst / max(own, 1e-300), most=limit("no-torque-transfer", "times", "marginal")
-        ),
-    ]
-    figures = finding("torque-errors", unseen=worst, file=name, own=own, rest=at_rest)
-    return sentence(figures), [*settle(totals)[:1], *joints]
+    moving = {name: score for name, score in validation.items() if score.motion_share >= MOVES}
+    training_error = max((score.judged.total for score in fit.values()), default=np.nan)
+    training_in_band = max((score.filtered.total for score in fit.values()), default=np.nan)
+    poor = limit("training-torque-unexplained", "share")
+    training = finding("training-torque-unexplained", share=training_in_band, poor=poor)
+    joints = _joints(moving or fit, rows, coordinate)
+    if not moving:
+        if repeated:
+            reason = finding("validation-repeats")
+        elif validation:
+            reason = finding("robot-stands")
+        else:
+            reason = finding("no-unseen-motion")
+        figures = sentence(finding("training-torque-error", own=training_error))
+        return figures, [*settle([training]), reason, *joints]
+
+    name = max(moving, key=lambda recording: moving[recording].judged.total)
+    error = moving[name].judged.total
+    totals = []
+    if excitation and all(report.poor for report in excitation.values()):
+        totals.append(finding("motion-poor"))
+    good, poor = limit("torque-unexplained", "share", "marginal"), limit("torque-unexplained", "share")
+    totals.append(finding("torque-unexplained", share=error, good=good, poor=poor))
+    totals.append(training)
+    times, most = error / max(training_error, 1e-300), limit("no-torque-transfer", "times", "marginal")
+    totals.append(finding("no-torque-transfer", times=times, most=most))
+    figures = finding("torque-errors", unseen=error, file=name, own=training_error, rest=moving[name].at_rest)
+    worst = settle(totals)[:1]
+    return sentence(figures), [*worst, *joints]
 
 
 def friction_drives(joints: Iterable[object], payload: str = "") -> list[Finding]:
     """Return the finding that friction of joints adds energy; `payload`: label of a possible payload."""
-    names = [str(one) for one in joints]
+    names = list(map(str, joints))
     return [finding("friction-drives", joints=names, payload=payload)] if names else []
 
 
 def with_duration(verdict: Verdict, excitation: Mapping[str, ExcitationReport]) -> Verdict:
     """Return the verdict; unless it is pass, its reason begins with a training motion that is too short."""
     seconds = sum(report.seconds for report in excitation.values())
-    min_motion = 3.0  # of all training files together [s] (our choice)
-    if verdict.level == "pass" or not excitation or seconds >= min_motion:
+    if verdict.level == "pass" or not excitation or seconds >= MIN_MOTION:
         return verdict
     (cause,) = lines_of([finding("training-short", seconds=seconds)])
     return replace(verdict, reason=f"{cause}; {verdict.reason}")
@@ -118,18 +134,24 @@ def _joints(scores: Mapping[str, Score], rows: Sequence[str], coordinate: str) -
 
     Taken in the band, since noise is no fault of the model, and moving, since friction at rest takes any value.
     """
-    least, matters = limit("joints-unexplained", "worst", "marginal"), 0.1  # of the greatest joint's rms torque
-    lost: dict[int, float] = {}
+    threshold = limit("joints-unexplained", "worst", "marginal")
+    unexplained: dict[int, float] = {}
     of_torque = 0.0
-    for scored in scores.values():
-        share = np.minimum(scored.filtered.joints, scored.moving.joints)  # NaN, a joint that stands, is not lost
+    for score in scores.values():
+        # NaN, a joint that stands, is not unexplained
+        share = np.minimum(score.filtered.joints, score.moving.joints)
         with np.errstate(divide="ignore", invalid="ignore"):
-            torque = np.nan_to_num(100.0 * scored.raw.rms / scored.raw.joints, posinf=0.0)
-        of_torque = max(of_torque, *share[(torque >= matters * torque.max()) & np.isfinite(share)], 0.0)
-        lost |= {int(k): max(lost.get(int(k), 0.0), float(share[k])) for k in np.flatnonzero(share > least)}
-    named = [f"{coordinate} {rows[k] if rows else k + 1} ({lost[k]:.0f} %)" for k in sorted(lost)]
-    worst = max(lost.values(), default=0.0)
-    return list(settle([finding("joints-unexplained", joints=named, worst=worst, of_torque=of_torque)]))
+            torque = np.nan_to_num(100.0 * score.raw.rms / score.raw.joints, posinf=0.0)
+        matters = (torque >= MATTERS * torque.max()) & np.isfinite(share)
+        of_torque = max(of_torque, *share[matters], 0.0)
+        for k in np.flatnonzero(share > threshold).tolist():
+            unexplained[k] = max(unexplained.get(k, 0.0), float(share[k]))
+    names = []
+    for k in sorted(unexplained):
+        row = rows[k] if rows else k + 1
+        names.append(f"{coordinate} {row} ({unexplained[k]:.0f} %)")
+    worst = max(unexplained.values(), default=0.0)
+    return list(settle([finding("joints-unexplained", joints=names, worst=worst, of_torque=of_torque)]))
 
 
 def too_narrow(expected: Mapping[str, TorqueIntervals], rows: Sequence[str]) -> list[Finding]:
@@ -139,19 +161,22 @@ def too_narrow(expected: Mapping[str, TorqueIntervals], rows: Sequence[str]) -> 
         expected: by unseen case.
         rows: what the torque rows are called.
     """
-    min_covered, min_covered_at_joint = 0.93, 0.90  # of 0.95 stated: a joint may miss it twice as often (our choice)
-    for name, one in expected.items():
-        chance = 3.0 * np.sqrt((1.0 - COVERED) * COVERED / np.maximum(one.independent, 1.0))
-        rare = np.flatnonzero(one.joints < min_covered_at_joint - chance).tolist()
-        if rare or one.covered < min_covered - np.sqrt(np.sum(chance**2)) / len(chance):
-            low = [f"{rows[k]} ({100 * one.joints[k]:.0f} %)" for k in rare]
-            return [finding("torque-intervals-too-narrow", file=name, covered=one.covered, joints=low)]
+    for name, intervals in expected.items():
+        sigma = np.sqrt((1.0 - COVERED) * COVERED / np.maximum(intervals.independent, 1.0))
+        chance = CHANCE_SIGMAS * sigma
+        low = np.flatnonzero(intervals.joints < MIN_COVERED_AT_JOINT - chance).tolist()
+        if len(low) or intervals.covered < MIN_COVERED - np.sqrt(np.sum(chance**2)) / len(chance):
+            joints = [f"{rows[k]} ({100 * intervals.joints[k]:.0f} %)" for k in low]
+            return [finding("torque-intervals-too-narrow", file=name, covered=intervals.covered, joints=joints)]
     return []
 
 
 def extrapolates(name: str, expected: TorqueIntervals | None) -> list[Finding]:
     """Return the finding on a recording whose motion leaves the training range."""
-    if expected is None or not (share := float(expected.beyond.mean())):
+    if expected is None:
+        return []
+    share = float(expected.beyond.mean())
+    if not share:
         return []
     joints = [str(joint + 1) for joint in range(expected.extrapolated.shape[2])]
     ways = "; ".join(expected.ways(joints))
@@ -162,16 +187,16 @@ def with_prior(verdict: Verdict, rests: Resting) -> Verdict:
     """Return the verdict, with a remark if most parameters come from a prior instead of the motion."""
     if 2 * len(rests.names) <= rests.of:
         return verdict
-    one = finding("mostly-prior", count=len(rests.names), parameters=rests.of, source=rests.origin)
-    return replace(verdict, reason=f"{verdict.reason}; {sentence(one)}")
+    remark = finding("mostly-prior", count=len(rests.names), parameters=rests.of, source=rests.origin)
+    return replace(verdict, reason=f"{verdict.reason}; {sentence(remark)}")
 
 
 def motion_findings(validation: Mapping[str, Score], repeated: Mapping[str, float]) -> list[Finding]:
     """Return the findings on the motion of recordings, for any robot."""
-    return [
-        *(finding("repeats-training", file=name, share=share) for name, share in repeated.items()),
-        *(finding("stands", file=name) for name, one in validation.items() if one.motion_share < MOVES),
-    ]
+    findings = [finding("repeats-training", file=name, share=share) for name, share in repeated.items()]
+    standing = [name for name, score in validation.items() if score.motion_share < MOVES]
+    findings += [finding("stands", file=name) for name in standing]
+    return findings
 
 
 def excitation_notes(excitation: Mapping[str, ExcitationReport]) -> list[str]:
@@ -179,60 +204,81 @@ def excitation_notes(excitation: Mapping[str, ExcitationReport]) -> list[str]:
     return [f"{name}: {note}" for name, report in excitation.items() for note in report.notes]
 
 
-def model_findings(cases: Sequence[Case], found: Identification) -> tuple[Finding, ...]:
+def model_findings(cases: Sequence[Case], identification: Identification) -> tuple[Finding, ...]:
     """Return the findings on the model and its training motion, independent of unseen motion."""
-    own = (*parameter_findings(found), *found.loop.findings)
-    return *own, *_unmodelled(found), *_elastic(cases)
+    return (
+        *parameter_findings(identification),
+        *identification.loop.findings,
+        *_unmodelled(identification),
+        *_elastic(cases),
+    )
 
 
-def parameter_findings(found: Identification[Any]) -> tuple[Finding, ...]:
+def parameter_findings(identification: Identification[Any]) -> tuple[Finding, ...]:
     """Return the findings on the parameters, for any robot: condition, bounds, signs, prior."""
-    rests = resting_parameters(found)
-    prior = finding("regularised", count=len(rests.names), parameters=rests.of, source=rests.origin, names=rests.names)
-    steps = () if found.elimination is None else found.elimination.steps
-    needed = [one.name for one in sorted(steps, key=lambda one: -one.f) if one.p < found.settings.level]
-    gone = finding("needed-parameters-dropped", count=len(needed), names=needed)
-    condition = settle([finding("motion-condition", condition=found.condition[1]), gone])
-    held = found.fitted.held.findings if found.fitted.held is not None else ()
-    return *condition, *held, *_negative(found), *([prior] if rests.names else [])
+    removed = []
+    if identification.elimination is not None:
+        steps = sorted(identification.elimination.steps, key=lambda step: -step.f)
+        removed = [step.name for step in steps if step.p < identification.settings.level]
+    _, condition = identification.condition
+    findings = list(
+        settle(
+            [
+                finding("motion-condition", condition=condition),
+                finding("needed-parameters-dropped", count=len(removed), names=removed),
+            ]
+        )
+    )
+    if identification.fitted.held is not None:
+        findings += identification.fitted.held.findings
+    findings += _negative(identification)
+    rests = resting_parameters(identification)
+    if rests.names:
+        count = len(rests.names)
+        findings.append(
+            finding("regularised", count=count, parameters=rests.of, source=rests.origin, names=rests.names)
+        )
+    return tuple(findings)
 
 
 def beyond(case: Case, chain: Chain) -> list[Finding]:
     """Return the finding on joints that a recording moves far beyond the robot's limits."""
     q = np.asarray(case.motion.q)
-    over = np.maximum(chain.lower - q.min(axis=0), q.max(axis=0) - chain.upper)
-    far = np.flatnonzero(np.isfinite(over) & (over > BEYOND * (chain.upper - chain.lower)))
-    named = [
-        f"{chain.joint_names[j]} by {over[j]:.2g} {'m' if chain.joints[j].kind == 'prismatic' else 'rad'}" for j in far
-    ]
-    return [finding("beyond-joint-limits", file=case.name, joints=named)] if named else []
+    excess = np.maximum(chain.lower - q.min(axis=0), q.max(axis=0) - chain.upper)
+    tolerance = BEYOND * (chain.upper - chain.lower)
+    joints = []
+    for j in np.flatnonzero(np.isfinite(excess) & (excess > tolerance)):
+        unit = "m" if chain.joints[j].kind == "prismatic" else "rad"
+        joints.append(f"{chain.joint_names[j]} by {excess[j]:.2g} {unit}")
+    return [finding("beyond-joint-limits", file=case.name, joints=joints)] if joints else []
 
 
-def resting_parameters(found: Identification[Any]) -> Resting:
+def resting_parameters(identification: Identification[Any]) -> Resting:
     """Return the base parameters that the motion does not identify."""
-    if found.prior is None:
-        return Resting(of=found.base.b)
-    on = found.prior.resting(found.fitted.estimate.covariance)
-    names = tuple(name for name, rests in zip(found.base.names, on) if rests)
-    return Resting(names, found.base.b, found.prior.source)
+    count, prior = identification.base.b, identification.prior
+    if prior is None:
+        return Resting(of=count)
+    rests = prior.resting(identification.fitted.estimate.covariance)
+    names = tuple(name for name, by_prior in zip(identification.base.names, rests) if by_prior)
+    return Resting(names, count, prior.source)
 
 
-def _negative(found: Identification[Any]) -> list[Finding]:
+def _negative(identification: Identification[Any]) -> list[Finding]:
     """Return the finding on drive inertias and friction that are negative by more than `SURELY` sigmas."""
-    estimate = found.fitted.estimate
-    wrong = [
-        f"{name} = {value:.3g} ± {sigma:.2g}"
-        for name, one, value, sigma in zip(found.names, found.terms, estimate.values, estimate.sigma)
-        if one is not None and one.nonnegative and value < -SURELY * sigma
-    ]
-    return [finding("negative-drives", names=wrong)] if wrong else []
+    estimate = identification.fitted.estimate
+    names = []
+    for name, term, value, sigma in zip(identification.names, identification.terms, estimate.values, estimate.sigma):
+        if term is not None and term.nonnegative and value < -SURELY * sigma:
+            names.append(f"{name} = {value:.3g} ± {sigma:.2g}")
+    return [finding("negative-drives", names=names)] if names else []
 
 
-def _unmodelled(found: Identification) -> list[Finding]:
+def _unmodelled(identification: Identification) -> list[Finding]:
     """Return the finding on joints with autocorrelated residuals, whose sigmas are valid for this motion only."""
-    alike = np.nan_to_num(found.fitted.inflation)
-    rows = found.settings.torque_rows.numbered(found.dynamics.model.n)
-    joints = [f"{rows[k]} (effective samples 1/{alike[k]:.0f})" for k in np.flatnonzero(alike >= MAX_CORRELATED_ROWS)]
+    inflation = np.nan_to_num(identification.fitted.inflation)
+    rows = identification.settings.torque_rows.numbered(identification.dynamics.model.n)
+    correlated = np.flatnonzero(inflation >= MAX_CORRELATED_ROWS)
+    joints = [f"{rows[k]} (effective samples 1/{inflation[k]:.0f})" for k in correlated]
     return [finding("autocorrelated-residual", joints=joints)] if joints else []
 
 
@@ -242,5 +288,6 @@ def _elastic(cases: Sequence[Case]) -> Iterable[Finding]:
         if case.motion.q_link is None:
             continue
         bend = np.std(np.asarray(case.motion.q_link - case.motion.q), axis=0)
-        if joints := [f"{1e3 * bend[j]:.2g} mrad at joint {j + 1}" for j in np.flatnonzero(bend > BEND)]:
+        joints = [f"{1e3 * bend[j]:.2g} mrad at joint {j + 1}" for j in np.flatnonzero(bend > BEND)]
+        if joints:
             yield finding("elastic-joints", file=case.name, joints=joints)

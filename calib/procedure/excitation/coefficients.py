@@ -47,17 +47,25 @@ from calib.data.signals.resampling import resample
 from calib.errors import MeasurementError, UsageError, refused_as, require
 from calib.folders import METRICS
 from calib.result_kinds import refusal
+from calib.trajectories.bspline import bspline_family
+from calib.trajectories.errors import BadInput
+from calib.trajectories.fourier import evaluate
+from calib.trajectories.recall import Averaged, Recalled, average, find_periods
 from calib.units import headings, motion_units
-from trajectories.bspline import bspline_family
-from trajectories.errors import BadInput
-from trajectories.fourier import evaluate
-from trajectories.recall import Averaged, Recalled, average, find_periods
 
 NAME = "trajectory.toml"
-ARM = "arm.toml"  # the robot that the motion was made for
-SAMPLES, RUN, PLANNED = "trajectory.csv", "run.csv", "motion.csv"
-"""Files of setpoints: one period at the controller's rate, the whole run if it is longer, and a planned motion."""
-
+# the robot that the motion was made for
+ARM = "arm.toml"
+# files of setpoints: one period at the controller's rate, the whole run if it is longer, and a planned motion
+SAMPLES = "trajectory.csv"
+RUN = "run.csv"
+PLANNED = "motion.csv"
+# of a file of the averaged motion
+SUFFIXES = (".npz", ".csv")
+# series of a recording -> its columns
+HEADERS = {"effort": "tau", "tau_link": "tau_link", "tau_motor": "tau_motor", "q_link": "q_link"}
+FOURIER_NOTE = "q(t) = q0 + sum_k a_k sin(k w t) + b_k cos(k w t), w = 2 pi / period; rad, m, s"
+SPLINE_NOTE = "periodic spline, uniform knots over the period; rad, m, s"
 
 Numbers = Annotated[tuple[float, ...], Expect("a list of finite numbers")]
 
@@ -110,7 +118,8 @@ class Periodic:
         if self.kind == "fourier":
             q, v, a = (evaluate(self.coefficients, self.period, times, order) for order in range(3))
             return q, v, a
-        family = bspline_family([len(c) for c in self.coefficients], self.period, degree=self.degree, rest=False)
+        point_counts = [len(points) for points in self.coefficients]
+        family = bspline_family(point_counts, self.period, degree=self.degree, rest=False)
         x = family.variables(self.coefficients)
         q, v, a = (family.evaluate(x, times, order) for order in range(3))
         return q, v, a
@@ -119,23 +128,28 @@ class Periodic:
 def table(motion: Periodic, robot: str, limits: Sequence[str]) -> dict[str, Any]:
     """Return the content of ``trajectory.toml`` for a motion; `limits`: text lines on its limits."""
     fourier = motion.kind == "fourier"
-    head: dict[str, Any] = {
+    content: dict[str, Any] = {
         "robot": robot,
         "family": motion.kind,
         "period": motion.period,
         "rate": motion.rate,
         "repeat": motion.repeat,
-        "note": "q(t) = q0 + sum_k a_k sin(k w t) + b_k cos(k w t), w = 2 pi / period; rad, m, s"
-        if fourier
-        else "periodic spline, uniform knots over the period; rad, m, s",
+        "note": FOURIER_NOTE if fourier else SPLINE_NOTE,
         "limits": list(limits),
     }
+    if not fourier:
+        content["degree"] = motion.degree
     joints = []
-    for name, kind, c in zip(motion.joint_names, motion.kinds, motion.coefficients):
-        half = len(c) // 2
-        series = {"q0": c[0], "a": c[1 : 1 + half], "b": c[1 + half :]} if fourier else {"points": c}
-        joints.append({"name": name, "kind": kind, **series})
-    return head | ({} if fourier else {"degree": motion.degree}) | {"joint": joints}
+    for name, kind, values in zip(motion.joint_names, motion.kinds, motion.coefficients):
+        joint: dict[str, Any] = {"name": name, "kind": kind}
+        if fourier:
+            half = len(values) // 2
+            joint |= {"q0": values[0], "a": values[1 : 1 + half], "b": values[1 + half :]}
+        else:
+            joint["points"] = values
+        joints.append(joint)
+    content["joint"] = joints
+    return content
 
 
 def read(folder: Path) -> Periodic:
@@ -146,35 +160,49 @@ def read(folder: Path) -> Periodic:
     """
     path = folder / NAME
     require(path.is_file(), refusal(folder, "recall"), UsageError)
-    table = parse(TrajectoryFile, read_toml(path), str(path))
-    coefficients = []
-    for number, joint in enumerate(table.joint, 1):
-        place = f"{path}: [[joint]] number {number}"
-        stated = (joint.points,) if table.family == "bspline" else ((joint.q0,), joint.a, joint.b)
-        parts = [part for part in stated if part is not None and None not in part]
-        if len(parts) < len(stated):
-            raise UsageError(f"{place}: family {table.family} needs {'points' if len(stated) == 1 else 'q0, a and b'}")
-        if len(parts) == 3 and not len(parts[1]) == len(parts[2]) == len(table.joint[0].a or ()):
-            raise UsageError(f"{place}: a and b need {len(table.joint[0].a or ())} values each, as many as joint 1's a")
-        coefficients.append(np.concatenate([np.array(part, dtype=float) for part in parts]))
-    found = Periodic(
-        tuple(joint.name for joint in table.joint),
-        tuple(joint.kind for joint in table.joint),
-        table.period,
-        table.rate,
-        table.repeat,
-        table.family,
-        tuple(coefficients),
-        table.degree,
+    content = parse(TrajectoryFile, read_toml(path), str(path))
+    if content.family == "bspline":
+        coefficients = _spline_points(content, path)
+    else:
+        coefficients = _fourier_coefficients(content, path)
+    motion = Periodic(
+        joint_names=tuple(joint.name for joint in content.joint),
+        kinds=tuple(joint.kind for joint in content.joint),
+        period=content.period,
+        rate=content.rate,
+        repeat=content.repeat,
+        kind=content.family,
+        coefficients=tuple(coefficients),
+        degree=content.degree,
     )
-    damage, words = (ValueError, IndexError, BadInput), f"{path} is damaged ({{}}); write it again with calib excite"
-    with refused_as(UsageError, damage, words):
-        found.orders(np.zeros(1))
-    return found
+    damaged = f"{path} is damaged ({{}}); write it again with calib excite"
+    with refused_as(UsageError, (ValueError, IndexError, BadInput), damaged):
+        motion.orders(np.zeros(1))
+    return motion
 
 
-SUFFIXES = (".npz", ".csv")
-HEADERS = {"effort": "tau", "tau_link": "tau_link", "tau_motor": "tau_motor", "q_link": "q_link"}
+def _spline_points(content: TrajectoryFile, path: Path) -> list[np.ndarray]:
+    """Return the control points of each joint."""
+    coefficients = []
+    for number, joint in enumerate(content.joint, 1):
+        if joint.points is None:
+            raise UsageError(f"{path}: [[joint]] number {number}: family bspline needs points")
+        coefficients.append(np.array(joint.points, dtype=float))
+    return coefficients
+
+
+def _fourier_coefficients(content: TrajectoryFile, path: Path) -> list[np.ndarray]:
+    """Return q0, a, b of each joint in a row; all joints have as many harmonics."""
+    count = len(content.joint[0].a or ())
+    coefficients = []
+    for number, joint in enumerate(content.joint, 1):
+        where = f"{path}: [[joint]] number {number}"
+        if joint.q0 is None or joint.a is None or joint.b is None:
+            raise UsageError(f"{where}: family fourier needs q0, a and b")
+        if not len(joint.a) == len(joint.b) == count:
+            raise UsageError(f"{where}: a and b need {count} values each, as many as joint 1's a")
+        coefficients.append(np.array([joint.q0, *joint.a, *joint.b], dtype=float))
+    return coefficients
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,47 +249,64 @@ def find(folder: Path, log: str, skip: int = 0) -> AveragedMotion:
     count = round(motion.period * rate)
     reference = motion.orders(np.arange(count) / rate)[0]
     with refused_as(MeasurementError, BadInput, "{}", recording.file):
-        found = find_periods(series["q"], reference, skip)
-        averages = {name: average(values, found) for name, values in series.items() if np.isfinite(values).all()}
+        recalled = find_periods(series["q"], reference, skip)
+        averages = {}
+        for name, values in series.items():
+            if np.isfinite(values).all():
+                averages[name] = average(values, recalled)
     error = averages["q"].mean - reference
     return AveragedMotion(
-        motion, recording.file, found, averages, recording.kind, rate, np.sqrt(np.mean(error**2, axis=0))
+        motion=motion,
+        file=recording.file,
+        found=recalled,
+        averages=averages,
+        kind=recording.kind,
+        rate=rate,
+        following=np.sqrt(np.mean(error**2, axis=0)),
     )
 
 
 def write(averaged: AveragedMotion, out: Path) -> Path:
     """Write one averaged period as a recording: CSV, or an archive with variances."""
-    averages, names = averaged.averages, averaged.motion.joint_names
-    called = HEADERS | {"q": "q", "v": "v", "effort": "tau" if averaged.kind == "torque" else "current"}
+    averages, motion = averaged.averages, averaged.motion
+    letters = HEADERS | {"q": "q", "v": "v", "effort": "tau" if averaged.kind == "torque" else "current"}
     t = np.arange(averaged.found.period) / averaged.rate
     if out.suffix == ".csv":
-        joints = [_JointTable(name, kind) for name, kind in zip(names, averaged.motion.kinds)]
-        header = ["t [s]", *(title for name in averages for title in headings(called[name], joints))]
-        table = np.column_stack([t, *(one.mean for one in averages.values())])
-        return files.write_numbers(out, header, table)
-    arrays = {called[name]: one.mean for name, one in averages.items()}
-    arrays |= {f"variance_{called[name]}": one.variance for name, one in averages.items()}
+        joints = [_JointTable(name, kind) for name, kind in zip(motion.joint_names, motion.kinds)]
+        header = ["t [s]"]
+        for name in averages:
+            header += headings(letters[name], joints)
+        means = [series.mean for series in averages.values()]
+        return files.write_numbers(out, header, np.column_stack([t, *means]))
+    arrays: dict[str, Any] = {letters[name]: series.mean for name, series in averages.items()}
+    for name, series in averages.items():
+        arrays[f"variance_{letters[name]}"] = series.variance
+    arrays["t"] = t
+    arrays["joint_names"] = np.array(motion.joint_names)
+    arrays["periods"] = np.array(averaged.found.periods)
     buffer = io.BytesIO()
-    arrays |= {"t": t, "joint_names": np.array(names), "periods": np.array(averaged.found.periods)}
-    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
+    np.savez_compressed(buffer, **arrays)
     return files.write(out, buffer.getvalue())
 
 
 def lines(averaged: AveragedMotion) -> list[str]:
     """Return the lines that `calib recall` prints: periods, their agreement, noise of each joint."""
-    found, averages = averaged.found, averaged.averages
-    start = found.start / averaged.rate
-    place, unit = motion_units(averaged.motion.kinds)[0], "N m" if averaged.kind == "torque" else "A"
-    result = [
-        f"{found.periods} whole periods of {averaged.motion.period:g} s in {averaged.file}, from {start:.3f} s "
-        f"on; each matches at least {min(found.likeness):.2%} of the motion",
-        f"{'joint':14} {f'off by [{place}]':>14} {f'noise [{place}]':>12} {f'noise [{unit}]':>14} {'of the mean':>12}",
+    recalled, averages, motion = averaged.found, averaged.averages, averaged.motion
+    start = recalled.start / averaged.rate
+    unit = motion_units(motion.kinds)[0]
+    effort_unit = "N m" if averaged.kind == "torque" else "A"
+    lines = [
+        f"{recalled.periods} whole periods of {motion.period:g} s in {averaged.file}, from {start:.3f} s "
+        f"on; each matches at least {min(recalled.likeness):.2%} of the motion",
+        f"{'joint':14} {f'off by [{unit}]':>14} {f'noise [{unit}]':>12} {f'noise [{effort_unit}]':>14} "
+        f"{'of the mean':>12}",
     ]
-    noise, effort = np.sqrt(averages["q"].pooled), np.sqrt(averages["effort"].pooled)
-    rows = zip(averaged.motion.joint_names, averaged.following, noise, effort)
-    for name, following, one, two in rows:
-        result.append(f"{name:14} {following:14.3g} {one:12.3g} {two:14.3g} {two / np.sqrt(found.periods):12.3g}")
-    return result
+    q_noise = np.sqrt(averages["q"].pooled)
+    effort_noise = np.sqrt(averages["effort"].pooled)
+    for name, following, noise, effort in zip(motion.joint_names, averaged.following, q_noise, effort_noise):
+        of_mean = effort / np.sqrt(recalled.periods)
+        lines.append(f"{name:14} {following:14.3g} {noise:12.3g} {effort:14.3g} {of_mean:12.3g}")
+    return lines
 
 
 def _longest(recording: Recording, period: float) -> tuple[float, dict[str, np.ndarray]]:

@@ -20,18 +20,18 @@ from calib.procedure.excitation.playback import Playback, check_start, play
 from calib.procedure.excitation.prediction import MotionOutlook, PredictedSigma, foretell
 from calib.procedure.excitation.settings import COARSE, DEFAULT_DESIGN, HARMONICS, ExcitationSettings, split_goal
 from calib.robot.calibrated import CalibratedChain
+from calib.trajectories.basis import Family
+from calib.trajectories.bspline import bspline_family
+from calib.trajectories.constraints import MotionConstraint, TorqueLimit
+from calib.trajectories.design.objectives import Excitation, TorqueSlack, condition_numbers
+from calib.trajectories.design.optimise import design
+from calib.trajectories.design.pareto import Front, proposed_goals, sweep
+from calib.trajectories.design.problem import AttainmentGoal, ExcitationProblem, exact_values, merit
+from calib.trajectories.design.search import SearchResult
+from calib.trajectories.design.verify import Verification, dense_motion, ensured
+from calib.trajectories.errors import NothingFeasible
+from calib.trajectories.fourier import fourier_family
 from calib.workers import finishing
-from trajectories.basis import Family
-from trajectories.bspline import bspline_family
-from trajectories.constraints import MotionConstraint, TorqueLimit
-from trajectories.design.objectives import Excitation, TorqueSlack, condition_numbers
-from trajectories.design.optimise import design
-from trajectories.design.pareto import Front, proposed_goals, sweep
-from trajectories.design.problem import AttainmentGoal, ExcitationProblem, exact_values, merit
-from trajectories.design.search import SearchResult
-from trajectories.design.verify import Verification, dense_motion, ensured
-from trajectories.errors import NothingFeasible
-from trajectories.fourier import fourier_family
 
 
 @dataclass(frozen=True)
@@ -156,8 +156,8 @@ def search_motion(
     """Search for an exciting motion of an arm, or of the platform's coordinates of a parallel robot."""
     show = progress or _silent
 
-    def report(done: int, total: int, stage: str) -> None:
-        show(f"{stage} ({done} of {total})")
+    def report(number: int, total: int, stage: str) -> None:
+        show(f"{stage} ({number} of {total})")
 
     def problem_of_period(period: float) -> ExcitationProblem:
         problem, _, _ = _excitation_problem(inputs, replace(settings, period=period, shortest=None))
@@ -216,12 +216,12 @@ def search_motion(
 
 
 def _reached(
-    problem: ExcitationProblem, goals: Sequence[AttainmentGoal], found: SearchResult, inputs: ExcitationInputs
+    problem: ExcitationProblem, goals: Sequence[AttainmentGoal], result: SearchResult, inputs: ExcitationInputs
 ) -> tuple[float, ...]:
     """Return the goals' values of a motion at `INSTANTS`, with the model's own Coulomb sign."""
     if not goals:
         return ()
-    motion = dense_motion(problem.family, found.x, _instants(problem.family, found), found.factor)
+    motion = dense_motion(problem.family, result.x, _instants(problem.family, result), result.factor)
     # as the condition's: information of earlier motions counts per sample
     scaled_goals = []
     for goal in goals:
@@ -308,18 +308,18 @@ def _searched(
     return replace(motion, evaluations=evaluations, seconds=seconds), attainment
 
 
-def _condition_of(inputs: ExcitationInputs, family: Family, found: SearchResult, repeat: int = 1) -> DesignCondition:
+def _condition_of(inputs: ExcitationInputs, family: Family, result: SearchResult, repeat: int = 1) -> DesignCondition:
     """Return the condition numbers at `INSTANTS` samples over the period, without smoothing of Coulomb friction.
 
     With motions before they are those of all motions together; ``alone`` and ``before`` say what each has by itself.
     """
     columns = inputs.columns
-    motion = dense_motion(family, found.x, _instants(family, found), found.factor)
+    motion = dense_motion(family, result.x, _instants(family, result), result.factor)
     Y = inputs.model.exact.regressor(motion.q, motion.v, motion.a)
     this_motion = condition_numbers(Y, columns.sigmas, columns=columns.aimed)
     if inputs.prior is None:
         return DesignCondition(**this_motion)
-    existing = inputs.prior.per_sample(INSTANTS, repeat * family.period * found.factor)
+    existing = inputs.prior.per_sample(INSTANTS, repeat * family.period * result.factor)
     together = condition_numbers(Y, columns.sigmas, existing, columns.aimed)
     earlier = condition_numbers(0.0 * Y, None, existing, columns.aimed)
     return DesignCondition(
@@ -366,7 +366,8 @@ def _constraints(
     dynamics: ExcitedModel, limits: MotionLimits
 ) -> tuple[tuple[MotionConstraint, ...], tuple[MotionConstraint, ...], tuple[str, ...]]:
     """Return the constraints for the search, those for the verification (Coulomb sign not smoothed), and notes."""
-    if dynamics.values is None or not np.isfinite(limits.torque).any():
+    values = dynamics.values
+    if values is None or not np.isfinite(limits.torque).any():
         return limits.constraints, limits.constraints, ()
     margin, notes = limits.margin, ()
     if margin is None:
@@ -379,7 +380,7 @@ def _constraints(
         return TorqueLimit(
             model.regressor,
             model.regressor_gradient,
-            dynamics.values,
+            values,
             model.of_rows(limits.torque),
             dynamics.covariance,
             limits.deviations,

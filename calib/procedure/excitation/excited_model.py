@@ -132,15 +132,15 @@ def check_held(model: ExcitedModel, limits: MotionLimits) -> None:
     high = np.minimum(box.upper, np.pi)
     q = low + (high - low) * np.random.default_rng(0).random((MANY_POSTURES, len(low)))
     torques = exact.regressor(q, 0.0 * q, 0.0 * q) @ model.values
-    held = exact.of_rows(limits.torque)
-    unheld = float(np.mean((np.abs(torques) > held).any(axis=1)))
+    limit = exact.of_rows(limits.torque)
+    unheld = float(np.mean((np.abs(torques) > limit).any(axis=1)))
     if unheld <= MAX_UNHELD:
         return
-    posture, row = np.unravel_index(np.argmax(np.abs(torques) / held), torques.shape)
+    posture, row = np.unravel_index(np.argmax(np.abs(torques) / limit), torques.shape)
     values = ", ".join(f"{value:.2f}" for value in q[posture])
     raise UsageError(
         f"gravity is beyond the torque limits in {unheld:.0%} of the postures: at {exact.row_names[row]} "
-        f"{abs(torques[posture, row]):.4g}, limit {held[row]:.4g} N m (or N), in the posture "
+        f"{abs(torques[posture, row]):.4g}, limit {limit[row]:.4g} N m (or N), in the posture "
         f"{values} rad (or m); take a lighter payload, or correct masses or limits"
     )
 
@@ -174,7 +174,9 @@ def loads_of(texts: Sequence[str], payloads: Sequence[str], with_payloads: bool)
         return (None,)
     runs = []
     for text in texts:
-        labels = () if text == "none" else tuple(part.strip() for part in text.split("+"))
+        labels: tuple[str, ...] = ()
+        if text != "none":
+            labels = tuple(part.strip() for part in text.split("+"))
         for label in labels:
             where = f"load '{text}': payload"
             require(payloads, f"{where} '{label}' is not known: options or model have no payloads", UsageError)

@@ -23,12 +23,12 @@ from calib.records import plain
 from calib.robot import description
 from calib.robot.chain import Chain
 from calib.robot.tables import dumps
+from calib.trajectories.design.pareto import Front
+from calib.trajectories.design.verify import dense_motion
+from calib.trajectories.messages import joint_trajectory, to_json, to_yaml
+from calib.trajectories.setpoints import Setpoints
+from calib.trajectories.timing.time_scaling import ACTIVE
 from calib.units import headings, motion_units
-from trajectories.design.pareto import Front
-from trajectories.design.verify import dense_motion
-from trajectories.messages import joint_trajectory, to_json, to_yaml
-from trajectories.setpoints import Setpoints
-from trajectories.timing.time_scaling import ACTIVE
 
 # files that identify the folder of an earlier run
 DESIGN = (METRICS, coefficients.SAMPLES, coefficients.NAME)
@@ -150,10 +150,10 @@ def _write_approach_and_rehearsal(motion: Playback | Planned, bounds: MotionBoun
         _write_setpoints(motion.rehearsal, bounds, folder / REHEARSAL)
 
 
-def _write_messages(track: Setpoints, bounds: MotionBounds, folder: Path, every: int = 1) -> None:
+def _write_messages(track: Setpoints, bounds: MotionBounds, folder: Path, step: int = 1) -> None:
     """Write ``trajectory.json`` and ``trajectory.yaml`` (trajectory_msgs/JointTrajectory), every `every`-th sample."""
     bounds.check(track)
-    message = joint_trajectory(track, [joint.name for joint in bounds.joints], every)
+    message = joint_trajectory(track, [joint.name for joint in bounds.joints], step)
     # JSON has no remarks
     files.write(folder / "trajectory.json", to_json(message))
     files.write(folder / "trajectory.yaml", files.remarks(bounds.lines()) + to_yaml(message))
@@ -285,6 +285,10 @@ def plan_metrics(planned: Planned) -> dict[str, Any]:
             "refused": shaped.refused,
             "parameters": shaped.phi,
         }
+    segments = [timing.duration for timing in timings]
+    histories = [timing.history for timing in timings]
+    iterations = sum(timing.iterations for timing in timings)
+    tightened = max(timing.tightened for timing in timings)
     return plain(
         {
             "feasible": True,
@@ -292,10 +296,10 @@ def plan_metrics(planned: Planned) -> dict[str, Any]:
             "margins": _margins(planned),
             "active_share": planned.active_share,
             "active_within": ACTIVE,
-            "iterations": sum(timing.iterations for timing in timings),
-            "tightened": max(timing.tightened for timing in timings),
-            "history": [timing.history for timing in timings],
-            "segments": [timing.duration for timing in timings],
+            "iterations": iterations,
+            "tightened": tightened,
+            "history": histories,
+            "segments": segments,
             "rate": planned.track.rate,
             "samples": len(planned.track),
             "samples_verified": _verified(planned),
@@ -354,9 +358,9 @@ def _margins(planned: Planned) -> dict[str, _PlanMargin]:
         size = planned.upper - planned.lower
         result["position"] = _margin(planned, "position", planned.margins, planned.margins[j] / size[j], 1.0)
     for name in planned.timings[0].used:
-        used = np.concatenate([timing.used[name] for timing in planned.timings])
+        shares = np.concatenate([timing.used[name] for timing in planned.timings])
         # as shares of the limits
-        margins = 1.0 - used.max(axis=0)
+        margins = 1.0 - shares.max(axis=0)
         j = int(np.argmin(margins))
         result[name] = _margin(planned, name, margins, margins[j], getattr(planned.limits, name)[j])
     return result

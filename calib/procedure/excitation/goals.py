@@ -13,7 +13,7 @@ from calib.errors import UsageError, require
 from calib.procedure.excitation.inputs import ExcitationInputs
 from calib.procedure.excitation.prediction import task_states
 from calib.procedure.excitation.settings import AIMS, ExcitationSettings, split_goal
-from trajectories.design.objectives import (
+from calib.trajectories.design.objectives import (
     Duration,
     Excitation,
     FrictionCoverage,
@@ -22,40 +22,49 @@ from trajectories.design.objectives import (
     Scaling,
     TorqueSlack,
 )
-from trajectories.design.problem import AttainmentGoal
+from calib.trajectories.design.problem import AttainmentGoal
 
 SCALINGS: tuple[Scaling, ...] = ("raw", "normalised")
-GUARD = 0.2  # share of the torque limits kept free where no friction is known (our choice)
-TYPICAL = {"sign": 0.07, "velocity": 0.13}  # Coulomb and viscous friction, at full speed together `GUARD` (our choice)
+# share of the torque limits kept free where no friction is known (our choice)
+GUARD = 0.2
+# shares of the torque limits: Coulomb and viscous friction, at full speed together `GUARD` (our choice)
+TYPICAL = {"sign": 0.07, "velocity": 0.13}
+# a goal is missed by more than this share of it (our choice)
+TOLERANCE = 0.01
 
 
 def objectives_of(
-    settings: ExcitationSettings, condition: Excitation, given: ExcitationInputs
+    settings: ExcitationSettings, condition: Excitation, inputs: ExcitationInputs
 ) -> tuple[tuple[Objective, float], ...]:
     """Return the objectives and their weights: as set, or both condition numbers with equal weights.
 
     Args:
+        settings: of the design.
         condition: see `read_goals`.
-        given: robot and model; without goals the determinant is the aim where an identification states torque errors.
+        inputs: robot and model; without goals the determinant is the aim where an identification states torque errors.
 
     Raises:
         UsageError: for two aims, or one together with the condition numbers that it replaces.
     """
-    aims = [one for one in AIMS if one in settings.goals]
-    if not aims and not (given.errors_known and not settings.goals):
-        if len(given.columns.aimed_names) == 1:
+    aims = [aim for aim in AIMS if aim in settings.goals]
+    default_aim = inputs.errors_known and not settings.goals
+    if not aims and not default_aim:
+        if len(inputs.columns.aimed_names) == 1:
             raise UsageError("columns: a single parameter has no condition number; add --goal parameters")
         return tuple((replace(condition, scaling=scaling), 0.5) for scaling in SCALINGS)
-    others = [text for text in (*settings.goals, *settings.hard) if text.partition("=")[0] in (*SCALINGS, *AIMS)]
-    if len(others) > 1:
-        raise UsageError(f"goals {', '.join(others)}: '{aims[0]}' replaces the others; leave them out")
-    aim = (*aims, AIMS[0])[0]
+    texts = (*settings.goals, *settings.hard)
+    of_parameters = [text for text in texts if text.partition("=")[0] in (*SCALINGS, *AIMS)]
+    if len(of_parameters) > 1:
+        raise UsageError(f"goals {', '.join(of_parameters)}: '{aims[0]}' replaces the others; leave them out")
+    aim = AIMS[0]
+    if aims:
+        aim = aims[0]
     if aim in get_args(Index):
         return ((replace(condition, index=cast(Index, aim)), 1.0),)
-    return ((_predicted(aim, settings, condition, given), 1.0),)
+    return ((_predicted(aim, settings, condition, inputs), 1.0),)
 
 
-def _predicted(aim: str, settings: ExcitationSettings, condition: Excitation, given: ExcitationInputs) -> Excitation:
+def _predicted(aim: str, settings: ExcitationSettings, condition: Excitation, inputs: ExcitationInputs) -> Excitation:
     """Return the objective that minimises the predicted σ of the torques of a typical task, or of the parameters.
 
     Rows are weighted by the torque errors that earlier motions state, or else by the torque limits.
@@ -63,49 +72,63 @@ def _predicted(aim: str, settings: ExcitationSettings, condition: Excitation, gi
     Raises:
         UsageError: where torque limits or the parameters' values are not known.
     """
-    exact, limits, values = given.model.exact, given.limits.torque, given.model.values
-    sigmas = np.ones(len(exact.joint_of_row)) if condition.sigmas is None else condition.sigmas
+    exact, limits, columns = inputs.model.exact, inputs.limits.torque, inputs.columns
+    limited = bool(np.isfinite(limits).all())
     if aim == "torque":
-        require(np.isfinite(limits).all(), "goal 'torque': needs torque limits of all joints", UsageError)
-        task = exact.regressor(*task_states(given, settings.seed))[:, :, given.columns.kept]
-        rows = (task / limits[exact.joint_of_row][:, None])[:, exact.limited.ravel()]
+        require(limited, "goal 'torque': needs torque limits of all joints", UsageError)
+        regressors = exact.regressor(*task_states(inputs, settings.seed))[:, :, columns.kept]
+        row_limits = limits[exact.joint_of_row][:, None]
+        rows = (regressors / row_limits)[:, exact.limited.ravel()]
         task = np.einsum("nri,nrj->ij", rows, rows) / rows[:, :, 0].size
     else:
-        require(values is not None, "goal 'parameters': needs masses, or a model (--model)", UsageError)
-        columns, known = given.columns, cast(np.ndarray, values)[given.columns.kept]
-        counted = (known != 0.0) & np.isin(columns.names, columns.aimed_names)
-        task = np.diag(np.divide(1.0, known**2, out=np.zeros(len(known)), where=counted))
-    if given.prior is None and given.limits.noise is None and np.isfinite(limits).all():
+        if inputs.model.values is None:
+            raise UsageError("goal 'parameters': needs masses, or a model (--model)")
+        values = inputs.model.values[columns.kept]
+        counted = (values != 0.0) & np.isin(columns.names, columns.aimed_names)
+        task = np.diag(np.divide(1.0, values**2, out=np.zeros(len(values)), where=counted))
+    sigmas = condition.sigmas
+    if sigmas is None:
+        sigmas = np.ones(len(exact.joint_of_row))
+    if inputs.prior is None and inputs.limits.noise is None and limited:
         sigmas = sigmas * limits[exact.joint_of_row]
-    return replace(condition, index="trace", sigmas=sigmas, task=task, columns=given.columns.columns)
+    return replace(condition, index="trace", sigmas=sigmas, task=task, columns=columns.columns)
 
 
-def read_goals(settings: ExcitationSettings, given: ExcitationInputs, condition: Excitation) -> list[AttainmentGoal]:
+def read_goals(settings: ExcitationSettings, inputs: ExcitationInputs, condition: Excitation) -> list[AttainmentGoal]:
     """Return the goals stated in the settings: first the soft goals, then the hard goals.
 
     Args:
-        condition: what a condition number is of: columns, rows, what is known already.
+        settings: of the design.
+        inputs: robot and model.
+        condition: what a condition number is of: columns, rows, earlier information.
 
     Raises:
-        UsageError: for an unknown goal, or one that the given data do not suffice to compute.
+        UsageError: for an unknown goal, or one that the inputs do not suffice to compute.
     """
-    result = []
-    for weight, texts in ((None, settings.goals), (0.0, settings.hard)):
-        for text in texts:
-            if text in AIMS and weight is None:
-                continue
-            name, value = split_goal(text)
-            twice = sum(split_goal(other)[0] == name for other in texts if other not in AIMS) > 1
-            require(not twice, f"goal '{text}': '{name}' is stated twice; leave one out", UsageError)
-            result.append(AttainmentGoal(*_objective(name, value, given, condition, settings.shortest), weight, text))
-    return result
+    soft = [text for text in settings.goals if text not in AIMS]
+    goals = _goals(soft, None, inputs, condition, settings.shortest)
+    return goals + _goals(settings.hard, 0.0, inputs, condition, settings.shortest)
+
+
+def _goals(
+    texts: Sequence[str], weight: float | None, inputs: ExcitationInputs, condition: Excitation, shortest: float | None
+) -> list[AttainmentGoal]:
+    """Return the goals that texts state; a hard goal has the weight 0."""
+    names = [split_goal(text)[0] for text in texts if text not in AIMS]
+    goals = []
+    for text in texts:
+        name, value = split_goal(text)
+        require(names.count(name) <= 1, f"goal '{text}': '{name}' is stated twice; leave one out", UsageError)
+        objective, goal = _objective(name, value, inputs, condition, shortest)
+        goals.append(AttainmentGoal(objective, goal, weight, text))
+    return goals
 
 
 def _objective(
-    name: str, value: float, given: ExcitationInputs, condition: Excitation, shortest: float | None
+    name: str, value: float, inputs: ExcitationInputs, condition: Excitation, shortest: float | None
 ) -> tuple[Objective, float]:
     """Return the objective that a goal names, and the value that the objective has to reach."""
-    text, chain = f"{name}={value:g}", given.chain
+    text, chain = f"{name}={value:g}", inputs.chain
     if name in SCALINGS:
         require(value > 1, f"goal '{text}': expected a condition number above 1", UsageError)
         return replace(condition, scaling=name), value
@@ -118,11 +141,12 @@ def _objective(
         if not np.isfinite(speeds).all() or not 0 < value < 0.25:
             raise UsageError(f"goal '{text}': needs velocity limits, and a share of time above 0 and below 0.25")
         return FrictionCoverage(0.1 * speeds, 0.5 * speeds, value), 0.01
-    numbered = {f"joint{j + 1}": (j,) for j in range(chain.n)} | {"wrist": wrist(chain.n)}
-    if name not in numbered:
+    joints_of: dict[str, tuple[int, ...]] = {f"joint{j + 1}": (j,) for j in range(chain.n)}
+    joints_of["wrist"] = wrist(chain.n)
+    if name not in joints_of:
         raise UsageError(f"goal '{text}': unknown; use raw, normalised, duration, coverage, wrist, joint1 …")
     require(0 < value < 1, f"goal '{text}': expected a share of the torque limit, above 0 and below 1", UsageError)
-    return torque_slack(numbered[name], given, f"goal '{text}'"), 1.0 - value
+    return torque_slack(joints_of[name], inputs, f"goal '{text}'"), 1.0 - value
 
 
 def wrist(n: int) -> tuple[int, ...]:
@@ -130,42 +154,47 @@ def wrist(n: int) -> tuple[int, ...]:
     return tuple(range(max(0, n - 2), n))
 
 
-def torque_slack(joints: tuple[int, ...], given: ExcitationInputs, where: str) -> TorqueSlack:
+def torque_slack(joints: tuple[int, ...], inputs: ExcitationInputs, where: str) -> TorqueSlack:
     """Return the objective that maximises the mean torque of some joints relative to their limits.
 
     Raises:
         UsageError: where torques cannot be predicted, or have no limit.
     """
-    values, limits = given.model.values, given.limits.torque
+    values, limits = inputs.model.values, inputs.limits.torque
     if values is None or not np.isfinite(limits[list(joints)]).all():
         raise UsageError(f"{where}: needs torque limits, and a model or masses to predict torques")
-    exact = given.model.exact
-    values = values if given.model.friction else values + exact.base.transform @ _typical_friction(given)
+    exact = inputs.model.exact
+    if not inputs.model.friction:
+        values = values + exact.base.transform @ _typical_friction(inputs)
     rows = tuple(exact.limited[:, list(joints)].ravel().tolist())
     label = f"torque slack of joints {', '.join(str(j + 1) for j in joints)}"
-    return TorqueSlack(rows, values, exact.of_rows(limits), given.model.smooth.torque_gradient, label=label)
+    return TorqueSlack(rows, values, exact.of_rows(limits), inputs.model.smooth.torque_gradient, label=label)
 
 
-def _typical_friction(given: ExcitationInputs) -> np.ndarray:
+def _typical_friction(inputs: ExcitationInputs) -> np.ndarray:
     """Return standard parameters (p,) of typical friction: `TYPICAL` shares of the torque limits at full speed."""
-    limits, model = given.limits, given.model.exact.model
-    sizes = {"sign": limits.torque, "velocity": limits.torque / limits.bounds.velocity}
+    limits, model = inputs.limits, inputs.model.exact.model
+    # the values at which a term's torque is the joint's limit
+    full = {"sign": limits.torque, "velocity": limits.torque / limits.bounds.velocity}
     side = "motor" if model.torque_rows.with_motors else "link"
-    found = np.zeros(model.p)
-    for k, one in enumerate(model.columns, model.inertial):
-        if one.side == side and one.shape in TYPICAL:
-            found[k] = TYPICAL[one.shape] * sizes[one.shape][one.acts[0][0]]
-    return np.where(np.isfinite(found), found, 0.0)
+    friction = np.zeros(model.p)
+    for k, term in enumerate(model.columns, model.inertial):
+        if term.side == side and term.shape in TYPICAL:
+            joint = term.acts[0][0]
+            friction[k] = TYPICAL[term.shape] * full[term.shape][joint]
+    return np.where(np.isfinite(friction), friction, 0.0)
 
 
-def missed(goals: list[AttainmentGoal], values: Sequence[float], given: ExcitationInputs) -> tuple[str, ...]:
+def missed(goals: Sequence[AttainmentGoal], values: Sequence[float], inputs: ExcitationInputs) -> tuple[str, ...]:
     """Return a note for each goal that a motion with these values misses by more than 1 %."""
-    words = [
-        f"goal {goal.words} is missed: {goal.stated(value):.4g}"
-        for goal, value in zip(goals, values)
-        if value > goal.goal + 0.01 * abs(goal.goal)
-    ]
-    parts = f"{TYPICAL['sign']:.0%} of the torque limits, and {TYPICAL['velocity']:.0%} more at full speed"
-    idle = f"torque goals expect friction of {parts} (typical): state [friction] in the limits file, or a model"
-    known = given.model.friction or not any(isinstance(goal.objective, TorqueSlack) for goal in goals)
-    return tuple(words if known else [*words, idle])
+    notes = []
+    for goal, value in zip(goals, values):
+        if value > goal.goal + TOLERANCE * abs(goal.goal):
+            notes.append(f"goal {goal.words} is missed: {goal.stated(value):.4g}")
+    of_torque = any(isinstance(goal.objective, TorqueSlack) for goal in goals)
+    if of_torque and not inputs.model.friction:
+        shares = f"{TYPICAL['sign']:.0%} of the torque limits, and {TYPICAL['velocity']:.0%} more at full speed"
+        notes.append(
+            f"torque goals expect friction of {shares} (typical): state [friction] in the limits file, or a model"
+        )
+    return tuple(notes)

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 
@@ -20,7 +19,10 @@ from calib.procedure.excitation.settings import ExcitationSettings
 from calib.procedure.kinematic_stage.inputs import load_rigid
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
-from trajectories.constraints import BoxLimit
+from calib.trajectories.constraints import BoxLimit
+
+# columns without effect that a note names
+LISTED_COLUMNS = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,18 +45,24 @@ class IdentifiableColumns:
     @property
     def aimed(self) -> np.ndarray | None:
         """The model's columns whose condition number counts; None: all."""
-        return self.columns if self.chosen is None else self.chosen
+        if self.chosen is None:
+            return self.columns
+        return self.chosen
 
     @property
     def aimed_names(self) -> tuple[str, ...]:
         """Names of the columns whose condition number counts."""
-        own = range(len(self.names)) if self.columns is None else self.columns
-        return tuple(name for k, name in zip(own, self.names) if self.chosen is None or k in self.chosen)
+        if self.chosen is None:
+            return self.names
+        columns = range(len(self.names)) if self.columns is None else self.columns
+        return tuple(name for column, name in zip(columns, self.names) if column in self.chosen)
 
     @property
     def kept(self) -> np.ndarray | slice:
         """Index of the identifiable columns among all columns of the model."""
-        return slice(None) if self.columns is None else self.columns
+        if self.columns is None:
+            return slice(None)
+        return self.columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,22 +121,36 @@ def read_inputs(
         raise UsageError(
             f"drives '{settings.drives}': {model or 'the options file'} states the drive terms; leave it out"
         )
-    found, source = load_rigid(robot, None, base, tip)
-    chain, nominal = found.chain, found.nominal if found.moved else None
-    known = read_motion_limits(limits, chain, source, predicted=model is not None)
+    calibrated, source = load_rigid(robot, None, base, tip)
+    chain = calibrated.chain
+    nominal = calibrated.nominal if calibrated.moved else None
+    motion_limits = read_motion_limits(limits, chain, source, predicted=model is not None)
     if settings.within:
-        orders = designed_orders(Path(settings.within), chain)[:3]
-        known = known.narrowed([(one.min(axis=0), one.max(axis=0)) for one in orders])
-    if settings.noise is not None and (after is not None or known.noise is not None):
+        q, v, a, _ = designed_orders(Path(settings.within), chain)
+        motion_limits = motion_limits.narrowed([(values.min(axis=0), values.max(axis=0)) for values in (q, v, a)])
+    if settings.noise is not None and (after is not None or motion_limits.noise is not None):
         raise UsageError(f"noise: {after or '[noise] of the limits file'} states the torque errors; leave --noise out")
-    dynamics = read_model(chain, model, settings.drives, known, options, settings.loads, nominal)
-    check_held(dynamics, known)
-    noise = None if known.noise is None or after is not None else known.noise[dynamics.exact.joint_of_row]
-    locked = _read_locked(settings.lock, chain, known.positions)
+    dynamics = read_model(chain, model, settings.drives, motion_limits, options, settings.loads, nominal)
+    check_held(dynamics, motion_limits)
+    # an identification states the torque errors itself
+    noise = None
+    if motion_limits.noise is not None and after is None:
+        noise = motion_limits.noise[dynamics.exact.joint_of_row]
+    locked = _read_locked(settings.lock, chain, motion_limits.positions)
     spread = geometry_spread(robot, source, chain, dynamics, after)
     prior = read_prior(settings.existing, dynamics, chain, after, noise, spread)
-    columns = selected_columns(identifiable(dynamics, chain, locked, prior, noise), dynamics, settings, model)
-    return ExcitationInputs(chain, known, dynamics, locked, columns, prior, spread, found.source or str(source))
+    columns = identifiable(dynamics, chain, locked, prior, noise)
+    columns = selected_columns(columns, dynamics, settings, model)
+    return ExcitationInputs(
+        chain=chain,
+        limits=motion_limits,
+        model=dynamics,
+        locked=locked,
+        columns=columns,
+        prior=prior,
+        geometry=spread,
+        source=calibrated.source or str(source),
+    )
 
 
 def _read_locked(texts: Sequence[str], chain: Chain, limits: BoxLimit) -> dict[int, float | None]:
@@ -137,14 +159,18 @@ def _read_locked(texts: Sequence[str], chain: Chain, limits: BoxLimit) -> dict[i
     Raises:
         UsageError: for an unknown joint, a value beyond its limits, or if all joints are locked.
     """
-    known = {f"{word}{j + 1}": j for word in ("joint", "q") for j in range(chain.n)}
-    known |= {name: j for j, name in enumerate(chain.joint_names)}
-    found: dict[int, float | None] = {}
-    for text in [part.strip() for word in texts for part in word.split(",")]:
+    index: dict[str, int] = {}
+    for j in range(chain.n):
+        index[f"joint{j + 1}"] = j
+        index[f"q{j + 1}"] = j
+    index |= {name: j for j, name in enumerate(chain.joint_names)}
+    locked: dict[int, float | None] = {}
+    for text in ",".join(texts).split(",") if texts else ():
+        text = text.strip()
         name, _, amount = (part.strip() for part in text.partition("="))
-        if name not in known:
+        if name not in index:
             raise UsageError(f"lock {text}: '{name}' is not a joint; joints: {', '.join(chain.joint_names)}")
-        j = known[name]
+        j = index[name]
         with refused_as(UsageError, ValueError, f"lock {text}: '{amount}' is not a number"):
             value = float(amount) if amount else None
         lower, upper = limits.lower[j], limits.upper[j]
@@ -152,9 +178,9 @@ def _read_locked(texts: Sequence[str], chain: Chain, limits: BoxLimit) -> dict[i
             raise UsageError(
                 f"lock {text}: {chain.joint_names[j]} at {value:g} is beyond its limits {lower:.4g} to {upper:.4g}"
             )
-        found[j] = value
-    require(len(found) != chain.n, "lock: all joints are locked; leave at least one free", UsageError)
-    return found
+        locked[j] = value
+    require(len(locked) != chain.n, "lock: all joints are locked; leave at least one free", UsageError)
+    return locked
 
 
 def identifiable(
@@ -170,26 +196,37 @@ def identifiable(
         noise: (rows,) by which torque rows are divided, where no earlier motion states it; None: 1.
     """
     names = model.exact.names
-    known, sigmas = (
-        (None, noise) if prior is None else (prior.information, noise if prior.sigmas is None else prior.sigmas)
-    )
+    information = None
+    sigmas = noise
+    if prior is not None:
+        information = prior.information
+        if prior.sigmas is not None:
+            sigmas = prior.sigmas
     if not locked:
         return IdentifiableColumns(None, sigmas, names)
-    still = np.isin(model.exact.joint_of_row, list(locked))
-    kept = columns_at_rest(model.exact, locked, *chain.sampling_limits(), known, np.flatnonzero(still))
-    sigmas = np.where(still, np.inf, 1.0 if sigmas is None else sigmas)
-    gone = [name for k, name in enumerate(names) if k not in set(kept.tolist())]
-    note = (
-        f"locked: {', '.join(chain.joint_names[j] for j in locked)}; their torques are not used "
-        f"(stiction); {len(kept)} of {len(names)} "
-        f"columns are identifiable ({len(gone)} are regrouped or have no effect: {', '.join(gone[:12])}"
-        f"{', ...' if len(gone) > 12 else ''})"
-    )
-    return IdentifiableColumns(kept, sigmas, tuple(names[k] for k in kept), (note,) if gone else ())
+    # torques of joints that do not move are not used: stiction
+    locked_row = np.isin(model.exact.joint_of_row, list(locked))
+    limits = chain.sampling_limits()
+    columns = columns_at_rest(model.exact, locked, *limits, information, np.flatnonzero(locked_row))
+    sigmas = np.where(locked_row, np.inf, 1.0 if sigmas is None else sigmas)
+    notes: tuple[str, ...] = ()
+    identifiable_columns = set(columns.tolist())
+    lost = [name for k, name in enumerate(names) if k not in identifiable_columns]
+    if lost:
+        joints = ", ".join(chain.joint_names[j] for j in locked)
+        listed = ", ".join(lost[:LISTED_COLUMNS])
+        if len(lost) > LISTED_COLUMNS:
+            listed += ", ..."
+        notes = (
+            f"locked: {joints}; their torques are not used "
+            f"(stiction); {len(columns)} of {len(names)} "
+            f"columns are identifiable ({len(lost)} are regrouped or have no effect: {listed})",
+        )
+    return IdentifiableColumns(columns, sigmas, tuple(names[k] for k in columns), notes)
 
 
 def selected_columns(
-    found: IdentifiableColumns, model: ExcitedModel, settings: ExcitationSettings, folder: Path | None
+    columns: IdentifiableColumns, model: ExcitedModel, settings: ExcitationSettings, folder: Path | None
 ) -> IdentifiableColumns:
     """Return the identifiable columns that the settings request: by name, or the essential ones of an identification.
 
@@ -198,18 +235,20 @@ def selected_columns(
     """
     requested = [name.strip() for text in settings.columns for name in text.split(",")]
     if not requested:
-        return found
+        return columns
     standard = model.exact.model.names
-    short = {standard_name(name, standard): name for name in found.names}
+    column_of = {standard_name(name, standard): name for name in columns.names}
     if "essential" in requested:
-        require(
-            folder is not None, "columns 'essential': needs --model with the folder of an identification", UsageError
-        )
+        if folder is None:
+            raise UsageError("columns 'essential': needs --model with the folder of an identification")
         requested.remove("essential")
-        essential = IdentificationFolder(cast(Path, folder)).essential()
-        requested += [name for name in essential if standard_name(name, standard) in short]  # friction has derivatives
+        # friction terms without derivatives are no columns of a design
+        essential = IdentificationFolder(folder).essential()
+        requested += [name for name in essential if standard_name(name, standard) in column_of]
+    selected = set()
     for name in requested:
-        one_of(standard_name(name, standard), short, "columns: parameter", UsageError)
-    chosen = {short[standard_name(name, standard)] for name in requested}
-    kept = np.array([k for k, name in enumerate(model.exact.names) if name in chosen])
-    return replace(found, chosen=kept)
+        short_name = standard_name(name, standard)
+        one_of(short_name, column_of, "columns: parameter", UsageError)
+        selected.add(column_of[short_name])
+    chosen = np.array([k for k, name in enumerate(model.exact.names) if name in selected])
+    return replace(columns, chosen=chosen)

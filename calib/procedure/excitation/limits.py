@@ -40,18 +40,18 @@ from calib.config import Tables, check_keys, read, strict
 from calib.config_types import Name, NotNegative, Numeric, Real, Spread, Whole, number
 from calib.errors import UsageError, require
 from calib.geometry.observability import targets_of
+from calib.poses.space import PoseConstraint
 from calib.procedure.measuring.constraints_file import DEFAULTS, ConstraintsFile, Point
 from calib.procedure.measuring.pose_limits import Limits, limits_of, tables_of
 from calib.robot.chain import Chain, Joint
 from calib.robot.description import impossible_bodies
 from calib.robot.kinematics import joint_frames, joint_jacobian, sweep
+from calib.trajectories.basis import SampledMotion
+from calib.trajectories.constraints import BoxLimit, MotionConstraint, box_limits
+from calib.trajectories.errors import NothingFeasible
+from calib.trajectories.places import Clearance, Workspace
+from calib.trajectories.setpoints import Setpoints
 from calib.units import motion_units
-from poses.space import PoseConstraint
-from trajectories.basis import SampledMotion
-from trajectories.constraints import BoxLimit, MotionConstraint, box_limits
-from trajectories.errors import NothingFeasible
-from trajectories.places import Clearance, Workspace
-from trajectories.setpoints import Setpoints
 
 # [rad or m, s, N m or N] a number above is no limit of a joint; direct drives of fast robots reach 1300 (our choice)
 MAX = {"velocity": 100.0, "acceleration": 3000.0, "torque": 1e5, "effort": 1e5}
@@ -294,45 +294,45 @@ def read_motion_limits(
         UsageError: for an unknown key or a value that a key cannot have, and where nothing limits speeds, or
             accelerations and torques (`MotionBounds`).
     """
-    stated, where = read(LimitsFile, *tables_of(tables, chain, source, "limits"))
+    settings, where = read(LimitsFile, *tables_of(tables, chain, source, "limits"))
     without = ()
     if stated_path:
-        without = ("joint-margin", "floor") if stated.collision or stated.obstacle else DEFAULTS
-    pose_limits = limits_of(stated, targets_of(chain), source, where, without, seen=False)
+        without = ("joint-margin", "floor") if settings.collision or settings.obstacle else DEFAULTS
+    pose_limits = limits_of(settings, targets_of(chain), source, where, without, measured=False)
 
     speeds = np.array([joint.velocity for joint in chain.joints])
     efforts = np.array([joint.effort for joint in chain.joints])
-    velocity = _per_joint(stated.velocity, f"{where}: velocity", chain, speeds, ("angular speed", "speed"))
-    acceleration = _per_joint(stated.acceleration, f"{where}: acceleration", chain)
-    jerk = _per_joint(stated.jerk, f"{where}: jerk", chain)
-    joint_torques = {key: value for key, value in stated.torque.items() if key not in MARGINS}
+    velocity = _per_joint(settings.velocity, f"{where}: velocity", chain, speeds, ("angular speed", "speed"))
+    acceleration = _per_joint(settings.acceleration, f"{where}: acceleration", chain)
+    jerk = _per_joint(settings.jerk, f"{where}: jerk", chain)
+    joint_torques = {key: value for key, value in settings.torque.items() if key not in MARGINS}
     torque = _per_joint(joint_torques, f"{where}: torque", chain, efforts, ("torque", "force"))
     # without masses no torque is predicted that a limit could hold against
     counted_torque = torque
     if not predicted and chain.inertias is None:
         counted_torque = np.full(chain.n, np.inf)
     sizes = velocity, acceleration, counted_torque
-    bounds = _bounds(chain, str(source or chain.name), stated, where, sizes, default=not stated_path)
+    bounds = _bounds(chain, str(source or chain.name), settings, where, sizes, default=not stated_path)
 
     margin = None
-    if "margin" in stated.torque:
-        margin = number(stated.torque["margin"], f"{where}: torque.margin")
+    if "margin" in settings.torque:
+        margin = number(settings.torque["margin"], f"{where}: torque.margin")
     if margin is not None and not 0.0 <= margin < 1.0:
         raise UsageError(f"{where}: torque.margin: expected a share of the limit, from 0 to below 1, found {margin:g}")
-    deviations = number(stated.torque.get("deviations", DEFAULT_DEVIATIONS), f"{where}: torque.deviations")
+    deviations = number(settings.torque.get("deviations", DEFAULT_DEVIATIONS), f"{where}: torque.deviations")
     if not 0.0 <= deviations < np.inf:
         raise UsageError(f"{where}: torque.deviations: expected 0 or more, found {deviations:g}")
     noise = None
-    if stated.noise:
-        noise = _per_joint(stated.noise, f"{where}: noise", chain, None, ("torque", "force"))
+    if settings.noise:
+        noise = _per_joint(settings.noise, f"{where}: noise", chain, None, ("torque", "force"))
         noise = np.where(np.isfinite(noise), noise, DEFAULT_NOISE * torque)
         require((noise > 0.0).all(), f"{where}: noise: expected standard deviations above 0", UsageError)
 
-    points = _points(stated.point, chain, where)
-    friction = _friction(stated.friction, chain, where)
+    points = _points(settings.point, chain, where)
+    friction = _friction(settings.friction, chain, where)
     linear = [joint.kind == "prismatic" for joint in chain.joints]
     boxes = box_limits(pose_limits.lower, pose_limits.upper, velocity, bounds.acceleration, jerk, linear=linear)
-    constraints: list[MotionConstraint] = [*boxes, *_position_constraints(stated, pose_limits, points)]
+    constraints: list[MotionConstraint] = [*boxes, *_position_constraints(settings, pose_limits, points)]
     notes = list(pose_limits.notes)
     collision = pose_limits.collision
     if collision is None:
@@ -353,7 +353,7 @@ def read_motion_limits(
         margin=margin,
         deviations=deviations,
         friction=friction,
-        resonance=stated.frequency.resonance,
+        resonance=settings.frequency.resonance,
         notes=tuple(notes),
         noise=noise,
     )
@@ -363,8 +363,8 @@ def located(error: NothingFeasible) -> NothingFeasible:
     """Return the error, with the table of the limits file that states the violated limit added to its message."""
     if error.constraint not in STATED_IN:
         return error
-    place = f"the limit is that of {STATED_IN[error.constraint]} {PLACE}"
-    return NothingFeasible(f"{error}; {place}", error.constraint, error.excess, error.unit)
+    advice = f"the limit is that of {STATED_IN[error.constraint]} {PLACE}"
+    return NothingFeasible(f"{error}; {advice}", error.constraint, error.excess, error.unit)
 
 
 def check_bodies(chain: Chain, torque: np.ndarray) -> None:
@@ -384,7 +384,7 @@ def check_bodies(chain: Chain, torque: np.ndarray) -> None:
 
 
 def _bounds(
-    chain: Chain, robot: str, stated: LimitsFile, path: str, sizes: Sequence[np.ndarray], default: bool
+    chain: Chain, robot: str, settings: LimitsFile, path: str, sizes: Sequence[np.ndarray], default: bool
 ) -> MotionBounds:
     """Return the bounds of speed, acceleration and torque; an acceleration without limit gets a default limit.
 
@@ -393,7 +393,7 @@ def _bounds(
     """
     velocity, acceleration, torque = sizes
     origin = {"acceleration": path}
-    for kind, table in (("velocity", stated.velocity), ("torque", stated.torque)):
+    for kind, table in (("velocity", settings.velocity), ("torque", settings.torque)):
         origin[kind] = f"robot description, {path}" if table else "robot description"
     unlimited = (acceleration > MAX["acceleration"]) & (torque > MAX["torque"])
     if default and unlimited.any():
@@ -455,20 +455,20 @@ class _PoseLimit:
         return np.asarray(self.of.function(motion.q), dtype=float)
 
     def slopes(self, motion: SampledMotion, weights: np.ndarray) -> np.ndarray:
-        from poses.space import constraint_gradient
+        from calib.poses.space import constraint_gradient
 
         result = np.zeros((4, *motion.q.shape))
         result[0] = np.einsum("mk,mkn->mn", weights, constraint_gradient(self.of, motion.q))
         return result
 
 
-def _position_constraints(stated: LimitsFile, pose_limits: Limits, points: Points) -> list[MotionConstraint]:
+def _position_constraints(settings: LimitsFile, pose_limits: Limits, points: Points) -> list[MotionConstraint]:
     """Return the constraints: workspace of the tip and of named points, and all other constraints of poses."""
     constraints: list[MotionConstraint] = []
-    radius = stated.target.axis_distance
-    lowest, highest = stated.target.heights
+    radius = settings.target.axis_distance
+    lowest, highest = settings.target.heights
     if radius is not None or lowest is not None:
-        names = ("tool", *(point.name for point in stated.point))
+        names = ("tool", *(point.name for point in settings.point))
         constraints.append(Workspace(points, points.product, names, radius, lowest, highest))
     posture = np.zeros((1, len(pose_limits.lower)))
     for constraint in pose_limits.constraints:
@@ -481,7 +481,7 @@ def _position_constraints(stated: LimitsFile, pose_limits: Limits, points: Point
 
 
 def _per_joint(
-    stated: Mapping[str, Any],
+    values: Mapping[str, Any],
     where: str,
     chain: Chain,
     default: np.ndarray | None = None,
@@ -495,41 +495,41 @@ def _per_joint(
     index = {f"q{j + 1}": j for j in range(chain.n)}
     index |= {name: j for j, name in enumerate(chain.joint_names)}
     further_keys = MARGINS if where.endswith("torque") else ()
-    check_keys(stated, ("all", "share", *further_keys, *index), where)
+    check_keys(values, ("all", "share", *further_keys, *index), where)
     bounds = np.full(chain.n, np.inf)
     if default is not None:
         bounds = default.copy()
-    for name, written in stated.items():
+    for name, written in values.items():
         if name == "share":
             continue
         joints = range(chain.n) if name == "all" else [index[name]]
         for j in joints:
             quantity = quantities[chain.joints[j].kind != "revolute"]
-            value = number(written, f"{where}.{name}", quantity)
+            limit = number(written, f"{where}.{name}", quantity)
             # a file narrows the robot's own limits only
-            bounds[j] = value if default is None else min(value, bounds[j])
-    share = number(stated.get("share", 1.0), f"{where}.share")
+            bounds[j] = limit if default is None else min(limit, bounds[j])
+    share = number(values.get("share", 1.0), f"{where}.share")
     if not 0 < share <= 1:
         raise UsageError(f"{where}.share: expected a share of the limits above 0 and up to 1, found {share:g}")
     return bounds * share
 
 
-def _points(stated: Sequence[PointTable], chain: Chain, where: str) -> Points:
-    for k, point in enumerate(stated, 1):
+def _points(tables: Sequence[PointTable], chain: Chain, where: str) -> Points:
+    for k, point in enumerate(tables, 1):
         if point.joint > chain.n:
             raise UsageError(f"{where}: [[point]] number {k}.joint: expected a joint from 1 to {chain.n} (0: the tip)")
-    joints = (0, *(point.joint for point in stated))
-    positions = [(0.0, 0.0, 0.0), *(point.xyz for point in stated)]
+    joints = (0, *(point.joint for point in tables))
+    positions = [(0.0, 0.0, 0.0), *(point.xyz for point in tables)]
     return Points(chain, joints, np.array(positions))
 
 
-def _friction(stated: FrictionTable | None, chain: Chain, where: str) -> np.ndarray | None:
-    if stated is None:
+def _friction(table: FrictionTable | None, chain: Chain, where: str) -> np.ndarray | None:
+    if table is None:
         return None
     result = []
-    for key, coefficients in (("Fv", stated.Fv), ("Fc", stated.Fc)):
-        values = coefficients or (0.0,) * chain.n
-        if len(values) not in (1, chain.n):
-            raise UsageError(f"{where}: friction.{key}: {len(values)} values for {chain.n} joints")
-        result.append(np.broadcast_to(np.array(values), (chain.n,)))
+    for key, coefficients in (("Fv", table.Fv), ("Fc", table.Fc)):
+        joint_values = coefficients or (0.0,) * chain.n
+        if len(joint_values) not in (1, chain.n):
+            raise UsageError(f"{where}: friction.{key}: {len(joint_values)} values for {chain.n} joints")
+        result.append(np.broadcast_to(np.array(joint_values), (chain.n,)))
     return np.array(result)

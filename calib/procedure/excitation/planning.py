@@ -39,16 +39,16 @@ from calib.procedure.kinematic_stage.inputs import load_rigid
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, joint_kinds
 from calib.robot.kinematics import forward, tip_jacobian
+from calib.trajectories.basis import SampledMotion
+from calib.trajectories.setpoints import Setpoints, joined, slowed
+from calib.trajectories.timing.limits import TimingLimits
+from calib.trajectories.timing.lines import line
+from calib.trajectories.timing.path import Path as JointPath
+from calib.trajectories.timing.path import check_within, checked, spline
+from calib.trajectories.timing.profile import track
+from calib.trajectories.timing.shape import Shaped, shorten
+from calib.trajectories.timing.time_scaling import Timing, time_optimal
 from calib.transforms import pose
-from trajectories.basis import SampledMotion
-from trajectories.setpoints import Setpoints, joined, slowed
-from trajectories.timing.limits import TimingLimits
-from trajectories.timing.lines import line
-from trajectories.timing.path import Path as JointPath
-from trajectories.timing.path import check_within, checked, spline
-from trajectories.timing.profile import track
-from trajectories.timing.shape import Shaped, shorten
-from trajectories.timing.time_scaling import Timing, time_optimal
 
 Progress = Callable[[str], None]
 
@@ -104,17 +104,17 @@ def read_waypoints(
         q = np.asarray(start, dtype=float)
     result = []
     for k in range(len(targets)):
-        near = q if targets.q is None else np.array(targets.q[k])
-        q = _reached(goal, target_poses[k : k + 1], near, configurations, targets, k)
+        start_q = q if targets.q is None else np.array(targets.q[k])
+        q = _reached(goal, target_poses[k : k + 1], start_q, configurations, targets, k)
         result.append(q)
     return np.array(result)
 
 
 def _reached(
-    goal: Goal, target: np.ndarray, near: np.ndarray, configurations: np.ndarray, targets: Targets, k: int
+    goal: Goal, target: np.ndarray, start_q: np.ndarray, configurations: np.ndarray, targets: Targets, k: int
 ) -> np.ndarray:
     """Return joint values (n,) at a target (1, 4, 4), solved from the present pose or else by many tries."""
-    present = near[None]
+    present = start_q[None]
     q = inverse.nearest(goal, target, present, inverse.reach(goal, target, present))
     if np.abs(inverse.differences(goal, q, target)).max() <= MAX_ERROR:
         return q[0]
@@ -132,7 +132,7 @@ def _reached(
             f"{1e3 * np.linalg.norm(nearest[:3]):.3g} mm{angle} off, within the joint limits. Are x y z those of the "
             "tip in the robot's base frame, in metres?"
         )
-    distance = np.where(reached, np.abs(tries - near).max(axis=1), np.inf)
+    distance = np.where(reached, np.abs(tries - start_q).max(axis=1), np.inf)
     closest = tries[np.argmin(distance)][None]
     return inverse.nearest(goal, target, present, closest)[0]
 
@@ -314,8 +314,8 @@ def _check_constraints(path: JointPath, limits: MotionLimits) -> None:
         UsageError: with the violated constraint, the place, and the excess.
     """
     s = np.linspace(0, path.length, CHECKED_POINTS)
-    rest = np.zeros((len(s), path.n))
-    for _, violation, k in limits.broken(SampledMotion(s, path(s), rest, rest, rest)):
+    zero = np.zeros((len(s), path.n))
+    for _, violation, k in limits.broken(SampledMotion(s, path(s), zero, zero, zero)):
         raise UsageError(f"{violation}, after {s[k] / path.length:.0%} of the path; move or add waypoints")
 
 

@@ -15,13 +15,13 @@ from calib.procedure.excitation.limits import DEFAULT_RISE, MotionLimits
 from calib.procedure.excitation.settings import ExcitationSettings
 from calib.records import evenly
 from calib.robot.chain import Chain
-from trajectories.approach import straight_approach
-from trajectories.basis import Family, SampledMotion
-from trajectories.constraints import BoxLimit
-from trajectories.design.search import SearchResult
-from trajectories.design.verify import dense_motion
-from trajectories.places import Clearance
-from trajectories.setpoints import Setpoints, joined, slowed
+from calib.trajectories.approach import straight_approach
+from calib.trajectories.basis import Family, SampledMotion
+from calib.trajectories.constraints import BoxLimit
+from calib.trajectories.design.search import SearchResult
+from calib.trajectories.design.verify import dense_motion
+from calib.trajectories.places import Clearance
+from calib.trajectories.setpoints import Setpoints, joined, slowed
 
 # [1/s, 1/s^2] acceleration and jerk of an approach over its speed, where none is stated
 APPROACH_RISE = DEFAULT_RISE
@@ -52,13 +52,13 @@ class Playback:
     notes: tuple[str, ...]
 
 
-def play(family: Family, found: SearchResult, inputs: ExcitationInputs, settings: ExcitationSettings) -> Playback:
+def play(family: Family, result: SearchResult, inputs: ExcitationInputs, settings: ExcitationSettings) -> Playback:
     """Return the setpoints of a designed motion: approach, periods and rehearsal, as set."""
     model, limits, chain = inputs.model, inputs.limits, inputs.chain
     # a period holds a whole number of the controller's samples
-    period = family.period * found.factor
+    period = family.period * result.factor
     count = round(period * settings.rate)
-    motion = dense_motion(family, found.x, np.arange(count + 1) * (period / count), found.factor)
+    motion = dense_motion(family, result.x, np.arange(count + 1) * (period / count), result.factor)
     once = _with_torque(Setpoints(settings.rate, motion.q, motion.v, motion.a), model)
     approach, notes = approach_to(settings.start, once.q[0], settings.rate, limits, chain)
     before: list[Setpoints] = []

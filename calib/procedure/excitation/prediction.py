@@ -34,11 +34,10 @@ from calib.procedure.excitation.settings import ExcitationSettings
 from calib.procedure.findings import sentence
 from calib.procedure.measuring.prediction import sigma_ratio
 from calib.records import Array, read_json, read_rows
-from calib.result_kinds import refusal
-from trajectories.basis import Family, SampledMotion
-from trajectories.design.problem import ExcitationProblem
-from trajectories.design.search import STAGES, SearchResult, one_start
-from trajectories.design.verify import dense_motion
+from calib.trajectories.basis import Family, SampledMotion
+from calib.trajectories.design.problem import ExcitationProblem
+from calib.trajectories.design.search import STAGES, SearchResult, one_start
+from calib.trajectories.design.verify import dense_motion
 
 NAME = "prediction.csv"
 # of the search for a motion of another period, which only informs the user (our choice)
@@ -133,7 +132,9 @@ def foretell(
     if not np.isfinite(limits).all():
         return None, ()
     if noise is None:
-        share = DEFAULT_NOISE if settings.noise is None else settings.noise
+        share = DEFAULT_NOISE
+        if settings.noise is not None:
+            share = settings.noise
         noise = share * limits
     noise_share = float(np.sqrt(np.mean((noise / limits) ** 2)))
     task = task_of(inputs, settings.seed)
@@ -344,7 +345,8 @@ def _shortened(
 
 def write(rows: Sequence[PredictedSigma], folder: Path) -> Path:
     """Write the parameters' predicted sigmas as CSV; value and rsd [%] are empty where the value is not known."""
-    header = [f"{name} [%]" if name == "rsd" else name for name in PredictedSigma._fields]
+    header = list(PredictedSigma._fields)
+    header[header.index("rsd")] = "rsd [%]"
     return files.write_table(folder / NAME, header, rows)
 
 
@@ -373,7 +375,7 @@ def lines(outlook: MotionOutlook, predicted: Sequence[PredictedSigma] = ()) -> l
 
 def check_folder(folder: Path) -> None:
     """Raise an error if a folder contains no prediction of `calib excite`."""
-    require((folder / NAME).is_file(), refusal(folder, "recall"), UsageError)
+    require((folder / NAME).is_file(), f"{folder} has no {NAME}: give the folder that calib excite wrote", UsageError)
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,18 @@ from calib.arguments import checked
 from calib.config_types import Checked, Flag, OneOf, Real, Seed, Text, Typed, Whole
 from calib.errors import UsageError, refused_as
 
-HARMONICS = 12  # per joint: cond falls by a fifth from 5 to 12, by a tenth more to 20 at twice the cost (our choice)
-DRIVES = ("Ia", "Fv", "Fc", "off")  # terms that a description may state
-GOALS = ("raw", "normalised", "duration", "coverage", "wrist")  # and joint1, joint2, …
 Solver = Literal["slsqp", "mma", "ccsaq", "auglag"]
+
+# per joint: cond falls by a fifth from 5 to 12, by a tenth more to 20 at twice the cost (our choice)
+HARMONICS = 12
+# harmonics that a search begins with (our choice)
+COARSE = 5
+# terms that a description may state
+DRIVES = ("Ia", "Fv", "Fc", "off")
+# with a number each; besides joint1, joint2, …
+GOALS = ("raw", "normalised", "duration", "coverage", "wrist")
+# without a number
 AIMS = ("logdet", "smallest", "torque", "parameters")
-COARSE = 5  # harmonics that a search begins with (our choice)
 
 
 def split_goal(text: str) -> tuple[str, float]:
@@ -27,8 +33,8 @@ def split_goal(text: str) -> tuple[str, float]:
     with refused_as(UsageError, ValueError, expected):
         value = float(amount)
     if name not in GOALS and not re.fullmatch(r"joint[1-9]\d*", name):
-        words = f"use {', '.join(GOALS)}, joint1 …, each with its number, or {' or '.join(AIMS)}"
-        raise UsageError(f"goal '{text}': '{name}' is unknown; {words}")
+        advice = f"use {', '.join(GOALS)}, joint1 …, each with its number, or {' or '.join(AIMS)}"
+        raise UsageError(f"goal '{text}': '{name}' is unknown; {advice}")
     return name, value
 
 
@@ -46,7 +52,8 @@ Slower = Annotated[float, Real(least=1.0, most=1000.0)]
 Starts = Annotated[int, Whole(1, 10_000)]
 Evaluations = Annotated[int, Whole(1, 10_000_000)]
 Harmonics = Annotated[int, Whole(1, 200)]
-Start = tuple[Annotated[float, Real(infinite=True, quantity="1")], ...]  # joint values [rad or m]
+# joint values [rad or m]
+Start = tuple[Annotated[float, Real(infinite=True, quantity="1")], ...]
 
 
 @checked

@@ -45,6 +45,7 @@ from calib import files
 from calib.errors import UsageError
 from calib.folders import OFFSETS, PARAMETERS, check_target, write_staged
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
+from calib.procedure.dynamic_stage.metrics import JudgedMetrics, ModelMetrics, UnseenReport
 from calib.procedure.export import geometry, identified
 from calib.procedure.export.geometry import results
 from calib.procedure.export.identified import ExportedPrediction, IdentifiedRobot
@@ -61,6 +62,7 @@ from calib.procedure.kinematic_stage.folder import (
     FitFolder,
     ValidationFolder,
 )
+from calib.procedure.kinematic_stage.metrics import FitMetrics, ValidationMetrics
 from calib.robot.calibrated import ROBOT, CalibratedChain, nominal_of
 from calib.robot.chain import Joint
 from calib.robot.description import impossible_bodies
@@ -120,49 +122,66 @@ class Export:
     @property
     def urdf(self) -> Path | None:
         """Path of the source if it is a URDF; else None."""
-        return self.source if self.source is not None and is_urdf(self.source) else None
+        if self.source is not None and is_urdf(self.source):
+            return self.source
+        return None
 
     @cached_property
     def with_masses(self) -> tuple[str, list[str]]:
         """URDF with identified masses and friction, and remarks."""
-        found = self.dynamics
+        robot = self.dynamics
         if self.urdf is None:
-            return identified.as_urdf(found, urdf_write.write_new(found.chain), "the chain's own URDF", found.chain)
-        return identified.as_urdf(found, text(self.urdf)[0], str(self.urdf), nominal_of(found.robot))
+            return identified.as_urdf(robot, urdf_write.write_new(robot.chain), "the chain's own URDF", robot.chain)
+        return identified.as_urdf(robot, text(self.urdf)[0], str(self.urdf), nominal_of(robot.robot))
 
     @property
     def files(self) -> list["ExportFile"]:
         """Files that this export may write, in the order of writing."""
-        stages = {GEOMETRY: self.fit is not None, DYNAMICS: self.identified is not None}
-        return [one for one in FILES if any(stages[stage] for stage in one.stages)]
+        files_of_stages = []
+        for file in FILES:
+            of_fit = self.fit is not None and GEOMETRY in file.stages
+            of_identification = self.identified is not None and DYNAMICS in file.stages
+            if of_fit or of_identification:
+                files_of_stages.append(file)
+        return files_of_stages
 
 
 def _urdf(export: Export, path: Path) -> list[str]:
     if export.identified is None:
         return _geometric_urdf(export, path, URDF)
-    edited, notes = export.with_masses
-    files.write(path, edited.encode("utf-8" if export.urdf is None else text(export.urdf)[1]))
-    made = f"{URDF}: joint origins, masses and friction; {READ_BACK}"
-    known = [str(export.prediction)] if export.prediction else []
-    return [*known, made, *identified.notes_of(export.dynamics), *notes]
+    edited, remarks = export.with_masses
+    encoding = "utf-8"
+    if export.urdf is not None:
+        _, encoding = text(export.urdf)
+    files.write(path, edited.encode(encoding))
+    notes = [str(export.prediction)] if export.prediction else []
+    notes.append(f"{URDF}: joint origins, masses and friction; {READ_BACK}")
+    return [*notes, *identified.notes_of(export.dynamics), *remarks]
 
 
 def _corrected_urdf(export: Export, path: Path) -> list[str]:
-    return [] if export.robot.corrections is None else _geometric_urdf(export, path, CORRECTED_URDF)
+    if export.robot.corrections is None:
+        return []
+    return _geometric_urdf(export, path, CORRECTED_URDF)
 
 
 def _geometric_urdf(export: Export, path: Path, name: str) -> list[str]:
+    """Write a URDF of the calibrated geometry: `URDF`, or `CORRECTED_URDF` for joint corrections beside it."""
     if export.urdf is not None:
-        content, read_by = geometry.edited_urdf(export.robot, export.urdf, for_corrections=name != URDF)
-        made = f"joint origins of {export.urdf} are calibrated; base link, flange and all else are unchanged"
-        made += "" if export.urdf.suffix == ".urdf" else f" (a URDF: {export.urdf.name} itself is not rewritten)"
+        content, programs = geometry.edited_urdf(export.robot, export.urdf, for_corrections=name != URDF)
+        change = f"joint origins of {export.urdf} are calibrated; base link, flange and all else are unchanged"
+        if export.urdf.suffix != ".urdf":
+            change += f" (a URDF: {export.urdf.name} itself is not rewritten)"
     else:
         content = ((export.fit or Path()) / name).read_bytes()
         chain = export.robot.chain if name == URDF else export.robot.complete
-        read_by, made = geometry.check_readback(content.decode(), name, chain), "written from the calibrated table"
+        programs = geometry.check_readback(content.decode(), name, chain)
+        change = "written from the calibrated table"
     files.write(path, _remarked(content, export.remark))
-    kept = impossible_bodies(export.robot.chain) if name == URDF else ()
-    return [f"{path.name}: {made}; {read_by}", *(f"unchanged from the source: {each}" for each in kept)]
+    notes = [f"{path.name}: {change}; {programs}"]
+    if name == URDF:
+        notes += [f"unchanged from the source: {fault}" for fault in impossible_bodies(export.robot.chain)]
+    return notes
 
 
 def _copy(export: Export, path: Path) -> list[str]:
@@ -170,7 +189,9 @@ def _copy(export: Export, path: Path) -> list[str]:
     if not original.exists():
         return []
     files.write(path, original.read_bytes())
-    return [f"{TERMS}: corrections for {CORRECTED_URDF}; formula in {FORMULA}"] if path.name == TERMS else []
+    if path.name == TERMS:
+        return [f"{TERMS}: corrections for {CORRECTED_URDF}; formula in {FORMULA}"]
+    return []
 
 
 def _offsets(export: Export, path: Path) -> list[str]:
@@ -191,19 +212,31 @@ def _mjcf(export: Export, path: Path) -> list[str]:
 
 def write_drives(joints: Sequence[Joint], drives: identified.Drives, path: Path) -> None:
     """Write ``drives.csv``: the drives' values of joints, and of couplings, with their sigmas."""
-    named = [(joint.name, joint) for joint in joints]
-    named += [(f"{joints[i].name} {'+' if w > 0 else '-'} {joints[j].name}", joints[i]) for i, j, w in drives.pairs]
-    rows, values = [], np.vstack([drives.values, drives.couplings])
+    names = [joint.name for joint in joints]
+    kinds = [joint.kind for joint in joints]
+    for first, second, weight in drives.pairs:
+        sign = "+" if weight > 0 else "-"
+        names.append(f"{joints[first].name} {sign} {joints[second].name}")
+        kinds.append(joints[first].kind)
+    values = np.vstack([drives.values, drives.couplings])
     sigmas = np.zeros(values.shape) if drives.sigma is None else drives.sigma
-    for (name, joint), row, sigma in zip(named, values, sigmas, strict=True):
-        units = ("kg", "N s/m", "N") if joint.kind == "prismatic" else ("kg m²", "N m s/rad", "N m")
-        rows.append((name, *map(float, row), *units, *(float(one) or None for one in sigma)))
+    rows = []
+    for name, kind, row, sigma in zip(names, kinds, values, sigmas, strict=True):
+        units = ("kg m²", "N m s/rad", "N m")
+        if kind == "prismatic":
+            units = ("kg", "N s/m", "N")
+        # a sigma is empty where the model has no such term
+        stated = [float(value) or None for value in sigma]
+        rows.append((name, *map(float, row), *units, *stated))
     files.write_table(path, DRIVE_COLUMNS, rows)
 
 
 def _drives(export: Export, path: Path) -> list[str]:
     write_drives(export.dynamics.chain.joints, export.dynamics.drives, path)
-    return [f"{path.name}, {PARAMETERS}" + ("" if export.urdf is None else ", joint_origins.yaml (tesseract's SRDF)")]
+    note = f"{path.name}, {PARAMETERS}"
+    if export.urdf is not None:
+        note += ", joint_origins.yaml (tesseract's SRDF)"
+    return [note]
 
 
 def _joint_origins(export: Export, path: Path) -> list[str]:
@@ -288,7 +321,11 @@ def deliver_single(export: Export, targets: Mapping[str, Path]) -> list[str]:
     Returns:
         What was written and what to know of it, in words.
     """
-    return [note for file in export.files if file.name in targets for note in file.write(export, targets[file.name])]
+    notes = []
+    for file in export.files:
+        if file.name in targets:
+            notes += file.write(export, targets[file.name])
+    return notes
 
 
 def check_into(export: Export, into: Path, folder: Path) -> None:
@@ -301,9 +338,12 @@ def check_into(export: Export, into: Path, folder: Path) -> None:
     Raises:
         UsageError: with the file or folder concerned.
     """
-    earlier = any((into / mark).exists() for mark in (OFFSETS, PARAMETERS))
     names = [file.name for file in export.files]
-    check_target(into, names, () if earlier else (PARAMETERS,), "export", [export.urdf, *results(folder)])
+    marks: tuple[str, ...] = (PARAMETERS,)
+    # an earlier export
+    if (into / OFFSETS).exists() or (into / PARAMETERS).exists():
+        marks = ()
+    check_target(into, names, marks, "export", [export.urdf, *results(folder)])
 
 
 def verdicts(folder: Path) -> Verdicts:
@@ -311,66 +351,108 @@ def verdicts(folder: Path) -> Verdicts:
 
     Empty where the folder is of an earlier version and does not say it, or where its session has yet to judge it.
     """
-    dynamics = IdentificationFolder(folder)
-    validated = ValidationFolder(folder.absolute().parent / VALIDATED)
     try:
-        if dynamics.model.is_file():
-            found = dynamics.unseen.read() if dynamics.unseen.report.is_file() else dynamics.metrics()
-            return Verdicts({"dynamics": Verdict(found.verdict, found.reason)} if found.verdict else {})
-        own = folder.absolute().name == IN_SESSION and validated.judged.is_file()
-        judged = validated.metrics() if own else FitFolder(folder).metrics()
+        if IdentificationFolder(folder).model.is_file():
+            return Verdicts(_stage_verdict("dynamics", _identification_record(folder)))
+        record = _fit_record(folder)
+        return Verdicts(_stage_verdict("geometry", record), record.deliverables)
     except UsageError:
         return Verdicts()
-    return Verdicts({"geometry": Verdict(judged.verdict, judged.reason)} if judged.verdict else {}, judged.deliverables)
 
 
-def by_file(out: Path, found: Verdicts) -> dict[str, Verdicts]:
+def _identification_record(folder: Path) -> UnseenReport | ModelMetrics:
+    """Return the record of an identification: on unseen motion where a session has judged it."""
+    identification = IdentificationFolder(folder)
+    if identification.unseen.report.is_file():
+        return identification.unseen.read()
+    return identification.metrics()
+
+
+def _fit_record(folder: Path) -> ValidationMetrics | FitMetrics:
+    """Return the record of a fit: on unseen poses where a session has judged it."""
+    validation = ValidationFolder(folder.absolute().parent / VALIDATED)
+    if folder.absolute().name == IN_SESSION and validation.judged.is_file():
+        return validation.metrics()
+    return FitFolder(folder).metrics()
+
+
+def _stage_verdict(stage: str, record: JudgedMetrics | ValidationMetrics) -> dict[str, Verdict]:
+    """Return the verdict of a stage by its name; none where the record says none."""
+    return {stage: Verdict(record.verdict, record.reason)} if record.verdict else {}
+
+
+def by_file(out: Path, verdicts: Verdicts) -> dict[str, Verdicts]:
     """Return the verdicts on each existing exported file that a robot or a simulation uses for motion."""
-    dynamic = (out / PARAMETERS).exists()
-    judged = [file for file in FILES if file.deliverable and (out / file.name).exists()]
-    return {file.name: found.of(file.deliverable, dynamic and "dynamics" in file.stages) for file in judged}
+    with_dynamics = (out / PARAMETERS).exists()
+    result = {}
+    for file in FILES:
+        if file.deliverable and (out / file.name).exists():
+            result[file.name] = verdicts.of(file.deliverable, with_dynamics and DYNAMICS in file.stages)
+    return result
 
 
 def prediction(out: Path) -> ExportedPrediction | None:
     """Return the torque prediction errors of an exported robot; None without dynamics, or if unknown."""
     path = out / PARAMETERS
-    found = json.loads(path.read_text(encoding="utf-8")).get("prediction") if path.exists() else None
-    return None if found is None else ExportedPrediction(**found)
+    if not path.exists():
+        return None
+    table = json.loads(path.read_text(encoding="utf-8")).get("prediction")
+    return None if table is None else ExportedPrediction(**table)
 
 
-def mark(out: Path, found: Verdicts) -> list[str]:
+def mark(out: Path, verdicts: Verdicts) -> list[str]:
     """Write verdicts other than pass at the head of the exported files, and the use of each file into README.txt.
 
     Args:
         out: the folder of the export.
-        found: what was judged.
+        verdicts: on the stages and deliverables.
 
     Returns:
         What does not pass, in words.
     """
-    judged = by_file(out, found)
+    of_files = by_file(out, verdicts)
     for file in FILES:
-        if file.marked and file.name in judged and judged[file.name].remark:
-            files.write(out / file.name, _remarked((out / file.name).read_bytes(), judged[file.name].remark))
-    readme, known = out / README, prediction(out)
+        if file.marked and file.name in of_files:
+            remark = of_files[file.name].remark
+            if remark:
+                files.write(out / file.name, _remarked((out / file.name).read_bytes(), remark))
+
+    # a README that is not ours stays
+    readme = out / README
     if not readme.exists() or readme.read_text(encoding="utf-8", errors="replace").startswith("verdict "):
-        head = [str(found) if found.level else "verdict unknown", *([str(known)] if known else []), ""]
-        files.write(readme, "\n".join([*head, *_uses(out, judged), ""]))
-    aside = {name: own for name, own in judged.items() if name in (URDF, CORRECTED_URDF) and own.level != found.level}
-    lines = [found.remark, *(own.remark and f"{name}: {own.remark}" for name, own in aside.items())]
-    return [line for line in lines if line]
+        lines = [str(verdicts) if verdicts.level else "verdict unknown"]
+        predicted = prediction(out)
+        if predicted:
+            lines.append(str(predicted))
+        files.write(readme, "\n".join([*lines, "", *_uses(out, of_files), ""]))
+
+    remarks = [verdicts.remark] if verdicts.remark else []
+    for name, file_verdicts in of_files.items():
+        differs = name in (URDF, CORRECTED_URDF) and file_verdicts.level != verdicts.level
+        if differs and file_verdicts.remark:
+            remarks.append(f"{name}: {file_verdicts.remark}")
+    return remarks
 
 
-def _uses(out: Path, judged: Mapping[str, Verdicts]) -> Iterator[str]:
+def _uses(out: Path, of_files: Mapping[str, Verdicts]) -> Iterator[str]:
     """Yield the use of each exported file, and the verdict on it."""
-    holds = "identified masses and friction" if (out / PARAMETERS).exists() else "masses of the source"
+    with_dynamics = (out / PARAMETERS).exists()
     for file in FILES:
         name = file.name
-        if (out / name).exists():
-            yield f"{name}: {file.use}" + (f"; geometry with {holds}" if name == URDF else "")
-            if name in judged and judged[name].level:
-                yield f"    {judged[name]}" if name in (URDF, CORRECTED_URDF) else f"    verdict {judged[name].level}"
-    if (out / PARAMETERS).exists():
+        if not (out / name).exists():
+            continue
+        use = f"{name}: {file.use}"
+        if name == URDF:
+            masses = "identified masses and friction" if with_dynamics else "masses of the source"
+            use += f"; geometry with {masses}"
+        yield use
+        if name in of_files and of_files[name].level:
+            # with its reasons where it is the robot
+            verdict = f"verdict {of_files[name].level}"
+            if name in (URDF, CORRECTED_URDF):
+                verdict = str(of_files[name])
+            yield f"    {verdict}"
+    if with_dynamics:
         yield "the geometry alone: calib export FIT --urdf SOURCE.urdf --out robot_geometry_only.urdf"
 
 
@@ -378,5 +460,7 @@ def _remarked(content: bytes, remark: str) -> bytes:
     """Return an XML or YAML file with a remark, one line, at its head, as a comment."""
     if not remark:
         return content
-    xml = b"<" in content[:8]  # behind a byte order mark, perhaps in UTF-16; our YAML begins with a comment
-    return with_comment(content, remark) if xml else f"# {remark}\n".encode() + content
+    # behind a byte order mark, perhaps in UTF-16; our YAML begins with a comment
+    if b"<" in content[:8]:
+        return with_comment(content, remark)
+    return f"# {remark}\n".encode() + content

@@ -20,8 +20,13 @@ from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.kinematics import forward, joint_frames
 from calib.transforms import invert
 
+# of poses read back [m, and as a rotation matrix], and of torques over the largest
+MAX_DIFFERENCE = 1e-9
+# random configurations at which a URDF is read back, by Pinocchio and by the slower yourdfpy
+CHECKED_POSES = 20
+CHECKED_AGAIN = 5
+
 OFFSETS_HEADER = ("joint", "unit", "add_to_reading", "add_to_command", "sigma")
-MAX_DIFFERENCE = 1e-9  # of poses read back [m, and as a rotation matrix], and of torques over the largest
 
 
 class NoSuchArm(UsageError):
@@ -70,8 +75,9 @@ def edited_urdf(robot: CalibratedChain, source: Path, for_corrections: bool = Fa
 
 def chain_in(tree: UrdfTree, chain: Chain, base: str | None = None) -> Chain:
     """Return the chain of a URDF with another chain's joints and tip, if the URDF has these names."""
-    named = chain.joint_names if chain.joint_names[0] in tree.joints else None
-    return urdf.build(tree, urdf.ends(tree, base, chain.tip if chain.tip in tree.bodies else None, named))
+    joints = chain.joint_names if chain.joint_names[0] in tree.joints else None
+    tip = chain.tip if chain.tip in tree.bodies else None
+    return urdf.build(tree, urdf.ends(tree, base, tip, joints))
 
 
 def check_readback(edited: str, where: str, chain: Chain) -> str:
@@ -81,20 +87,26 @@ def check_readback(edited: str, where: str, chain: Chain) -> str:
         The programs that have read it. A text that yourdfpy cannot read is accepted, and the reason is stated.
     """
     tree = read_tree(edited, where)
-    own = chain_in(tree, chain)
-    q = random_joints(own, 20, 0)
-    error = float(np.abs(tip_poses(edited, own, q) - forward(own, q)).max())
-    if error > MAX_DIFFERENCE:
-        raise RobotError(f"{where}: poses differ by {error:.2g} when Pinocchio reads the URDF; nothing was written")
-    few = q[:5]
+    urdf_chain = chain_in(tree, chain)
+    q = random_joints(urdf_chain, CHECKED_POSES, 0)
+    difference = float(np.abs(tip_poses(edited, urdf_chain, q) - forward(urdf_chain, q)).max())
+    if difference > MAX_DIFFERENCE:
+        raise RobotError(
+            f"{where}: poses differ by {difference:.2g} when Pinocchio reads the URDF; nothing was written"
+        )
+
+    q = q[:CHECKED_AGAIN]
+    links = (*urdf_chain.links, urdf_chain.tip)
     try:
-        seen = link_poses(edited, (*own.links, own.tip), own.base, own.joint_names, few)
+        T_base_links = link_poses(edited, links, urdf_chain.base, urdf_chain.joint_names, q)
     except RobotError as error:
         return f"Pinocchio reads the same poses to 1e-9; not read a second time: {error}"
-    straight = np.stack([invert(urdf.align(tree.above[link].axis)) for link in own.links])[:, None]  # of slanted axes
-    error = float(np.abs(seen - np.concatenate([joint_frames(own, few) @ straight, forward(own, few)[None]])).max())
-    if error > MAX_DIFFERENCE:
-        raise RobotError(f"{where}: poses differ by {error:.2g} when yourdfpy reads the URDF; nothing was written")
+    # links of slanted axes are turned against the chain's frames
+    turns = [invert(urdf.align(tree.above[link].axis)) for link in urdf_chain.links]
+    expected = [joint_frames(urdf_chain, q) @ np.stack(turns)[:, None], forward(urdf_chain, q)[None]]
+    difference = float(np.abs(T_base_links - np.concatenate(expected)).max())
+    if difference > MAX_DIFFERENCE:
+        raise RobotError(f"{where}: poses differ by {difference:.2g} when yourdfpy reads the URDF; nothing was written")
     return "Pinocchio and yourdfpy read the same poses to 1e-9"
 
 
@@ -105,12 +117,14 @@ def export_offsets(robot: CalibratedChain, out: Path) -> Path:
     Where the fit has joint corrections, offsets and their sigmas are those of the best geometry without them: for
     whoever does not apply them.
     """
-    nominal, sigma = nominal_of(robot), np.full(len(robot.chain.elements), np.nan)
+    nominal = nominal_of(robot)
+    sigma = np.full(len(robot.chain.elements), np.nan)
     if robot.covariance is not None:
         sigma = np.sqrt(np.diag(robot.covariance))
     rows = []
     for joint, k in zip(robot.chain.joints, robot.chain.moving):
-        element, before = robot.chain.elements[k], nominal.elements[k]
-        offset = (element.value - before.value) / element.ratio
-        rows.append((joint.name, joint.unit, offset, 0.0 - offset, float(sigma[k]) if sigma[k] > 0.0 else None))
+        element = robot.chain.elements[k]
+        offset = (element.value - nominal.elements[k].value) / element.ratio
+        offset_sigma = float(sigma[k]) if sigma[k] > 0.0 else None
+        rows.append((joint.name, joint.unit, offset, 0.0 - offset, offset_sigma))
     return files.write_table(out, OFFSETS_HEADER, rows)

@@ -33,10 +33,12 @@ from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.kinematics import moving_frames
 from calib.transforms import invert
 
-MAX_MASS_RATIO = 3.0  # times a body's mass in the description from which on it is named (our choice)
-
-
+# ratio of a body's mass to that in the description from which on it is named (our choice)
+MAX_MASS_RATIO = 3.0
+# columns of `Drives.values` by the shape of a drive term
 PLAIN = {"acceleration": 0, "velocity": 1, "sign": 2, "one": 3}
+# random configurations at which a file is read back
+CHECKED_MOTIONS = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,11 +97,11 @@ def read(folder: Path, prior: str = "entropic") -> IdentifiedRobot:
     """Return the robot of an identification's folder, made physically consistent by a prior (`find_possible`)."""
     refuse_currents(folder, "an export of masses")
     information = read_information(folder)
-    found = find_possible(information, prior=prior)
-    own = bodies_of(information.chain).count
-    bodies = found.dynamics.values[: 10 * own].reshape(own, 10)
-    table = drive_table(found.dynamics, found.covariance)
-    return IdentifiedRobot(geometry.read(folder), information, found, bodies, table)
+    solution = find_possible(information, prior=prior)
+    count = bodies_of(information.chain).count
+    bodies = solution.dynamics.values[: 10 * count].reshape(count, 10)
+    drives = drive_table(solution.dynamics, solution.covariance)
+    return IdentifiedRobot(geometry.read(folder), information, solution, bodies, drives)
 
 
 @dataclass(frozen=True)
@@ -117,103 +119,135 @@ class ExportedPrediction:
         )
 
 
-def exported_prediction(given: IdentifiedRobot, folder: Path) -> ExportedPrediction | None:
+def exported_prediction(robot: IdentifiedRobot, folder: Path) -> ExportedPrediction | None:
     """Return the torque prediction error of the exported robot, on the worst recording in `folder`.
 
     None where these recordings carry payloads or are by a version that did not keep their speeds.
     """
-    dynamics, found = without_left(given.found.dynamics), []
+    dynamics = without_left(robot.found.dynamics)
+    worst = None
     for path in IdentificationFolder(folder).torques:
         motion = read_torques(path) if path.is_file() else {}
         if not motion:
             continue
+        measured = motion["measured"]
         torque = dynamics.model.torque(dynamics.values, motion["q"], motion["v"], motion["a"], ())
-        size = np.linalg.norm(motion["measured"]) / 100.0
-        left = [float(np.linalg.norm(motion["measured"] - one) / size) for one in (torque, motion["predicted"])]
-        found.append(ExportedPrediction(str(path.relative_to(folder)), *left))
-    return max(found, key=lambda one: one.exported, default=None)
+        one_percent = np.linalg.norm(measured) / 100.0
+        exported = float(np.linalg.norm(measured - torque) / one_percent)
+        identified = float(np.linalg.norm(measured - motion["predicted"]) / one_percent)
+        if worst is None or exported > worst.exported:
+            worst = ExportedPrediction(str(path.relative_to(folder)), exported, identified)
+    return worst
 
 
-def notes_of(given: IdentifiedRobot) -> list[str]:
+def notes_of(robot: IdentifiedRobot) -> list[str]:
     """Return findings on the exported inertias and masses, and on parameters that no robot file contains."""
-    solved, chain, bodies = given.found, given.chain, given.found.dynamics.model.bodies
-    masses, theirs = given.bodies[:, 9], [] if chain.inertias is None else chain.inertias[:, 9]
-    found = [
+    solution, drives = robot.found, robot.drives
+    findings = [
         finding(
             "inertias",
-            distance=solved.distance,
-            count=given.information.b,
-            allowed=solved.allowed,
-            source=solved.source,
-            weight=solved.weight,
-            prior=solved.prior,
-            thinnest=solved.margins.min(),
+            distance=solution.distance,
+            count=robot.information.b,
+            allowed=solution.allowed,
+            source=solution.source,
+            weight=solution.weight,
+            prior=solution.prior,
+            thinnest=solution.margins.min(),
         )
     ]
-    if not solved.possible:
-        blamed = [f"{name} (without it {left:.3g})" for name, left in solved.blamed]
-        found.append(finding("inertias-inconsistent", nearest=solved.nearest, allowed=solved.allowed, blamed=blamed))
-    found.append(finding("masses-written", masses=[f"{mass:.3g}" for mass in masses]))
-    rows = [row for row in zip(chain.joint_names, masses, theirs) if max(row[1:]) > MAX_MASS_RATIO * min(row[1:])]
-    offsets = ["offsets"] if np.any(given.drives.values[:, 3]) else []
+    if not solution.possible:
+        blamed = [f"{name} (without it {distance:.3g})" for name, distance in solution.blamed]
+        findings.append(
+            finding("inertias-inconsistent", nearest=solution.nearest, allowed=solution.allowed, blamed=blamed)
+        )
+    masses = robot.bodies[:, 9]
+    findings.append(finding("masses-written", masses=[f"{mass:.3g}" for mass in masses]))
+
+    unlike = []
+    if robot.chain.inertias is not None:
+        for name, mass, described in zip(robot.chain.joint_names, masses, robot.chain.inertias[:, 9]):
+            if max(mass, described) > MAX_MASS_RATIO * min(mass, described):
+                unlike.append(f"{name} {mass:.3g} kg ({described:.3g})")
+    only_in_parameters = list(drives.left)
+    if np.any(drives.values[:, 3]):
+        only_in_parameters.insert(0, "offsets")
+    bodies = solution.dynamics.model.bodies
     optional = {
-        "masses-unlike": [f"{name} {mass:.3g} kg ({stated:.3g})" for name, mass, stated in rows],
-        "description-inconsistent": impossible_bodies(chain),
-        "urdf-without-motor-inertias": given.drives.values[:, 0].nonzero()[0],
-        "only-in-parameters": [*offsets, *given.drives.left],
-        "payload-not-exported": [label for label, c in zip(bodies.labels, bodies.coordinates) if c < 0],
+        "masses-unlike": unlike,
+        "description-inconsistent": impossible_bodies(robot.chain),
+        "urdf-without-motor-inertias": drives.values[:, 0].nonzero()[0],
+        "only-in-parameters": only_in_parameters,
+        "payload-not-exported": [label for label, row in zip(bodies.labels, bodies.coordinates) if row < 0],
     }
-    found += [finding(code, names=names, times=MAX_MASS_RATIO) for code, names in optional.items() if len(names)]
-    return [*lines_of(found), *solved.notes]
+    for code, names in optional.items():
+        if len(names):
+            findings.append(finding(code, names=names, times=MAX_MASS_RATIO))
+    return [*lines_of(findings), *solution.notes]
 
 
-def parameters(given: IdentifiedRobot) -> dict[str, Any]:
+def parameters(robot: IdentifiedRobot) -> dict[str, Any]:
     """Return the content of ``parameters.json``."""
-    estimate, found, chain = given.information, given.found, given.chain
-    model = found.dynamics.model
-    same = ("possible", "nearest", "distance", "allowed", "weight", "prior", "notes")
-    consistency = {name: getattr(found, name) for name in same} | {
-        "margins_m": dict(zip(model.bodies.labels, found.margins)),
-        "sigmas_widened_by": found.doubt,
-        "drawn_to": found.source,
-        "blamed": dict(found.blamed),
-    }
-    geometric = {"nominal": nominal_of(given.robot).values, "covariance": given.robot.covariance}
-    frames = "about the chain's frame behind each joint (robot.toml), payloads about the tip"
-    standard = {"names": model.names, "units": model.units, "values": found.dynamics.values}
+    estimate, solution, chain = robot.information, robot.found, robot.chain
+    model = solution.dynamics.model
     return {
         "robot": chain.name,
-        "geometry": _columns(chain) | geometric,
+        "geometry": {
+            "names": chain.names,
+            "units": chain.units,
+            "values": chain.values,
+            "nominal": nominal_of(robot.robot).values,
+            "covariance": robot.robot.covariance,
+        },
         "dynamics": {
             "gravity": model.bodies.gravity,
             "rows": model.torque_rows.name,
-            "base": _columns(estimate) | {"covariance": estimate.covariance},
-            "standard": standard | {"covariance": found.covariance, "frames": frames},
-            "consistency": consistency,
+            "base": {
+                "names": estimate.names,
+                "units": estimate.units,
+                "values": estimate.values,
+                "covariance": estimate.covariance,
+            },
+            "standard": {
+                "names": model.names,
+                "units": model.units,
+                "values": solution.dynamics.values,
+                "covariance": solution.covariance,
+                "frames": "about the chain's frame behind each joint (robot.toml), payloads about the tip",
+            },
+            "consistency": {
+                "possible": solution.possible,
+                "nearest": solution.nearest,
+                "distance": solution.distance,
+                "allowed": solution.allowed,
+                "weight": solution.weight,
+                "prior": solution.prior,
+                "notes": solution.notes,
+                "margins_m": dict(zip(model.bodies.labels, solution.margins)),
+                "sigmas_widened_by": solution.doubt,
+                "drawn_to": solution.source,
+                "blamed": dict(solution.blamed),
+            },
         },
     }
 
 
-def _columns(of: Chain | Information) -> dict[str, Any]:
-    return {name: getattr(of, name) for name in ("names", "units", "values")}
-
-
-def as_mjcf(given: IdentifiedRobot, where: str) -> str:
+def as_mjcf(robot: IdentifiedRobot, where: str) -> str:
     """Return the MJCF of an identified robot.
 
     Raises:
         RobotError: where Pinocchio reads other poses, torques or drives.
     """
-    model = mjcf_text(given.chain, given.bodies, *given.drives.values.T[:3])
-    _check(given, model, given.chain, where, mjcf=True)
+    armature, damping, friction, _ = robot.drives.values.T
+    model = mjcf_text(robot.chain, robot.bodies, armature, damping, friction)
+    _check(robot, model, robot.chain, where, mjcf=True)
     return model
 
 
-def as_urdf(given: IdentifiedRobot, content: str, where: str, nominal: Chain) -> tuple[str, list[str]]:
+def as_urdf(robot: IdentifiedRobot, content: str, where: str, nominal: Chain) -> tuple[str, list[str]]:
     """Return a URDF text with calibrated origins, masses and friction, and notes.
 
     Args:
-        given: the identified robot.
+        robot: the identified robot.
         content: the URDF of the nominal robot.
         where: names it in messages.
         nominal: the arm that `content` describes.
@@ -221,99 +255,101 @@ def as_urdf(given: IdentifiedRobot, content: str, where: str, nominal: Chain) ->
     Raises:
         RobotError: where Pinocchio reads other poses, torques or drives.
     """
-    chain = given.chain
+    chain = robot.chain
     calibrated_text = urdf_write.edit(content, nominal, chain, where)
     tree = read_tree(calibrated_text, where)
-    own = geometry.chain_in(tree, chain, chain.base if chain.base in tree.bodies else None)
-    own = replace(own, gravity=chain.gravity)
-    links, notes = _link_bodies(given, tree, own)
-    names = own.joint_names
-    friction = {name: (float(row[1]), float(row[2])) for name, row in zip(names, given.drives.values)}
+    base = chain.base if chain.base in tree.bodies else None
+    urdf_chain = replace(geometry.chain_in(tree, chain, base), gravity=chain.gravity)
+    links, notes = _link_bodies(robot, tree, urdf_chain)
+    friction = {}
+    for name, (_, damping, coulomb, _) in zip(urdf_chain.joint_names, robot.drives.values):
+        friction[name] = float(damping), float(coulomb)
     edited = urdf_write.put(calibrated_text, where, links, friction)
     geometry.check_readback(edited, where, chain)
-    _check(given, edited, own, where)
+    _check(robot, edited, urdf_chain, where)
     return edited, notes
 
 
-def _link_bodies(given: IdentifiedRobot, tree: UrdfTree, own: Chain) -> tuple[dict[str, np.ndarray], list[str]]:
+def _link_bodies(robot: IdentifiedRobot, tree: UrdfTree, chain: Chain) -> tuple[dict[str, np.ndarray], list[str]]:
     """Return the inertials to write by link, about the links' frames, and notes."""
-    path = [joint for joint in tree.path(own.base, own.tip) if joint.moves]
-    zero = np.zeros((1, own.n))
-    between = invert(moving_frames(own, zero)[:, 0]) @ moving_frames(given.chain, zero)[:, 0]
+    joints_to_tip = tree.path(chain.base, chain.tip)
+    moving = [joint for joint in joints_to_tip if joint.moves]
+    zero = np.zeros((1, chain.n))
+    T_urdf_chain = invert(moving_frames(chain, zero)[:, 0]) @ moving_frames(robot.chain, zero)[:, 0]
     links: dict[str, np.ndarray] = {}
     notes: list[str] = []
-    for joint, turn, body in zip(path, between, given.bodies):
-        if not body.any():
+    for joint, T, identified_body in zip(moving, T_urdf_chain, robot.bodies):
+        if not identified_body.any():
             continue
-        whole = transform_body(body, urdf.align(joint.axis) @ turn)
-        fixed, loose = urdf_write.hanging(tree, tree.path(own.base, own.tip), joint.child)
-        others = {
-            name: placed for name, placed in fixed.items() if name != joint.child and tree.bodies[name] is not None
-        }
-        rest = whole - _sum(tree, loose)
-        links[joint.child] = rest - _sum(tree, others)
-        if others and not pseudo_inertia.margin(links[joint.child]) > 0.0:
-            links |= {joint.child: rest, **{name: np.zeros(10) for name in others}}
+        # all that moves with the joint up to the next one; links on other joints keep their masses
+        total = transform_body(identified_body, urdf.align(joint.axis) @ T)
+        fixed, loose = urdf_write.hanging(tree, joints_to_tip, joint.child)
+        remainder = total - _sum(tree, loose)
+        with_mass = [name for name in fixed if name != joint.child and tree.bodies[name] is not None]
+        attached = {name: fixed[name] for name in with_mass}
+        links[joint.child] = remainder - _sum(tree, attached)
+        if attached and not pseudo_inertia.margin(links[joint.child]) > 0.0:
+            links[joint.child] = remainder
+            links |= {name: np.zeros(10) for name in attached}
             notes.append(
-                f"link {joint.child}: it has the whole mass, and {', '.join(others)} have mass zero: with their masses "
-                "in the URDF the remaining body is not physically consistent"
+                f"link {joint.child}: it has the whole mass, and {', '.join(attached)} have mass zero: with their "
+                "masses in the URDF the remaining body is not physically consistent"
             )
         if not pseudo_inertia.margin(links[joint.child]) > 0.0:
-            raise RobotError(_no_room(tree, joint.name, joint.child, whole[9], loose))
+            bodies = [tree.bodies[name] for name in loose]
+            loose_mass = sum(float(body[9]) for body in bodies if body is not None)
+            raise RobotError(
+                f"{tree.where}: {total[9]:.3g} kg were identified between {joint.name} and the arm's next joint, and "
+                f"the file hangs {loose_mass:.3g} kg on link '{joint.child}' by joints that are not the arm's "
+                f"({listing(loose, 3)}): no possible body remains for the link. Either the motion does not identify "
+                "that joint's mass (estimate.csv: its sigma), or the drive gains or the masses of those links are "
+                "wrong: correct these and identify again, or omit --urdf: then robot.urdf is the arm alone"
+            )
     return links, notes
 
 
-def _no_room(tree: UrdfTree, joint: str, link: str, mass: float, loose: Mapping[str, np.ndarray]) -> str:
-    """Return the message for a link whose identified inertia leaves no possible body beside what hangs on it.
-
-    Args:
-        mass: identified for all that the joint moves up to the arm's next joint [kg].
-        loose: links on joints that are not the arm's, by name.
-    """
-    hanging = sum(float(body[9]) for name in loose if (body := tree.bodies[name]) is not None)
-    return (
-        f"{tree.where}: {mass:.3g} kg were identified between {joint} and the arm's next joint, and the file hangs "
-        f"{hanging:.3g} kg on link '{link}' by joints that are not the arm's ({listing(loose, 3)}): no possible body "
-        "remains for the link. Either the motion does not identify that joint's mass (estimate.csv: its sigma), or the "
-        "drive gains or the masses of those links are wrong: correct these and identify again, or omit --urdf: then "
-        "robot.urdf is the arm alone"
-    )
-
-
-def _sum(tree: UrdfTree, placed: Mapping[str, np.ndarray]) -> np.ndarray:
+def _sum(tree: UrdfTree, placements: Mapping[str, np.ndarray]) -> np.ndarray:
     """Return the summed standard parameters (10,) of links in the URDF."""
-    found = [(tree.bodies[name], pose) for name, pose in placed.items()]
-    return sum((transform_body(body, pose) for body, pose in found if body is not None), np.zeros(10))
+    total = np.zeros(10)
+    for name, T_link in placements.items():
+        body = tree.bodies[name]
+        if body is not None:
+            total = total + transform_body(body, T_link)
+    return total
 
 
-def _check(given: IdentifiedRobot, source: str, chain: Chain, where: str, mjcf: bool = False) -> None:
+def _check(robot: IdentifiedRobot, source: str, chain: Chain, where: str, mjcf: bool = False) -> None:
     """Refuse a file if Pinocchio reads other frames, torques, motor inertias or friction, on random motion."""
     rng = np.random.default_rng(0)
-    q = random_joints(given.chain, 20, 0)
+    q = random_joints(robot.chain, CHECKED_MOTIONS, 0)
     v, a = rng.uniform(-1.0, 1.0, (2, *q.shape))
     torques, frames, damping, friction = motion_torques(source, chain, q, v, a, mjcf)
-    wanted = rigid_body.inverse_dynamics(given.arm, given.bodies.ravel(), q, v, a)
+    expected = rigid_body.inverse_dynamics(robot.arm, robot.bodies.ravel(), q, v, a)
     if mjcf:
-        wanted = wanted + given.drives.values[:, 0] * a
-        away = float(np.abs(frames - moving_frames(given.chain, q)).max())
-        if away > MAX_DIFFERENCE:
-            raise RobotError(f"{where}: poses differ by {away:.2g} when Pinocchio reads the file; nothing was written")
-    off = float(np.abs(torques - wanted).max()) / max(1.0, float(np.abs(wanted).max()))
-    if off > MAX_DIFFERENCE:
+        expected = expected + robot.drives.values[:, 0] * a
+        difference = float(np.abs(frames - moving_frames(robot.chain, q)).max())
+        if difference > MAX_DIFFERENCE:
+            raise RobotError(
+                f"{where}: poses differ by {difference:.2g} when Pinocchio reads the file; nothing was written"
+            )
+    share = float(np.abs(torques - expected).max()) / max(1.0, float(np.abs(expected).max()))
+    if share > MAX_DIFFERENCE:
         raise RobotError(
-            f"{where}: torques differ by {off:.2g} of the largest when Pinocchio reads the file; nothing was written. "
-            "Do other joints of the file have masses that were not part of the identification?"
+            f"{where}: torques differ by {share:.2g} of the largest when Pinocchio reads the file; nothing was "
+            "written. Do other joints of the file have masses that were not part of the identification?"
         )
-    for what, read_back, own in (("damping", damping, 1), ("friction", friction, 2)):
-        if not np.allclose(read_back, given.drives.values[:, own], rtol=MAX_DIFFERENCE, atol=1e-12):
-            raise RobotError(f"{where}: Pinocchio reads another {what} than was written")
+    for quantity, values, column in (("damping", damping, 1), ("friction", friction, 2)):
+        if not np.allclose(values, robot.drives.values[:, column], rtol=MAX_DIFFERENCE, atol=1e-12):
+            raise RobotError(f"{where}: Pinocchio reads another {quantity} than was written")
 
 
 def without_left(dynamics: Dynamics) -> Dynamics:
     """Return an identified model without the drive terms that ``drives.csv`` cannot contain."""
-    left, first = drive_table(dynamics).left, dynamics.model.inertial
+    omitted = drive_table(dynamics).left
     values = np.array(dynamics.values)
-    values[[first + k for k, one in enumerate(dynamics.model.columns) if one.name in left]] = 0.0
+    for k, term in enumerate(dynamics.model.columns, dynamics.model.inertial):
+        if term.name in omitted:
+            values[k] = 0.0
     return Dynamics(dynamics.model, values)
 
 
@@ -325,31 +361,41 @@ def drive_table(dynamics: Dynamics, covariance: np.ndarray | None = None) -> Dri
         covariance: of all its parameters.
     """
     model = dynamics.model
-    n, left = model.bodies.n, []
-    pairs = tuple(dict.fromkeys(pair for one in model.columns if (pair := _pair(one)) is not None))
+    n = model.bodies.n
+    couplings = map(_pair, model.columns)
+    pairs = tuple(dict.fromkeys(pair for pair in couplings if pair is not None))
     values = np.zeros((n + len(pairs), 4))
-    adds = np.zeros((*values.shape, len(dynamics.values)))
-    for k, (one, value) in enumerate(zip(model.columns, dynamics.values[model.inertial :]), model.inertial):
-        if not one.acts or value == 0.0:
+    # which parameters add to which value
+    additions = np.zeros((*values.shape, len(dynamics.values)))
+    omitted = []
+    for k, term in enumerate(model.columns, model.inertial):
+        value = dynamics.values[k]
+        if not term.acts or value == 0.0:
             continue
-        if one.shape in PLAIN and one.joint is not None:
-            values[one.joint, PLAIN[one.shape]] += value
-            adds[one.joint, PLAIN[one.shape], k] = 1.0
-        elif (pair := _pair(one)) is not None:
-            values[n + pairs.index(pair), PLAIN[one.shape]] = value
-            adds[n + pairs.index(pair), PLAIN[one.shape], k] = 1.0
+        pair = _pair(term)
+        if term.shape in PLAIN and term.joint is not None:
+            row, column = term.joint, PLAIN[term.shape]
+            values[row, column] += value
+        elif pair is not None:
+            row, column = n + pairs.index(pair), PLAIN[term.shape]
+            values[row, column] = value
         else:
-            left.append(one.name)
-    if covariance is None:
-        return Drives(values[:n], tuple(left), values[n:], pairs)
-    variance = np.einsum("nki,ij,nkj->nk", adds, covariance, adds)
-    return Drives(values[:n], tuple(left), values[n:], pairs, np.sqrt(np.clip(variance, 0.0, None)))
+            omitted.append(term.name)
+            continue
+        additions[row, column, k] = 1.0
+    sigma = None
+    if covariance is not None:
+        variance = np.einsum("nki,ij,nkj->nk", additions, covariance, additions)
+        sigma = np.sqrt(np.clip(variance, 0.0, None))
+    return Drives(values[:n], tuple(omitted), values[n:], pairs, sigma)
 
 
-def _pair(one: DriveTerm) -> tuple[int, int, float] | None:
+def _pair(term: DriveTerm) -> tuple[int, int, float] | None:
     """Return the joints that a term couples and the weight of the second; None for any other term."""
-    if one.shape not in PLAIN or len(one.acts) != 2:
+    if term.shape not in PLAIN or len(term.acts) != 2:
         return None
-    (first, motion), (second, _) = one.acts
+    (first, motion), (second, _) = term.acts
     weights = dict(motion)
-    return None if second not in weights else (first, second, weights[second])
+    if second not in weights:
+        return None
+    return first, second, weights[second]

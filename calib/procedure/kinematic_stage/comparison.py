@@ -123,9 +123,13 @@ class Comparison:
         pair_distances = {}
         if len(self.pairs[0]):
             pair_distances = {arm: statistics(sizes, 1e3) for arm, sizes in zip(ARMS, self.pairs)}
-        urdf_alone = None if self.alone is None else self.alone.summary()
-        plain = None if self.plain is None else self.plain.summary()
-        interval95 = None if self.intervals is None else self.intervals.record
+        urdf_alone = plain = interval95 = None
+        if self.alone is not None:
+            urdf_alone = self.alone.summary()
+        if self.plain is not None:
+            plain = self.plain.summary()
+        if self.intervals is not None:
+            interval95 = self.intervals.record
         return ComparedRows(
             poses=self.poses,
             frames=self.frames,
@@ -156,8 +160,9 @@ def compare(
     """Return the errors of the nominal arm, the calibrated arm and (if given) the URDF alone on the same rows."""
     nominal, calibrated, *urdf_alone = [errors(cell, blocks) for cell in cells]
     arms = (cells[0], cells[1])
-    pairs_nominal, pairs_calibrated = (pair_errors(cell, blocks, seed=seed) for cell in arms)
-    corners: Any = tuple(reprojection(cell, blocks) for cell in arms)
+    pairs_nominal = pair_errors(arms[0], blocks, seed=seed)
+    pairs_calibrated = pair_errors(arms[1], blocks, seed=seed)
+    corners: Any = (reprojection(arms[0], blocks), reprojection(arms[1], blocks))
     return Comparison(
         blocks=tuple(blocks),
         cells=arms,
@@ -168,7 +173,7 @@ def compare(
         proves=proves,
         alone=urdf_alone[0] if urdf_alone else None,
         repeated=repeated_poses(arms, blocks),
-        reprojection=None if None in corners else corners or None,
+        reprojection=None if None in corners else corners,
     )
 
 
@@ -252,7 +257,9 @@ def interval_cells(comparison: Comparison) -> np.ndarray:
 def iso9283_sentence(repeated: RepeatedPoses, arm: str) -> str:
     """Return a sentence with repeatability RP and accuracy AP of repeated poses (ISO 9283); `arm`: what was fitted."""
     fewest, largest = repeated.cycles
-    cycles = f"{fewest}" if fewest == largest else f"{fewest} to {largest}"
+    cycles = f"{fewest}"
+    if largest != fewest:
+        cycles += f" to {largest}"
     nominal, calibrated = (repeated.accuracy_mm[name]["mean"] for name in ARMS)
     text = (
         f"ISO 9283 on {repeated.poses} poses repeated {cycles} times: RP {repeated.repeatability_mm['mean']:.3f} mm "

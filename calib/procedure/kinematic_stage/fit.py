@@ -259,18 +259,13 @@ def _findings(
     noticed = [*contradictions, *notes]
     if selection.folds.blind:
         noticed.append(finding("transfer-by-regions", stations=selection.folds.blind))
-    nominal_cross_validated = None
-    for rung in selection.rungs:
-        if rung.model == "frames":
-            nominal_cross_validated = rung.cross_validated
-            break
     outlier_rows = {(outlier.file, outlier.row) for outlier in outliers}
     row_count = sum(len(block) for block in inputs.fit)
     return Findings(
         model=selection.chosen,
         loss=selection.loss,
         cross_validated=cross_validated,
-        nominal_cross_validated=nominal_cross_validated,
+        nominal_cross_validated=selection.nominal_step.cross_validated,
         outlier_share=len(outlier_rows) / row_count,
         reach=nominal.reach,
         noticed=settle(noticed, accepted),

@@ -15,52 +15,65 @@ from calib.geometry.observation import observe, prepare
 from calib.geometry.weighing import GeometricFit
 from calib.procedure.kinematic_stage.metrics import ImageCoverage
 
-MAX_NOISE = 4.0  # corner noise over its stated sigma from which on it is remarked on (our choice)
+# corner noise over its stated sigma from which on it is remarked on (our choice)
+MAX_NOISE = 4.0
 
 
-def image_coverage(found: GeometricFit) -> tuple[ImageCoverage, ...]:
+def image_coverage(fit: GeometricFit) -> tuple[ImageCoverage, ...]:
     """Return how the corners of a fit cover each set of images; empty without images."""
     result = []
-    for piece in found.pieces:
-        block, part = found.blocks[piece.block].measured, piece.part
+    for piece in fit.pieces:
+        block, part = fit.blocks[piece.block].measured, piece.part
         if not isinstance(block, Pixels) or not isinstance(part, PixelPart):
             continue
         pixels = block.pixel[part.index, part.corner]
         count = coverage(pixels, block.size)
-        square = coverage(pixels, block.size, np.sum(part.value**2, axis=0))
-        rms = np.round(np.sqrt(square / np.maximum(count, 1.0)), 4)
-        cells = tuple(map(tuple, count.astype(int).tolist())), tuple(map(tuple, rms.tolist()))
-        result.append(ImageCoverage(Path(block.file).name, block.size, *cells))
+        square_sum = coverage(pixels, block.size, np.sum(part.value**2, axis=0))
+        rms = np.round(np.sqrt(square_sum / np.maximum(count, 1.0)), 4)
+        counts = tuple(map(tuple, count.astype(int).tolist()))
+        sizes = tuple(map(tuple, rms.tolist()))
+        result.append(ImageCoverage(Path(block.file).name, block.size, counts, sizes))
     return tuple(result)
 
 
 def reprojection(cell: Installation, blocks: Sequence[PoseMeasurements]) -> float | None:
     """Return the rms distance between detected and predicted corners [px]; None without images."""
-    squares = [
-        np.sum(part.value**2, axis=0)
-        for block in prepare(cell, [block for block in blocks if isinstance(block, Pixels)])
-        for part in observe(cell, block, np.array([], dtype=int))
-        if isinstance(part, PixelPart)
-    ]
-    return float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else None
+    images = [block for block in blocks if isinstance(block, Pixels)]
+    no_parameters = np.array([], dtype=int)
+    squares: list[np.ndarray] = []
+    for block in prepare(cell, images):
+        parts = [part for part in observe(cell, block, no_parameters) if isinstance(part, PixelPart)]
+        squares += [np.sum(part.value**2, axis=0) for part in parts]
+    if not squares:
+        return None
+    return float(np.sqrt(np.mean(np.concatenate(squares))))
 
 
-def image_notes(found: GeometricFit) -> list[Finding]:
+def _rms(residuals: np.ndarray) -> float:
+    """Return the rms distance of residuals (2, k)."""
+    return float(np.sqrt(np.mean(np.sum(residuals**2, axis=0))))
+
+
+def image_notes(fit: GeometricFit) -> list[Finding]:
     """Return the findings on the images of a fit; empty without images."""
-    result: list[Finding] = []
-    others = [Path(block.measured.file).name for block in found.blocks if not isinstance(block.measured, Pixels)]
-    for piece in found.pieces:
-        block, part = found.blocks[piece.block].measured, piece.part
+    notes: list[Finding] = []
+    without_images = [block.measured for block in fit.blocks if not isinstance(block.measured, Pixels)]
+    other_files = [Path(block.file).name for block in without_images]
+    for piece in fit.pieces:
+        block, part = fit.blocks[piece.block].measured, piece.part
         if not isinstance(block, Pixels) or not isinstance(part, PixelPart) or part.noise is None:
             continue
-        name, noise = Path(block.file).name, part.noise
-        rms, image = (float(np.sqrt(np.mean(np.sum(v**2, axis=0)))) for v in (part.value, part.alone(piece.sigma)))
-        values = {"rms": rms, "image": image, "shift": noise.displacement, "turn": noise.turn}
-        result.append(finding("reprojection", file=name, **values))
+        name = Path(block.file).name
+        noise = part.noise
+        rms = _rms(part.value)
+        rms_in_image = _rms(part.alone(piece.sigma))
+        notes.append(
+            finding("reprojection", file=name, rms=rms, image=rms_in_image, shift=noise.displacement, turn=noise.turn)
+        )
         if noise.factor > MAX_NOISE and block.sigma is not None:
-            result.append(finding("corners-off", file=name, times=noise.factor))
-        words = coverage_words(block.pixel[block.seen], block.size)
-        result.append(finding("image-coverage", file=name, coverage=words))
+            notes.append(finding("corners-off", file=name, times=noise.factor))
+        covered = coverage_words(block.pixel[block.seen], block.size)
+        notes.append(finding("image-coverage", file=name, coverage=covered))
         if "scale" not in block.free:
-            result.append(finding("board-scale", file=name, square=block.board.square, others=others))
-    return result
+            notes.append(finding("board-scale", file=name, square=block.board.square, others=other_files))
+    return notes

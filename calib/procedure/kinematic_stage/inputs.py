@@ -214,7 +214,9 @@ def plain_reference(nominal: Installation, inputs: Inputs) -> Installation | Non
     if bare is not None:
         nominal = replace(nominal, chain=bare, known=Deflection())
     reference = plain_fit(nominal, inputs.fit)
-    return None if reference is None else reference.cell
+    if reference is None:
+        return None
+    return reference.cell
 
 
 def load_robot(
@@ -390,7 +392,9 @@ def _with_station_and_tool_names(
         if tools == "each":
             block = replace(block, tool_names=tuple(f"{path.stem} {name}" for name in block.tool_names))
         if path not in station_of:
-            station = "station" if stations == "one" else block.station
+            station = block.station
+            if stations == "one":
+                station = "station"
             if stations == "each" and not options.for_file(path).station:
                 number = files_of_station.get(station, 0) + 1
                 files_of_station[station] = number

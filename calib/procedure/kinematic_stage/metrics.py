@@ -64,7 +64,9 @@ class ComparedRows:
 
     def words(self, nature: str) -> str:
         """Return the name of an error (position, orientation, distance) by what was measured."""
-        return self.position_means if nature == "position" else nature
+        if nature == "position":
+            return self.position_means
+        return nature
 
     def judged(self, deliverable: str) -> ArmErrors:
         """Return the errors of the deliverable (robot file) on which the verdict is based."""
@@ -87,7 +89,9 @@ class Outlier:
     @property
     def size(self) -> str:
         """Residual with its unit, as text."""
-        return f"{self.size_mm:.3g} mm" if self.size_deg is None else f"{self.size_deg:.3g} deg"
+        if self.size_deg is None:
+            return f"{self.size_mm:.3g} mm"
+        return f"{self.size_deg:.3g} deg"
 
     @property
     def words(self) -> str:

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,6 +16,11 @@ from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.pose_lists import read_poses, write_poses
 from calib.errors import UsageError, require
 from calib.geometry.observability import Observation, observation, targets_of
+from calib.poses.candidates import draw_candidates
+from calib.poses.errors import NothingFeasible
+from calib.poses.indices import observability
+from calib.poses.select import SearchSettings, Selection, select_poses
+from calib.poses.space import SearchSpace, is_feasible
 from calib.procedure.kinematic_stage.inputs import load_robot
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
 from calib.procedure.measuring import prediction as forecast
@@ -25,11 +31,6 @@ from calib.procedure.measuring.run import lines as run_lines
 from calib.procedure.robot_kinds import joints_of
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, joint_kinds
-from poses.candidates import draw_candidates
-from poses.errors import NothingFeasible
-from poses.indices import observability
-from poses.select import SearchSettings, Selection, select_poses
-from poses.space import SearchSpace, is_feasible
 
 Progress = Callable[[int, int, str], None]
 # postures that see a camera's board, to choose from (our choice)
@@ -65,7 +66,7 @@ class Chosen:
 
     Attributes:
         chain: the nominal arm.
-        selection: see `poses.select`.
+        selection: see `calib.poses.select`.
         parameters: how many are identifiable from the measurements.
         existing: index of the existing poses alone; None without them, or if they are too few.
         checked, unchecked: constraints that were checked, and those that could not be, as text.
@@ -90,7 +91,9 @@ class Chosen:
     @property
     def prediction(self) -> SelectionPrediction | None:
         """Prediction stored next to the poses; None if a parameter is not identifiable."""
-        return self.outlook.poses if np.isfinite(self.outlook.poses.rms) else None
+        if not np.isfinite(self.outlook.poses.rms):
+            return None
+        return self.outlook.poses
 
     @property
     def figures(self) -> tuple[str, ...]:
@@ -187,7 +190,9 @@ def choose(
         None, m, search, q=candidates, space=space, existing=existing_jacobian, map=map, progress=progress
     )
     # the selection without sight limits is not polished: the start of a polished one compares with it
-    comparable = float(selection.history[0]) if method == "polish" else selection.value
+    comparable = selection.value
+    if method == "polish":
+        comparable = float(selection.history[0])
     if view is not None:
         notes.append(view.assumed)
 
@@ -248,7 +253,7 @@ def _draw_feasible(space: SearchSpace, limits: Limits, settings: SelectionSettin
         for constraint in space.constraints:
             satisfied = (np.asarray(constraint.function(q)) <= 0.0).all(1)
             shares.append((constraint.name, satisfied.mean()))
-        shares.sort(key=lambda named_share: named_share[1])
+        shares.sort(key=itemgetter(1))
         listed = ", ".join(f"{name} {100 * share:.2g} %" for name, share in shares)
         hint = ""
         if limits.sight is not None:

@@ -150,7 +150,9 @@ def residuals(outcome: Outcome) -> tuple[Iterator[Sequence[object]], list[str]]:
     """
     sets = [("fit", outcome.fit)]
     for name, unseen in outcome.inputs.unseen.items():
-        label = "held out" if unseen.held_out else "validation"
+        label = "validation"
+        if unseen.held_out:
+            label = "held out"
         sets.append((label, outcome.validation[name]))
     joints = [f"{joint.name} [{joint.unit}]" for joint in outcome.inputs.chain.joints]
     header = ["set", "file", "row", "station", "tool", *joints]
@@ -190,7 +192,9 @@ def _residual_rows(label: str, comparison: Comparison, outcome: Outcome) -> Iter
         weight = next(weights, np.full(count, np.nan))
         components = [values.T for values in columns.values()]
         numbers = np.column_stack([measured.q, *components, size, nominal_size, weight])
-        station = measured.station if measured.has_instrument else ""
+        station = ""
+        if measured.has_instrument:
+            station = measured.station
         for row, tool, values in zip(measured.rows.tolist(), measured.tool.tolist(), numbers):
             outlier = int((measured.file, row) in outliers)
             tool_name = measured.tool_names[tool]

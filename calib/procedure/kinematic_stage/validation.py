@@ -8,6 +8,7 @@ The rules of the verdict have their limits and sentences in the catalogue of fin
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -95,7 +96,8 @@ def judge(
         arm: what is judged, in a word or two, where there are several deliverables.
     """
     unseen = {name: comparison for name, comparison in validation.items() if comparison.proves}
-    nominal_rms, fitted_rms = (arm.rms for arm in fit.errors)
+    nominal_rms = fit.errors[0].rms
+    fitted_rms = fit.errors[1].rms
     frames_only = findings.model == requested_model == "frames"
 
     # The errors to judge by: on unseen rows, else by cross-validation, else on the fitted rows.
@@ -110,7 +112,7 @@ def judge(
     if not proofs and frames_only:
         # so few parameters leave the errors on the fitted poses as they are
         proofs = [_Proof(nominal_rms, fitted_rms, "on the fitted poses")]
-    worst = max(proofs, key=lambda proof: proof.after, default=None)
+    worst = max(proofs, key=attrgetter("after"), default=None)
 
     gross: list[Finding] = []
     for proof in proofs:
@@ -137,8 +139,9 @@ def judge(
         return _frames_verdict(worst, tolerance, arm, common)
 
     # Grossly wrong unseen rows refute no promise of the fit.
-    promised = None if gross else cross_validated
-    doubts = _doubts(worst, fitted_rms, promised, unseen, findings)
+    if gross:
+        cross_validated = None
+    doubts = _doubts(worst, fitted_rms, cross_validated, unseen, findings)
     verdict = Verdict.of(_figures(worst, arm), [*gross, *findings.noticed, *doubts])
     if verdict.level == "pass":
         return Verdict("pass", _figures(worst, arm, tolerance))
@@ -170,7 +173,9 @@ def _far_off(
     """
     for proof in proofs:
         if proof.rows is not None:
-            code = "placed-elsewhere" if proof.rows.shares_frames else "far-off"
+            code = "far-off"
+            if proof.rows.shares_frames:
+                code = "placed-elsewhere"
             yield finding(code, share=min(proof.before, proof.after) / reach)
     for name, rows in sets.items():
         angle = rows.errors[1].orientation
@@ -185,7 +190,8 @@ def _gross(proof: _Proof, reach: float) -> Iterator[Finding]:
     """Yield the finding that rows far off for both arms alike, probably measured wrongly, make most of the error."""
     if proof.rows is None:
         return
-    before, after = (arm.main for arm in proof.rows.errors)
+    before = proof.rows.errors[0].main
+    after = proof.rows.errors[1].main
     gross = _far_above_median(before) & _far_above_median(after)
     rows = _row_texts(proof.rows, gross)
     if rows:
@@ -212,7 +218,7 @@ def _nothing_gained(proofs: Sequence[_Proof], findings: Findings) -> list[Findin
     """Return a finding where the calibrated arm is as good as the nominal one: nothing to gain, or no model helps."""
     if not proofs:
         return []
-    proof = max(proofs, key=lambda proof: proof.before)
+    proof = max(proofs, key=attrgetter("before"))
     nothing_to_gain = finding("nothing-to-gain", before=proof.before, where=proof.where)
     if proof.before < TOO_GOOD:
         return [nothing_to_gain]
@@ -349,7 +355,9 @@ def assess(arms: Arms, inputs: Inputs, findings: Findings, weighing: Settings, s
     for name, unseen in inputs.unseen.items():
         validation[name] = compare_unseen(cells, unseen, weighing, settings.seed, arms.expected, arms.plain)
     verdicts = judge_deliverables(fitted, validation, findings, settings)
-    deliverable = settings.deliverable if settings.deliverable in verdicts else "urdf"
+    deliverable = settings.deliverable
+    if deliverable not in verdicts:
+        deliverable = "urdf"
 
     noticed: list[Finding] = []
     for name in verdicts.keys() - {deliverable}:
@@ -368,17 +376,29 @@ def assess(arms: Arms, inputs: Inputs, findings: Findings, weighing: Settings, s
     for name, rows in validation.items():
         noticed += _noticed(name, rows, usual)
 
-    blocks = (*inputs.fit, *(unseen.block for unseen in inputs.unseen.values()))
-    notes = (*inputs.notes, *(note for block in blocks for note in block.notes))
-    return Assessment(fitted, validation, verdicts[deliverable], tuple(noticed), notes, verdicts, deliverable)
+    notes = [*inputs.notes]
+    for block in inputs.fit:
+        notes += block.notes
+    for unseen in inputs.unseen.values():
+        notes += unseen.block.notes
+    return Assessment(
+        fit=fitted,
+        validation=validation,
+        verdict=verdicts[deliverable],
+        noticed=tuple(noticed),
+        notes=tuple(notes),
+        deliverables=verdicts,
+        deliverable=deliverable,
+    )
 
 
 def _references(name: str, rows: Comparison, deliverable: str, frames_only: bool) -> Iterator[Finding]:
     """Yield the nominal arm's, the plain fit's and the delivered arm's error on validation rows, and what is worse."""
     if rows.plain is None or not rows.proves:
         return
-    delivered_rows = rows.of_urdf if deliverable == "urdf" else rows
-    delivered = delivered_rows.errors[1].rms
+    delivered = rows.errors[1].rms
+    if deliverable == "urdf":
+        delivered = rows.of_urdf.errors[1].rms
     plain = rows.plain.rms
     yield finding("plain-reference", nominal=rows.errors[0].rms, where=name, plain=plain, delivered=delivered)
     if not frames_only:
@@ -411,7 +431,9 @@ def _worst_rms(validation: Mapping[str, Comparison], findings: Findings, deliver
         cross_validated = findings.rigid_cross_validated
     if comparisons:
         return max(rows.errors[1].rms for rows in comparisons)
-    return np.nan if cross_validated is None else cross_validated
+    if cross_validated is None:
+        return np.nan
+    return cross_validated
 
 
 def _copies(inputs: Inputs) -> list[str]:
@@ -442,7 +464,8 @@ def _noticed(name: str, rows: Comparison, usual: float) -> Iterator[Finding]:
     measurements, a placement of base and tool that did not settle or took up most of the errors, and how many errors
     are within the 95 % interval.
     """
-    before, sizes = (arm.main for arm in rows.errors)
+    before = rows.errors[0].main
+    sizes = rows.errors[1].main
     intervals = rows.intervals
     if np.median(before) > ELSEWHERE * usual:
         yield finding("validation-elsewhere", file=name, rms=float(np.median(before)))

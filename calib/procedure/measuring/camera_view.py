@@ -23,18 +23,35 @@ from calib.geometry.installation import Installation, see
 from calib.geometry.inverse import Goal, reach, seen_at
 from calib.geometry.observability import Observation, base_columns
 from calib.geometry.observation import Block, layout, observe, prepare, target_jacobian
+from calib.poses.space import PoseConstraint
 from calib.procedure.measuring.constraints_file import CameraTable
 from calib.robot.chain import Chain
 from calib.robot.tables import placement
 from calib.transforms import invert, pose
-from poses.space import PoseConstraint
 
-CORNER, DISPLACEMENT, TURN = 0.05, 2e-5, 2e-5  # noise that a pose is judged by [px], [m], [rad]; our choice
+# noise that a pose is judged by: of corners [px], of the arm's repeatability per axis [m], [rad] (our choice)
+CORNER = 0.05
+DISPLACEMENT = 2e-5
+TURN = 2e-5
 ASSUMED = (
     f"predicted σ: for corner noise of {CORNER:g} px and a repeatability of {1e3 * DISPLACEMENT:g} mm and "
     f"{1e3 * TURN:g} mrad per axis; unmodelled effects come on top"
 )
+# times that views are drawn
 TRIES = 60
+# steps of the inverse kinematics of a view
+INVERSE_STEPS = 30
+# [m and rad] difference of a pose from the drawn view up to which it is reached
+REACHED = 1e-3
+# postures drawn to find the identifiable columns, and of those needed at least
+POSTURES = 100
+MIN_POSTURES = 20
+# largest constraint violation at which the board still counts as seen
+SEEN = 1e-8
+# share of the half image in which the board's middle is drawn
+CENTRAL = 0.8
+# parameters of a lens that may be fitted
+FREE_LENS_PARAMETERS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,31 +81,40 @@ class CameraView:
 
     def poses(self, q: np.ndarray) -> np.ndarray:
         """Return the board's poses (m, 4, 4) in the camera's frame."""
-        found = see(self.cell, q).poses()
-        return invert(found) if self.mounting == IN_HAND else found
+        poses = see(self.cell, q).poses()
+        if self.mounting == IN_HAND:
+            return invert(poses)
+        return poses
 
     def __call__(self, q: np.ndarray) -> np.ndarray:
-        poses, size = self.poses(q), np.array(self.lens.size)
+        poses = self.poses(q)
+        size = np.array(self.lens.size)
         table = corners(self.board)
-        wide, high = table[:, :2].min(axis=0), table[:, :2].max(axis=0)
-        edge = np.array([[x, y, 0.0] for x in (wide[0], high[0]) for y in (wide[1], high[1])])
+        (left, bottom), (right, top) = table[:, :2].min(axis=0), table[:, :2].max(axis=0)
+        edge = np.array([[left, bottom, 0.0], [left, top, 0.0], [right, bottom, 0.0], [right, top, 0.0]])
         point = np.einsum("mij,kj->mki", poses[:, :3, :3], edge) + poses[:, None, :3, 3]
-        aside = np.maximum(np.linalg.norm(point[:, :, :2], axis=2), 1e-3)
-        ahead = np.concatenate([point[:, :, :2], np.maximum(point[:, :, 2:], aside[:, :, None] / 2.0)], axis=2)
+        # points behind or beside the camera are projected as if ahead of it: far outside of the image
+        lateral = np.maximum(np.linalg.norm(point[:, :, :2], axis=2), 1e-3)
+        depth = np.maximum(point[:, :, 2:], lateral[:, :, None] / 2.0)
+        ahead = np.concatenate([point[:, :, :2], depth], axis=2)
         pixel = self.lens.project(ahead.reshape(-1, 3)).reshape(len(q), -1, 2)
-        outside = np.concatenate([self.margin - pixel, pixel + self.margin + 1 - size], axis=2) / size[0]
+        outside_image = np.concatenate([self.margin - pixel, pixel + self.margin + 1 - size], axis=2) / size[0]
+
         middle = poses[:, :3, :3] @ (0.5 * np.array([*self.board.extent, 0.0])) + poses[:, :3, 3]
-        far = np.linalg.norm(middle, axis=1)
-        lean = np.cos(self.tilt) - np.einsum("mi,mi->m", poses[:, :3, 2], middle) / np.maximum(far, 1e-9)
-        rest = np.column_stack([self.span[0] - far, far - self.span[1], lean])
-        return np.concatenate([outside.reshape(len(q), -1), rest], axis=1)
+        distance = np.linalg.norm(middle, axis=1)
+        cosine = np.einsum("mi,mi->m", poses[:, :3, 2], middle) / np.maximum(distance, 1e-9)
+        tilt = np.cos(self.tilt) - cosine
+        limits = np.column_stack([self.span[0] - distance, distance - self.span[1], tilt])
+        return np.concatenate([outside_image.reshape(len(q), -1), limits], axis=1)
 
     @property
     def stand(self) -> np.ndarray:
         """Position (3,) of the fixed camera or of the fixed board's centre in the arm's base [m]."""
-        placed = invert(self.cell.stations[0])
-        middle = 0.5 * np.array(self.board.extent) if self.mounting == IN_HAND else np.zeros(2)
-        return (placed @ [*middle, 0.0, 1.0])[:3]
+        T_base_station = invert(self.cell.stations[0])
+        middle = np.zeros(2)
+        if self.mounting == IN_HAND:
+            middle = 0.5 * np.array(self.board.extent)
+        return (T_base_station @ [*middle, 0.0, 1.0])[:3]
 
     def constraint(self) -> PoseConstraint:
         """Return the visibility constraint for pose selection."""
@@ -102,10 +128,14 @@ class CameraView:
     def observation(self, lower: np.ndarray, upper: np.ndarray, seed: int = 0) -> ImageObservation:
         """Return the observation Jacobian of images for the parameters that views of the board can identify."""
         columns = layout(self.cell).rigid_index
-        q = self.draw(100, lambda each: np.all(self(each) <= 1e-8, axis=1), lower, upper, seed)
-        if len(q) < 20:
+
+        def in_view(q: np.ndarray) -> np.ndarray:
+            return np.all(self(q) <= SEEN, axis=1)
+
+        q = self.draw(POSTURES, in_view, lower, upper, seed)
+        if len(q) < MIN_POSTURES:
             raise UsageError(
-                f"the camera sees the board at hardly any posture ({len(q)} of 100 found): check [camera], "
+                f"the camera sees the board at hardly any posture ({len(q)} of {POSTURES} found): check [camera], "
                 "carried, stands, tilt and range"
             )
         split = base_columns(self.cell, self.block(q), columns)
@@ -138,28 +168,37 @@ class CameraView:
 
         Postures drawn at random see a board once in a thousand.
         """
-        rng, goal = np.random.default_rng(seed), Goal(self.cell, 6, lower, upper)
+        stream = np.random.default_rng(seed)
+        goal = Goal(self.cell, 6, lower, upper)
         result = np.zeros((0, self.cell.chain.n))
         for attempt in range(TRIES):
-            wanted = self._views(4 * count, rng)
-            targets = invert(wanted) if self.mounting == IN_HAND else wanted
-            q = reach(goal, targets, rng.uniform(lower, upper, (len(targets), len(lower))), 30)
-            q = q[np.linalg.norm(seen_at(goal, q).poses() - targets, axis=(1, 2)) < 1e-3]
-            result = np.concatenate([result, q[feasible(q)] if len(q) else q])
-            if len(result) >= count or (attempt >= TRIES // 10 and len(result) < count // 50):
+            targets = self._views(4 * count, stream)
+            if self.mounting == IN_HAND:
+                targets = invert(targets)
+            starts = stream.uniform(lower, upper, (len(targets), len(lower)))
+            q = reach(goal, targets, starts, INVERSE_STEPS)
+            difference = np.linalg.norm(seen_at(goal, q).poses() - targets, axis=(1, 2))
+            q = q[difference < REACHED]
+            if len(q):
+                q = q[feasible(q)]
+            result = np.concatenate([result, q])
+            # hardly any after a tenth of the tries: there will not be enough
+            hopeless = attempt >= TRIES // 10 and len(result) < count // 50
+            if len(result) >= count or hopeless:
                 break
         return result[:count]
 
-    def _views(self, count: int, rng: np.random.Generator) -> np.ndarray:
+    def _views(self, count: int, stream: np.random.Generator) -> np.ndarray:
         """Return random poses (count, 4, 4) of the board in front of the camera."""
-        about, lean = rng.uniform(-np.pi, np.pi, count), self.tilt * np.sqrt(rng.uniform(0.0, 1.0, count))
-        axis = np.column_stack([np.cos(about), np.sin(about), np.zeros(count)])
-        roll = Rotation.from_rotvec(np.outer(rng.uniform(-np.pi, np.pi, count), [0.0, 0.0, 1.0]))
-        turn = (Rotation.from_rotvec(lean[:, None] * axis) * roll).as_matrix()
-        depth = rng.uniform(*self.span, count)
-        share = rng.uniform(-0.8, 0.8, (count, 2)) * 0.5 * np.array(self.lens.size) / self.lens.values[:2]
-        place = np.column_stack([share * depth[:, None], depth])
-        return pose(turn, place - turn @ (0.5 * np.array([*self.board.extent, 0.0])))
+        azimuth = stream.uniform(-np.pi, np.pi, count)
+        tilt = self.tilt * np.sqrt(stream.uniform(0.0, 1.0, count))
+        axis = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.zeros(count)])
+        roll = Rotation.from_rotvec(np.outer(stream.uniform(-np.pi, np.pi, count), [0.0, 0.0, 1.0]))
+        rotation = (Rotation.from_rotvec(tilt[:, None] * axis) * roll).as_matrix()
+        depth = stream.uniform(*self.span, count)
+        offset = stream.uniform(-CENTRAL, CENTRAL, (count, 2)) * 0.5 * np.array(self.lens.size) / self.lens.values[:2]
+        middle = np.column_stack([offset * depth[:, None], depth])
+        return pose(rotation, middle - rotation @ (0.5 * np.array([*self.board.extent, 0.0])))
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,9 +218,9 @@ class ImageObservation(Observation):
 
     def position(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the position (m, 3) [m] of the carried camera or board, and its Jacobian (m, 3, p), not whitened."""
-        seen = see(self.cell, q, -1)
-        columns = target_jacobian(self.cell, seen, self.free, -1, np.zeros(len(q), dtype=int))
-        return seen.point.T, columns[:, :3].transpose(2, 1, 0)
+        target = see(self.cell, q, -1)
+        columns = target_jacobian(self.cell, target, self.free, -1, np.zeros(len(q), dtype=int))
+        return target.point.T, columns[:, :3].transpose(2, 1, 0)
 
     def __call__(self, q: np.ndarray) -> np.ndarray:
         part = observe(self.cell, self.view.block(q)[0], self.free)[0]
@@ -190,11 +229,11 @@ class ImageObservation(Observation):
         return matrix.reshape(len(q), -1, len(self.free))
 
 
-def camera_view(stated: CameraTable, chain: Chain, where: str, folder: Path) -> CameraView:
+def camera_view(table: CameraTable, chain: Chain, where: str, folder: Path) -> CameraView:
     """Return the camera view described by a constraints file.
 
     Args:
-        stated: its table.
+        table: its table [camera].
         chain: the nominal arm.
         where: for messages.
         folder: that the lens's and the board's files are beside.
@@ -202,20 +241,23 @@ def camera_view(stated: CameraTable, chain: Chain, where: str, folder: Path) -> 
     Raises:
         UsageError, MeasurementError, RobotError: for a file that is missing, or a place that cannot be.
     """
-    for name in (stated.lens, stated.board):
+    for name in (table.lens, table.board):
         require((folder / name).is_file(), f"{where}: camera: no file '{name}' next to it", UsageError)
-    if not stated.range[0] < stated.range[1]:
-        raise UsageError(f"{where}: camera.range: {stated.range[0]:g} is not below {stated.range[1]:g}")
-    lens, board = read_lens(folder / stated.lens), read_board(folder / stated.board)
-    carried = placement(dict(stated.carried), f"{where}: camera.carried")
-    stands = placement(dict(stated.stands), f"{where}: camera.stands")
-    names = ("board", "camera") if stated.mounting == IN_HAND else ("camera", "board")
-    middle = pose(None, -0.5 * np.array([*board.extent, 0.0]))  # places are those of the board's middle
-    if stated.mounting == IN_HAND:
-        stands = stands @ middle
+    if not table.range[0] < table.range[1]:
+        raise UsageError(f"{where}: camera.range: {table.range[0]:g} is not below {table.range[1]:g}")
+    lens = read_lens(folder / table.lens)
+    board = read_board(folder / table.board)
+    carried = placement(dict(table.carried), f"{where}: camera.carried")
+    stands = placement(dict(table.stands), f"{where}: camera.stands")
+    # the places are those of the board's middle
+    T_middle_board = pose(None, -0.5 * np.array([*board.extent, 0.0]))
+    if table.mounting == IN_HAND:
+        station, tool = "board", "camera"
+        stands = stands @ T_middle_board
     else:
-        carried = carried @ middle
-    free = frozenset(f"camera.{name}" for name in lens.names[:8])
+        station, tool = "camera", "board"
+        carried = carried @ T_middle_board
+    free = frozenset(f"camera.{name}" for name in lens.names[:FREE_LENS_PARAMETERS])
     optics = Optics((lens,), ("camera",), (BoardShape(),), ("board",), free)
-    cell = Installation(chain, invert(stands)[None], carried[None], names[:1], names[1:], optics=optics)
-    return CameraView(cell, board, stated.mounting, stated.tilt, stated.range, stated.margin)
+    cell = Installation(chain, invert(stands)[None], carried[None], (station,), (tool,), optics=optics)
+    return CameraView(cell, board, table.mounting, table.tilt, table.range, table.margin)

@@ -62,8 +62,11 @@ from calib.config_types import Checked, Expect, Name, Numeric, OneOf, OneOrMany,
 from calib.data.poses import IN_HAND, TO_HAND
 from calib.errors import require
 
-MOTION = ("velocity", "acceleration", "jerk", "torque", "friction", "point", "frequency")  # `motion_limits` reads them
-MARGIN, JOINT_MARGIN = 0.01, 0.01  # [m], share of a joint's range: where the file does not tell (our choice)
+# tables that `calib.procedure.excitation.limits` reads
+MOTION = ("velocity", "acceleration", "jerk", "torque", "friction", "point", "frequency")
+# [m] distance between parts, and share of a joint's range that stays free: where the file does not tell (our choice)
+MARGIN = 0.01
+JOINT_MARGIN = 0.01
 DEFAULTS = ("self-collision", "floor", "joint-margin", "view")
 UNKNOWN = "unknown"
 VIEW_UNCHECKED = "the camera's view of the board"
@@ -80,20 +83,28 @@ Box = Annotated[tuple[Span, Span, Span], Expect("three lists of 2 numbers, x, y 
 Size = Annotated[tuple[Annotated[float, Real(above=0, quantity="length")], ...], Expect("lengths above 0")]
 
 
-AXES = {
-    f"{sign}{axis}": [(-1.0 if sign == "-" else 1.0) * (k == j) for j in range(3)]
-    for k, axis in enumerate("xyz")
-    for sign in ("", "+", "-")
-}
-_ONE = {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3}
+# names of the axes of a frame, as directions
+AXES: dict[str, list[float]] = {}
+for _index, _axis in enumerate("xyz"):
+    for _sign in ("", "+", "-"):
+        _direction = [0.0, 0.0, 0.0]
+        _direction[_index] = -1.0 if _sign == "-" else 1.0
+        AXES[_sign + _axis] = _direction
+
+# JSON schemas
+_DIRECTION = {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3}
+_DIRECTIONS = {"anyOf": [{"enum": [*AXES]}, _DIRECTION, {"type": "array", "items": _DIRECTION, "minItems": 1}]}
 _PAIR = {"type": "array", "minItems": 2, "maxItems": 2, "items": {"type": ["number", "string"]}}
+_SPAN_OR_MARGIN = {"anyOf": [_PAIR, {"type": ["number", "string"]}]}
 
 
 def _directions(value: Any) -> Any:
     """Return directions as a list; a single direction or an axis name becomes a list of one."""
-    value = AXES.get(value, value) if isinstance(value, str) else value
-    single = isinstance(value, list | tuple) and len(value) > 0 and not isinstance(value[0], list | tuple)
-    return [value] if single else value
+    if isinstance(value, str):
+        value = AXES.get(value, value)
+    if isinstance(value, list | tuple) and len(value) > 0 and not isinstance(value[0], list | tuple):
+        return [value]
+    return value
 
 
 @strict
@@ -106,7 +117,7 @@ class TargetTable:
     reach: Annotated[float, Real(above=0, quantity="length")] | None = None
     facing: Annotated[
         tuple[Annotated[tuple[float, float, float], Expect("a list of 3 numbers")], ...],
-        Checked(_directions, {"anyOf": [{"enum": [*AXES]}, _ONE, {"type": "array", "items": _ONE, "minItems": 1}]}),
+        Checked(_directions, _DIRECTIONS),
     ] = ((0.0, 0.0, 1.0),)
 
     def __post_init__(self) -> None:
@@ -118,7 +129,9 @@ class TargetTable:
     @property
     def heights(self) -> tuple[float | None, float | None]:
         """The least and the largest height of the target [m]."""
-        return (self.height[0], self.height[1]) if isinstance(self.height, tuple) else (self.height, None)
+        if isinstance(self.height, tuple):
+            return self.height[0], self.height[1]
+        return self.height, None
 
 
 @strict
@@ -133,7 +146,8 @@ class PlacedTable:
     @property
     def stated(self) -> dict[str, Any]:
         """The placement keys of the table that have a value."""
-        return {key: value for key in ("xyz", "rpy", "matrix") if (value := getattr(self, key)) is not None}
+        placement = {"xyz": self.xyz, "rpy": self.rpy, "matrix": self.matrix}
+        return {key: value for key, value in placement.items() if value is not None}
 
 
 @strict
@@ -177,11 +191,14 @@ class ObstacleTable(PlacedTable):
 
 def _span_or_margin(value: Any) -> Any:
     """Return the value after a check that it is a range (two numbers or texts with units) or a single margin."""
+    parts = (value,)
     pair = isinstance(value, list | tuple) and len(value) == 2
-    parts = value if pair else (value,)
-    if not all(isinstance(part, str | int | float) and not isinstance(part, bool) for part in parts):
-        raise ValueError(f"expected a list of 2 numbers, lower and upper, found {shown(value)}")
-    return tuple(parts) if pair else value
+    if pair:
+        parts = tuple(value)
+    for part in parts:
+        if isinstance(part, bool) or not isinstance(part, str | int | float):
+            raise ValueError(f"expected a list of 2 numbers, lower and upper, found {shown(value)}")
+    return parts if pair else value
 
 
 def _place_or_unknown(value: Any) -> Any:
@@ -219,9 +236,7 @@ class CameraTable:
 class ConstraintsFile:
     """The content of a constraints file."""
 
-    joints: Mapping[
-        str, Annotated[Any, Checked(_span_or_margin, {"anyOf": [_PAIR, {"type": ["number", "string"]}]})]
-    ] = field(default_factory=dict)
+    joints: Mapping[str, Annotated[Any, Checked(_span_or_margin, _SPAN_OR_MARGIN)]] = field(default_factory=dict)
     target: TargetTable = field(default_factory=TargetTable)
     instrument: InstrumentTable | None = None
     camera: CameraTable | None = None
@@ -233,10 +248,12 @@ class ConstraintsFile:
 def beside(path: Path) -> dict[str, Path]:
     """Return the camera lens and board files that a constraints file names, by name."""
     camera = read(ConstraintsFile, path, "", MOTION)[0].camera
-    names = () if camera is None else (camera.lens, camera.board)
-    return {name: path.parent / name for name in names if name != UNKNOWN}
+    if camera is None:
+        return {}
+    return {name: path.parent / name for name in (camera.lens, camera.board) if name != UNKNOWN}
 
 
 def rising(span: tuple[float, ...], where: str) -> None:
+    """Raise an error unless a span has two numbers, the lower one first."""
     require(len(span) == 2, f"{where}: expected a list of 2 numbers, lower and upper, found {len(span)}", ValueError)
     require(span[0] < span[1], f"{where}: {span[0]:g} is not below {span[1]:g}", ValueError)

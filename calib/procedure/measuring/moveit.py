@@ -16,7 +16,7 @@ Joints and links of the robot's file that are not part of the arm (a gripper's) 
 does not have is refused, and so is an SRDF of which no pair of links is the robot's.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from math import radians
 from pathlib import Path
 from typing import Any
@@ -28,8 +28,10 @@ from calib.robot.chain import Chain
 from calib.robot.formats.urdf_tree import is_urdf, parse, text
 from calib.robot.formats.urdf_tree import read as read_tree
 
-JOINT_LIMITS, SRDF = "joint_limits.yaml", ".srdf"
-TABLES = {"velocity": "velocity", "acceleration": "acceleration", "jerk": "jerk", "torque": "effort"}  # ours: MoveIt's
+JOINT_LIMITS = "joint_limits.yaml"
+SRDF = ".srdf"
+# table of a limits file -> MoveIt's name of the quantity
+TABLES = {"velocity": "velocity", "acceleration": "acceleration", "jerk": "jerk", "torque": "effort"}
 
 
 def moveit_files(path: Path) -> list[Path]:
@@ -39,17 +41,20 @@ def moveit_files(path: Path) -> list[Path]:
         UsageError: for a folder without them, or with several SRDF.
     """
     if not path.is_dir():
-        return [path] if path.suffix in (".yaml", ".yml", SRDF) else []
-    places = [path, path / "config"]
-    found = [one / JOINT_LIMITS for one in places if (one / JOINT_LIMITS).is_file()][:1]
-    pairs = sorted(file for one in places for file in one.glob(f"*{SRDF}"))
-    require(
-        len(pairs) < 2,
-        f"{path} has {len(pairs)} SRDF files: give one of them, as {', '.join(map(str, pairs[:1]))}",
-        UsageError,
-    )
-    require(found or pairs, f"{path}: neither {JOINT_LIMITS} nor *{SRDF} in this folder or its config", UsageError)
-    return [*found, *pairs]
+        if path.suffix in (".yaml", ".yml", SRDF):
+            return [path]
+        return []
+    folders = [path, path / "config"]
+    limits = [folder / JOINT_LIMITS for folder in folders if (folder / JOINT_LIMITS).is_file()]
+    srdf: list[Path] = []
+    for folder in folders:
+        srdf += folder.glob(f"*{SRDF}")
+    srdf.sort()
+    if len(srdf) > 1:
+        raise UsageError(f"{path} has {len(srdf)} SRDF files: give one of them, as {srdf[0]}")
+    if not limits and not srdf:
+        raise UsageError(f"{path}: neither {JOINT_LIMITS} nor *{SRDF} in this folder or its config")
+    return [*limits[:1], *srdf]
 
 
 def limit_tables(path: Path, chain: Chain, source: Path | None) -> dict[str, Any] | None:
@@ -64,39 +69,55 @@ def limit_tables(path: Path, chain: Chain, source: Path | None) -> dict[str, Any
     """
     tables: dict[str, Any] = {}
     for file in moveit_files(path):
-        tables |= {"collision": _pairs(file, chain, source)} if file.suffix == SRDF else _limits(file, chain, source)
+        if file.suffix == SRDF:
+            tables["collision"] = _pairs(file, chain, source)
+        else:
+            tables |= _limits(file, chain, source)
     return tables or None
 
 
 def _limits(path: Path, chain: Chain, source: Path | None) -> dict[str, Any]:
     """Return the tables [joints], [velocity] … of a ``joint_limits.yaml``."""
-    found = _yaml(path)
-    stated = found.get("joint_limits") if isinstance(found, dict) else None
-    words = f"{path}: is no {JOINT_LIMITS} of MoveIt: expected joints under 'joint_limits:'"
-    require(isinstance(stated, dict) and all(isinstance(one, dict) for one in stated.values()), words, UsageError)
-    known = read_tree(text(source)[0], str(source)).joints if source and is_urdf(source) else chain.joint_names
-    own, tables = dict[str, Any](stated or {}), dict[str, Any]()
-    for name in own:
-        one_of(name, known, f"{path}: joint", UsageError)
+    content = _yaml(path)
+    entries: Any = None
+    if isinstance(content, dict):
+        entries = content.get("joint_limits")
+    if not isinstance(entries, dict) or not all(isinstance(entry, dict) for entry in entries.values()):
+        raise UsageError(f"{path}: is no {JOINT_LIMITS} of MoveIt: expected joints under 'joint_limits:'")
+    robot_joints: Collection[str] = chain.joint_names
+    if source and is_urdf(source):
+        robot_joints = read_tree(text(source)[0], str(source)).joints
+    for name in entries:
+        one_of(name, robot_joints, f"{path}: joint", UsageError)
+
+    tables: dict[str, Any] = {}
     for joint in chain.joints:
-        limits = own.get(joint.name, {})
-        place = f"{path}: {joint.name}"
-        for table, what in TABLES.items():
-            if (largest := _stated(limits, what, "max", place)) is not None:
+        limits = entries.get(joint.name, {})
+        where = f"{path}: {joint.name}"
+        for table, quantity in TABLES.items():
+            largest = _limit(limits, quantity, "max", where)
+            if largest is not None:
                 tables.setdefault(table, {})[joint.name] = largest
-        ends = [_stated(limits, "position", end, place) for end in ("min", "max")]
-        if ends != [None, None]:
-            sides = zip(ends, (joint.lower, joint.upper))
-            tables.setdefault("joints", {})[joint.name] = [side if end is None else end for end, side in sides]
+        lower = _limit(limits, "position", "min", where)
+        upper = _limit(limits, "position", "max", where)
+        if lower is None and upper is None:
+            continue
+        # an end that is not stated is the robot's own
+        if lower is None:
+            lower = joint.lower
+        if upper is None:
+            upper = joint.upper
+        tables.setdefault("joints", {})[joint.name] = [lower, upper]
     require(tables, f"{path}: limits no joint of the arm ({', '.join(chain.joint_names)})", UsageError)
     return tables
 
 
-def _stated(limits: Mapping[str, Any], what: str, end: str, place: str) -> float | None:
-    key = f"{end}_{what}"
-    if not limits.get(f"has_{what}_limits", True) or key not in limits:
+def _limit(limits: Mapping[str, Any], quantity: str, end: str, where: str) -> float | None:
+    """Return a joint's limit; None where it is not stated, or switched off."""
+    key = f"{end}_{quantity}"
+    if not limits.get(f"has_{quantity}_limits", True) or key not in limits:
         return None
-    return number(limits[key], f"{place}.{key}")
+    return number(limits[key], f"{where}.{key}")
 
 
 def _yaml(path: Path) -> Any:
@@ -122,10 +143,13 @@ def _pairs(path: Path, chain: Chain, source: Path | None) -> dict[str, Any]:
     """Return the table [collision] of an SRDF: its disabled pairs, of links that the robot has."""
     with refused_as(UsageError, (OSError, UnicodeDecodeError), f"{path}: cannot be read: {{}}"):
         root = parse(path.read_text(encoding="utf-8"), str(path))
-    nodes = root.all("disable_collisions")
-    pairs = [tuple(node.attributes.get(key, "") for key in ("link1", "link2")) for node in nodes]
-    known = links_of(chain, source)
-    own = [list(pair) for pair in pairs if {*pair} <= {*known}]
-    words = f"{path}: none of its {len(pairs)} disabled pairs is of links of {chain.name}, as {shown(pairs[:1])}"
-    require(own or not pairs, f"{words}: is it another robot's?", UsageError)
-    return {"ignored": own}
+    attributes = [node.attributes for node in root.all("disable_collisions")]
+    pairs = [(node.get("link1", ""), node.get("link2", "")) for node in attributes]
+    links = {*links_of(chain, source)}
+    ignored = [list(pair) for pair in pairs if {*pair} <= links]
+    if pairs and not ignored:
+        raise UsageError(
+            f"{path}: none of its {len(pairs)} disabled pairs is of links of {chain.name}, as {shown(pairs[:1])}: "
+            "is it another robot's?"
+        )
+    return {"ignored": ignored}

@@ -18,6 +18,8 @@ from calib.config_types import number
 from calib.errors import RobotError, UsageError, listing, one_of, refused_as, require
 from calib.geometry.installation import Installation
 from calib.geometry.observability import Observation, Target, TargetJacobian
+from calib.poses import constraints
+from calib.poses.space import PoseConstraint, SearchSpace
 from calib.procedure.measuring import constraints_file
 from calib.procedure.measuring.camera_view import camera_view
 from calib.procedure.measuring.constraints_file import CameraTable, CollisionTable, ConstraintsFile, InstrumentTable
@@ -31,12 +33,18 @@ from calib.robot.formats.urdf_tree import is_urdf, text
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.tables import load as load_table
 from calib.robot.tables import placement
-from poses import constraints
-from poses.space import PoseConstraint, SearchSpace
 
-MAX_REACHES = 100.0  # times the arm's reach: no cell is that large (our choice)
-BODY = 1.2  # of the reach is where a link's body ends (our choice)
-DISTANCES = 3  # distances that a constraint holds: the smallest ones, so that two that change places both are there
+# times the arm's reach: no cell is that large (our choice)
+MAX_REACHES = 100.0
+# of the reach is where a link's body ends (our choice)
+BODY = 1.2
+# smallest distances that the collision constraint holds: if two exchange their ranks, both are included
+DISTANCES = 3
+# names that a message lists
+LISTED_NAMES = 4
+LISTED_MESHES = 3
+# name of a line-of-sight constraint -> name of the limit
+SIGHT_NAMES = {"line of sight": "cone of acceptance"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,39 +74,47 @@ class Limits:
     camera: Any = None
     views: tuple[PoseConstraint, ...] = ()
 
-    def space(self, seen: Observation, sight: bool = True) -> SearchSpace:
+    def space(self, observation: Observation, sight: bool = True) -> SearchSpace:
         """Return the search space of pose selection: the observation Jacobian, joint limits and constraints.
 
         Args:
-            seen: all targets' rows.
+            observation: all targets' rows.
             sight: False leaves out what it takes to be seen, to tell what that costs.
         """
-        looked = (*self.views, *(self.sight.constraints() if self.sight is not None else ())) if sight else ()
-        kept, rows = (*self.constraints, *looked), seen  # what is quick to tell, and excludes most, comes first
+        # constraints that are quick to compute, and exclude most, come first
+        constraints = [*self.constraints]
+        if sight:
+            constraints += self.views
+            if self.sight is not None:
+                constraints += self.sight.constraints()
         if self.collision is not None and self.collision.pairs:
-            slope = partial(_closing, self.collision)
-            kept = (*kept, PoseConstraint("collision", partial(_shortfall, self.collision, self.clearance), slope))
-        if self.sight is not None and sight and len(self.sight.targets) > 1 and seen.product is not None:
-            rows = SeenOnly(seen, self.sight)
-        return SearchSpace(rows, self.lower, self.upper, rows.product, kept)
+            shortfall = partial(_shortfall, self.collision, self.clearance)
+            gradient = partial(_shortfall_gradient, self.collision)
+            constraints.append(PoseConstraint("collision", shortfall, gradient))
+        rows: Observation | SeenOnly = observation
+        targets = () if self.sight is None else self.sight.targets
+        if self.sight is not None and sight and len(targets) > 1 and observation.product is not None:
+            # rows of several targets count where these are seen
+            rows = SeenOnly(observation, self.sight)
+        return SearchSpace(rows, self.lower, self.upper, rows.product, tuple(constraints))
 
 
 def _shortfall(model: Any, clearance: float, q: np.ndarray) -> np.ndarray:
     return clearance - np.sort(model.distances(q), axis=1)[:, :DISTANCES]
 
 
-def _closing(model: Any, q: np.ndarray) -> np.ndarray:
+def _shortfall_gradient(model: Any, q: np.ndarray) -> np.ndarray:
     order = np.argsort(model.distances(q), axis=1)[:, :DISTANCES]
     return -np.take_along_axis(model.gradients(q), order[:, :, None], axis=1)
 
 
 def read_limits(
-    given: Tables | None, cell: Installation, source: Path | None = None, without: Sequence[str] = ()
+    tables: Tables | None, cell: Installation, source: Path | None = None, without: Sequence[str] = ()
 ) -> Limits:
     """Read the constraints for an arm with its targets.
 
     Args:
-        given: the file, or its tables; None for the defaults alone. Tables of motions (`MOTION`) may stand in it.
+        tables: the file, or its tables; None for the defaults alone. Tables of motions (`MOTION`) may stand in it.
         cell: the arm, see `calib.geometry.observability.targets_of`.
         source: the robot's file, whose collision shapes are used where it is a URDF.
         without: names of `DEFAULTS` not to keep, and of `CELL` that are not there.
@@ -106,96 +122,122 @@ def read_limits(
     Raises:
         UsageError: for an unknown key or a value that a key cannot have.
     """
-    known = (*constraints_file.DEFAULTS, *constraints_file.CELL)
-    if unknown := sorted(set(without) - {*known}):
-        raise UsageError(f"without {unknown[0]}: expected one of {', '.join(known)}")
-    stated, where = read(ConstraintsFile, *tables_of(given, cell.chain, source, "constraints"), constraints_file.MOTION)
-    limits = limits_of(stated, cell, source, where, without)
-    if stated.camera is None:
+    names = (*constraints_file.DEFAULTS, *constraints_file.CELL)
+    unknown = sorted(set(without) - {*names})
+    if unknown:
+        raise UsageError(f"without {unknown[0]}: expected one of {', '.join(names)}")
+    content, name = tables_of(tables, cell.chain, source, "constraints")
+    settings, where = read(ConstraintsFile, content, name, constraints_file.MOTION)
+    limits = limits_of(settings, cell, source, where, without)
+    if settings.camera is None:
         return limits
-    folder = given.parent if isinstance(given, Path) else Path()
-    return _with_camera(limits, stated.camera, cell, where, folder, {*stated.without, *without})
+    folder = Path()
+    if isinstance(tables, Path):
+        folder = tables.parent
+    return _with_camera(limits, settings.camera, cell, where, folder, {*settings.without, *without})
 
 
-def tables_of(given: Tables | None, chain: Chain, source: Path | None, name: str) -> tuple[Tables | None, str]:
+def tables_of(tables: Tables | None, chain: Chain, source: Path | None, name: str) -> tuple[Tables | None, str]:
     """Return limits as a file or tables, from MoveIt's files where they are such, and their name.
 
     Args:
-        given: a file, a folder, or tables, which are named by `name`.
-        chain, source: the arm, and its file.
+        tables: a file, a folder, or tables, which are named by `name`.
+        chain: the arm.
+        source: its file.
+        name: of tables.
     """
-    if isinstance(given, str | Path):
-        found = limit_tables(Path(given), chain, source)
-        if found is not None:
-            return found, str(given)
-    return given, name
+    if isinstance(tables, str | Path):
+        content = limit_tables(Path(tables), chain, source)
+        if content is not None:
+            return content, str(tables)
+    return tables, name
 
 
 def _with_camera(
-    limits: Limits, stated: CameraTable, cell: Installation, where: str, folder: Path, absent: set[str]
+    limits: Limits, camera: CameraTable, cell: Installation, where: str, folder: Path, absent: set[str]
 ) -> Limits:
     """Return the limits with the camera's view of the board added, if camera and board are known."""
-    unchecked = tuple(each for each in limits.unchecked if not each.startswith("line of sight"))
-    if stated.unknown:
-        words = f"{constraints_file.VIEW_UNCHECKED} (not known: {', '.join(stated.unknown)})"
-        return replace(limits, unchecked=(*unchecked, words))
+    unchecked = tuple(name for name in limits.unchecked if not name.startswith("line of sight"))
+    if camera.unknown:
+        name = f"{constraints_file.VIEW_UNCHECKED} (not known: {', '.join(camera.unknown)})"
+        return replace(limits, unchecked=(*unchecked, name))
     with refused_as(UsageError, RobotError, "{}"):
-        view = camera_view(stated, cell.chain, where, folder)
+        view = camera_view(camera, cell.chain, where, folder)
     arm = replace(view.cell, stations=np.eye(4)[None])
-    model = None if "view" in absent else limits.collision
+    model = limits.collision
+    if "view" in absent:
+        model = None
     sight = sight_of(arm, view.stand, [[0.0, 0.0, 1.0]], None, (0.0, np.inf), model)
-    found = (view.constraint(), *(sight.targets[0] if sight is not None else ()))
-    words = "the whole board in the camera's view, its range and its tilt"
-    past = ("view past the arm",) if sight is not None else ()
-    return replace(limits, views=found, camera=view, unchecked=unchecked, checked=(*limits.checked, words, *past))
+    views = [view.constraint()]
+    checked = [*limits.checked, "the whole board in the camera's view, its range and its tilt"]
+    if sight is not None:
+        views += sight.targets[0]
+        checked.append("view past the arm")
+    return replace(limits, views=tuple(views), camera=view, unchecked=unchecked, checked=tuple(checked))
 
 
 def limits_of(
-    stated: ConstraintsFile,
+    settings: ConstraintsFile,
     cell: Installation,
     source: Path | None = None,
     where: str = "constraints",
     without: Sequence[str] = (),
-    seen: bool = True,
+    measured: bool = True,
 ) -> Limits:
     """Return the pose limits of an arm from the content of a constraints file; see `read_limits`.
 
     Args:
-        seen: False for motions, which nothing measures: no lines of sight.
+        measured: False for motions, which nothing measures: no lines of sight.
     """
-    absent = {*stated.without, *without}
+    absent = {*settings.without, *without}
+    collision = settings.collision or CollisionTable()
     with refused_as(UsageError, RobotError, "{}"):
-        margin = 0.0 if "joint-margin" in absent else _joint_margin(stated.joints, where)
-        lower, upper, wide = _joints(stated.joints, cell, where, margin)
-        model, checked, notes, missed = _collision(stated, cell, source, where, absent)
-        found = (*_target(stated, cell), *_orientation(stated, cell, where))
-        sight = _sight(stated, cell, where, None if "view" in absent else model) if seen else None
-    kept = (f"{100 * margin:g} % of each joint's range to its limits", *checked) if margin else checked
+        margin = 0.0
+        if "joint-margin" not in absent:
+            margin = _joint_margin(settings.joints, where)
+        lower, upper, joint_notes = _joints(settings.joints, cell, where, margin)
+        model, checks, collision_notes, not_checked = _collision(settings, cell, source, where, absent)
+        constraints_of_target = (*_target(settings, cell), *_orientation(settings, cell, where))
+        sight = None
+        if measured:
+            sight = _sight(settings, cell, where, None if "view" in absent else model)
+    checked = [*checks]
+    if margin:
+        checked.insert(0, f"{100 * margin:g} % of each joint's range to its limits")
     if sight is not None:
-        words = {"line of sight": "cone of acceptance"}
-        kept = (*kept, *(words.get(part.name, part.name) for part in sight.targets[0]))
-    clearance = (stated.collision or CollisionTable()).margin
-    pairs = None if model is None or not model.pairs else model
-    notes = (*notes, *wide, *remarks(cell.chain))
-    unchecked = (*_unchecked(stated, absent, seen), *missed)
-    return Limits(lower, upper, found, notes, pairs, clearance, sight, kept, unchecked)
+        checked += [SIGHT_NAMES.get(part.name, part.name) for part in sight.targets[0]]
+    if model is not None and not model.pairs:
+        model = None
+    return Limits(
+        lower=lower,
+        upper=upper,
+        constraints=constraints_of_target,
+        notes=(*collision_notes, *joint_notes, *remarks(cell.chain)),
+        collision=model,
+        clearance=collision.margin,
+        sight=sight,
+        checked=tuple(checked),
+        unchecked=(*_unchecked(settings, absent, measured), *not_checked),
+    )
 
 
-def _unchecked(stated: ConstraintsFile, absent: set[str], seen: bool) -> tuple[str, ...]:
-    """Return the names of the limits that are not checked, for poses (if `seen`) or for motions."""
-    table, collision = stated.instrument or InstrumentTable(), stated.collision or CollisionTable()
-    placed = bool(table.stated)
+def _unchecked(settings: ConstraintsFile, absent: set[str], measured: bool) -> tuple[str, ...]:
+    """Return the names of the limits that are not checked, for poses (if `measured`) or for motions."""
+    instrument = settings.instrument or InstrumentTable()
+    collision = settings.collision or CollisionTable()
+    placed = bool(instrument.stated)
+    no_instrument = not placed and "instrument" not in absent
     missing = {
         "margin to the joint limits (switched off)": "joint-margin" in absent,
         "self-collision (switched off)": "self-collision" in absent,
         "floor (switched off)": "floor" in absent and collision.floor is None,
-        "line of sight (the instrument's position is not known)": seen and not placed and "instrument" not in absent,
-        "cone of acceptance of the target (not known)": seen and placed and table.sight is None,
-        "links in the line of sight (switched off)": seen and placed and "view" in absent,
+        "line of sight (the instrument's position is not known)": measured and no_instrument,
+        "cone of acceptance of the target (not known)": measured and placed and instrument.sight is None,
+        "links in the line of sight (switched off)": measured and placed and "view" in absent,
         "walls of the cell (not known)": collision.box is None and "box" not in absent,
-        "obstacles (not known)": not stated.obstacle and "obstacles" not in absent,
+        "obstacles (not known)": not settings.obstacle and "obstacles" not in absent,
     }
-    return tuple(words for words, holds in missing.items() if holds)
+    return tuple(name for name, is_missing in missing.items() if is_missing)
 
 
 def _joint_margin(spans: Mapping[str, Any], where: str) -> float:
@@ -209,52 +251,64 @@ def _joints(
     spans: Mapping[str, Any], cell: Installation, where: str, margin: float
 ) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
     """Return lower and upper joint limits (n,), and notes on given ranges that have no effect."""
-    notes = []
-    lower, upper = (side.copy() for side in cell.chain.sampling_limits())
-    limited = np.isfinite(cell.chain.lower) & np.isfinite(cell.chain.upper)
+    chain = cell.chain
+    lower, upper = (limit.copy() for limit in chain.sampling_limits())
+    limited = np.isfinite(chain.lower) & np.isfinite(chain.upper)
     free = np.where(limited, margin * (upper - lower), 0.0)
     lower, upper = lower + free, upper - free
-    names = cell.chain.joint_names
-    numbered = {f"q{j + 1}": j for j in range(len(names))} | {name: j for j, name in enumerate(names)}
-    check_keys(spans, (*numbered, "margin"), f"{where}: joints")
+    index = {f"q{j + 1}": j for j in range(chain.n)}
+    index |= {name: j for j, name in enumerate(chain.joint_names)}
+    check_keys(spans, (*index, "margin"), f"{where}: joints")
+    notes = []
     for name, span in spans.items():
-        if name == "margin" and name not in numbered:
+        if name == "margin" and name not in index:
             continue
-        j, place = numbered[name], f"{where}: joints.{name}"
+        j = index[name]
+        key = f"{where}: joints.{name}"
         if not isinstance(span, tuple):
-            raise UsageError(f"{place}: expected a list of 2 numbers, lower and upper, found {span}")
-        low, high = _span(span, place, "length" if cell.chain.joints[j].unit == "m" else "angle")
-        turns, own = cell.chain.joints[j].unit != "m", (cell.chain.lower[j], cell.chain.upper[j])
-        if far := turns and max(-low, high) > MAX_TURN:
-            notes.append(f'{place}: {low:g} to {high:g} rad; if in degrees, write ["{low:g} deg", "{high:g} deg"]')
-        if low <= own[0] and high >= own[1] and not far and (low, high) != own:
-            notes.append(f"{place}: {low:g} to {high:g} has no effect: the joint has {own[0]:g} to {own[1]:g}")
-        lower[j], upper[j] = max(lower[j], low), min(upper[j], high)
-        require(lower[j] < upper[j], f"{place}: the range {lower[j]:g} to {upper[j]:g} is empty", UsageError)
+            raise UsageError(f"{key}: expected a list of 2 numbers, lower and upper, found {span}")
+        revolute = chain.joints[j].unit != "m"
+        low, high = _span(span, key, "angle" if revolute else "length")
+        # a range in degrees that was written without its unit
+        in_degrees = revolute and max(-low, high) > MAX_TURN
+        if in_degrees:
+            notes.append(f'{key}: {low:g} to {high:g} rad; if in degrees, write ["{low:g} deg", "{high:g} deg"]')
+        joint_low, joint_high = chain.lower[j], chain.upper[j]
+        wider = low <= joint_low and high >= joint_high and (low, high) != (joint_low, joint_high)
+        if wider and not in_degrees:
+            notes.append(f"{key}: {low:g} to {high:g} has no effect: the joint has {joint_low:g} to {joint_high:g}")
+        lower[j] = max(lower[j], low)
+        upper[j] = min(upper[j], high)
+        require(lower[j] < upper[j], f"{key}: the range {lower[j]:g} to {upper[j]:g} is empty", UsageError)
     return lower, upper, tuple(notes)
 
 
 def _span(value: tuple[Any, Any], where: str, quantity: str) -> tuple[float, float]:
-    low, high = (number(side, where, quantity) for side in value)
+    lower, upper = value
+    low = number(lower, where, quantity)
+    high = number(upper, where, quantity)
     with refused_as(UsageError, ValueError, "{}"):
         constraints_file.rising((low, high), where)
     return low, high
 
 
-def _target(stated: ConstraintsFile, cell: Installation) -> list[PoseConstraint]:
-    table, target, slope, result = stated.target, Target(cell), TargetJacobian(cell), []
+def _target(settings: ConstraintsFile, cell: Installation) -> list[PoseConstraint]:
+    table = settings.target
+    target = Target(cell)
+    jacobian = TargetJacobian(cell)
+    result = []
     low, high = table.heights
     if low is not None:
-        result.append(constraints.height(target, low, np.inf if high is None else high, slope))
+        result.append(constraints.height(target, low, np.inf if high is None else high, jacobian))
     if table.axis_distance is not None:
-        result.append(constraints.axis_distance(target, table.axis_distance, slope))
+        result.append(constraints.axis_distance(target, table.axis_distance, jacobian))
     if table.reach is not None:
-        result.append(constraints.reach(target, table.reach, jacobian=slope))
+        result.append(constraints.reach(target, table.reach, jacobian=jacobian))
     return result
 
 
-def _orientation(stated: ConstraintsFile, cell: Installation, where: str) -> list[PoseConstraint]:
-    table, where = stated.instrument, f"{where}: instrument"
+def _orientation(settings: ConstraintsFile, cell: Installation, where: str) -> list[PoseConstraint]:
+    table, where = settings.instrument, f"{where}: instrument"
     if table is None or (table.roll is None and table.pitch is None):
         return []
     stand = placement(table.stated, where)
@@ -263,55 +317,68 @@ def _orientation(stated: ConstraintsFile, cell: Installation, where: str) -> lis
     return [constraints.orientation(Target(cell), stand[:3, :3], roll, pitch, TargetJacobian(cell))]
 
 
-def _sight(stated: ConstraintsFile, cell: Installation, where: str, model: Any) -> Sight | None:
+def _sight(settings: ConstraintsFile, cell: Installation, where: str, model: Any) -> Sight | None:
     """Return the lines of sight: cone and range if given, and no link of the arm in between.
 
     An instrument with roll and pitch alone is a camera whose view these state.
     """
-    table, facing = stated.instrument, stated.target.facing
-    turned = table is not None and (table.roll is not None or table.pitch is not None)
-    if table is None or (table.sight is None and table.range is None and (turned or not table.stated)):
+    table, facing = settings.instrument, settings.target.facing
+    if table is None:
+        return None
+    is_camera = table.roll is not None or table.pitch is not None
+    conditions = table.sight is not None or table.range is not None
+    if not conditions and (is_camera or not table.stated):
         return None
     if len(facing) not in (1, len(cell.tools)):
         raise UsageError(f"{where}: target.facing: {len(facing)} directions for {len(cell.tools)} targets")
-    span = (0.0, np.inf) if table.range is None else _span(table.range, f"{where}: instrument.range", "length")
+    span = (0.0, np.inf)
+    if table.range is not None:
+        span = _span(table.range, f"{where}: instrument.range", "length")
     stand = placement(table.stated, f"{where}: instrument")[:3, 3]
     return sight_of(cell, stand, facing, table.sight, span, model)
 
 
 def _collision(
-    stated: ConstraintsFile, cell: Installation, source: Path | None, where: str, absent: set[str]
+    settings: ConstraintsFile, cell: Installation, source: Path | None, where: str, absent: set[str]
 ) -> tuple[Any, tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
     """Return the collision model, the names of its checks, notes, and what it does not check."""
-    table, chain = stated.collision or CollisionTable(), cell.chain
-    floor = (None if "floor" in absent else chain.floor) if table.floor is None else table.floor
-    obstacles = [
-        Obstacle(one.name, one.kind, one.size, placement(one.stated, f"{where}: [[obstacle]] number {k}"))
-        for k, one in enumerate(stated.obstacle, 1)
-    ]
-    walls, within = _walls(table.box, f"{where}: collision.box"), "self-collision" not in absent
-    idle, far = _never_act(table, obstacles, walls, cell, where)
-    place = partial(_model, cell, source, table, obstacles, walls, within)
+    table = settings.collision or CollisionTable()
+    floor = table.floor
+    if floor is None and "floor" not in absent:
+        floor = cell.chain.floor
+    obstacles = []
+    for k, obstacle in enumerate(settings.obstacle, 1):
+        T_base_obstacle = placement(obstacle.stated, f"{where}: [[obstacle]] number {k}")
+        obstacles.append(Obstacle(obstacle.name, obstacle.kind, obstacle.size, T_base_obstacle))
+    walls = _walls(table.box, f"{where}: collision.box")
+    self_collision = "self-collision" not in absent
+    unreachable, distance_notes = _never_act(table, obstacles, walls, cell, where)
+    model_with = partial(_model, cell, source, table, obstacles, walls, self_collision)
     with refused_as(UsageError, RobotError, f"{where}: {{}}"):
         try:
-            model, shapes, notes, missed = place(floor)
+            model, shapes, notes, unchecked = model_with(floor)
         except RobotError:
             if floor is None or table.floor is not None:
                 raise
-            model, shapes, notes, missed = place(None)
+            # the default floor does not hold for an arm that hangs or stands elsewhere
+            model, shapes, notes, unchecked = model_with(None)
             notes = (*notes, f"floor NOT checked: all postures reach below {floor:g} m; set its height in [collision]")
             floor = None
     if model.excluded:
-        pairs = listing((" with ".join(pair) for pair in model.excluded), 4)
-        missed = (*missed, f"collision of {pairs} (their shapes touch in nearly all postures)")
-    kept = [*([f"self-collision ({shapes})"] if within else [])]
-    kept += [] if floor is None or "floor" in idle else [f"floor at {floor:g} m"]
-    kept += ["walls of the cell"] if not {wall.name for wall in walls} <= idle else []
-    kept += [f"obstacle {one.name}" for one in obstacles if one.name not in idle]
-    notes = (*notes, *far)
-    if kept:
-        kept[-1] += f", {1e3 * table.margin:g} mm clearance each"
-    return model, tuple(kept), notes, missed if within else ()
+        pairs = listing((" with ".join(pair) for pair in model.excluded), LISTED_NAMES)
+        unchecked = (*unchecked, f"collision of {pairs} (their shapes touch in nearly all postures)")
+
+    checked = []
+    if self_collision:
+        checked.append(f"self-collision ({shapes})")
+    if floor is not None and "floor" not in unreachable:
+        checked.append(f"floor at {floor:g} m")
+    if any(wall.name not in unreachable for wall in walls):
+        checked.append("walls of the cell")
+    checked += [f"obstacle {obstacle.name}" for obstacle in obstacles if obstacle.name not in unreachable]
+    if checked:
+        checked[-1] += f", {1e3 * table.margin:g} mm clearance each"
+    return model, tuple(checked), (*notes, *distance_notes), unchecked if self_collision else ()
 
 
 def _never_act(
@@ -322,23 +389,31 @@ def _never_act(
     Raises:
         UsageError: for what stands `MAX_REACHES` times as far, and for links thicker than the arm is long.
     """
-    slides = sum(max(-joint.lower, joint.upper) for joint in cell.chain.joints if joint.unit == "m")
-    reach = cell.reach + slides
+    strokes = [max(-joint.lower, joint.upper) for joint in cell.chain.joints if joint.unit == "m"]
+    reach = cell.reach + sum(strokes)
     if table.radius is not None and table.radius > reach:
-        words = f"links of radius {table.radius:g} m in an arm of {reach:.3g} m reach; is it in mm?"
-        raise UsageError(f"{where}: collision.radius: {words}")
+        raise UsageError(
+            f"{where}: collision.radius: links of radius {table.radius:g} m in an arm of {reach:.3g} m reach; "
+            "is it in mm?"
+        )
     base = np.zeros((1, 3))
-    away = {} if table.floor is None else {"floor": -table.floor}
-    away |= {wall.name: -wall.offset for wall in walls}
-    away |= {one.name: float(signed_distance(one, base)[0][0]) for one in obstacles}
-    beyond = {name: distance for name, distance in away.items() if distance > BODY * reach + table.margin}
-    words = [
-        f"{name}: {distance:.3g} m from the base, but the arm reaches {reach:.3g} m, so it has no effect; is it in mm?"
-        for name, distance in beyond.items()
-    ]
-    for said, distance in zip(words, beyond.values()):
-        require(distance <= MAX_REACHES * reach, f"{where}: {said} Give lengths in m", UsageError)
-    return set(beyond), tuple(words)
+    distances = {}
+    if table.floor is not None:
+        distances["floor"] = -table.floor
+    for wall in walls:
+        distances[wall.name] = -wall.offset
+    for obstacle in obstacles:
+        distances[obstacle.name] = float(signed_distance(obstacle, base)[0][0])
+    unreachable = {name: distance for name, distance in distances.items() if distance > BODY * reach + table.margin}
+    notes = []
+    for name, distance in unreachable.items():
+        note = (
+            f"{name}: {distance:.3g} m from the base, but the arm reaches {reach:.3g} m, so it has no effect; "
+            "is it in mm?"
+        )
+        require(distance <= MAX_REACHES * reach, f"{where}: {note} Give lengths in m", UsageError)
+        notes.append(note)
+    return set(unreachable), tuple(notes)
 
 
 def _model(
@@ -347,73 +422,83 @@ def _model(
     table: CollisionTable,
     obstacles: Sequence[Obstacle],
     walls: Sequence[Wall],
-    within: bool,
+    self_collision: bool,
     floor: float | None,
 ) -> tuple[Any, str, tuple[str, ...], tuple[str, ...]]:
     """Return the collision model, the name of its link shapes, notes, and links that it does not hold."""
     from calib.robot import capsules, collision
     from calib.robot.beside import links_beside
 
-    chain, notes = cell.chain, ()
-    known = links_of(chain, source) if table.ignored else ()
-    for name in (name for pair in table.ignored for name in pair):
-        one_of(name, known, "collision.ignored: link", RobotError)
+    chain = cell.chain
+    notes: tuple[str, ...] = ()
+    links = links_of(chain, source) if table.ignored else ()
+    for pair in table.ignored:
+        for name in pair:
+            one_of(name, links, "collision.ignored: link", RobotError)
     posture = _posture(table.posture, chain, source)
-    stands = "the stated posture" if posture else "zero of their joints"
-    around: dict[str, Any] = {
+    posture_name = "the stated posture" if posture else "zero of their joints"
+    common: dict[str, Any] = {
         "walls": walls,
         "targets": cell.tools[:, :3, 3],
         "margin": table.margin,
-        "within": within,
+        "within": self_collision,
         "ignored": {frozenset(pair) for pair in table.ignored},
     }
     if source is not None and is_urdf(source) and "<collision" in text(source)[0]:
         try:
-            model = collision.from_urdf(source, chain.base, chain.tip, floor, obstacles, posture=posture, **around)
+            model = collision.from_urdf(source, chain.base, chain.tip, floor, obstacles, posture=posture, **common)
             if model.missing:
-                notes = (f"collision meshes not found, their shapes are not checked: {', '.join(model.missing[:3])}",)
-            bare = [
-                one.name for one in links_beside(text(source)[0], str(source), chain) if one.name not in model.links
-            ]
-            missed = (f"{listing(bare, 4)} (not in the arm, without collision shapes)",) if bare else ()
-            return model, f"the URDF's collision shapes, links outside the arm at {stands}", notes, missed
+                meshes = ", ".join(model.missing[:LISTED_MESHES])
+                notes = (f"collision meshes not found, their shapes are not checked: {meshes}",)
+            links_outside = links_beside(text(source)[0], str(source), chain)
+            bare = [link.name for link in links_outside if link.name not in model.links]
+            unchecked: tuple[str, ...] = ()
+            if bare:
+                unchecked = (f"{listing(bare, LISTED_NAMES)} (not in the arm, without collision shapes)",)
+            return model, f"the URDF's collision shapes, links outside the arm at {posture_name}", notes, unchecked
         except RobotError as error:
             if "no usable <collision> shape" not in str(error):
                 raise
             notes = (f"{error.args[0].partition(';')[0]}: capsules are used as link shapes",)
-    radius = capsules.usual_radius(chain) if table.radius is None else table.radius
-    described = _description(source, chain)
-    if described is None:
-        beside, missed = (), ("links outside the arm (the URDF is not at hand)",) if chain.links else ()
-    else:
-        beside, missed = links_beside(text(described)[0], str(described), chain, posture), ()
-    model = capsules.from_chain(chain, radius, floor, obstacles, beside=beside, **around)
-    words = f"capsules of radius {radius:g} m"
+
+    radius = table.radius
+    if radius is None:
+        radius = capsules.usual_radius(chain)
+    urdf = _description(source, chain)
+    unchecked = ()
+    beside = ()
+    if urdf is not None:
+        beside = links_beside(text(urdf)[0], str(urdf), chain, posture)
+    elif chain.links:
+        unchecked = ("links outside the arm (the URDF is not at hand)",)
+    model = capsules.from_chain(chain, radius, floor, obstacles, beside=beside, **common)
+    shapes = f"capsules of radius {radius:g} m"
     if beside:
-        names = listing((one.name for one in beside), 4)
-        words += f"; outside the arm, at {stands}: {names}"
-    return model, words, notes, missed
+        names = listing((link.name for link in beside), LISTED_NAMES)
+        shapes += f"; outside the arm, at {posture_name}: {names}"
+    return model, shapes, notes, unchecked
 
 
-def _posture(stated: Mapping[str, Any], chain: Chain, source: Path | None) -> dict[str, float]:
+def _posture(values: Mapping[str, Any], chain: Chain, source: Path | None) -> dict[str, float]:
     """Return the values [rad or m] of joints outside the arm.
 
     Raises:
         RobotError: for a joint of the arm, or one that its URDF does not have.
     """
-    if not stated:
+    if not values:
         return {}
-    described = _description(source, chain)
-    if described is None:
+    urdf = _description(source, chain)
+    if urdf is None:
         raise RobotError("collision.posture: the links outside the arm are not known; give the URDF as the robot")
-    joints = read_tree(text(described)[0], str(described)).joints
-    result: dict[str, float] = {}
-    for name, value in stated.items():
-        others = [joint.name for joint in joints.values() if joint.actuated and joint.name not in chain.joint_names]
-        one_of(name, others, "collision.posture: joint outside the arm", RobotError)
+    joints = read_tree(text(urdf)[0], str(urdf)).joints
+    actuated = [joint.name for joint in joints.values() if joint.actuated]
+    outside_joints = [name for name in actuated if name not in chain.joint_names]
+    posture: dict[str, float] = {}
+    for name, value in values.items():
+        one_of(name, outside_joints, "collision.posture: joint outside the arm", RobotError)
         quantity = "length" if joints[name].kind == "prismatic" else "angle"
-        result[name] = number(value, f"collision.posture: {name}", quantity)
-    return result
+        posture[name] = number(value, f"collision.posture: {name}", quantity)
+    return posture
 
 
 def _description(source: Path | None, chain: Chain) -> Path | None:
@@ -425,18 +510,21 @@ def _description(source: Path | None, chain: Chain) -> Path | None:
         return source
     if source.suffix != ".toml" or not source.is_file():
         return None
-    named = load_table(source).get("provenance", {}).get("robot", "")
-    places = [Path(named), source.parent.parent / "1-robot" / Path(named).name] if named else []
-    for place in places:
-        if place.is_file() and is_urdf(place) and {chain.base, chain.tip} <= set(links_of(chain, place)):
-            return place
+    robot = load_table(source).get("provenance", {}).get("robot", "")
+    if not robot:
+        return None
+    for path in (Path(robot), source.parent.parent / "1-robot" / Path(robot).name):
+        if not path.is_file() or not is_urdf(path):
+            continue
+        if {chain.base, chain.tip} <= set(links_of(chain, path)):
+            return path
     return None
 
 
 def _walls(box: tuple[Any, ...] | None, where: str) -> list[Wall]:
-    found = []
-    for k, span in enumerate(box or ()):
-        normal = np.eye(3)[k]
-        low, high = _span(span, f"{where}: {'xyz'[k]}", "length")
-        found += [Wall(f"wall -{'xyz'[k]}", normal, low), Wall(f"wall +{'xyz'[k]}", -normal, -high)]
-    return found
+    """Return the two walls across each axis."""
+    walls = []
+    for axis, normal, span in zip("xyz", np.eye(3), box or ()):
+        low, high = _span(span, f"{where}: {axis}", "length")
+        walls += [Wall(f"wall -{axis}", normal, low), Wall(f"wall +{axis}", -normal, -high)]
+    return walls

@@ -14,19 +14,27 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
-from calib.errors import Finding, UsageError, finding, require
+from calib.errors import Finding, UsageError, finding
 from calib.geometry.observability import Observation
 from calib.geometry.observation import layout
 from calib.geometry.weighing import GeometricFit
+from calib.poses.design import Pool
+from calib.poses.errors import NotIdentifiable, TooFewCandidates
+from calib.poses.exchange import greedy
+from calib.poses.information import prepared
 from calib.records import Array, read_json
-from poses.design import Pool
-from poses.errors import NotIdentifiable, TooFewCandidates
-from poses.exchange import greedy
-from poses.information import prepared
 
 SUFFIX = "_prediction.json"
+# numbers of poses for which the accuracy is predicted besides
 COUNTS = (10, 20, 40, 80)
+# quantile over typical poses that is stated as the worst
 WORST = 0.95
+# ratio of singular values from which on parameters count as not identifiable
+MIN_SINGULAR = 1e-9
+# column norm below which no column is scaled
+TINY = 1e-300
+# (unit, name of the parameters, unit in messages)
+QUANTITIES = (("m", "lengths", "mm"), ("rad", "angles", "mrad"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +56,11 @@ class SelectionPrediction:
     def check_robot(self, joints: Sequence[str]) -> None:
         """Raise an error if the selection belongs to a robot with other joints."""
         if self.joints != tuple(joints):
-            ours, theirs = ", ".join(joints), ", ".join(self.joints)
-            raise UsageError(f"the selection belongs to another robot: its joints are {theirs}; this robot has {ours}")
+            selection_joints = ", ".join(self.joints)
+            raise UsageError(
+                f"the selection belongs to another robot: its joints are {selection_joints}; "
+                f"this robot has {', '.join(joints)}"
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +68,7 @@ class Prediction(SelectionPrediction):
     """Predicted accuracy of a fit to m poses: sigmas of the parameters, and of the tool's position.
 
     Attributes:
-        points, spread: (s, 3), (s,) where the tool is at typical poses, and sigma of its position there [m]; infinite
+        points, spread: (s, 3), (s,): where the tool is at typical poses, and sigma of its position there [m]; infinite
             where a parameter is not identifiable.
     """
 
@@ -72,72 +83,98 @@ class Prediction(SelectionPrediction):
     @property
     def worst(self) -> float:
         """Sigma of the tool's position, 95 % quantile over typical poses [m]."""
-        return float(np.quantile(self.spread, WORST)) if np.isfinite(self.spread).all() else float("inf")
+        if not np.isfinite(self.spread).all():
+            return float("inf")
+        return float(np.quantile(self.spread, WORST))
 
 
-def predicted(seen: Observation, jacobians: np.ndarray, typical: np.ndarray, poses: int | None = None) -> Prediction:
+def predicted(
+    observation: Observation, jacobians: np.ndarray, typical: np.ndarray, poses: int | None = None
+) -> Prediction:
     """Return the predicted accuracy of a fit from its Jacobians (m, rows, p), at typical poses (s, n).
 
     Args:
-        seen: the observation Jacobian they come from.
+        observation: the observation Jacobian they come from.
         jacobians: whitened; of all that will have been measured.
         typical: where the tool's position matters [rad or m].
         poses: the number to say; by default m.
     """
-    names, units = layout(seen.cell).names, layout(seen.cell).units
     rows = jacobians.reshape(-1, jacobians.shape[2])
-    scale = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
-    _, s, vt = np.linalg.svd(rows / scale, full_matrices=False)
-    count = len(jacobians) if poses is None else poses
-    identifiable = len(rows) >= rows.shape[1] and len(s) == rows.shape[1] and s[-1] > 1e-9 * s[0]
-    root = (vt.T / s) / scale[:, None] if identifiable else np.full((rows.shape[1], 1), np.inf)
-    points, slopes = seen.position(typical)
-    spread = np.sqrt(((slopes @ root) ** 2).sum((1, 2))) if identifiable else np.full(len(typical), np.inf)
-    free_names, free_units = (tuple(each[k] for k in seen.free) for each in (names, units))
-    sigmas = np.linalg.norm(root, axis=1)
-    return Prediction(seen.cell.chain.joint_names, count, free_names, free_units, sigmas, points, spread)
+    scale = np.maximum(np.linalg.norm(rows, axis=0), TINY)
+    _, singular, vt = np.linalg.svd(rows / scale, full_matrices=False)
+    parameter_count = rows.shape[1]
+    points, position_jacobians = observation.position(typical)
+    if len(singular) == parameter_count and singular[-1] > MIN_SINGULAR * singular[0]:
+        # a root of the covariance
+        root = (vt.T / singular) / scale[:, None]
+        spread = np.sqrt(((position_jacobians @ root) ** 2).sum((1, 2)))
+    else:
+        root = np.full((parameter_count, 1), np.inf)
+        spread = np.full(len(typical), np.inf)
+    parameters = layout(observation.cell)
+    names = tuple(parameters.names[k] for k in observation.free)
+    units = tuple(parameters.units[k] for k in observation.free)
+    return Prediction(
+        joints=observation.cell.chain.joint_names,
+        poses=len(jacobians) if poses is None else poses,
+        names=names,
+        units=units,
+        sigmas=np.linalg.norm(root, axis=1),
+        points=points,
+        spread=spread,
+    )
 
 
 def by_count(
-    seen: Observation, candidates: np.ndarray, typical: np.ndarray, before: np.ndarray | None = None
+    observation: Observation, candidates: np.ndarray, typical: np.ndarray, before: np.ndarray | None = None
 ) -> tuple[Prediction, ...]:
     """Return the predicted accuracy with `COUNTS` poses each, chosen greedily among candidates (N, rows, p).
 
     Args:
-        seen, typical: see `predicted`.
+        observation, typical: see `predicted`.
         candidates: whitened Jacobians.
         before: (k, rows, p) Jacobians of poses measured before.
     """
-    past = np.zeros((0, *candidates.shape[1:])) if before is None else before
     counts = [count for count in COUNTS if count <= len(candidates)]
     if not counts:
         return ()
     try:
-        ready = prepared(candidates, counts[-1], before)
+        information = prepared(candidates, counts[-1], before)
     except (NotIdentifiable, TooFewCandidates):
         return ()
-    order = list(greedy(Pool(ready.z, ready.known), counts[-1]).members)
-    found = [predicted(seen, np.concatenate([candidates[order[:k]], past]), typical, k) for k in counts]
-    return tuple(one for one in found if np.isfinite(one.rms))
+    if before is None:
+        before = np.zeros((0, *candidates.shape[1:]))
+    order = list(greedy(Pool(information.z, information.known), counts[-1]).members)
+    predictions = []
+    for count in counts:
+        jacobians = np.concatenate([candidates[order[:count]], before])
+        prediction = predicted(observation, jacobians, typical, count)
+        if np.isfinite(prediction.rms):
+            predictions.append(prediction)
+    return tuple(predictions)
 
 
-def table(one: Prediction, others: tuple[Prediction, ...]) -> list[tuple[str, str]]:
+def table(prediction: Prediction, by_pose_count: tuple[Prediction, ...]) -> list[tuple[str, str]]:
     """Return the rows (label, values) of a table: sigmas of tool and parameters, also for other pose counts."""
-    if not np.isfinite(one.rms):
-        return [("predicted σ of the tool's position", "not available: these poses do not identify all parameters")]
-    rows = [("predicted σ of the tool's position", f"{1e3 * one.rms:.3g} mm rms, {1e3 * one.worst:.3g} mm at 95 %")]
-    worst = []
-    for unit, words, shown in (("m", "lengths", "mm"), ("rad", "angles", "mrad")):
-        own = [k for k, each in enumerate(one.units) if each == unit]
-        if own:
-            k = max(own, key=lambda i: one.sigmas[i])
-            middle, most = 1e3 * np.median(one.sigmas[own]), 1e3 * one.sigmas[k]
-            worst.append(f"{words} {middle:.2g}, at most {most:.2g} {shown} ({one.names[k]})")
-    rows.append(("predicted σ of parameters, median", "; ".join(worst)))
-    if others:
-        numbers = " / ".join(f"{each.poses}" for each in others)
-        sizes = " / ".join(f"{1e3 * each.rms:.3g}" for each in others)
-        rows.append((f"σ of the tool with {numbers} poses", f"{sizes} mm rms"))
+    label = "predicted σ of the tool's position"
+    if not np.isfinite(prediction.rms):
+        return [(label, "not available: these poses do not identify all parameters")]
+    rows = [(label, f"{1e3 * prediction.rms:.3g} mm rms, {1e3 * prediction.worst:.3g} mm at 95 %")]
+    sigmas = []
+    for unit, quantity, printed_unit in QUANTITIES:
+        indices = [k for k, parameter_unit in enumerate(prediction.units) if parameter_unit == unit]
+        if not indices:
+            continue
+        largest = indices[int(np.argmax(prediction.sigmas[indices]))]
+        median_sigma = 1e3 * np.median(prediction.sigmas[indices])
+        largest_sigma = 1e3 * prediction.sigmas[largest]
+        name = prediction.names[largest]
+        sigmas.append(f"{quantity} {median_sigma:.2g}, at most {largest_sigma:.2g} {printed_unit} ({name})")
+    rows.append(("predicted σ of parameters, median", "; ".join(sigmas)))
+    if by_pose_count:
+        counts = " / ".join(f"{prediction.poses}" for prediction in by_pose_count)
+        values = " / ".join(f"{1e3 * prediction.rms:.3g}" for prediction in by_pose_count)
+        rows.append((f"σ of the tool with {counts} poses", f"{values} mm rms"))
     return rows
 
 
@@ -148,9 +185,8 @@ def beside(poses: Path) -> Path:
 
 def write(prediction: SelectionPrediction, poses: Path) -> Path:
     """Write the prediction for a selection next to its CSV, and return its path."""
-    return files.write_json(
-        beside(poses), {each.name: getattr(prediction, each.name) for each in fields(SelectionPrediction)}
-    )
+    content = {field.name: getattr(prediction, field.name) for field in fields(SelectionPrediction)}
+    return files.write_json(beside(poses), content)
 
 
 def read(selection: Path) -> SelectionPrediction:
@@ -162,15 +198,15 @@ def read(selection: Path) -> SelectionPrediction:
     Raises:
         UsageError: if no prediction, or more than one, is found, or it cannot be read.
     """
-    path = selection
-    if not selection.is_dir():
-        path = beside(selection)
+    if selection.is_dir():
+        predictions = sorted(selection.glob(f"*{SUFFIX}"))
+        if len(predictions) > 1:
+            raise UsageError(f"{selection} contains {len(predictions)} predictions: name one CSV of poses")
+        path = predictions[0] if predictions else selection / f"*{SUFFIX}"
     else:
-        found = sorted(selection.glob(f"*{SUFFIX}"))
-        require(len(found) <= 1, f"{selection} contains {len(found)} predictions: name one CSV of poses", UsageError)
-        path = found[0] if found else selection / f"*{SUFFIX}"
-    words = f"{path} not found; give the CSV written by `calib select`, or its folder"
-    require(path.is_file(), words, UsageError)
+        path = beside(selection)
+    if not path.is_file():
+        raise UsageError(f"{path} not found; give the CSV written by `calib select`, or its folder")
     return read_json(path, "choose the poses again", SelectionPrediction)
 
 
@@ -178,7 +214,8 @@ def compared_with_fit(prediction: SelectionPrediction, fit: GeometricFit) -> Fin
     """Return a finding on the ratio of the fit's σ to those predicted at pose selection; None without common names."""
     names = layout(fit.cell).names
     estimated = {names[k]: float(sigma) for k, sigma in zip(fit.base, fit.base_sigma())}
-    return sigma_ratio(dict(zip(prediction.names, prediction.sigmas)), estimated)
+    predicted = dict(zip(prediction.names, prediction.sigmas))
+    return sigma_ratio(predicted, estimated)
 
 
 def sigma_ratio(
@@ -196,7 +233,8 @@ def sigma_ratio(
     common = [name for name in predicted if estimated.get(name, 0.0) > 0.0 and predicted[name] > 0.0]
     if not common:
         return None
-    low, median, high = np.quantile([estimated[name] / predicted[name] for name in common], [0.1, 0.5, 0.9])
+    ratios = [estimated[name] / predicted[name] for name in common]
+    low, median, high = np.quantile(ratios, [0.1, 0.5, 0.9])
     return finding(
         "sigma-ratio", count=len(common), median=median, low=low, high=high, residual=residual, assumed=assumed
     )

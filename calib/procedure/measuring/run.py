@@ -18,33 +18,83 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import pairwise, product
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from calib import files
 from calib.data.poses.pose_lists import joint_columns
+from calib.poses.by_index import merits
+from calib.poses.indices import Index, observability
+from calib.poses.information import log_det
 from calib.procedure.measuring import DEFAULT_RUN, RunSettings
 from calib.robot.chain import Chain
-from poses.by_index import merits
-from poses.indices import Index, observability
-from poses.information import log_det
-from trajectories.tour import move_times, tour
-from trajectories.ways import Room, way
+from calib.trajectories.tour import move_times, tour
+from calib.trajectories.ways import Room, way
 
-# full speed of a joint whose limit nobody knows [rad/s, m/s]; our choice
-LEISURE = {"revolute": 1.0, "prismatic": 0.25}
-RISE = 2.0  # acceleration [1/s] times the speed: half a second to get there; our choice
-BLOCKED = 3.0  # times that a straight move which does not keep clear is taken to last; our choice
-PLACES = 8  # of a straight move that are looked at to guess whether it keeps clear
-# orders tried, and random places per way in them and in the last; our choice
-ROUNDS, WAY_TRIES, LAST_WAY_TRIES = 4, 250, 1000
-# turns of a pose, and poses to come from, that are tried to tell whether there is any way; our choice
-MAX_NEIGHBOURS = 8
-MIN_STEP = 0.01  # of a joint's range that the search for a way goes at once, however slow the joint is; our choice
-FORBIDDEN = 1e4  # [s] a move for which no way was found
 Progress = Callable[[str], None]
-Ways = dict[tuple[int, int], np.ndarray]  # by the numbers of two poses, the smaller one first
+# by the numbers of two poses, the smaller one first
+Ways = dict[tuple[int, int], np.ndarray]
+
+# full speed of a joint whose limit nobody knows [rad/s, m/s] (our choice)
+LEISURE = {"revolute": 1.0, "prismatic": 0.25}
+# [1/s] acceleration over the speed: half a second to get there (our choice)
+RISE = 2.0
+# times that a straight move which does not keep clear is taken to last (our choice)
+BLOCKED = 3.0
+# postures of a straight move at which is guessed whether it keeps clear
+PLACES = 8
+# orders tried, and random postures per way in them and in the last (our choice)
+ROUNDS = 4
+WAY_TRIES = 250
+LAST_WAY_TRIES = 1000
+# turns of a pose, and poses to come from, that are tried to tell whether there is any way (our choice)
+MAX_NEIGHBOURS = 8
+# of a joint's range that the search for a way goes at once, however slow the joint is (our choice)
+MIN_STEP = 0.01
+# [rad] a gap between angles in which the range of a joint may be cut
+MIN_GAP = np.radians(30.0)
+# turns of a joint to either side that are considered
+MAX_TURNS = 3
+# [s] a move for which no way was found
+FORBIDDEN = 1e4
+# parts in which places are checked for collisions, for memory
+CLEARANCE_BLOCKS = 16
+# times that poses are replaced, and the run is planned again (our choice)
+EXCHANGES = 3
+# candidates tried in the place of one pose, by straight moves, by via-points (our choice)
+MAX_STRAIGHT_TRIES = 200
+MAX_VIA_TRIES = 4
+# [rad or m] a candidate that differs by less from a pose of the list is that pose
+SAME_POSE = 1e-9
+
+
+class MoveLimits(Protocol):
+    """Limits that moves keep, see `calib.procedure.measuring.pose_limits.Limits`."""
+
+    @property
+    def lower(self) -> np.ndarray:
+        """Joint limits (n,) [rad or m]."""
+        ...
+
+    @property
+    def upper(self) -> np.ndarray:
+        """Joint limits (n,) [rad or m]."""
+        ...
+
+    @property
+    def collision(self) -> Any:
+        """Collision model, or None."""
+        ...
+
+    @property
+    def clearance(self) -> float:
+        """Distance that the model asks for [m]."""
+        ...
+
+
+def _silent(stage: str) -> None:
+    """Show no progress."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,19 +122,24 @@ class Run:
     @property
     def found_ways(self) -> Ways:
         """The collision-free paths, keyed by the input numbers of start and end pose."""
-        pairs = enumerate(pairwise(self.order))
-        return {
-            _pair(one, two): self.ways[k] if one < two else self.ways[k][::-1]
-            for k, (one, two) in pairs
-            if k not in self.blocked
-        }
+        clear_ways = {}
+        for k, (start, end) in enumerate(pairwise(self.order)):
+            if k in self.blocked:
+                continue
+            path = self.ways[k]
+            clear_ways[_pair(start, end)] = path if start < end else path[::-1]
+        return clear_ways
 
     @property
     def cut_off(self) -> tuple[int, ...]:
         """Indices of the poses (in input order) without a clear path from the largest connected group."""
-        parts = np.split(self.order, np.array(self.blocked, dtype=int) + 1)
-        most = max(parts, key=len)
-        return tuple(sorted(int(k) for part in parts if part is not most for k in part))
+        groups = np.split(self.order, np.array(self.blocked, dtype=int) + 1)
+        largest = max(groups, key=len)
+        separate: list[int] = []
+        for group in groups:
+            if group is not largest:
+                separate += group.tolist()
+        return tuple(sorted(separate))
 
     @property
     def seconds(self) -> float:
@@ -95,11 +150,11 @@ class Run:
 def plan_run(
     chain: Chain,
     q: np.ndarray,
-    limits: Any,
+    limits: MoveLimits,
     settings: RunSettings = DEFAULT_RUN,
     seed: int = 0,
     progress: Progress | None = None,
-    found: Ways | None = None,
+    clear: Ways | None = None,
 ) -> Run:
     """Return the run through poses q (m, n) [rad or m]: their order, and the paths between them.
 
@@ -112,40 +167,65 @@ def plan_run(
         settings: speed and dwell.
         seed: of the search for ways around.
         progress: called with a few words now and then.
-        found: clear ways that are known already, see `Run.found_ways`; those between other places are left out.
+        clear: clear ways from an earlier run, see `Run.found_ways`; those between other postures are left out.
     """
-    say, (velocity, acceleration) = progress or (lambda words: None), _speeds(chain, settings.speed)
+    show = progress or _silent
+    velocity, acceleration = _speeds(chain, settings.speed)
     seconds = partial(move_times, velocity=velocity, acceleration=acceleration)
     room = _room(chain, limits, velocity)
-    say("checking moves for collisions")
+
+    def duration(path: np.ndarray) -> float:
+        return seconds(path[:-1], path[1:]).sum()
+
+    show("checking moves for collisions")
     cost = np.where(_clear_at_places(room, q), 1.0, BLOCKED) * seconds(q[:, None], q)
-    known = dict[tuple[int, int], np.ndarray | None]()
-    for (one, two), own in (found or {}).items():
-        if np.array_equal(own[[0, -1]], q[[one, two]]):
-            known[one, two] = own
-            cost[one, two] = cost[two, one] = seconds(own[:-1], own[1:]).sum()
+    # a pair of poses -> its clear way; None where none was found
+    clear_ways_of: dict[tuple[int, int], np.ndarray | None] = {}
+
+    def enter(pair: tuple[int, int], path: np.ndarray | None) -> None:
+        clear_ways_of[pair] = path
+        cost[pair] = cost[pair[::-1]] = FORBIDDEN if path is None else duration(path)
+
+    for (start, end), path in (clear or {}).items():
+        if np.array_equal(path[[0, -1]], q[[start, end]]):
+            enter((start, end), path)
     for tries in (*[WAY_TRIES] * ROUNDS, LAST_WAY_TRIES):
         order = tour(cost)
-        fresh = [pair for pair in map(_pair, order[:-1], order[1:]) if known.get(pair) is None]
-        for number, (one, two) in enumerate(fresh, 1):
-            say(f"path {number} of {len(fresh)}")
-            own = way(room, q[one], q[two], seed=seed + number, most=tries)
-            known[one, two] = own
-            cost[one, two] = cost[two, one] = FORBIDDEN if own is None else seconds(own[:-1], own[1:]).sum()
-        if all(known[_pair(*pair)] is not None for pair in pairwise(order)):
+        pairs = [_pair(start, end) for start, end in pairwise(order)]
+        searched = [pair for pair in pairs if clear_ways_of.get(pair) is None]
+        for number, (start, end) in enumerate(searched, 1):
+            show(f"path {number} of {len(searched)}")
+            enter((start, end), way(room, q[start], q[end], seed=seed + number, most=tries))
+        if all(clear_ways_of[pair] is not None for pair in pairs):
             break
     else:
-        order, through = _joined({pair: own for pair, own in known.items() if own is not None}, cost)
-        known = dict.fromkeys(known) | through
-    ways, blocked = [], []
-    for number, (one, two) in enumerate(pairwise(order)):
-        own = known.get(_pair(one, two))
-        if own is None:
+        # no order has clear ways alone: go by way of third poses
+        clear_ways = {pair: path for pair, path in clear_ways_of.items() if path is not None}
+        order, joined_ways = _joined(clear_ways, cost)
+        clear_ways_of = dict.fromkeys(clear_ways_of) | joined_ways
+
+    paths: list[np.ndarray] = []
+    blocked = []
+    around = 0
+    for number, (start, end) in enumerate(pairwise(order)):
+        path = clear_ways_of.get(_pair(start, end))
+        if path is None:
             blocked.append(number)
-        ways.append(q[[one, two]] if own is None else own if one < two else own[::-1])
-    times = np.array([seconds(each[:-1], each[1:]).sum() for each in ways])
-    before = float(seconds(q[:-1], q[1:]).sum()) + settings.dwell * len(q)
-    return Run(order, tuple(ways), times, settings.dwell, before, sum(len(w) > 2 for w in ways), tuple(blocked))
+            path = q[[start, end]]
+        elif start > end:
+            path = path[::-1]
+        paths.append(path)
+        if len(path) > 2:
+            around += 1
+    return Run(
+        order=order,
+        ways=tuple(paths),
+        times=np.array([duration(path) for path in paths]),
+        dwell=settings.dwell,
+        found=float(duration(q)) + settings.dwell * len(q),
+        around=around,
+        blocked=tuple(blocked),
+    )
 
 
 def same_turn(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
@@ -155,146 +235,170 @@ def same_turn(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray)
     poses' angles (where there is one of more than 30 degrees, else half a turn from the middle of the range), so that
     moves between them need not go the long way round.
     """
-    result, full = q.copy(), 2 * np.pi
+    full = 2 * np.pi
+    result = q.copy()
     for j, joint in enumerate(chain.joints):
         if joint.kind != "revolute" or upper[j] - lower[j] <= full:
             continue
-        middle, angles = (lower[j] + upper[j]) / 2, np.sort(np.mod(q[:, j], full))
+        middle = (lower[j] + upper[j]) / 2
+        angles = np.sort(np.mod(q[:, j], full))
         gaps = np.diff(np.append(angles, angles[0] + full))
         k = int(gaps.argmax())
-        cut = angles[k] + gaps[k] / 2 if gaps[k] > np.radians(30.0) else middle - np.pi
+        cut = middle - np.pi
+        if gaps[k] > MIN_GAP:
+            cut = angles[k] + gaps[k] / 2
         cut += full * np.round((middle - np.pi - cut) / full)
-        moved = cut + np.mod(q[:, j] - cut, full)
-        result[:, j] = np.where((moved >= lower[j]) & (moved <= upper[j]), moved, q[:, j])
+        turned = cut + np.mod(q[:, j] - cut, full)
+        within = (turned >= lower[j]) & (turned <= upper[j])
+        result[:, j] = np.where(within, turned, q[:, j])
     return result
 
 
 def _joined(clear: Ways, cost: np.ndarray) -> tuple[np.ndarray, Ways]:
     """Return the fastest order, in which moves may pass through other poses, and the paths between the poses."""
-    direct = np.full(cost.shape, np.inf)
-    for one, two in clear:
-        direct[one, two] = direct[two, one] = cost[one, two]
     from scipy.sparse.csgraph import shortest_path  # slow to load
 
+    direct = np.full(cost.shape, np.inf)
+    for start, end in clear:
+        direct[start, end] = direct[end, start] = cost[start, end]
     total, before = shortest_path(direct, directed=False, return_predecessors=True)
-    order, ways = tour(np.where(np.isfinite(total), total, FORBIDDEN)), Ways()
-    for one, two in (_pair(*pair) for pair in pairwise(order)):
-        if not np.isfinite(total[one, two]):
+    order = tour(np.where(np.isfinite(total), total, FORBIDDEN))
+    joined_ways: Ways = {}
+    for start, end in (_pair(*pair) for pair in pairwise(order)):
+        if not np.isfinite(total[start, end]):
             continue
-        stops = [two]
-        while stops[-1] != one:
-            stops.append(int(before[one, stops[-1]]))
-        legs = [clear[_pair(*leg)][:: 1 if leg[0] < leg[1] else -1] for leg in pairwise(stops[::-1])]
-        ways[one, two] = np.concatenate([legs[0][:1], *(leg[1:] for leg in legs)])
-    return order, ways
+        # from the end back to the start
+        stops = [end]
+        while stops[-1] != start:
+            stops.append(int(before[start, stops[-1]]))
+        stops.reverse()
+        path = []
+        for leg_start, leg_end in pairwise(stops):
+            leg = clear[_pair(leg_start, leg_end)]
+            if leg_start > leg_end:
+                leg = leg[::-1]
+            path.append(leg if not path else leg[1:])
+        joined_ways[start, end] = np.concatenate(path)
+    return order, joined_ways
 
 
 def turns(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
     """Return the postures (k, n) within limits that differ from q (n,) by whole turns of revolute joints."""
     values = []
     for j, joint in enumerate(chain.joints):
-        other = q[j] + 2 * np.pi * np.arange(-3, 4) if joint.kind == "revolute" else q[j : j + 1]
-        values.append(other[(other >= lower[j]) & (other <= upper[j])])
+        positions = q[j : j + 1]
+        if joint.kind == "revolute":
+            positions = q[j] + 2 * np.pi * np.arange(-MAX_TURNS, MAX_TURNS + 1)
+        values.append(positions[(positions >= lower[j]) & (positions <= upper[j])])
     return np.array(list(product(*values)))
 
 
 def way_to(
     chain: Chain,
-    limits: Any,
+    limits: MoveLimits,
     settings: RunSettings,
     postures: np.ndarray,
-    others: np.ndarray,
+    starts: np.ndarray,
     *,
     straight: bool,
     seed: int = 0,
 ) -> tuple[int, np.ndarray] | None:
-    """Return a clear path (k, n) from one of m poses to one of p postures, and the start's index; None: not found.
+    """Return a clear path (k, n) from one of m starts to one of p postures, and the start's index; None: not found.
 
     The moves of least time are tried, for each of the `MAX_NEIGHBOURS` nearest postures: straight ones from the
-    `MAX_NEIGHBOURS` nearest of the others, or with via-points from the nearest.
+    `MAX_NEIGHBOURS` nearest of the starts, or with via-points from the nearest.
     """
     velocity, acceleration = _speeds(chain, settings.speed)
-    room, times = _room(chain, limits, velocity), move_times(postures[:, None], others, velocity, acceleration)
+    room = _room(chain, limits, velocity)
+    times = move_times(postures[:, None], starts, velocity, acceleration)
+    start_count, tries = (MAX_NEIGHBOURS, 0) if straight else (1, WAY_TRIES)
     for end in np.argsort(times.min(axis=1))[:MAX_NEIGHBOURS]:
-        for start in np.argsort(times[end])[: MAX_NEIGHBOURS if straight else 1]:
-            own = way(room, others[start], postures[end], seed=seed, most=0 if straight else WAY_TRIES)
-            if own is not None:
-                return int(start), own
+        for start in np.argsort(times[end])[:start_count]:
+            path = way(room, starts[start], postures[end], seed=seed, most=tries)
+            if path is not None:
+                return int(start), path
     return None
 
 
-def _pair(one: int, two: int) -> tuple[int, int]:
-    return (int(min(one, two)), int(max(one, two)))
+def _pair(start: int, end: int) -> tuple[int, int]:
+    return (int(min(start, end)), int(max(start, end)))
 
 
 def _clear_at_places(room: Room, q: np.ndarray) -> np.ndarray:
     """Return (m, m) flags: straight moves clear at `PLACES` places (an estimate, used to order the poses)."""
-    one, two = np.triu_indices(len(q), 1)
+    start, end = np.triu_indices(len(q), 1)
     share = ((np.arange(PLACES) + 0.5) / PLACES)[:, None, None]
-    places = q[one] + share * (q[two] - q[one])
-    good = np.concatenate([room.clear(block) for block in np.array_split(places.reshape(-1, q.shape[1]), 16)])
+    postures = (q[start] + share * (q[end] - q[start])).reshape(-1, q.shape[1])
+    free = np.concatenate([room.clear(block) for block in np.array_split(postures, CLEARANCE_BLOCKS)])
     clear = np.ones((len(q), len(q)), dtype=bool)
-    clear[one, two] = clear[two, one] = good.reshape(PLACES, -1).all(axis=0)
+    clear[start, end] = clear[end, start] = free.reshape(PLACES, -1).all(axis=0)
     return clear
 
 
 def lines(run: Run, settings: RunSettings) -> list[str]:
     """Return the lines on a run: duration, paths around obstacles, and poses without a clear path."""
     minutes, before = run.seconds / 60, run.found / 60
-    found = [
+    result = [
         f"run: {len(run.order)} poses in {minutes:.1f} min at {settings.speed:.0%} of the joints' speed, "
         f"{settings.dwell:g} s at each pose ({before:.1f} min in their original order with straight moves)"
     ]
     if run.around:
-        found.append(f"{run.around} of {len(run.ways)} paths lead around an obstacle: also drive their via-points")
+        result.append(f"{run.around} of {len(run.ways)} paths lead around an obstacle: also drive their via-points")
     if run.blocked:
         pairs = ", ".join(f"{k + 1} to {k + 2}" for k in run.blocked)
-        found.append(f"NO clear path was found from pose {pairs}: drive there by hand, or omit the pose")
-    return found
+        result.append(f"NO clear path was found from pose {pairs}: drive there by hand, or omit the pose")
+    return result
 
 
 def write_run(path: Path, run: Run, chain: Chain) -> Path:
     """Write the file of a run (format: see the module), its poses numbered in visiting order."""
     header, factors = joint_columns(chain.joint_names, [joint.kind for joint in chain.joints])
     velocity, acceleration = _speeds(chain, 1.0)
-    rows, clock = [], 0.0
+    rows = []
+    clock = 0.0
+
+    def add(pose: int, posture: np.ndarray) -> None:
+        rows.append([round(clock, 3), pose, *(posture * factors)])
+
     for k in range(len(run.order)):
         if k:
-            own = run.ways[k - 1]
-            parts = move_times(own[:-1], own[1:], velocity, acceleration)
+            # the parts of a way last in proportion to their times at full speed
+            way_postures = run.ways[k - 1]
+            parts = move_times(way_postures[:-1], way_postures[1:], velocity, acceleration)
             parts = parts * (run.times[k - 1] / parts.sum())
-            for place, spent in zip(own[1:-1], parts[:-1]):
-                clock += float(spent)
-                rows.append([round(clock, 3), 0, *(place * factors)])
+            for via_point, seconds in zip(way_postures[1:-1], parts[:-1]):
+                clock += float(seconds)
+                add(0, via_point)
             clock += float(parts[-1])
-        place = run.ways[k][0] if k < len(run.ways) else run.ways[-1][-1]
-        rows.append([round(clock, 3), k + 1, *(place * factors)])
+        if k < len(run.ways):
+            posture = run.ways[k][0]
+        else:
+            posture = run.ways[-1][-1]
+        add(k + 1, posture)
         clock += run.dwell
-        rows.append([round(clock, 3), k + 1, *(place * factors)])
+        add(k + 1, posture)
     return files.write_table(path, ["t [s]", "pose", *header], rows)
 
 
 def _speeds(chain: Chain, share: float) -> tuple[np.ndarray, np.ndarray]:
-    limits = [j.velocity if np.isfinite(j.velocity) else LEISURE[j.kind] for j in chain.joints]
-    velocity = share * np.array(limits)
+    joints = chain.joints
+    speeds = [joint.velocity if np.isfinite(joint.velocity) else LEISURE[joint.kind] for joint in joints]
+    velocity = share * np.array(speeds)
     return velocity, RISE * velocity
 
 
-def _room(chain: Chain, limits: Any, velocity: np.ndarray) -> Room:
+def _room(chain: Chain, limits: MoveLimits, velocity: np.ndarray) -> Room:
     """Return the collision test of paths: it requires half the clearance at places at most one clearance apart."""
     model, clearance = limits.collision, limits.clearance
     reach = np.array([chain.stretched_length() if joint.kind == "revolute" else 1.0 for joint in chain.joints])
 
     def clear(q: np.ndarray) -> np.ndarray:
-        return np.ones(len(q), dtype=bool) if model is None else model.free(q, 0.5 * clearance)
+        if model is None:
+            return np.ones(len(q), dtype=bool)
+        return model.free(q, 0.5 * clearance)
 
     unit = np.maximum(velocity, MIN_STEP * (limits.upper - limits.lower))
     return Room(limits.lower, limits.upper, clear, max(clearance, 1e-3) / reach, unit)
-
-
-EXCHANGES = 3  # times that poses are replaced, and the run is planned again (our choice)
-# candidates tried in the place of one pose, by straight moves, by via-points (our choice)
-MAX_STRAIGHT_TRIES, MAX_VIA_TRIES = 200, 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -323,19 +427,24 @@ class Exchange:
         """Return the candidates' numbers (N,), best first, by the index of each together with poses (m, n)."""
         rows = self._rows(q)
         flat = rows.reshape(-1, rows.shape[2])
-        matrices = flat.T @ flat + self._alone
-        values = log_det(matrices) if self.index == "O1" else merits(matrices, self.index)
+        matrices = flat.T @ flat + self._information
+        if self.index == "O1":
+            values = log_det(matrices)
+        else:
+            values = merits(matrices, self.index)
         return np.argsort(-values, kind="stable")
 
     @cached_property
-    def _alone(self) -> np.ndarray:
+    def _information(self) -> np.ndarray:
         """Information matrices (N, p, p) of the candidates."""
-        trials = self.jacobian(self.candidates)
-        return trials.transpose(0, 2, 1) @ trials
+        jacobians = self.jacobian(self.candidates)
+        return jacobians.transpose(0, 2, 1) @ jacobians
 
     def _rows(self, q: np.ndarray) -> np.ndarray:
         rows = np.asarray(self.jacobian(q))
-        return rows if self.before is None else np.concatenate([rows, self.before])
+        if self.before is None:
+            return rows
+        return np.concatenate([rows, self.before])
 
 
 @dataclass(frozen=True, eq=False)
@@ -361,17 +470,22 @@ class Drivable:
         """Sentence on the replaced poses, numbered from 1 in the order of the run; "" without replacements."""
         if not self.replaced:
             return ""
-        numbers = ", ".join(f"{k}" for k, place in enumerate(self.run.order, 1) if place in self.replaced)
-        poses = f"pose{'s' if len(self.replaced) > 1 else ''} {numbers}"
+        numbers = [f"{k}" for k, index in enumerate(self.run.order, 1) if index in self.replaced]
+        noun = "pose"
+        if len(self.replaced) > 1:
+            noun = "poses"
         before, after = self.value
-        return f"{poses} replaced, since no clear path led to the original (index {before:.5g} → {after:.5g})"
+        return (
+            f"{noun} {', '.join(numbers)} replaced, since no clear path led to the original "
+            f"(index {before:.5g} → {after:.5g})"
+        )
 
 
 def drivable(
     chain: Chain,
     q: np.ndarray,
     exchange: Exchange,
-    limits: Any,
+    limits: MoveLimits,
     settings: RunSettings,
     seed: int = 0,
     progress: Progress | None = None,
@@ -382,39 +496,53 @@ def drivable(
         chain, limits, settings, seed, progress: see `calib.procedure.measuring.run.plan_run`.
         exchange: what poses are replaced from.
     """
-    say, replaced, ways = progress or (lambda words: None), dict[int, int](), Ways()
-    first = q = same_turn(chain, q, limits.lower, limits.upper)
-    for last in (*[False] * EXCHANGES, True):
-        run = plan_run(chain, q, limits, settings, seed, say, ways)
-        if last or not run.cut_off:
+    show = progress or _silent
+    replaced: dict[int, int] = {}
+    clear_ways: Ways = {}
+    original = same_turn(chain, q, limits.lower, limits.upper)
+    q = original
+    run = plan_run(chain, q, limits, settings, seed, show, clear_ways)
+    for _ in range(EXCHANGES):
+        if not run.cut_off:
             break
-        say(f"{len(run.cut_off)} poses without a clear path")
-        q, fresh, ways = _rejoined(chain, q, run, exchange, limits, settings, seed)
-        replaced |= fresh
-    (before, log_before), (after, log_after) = exchange.value(first), exchange.value(q)
-    return Drivable(q, run, replaced, (before, after), log_after - log_before)
+        show(f"{len(run.cut_off)} poses without a clear path")
+        q, replacements, clear_ways = _rejoined(chain, q, run, exchange, limits, settings, seed)
+        replaced |= replacements
+        run = plan_run(chain, q, limits, settings, seed, show, clear_ways)
+    value_before, log_before = exchange.value(original)
+    value_after, log_after = exchange.value(q)
+    return Drivable(q, run, replaced, (value_before, value_after), log_after - log_before)
 
 
 def _rejoined(
-    chain: Chain, q: np.ndarray, run: Run, exchange: Exchange, limits: Any, settings: RunSettings, seed: int
+    chain: Chain, q: np.ndarray, run: Run, exchange: Exchange, limits: MoveLimits, settings: RunSettings, seed: int
 ) -> tuple[np.ndarray, dict[int, int], Ways]:
     """Return the poses (m, n) with unreachable ones replaced, the replacements (place -> candidate), and all paths."""
-    q, found, ways = q.copy(), dict[int, int](), run.found_ways
+    q = q.copy()
+    replacements: dict[int, int] = {}
+    clear_ways = run.found_ways
     joined = [k for k in range(len(q)) if k not in run.cut_off]
-    for place in run.cut_off:
-        apart = np.abs(q - exchange.candidates[:, None]).max(axis=2).min(axis=1)
-        ranked = [int(k) for k in exchange.ranked(np.delete(q, place, axis=0)) if apart[k] > 1e-9]
-        itself = [(None, straight) for straight in (True, False)]
-        others = [(k, True) for k in ranked[:MAX_STRAIGHT_TRIES]] + [(k, False) for k in ranked[:MAX_VIA_TRIES]]
-        for number, straight in itself + others:
-            trial = q[place] if number is None else exchange.candidates[number]
-            postures = turns(chain, trial, limits.lower, limits.upper)
-            own = way_to(chain, limits, settings, postures, q[joined], straight=straight, seed=seed)
-            if own is not None:
-                start, path = joined[own[0]], own[1]
-                q[place] = path[-1]
-                ways[min(start, place), max(start, place)] = path if start < place else path[::-1]
-                found |= {} if number is None else {place: number}
-                joined.append(place)
-                break
-    return q, found, ways
+    for index in run.cut_off:
+        # the pose itself on another turn, then candidates that are not in the list, best first
+        distance = np.abs(q - exchange.candidates[:, None]).max(axis=2).min(axis=1)
+        ranked = exchange.ranked(np.delete(q, index, axis=0)).tolist()
+        fresh = [candidate for candidate in ranked if distance[candidate] > SAME_POSE]
+        trials: list[tuple[int | None, bool]] = [(None, True), (None, False)]
+        trials += [(candidate, True) for candidate in fresh[:MAX_STRAIGHT_TRIES]]
+        trials += [(candidate, False) for candidate in fresh[:MAX_VIA_TRIES]]
+        for candidate, straight in trials:
+            posture = q[index]
+            if candidate is not None:
+                posture = exchange.candidates[candidate]
+            postures = turns(chain, posture, limits.lower, limits.upper)
+            result = way_to(chain, limits, settings, postures, q[joined], straight=straight, seed=seed)
+            if result is None:
+                continue
+            start, path = joined[result[0]], result[1]
+            q[index] = path[-1]
+            clear_ways[_pair(start, index)] = path if start < index else path[::-1]
+            if candidate is not None:
+                replacements[index] = candidate
+            joined.append(index)
+            break
+    return q, replacements, clear_ways

@@ -12,17 +12,17 @@ import numpy as np
 
 from calib.geometry.installation import Installation
 from calib.geometry.observability import Observation, Target, TargetJacobian
+from calib.poses import constraints
+from calib.poses.space import PoseConstraint, constraint_gradient
 from calib.robot.capsules import ALWAYS, SAMPLES
 from calib.robot.chain import Chain, random_joints
-from poses import constraints
-from poses.space import PoseConstraint, constraint_gradient
 
+# distance [m] of a link from the line of sight below which it blocks it: about a tracker beam's radius (our choice)
 BEAM = 0.01
-"""Least distance of a link from the line of sight [m]: about the radius of a tracker's beam. Our choice."""
+# number of nearest links checked per line of sight; if two exchange their ranks, both are included (our choice)
 DISTANCES = 2
-"""Number of nearest links checked per line of sight. Our choice; if two exchange their ranks, both are included."""
+# largest constraint violation at which a target still counts as seen
 SEEN = 1e-6
-"""Largest constraint violation at which a target still counts as seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,11 +49,14 @@ class _Behind:
         return self._nearest(q)[1]
 
     def _nearest(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        found = self.arm.beam(q, self.target(q)[1], self.velocity(q)[:, :3], self.instrument)
-        distances, slopes = (part[:, self.links] for part in found)
-        order = np.argsort(distances, axis=1)[:, :DISTANCES]
+        position = self.target(q)[1]
+        velocity = self.velocity(q)[:, :3]
+        beam = self.arm.beam(q, position, velocity, self.instrument)
+        distances = beam[0][:, self.links]
+        gradients = beam[1][:, self.links]
+        nearest = np.argsort(distances, axis=1)[:, :DISTANCES]
         rows = np.arange(len(q))[:, None]
-        return BEAM - distances[rows, order], -slopes[rows, order]
+        return BEAM - distances[rows, nearest], -gradients[rows, nearest]
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,20 +81,26 @@ class Sight:
 
     def _values(self, q: np.ndarray) -> np.ndarray:
         """Return the constraint violations (m, T, k) of each target."""
-        return np.stack([np.concatenate([c.function(q) for c in parts], axis=1) for parts in self.targets], axis=1)
+
+        def violations(parts: Sequence[PoseConstraint]) -> np.ndarray:
+            return np.concatenate([constraint.function(q) for constraint in parts], axis=1)
+
+        return np.stack([violations(parts) for parts in self.targets], axis=1)
 
     def _best(self, q: np.ndarray) -> np.ndarray:
         values = self._values(q)
-        return values[np.arange(len(q)), values.max(axis=2).argmin(axis=1)]
+        best_target = values.max(axis=2).argmin(axis=1)
+        return values[np.arange(len(q)), best_target]
 
     def _best_gradient(self, q: np.ndarray) -> np.ndarray:
         values = self._values(q)
-        best, result = values.max(axis=2).argmin(axis=1), np.zeros((len(q), values.shape[2], q.shape[1]))
-        for number in np.unique(best):
-            own = best == number
-            slopes = [constraint_gradient(c, q[own]) for c in self.targets[number]]
-            result[own] = np.concatenate(slopes, axis=1)
-        return result
+        best_target = values.max(axis=2).argmin(axis=1)
+        gradient = np.zeros((len(q), values.shape[2], q.shape[1]))
+        for number in np.unique(best_target):
+            rows = best_target == number
+            parts = [constraint_gradient(constraint, q[rows]) for constraint in self.targets[number]]
+            gradient[rows] = np.concatenate(parts, axis=1)
+        return gradient
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +118,10 @@ class SeenOnly:
         return self.of.product(q, G * self._mask(q))
 
     def _mask(self, q: np.ndarray) -> np.ndarray:
-        return np.repeat(self.sight.visible(q), 6 if self.of.full else 3, axis=1)[:, :, None]
+        rows_per_target = 3
+        if self.of.full:
+            rows_per_target = 6
+        return np.repeat(self.sight.visible(q), rows_per_target, axis=1)[:, :, None]
 
 
 def sight_of(
@@ -130,25 +142,33 @@ def sight_of(
         span: least and largest distance [m].
         arm: what may stand in the way (`_Behind`); None: nothing does.
     """
-    directions = [*facing] * (len(cell.tools) if len(facing) == 1 else 1)
-    found = []
+    directions = [*facing]
+    if len(facing) == 1:
+        directions = directions * len(cell.tools)
+    nearest, largest = span
+    targets = []
     for number, direction in enumerate(directions):
-        target, velocity, parts = Target(cell, number), TargetJacobian(cell, number), list[PoseConstraint]()
+        target = Target(cell, number)
+        velocity = TargetJacobian(cell, number)
+        parts: list[PoseConstraint] = []
         if half_angle is not None:
             parts.append(constraints.line_of_sight(target, instrument, direction, half_angle, velocity))
-        if span[0] > 0.0 or np.isfinite(span[1]):
-            parts.append(constraints.distance(target, span[0] or -np.inf, span[1], instrument, velocity))
+        if nearest > 0.0 or np.isfinite(largest):
+            parts.append(constraints.distance(target, nearest or -np.inf, largest, instrument, velocity))
         if arm is not None:
-            links = _beside(arm, cell.chain, target)
+            links = _blocking_links(arm, cell.chain, target)
             behind = _Behind(arm, target, velocity, np.asarray(instrument, dtype=float), links)
             parts.append(PoseConstraint("view past the arm", behind, behind.gradient))
-        found.append(tuple(parts))
-    return Sight(tuple(found)) if found and found[0] else None
+        targets.append(tuple(parts))
+    if not targets or not targets[0]:
+        return None
+    return Sight(tuple(targets))
 
 
-def _beside(arm: Any, chain: Chain, target: Target) -> np.ndarray:
+def _blocking_links(arm: Any, chain: Chain, target: Target) -> np.ndarray:
     """Return the indices of links that can block the view: all except those next to the target in every posture."""
     q = random_joints(chain, SAMPLES)
-    place = target(q)[1]
-    distances = arm.beam(q, place, np.zeros((len(q), 3, chain.n)), place + 1e-6)[0]
+    position = target(q)[1]
+    # a beam of almost no length: the distances of the links from the target itself
+    distances, _ = arm.beam(q, position, np.zeros((len(q), 3, chain.n)), position + 1e-6)
     return np.flatnonzero((distances <= BEAM).mean(axis=0) < ALWAYS)

@@ -13,11 +13,11 @@ from calib.procedure.report.geometry_figures import outlook_figure
 from calib.procedure.report.style import AFTER, BEFORE, HALF_WIDTH, MARK, QUIET
 from calib.robot.chain import Chain, Joint
 from calib.robot.kinematics import sweep
+from calib.trajectories.basis import SampledMotion
+from calib.trajectories.constraints import BoxLimit
+from calib.trajectories.design.pareto import Front
+from calib.trajectories.design.verify import dense_motion
 from calib.units import motion_units
-from trajectories.basis import SampledMotion
-from trajectories.constraints import BoxLimit
-from trajectories.design.pareto import Front
-from trajectories.design.verify import dense_motion
 
 if TYPE_CHECKING:
     from calib.procedure.excitation.design import Designed

@@ -8,7 +8,7 @@ from calib import files
 from calib.data.poses import CORNERS, JOINTS
 from calib.errors import command_line
 from calib.extensions import Point
-from calib.folders import CERTIFICATE, PAGES
+from calib.folders import CERTIFICATE, ESTIMATE, METRICS, PAGES, REPORT
 from calib.procedure.excitation import coefficients
 from calib.procedure.export.delivery import prediction
 from calib.procedure.kinematic_stage.folder import SCHEMA, URDF
@@ -59,56 +59,86 @@ TORQUES = {
 def certify(session: Session, say: Say) -> list[str]:
     """Write certificate and report of a session, and return its notes."""
     say("drawing" if session.plots else "writing")
-    one, whole = pages(session)
-    judged = [section for section in whole.sections if section.verdict]
+    certificate, report = pages(session)
+    judged = [section for section in report.sections if section.verdict]
     notes = [f"{section.title.lower()} {section.verdict}: {section.reason}" for section in judged]
-    written = rendering.write(session.folder, one, whole)
+    written = rendering.write(session.folder, certificate, report)
     recordings = [write(session.folder) for write in RECORDINGS.all() if session.plots]
     return [*notes, CERTIFICATE, *written, *recordings]
 
 
 def pages(session: Session) -> tuple[Certificate, Page]:
     """Return certificate and report of a session."""
-    whole = _whole_report(session) if session.geometric else None
-    stages = [*([_geometry(session, whole)] if whole else []), *([_dynamics(session)] if session.dynamic else [])]
-    simulated, settings, rows = read_lines(session.path(MARK)), session.settings, listed(session)
-    title = f"{'Simulated calibration' if simulated else 'Calibration'} of {settings.name}"
+    stages = []
+    metrics = None
+    if session.geometric:
+        report = _validated_report(session)
+        metrics = report.metrics
+        stages.append(_geometry(session, report))
+    if session.dynamic:
+        stages.append(_dynamics(session))
+
+    settings = session.settings
+    simulated = read_lines(session.path(MARK))
+    title, alert = f"Calibration of {settings.name}", ""
+    if simulated:
+        _, _, mark = simulated[0].rpartition("; ")
+        title, alert = f"Simulated calibration of {settings.name}", f"SIMULATED: {mark}"
     subtitle = f"{settings.instrument.name}, {settings.created[:10]}"
-    setup = [*(Entry("simulated", line) for line in simulated), *_setup(session, whole and whole.metrics)]
-    alert = f"SIMULATED: {simulated[0].rpartition('; ')[2]}" if simulated else ""
-    return records(title, subtitle, setup, stages, [*_unchecked(session)], rows, settings.certificate, alert)
+    setup = [Entry("simulated", line) for line in simulated]
+    setup += _setup(session, metrics)
+    unchecked = list(_unchecked(session))
+    return records(title, subtitle, setup, stages, unchecked, listed(session), settings.certificate, alert)
 
 
-def _geometry(session: Session, whole: fit_report.Report) -> Stage:
-    drawn = {}
+def _geometry(session: Session, report: fit_report.Report) -> Stage:
+    """Return the stage of the geometry, with figures if the session draws any."""
+    figures = {}
     if session.plots:
         from calib.procedure.report.charts import pictures
         from calib.procedure.report.geometry_figures import captioned
 
-        drawn = pictures(captioned(whole))
-    found = geometry.stage(whole, drawn)
-    return _with_arrival(found, _arrival_notes(session, "3-measured", "validate"))
+        figures = pictures(captioned(report))
+    return _with_arrival(geometry.stage(report, figures), _arrival_notes(session, "3-measured", "validate"))
 
 
 def _dynamics(session: Session) -> Stage:
+    """Return the stage of the dynamics, with figures if the session draws any, judged on the exported robot."""
     from calib.procedure.report import dynamics_section
 
-    found, drawn = dynamics_section.read(session.identification.path), {}
+    report = dynamics_section.read(session.identification.path)
+    figures = {}
     if session.plots:
         from calib.procedure.report.charts import picture, pictures
         from calib.procedure.report.dynamics_figures import captioned
 
-        drawn = pictures(captioned(found, session.identification.path))
+        figures = pictures(captioned(report, session.identification.path))
         training = session.path("6-excitation") / "training"
         if session.settings.dynamics.plan and (training / coefficients.NAME).exists():
-            drawn["excitation"] = picture(*dynamics.trained_on(training, chain_of(session).joints))
-    allowed, exported = session.settings.dynamics.tolerance_percent, read_state(session).notes("export")
-    known = prediction(session.path(session.export))
-    section = dynamics_section.report_section(found, drawn, exported, allowed, known and known.exported)
-    own = session.verdicts().stages["dynamics"]
-    section = replace(section, verdict=own.level, reason=own.reason)
-    stage = dynamics.stage(found, section, session.plots, allowed)
+            figures["excitation"] = picture(*dynamics.trained_on(training, chain_of(session).joints))
+    allowed = session.settings.dynamics.tolerance_percent
+    predicted = prediction(session.path(session.export))
+    delivered = None if predicted is None else predicted.exported
+    exported = read_state(session).notes("export")
+    section = dynamics_section.report_section(report, figures, exported, allowed, delivered)
+    verdict = session.verdicts().stages["dynamics"]
+    section = replace(section, verdict=verdict.level, reason=verdict.reason)
+    stage = dynamics.stage(report, section, session.plots, allowed)
     return _with_arrival(stage, _arrival_notes(session, "7-recorded", "predict"))
+
+
+def _validated_report(session: Session) -> fit_report.Report:
+    """Return the report of the fit, including the results of the step validate."""
+    validation = session.validation
+    metrics = validation.metrics()
+    if metrics.schema >= SCHEMA:
+        return fit_report.read(validation.report)
+    # earlier versions stored the rows of the validation alone
+    report = fit_report.read(session.fit.report)
+    rows: tuple[RowErrors, ...] = ()
+    if validation.rows.exists() and metrics.validation:
+        rows = read_json(validation.rows, "validate again", tuple[RowErrors, ...])
+    return report.with_unseen(replace(metrics, warnings=(*report.metrics.warnings, *metrics.warnings)), rows)
 
 
 def _unchecked(session: Session) -> Iterator[str]:
@@ -126,65 +156,62 @@ def _unchecked(session: Session) -> Iterator[str]:
         yield "calibration of the instrument: its date was not stated"
 
 
-def _whole_report(session: Session) -> fit_report.Report:
-    """Return the report of the fit, including the results of the step validate."""
-    place = session.validation
-    found = place.metrics()
-    if found.schema >= SCHEMA:
-        return fit_report.read(place.report)
-    fit = fit_report.read(session.fit.report)
-    known = place.rows.exists() and found.validation
-    rows = read_json(place.rows, "validate again", tuple[RowErrors, ...]) if known else ()
-    return fit.with_unseen(replace(found, warnings=(*fit.metrics.warnings, *found.warnings)), rows)
-
-
-def _arrival_notes(session: Session, place: str, unseen: str) -> list[str]:
-    """Return the notes made when the files were read: training files, and files of the step `unseen`."""
-    lines = read_lines(session.path(f"{place}/{CHECKED}"))
-    files_there = session.brought("validation" if place == "3-measured" else "unseen")
-    said = read_state(session).notes(unseen)
-    names = tuple(f"{each.name}: " for each in files_there)
-    return [line for line in (*lines, *(note for note in said if names and note.startswith(names))) if line.strip()]
+def _arrival_notes(session: Session, folder: str, step: str) -> list[str]:
+    """Return the notes made when the files were read: training files, and the unseen files of a step."""
+    lines = read_lines(session.path(f"{folder}/{CHECKED}"))
+    unseen = session.brought("validation" if folder == "3-measured" else "unseen")
+    prefixes = tuple(f"{path.name}: " for path in unseen)
+    if prefixes:
+        lines = [*lines, *(note for note in read_state(session).notes(step) if note.startswith(prefixes))]
+    return [line for line in lines if line.strip()]
 
 
 def _with_arrival(stage: Stage, lines: list[str]) -> Stage:
     """Return a stage whose section of the report has the missing notes on its input files, too."""
     blocks = stage.section.blocks
-    said = {line for block in blocks if isinstance(block, Text) for line in block.lines}
-    fresh = [line for line in dict.fromkeys(lines) if line not in said]
-    notes = Text("Notes on the files when they were read", fresh)
+    present: set[str] = set()
+    for block in blocks:
+        if isinstance(block, Text):
+            present.update(block.lines)
+    missing = [line for line in dict.fromkeys(lines) if line not in present]
+    notes = Text("Notes on the files when they were read", missing)
     return replace(stage, section=replace(stage.section, blocks=[*blocks, notes]))
 
 
-def _setup(session: Session, found: FitMetrics | None) -> list[Entry]:
+def _setup(session: Session, metrics: FitMetrics | None) -> list[Entry]:
     """Return what was calibrated, with what and how, for the stages that the session has."""
     settings, chain = session.settings, chain_of(session)
-    described = settings.robot.given if found else f"{settings.robot.given}, taken as calibrated"
+    description = settings.robot.given
+    if metrics is None:
+        description += ", taken as calibrated"
     rows = [
         ("robot", f"{chain.name}, {chain.base} to {chain.tip}, {chain.n} joints"),
-        ("description", described),
+        ("description", description),
         ("session made", settings.created.replace("T", " ")),
     ]
-    if found:
+    if metrics is not None:
         plan = _session_plan(session)
         rows += [
-            ("instrument", _instrument(session, found)),
-            ("measurements", _named(session.brought("measured", "validation"))),
+            ("instrument", _instrument(session, metrics)),
+            ("measurements", _names(session.brought("measured", "validation"))),
             ("pose plan", plan.words),
             ("poses kept", ", ".join(plan.checked)),
             ("poses NOT checked for", ", ".join(plan.unchecked)),
-            ("model", found.model),
-            ("measured range", measured_range(found)),
-            ("tolerance", tolerance(settings.fit.tolerance_mm, found)),
+            ("model", metrics.model),
+            ("measured range", measured_range(metrics)),
+            ("tolerance", tolerance(settings.fit.tolerance_mm, metrics)),
         ]
     if session.dynamic:
         section = settings.dynamics
-        allowed = section.tolerance_percent
+        allowed = "none given: pass below 10 %"
+        if section.tolerance_percent:
+            allowed = f"{section.tolerance_percent:g} % on unseen motion"
+        payloads = ", ".join(f"{label} {mass:g} kg" for label, mass in section.payloads.items())
         rows += [
-            ("recordings", _named(session.brought("training", "unseen"))),
+            ("recordings", _names(session.brought("training", "unseen"))),
             ("torques", TORQUES[section.torques]),
-            ("tolerance of torque", f"{allowed:g} % on unseen motion" if allowed else "none given: pass below 10 %"),
-            ("payloads", ", ".join(f"{label} {mass:g} kg" for label, mass in section.payloads.items())),
+            ("tolerance of torque", allowed),
+            ("payloads", payloads),
         ]
     rows += [
         ("seed", str(settings.seed)),
@@ -194,21 +221,24 @@ def _setup(session: Session, found: FitMetrics | None) -> list[Entry]:
     return [Entry(label, value) for label, value in rows if value.strip()]
 
 
-def _instrument(session: Session, found: FitMetrics) -> str:
+def _instrument(session: Session, metrics: FitMetrics) -> str:
     """Return a text on the instrument: kind of measurement (as given, and as used) and sigmas."""
     instrument = session.settings.instrument
-    said, turned = instrument.measures, found.fit.calibrated.orientation_deg is not None
-    used = {("position", True): "poses with orientation", ("pose", False): "positions or distances alone"}
-    other = used.get((said, turned))
-    measures = (
-        f"said to measure {said}, but the files contain {other}; these were used" if other else f"measures {said}"
-    )
-    stated = f"σ {1e6 * instrument.sigma_position:g} µm" if instrument.sigma_position else "σ estimated"
-    turning = f", {1e3 * instrument.sigma_orientation:g} mrad" if instrument.sigma_orientation else ""
-    return f"{instrument.name}, {measures}, {stated}{turning}"
+    with_orientation = metrics.fit.calibrated.orientation_deg is not None
+    measures = f"measures {instrument.measures}"
+    if instrument.measures == "position" and with_orientation:
+        measures = "said to measure position, but the files contain poses with orientation; these were used"
+    if instrument.measures == "pose" and not with_orientation:
+        measures = "said to measure pose, but the files contain positions or distances alone; these were used"
+    sigma = "σ estimated"
+    if instrument.sigma_position:
+        sigma = f"σ {1e6 * instrument.sigma_position:g} µm"
+    if instrument.sigma_orientation:
+        sigma += f", {1e3 * instrument.sigma_orientation:g} mrad"
+    return f"{instrument.name}, {measures}, {sigma}"
 
 
-def _named(paths: list[Path]) -> str:
+def _names(paths: list[Path]) -> str:
     """Return the file names as one text, without dates, since copying changes a file's date."""
     return ", ".join(path.name for path in paths)
 
@@ -231,45 +261,69 @@ def _session_plan(session: Session) -> _Plan:
 
 def _filed(paths: list[Path]) -> list[Path]:
     """Return the measured files to archive; an image folder is represented by its file of detected corners."""
-    own = [
-        (path / CORNERS if (path / CORNERS).exists() else path / JOINTS) if path.is_dir() else path for path in paths
-    ]
-    return [*own, *(path / JOINTS for path in paths if path.is_dir() and (path / CORNERS).exists())]
+    archived = []
+    joints = []
+    for path in paths:
+        if not path.is_dir():
+            archived.append(path)
+        elif (path / CORNERS).exists():
+            archived.append(path / CORNERS)
+            joints.append(path / JOINTS)
+        else:
+            archived.append(path / JOINTS)
+    return [*archived, *joints]
 
 
 def listed(session: Session) -> list[FileRow]:
     """Return name, content, size [bytes] and SHA-256 of the certificate's files, the most important ones first."""
-    exported = sorted(path for path in session.path(session.export).glob("*") if path.is_file())
-    exported.sort(key=lambda path: path.name != URDF)
-    filed = [
-        *exported[:1],
-        session.robot_file,
-        *_filed(session.brought("measured")),
-        *_filed(session.brought("validation")),
-    ]
-    if session.dynamic:
-        filed += [path for path in session.brought("training", "unseen") if path.is_file()]
-        if session.settings.dynamics.plan:  # else other motions were played
-            filed += sorted(session.path("6-excitation").glob(f"*/{coefficients.SAMPLES}"))
-        filed += [*session.identification.tables, session.identification.model]
-    filed += [*(session.fit.tables if session.geometric else ()), *exported[1:]]
-    judged_files = read_json(session.path(VERDICT)).get("files", {}) if session.path(VERDICT).exists() else {}
-    made = {name: mark for step in read_state(session).steps.values() for name, mark in step.outputs.items()}
-    judged = session.validation.metrics().validation if session.geometric else {}
-    rows, seen = [], [name for name, found in judged.items() if not found.unseen]
-    for path in filed:
+    judged_files = {}
+    if session.path(VERDICT).exists():
+        judged_files = read_json(session.path(VERDICT)).get("files", {})
+    fingerprints: dict[str, str] = {}
+    for record in read_state(session).steps.values():
+        fingerprints |= record.outputs
+    # validation files that the fit has used
+    fitted = []
+    if session.geometric:
+        validation = session.validation.metrics().validation
+        fitted = [name for name, rows in validation.items() if not rows.unseen]
+
+    rows = []
+    for path in _archive(session):
         name = path.relative_to(session.folder)
-        role = ROLES[name.parts[0]]
-        if name.parts[-1].lower().startswith("validation") or name.parts[1].lower().startswith("validation"):
-            which = "the fit" if name.parts[0] == "3-measured" else "the identification"
-            known = name.parts[0] == "3-measured" and name.parts[1] in seen
-            role = unseen_role(role, known, which)
-        if name.parts[0] == session.export and name.name in judged_files:
+        folder, file = name.parts[0], name.parts[1]
+        role = ROLES[folder]
+        # the file, or the folder of images or bags
+        if name.name.lower().startswith("validation") or file.lower().startswith("validation"):
+            if folder == "3-measured":
+                role = unseen_role(role, file in fitted, "the fit")
+            else:
+                role = unseen_role(role, False, "the identification")
+        if folder == session.export and name.name in judged_files:
             role = f"{role}, verdict {judged_files[name.name]['verdict']}"
-        if name.parts[0] in ("4-fit", "8-dynamics", session.export) and made.get(str(name)) != files.fingerprint(path):
+        is_output = folder in ("4-fit", "8-dynamics", session.export)
+        if is_output and fingerprints.get(str(name)) != files.fingerprint(path):
             role = EDITED
         rows.append(file_row(str(name), role, path))
     return rows
+
+
+def _archive(session: Session) -> list[Path]:
+    """Return the files that the certificate lists, the most important ones first."""
+    exported = sorted(path for path in session.path(session.export).glob("*") if path.is_file())
+    exported.sort(key=lambda path: path.name != URDF)
+    paths = [*exported[:1], session.robot_file]
+    paths += _filed(session.brought("measured"))
+    paths += _filed(session.brought("validation"))
+    if session.dynamic:
+        paths += [path for path in session.brought("training", "unseen") if path.is_file()]
+        # else other motions were played
+        if session.settings.dynamics.plan:
+            paths += sorted(session.path("6-excitation").glob(f"*/{coefficients.SAMPLES}"))
+        paths += [*session.identification.tables, session.identification.model]
+    if session.geometric:
+        paths += session.fit.tables
+    return [*paths, *exported[1:]]
 
 
 STEP = SessionStep(
@@ -278,15 +332,15 @@ STEP = SessionStep(
     certify,
     reads=(
         SessionFile(VERDICT, without_geometry=True),
-        SessionFile("4-fit/report.json"),
-        SessionFile("5-validation/metrics.json"),
+        SessionFile(f"4-fit/{REPORT}"),
+        SessionFile(f"5-validation/{METRICS}"),
         ExportedFile("robot.urdf"),
         SessionFile(SELECTION, optional=True),
         SessionFile(POSES_CHECKED),
         SessionFile(MOTION_CHECKED),
-        SessionFile("8-dynamics/metrics.json"),
-        SessionFile("8-dynamics/estimate.csv"),
-        SessionFile("8-dynamics/unseen/report.json"),
+        SessionFile(f"8-dynamics/{METRICS}"),
+        SessionFile(f"8-dynamics/{ESTIMATE}"),
+        SessionFile(f"8-dynamics/unseen/{REPORT}"),
         SessionFile(MARK, optional=True),
     ),
     makes=PAGES,

@@ -39,61 +39,91 @@ from calib.robot.collision import meshes_beside
 from calib.robot.library import load, resolve
 from calib.robot.tables import dumps
 
+# units of a log: positions and torques
+UNITS = {"prismatic": ("m", "N"), "revolute": ("deg", "Nm")}
+# the file of the cell in a session, and a camera's files beside it
+LIMITS = "limits.toml"
+CAMERA_FILES = {"lens": "camera.yaml", "board": "board.toml"}
+LIMITS_HEAD = "# The cell, as given to `calib new`. `calib formats limits` lists the possible keys.\n"
+# files of measured poses, as they are proposed, by the list of planned ones
+MEASURED_FILES = {POSES: "measured.csv", UNSEEN: "validation_measured.csv"}
+
 
 def asks(session: Session, state: State) -> tuple[str, str]:
     """Return the task at the robot, a line for each part of it, and the file to provide, with the file's format."""
-    step, again = state.step.name, command_line("next", session.folder)
+    step, next_command = state.step.name, command_line("next", session.folder)
     if state.kind == WAITING and step in ("record", "predict"):
         task, file = _to_record(session, step)
     elif state.kind == WAITING and step in ("measure", "validate"):
         task, file = _to_measure(session, step)
     else:
-        return f"step {step} needs {state.words}", f"put it into {session.folder} and run {again} again"
-    return task, f"Bring {file}; then: {again}"
+        return f"step {step} needs {state.words}", f"put it into {session.folder} and run {next_command} again"
+    return task, f"Bring {file}; then: {next_command}"
 
 
 def _to_measure(session: Session, step: str) -> tuple[str, str]:
     """Return what to measure at the robot, and the files of measurements or images to provide."""
     settings, joints = session.settings, chain_of(session).joint_names
-    device, images = settings.instrument, settings.instrument.measures == IMAGES
+    instrument, images = settings.instrument, settings.instrument.measures == IMAGES
     lists = [POSES] if step == "measure" else [UNSEEN]
+    # both are measured in one visit
     if step == "measure" and settings.poses.validation and not session.brought("validation"):
-        lists.append(UNSEEN)  # both are measured in one visit
-    sets = []
-    for path in (session.path(f"2-poses/{name}") for name in lists if settings.poses.plan):
-        if path.exists():
-            noun, unseen = "" if sets else "poses ", " (never fitted)" if sets else ""
-            programs = ", ".join(map(str, sorted({*path.parent.glob(f"{path.stem}.*")} - {path})))
-            played = f" (program: {programs})" if settings.robot.controller and programs else ""
-            sets.append(f"the {len(read_table(path))} {noun}of {path}{played}{unseen}")
-    if sets and lists[0] == POSES and not images and (ways := session.path(f"2-poses/{WAYS}")).exists():
-        sets[0] += f" in their order (ways: {ways}; calib view {session.folder} rehearses them)"
-    where = " and, into a separate file, ".join(sets) or "poses all over the workspace"
-    names = {POSES: "measured.csv", UNSEEN: "validation_measured.csv"}
-    files = [str(session.path("3-measured") / names[name]) for name in lists]
+        lists.append(UNSEEN)
+
+    planned = _planned_poses(session, lists)
+    ways = session.path(f"2-poses/{WAYS}")
+    if planned and lists[0] == POSES and not images and ways.exists():
+        planned[0] += f" in their order (ways: {ways}; calib view {session.folder} rehearses them)"
+    poses = " and, into a separate file, ".join(planned) or "poses all over the workspace"
+    files = [str(session.path("3-measured") / MEASURED_FILES[name]) for name in lists]
+
     if images:
-        spread = "" if sets else ", with the board near, far and tilted"
-        return (
-            _numbered(
-                f"Drive {where}{spread}; at each let the arm settle for a second.",
-                "Take an image of the board (fixed focus, zoom and exposure; images neither rotated nor scaled).",
-                "Log the joint angles read back.",
-            ),
-            f"{' and '.join(file.removesuffix('.csv') for file in files)}: images, joints.csv (image, {joints[0]} "
-            f"[deg] … {joints[-1]} [deg]; one row per image), board.toml (calib board makes boards), and camera.yaml "
-            "if the lens is known (calib formats images)",
+        if not planned:
+            poses += ", with the board near, far and tilted"
+        task = _numbered(
+            f"Drive {poses}; at each let the arm settle for a second.",
+            "Take an image of the board (fixed focus, zoom and exposure; images neither rotated nor scaled).",
+            "Log the joint angles read back.",
         )
-    columns = ", ".join((*(f"{joint} [deg]" for joint in joints), *(f"{axis} [mm]" for axis in "xyz")))
-    turned = ", qx, qy, qz, qw" if device.measures == "pose" else ""
-    return (
-        _numbered(
-            f"Drive {where}; at each let the arm settle.",
-            f"Measure the target's {device.measures} with the {device.name} and log the joint angles read back.",
-            "At the end, measure the first three again to check for drift (optional, into drift.csv).",
-        ),
-        f"{' and '.join(files)}, one row per pose: {columns}{turned} (calib formats measurements), "
-        "or joints and points apart, by calib join",
+        folders = " and ".join(file.removesuffix(".csv") for file in files)
+        return task, (
+            f"{folders}: images, joints.csv (image, {joints[0]} "
+            f"[deg] … {joints[-1]} [deg]; one row per image), board.toml (calib board makes boards), and camera.yaml "
+            "if the lens is known (calib formats images)"
+        )
+    task = _numbered(
+        f"Drive {poses}; at each let the arm settle.",
+        f"Measure the target's {instrument.measures} with the {instrument.name} and log the joint angles read back.",
+        "At the end, measure the first three again to check for drift (optional, into drift.csv).",
     )
+    columns = [f"{joint} [deg]" for joint in joints]
+    columns += ["x [mm]", "y [mm]", "z [mm]"]
+    if instrument.measures == "pose":
+        columns += ["qx", "qy", "qz", "qw"]
+    return task, (
+        f"{' and '.join(files)}, one row per pose: {', '.join(columns)} (calib formats measurements), "
+        "or joints and points apart, by calib join"
+    )
+
+
+def _planned_poses(session: Session, lists: Sequence[str]) -> list[str]:
+    """Return for each list of planned poses that exists its number of poses, its file, and programs of it."""
+    if not session.settings.poses.plan:
+        return []
+    planned = []
+    for name in lists:
+        path = session.path(f"2-poses/{name}")
+        if not path.exists():
+            continue
+        noun, remark = "poses ", ""
+        # the second list is that for validation
+        if planned:
+            noun, remark = "", " (never fitted)"
+        programs = {*path.parent.glob(f"{path.stem}.*")} - {path}
+        if session.settings.robot.controller and programs:
+            remark = f" (program: {', '.join(map(str, sorted(programs)))}){remark}"
+        planned.append(f"the {len(read_table(path))} {noun}of {path}{remark}")
+    return planned
 
 
 def _numbered(*parts: str) -> str:
@@ -103,41 +133,48 @@ def _numbered(*parts: str) -> str:
 def _to_record(session: Session, step: str) -> tuple[str, str]:
     """Return which motions to play, and the logs to provide."""
     section, joints = session.settings.dynamics, chain_of(session).joints
-    names = [] if step == "predict" or session.brought("training") else ["training"]
-    names += ["validation"] if section.validation and not session.brought("unseen") else []
-    file = RUN if section.repeats > 1 else SAMPLES
-    motions = " and, into a separate file, ".join(str(session.path(f"6-excitation/{name}/{file}")) for name in names)
-    unseen = " (never used for training)" if "validation" in names else ""
-    loads = ", ".join(f"'{label}' ({mass:g} kg)" for label, mass in section.payloads.items())
-    again = f"Then repeat it with {loads} on the flange, and put the label into the file's name."
-    task = _numbered(
-        "Rehearse: play the motion at a low override to check for collisions.",
-        f"Play {motions}{unseen}, the motion {section.repeats} times each, at {section.rate:g} Hz, from rest at its "
-        "first row.",
-        "Log joint positions and torques all the time.",
-        *([again] if loads and step == "record" else []),
-    )
-    if not section.plan:
+    names = []
+    if step == "record" and not session.brought("training"):
+        names.append("training")
+    if section.validation and not session.brought("unseen"):
+        names.append("validation")
+
+    if section.plan:
+        task = _to_play(session, names, step == "record")
+    else:
         task = "Record two motions of all joints: one for training, and a different one for validation."
-    (first, place, force), (last, to_place, to_force) = (
-        (one.name, *UNITS[one.kind]) for one in (joints[0], joints[-1])
-    )
-    columns = [f"q_{first} [{place}] to q_{last} [{to_place}]"]
+    first, last = joints[0], joints[-1]
+    (position, torque), (last_position, last_torque) = UNITS[first.kind], UNITS[last.kind]
+    columns = [f"q_{first.name} [{position}] to q_{last.name} [{last_position}]"]
     if section.torques != "link":
-        columns.append(f"tau_{first} [{force}] to tau_{last} [{to_force}]")
+        columns.append(f"tau_{first.name} [{torque}] to tau_{last.name} [{last_torque}]")
     if section.torques != "motor":
-        columns.append(f"tau_link_{first} to tau_link_{last} (the sensors')")
+        columns.append(f"tau_link_{first.name} to tau_link_{last.name} (the sensors')")
     files = " and ".join(str(session.path(f"7-recorded/{name}_log.csv")) for name in names)
     return task, (
-        f"{files}, one row per sample: t [s], {', '.join(columns)}; currents are i_{first} [A] …; .npz and ROS bags "
-        "work, too (calib formats recordings)"
+        f"{files}, one row per sample: t [s], {', '.join(columns)}; currents are i_{first.name} [A] …; .npz and ROS "
+        "bags work, too (calib formats recordings)"
     )
 
 
-UNITS = {"prismatic": ("m", "N"), "revolute": ("deg", "Nm")}  # of a log: positions and torques
-LIMITS = "limits.toml"
-CAMERA_FILES = {"lens": "camera.yaml", "board": "board.toml"}  # a camera's files, beside the limits
-HEAD = "# The cell, as given to `calib new`. `calib formats limits` lists the possible keys.\n"
+def _to_play(session: Session, names: Sequence[str], with_payloads: bool) -> str:
+    """Return how to play the designed motions of these names, and again with each payload."""
+    section = session.settings.dynamics
+    file = RUN if section.repeats > 1 else SAMPLES
+    motions = " and, into a separate file, ".join(str(session.path(f"6-excitation/{name}/{file}")) for name in names)
+    remark = " (never used for training)" if "validation" in names else ""
+    parts = [
+        "Rehearse: play the motion at a low override to check for collisions.",
+        f"Play {motions}{remark}, the motion {section.repeats} times each, at {section.rate:g} Hz, from rest at its "
+        "first row.",
+        "Log joint positions and torques all the time.",
+    ]
+    if section.payloads and with_payloads:
+        loads = ", ".join(f"'{label}' ({mass:g} kg)" for label, mass in section.payloads.items())
+        parts.append(f"Then repeat it with {loads} on the flange, and put the label into the file's name.")
+    return _numbered(*parts)
+
+
 COLOURS = {
     **page.COLOURS,
     "done": "green",
@@ -227,24 +264,28 @@ def new_session(
 
 
 def _limits(
-    stated: str | Path | Mapping[str, Any] | None, chain: Chain, source: Path, motions: bool
+    limits: str | Path | Mapping[str, Any] | None, chain: Chain, source: Path, motions: bool
 ) -> tuple[dict[str, Path | str], str]:
     """Return the files of the given limits (name -> path or text) after checking them, and the limits file's name."""
-    if stated is None:
+    if limits is None:
         return {}, ""
-    stated = Path(stated) if isinstance(stated, str) else stated
-    if motions and isinstance(stated, Path):
-        read_motion_limits(stated, chain, source)
-    read_limits(stated, targets_of(chain), source)
-    found, _ = tables_of(stated, chain, source, "")
-    if isinstance(found, str | Path):
-        return {LIMITS: Path(found), **beside(Path(found))}, LIMITS
-    tables = dict(found or {})
+    if isinstance(limits, str):
+        limits = Path(limits)
+    if motions and isinstance(limits, Path):
+        read_motion_limits(limits, chain, source)
+    read_limits(limits, targets_of(chain), source)
+    content, _ = tables_of(limits, chain, source, "")
+    if isinstance(content, str | Path):
+        return {LIMITS: Path(content), **beside(Path(content))}, LIMITS
+    tables = dict(content or {})
     camera = tables.get("camera", {})
-    given = {key: camera[key] for key in CAMERA_FILES if camera.get(key, UNKNOWN) != UNKNOWN}
-    named = {"camera": {**camera, **{key: CAMERA_FILES[key] for key in given}}} if given else {}
-    copied = {CAMERA_FILES[key]: Path(name) for key, name in given.items()}
-    return {LIMITS: f"{HEAD}{dumps(tables | named)}", **copied}, LIMITS
+    files: dict[str, Path | str] = {}
+    for key, name in CAMERA_FILES.items():
+        # the session's limits name the copies beside them
+        if camera.get(key, UNKNOWN) != UNKNOWN:
+            files[name] = Path(camera[key])
+            tables["camera"] = {**tables["camera"], key: name}
+    return {LIMITS: f"{LIMITS_HEAD}{dumps(tables)}", **files}, LIMITS
 
 
 def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", plots: bool = True) -> _Stop:
@@ -286,24 +327,26 @@ def _ending(session: Session) -> tuple[str, ...]:
 def status_lines(folder: Path) -> Iterator[RenderableType]:
     """Yield the status of every step of a session, and the next command."""
     session = open_session(folder)
-    settings, found = session.settings, steps.states(session)
-    ahead = next((state for state in found if state.kind not in (DONE, KEPT)), None)
-    if ahead is None:
+    settings, states = session.settings, steps.states(session)
+    pending = [state for state in states if state.kind not in (DONE, KEPT)]
+    if not pending:
         yield str(session.verdicts())
     yield Text.assemble((settings.name, "bold"), f", {settings.instrument.name}, made {settings.created[:10]}")
     table = Table("", "step", "state", "", box=None, pad_edge=False)
-    for number, state in enumerate(found, 1):
+    for number, state in enumerate(states, 1):
         table.add_row(str(number), state.step.name, Text(state.kind, COLOURS[state.kind]), Text(state.words))
     yield table
-    if ahead is None:
+    if not pending:
         yield f"certificate: {session.path(CERTIFICATE)}"
-    elif ahead.kind == WAITING:
-        yield from asks(session, ahead)
+    elif pending[0].kind == WAITING:
+        yield from asks(session, pending[0])
     else:
         yield f"next: {command_line('next', folder)}"
 
 
 def noted(folder: Path) -> list[str]:
     """Return the notes of each completed step of a session."""
-    recorded = read_state(open_session(folder)).steps
-    return [f"  {name}: {note}" for name, record in recorded.items() for note in record.notes]
+    lines = []
+    for name, record in read_state(open_session(folder)).steps.items():
+        lines += [f"  {name}: {note}" for note in record.notes]
+    return lines

@@ -32,6 +32,7 @@ from calib.procedure.dynamic_stage import inputs
 from calib.procedure.dynamic_stage.identify import Assessment, assess
 from calib.procedure.excitation import coefficients, prediction
 from calib.procedure.excitation.coefficients import Periodic
+from calib.procedure.excitation.settings import ExcitationSettings
 from calib.procedure.findings import UNJUDGED, Verdict, lines_of
 from calib.procedure.robot_kinds import joints_of
 from calib.procedure.session.folder import CUTS, MOTION_CHECKED, ROUND, Say, Session
@@ -40,11 +41,19 @@ from calib.records import read_json
 from calib.robot.chain import Chain
 from calib.robot.library import load_calibrated
 
-Cuts = Mapping[str, tuple[float, float] | None]  # of recordings, by their names [s]
-MIN_TRACKED_SHARE = 0.98  # of the motion, explained by a recorded period; below it is noted
-MAX_TORQUE_RATIO = 10.0  # a factor between measured and nominal torques that no wrong mass explains
-VALIDATION_PERIOD = 0.8  # of the validation motion, over the training motion's (our choice)
-VALIDATION_SEED = 3  # added to the seed for the validation motion
+# start and end of the motion in recordings [s], by their names
+Cuts = Mapping[str, tuple[float, float] | None]
+# of the motion, explained by a recorded period; below it is noted
+MIN_TRACKED_SHARE = 0.98
+# a factor between measured and nominal torques that no wrong mass explains
+MAX_TORQUE_RATIO = 10.0
+# of the validation motion, over the training motion's (our choice)
+VALIDATION_PERIOD = 0.8
+# added to the seed for the validation motion
+VALIDATION_SEED = 3
+# evaluations of the search for the validation motion: at least, and as a fraction of the training motion's
+VALIDATION_EVALUATIONS = 20
+VALIDATION_FRACTION = 3
 
 
 def options_of(session: Session) -> IdentifyOptions:
@@ -55,80 +64,114 @@ def options_of(session: Session) -> IdentifyOptions:
     if not section.options:
         rows = torque_rows(section.torques)
         settings = replace(settings, torque_rows=rows, friction=section.friction, method=section.method)
-    known = {label: Payload(float(mass)) for label, mass in section.payloads.items()}
-    settings = replace(settings, payloads={**known, **settings.payloads}, seed=session.settings.seed)
-    named = dict(options.files)
+    payloads = {label: Payload(float(mass)) for label, mass in section.payloads.items()}
+    settings = replace(settings, payloads=payloads | dict(settings.payloads), seed=session.settings.seed)
+    # a recording carries the payloads whose labels are in its name
+    by_file = dict(options.files)
     for path in session.brought("training", "unseen"):
-        labels = tuple(label for label in known if label.lower() in path.stem.lower())
+        labels = tuple(label for label in payloads if label.lower() in path.stem.lower())
         if labels:
-            named[path.name] = replace(
-                named.get(path.name, FileSettings(options.every.recording, options.every.filter)), payload=labels
-            )
-    return replace(options, settings=settings, files=named)
+            default = FileSettings(options.every.recording, options.every.filter)
+            by_file[path.name] = replace(by_file.get(path.name, default), payload=labels)
+    return replace(options, settings=settings, files=by_file)
 
 
 def excite(session: Session, say: Say) -> list[str]:
     """Design the training motion and the validation motion, and return notes."""
-    from calib.procedure.excitation import design
-    from calib.procedure.excitation import folder as motion_folder
-    from calib.procedure.excitation.settings import ExcitationSettings
-
-    section, notes, draw = session.settings.dynamics, [], None
+    section = session.settings.dynamics
     if not section.plan:
         return ["no motion was designed, since plan = false: the recordings may contain any motions"]
-    if session.plots:
-        from calib.procedure.report.motion_figures import write_design as draw
-    limits = session.named(section.limits)
-    names = ["training", "validation"] if section.validation else ["training"]
-    for name in names:
-        first = name == "training"
-        settings = ExcitationSettings(
-            period=section.period * (1.0 if first else VALIDATION_PERIOD),
-            harmonics=section.harmonics,
-            rate=section.rate,
-            starts=section.starts if first else 1,
-            evaluations=section.evaluations if first else max(20, section.evaluations // 3),
-            seed=session.settings.seed + (0 if first else VALIDATION_SEED),
-            repeat=section.repeats,
-            outlook=first,
-            goals=section.goals if first else (),
-            hard=section.hard if first else (),
-            front=section.front if first else 0,
-            within="" if first else str(session.path("6-excitation/training")),
-        )
-        designed = design.excite(
-            session.fit.path,
-            settings,
-            limits=limits,
-            options=options_of(session).settings,
-            progress=lambda words, name=name: say(f"{name} motion: {words}"),
-        )
-        if designed.found.interrupted:  # a session is resumed, not gone on with half a search
-            raise KeyboardInterrupt
-        motion_folder.write_design(designed, session.path("6-excitation") / name, draw if first else None)
-        cond = designed.condition
-        notes.append(
-            f"{name}: {designed.period:g} s, condition number {cond.raw:.3g} raw, {cond.normalised:.3g} "
-            f"normalised, {len(designed.inputs.model.exact.names)} columns; all limits are respected"
-        )
-        said = (*designed.inputs.limits.bounds.lines(), *designed.notes)
-        notes += [f"{name}: {note}" for note in said if first]
-    if limits is None:
+    notes = _design(session, "training", _training_settings(session), say)
+    if section.validation:
+        notes += _design(session, "validation", _validation_settings(session), say)
+    if session.named(section.limits) is None:
         notes.append("only the limits in the robot's file were checked: watch for collisions, or give a limits file")
+    return notes
+
+
+def _training_settings(session: Session) -> ExcitationSettings:
+    """Return the settings of the training motion."""
+    section = session.settings.dynamics
+    return ExcitationSettings(
+        period=section.period,
+        harmonics=section.harmonics,
+        rate=section.rate,
+        starts=section.starts,
+        evaluations=section.evaluations,
+        seed=session.settings.seed,
+        repeat=section.repeats,
+        outlook=True,
+        goals=section.goals,
+        hard=section.hard,
+        front=section.front,
+        within="",
+    )
+
+
+def _validation_settings(session: Session) -> ExcitationSettings:
+    """Return the settings of the validation motion: another period and seed, within the training motion's states."""
+    section = session.settings.dynamics
+    return replace(
+        _training_settings(session),
+        period=section.period * VALIDATION_PERIOD,
+        starts=1,
+        evaluations=max(VALIDATION_EVALUATIONS, section.evaluations // VALIDATION_FRACTION),
+        seed=session.settings.seed + VALIDATION_SEED,
+        outlook=False,
+        goals=(),
+        hard=(),
+        front=0,
+        within=str(session.path("6-excitation/training")),
+    )
+
+
+def _design(session: Session, name: str, settings: ExcitationSettings, say: Say) -> list[str]:
+    """Design a motion, write its folder, and return notes; figures and details of the training motion alone."""
+    from calib.procedure.excitation import design
+    from calib.procedure.excitation import folder as motion_folder
+
+    def report_progress(words: str) -> None:
+        say(f"{name} motion: {words}")
+
+    designed = design.excite(
+        session.fit.path,
+        settings,
+        limits=session.named(session.settings.dynamics.limits),
+        options=options_of(session).settings,
+        progress=report_progress,
+    )
+    # a session is resumed, not gone on with half a search
+    if designed.found.interrupted:
+        raise KeyboardInterrupt
+    draw = None
+    if session.plots and name == "training":
+        from calib.procedure.report.motion_figures import write_design as draw
+    motion_folder.write_design(designed, session.path("6-excitation") / name, draw)
+
+    condition, columns = designed.condition, len(designed.inputs.model.exact.names)
+    notes = [
+        f"{name}: {designed.period:g} s, condition number {condition.raw:.3g} raw, {condition.normalised:.3g} "
+        f"normalised, {columns} columns; all limits are respected"
+    ]
+    if name == "training":
+        remarks = (*designed.inputs.limits.bounds.lines(), *designed.notes)
+        notes += [f"{name}: {remark}" for remark in remarks]
     return notes
 
 
 def record(session: Session, say: Say) -> list[str]:
     """Check the training recordings, and return notes."""
-    cuts, notes = {}, []
+    cuts = {}
+    notes = []
     for path in session.brought("training"):
         say(f"reading {path.name}")
-        rounds = [
-            name for name in designed_motions(session) if name.startswith(ROUND) and path in _logs_of(session, name)
-        ]
-        found, said = check_recording(session, path, ["training", *rounds][-1])
-        cuts[path.name] = found
-        notes += said
+        # the name of a further motion's log begins like its folder
+        motion = "training"
+        for name in designed_motions(session):
+            if name.startswith(ROUND) and path in _logs_of(session, name):
+                motion = name
+        cuts[path.name], recording_notes = check_recording(session, path, motion)
+        notes += recording_notes
     files.write_json(session.path(CUTS), cuts)
     files.write(session.path(MOTION_CHECKED), "\n".join(notes) + "\n")
     return notes
@@ -140,27 +183,31 @@ def check_recording(session: Session, path: Path, name: str) -> tuple[list[float
     Raises:
         MeasurementError: for wrong units or joint order, another motion, or reversed torques.
     """
-    chain, options = load_calibrated(session.fit.path).chain, options_of(session)
-    own = options.file_settings(str(path))
-    recording = read_recording(str(path), joints_of(chain), own.recording)
-    rate = 1.0 / max(float(np.median(np.diff(recording.t))), 1e-9)  # as identification takes it
+    chain = load_calibrated(session.fit.path).chain
+    settings = options_of(session).file_settings(str(path))
+    recording = read_recording(str(path), joints_of(chain), settings.recording)
+    # as identification takes it
+    rate = 1.0 / max(float(np.median(np.diff(recording.t))), 1e-9)
     sensors = ", and sensors behind the gears" if recording.tau_link is not None else ""
     notes = [f"{path.name}: {recording.duration:.1f} s at {rate:.4g} Hz, {recording.kind}s{sensors}"]
     notes += [f"{path.name}: {note}" for note in recording.notes]
-    if not own.payload:  # the nominal masses hold no payload
+    # the nominal masses hold no payload
+    if not settings.payload:
         check_torques(recording, chain)
+
     motions = designed_motions(session)
     if name not in motions:
-        whole = [float(recording.t[0]), float(recording.t[-1])]
-        return whole if session.settings.dynamics.holdout else None, notes
-    others = {other: motion for other, motion in motions.items() if other != name}
-    found, loose = check_motion(recording, motions[name], others, session.settings.dynamics.repeats)
-    worst = max(found.tracking)
+        if session.settings.dynamics.holdout:
+            return [float(recording.t[0]), float(recording.t[-1])], notes
+        return None, notes
+    motion = motions.pop(name)
+    located, findings = check_motion(recording, motion, motions, session.settings.dynamics.repeats)
     notes.append(
-        f"{path.name}: the {name} motion, {found.periods} times, from {found.start:.2f} s ({EDGE_TIME:g} s before it, "
-        f"for the filters); deviation up to {1e3 * worst:.2g} mrad rms"
+        f"{path.name}: the {name} motion, {located.periods} times, from {located.start:.2f} s ({EDGE_TIME:g} s before "
+        f"it, for the filters); deviation up to {1e3 * max(located.tracking):.2g} mrad rms"
     )
-    return [found.start, found.stop], notes + [f"{path.name}: {note}" for note in lines_of(loose)]
+    notes += [f"{path.name}: {note}" for note in lines_of(findings)]
+    return [located.start, located.stop], notes
 
 
 def check_motion(
@@ -177,35 +224,38 @@ def check_motion(
     Raises:
         MeasurementError: if the motion is not found, with the likely reason.
     """
-    found = locate(recording, motion)
-    if found is None:
+    located = locate(recording, motion)
+    if located is None:
         _refuse(recording, _other_motion(recording, motion, another_motion(recording, motion, others)))
-    notes = []
-    if found.periods < repeats:
-        notes.append(finding("repetitions-missing", periods=found.periods, wanted=repeats))
-    if found.likeness < MIN_TRACKED_SHARE:
-        joint = recording.joint_names[found.loosest]
-        notes.append(finding("tracking-loose", share=found.likeness, joint=joint))
-    return found, notes
+    findings = []
+    if located.periods < repeats:
+        findings.append(finding("repetitions-missing", periods=located.periods, wanted=repeats))
+    if located.likeness < MIN_TRACKED_SHARE:
+        joint = recording.joint_names[located.loosest]
+        findings.append(finding("tracking-loose", share=located.likeness, joint=joint))
+    return located, findings
 
 
-def _other_motion(recording: Recording, motion: DesignedMotion, found: Change | None) -> Finding:
+def _other_motion(recording: Recording, motion: DesignedMotion, change: Change | None) -> Finding:
     """Return the finding on what a recording contains instead of the designed motion."""
-    if found is None and recording.duration < motion.period:
-        return finding("motion-short", duration=recording.duration, period=motion.period)
-    if found is None:
+    if change is None:
+        if recording.duration < motion.period:
+            return finding("motion-short", duration=recording.duration, period=motion.period)
         return finding("motion-unknown")
     names = recording.joint_names
-    if found.code != "motion-altered":
-        return finding(found.code, joints=[names[j] for j in found.joints], **found.values)
-    unit, order, sign = (found.values[key] for key in ("unit", "order", "sign"))
-    moved = [(names[column], names[j]) for j, column in enumerate(order) if column != j]
-    return finding(
-        found.code,
-        unit="" if unit == 1.0 else "deg" if unit < 1.0 else "rad although the header says deg",
-        swapped=[f"the column of {column} contains {joint}" for column, joint in moved],
-        reversed=[names[j] for j, one in enumerate(sign) if one < 0],
-    )
+    if change.code != "motion-altered":
+        return finding(change.code, joints=[names[j] for j in change.joints], **change.values)
+
+    factor, order, sign = change.values["unit"], change.values["order"], change.values["sign"]
+    unit = ""
+    if factor != 1.0:
+        unit = "deg" if factor < 1.0 else "rad although the header says deg"
+    swapped = []
+    for j, column in enumerate(order):
+        if column != j:
+            swapped.append(f"the column of {names[column]} contains {names[j]}")
+    reversed_joints = [names[j] for j, direction in enumerate(sign) if direction < 0]
+    return finding(change.code, unit=unit, swapped=swapped, reversed=reversed_joints)
 
 
 def check_torques(recording: Recording, chain: Chain) -> None:
@@ -217,23 +267,23 @@ def check_torques(recording: Recording, chain: Chain) -> None:
     if chain.inertias is None or recording.kind != "torque":
         return
     share = share_of_nominal(recording.t, recording.q, recording.effort, chain)
-    sure = np.flatnonzero(np.isfinite(share))
-    if not len(sure):
+    loaded = np.flatnonzero(np.isfinite(share))
+    if not len(loaded):
         return
-    joints, size = [recording.joint_names[j] for j in sure], np.abs(share[sure])
+    joints = [recording.joint_names[j] for j in loaded]
+    size = np.abs(share[loaded])
     if (size > MAX_TORQUE_RATIO).all() or (size < 1 / MAX_TORQUE_RATIO).all():
         ratio = float(np.median(size))
         code = "torques-too-small" if ratio < 1 else "torques-too-large"
         _refuse(recording, finding(code, joints=joints, ratio=ratio))
-    turned = [recording.joint_names[j] for j in sure if share[j] < 0]
-    if turned:
-        _refuse(
-            recording, finding("torques-reversed" if turned == joints else "torque-of-joint-reversed", joints=turned)
-        )
+    reversed_joints = [recording.joint_names[j] for j in loaded if share[j] < 0]
+    if reversed_joints:
+        code = "torques-reversed" if reversed_joints == joints else "torque-of-joint-reversed"
+        _refuse(recording, finding(code, joints=reversed_joints))
 
 
-def _refuse(recording: Recording, found: Finding) -> NoReturn:
-    refuse_data(recording.file, lines_of([found])[0])
+def _refuse(recording: Recording, reason: Finding) -> NoReturn:
+    refuse_data(recording.file, lines_of([reason])[0])
 
 
 def designed_motions(session: Session) -> dict[str, Periodic]:
@@ -260,8 +310,15 @@ def _logs_of(session: Session, name: str) -> list[Path]:
 
 def _cut_paths(paths: list[Path], cuts: Cuts) -> list[str]:
     """Return each recording's path with the time range of the motion appended, as ``log.csv@0:9``."""
-    marked = {path: cuts.get(path.name) for path in paths}
-    return [str(path) if cut is None else f"{path}@{cut[0]:.6g}:{cut[1]:.6g}" for path, cut in marked.items()]
+    ranges = []
+    for path in paths:
+        cut = cuts.get(path.name)
+        if cut is None:
+            ranges.append(str(path))
+        else:
+            start, stop = cut
+            ranges.append(f"{path}@{start:.6g}:{stop:.6g}")
+    return ranges
 
 
 def _divided(session: Session) -> tuple[list[str], list[str]]:
@@ -271,20 +328,28 @@ def _divided(session: Session) -> tuple[list[str], list[str]]:
     training = session.brought("training")
     if not share:
         return _cut_paths(training, cuts), []
-    middle = {name: stop - share * (stop - start) for name, (start, stop) in cuts.items()}
-    learnt = {name: (start, middle[name]) for name, (start, _) in cuts.items()}
-    held = {name: (middle[name], stop) for name, (_, stop) in cuts.items()}
-    return _cut_paths(training, learnt), _cut_paths(training, held)
+    # the end of each recording is held out
+    first_parts, last_parts = {}, {}
+    for name, (start, stop) in cuts.items():
+        middle = stop - share * (stop - start)
+        first_parts[name] = start, middle
+        last_parts[name] = middle, stop
+    return _cut_paths(training, first_parts), _cut_paths(training, last_parts)
 
 
 def _gathered(
     session: Session, training: Sequence[str], unseen: Sequence[str], say: Say
 ) -> inputs.IdentificationInputs:
     """Return the inputs of the identification: calibrated robot, training recordings, validation recordings."""
-    options, seed = options_of(session), session.settings.seed
-    designed = [motion for name, motion in designed_motions(session).items() if name == "training"]
+    motions = designed_motions(session)
     return inputs.gather(
-        session.fit.path, training, unseen, options=options, seed=seed, designed=designed, progress=say
+        session.fit.path,
+        training,
+        unseen,
+        options=options_of(session),
+        seed=session.settings.seed,
+        designed=[motions["training"]] if "training" in motions else [],
+        progress=say,
     )
 
 
@@ -293,66 +358,78 @@ def identify(session: Session, say: Say) -> list[str]:
     from calib.procedure.dynamic_stage import folder as identification_outputs
     from calib.procedure.report.outputs import write_model
 
-    given = _gathered(session, _divided(session)[0], (), say)
-    outcome = identifying.run(replace(given, replayed=False), progress=say)  # `predict` replays unseen motion
+    training, _ = _divided(session)
+    gathered = _gathered(session, training, (), say)
+    # `predict` replays unseen motion, and judges
+    outcome = identifying.run(replace(gathered, replayed=False), progress=say)
     outcome = replace(outcome, verdict=UNJUDGED)
     say("writing")
     write = partial(write_model, plots=session.plots, pages=False)
     identification_outputs.write_folder(outcome, session.identification.path, write, owned=True)
-    found = outcome.found
-    raw, normalised = found.condition
-    fitted = next(iter(outcome.fit.values()))
+
+    identification = outcome.found
+    raw, normalised = identification.condition
+    friction = identification.friction.chosen or "standard"
+    score = next(iter(outcome.fit.values()))
     notes = [
-        f"{len(found.names)} parameters by {found.fitted.method}, friction {found.friction.chosen or 'standard'}, "
-        "condition "
-        f"number {raw:.3g}, with unit columns {normalised:.3g}; {fitted.judged.total:.2f} % of the torque unexplained"
+        f"{len(identification.names)} parameters by {identification.fitted.method}, friction {friction}, condition "
+        f"number {raw:.3g}, with unit columns {normalised:.3g}; {score.judged.total:.2f} % of the torque unexplained"
     ]
-    before = f"{ROUND}{int(next_round(session).removeprefix(ROUND)) - 1}"
-    designed = session.path(f"6-excitation/{before if before in designed_motions(session) else 'training'}")
+    # the motion of the last round that was recorded
+    last_round = f"{ROUND}{int(next_round(session).removeprefix(ROUND)) - 1}"
+    motion = last_round if last_round in designed_motions(session) else "training"
+    designed = session.path(f"6-excitation/{motion}")
     if session.settings.dynamics.plan and (designed / prediction.NAME).is_file():
         notes.append(prediction.compared_with_identification(designed, outcome))
     notes += return_masses(session)
-    later = lines_of([one for one in outcome.noticed if one.code == "no-unseen-motion"])  # `predict` judges
-    return [*notes, *(words for words in outcome.warnings if words not in later)]
+    # `predict` judges on unseen motion
+    later = lines_of([warning for warning in outcome.noticed if warning.code == "no-unseen-motion"])
+    notes += [warning for warning in outcome.warnings if warning not in later]
+    return notes
 
 
 def predict(session: Session, say: Say) -> list[str]:
     """Validate the identified model on unseen motion, and write the verdict."""
-    training, held = _divided(session)
+    training, held_out = _divided(session)
     unseen = session.brought("unseen")
-    notes, aside = [], {}
+    notes = []
+    cuts = {}
     for path in unseen:
-        aside[path.name], said = check_recording(session, path, "validation")
-        notes += said
+        cuts[path.name], recording_notes = check_recording(session, path, "validation")
+        notes += recording_notes
     say("predicting unseen motion")
-    given = _gathered(session, training, [*held, *_cut_paths(unseen, aside)], say)
-    place = session.identification
-    found = assess(given, place.dynamics(), place.findings(), place.errors(), progress=say)
-    place.unseen.write(given, found)  # the export is judged by the torques written here
-    found = replace(found, verdict=_as_delivered(session, found))
-    place.unseen.write(given, found)
-    known = place.metrics().warnings
-    fresh = [words for words in found.warnings if words not in known]
-    return [*notes, str(found.verdict), *fresh]
+    gathered = _gathered(session, training, [*held_out, *_cut_paths(unseen, cuts)], say)
+    folder = session.identification
+    assessment = assess(gathered, folder.dynamics(), folder.findings(), folder.errors(), progress=say)
+    # the export is judged by the torques written here
+    folder.unseen.write(gathered, assessment)
+    assessment = replace(assessment, verdict=_as_delivered(session, assessment))
+    folder.unseen.write(gathered, assessment)
+    earlier = folder.metrics().warnings
+    new_warnings = [warning for warning in assessment.warnings if warning not in earlier]
+    return [*notes, str(assessment.verdict), *new_warnings]
 
 
-def _as_delivered(session: Session, found: Assessment) -> Verdict:
+def _as_delivered(session: Session, assessment: Assessment) -> Verdict:
     """Return the verdict on the exported robot; a model that cannot be exported gets the verdict prediction only."""
     from calib.procedure.export.delivery import Export
 
-    verdict, known = found.verdict, None
+    verdict = assessment.verdict
     exported = Export(session.robot_file, identified=session.identification.path)
+    errors = [score.judged.total for score in assessment.proofs.values()]
+    error, model = max(errors, default=0.0), "identified model"
+    predicted = None
     try:
-        known = exported.with_masses and exported.prediction
-    except CalibError as error:
-        verdict = verdict.for_prediction(f"the dynamics cannot be exported: {error}")
-    left, what = max((one.judged.total for one in found.proofs.values()), default=0.0), "identified model"
-    if known is not None:
-        left, what = known.exported, "exported robot"
-        figure = f"{left:.2f} % of the torque unexplained by the exported robot"
+        # a URDF that cannot be written is refused here
+        predicted = exported.with_masses and exported.prediction
+    except CalibError as reason:
+        verdict = verdict.for_prediction(f"the dynamics cannot be exported: {reason}")
+    if predicted is not None:
+        error, model = predicted.exported, "exported robot"
+        figure = f"{error:.2f} % of the torque unexplained by the exported robot"
         verdict = replace(verdict, reason=f"{figure} (identified model: {verdict.reason})")
     tolerance = session.settings.dynamics.tolerance_percent
-    if not tolerance or left <= tolerance:
+    if not tolerance or error <= tolerance:
         return verdict
-    why = f"the {what} has an error of {left:.2f} %, above the tolerance of {tolerance:g} %"
-    return Verdict("fail", f"{verdict.reason}; {why}")
+    excess = f"the {model} has an error of {error:.2f} %, above the tolerance of {tolerance:g} %"
+    return Verdict("fail", f"{verdict.reason}; {excess}")

@@ -53,29 +53,39 @@ from calib.robot import tables
 from calib.robot.calibrated import ROBOT
 from calib.robot.formats.urdf_tree import converter, is_urdf, text
 
-Say = Callable[[str], None]
 FOLDERS = ("1-robot", "2-poses", "3-measured", "4-fit", "5-validation")
 DYNAMIC = ("6-excitation", "7-recorded", "8-dynamics")
-EXPORT = {False: "6-export", True: "9-export"}  # without, with dynamics
+# of the export: without, with dynamics
+EXPORT = {False: "6-export", True: "9-export"}
+# says that a simulated cell brought files
 MARK = "simulated.txt"
-MASSES = "8-masses"  # the identification whose masses the fit uses
-AS_GIVEN = "1-robot/as_given"  # the robot as it is described, where its geometry is not fitted
+# the identification whose masses the fit uses
+MASSES = "8-masses"
+# the robot as it is described, where its geometry is not fitted
+AS_GIVEN = "1-robot/as_given"
 CHECKED, VERDICT = "checked.txt", "verdict.json"
 SUMMARY, SELECTION, CUTS = "1-robot/summary.txt", "2-poses/selection.json", "7-recorded/cuts.json"
-PREDICTED = "2-poses/predicted.png"  # sigma of the tool over the workspace
-PREDICTION = "2-poses/poses_prediction.json"  # what the poses will tell: calib fit --selection
-POSES, UNSEEN, WAYS = "poses.csv", "validation_poses.csv", "poses_run.csv"  # as planned, in 2-poses
-OLDER = {f"2-poses/{UNSEEN}": "2-poses/validation.csv"}  # name today -> in sessions of earlier versions
+# sigma of the tool over the workspace, and what the poses will tell: calib fit --selection
+PREDICTED = "2-poses/predicted.png"
+PREDICTION = "2-poses/poses_prediction.json"
+# as planned, in 2-poses
+POSES, UNSEEN, WAYS = "poses.csv", "validation_poses.csv", "poses_run.csv"
+# name today -> in sessions of earlier versions
+OLDER = {f"2-poses/{UNSEEN}": "2-poses/validation.csv"}
 POSES_CHECKED, MOTION_CHECKED = f"3-measured/{CHECKED}", f"7-recorded/{CHECKED}"
-ROUND = "round"  # of further motions: round2, round3 …
+# of further motions: round2, round3 …
+ROUND = "round"
 LOGS = (".csv", ".npz", ".mcap", ".bag", ".db3")
-BROUGHT = {  # what people bring: where to, and how its name begins
+# what people bring: where to, and how its name begins
+BROUGHT = {
     "measured": ("3-measured", ""),
     "validation": ("3-measured", "validation"),
     "drift": ("3-measured", "drift"),
     "training": ("7-recorded", ""),
     "unseen": ("7-recorded", "validation"),
 }
+
+Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -142,18 +152,26 @@ class Session:
     def brought(self, *kinds: str) -> list[Path]:
         """Return the user's files of the kinds in `BROUGHT`, followed by the folders with images or bags."""
         result = []
-        for folder, prefix in (BROUGHT[kind] for kind in kinds):
-            others = tuple(start for where, start in BROUGHT.values() if where == folder and start not in ("", prefix))
-            belongs = _is_log if folder == "7-recorded" else _is_measured
-            found = {path: path.name.lower() for path in self.path(folder).glob("*") if belongs(path)}
-            mine = [path for path, name in found.items() if name.startswith(prefix) and not name.startswith(others)]
-            result += sorted(mine, key=lambda path: (path.is_dir(), path))
+        for kind in kinds:
+            folder, prefix = BROUGHT[kind]
+            prefixes = {start for where, start in BROUGHT.values() if where == folder}
+            other_prefixes = tuple(prefixes - {"", prefix})
+            is_data = _is_log if folder == "7-recorded" else _is_measured
+            paths = []
+            for path in self.path(folder).glob("*"):
+                name = path.name.lower()
+                if is_data(path) and name.startswith(prefix) and not name.startswith(other_prefixes):
+                    paths.append(path)
+            result += sorted(paths, key=_files_before_folders)
         return result
 
     def files_brought(self, kind: str) -> list[Path]:
         """Return the user's files of a kind, including those in folders, but not the toolkit's corner files."""
-        behind = (sorted(each for each in path.rglob("*") if each.is_file()) or [path] for path in self.brought(kind))
-        return [each for paths in behind for each in paths if each.name != CORNERS]
+        files_of_kind = []
+        for path in self.brought(kind):
+            inside = sorted(file for file in path.rglob("*") if file.is_file())
+            files_of_kind += inside or [path]
+        return [file for file in files_of_kind if file.name != CORNERS]
 
     @property
     def dynamic(self) -> bool:
@@ -197,23 +215,37 @@ class Session:
 
     def verdicts(self) -> Verdicts:
         """Return the verdict of each stage; without an export, the dynamics are for prediction only."""
-        geometry = self.validation.metrics() if self.geometric else None
-        judged = {"geometry": geometry, "dynamics": self.identification.unseen.read() if self.dynamic else None}
-        found = {stage: Verdict(one.verdict, one.reason) for stage, one in judged.items() if one}
-        out = self.path(self.export)
-        if self.dynamic and (out / ROBOT).exists() and not any(out.rglob(PARAMETERS)):
-            found["dynamics"] = found["dynamics"].for_prediction("the dynamics could not be exported")
-        return Verdicts(found, geometry.deliverables if geometry else {})
+        stages = {}
+        deliverables: Mapping[str, Verdict] = {}
+        if self.geometric:
+            geometry = self.validation.metrics()
+            stages["geometry"] = Verdict(geometry.verdict, geometry.reason)
+            deliverables = geometry.deliverables
+        if self.dynamic:
+            dynamics = self.identification.unseen.read()
+            stages["dynamics"] = Verdict(dynamics.verdict, dynamics.reason)
+            out = self.path(self.export)
+            if (out / ROBOT).exists() and not any(out.rglob(PARAMETERS)):
+                stages["dynamics"] = stages["dynamics"].for_prediction("the dynamics could not be exported")
+        return Verdicts(stages, deliverables)
 
 
 def _is_log(path: Path) -> bool:
     if path.name.startswith("."):
         return False
-    return (path / "metadata.yaml").exists() if path.is_dir() else path.suffix.lower() in LOGS
+    if path.is_dir():
+        return (path / "metadata.yaml").exists()
+    return path.suffix.lower() in LOGS
 
 
 def _is_measured(path: Path) -> bool:
-    return path.suffix == ".csv" if path.is_file() else is_image_folder(path)
+    if path.is_file():
+        return path.suffix == ".csv"
+    return is_image_folder(path)
+
+
+def _files_before_folders(path: Path) -> tuple[bool, Path]:
+    return path.is_dir(), path
 
 
 def create(folder: Path, robot_file: Path, settings: SessionSettings, copied: Mapping[str, Path | str]) -> None:
@@ -228,16 +260,26 @@ def create(folder: Path, robot_file: Path, settings: SessionSettings, copied: Ma
     Raises:
         SessionError: if the folder is not empty, or cannot be written.
     """
-    own = text(robot_file)[0] if converter(robot_file) else robot_file
-    target = f"1-robot/robot{robot_file.suffix if own is robot_file else '.urdf'}"
+    robot: Path | str = robot_file
+    robot_name = f"1-robot/robot{robot_file.suffix}"
+    if converter(robot_file):
+        robot, _ = text(robot_file)
+        robot_name = "1-robot/robot.urdf"
     created = datetime.now().astimezone().isoformat(timespec="seconds")
-    settings = replace(settings, created=created, robot=replace(settings.robot, file=target))
-    wanted, measured = settings.dynamics.wanted, settings.instrument.measures != NOTHING
+    settings = replace(settings, created=created, robot=replace(settings.robot, file=robot_name))
+
+    folders = [FOLDERS[0]]
+    if settings.instrument.measures != NOTHING:
+        folders += FOLDERS[1:]
+    if settings.dynamics.wanted:
+        folders += DYNAMIC
+    folders.append(EXPORT[settings.dynamics.wanted])
+    contents = {**copied, robot_name: robot, SETTINGS: written(settings)}
 
     def fill(staging: Path) -> None:
-        for name in (*(FOLDERS if measured else FOLDERS[:1]), *(DYNAMIC if wanted else ()), EXPORT[wanted]):
+        for name in folders:
             (staging / name).mkdir()
-        for name, source in {**copied, target: own, SETTINGS: written(settings)}.items():
+        for name, source in contents.items():
             files.write(staging / name, source.read_bytes() if isinstance(source, Path) else source)
         if folder.exists():
             folder.rmdir()

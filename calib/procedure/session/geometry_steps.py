@@ -33,6 +33,8 @@ from calib.extensions import Point
 from calib.folders import write_staged
 from calib.geometry.observability import SIGMA_ORIENTATION, observation, targets_of
 from calib.identification.model_file import MODEL
+from calib.poses.candidates import draw_candidates
+from calib.poses.space import is_feasible
 from calib.procedure.findings import UNJUDGED, Warned, lines_of
 from calib.procedure.kinematic_stage import fit as fitting
 from calib.procedure.kinematic_stage import folder as outputs
@@ -55,93 +57,116 @@ from calib.robot.chain import Chain, joint_kinds
 from calib.robot.formats.urdf_tree import is_urdf
 from calib.robot.library import load_calibrated
 from calib.units import JOINT
-from poses.candidates import draw_candidates
-from poses.space import is_feasible
+
+# advice for a camera whose view cannot be checked
+CAMERA_ADVICE = "add [camera] to the limits file, see `calib formats constraints`"
+# [rad or m]: joints closer to the commanded ones were not read back
+MIN_READBACK_DIFFERENCE = 1e-8
 
 WRITE_PROGRAM: Point[Callable[[Path, Path, str], Any]] = Point(
     "write_program", "files of a program of the poses in a CSV"
 )
-
-HOW = "add [camera] to the limits file, see `calib formats constraints`"
 
 
 def _choose(session: Session, chain: Chain, say: Say) -> list[str]:
     """Choose poses as set in ``session.toml``; write the poses, the driving order, and the predicted sigmas."""
     settings, robot_file = session.settings, session.robot_file
     section, instrument = settings.poses, settings.instrument
-    sigmas = (instrument.sigma_position, instrument.sigma_orientation or SIGMA_ORIENTATION)
-    choice = SelectionSettings(
-        kind=_seen_as(instrument.measures),
-        tools=(instrument.tool,),
-        index=section.index,
-        method=section.method,
-        sigmas=sigmas if instrument.sigma_position else None,
-        seed=settings.seed,
-    )
-    chosen = selection.choose(
+    sigmas = None
+    if instrument.sigma_position:
+        sigmas = instrument.sigma_position, instrument.sigma_orientation or SIGMA_ORIENTATION
+
+    def report_progress(done: int, total: int, stage: str) -> None:
+        say(f"choosing poses: {stage}")
+
+    choice = selection.choose(
         robot_file,
         section.fit,
-        choice,
+        SelectionSettings(
+            kind=_selection_kind(instrument.measures),
+            tools=(instrument.tool,),
+            index=section.index,
+            method=section.method,
+            sigmas=sigmas,
+            seed=settings.seed,
+        ),
         constraints=session.named(section.constraints),
         **session.links,
-        progress=lambda done, total, what: say(f"choosing poses: {what}"),
+        progress=report_progress,
     )
-    said = any(words.startswith(VIEW_UNCHECKED) for words in chosen.unchecked)
-    if instrument.measures == IMAGES and not chosen.by_images and not said:
-        chosen = replace(chosen, unchecked=(*chosen.unchecked, f"{VIEW_UNCHECKED} ({HOW})"))
-    found, q = chosen.selection, chosen.selection.joints
-    if found.interrupted:  # a session is resumed, not gone on with half a search
+    is_noted = any(words.startswith(VIEW_UNCHECKED) for words in choice.unchecked)
+    if instrument.measures == IMAGES and not choice.by_images and not is_noted:
+        choice = replace(choice, unchecked=(*choice.unchecked, f"{VIEW_UNCHECKED} ({CAMERA_ADVICE})"))
+    poses = choice.selection
+    # a session is resumed, not gone on with half a search
+    if poses.interrupted:
         raise KeyboardInterrupt
-    gain = found.random_baseline / found.value if found.index == "cond" else found.value / found.random_baseline
-    words = (
-        f"{len(q)} poses by {found.method}, {found.index} = {found.value:.4g}, {gain:.2f} times the best of 1000 "
-        f"random sets, {100 * found.efficiency:.1f} % of the convex bound ({selection.bound_words(found)})"
-    )
-    unseen = _unseen(session, robot_file, chain, section.validation)
-    sets = {folder.POSES: q, folder.UNSEEN: unseen} if section.validation else {folder.POSES: q}
-    for name, joints in sets.items():
-        path = write_poses(session.path(f"2-poses/{name}"), joints, chain.joint_names, joint_kinds(chain))
-        if settings.robot.controller:
-            WRITE_PROGRAM.one()(path, path.with_suffix(""), settings.robot.controller)
-    write_run(session.path(f"2-poses/{folder.WAYS}"), chosen.run, chain)
-    if chosen.prediction is not None:
-        write_prediction(chosen.prediction, session.path(f"2-poses/{folder.POSES}"))
-    outlook = chosen.outlook.poses
+
+    validation = _write_pose_lists(session, chain, poses.joints)
+    write_run(session.path(f"2-poses/{folder.WAYS}"), choice.run, chain)
+    if choice.prediction is not None:
+        write_prediction(choice.prediction, session.path(f"2-poses/{folder.POSES}"))
+    outlook = choice.outlook.poses
     if session.plots and np.isfinite(outlook.rms):
         from calib.procedure.report.charts import picture
         from calib.procedure.report.geometry_figures import predicted_map
 
         chart = predicted_map(outlook.points, outlook.spread)
         files.write(session.path(folder.PREDICTED), picture(chart, "").image)
-    record = {"words": words, **selection.record(chosen), "seed": settings.seed}
+
+    # a condition number is the better the smaller it is, other indices the larger
+    gain = poses.value / poses.random_baseline
+    if poses.index == "cond":
+        gain = poses.random_baseline / poses.value
+    words = (
+        f"{len(poses.joints)} poses by {poses.method}, {poses.index} = {poses.value:.4g}, {gain:.2f} times the best of "
+        f"1000 random sets, {100 * poses.efficiency:.1f} % of the convex bound ({selection.bound_words(poses)})"
+    )
+    record = {"words": words, **selection.record(choice), "seed": settings.seed}
     files.write_json(session.path(folder.SELECTION), record)
-    notes = [f"{len(q)} poses for the fit: {words}"]
-    notes += [f"{len(unseen)} random poses for validation"] if section.validation else []
-    numbers = (f"{words}: {number}" for words, number in selection.predicted_rows(chosen))
-    return [*notes, *chosen.kept(), *numbers, *record["notes"]]
+
+    notes = [f"{len(poses.joints)} poses for the fit: {words}"]
+    if section.validation:
+        notes.append(f"{validation} random poses for validation")
+    notes += choice.kept()
+    notes += [f"{quantity}: {value}" for quantity, value in selection.predicted_rows(choice)]
+    notes += record["notes"]
+    return notes
 
 
-def _seen_as(measures: str) -> str:
+def _write_pose_lists(session: Session, chain: Chain, q: np.ndarray) -> int:
+    """Write the poses (m, n) for the fit and those for validation, and programs of them for the robot's controller.
+
+    Returns:
+        The number of poses for validation.
+    """
+    lists = {folder.POSES: q}
+    if session.settings.poses.validation:
+        lists[folder.UNSEEN] = _random_poses(session, chain, session.settings.poses.validation)
+    controller = session.settings.robot.controller
+    for name, joints in lists.items():
+        path = write_poses(session.path(f"2-poses/{name}"), joints, chain.joint_names, joint_kinds(chain))
+        if controller:
+            WRITE_PROGRAM.one()(path, path.with_suffix(""), controller)
+    return len(lists.get(folder.UNSEEN, ()))
+
+
+def _selection_kind(measures: str) -> str:
     """Return the kind of measurement for pose selection; an image counts as a pose."""
     return "pose" if measures == IMAGES else measures
 
 
-def _unseen(session: Session, robot_file: Any, chain: Chain, count: int) -> np.ndarray:
+def _random_poses(session: Session, chain: Chain, count: int) -> np.ndarray:
     """Return random poses (count, n) within all limits, independent of the poses chosen for the fit."""
-    if not count:
-        return np.zeros((0, chain.n))
     cell = targets_of(chain, [session.settings.instrument.tool])
-    limits = read_limits(session.named(session.settings.poses.constraints), cell, robot_file)
-    jacobian = observation(cell, _seen_as(session.settings.instrument.measures))
-    space = limits.space(jacobian)
+    limits = read_limits(session.named(session.settings.poses.constraints), cell, session.robot_file)
+    jacobian = observation(cell, _selection_kind(session.settings.instrument.measures))
+    feasible = partial(is_feasible, limits.space(jacobian))
     stream = np.random.default_rng([session.settings.seed, 1])
     if limits.camera is not None:
-        return limits.camera.draw(count, partial(is_feasible, space), limits.lower, limits.upper, stream)
-    q = draw_candidates(limits.lower, limits.upper, count, lambda q: is_feasible(space, q), seed=stream)
+        return limits.camera.draw(count, feasible, limits.lower, limits.upper, stream)
+    q = draw_candidates(limits.lower, limits.upper, count, feasible, seed=stream)
     return same_turn(chain, q, limits.lower, limits.upper)
-
-
-MIN_READBACK_DIFFERENCE = 1e-8  # [rad or m] closer to the commanded joints they were not read back
 
 
 def chain_of(session: Session) -> Chain:
@@ -151,23 +176,26 @@ def chain_of(session: Session) -> Chain:
 
 def _options_of(session: Session, paths: Sequence[Path] = ()) -> FitOptions:
     """Return the fit options; files without a sigma get the instrument's, those (`paths`) without joints the plan's."""
-    instrument, unseen = session.settings.instrument, session.brought("validation")
     options = read_options(session.named(session.settings.fit.options))
-    position, turn = instrument.sigma_position, instrument.sigma_orientation
+    by_file = dict(options.files)
+    if session.settings.poses.plan:
+        validation = session.brought("validation")
+        for path in paths:
+            plan = session.path(f"2-poses/{folder.UNSEEN if path in validation else folder.POSES}")
+            if plan.exists():
+                by_file[path.name] = replace(options.for_file(path), planned=str(plan))
+    by_file = {name: _with_sigma(session, file_options) for name, file_options in by_file.items()}
+    return replace(options, sigma=_with_sigma(session, options).sigma, files=by_file)
 
-    def stated(each: FileOptions) -> FileOptions:
-        sigma = each.sigma
-        if position and sigma.position is None:
-            sigma = replace(sigma, position=(position,) * 3)
-        if turn and sigma.orientation is None:
-            sigma = replace(sigma, orientation=(turn,) * 3)
-        return replace(each, sigma=sigma)
 
-    lists = {path: session.path(f"2-poses/{folder.UNSEEN if path in unseen else folder.POSES}") for path in paths}
-    there = {path: plan for path, plan in lists.items() if session.settings.poses.plan and plan.exists()}
-    own = {path.name: replace(options.for_file(path), planned=str(plan)) for path, plan in there.items()}
-    files = {name: stated(each) for name, each in {**options.files, **own}.items()}
-    return replace(options, sigma=stated(options).sigma, files=files)
+def _with_sigma(session: Session, options: FileOptions) -> FileOptions:
+    """Return a file's options with the instrument's sigmas where they state none."""
+    instrument, sigma = session.settings.instrument, options.sigma
+    if instrument.sigma_position and sigma.position is None:
+        sigma = replace(sigma, position=(instrument.sigma_position,) * 3)
+    if instrument.sigma_orientation and sigma.orientation is None:
+        sigma = replace(sigma, orientation=(instrument.sigma_orientation,) * 3)
+    return replace(options, sigma=sigma)
 
 
 def describe(session: Session, say: Say) -> list[str]:
@@ -182,16 +210,17 @@ def describe(session: Session, say: Say) -> list[str]:
     files.write(session.path(folder.SUMMARY), "\n".join(lines) + "\n")
     if session.geometric:
         return [lines[0]]
-    known = load_calibrated(session.robot_file, **session.links)
+    robot = load_calibrated(session.robot_file, **session.links)
     session.fit.path.mkdir(exist_ok=True)
-    calibrated.write(session.fit.path, replace(known, nominal=known.nominal or known.chain))
+    calibrated.write(session.fit.path, replace(robot, nominal=robot.nominal or robot.chain))
     return [lines[0], "nothing is measured: the geometry of the robot's file is used"]
 
 
 def select(session: Session, say: Say) -> list[str]:
     """Choose poses for the fit, and random ones for validation, and return notes."""
     chain = chain_of(session)
-    for path in (session.path(f"2-poses/{name}") for name in (folder.POSES, folder.UNSEEN)):
+    for name in (folder.POSES, folder.UNSEEN):
+        path = session.path(f"2-poses/{name}")
         if path.exists() and filled_in(path, chain.n):
             raise UsageError(
                 f"{path} contains more than the planned poses and would be overwritten: move measurements to "
@@ -204,9 +233,12 @@ def select(session: Session, say: Say) -> list[str]:
 def arrive(session: Session, say: Say) -> list[str]:
     """Check the measured files for the fit, and return notes."""
     chain = chain_of(session)
-    blocks, again = (read_measured(session, chain, session.brought(kind)) for kind in ("measured", "drift"))
+    blocks = read_measured(session, chain, session.brought("measured"))
+    repeated = read_measured(session, chain, session.brought("drift"))
     notes = notes_on(session, chain, blocks, folder.POSES)
-    notes += lines_of(drift.of_session(session, chain, *([block for _, block in own] for own in (blocks, again))))
+    measured = [block for _, block in blocks]
+    measured_later = [block for _, block in repeated]
+    notes += lines_of(drift.of_session(session, chain, measured, measured_later))
     files.write(session.path(folder.POSES_CHECKED), "\n".join(notes) + "\n")
     return notes
 
@@ -220,65 +252,85 @@ def read_measured(
         MeasurementError: for implausible values, with row and column.
     """
     options = _options_of(session, paths)
-    return [(path.name, block) for path in paths for block in inputs.read_file(path, chain, options, like)]
+    blocks = []
+    for path in paths:
+        blocks += [(path.name, block) for block in inputs.read_file(path, chain, options, like)]
+    return blocks
 
 
 def notes_on(session: Session, chain: Chain, blocks: Sequence[tuple[str, PoseMeasurements]], plan: str) -> list[str]:
     """Return the notes on measured blocks: rows, kind, ignored columns, poses missing from a list in ``2-poses``."""
-    measures, notes, path = session.settings.instrument.measures, [], session.path(f"2-poses/{plan}")
+    measures = session.settings.instrument.measures
+    path = session.path(f"2-poses/{plan}")
     planned = None
     if session.settings.poses.plan and path.exists():
         planned = read_poses(path, Joints(chain.joint_names, joint_kinds(chain)))
+    notes = []
     for name, block in blocks:
         ignored = f", ignored: {', '.join(block.ignored)}" if block.ignored else ""
-        found = [f"{len(block)} rows of kind {block.kind}{ignored}"]
+        remarks = [f"{len(block)} rows of kind {block.kind}{ignored}"]
         if measures == Poses.kind and isinstance(block, Positions) and not isinstance(block, Poses):
-            found.append("only positions, although the instrument measures poses")
+            remarks.append("only positions, although the instrument measures poses")
         if block.kind == IMAGES:
-            found.append(image_words(block))
+            remarks.append(image_words(block))
         elif measures == IMAGES:
-            found.append("contains no images, although the instrument is a camera; the file is fitted nevertheless")
-        found += block.notes
+            remarks.append("contains no images, although the instrument is a camera; the file is fitted nevertheless")
+        remarks += block.notes
         if planned is not None:
-            found += [*check_against(planned, block), *lines_of(readback(planned, block))]
-        notes += [(Warned if isinstance(note, Warned) else str)(f"{name}: {note}") for note in found]
-    return notes if planned is None else [*notes, *unmeasured(planned, [block for _, block in blocks])]
+            remarks += check_against(planned, block)
+            remarks += lines_of(readback(planned, block))
+        for remark in remarks:
+            note = f"{name}: {remark}"
+            notes.append(Warned(note) if isinstance(remark, Warned) else note)
+    if planned is not None:
+        notes += unmeasured(planned, [block for _, block in blocks])
+    return notes
 
 
 def readback(plan: np.ndarray, measured: PoseMeasurements) -> list[Finding]:
     """Return findings on measured minus planned joint values (m, n) [rad or m]; empty if no pose was planned."""
-    distance, index = (np.atleast_1d(found) for found in KDTree(plan).query(measured.q, p=np.inf))
+    distance, index = KDTree(plan).query(measured.q, p=np.inf)
+    distance, index = np.atleast_1d(distance), np.atleast_1d(index)
     close = distance <= MAX_JOINT_DIFFERENCE
     if not close.any():
         return []
-    off = np.abs(measured.q[close] - plan[index[close]])
-    if off.max() < MIN_READBACK_DIFFERENCE:
+    difference = np.abs(measured.q[close] - plan[index[close]])
+    if difference.max() < MIN_READBACK_DIFFERENCE:
         return [finding("readback-copied")]
-    joint = measured.joint_names[int(np.argmax(off.max(axis=0)))]
-    return [finding("readback", rms=np.sqrt(np.mean(off**2)), largest=off.max(), joint=joint)]
+    joint = measured.joint_names[int(np.argmax(difference.max(axis=0)))]
+    rms = np.sqrt(np.mean(difference**2))
+    return [finding("readback", rms=rms, largest=difference.max(), joint=joint)]
 
 
 def _fit_settings(session: Session) -> FitSettings:
     """Return the fit settings of ``session.toml``; a value ``auto`` leaves the choice to the options file."""
-    section, masses = session.settings.fit, session.path(folder.MASSES)
-    model, loss = (None if value == "auto" else value for value in (section.model, section.loss))
-    return FitSettings(
-        model=model,
-        loss=loss,
+    section = session.settings.fit
+    masses = ""
+    if (session.path(folder.MASSES) / MODEL).is_file():
+        masses = str(session.path(folder.MASSES))
+    settings = FitSettings(
         stations=section.stations,
         tolerance=1e-3 * section.tolerance_mm or None,
         refit_frames=section.validation_frames == "own",
         seed=session.settings.seed,
         holdout=section.holdout,
         deliverable=section.deliverable,
-        masses=str(masses) if (masses / MODEL).is_file() else "",
+        masses=masses,
     )
+    if section.model != "auto":
+        settings = replace(settings, model=section.model)
+    if section.loss != "auto":
+        settings = replace(settings, loss=section.loss)
+    return settings
 
 
 def _gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
     """Return the inputs of the fit: robot, measurements, and the given validation files."""
-    chain, links, measured = chain_of(session), session.links, session.brought("measured")
-    if is_urdf(session.robot_file):  # whatever joints the files' columns name
+    measured = session.brought("measured")
+    links = session.links
+    # the same links whatever joints the files' columns name
+    if is_urdf(session.robot_file):
+        chain = chain_of(session)
         links = {"base": chain.base, "tip": chain.tip}
     return inputs.gather(
         session.robot_file,
@@ -293,34 +345,47 @@ def _gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
 def fit(session: Session, say: Say) -> list[str]:
     """Fit the geometry to the measured files; validation files are not used."""
     poses = session.path(f"2-poses/{folder.POSES}")
-    selection = read_prediction(poses) if session.settings.poses.plan and beside(poses).exists() else None
-    outcome = fitting.run(_gathered(session), _options_of(session), _fit_settings(session), say, selection)
+    predicted = None
+    if session.settings.poses.plan and beside(poses).exists():
+        predicted = read_prediction(poses)
+    outcome = fitting.run(_gathered(session), _options_of(session), _fit_settings(session), say, predicted)
+    # the session judges on unseen rows
     outcome = replace(outcome, assessment=replace(outcome.assessment, verdict=UNJUDGED, deliverables={}))
     draw = partial(write_fit, plots=session.plots, pages=False)
     outputs.write_folder(outcome, session.fit.path, draw, owned=True)
+
     metrics = session.fit.metrics()
-    words = f"model {metrics.model}: {error_words(metrics)}; {parameter_words(metrics)}"
-    advice = () if outcome.selection.loss != "none" else ('check these rows, or set loss = "cauchy" in session.toml',)
-    outliers = ["; ".join((line, *advice)) for line in outlier_sentences(metrics)]
-    return [words, *outcome.warnings, *outliers]
+    notes = [f"model {metrics.model}: {error_words(metrics)}; {parameter_words(metrics)}", *outcome.warnings]
+    for sentence in outlier_sentences(metrics):
+        if outcome.selection.loss == "none":
+            sentence += '; check these rows, or set loss = "cauchy" in session.toml'
+        notes.append(sentence)
+    return notes
 
 
 def validate(session: Session, say: Say) -> list[str]:
     """Validate the fitted robot on unseen poses, as `calib fit` does with validation files."""
-    chain, unseen, fit, out = chain_of(session), session.brought("validation"), session.fit, session.validation
-    before, report = fit.metrics(), fit_report.read(fit.report)
-    like = _gathered(session).fit if any(path.is_dir() for path in unseen) else ()
+    chain, unseen = chain_of(session), session.brought("validation")
+    metrics, report = session.fit.metrics(), fit_report.read(session.fit.report)
+    # images are read with the lens and board of those of the fit
+    like: Sequence[PoseMeasurements] = ()
+    if any(path.is_dir() for path in unseen):
+        like = _gathered(session).fit
     notes = notes_on(session, chain, read_measured(session, chain, unseen, like), folder.UNSEEN)
+
     say("comparing on unseen poses")
-    given, options, wanted = _gathered(session, unseen), _options_of(session), _fit_settings(session)
-    settings = fitting.weighing_settings(options, wanted)
-    asked = replace(wanted, model=wanted.model or options.model)
-    found = assess(fit.arms(given, settings), given, fit.findings(), settings, asked)
-    rows = [fit_report.rows_of(name, each, each.proves) for name, each in found.validation.items()]
-    written = out.write(found, given, rows)
-    fit_report.write(report.with_unseen(written, rows), out.report)
-    fresh = [words for words in found.warnings if words not in before.warnings]
-    return [*notes, str(found.verdict), *fresh]
+    gathered, options, fit_settings = _gathered(session, unseen), _options_of(session), _fit_settings(session)
+    weighing = fitting.weighing_settings(options, fit_settings)
+    fit_settings = replace(fit_settings, model=fit_settings.model or options.model)
+    arms = session.fit.arms(gathered, weighing)
+    assessment = assess(arms, gathered, session.fit.findings(), weighing, fit_settings)
+    rows = []
+    for name, comparison in assessment.validation.items():
+        rows.append(fit_report.rows_of(name, comparison, comparison.proves))
+    validation_metrics = session.validation.write(assessment, gathered, rows)
+    fit_report.write(report.with_unseen(validation_metrics, rows), session.validation.report)
+    new_warnings = [warning for warning in assessment.warnings if warning not in metrics.warnings]
+    return [*notes, str(assessment.verdict), *new_warnings]
 
 
 def export(session: Session, say: Say) -> list[str]:
@@ -328,16 +393,26 @@ def export(session: Session, say: Say) -> list[str]:
     from calib.procedure.export.delivery import by_file, mark, prediction
 
     out = session.path(session.export)
-    lines = _exported(session, out, say)
-    found = session.verdicts()
-    judged = {name: one.table() for name, one in by_file(out, found).items() if one.level}
-    whole = {"schema": 1, **found.table(), "deliverable": session.settings.fit.deliverable, "files": judged}
-    known = prediction(out)
-    files.write_json(session.path(folder.VERDICT), whole | {"exported_prediction": known and asdict(known)})
-    return [*mark(out, found), *lines]
+    lines = _deliver(session, out, say)
+    verdicts = session.verdicts()
+    files_table = {}
+    for name, file_verdicts in by_file(out, verdicts).items():
+        if file_verdicts.level:
+            files_table[name] = file_verdicts.table()
+    predicted = prediction(out)
+    table = {
+        "schema": 1,
+        **verdicts.table(),
+        "deliverable": session.settings.fit.deliverable,
+        "files": files_table,
+        "exported_prediction": predicted and asdict(predicted),
+    }
+    files.write_json(session.path(folder.VERDICT), table)
+    return [*mark(out, verdicts), *lines]
 
 
-def _exported(session: Session, out: Path, say: Say) -> list[str]:
+def _deliver(session: Session, out: Path, say: Say) -> list[str]:
+    """Write the exported files of the session's stages; without the dynamics if they cannot be exported."""
     from calib.procedure.export.delivery import FILES, Export, deliver
 
     if not session.geometric:
@@ -345,16 +420,22 @@ def _exported(session: Session, out: Path, say: Say) -> list[str]:
     if not session.dynamic:
         return deliver(Export(session.robot_file, session.fit.path), out)
     say("physically consistent parameters")
-    for name in FILES:  # a second robot.urdf, by earlier versions
-        (out / "dynamics" / name.name).unlink(missing_ok=True)
-    with suppress(OSError):  # not there, or not empty
+    # earlier versions wrote a second robot.urdf
+    for file in FILES:
+        (out / "dynamics" / file.name).unlink(missing_ok=True)
+    # not there, or not empty
+    with suppress(OSError):
         (out / "dynamics").rmdir()
-    whole = Export(session.robot_file, session.fit.path if session.geometric else None, session.identification.path)
+    fitted = session.fit.path if session.geometric else None
+    robot = Export(session.robot_file, fitted, session.identification.path)
     try:
-        return deliver(whole, out)
-    except CalibError as error:  # the geometry stands by itself
-        alone = deliver(replace(whole, identified=None), out) if session.geometric else [calibrated.ROBOT]
-        return [*alone, f"the dynamics were not exported: {error}"]
+        return deliver(robot, out)
+    except CalibError as error:
+        # the geometry stands by itself
+        lines = [calibrated.ROBOT]
+        if session.geometric:
+            lines = deliver(replace(robot, identified=None), out)
+        return [*lines, f"the dynamics were not exported: {error}"]
 
 
 def clear_staging(session: Session) -> None:

@@ -14,23 +14,30 @@ from calib.config_types import OneOf, Real
 from calib.data.images.board import read_board
 from calib.data.images.lens import read_lens
 from calib.data.poses import BOARD, IMAGES, IN_HAND, TO_HAND
-from calib.errors import UsageError, one_of, refused_as, require
+from calib.errors import CalibError, UsageError, one_of, refused_as, require
 from calib.procedure.answers import CAMERA, CELL, Answers, CertificateSection
 from calib.procedure.measuring.constraints_file import AXES, ConstraintsFile
 from calib.procedure.session.settings import NOTHING, InstrumentSection
 from calib.robot.library import resolve
 from calib.transforms import pose, to_xyz_rpy
 
-MAX_MASS = 2000.0  # [kg]: of a payload (our choice)
+# of a payload [kg] (our choice)
+MAX_MASS = 2000.0
+# answers for what is not known, and for what does not exist
+UNSAID = ("", "unknown", "not known", "?", "-")
 
-
-INSTRUMENTS = {  # starting values in ``session.toml``; a sigma of 0 is estimated from the residuals
-    "cmm": InstrumentSection("optical CMM", "pose", 60e-6, 0.2e-3),  # Nikon K610: 60 µm volumetric; turn: our guess
-    "tracker": InstrumentSection("laser tracker", "position", 20e-6),  # about 15 µm + 6 µm/m in a small cell: our guess
-    "tracker6d": InstrumentSection("laser tracker, 6-D probe", "pose", 30e-6, 0.1e-3),  # our guess
+# starting values in ``session.toml``; a sigma of 0 is estimated from the residuals
+INSTRUMENTS = {
+    # Nikon K610: 60 µm volumetric; turn: our guess
+    "cmm": InstrumentSection("optical CMM", "pose", 60e-6, 0.2e-3),
+    # about 15 µm + 6 µm/m in a small cell: our guess
+    "tracker": InstrumentSection("laser tracker", "position", 20e-6),
+    # our guess
+    "tracker6d": InstrumentSection("laser tracker, 6-D probe", "pose", 30e-6, 0.1e-3),
     "mocap": InstrumentSection("motion capture", "pose"),
     "camera": InstrumentSection("camera and board", "pixels"),
-    "camera-poses": InstrumentSection("camera and board", "pose"),  # by another program
+    # determined by another program
+    "camera-poses": InstrumentSection("camera and board", "pose"),
     "none": InstrumentSection("no instrument", NOTHING),
     "other-pose": InstrumentSection("instrument", "pose"),
     "other-position": InstrumentSection("instrument", "position"),
@@ -46,9 +53,11 @@ def instrument_named(name: str) -> InstrumentSection:
     return INSTRUMENTS[one_of(name, INSTRUMENTS, "instrument", UsageError)]
 
 
-def _measures(given: Answers) -> str:
+def _measures(answers: Answers) -> str:
     """Return what the instrument in the answers measures; "" if the instrument is unknown."""
-    return INSTRUMENTS[given.instrument].measures if given.instrument in INSTRUMENTS else ""
+    if answers.instrument not in INSTRUMENTS:
+        return ""
+    return INSTRUMENTS[answers.instrument].measures
 
 
 @dataclass(frozen=True)
@@ -65,31 +74,43 @@ class Question:
         about = described(self.of)[self.name]
         return f"{self.name.replace('_', ' ')} ({about})" if self.of is Answers else f"{about} (Enter: by hand, later)"
 
-    def open(self, given: Answers) -> bool:
+    def open(self, answers: Answers) -> bool:
         """Return whether the question still needs an answer, given the earlier answers."""
         if self.of is CertificateSection:
-            return bool(given.details) and not getattr(given.certificate, self.name)
-        if getattr(given, self.name) not in (None, ()) or (self.name in CELL and given.limits is not None):
+            return bool(answers.details) and not getattr(answers.certificate, self.name)
+        if getattr(answers, self.name) not in (None, ()):
             return False
-        camera, nothing = _measures(given) == IMAGES, _measures(given) == NOTHING
+        # a limits file describes the cell
+        if self.name in CELL and answers.limits is not None:
+            return False
+        measures = _measures(answers)
+        camera, nothing = measures == IMAGES, measures == NOTHING
         match self.name:
             case "tool" | "instrument_at":
                 return not camera and not nothing
             case "limits":
-                return not given.cell
+                return not answers.cell
             case "cone" | "facing":
-                return "instrument" in cell_tables(instrument_at=given.instrument_at)
+                return "instrument" in cell_tables(instrument_at=answers.instrument_at)
             case "mounting":
                 return camera
             case "lens" | "board" | "carried" | "stands":
-                return camera and (given.mounting or "").lower() not in UNSAID
+                return camera and (answers.mounting or "").lower() not in UNSAID
             case "dynamics":
                 return not nothing
             case "torques" | "payloads" | "tolerance_percent":
-                return given.dynamics is not False
+                return answers.dynamics is not False
             case "tolerance_mm" | "program":
                 return not nothing
         return True
+
+
+def _questions() -> tuple[Question, ...]:
+    """Return all questions in their order: those on the session, then those on its certificate."""
+    names = [answer.name for answer in fields(Answers) if answer.name != "certificate"]
+    questions = [Question(name, DEFAULTS.get(name, "unknown")) for name in names]
+    questions += [Question(entry.name, "", CertificateSection) for entry in fields(CertificateSection)]
+    return tuple(questions)
 
 
 DEFAULTS = {
@@ -106,86 +127,98 @@ DEFAULTS = {
     "tolerance_percent": "0",
     "details": "yes",
 }
-QUESTIONS = (
-    *(Question(one.name, DEFAULTS.get(one.name, "unknown")) for one in fields(Answers) if one.name != "certificate"),
-    *(Question(one.name, "", CertificateSection) for one in fields(CertificateSection)),
-)
+QUESTIONS = _questions()
 
 
-def with_answer(given: Answers, question: Question, text: str) -> Answers:
+def with_answer(answers: Answers, question: Question, text: str) -> Answers:
     """Return the answers with the text of one more answer added, after checking it.
 
     Raises:
         UsageError: for an invalid answer, with the valid form.
     """
-    name, empty = question.name, text.lower() in ("", "none", "-")
+    name = question.name
     if question.of is CertificateSection:
         entry = getattr(parse(CertificateSection, {name: text}, ""), name)
-        return replace(given, certificate=replace(given.certificate, **{name: entry}))
-    said = {"y": True, "n": False}.get(text[:1].lower(), text)
-    values: dict[str, Any] = {
-        "tool": text.split(","),
-        "limits": None if empty else text,
-        "payloads": [] if empty else text.split(),
-        "obstacles": [text],
-        "dynamics": said,
-        "details": said,
-    }
-    found = replace(given, **{name: getattr(parse(Answers, {name: values.get(name, text)}, ""), name)})
+        return replace(answers, certificate=replace(answers.certificate, **{name: entry}))
+
+    value: Any = text
+    is_empty = text.lower() in ("", "none", "-")
+    match name:
+        case "tool":
+            value = text.split(",")
+        case "limits":
+            value = None if is_empty else text
+        case "payloads":
+            value = [] if is_empty else text.split()
+        case "obstacles":
+            value = [text]
+        case "dynamics" | "details":
+            value = {"y": True, "n": False}.get(text[:1].lower(), text)
+    result = replace(answers, **{name: getattr(parse(Answers, {name: value}, ""), name)})
     if name == "robot":
         require(text, "a robot is needed", UsageError)
         resolve(text)
-    checked(replace(found, robot=found.robot or "", instrument=found.instrument or "tracker"))
-    return found
+    # what is not answered yet is no error
+    checked(replace(result, robot=result.robot or "", instrument=result.instrument or "tracker"))
+    return result
 
 
-def checked(given: Answers) -> dict[str, Any]:
+def checked(answers: Answers) -> dict[str, Any]:
     """Return the arguments of `calib.procedure.session.commands.new_session` from checked answers.
 
     Raises:
         UsageError: for an invalid answer.
     """
-    robot, instrument = given.robot, given.instrument
+    robot, instrument = answers.robot, answers.instrument
     require(robot is not None and instrument is not None, "a robot and an instrument are needed", UsageError)
     instrument_named(instrument or "")
-    stated = next((name for name in CAMERA if getattr(given, name) is not None), None)
-    require(
-        _measures(given) == IMAGES or not stated,
-        f"--{stated} applies to a camera that takes images; the instrument is {instrument}",
-    )
-    dynamics = given.dynamics is not False
-    words = "--payload and --torques apply to the dynamics, which --geometry-only excludes"
-    require(dynamics or not (given.payloads or given.torques), words, UsageError)
-    result = {"robot": robot, "instrument": instrument, "dynamics": dynamics, "limits": given.limits}
-    if given.limits is not None:
-        require(given.limits.exists(), f"--limits {given.limits}: no such file", UsageError)
-        option = next(iter(given.cell), "").replace("_", "-").replace("obstacles", "obstacle")
-        words = f"--{option} and --limits both describe the cell; put it into {given.limits}"
-        require(not given.cell, words, UsageError)
+    of_camera = [name for name in CAMERA if getattr(answers, name) is not None]
+    if of_camera and _measures(answers) != IMAGES:
+        raise CalibError(f"--{of_camera[0]} applies to a camera that takes images; the instrument is {instrument}")
+    dynamics = answers.dynamics is not False
+    if not dynamics and (answers.payloads or answers.torques):
+        raise UsageError("--payload and --torques apply to the dynamics, which --geometry-only excludes")
+
+    limits: Path | dict[str, Any] | None = answers.limits
+    if answers.limits is None:
+        limits = cell_tables(**answers.cell) or None
     else:
-        result["limits"] = cell_tables(**given.cell) or None
-    others = {"payloads": dict(map(_payload, given.payloads)), "certificate": asdict(given.certificate)}
-    others |= {
-        name: getattr(given, name) for name in ("tool", "program", "torques", "tolerance_mm", "tolerance_percent")
+        require(answers.limits.exists(), f"--limits {answers.limits}: no such file", UsageError)
+        if answers.cell:
+            first = next(iter(answers.cell))
+            option = first.replace("_", "-").replace("obstacles", "obstacle")
+            raise UsageError(f"--{option} and --limits both describe the cell; put it into {answers.limits}")
+
+    optional = {
+        "payloads": dict(map(_payload, answers.payloads)),
+        "certificate": asdict(answers.certificate),
+        "tool": answers.tool,
+        "program": answers.program,
+        "torques": answers.torques,
+        "tolerance_mm": answers.tolerance_mm,
+        "tolerance_percent": answers.tolerance_percent,
     }
-    return result | {name: value for name, value in others.items() if value and value != NONE}
+    result = {"robot": robot, "instrument": instrument, "dynamics": dynamics, "limits": limits}
+    return result | {name: value for name, value in optional.items() if value and value != NONE}
 
 
 def _payload(text: str) -> tuple[str, float]:
+    """Return label and mass [kg] of a payload given as ``label=kg``."""
     label, _, mass = text.partition("=")
     try:
         value = float(mass.removesuffix("kg"))
     except ValueError:
         value = float("nan")
-    words = f"--payload {text}: expected label=kg, e.g. loaded=3.28 (the label goes into the file's name)"
-    require(label.isidentifier() and 0.0 < value < MAX_MASS, words, UsageError)
+    if not label.isidentifier() or not 0.0 < value < MAX_MASS:
+        raise UsageError(f"--payload {text}: expected label=kg, e.g. loaded=3.28 (the label goes into the file's name)")
     return label, value
 
 
-UNSAID = ("", "unknown", "not known", "?", "-")
 NONE = "none"
-MAX_FAR, MAX_WIDE, MAX_HELD = 100.0, 10.0, 3.0  # [m]: of an instrument, a cell, a tool; beyond, numbers are millimetres
-ABSENT = {"instrument_at": "instrument", "box": "box", "obstacles": "obstacles"}  # what "none" says is not there
+# [m]: of an instrument, a cell, a tool; beyond, numbers are millimetres
+MAX_FAR, MAX_WIDE, MAX_HELD = 100.0, 10.0, 3.0
+# what the answer "none" says is not there
+ABSENT = {"instrument_at": "instrument", "box": "box", "obstacles": "obstacles"}
 
 
 def cell_tables(**answers: str | Sequence[str] | None) -> dict[str, Any]:
@@ -200,25 +233,36 @@ def cell_tables(**answers: str | Sequence[str] | None) -> dict[str, Any]:
     Raises:
         UsageError: for an invalid answer, with the valid form.
     """
-    texts = {name: text if isinstance(text, str) else ";".join(text or ()) for name, text in answers.items()}
-    found: dict[str, Any] = {}
-    if absent := [ABSENT[name] for name, text in texts.items() if name in ABSENT and _plain(text) == NONE]:
-        found["without"] = absent
-    known = {name: text.strip() for name, text in texts.items() if _plain(text) not in (*UNSAID, NONE)}
-    require("cone" not in known or "instrument_at" in known, "--cone needs --instrument-at, too", UsageError)
-    for name, text in known.items():
-        place, read = _KEYS[name]
-        table, _, key = place.partition(".")
+    texts = {}
+    absent = []
+    for name, answer in answers.items():
+        text = answer if isinstance(answer, str) else ";".join(answer or ())
+        if name in ABSENT and _plain(text) == NONE:
+            absent.append(ABSENT[name])
+        if _plain(text) not in (*UNSAID, NONE):
+            texts[name] = text.strip()
+    require("cone" not in texts or "instrument_at" in texts, "--cone needs --instrument-at, too", UsageError)
+
+    tables: dict[str, Any] = {}
+    if absent:
+        tables["without"] = absent
+    for name, text in texts.items():
+        path, read = _KEYS[name]
+        table, _, key = path.partition(".")
         try:
-            value = read(text, known) if name in ("carried", "stands") else read(text)
-        except ValueError as wrong:
-            option = name.removesuffix("s") if name == "obstacles" else name
-            raise UsageError(f"--{option.replace('_', '-')} {text}: {wrong}, or unknown") from None
-        found[table] = found.get(table, {}) | {key: value} if key else value
-    if "camera" in found:
-        found["camera"] = dict.fromkeys(CAMERA, "unknown") | found["camera"]
-    parse(ConstraintsFile, found, "the cell")
-    return found
+            # the placement of camera and board depends on which of them the arm carries
+            value = read(text, texts) if name in ("carried", "stands") else read(text)
+        except ValueError as error:
+            option = "obstacle" if name == "obstacles" else name.replace("_", "-")
+            raise UsageError(f"--{option} {text}: {error}, or unknown") from None
+        if key:
+            tables[table] = tables.get(table, {}) | {key: value}
+        else:
+            tables[table] = value
+    if "camera" in tables:
+        tables["camera"] = dict.fromkeys(CAMERA, "unknown") | tables["camera"]
+    parse(ConstraintsFile, tables, "the cell")
+    return tables
 
 
 def _plain(text: str) -> str:
@@ -232,31 +276,39 @@ def _lengths(text: str, count: int, most: float, expected: str = "x,y,z in metre
 
 
 def _direction(text: str) -> Any:
+    """Return the name of an axis, or a direction of three numbers."""
+    if text.lower() in AXES:
+        return text.lower()
     with refused_as(ValueError, ValueError, f"expected {', '.join(AXES)}, or three numbers"):
-        return text.lower() if text.lower() in AXES else [Real(quantity="1").read(part) for part in text.split(",")]
+        return [Real(quantity="1").read(part) for part in text.split(",")]
 
 
 def _box(text: str) -> list[list[float]]:
+    """Return the ranges along x, y and z of a box around the robot [m]."""
     sides = _lengths(text, 6, MAX_WIDE, "x,x,y,y,z,z in metres, the smaller one first")
     ranges = [sides[k : k + 2] for k in (0, 2, 4)]
     if any(low >= high for low, high in ranges):
         raise ValueError("expected x,x,y,y,z,z in metres, the smaller one first")
-    if not all(low <= 0.0 <= high for low, high in ranges[:2]):
+    horizontal = ranges[:2]
+    if not all(low <= 0.0 <= high for low, high in horizontal):
         raise ValueError("the robot's base, at 0,0, is outside the box; coordinates are in the base frame")
     return ranges
 
 
 def _obstacles(text: str) -> list[dict[str, Any]]:
+    """Return the tables of obstacles, given as texts between semicolons."""
     form = "NAME box|sphere|cylinder SIZES at X,Y,Z in metres, e.g. table box 1.2,0.8,0.05 at 0.7,0,-0.03"
-    result = []
-    for each in text.split(";"):
-        words = each.replace(" at ", " ").split()
-        if _plain(each) in (*UNSAID, NONE):
+    length = Real(above=0, most=MAX_WIDE, unit="m", quantity="length")
+    tables = []
+    for obstacle in text.split(";"):
+        if _plain(obstacle) in (*UNSAID, NONE):
             continue
-        require(len(words) == 4, f"expected {form}", ValueError)
-        sizes = [Real(above=0, most=MAX_WIDE, unit="m", quantity="length").read(part) for part in words[2].split(",")]
-        result.append({"name": words[0], "kind": words[1], "size": sizes, "xyz": _lengths(words[3], 3, MAX_WIDE)})
-    return result
+        parts = obstacle.replace(" at ", " ").split()
+        require(len(parts) == 4, f"expected {form}", ValueError)
+        name, kind, sizes, position = parts
+        size = [length.read(part) for part in sizes.split(",")]
+        tables.append({"name": name, "kind": kind, "size": size, "xyz": _lengths(position, 3, MAX_WIDE)})
+    return tables
 
 
 def _mounting(text: str) -> str:
@@ -272,29 +324,37 @@ def _file(read: Callable[[Path], object], text: str) -> str:
     return str(path)
 
 
-def _turned(name: str, most: float, text: str, known: dict[str, str]) -> dict[str, list[float]]:
+def _turned(name: str, most: float, text: str, answers: dict[str, str]) -> dict[str, list[float]]:
     """Return a placement with z along the viewing direction: the camera's, or opposite to the board's normal."""
     require(
-        "mounting" in known,
+        "mounting" in answers,
         "it is not known whether the arm carries the camera or the board; give --mounting, too",
         ValueError,
     )
-    looks = (_mounting(known["mounting"]) == IN_HAND) == (name == "carried")
-    spot, _, way = text.partition("facing")
-    if not way.strip() and name == "stands":
+    position, _, facing = text.partition("facing")
+    if not facing.strip() and name == "stands":
         raise ValueError("expected x,y,z in metres and a direction, e.g. 0.5,0,0 facing z")
-    direction = _direction(way.strip() or "z")
-    along = np.array(AXES[direction] if isinstance(direction, str) else direction)
-    if along.shape != (3,) or not along.any():
+    direction = _direction(facing.strip() or "z")
+    axis = np.array(AXES[direction] if isinstance(direction, str) else direction)
+    if axis.shape != (3,) or not axis.any():
         raise ValueError("expected an axis of the frame (x, -z …) or three numbers after facing")
-    turn = Rotation.align_vectors([along if looks else -along], [[0.0, 0.0, 1.0]])[0].as_matrix()
-    xyz, rpy = to_xyz_rpy(pose(turn, _lengths(spot.strip(), 3, most)))
+    # the board looks against its normal
+    is_camera = (_mounting(answers["mounting"]) == IN_HAND) == (name == "carried")
+    if not is_camera:
+        axis = -axis
+    rotation, _ = Rotation.align_vectors([axis], [[0.0, 0.0, 1.0]])
+    xyz, rpy = to_xyz_rpy(pose(rotation.as_matrix(), _lengths(position.strip(), 3, most)))
     return {"xyz": [float(x) for x in xyz], "rpy": [round(float(x), 6) for x in rpy]}
+
+
+def _cone(text: str) -> str:
+    """Return the half angle of a cone with its unit; without one it is in degrees."""
+    return text if any(map(str.isalpha, text)) else f"{text} deg"
 
 
 _KEYS: dict[str, tuple[str, Any]] = {  # of the limits file, and how the answer is read
     "instrument_at": ("instrument.xyz", partial(_lengths, count=3, most=MAX_FAR)),
-    "cone": ("instrument.sight", lambda text: text if any(map(str.isalpha, text)) else f"{text} deg"),
+    "cone": ("instrument.sight", _cone),
     "facing": ("target.facing", _direction),
     "box": ("collision.box", _box),
     "obstacles": ("obstacle", _obstacles),

@@ -7,8 +7,13 @@ from calib.errors import UsageError, require
 from calib.procedure.session.folder import SETTINGS, Session
 
 
+def _on_this_machine(address: str) -> list[str]:
+    """Return no addresses: a path on this machine names one folder."""
+    return []
+
+
 def folders_of(
-    given: str | Path | Sequence[str | Path], elsewhere: Callable[[str], list[str]] = lambda address: []
+    given: str | Path | Sequence[str | Path], elsewhere: Callable[[str], list[str]] = _on_this_machine
 ) -> list[Path | str]:
     """Return the folders of sessions or fits, given as one or several folders, ``session.toml`` files or addresses.
 
@@ -19,25 +24,34 @@ def folders_of(
     Raises:
         UsageError: for a duplicate, or an empty list.
     """
-    found = list[Path | str]()
-    for each in [given] if isinstance(given, (str, Path)) else given:
-        path = Path(each)
-        found += elsewhere(str(each)) or [path.parent if path.name == SETTINGS else path]
-    real = [one.resolve() if isinstance(one, Path) else one for one in found]
-    twice = [path for path, own in zip(found, real) if real.count(own) > 1]
-    require(not twice, f"{next(iter(twice), '')} is given twice", UsageError)
-    require(found, "no session given; give folders or their session.toml", UsageError)
-    return found
+    names = [given] if isinstance(given, (str, Path)) else given
+    folders: list[Path | str] = []
+    for name in names:
+        path = Path(name)
+        if path.name == SETTINGS:
+            path = path.parent
+        folders += elsewhere(str(name)) or [path]
+
+    resolved = [folder.resolve() if isinstance(folder, Path) else folder for folder in folders]
+    for folder, target in zip(folders, resolved):
+        require(resolved.count(target) == 1, f"{folder} is given twice", UsageError)
+    require(folders, "no session given; give folders or their session.toml", UsageError)
+    return folders
 
 
 def position_errors(session: Session) -> tuple[float, float] | None:
     """Return the rms errors of nominal and calibrated robot on the worst unseen poses [mm]; None without such."""
     if not session.geometric:
         return None
-    found = session.validation.metrics()
-    pairs = [(one.nominal.main, one.judged(found.deliverable).main) for one in found.validation.values()]
-    rms = [(before.rms, after.rms) for before, after in pairs if before is not None and after is not None]
-    return max(rms, key=lambda pair: pair[1], default=None)
+    metrics = session.validation.metrics()
+    worst = None
+    for rows in metrics.validation.values():
+        before, after = rows.nominal.main, rows.judged(metrics.deliverable).main
+        if before is None or after is None:
+            continue
+        if worst is None or after.rms > worst[1]:
+            worst = before.rms, after.rms
+    return worst
 
 
 def torque_error(session: Session) -> float | None:
@@ -45,4 +59,5 @@ def torque_error(session: Session) -> float | None:
     if not session.dynamic:
         return None
     unseen = session.identification.unseen.read()
-    return max((one.judged.total for one in (unseen.validation or unseen.fit).values()), default=None)
+    scores = unseen.validation or unseen.fit
+    return max((score.judged.total for score in scores.values()), default=None)

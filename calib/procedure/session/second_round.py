@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calib.errors import CalibError, command_line, listing
-from calib.folders import read_estimate
+from calib.folders import ESTIMATE, REPORT, read_estimate
 from calib.procedure.excitation import design, prediction
 from calib.procedure.excitation import folder as motion_folder
 from calib.procedure.excitation.coefficients import RUN, SAMPLES
@@ -215,8 +215,8 @@ STEP = SessionStep(
         FITTED_ROBOT,
         NamedFile("dynamics", "limits"),
         IDENTIFY_OPTIONS,
-        SessionFile("8-dynamics/estimate.csv"),
-        SessionFile("8-dynamics/unseen/report.json"),
+        SessionFile(f"8-dynamics/{ESTIMATE}"),
+        SessionFile(f"8-dynamics/unseen/{REPORT}"),
     ),
     makes=(f"6-excitation/{ROUND}*/*",),
     settings=(

@@ -41,12 +41,20 @@ from calib.procedure.kinematic_stage.settings import (
     Stations,
 )
 
+# version of ``session.toml``, and those that can be read: a session of schema 1 knows no dynamics; it goes on as
+# geometry alone
 SCHEMA = 2
-READ = (1, SCHEMA)  # a session of schema 1 knows no dynamics; it goes on as geometry alone
-NOTHING = "nothing"  # is measured: the geometry is taken as it is described
-MAX_SAMPLES = 20_000_000  # of a designed motion (our choice): 160 MB per joint and derivative
+READABLE_SCHEMAS = (1, SCHEMA)
+# is measured: the geometry is taken as it is described
+NOTHING = "nothing"
+# of a designed motion (our choice): 160 MB per joint and derivative
+MAX_SAMPLES = 20_000_000
+# letters of a file's name
+MAX_NAME = 200
+# where comments begin and end
+COLUMN, WIDTH = 41, 118
+
 FILES = ("robot.file", "poses.constraints", "fit.options", "dynamics.limits", "dynamics.options")
-COLUMN, WIDTH = 41, 118  # where comments begin and end
 _HEAD = (
     "A calibration session; see `calib status` and `calib next`. Lengths in m, angles in rad.",
     "All values may be changed: steps that depend on a changed value become stale and are repeated.",
@@ -55,7 +63,9 @@ _HEAD = (
 
 def _beside(value: Any) -> Any:
     """Check that a name is a valid relative path, and return it."""
-    if isinstance(value, str) and (PurePath(value).is_absolute() or len(value) > 200 or "\0" in value):
+    if not isinstance(value, str):
+        return value
+    if PurePath(value).is_absolute() or len(value) > MAX_NAME or "\0" in value:
         raise ValueError(f"expected a file next to session.toml, found {shown(value)}; copy it there and give its name")
     return value
 
@@ -253,30 +263,30 @@ def read_settings(path: Path) -> SessionSettings:
     check_schema(path, table.get("schema"))
     if table["schema"] == 1:
         table.setdefault("dynamics", {"wanted": False})
-    found = parse(SessionSettings, table, str(path), SessionError)
+    settings = parse(SessionSettings, table, str(path), SessionError)
     for key in FILES:
-        name = attrgetter(key)(found)
+        name = attrgetter(key)(settings)
         if name and (path.parent / name).is_dir():
             raise SessionError(f"{path}: {key}: expected a file, found the folder '{name}'")
-    return found
+    return settings
 
 
-def check_schema(path: Path, found: Any) -> None:
+def check_schema(path: Path, schema: Any) -> None:
     """Raise an error for a schema number that this version cannot read.
 
     Raises:
         SessionError: with advice.
     """
-    if found in READ and type(found) is int:
+    if schema in READABLE_SCHEMAS and type(schema) is int:
         return
-    if isinstance(found, int) and found > SCHEMA:
-        raise SessionError(f"{path}: schema {found} was made by a newer version; this one reads {SCHEMA}: upgrade")
-    if found is None:
+    if isinstance(schema, int) and schema > SCHEMA:
+        raise SessionError(f"{path}: schema {schema} was made by a newer version; this one reads {SCHEMA}: upgrade")
+    if schema is None:
         raise SessionError(
             f"{path} contains no key 'schema', maybe since it was truncated while copying; copy the session again"
         )
-    known = " and ".join(map(str, READ))
-    raise SessionError(f"{path}: schema {shown(found)} is unknown, this version reads {known}; make a new session")
+    readable = " and ".join(map(str, READABLE_SCHEMAS))
+    raise SessionError(f"{path}: schema {shown(schema)} is unknown, this version reads {readable}; make a new session")
 
 
 def default_keys(section: str) -> dict[str, Any]:
@@ -288,31 +298,46 @@ def default_keys(section: str) -> dict[str, Any]:
 
 def written(settings: SessionSettings) -> str:
     """Return the text of ``session.toml`` with these settings, including a comment for every key."""
-    head = [*(f"# {line}" for line in _HEAD), f"schema = {settings.schema}"]
-    return "\n".join([*head, *_lines(settings)]) + "\n"
+    lines = [f"# {line}" for line in _HEAD]
+    lines.append(f"schema = {settings.schema}")
+    lines += _lines(settings)
+    return "\n".join(lines) + "\n"
 
 
-def _lines(section: Any, place: str = "") -> Iterator[str]:
+def _lines(section: Any, prefix: str = "") -> Iterator[str]:
     """Yield the lines of a section, with the comments of keys aligned in one column, and tables last."""
-    words, tables = described(type(section)), []
+    comments = described(type(section))
+    tables = []
     for key in fields(section):
-        value, about = getattr(section, key.name), words.get(key.name, "")
+        value, comment = getattr(section, key.name), comments.get(key.name, "")
         if is_dataclass(value) or isinstance(value, Mapping):
-            head = f"[{place}{key.name}]"
-            inner = _lines(value, f"{key.name}.") if is_dataclass(value) else rtoml.dumps(value).splitlines()
-            tables += ["", f"{head}  # {about}" if about else head, *inner]
+            header = f"[{prefix}{key.name}]"
+            if comment:
+                header += f"  # {comment}"
+            tables += ["", header]
+            if is_dataclass(value):
+                tables += _lines(value, f"{key.name}.")
+            else:
+                tables += rtoml.dumps(value).splitlines()
         elif key.name != "schema":
             entry = rtoml.dumps({key.name: value}).rstrip()
-            first, *rest = wrap(about, WIDTH - COLUMN) or [""]
+            first, *further = wrap(comment, WIDTH - COLUMN) or [""]
             yield f"{entry:<{COLUMN - 3}} # {first}" if first else entry
-            yield from (f"{'':{COLUMN - 2}}# {line}" for line in rest)
+            for line in further:
+                yield f"{'':{COLUMN - 2}}# {line}"
     yield from tables
 
 
 def example() -> str:
     """Return the text of an example ``session.toml`` with every key."""
-    return written(
-        SessionSettings(
-            "", "", 0, RobotSection(""), InstrumentSection("", "pose"), PosesSection(), FitSection(), DynamicsSection()
-        )
+    settings = SessionSettings(
+        name="",
+        created="",
+        seed=0,
+        robot=RobotSection(""),
+        instrument=InstrumentSection("", "pose"),
+        poses=PosesSection(),
+        fit=FitSection(),
+        dynamics=DynamicsSection(),
     )
+    return written(settings)

@@ -19,6 +19,8 @@ from typing import Any
 from calib.errors import SessionError
 from calib.extensions import Point
 from calib.files import fingerprint
+from calib.folders import COVARIANCE, ESTIMATE, METRICS, REPORT
+from calib.identification.model_file import MODEL
 from calib.procedure.excitation.coefficients import NAME as MOTION
 from calib.procedure.findings import Warned
 from calib.procedure.report.templates import versions
@@ -26,6 +28,7 @@ from calib.procedure.session import dynamics_steps, folder, geometry_steps
 from calib.procedure.session.folder import Say, Session, StateFile, StepRecord, read_state
 from calib.procedure.session.geometry_steps import clear_staging
 from calib.procedure.session.settings import default_keys
+from calib.robot import calibrated
 
 MORE_STEPS: "Point[SessionStep]" = Point("steps", "steps after the export")
 
@@ -168,7 +171,7 @@ class SessionStep:
 
 
 ROBOT = NamedFile("robot", "file")
-FITTED_ROBOT = FitFile("robot.toml")
+FITTED_ROBOT = FitFile(calibrated.ROBOT)
 FIT_OPTIONS = NamedFile("fit", "options")
 IDENTIFY_OPTIONS = NamedFile("dynamics", "options")
 # keys of [dynamics] on which the identified model depends
@@ -221,7 +224,7 @@ STEPS = (
         "fit",
         "fit the geometry",
         geometry_steps.fit,
-        reads=(ROBOT, FIT_OPTIONS, UserFiles("measured"), SessionFile(f"{folder.MASSES}/dynamics.json", optional=True)),
+        reads=(ROBOT, FIT_OPTIONS, UserFiles("measured"), SessionFile(f"{folder.MASSES}/{MODEL}", optional=True)),
         makes=("4-fit/*",),
         settings=(Setting("robot"), Setting("instrument"), Setting("fit"), Setting("seed")),
         stage="geometry",
@@ -232,7 +235,7 @@ STEPS = (
         geometry_steps.validate,
         reads=(
             FITTED_ROBOT,
-            FitFile("report.json"),
+            FitFile(REPORT),
             SessionFile(f"2-poses/{folder.UNSEEN}", optional=True),
             FIT_OPTIONS,
             UserFiles("validation"),
@@ -281,9 +284,9 @@ STEPS = (
         "validate the dynamics on unseen motion",
         dynamics_steps.predict,
         reads=(
-            SessionFile("8-dynamics/robot.toml"),
-            SessionFile("8-dynamics/dynamics.json"),
-            SessionFile("8-dynamics/metrics.json"),
+            SessionFile(f"8-dynamics/{calibrated.ROBOT}"),
+            SessionFile(f"8-dynamics/{MODEL}"),
+            SessionFile(f"8-dynamics/{METRICS}"),
             SessionFile(f"6-excitation/validation/{MOTION}", optional=True),
             SessionFile(folder.CUTS),
             IDENTIFY_OPTIONS,
@@ -306,11 +309,11 @@ STEPS = (
             ROBOT,
             FITTED_ROBOT,
             SessionFile("4-fit/robot.urdf"),
-            SessionFile("5-validation/metrics.json"),
-            SessionFile("8-dynamics/dynamics.json"),
-            SessionFile("8-dynamics/estimate.csv"),
-            SessionFile("8-dynamics/covariance.csv"),
-            SessionFile("8-dynamics/unseen/report.json"),
+            SessionFile(f"5-validation/{METRICS}"),
+            SessionFile(f"8-dynamics/{MODEL}"),
+            SessionFile(f"8-dynamics/{ESTIMATE}"),
+            SessionFile(f"8-dynamics/{COVARIANCE}"),
+            SessionFile(f"8-dynamics/unseen/{REPORT}"),
         ),
         makes=("6-export/*", "9-export/*", folder.VERDICT),
         settings=(Setting("robot"),),

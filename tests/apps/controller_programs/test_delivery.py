@@ -12,8 +12,8 @@ from calib.controllers.table import as_described, controller_named, controllers
 from calib.procedure.kinematic_stage.folder import FitFolder
 from calib.robot.kinematics import forward
 from calib.robot.library import load
-from calib.rooms.cells.cell import SimulatedInstrument, measure, write_measured
-from calib.rooms.cells.virtual_cells import perturbed_cell
+from calib.simulation.cell import SimulatedInstrument, measure, write_measured
+from calib.simulation.virtual_cells import perturbed_cell
 from calib.transforms import from_xyz_rpy, invert, pose
 
 NUMBER = r"(-?\d+\.\d+)"

@@ -10,8 +10,8 @@ from calib.apps.controller_programs.targets import pose_values, read_program
 from calib.controllers.table import controller_named
 from calib.robot.formats.urdf import parse
 from calib.robot.kinematics import forward
-from calib.rooms.cells.cell import SimulatedInstrument, measure, write_measured
-from calib.rooms.cells.virtual_cells import perturbed_cell
+from calib.simulation.cell import SimulatedInstrument, measure, write_measured
+from calib.simulation.virtual_cells import perturbed_cell
 from calib.transforms import from_xyz_rpy, invert, to_quaternion
 
 FANUC = Path(__file__).parent / "fanuc_m20ia.urdf"

@@ -23,8 +23,8 @@ from calib.geometry.observation import observe, predict, prepare, target_jacobia
 from calib.procedure.findings import lines_of
 from calib.robot.chain import Chain
 from calib.robot.library import load
-from calib.rooms.cells.cell import Cell, true_poses
-from calib.rooms.cells.virtual_cells import perturbed_cell, rigid, virtual_cell
+from calib.simulation.cell import Cell, true_poses
+from calib.simulation.virtual_cells import perturbed_cell, rigid, virtual_cell
 from calib.transforms import to_quaternion
 
 OFFSET, SIGMA, MEMORY = 0.137, 30e-6, 0.03  # [s], [m], [s]: the noise is correlated, as an AR(1) process

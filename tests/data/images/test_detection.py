@@ -15,7 +15,7 @@ from calib.data.images.images import decode, read_image
 from calib.data.images.lens import Lens
 from calib.data.images.pixels import Detection
 from calib.errors import MeasurementError
-from calib.rooms.cells.rendered_camera import Imaging, render
+from calib.simulation.rendered_camera import Imaging, render
 from calib.transforms import pose
 
 LENS = Lens("pinhole", np.array([620.0, 622.0, 320.0, 238.0, -0.2, 0.08, 5e-4, -3e-4, 0.0]), (640, 480))

@@ -13,9 +13,9 @@ from calib.data.images.lens import Lens, write_lens
 from calib.data.poses import is_image_folder
 from calib.data.poses.fit_options import parse_options
 from calib.errors import MeasurementError
-from calib.rooms.cells import camera_cell as camera
-from calib.rooms.cells.cell import SimulatedInstrument
-from calib.rooms.cells.virtual_cells import rigid, virtual_cell
+from calib.simulation import camera_cell as camera
+from calib.simulation.cell import SimulatedInstrument
+from calib.simulation.virtual_cells import rigid, virtual_cell
 
 LENS = Lens("pinhole", np.array([470.0, 471.0, 240.0, 178.0, -0.12, 0.05, 4e-4, -3e-4, 0.0]), (480, 360))
 

@@ -22,7 +22,7 @@ from calib.identification.methods.constraint_settings import ConstraintSettings,
 from calib.identification.methods.parameter_constraints import make_constraints
 from calib.identification.rows import make_case
 from calib.robot import mdh
-from calib.rooms.cells import known_robots
+from calib.simulation import known_robots
 
 RATE, EVERY = 2000.0, 4
 ROWS = [

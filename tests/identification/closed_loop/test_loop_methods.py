@@ -30,7 +30,7 @@ from calib.identification.uncertainty.geometry_uncertainty import sensitivity
 from calib.procedure.excitation.coefficients import NAME, Periodic, read, table
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.tables import dumps
-from calib.rooms.cells import known_robots
+from calib.simulation import known_robots
 
 RATE, EVERY = 1000.0, 4
 KP, KD = np.array([4000.0, 3000.0, 500.0]), np.array([200.0, 150.0, 25.0])

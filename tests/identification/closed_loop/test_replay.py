@@ -15,7 +15,7 @@ from calib.identification.closed_loop.simulation import Plant, simulate, trackin
 from calib.identification.prediction import Dynamics, predict
 from calib.identification.rows import Case, make_case
 from calib.procedure.dynamic_stage import replay as replays
-from calib.rooms.cells import known_robots
+from calib.simulation import known_robots
 
 PD = controllers.pd(np.array([900.0, 700.0, 120.0]), np.array([80.0, 60.0, 10.0]))
 

@@ -6,7 +6,7 @@ import pytest
 from calib.errors import CannotSimulate, UsageError
 from calib.identification.closed_loop import instrumental
 from calib.identification.closed_loop.simulation import Plant
-from calib.rooms.cells import known_robots
+from calib.simulation import known_robots
 
 
 @pytest.mark.parametrize(("stable", "share"), [(0.6, 0.5), (0.3, 0.25), (0.02, 2.0**-6)])

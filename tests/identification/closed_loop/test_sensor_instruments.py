@@ -20,7 +20,7 @@ from calib.identification.closed_loop.loop_recordings import Loop
 from calib.identification.closed_loop.simulation import Plant, Sensing, simulate
 from calib.identification.rows import make_case
 from calib.robot.library import load
-from calib.rooms.cells import known_robots
+from calib.simulation import known_robots
 
 RATE, WIDTH, FREQUENCY = 1000.0, 0.5, 3.0  # of the controller [Hz], of the Coulomb sign [rad/s], of the loop [Hz]
 

@@ -22,7 +22,7 @@ from calib.identification.closed_loop.simulation import (
 )
 from calib.robot import description, library
 from calib.robot.chain import Chain
-from calib.rooms.cells import known_robots
+from calib.simulation import known_robots
 from calib.transforms import displace
 
 HIGH = np.array([2.0, 1.2, 1.2, 2.0, 1.5, 2.0])

@@ -12,7 +12,7 @@ from calib.errors import CalibError, NotConverged
 from calib.identification.closed_loop import controllers
 from calib.identification.closed_loop.simulation import Plant, Sensing, simulate
 from calib.identification.survey.simulated_robot import simulate_differences, simulate_tangents
-from calib.rooms.cells import known_robots
+from calib.simulation import known_robots
 
 RATE = 1000.0
 SHAPES = [

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from calib.apps.studies.conditions import Condition
+from calib.apps.studies.experiment import make_experiment
 from calib.identification.registry import METHODS
-from calib.rooms.studies.conditions import Condition
-from calib.rooms.studies.experiment import make_experiment
 
 # torque error [%] on unseen motion, and size of the errors in stated standard deviations (None: biased by more than
 # their sigma, since filtered positions round off friction's reversals)

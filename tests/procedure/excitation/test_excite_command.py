@@ -32,12 +32,12 @@ from calib.procedure.excitation.settings import ExcitationSettings
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.kinematics import forward
 from calib.robot.library import load
-from trajectories.basis import SampledMotion
-from trajectories.design.objectives import condition_numbers
-from trajectories.design.search import StartSearch
-from trajectories.design.verify import dense_motion
-from trajectories.errors import NothingFeasible
-from trajectories.fourier import evaluate
+from calib.trajectories.basis import SampledMotion
+from calib.trajectories.design.objectives import condition_numbers
+from calib.trajectories.design.search import StartSearch
+from calib.trajectories.design.verify import dense_motion
+from calib.trajectories.errors import NothingFeasible
+from calib.trajectories.fourier import evaluate
 
 LIMITS = """
 [target]

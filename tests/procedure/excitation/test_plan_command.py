@@ -20,7 +20,7 @@ from calib.procedure.excitation.planning import read_waypoints
 from calib.procedure.excitation.settings import PlanSettings
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.kinematics import forward
-from calib.rooms.cells.known_robots import truth
+from calib.simulation.known_robots import truth
 from calib.transforms import to_quaternion
 
 

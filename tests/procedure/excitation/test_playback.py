@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import yaml
 
-from trajectories.approach import straight_approach
-from trajectories.errors import BadInput
-from trajectories.messages import joint_trajectory, to_json, to_yaml
-from trajectories.recall import average, find_periods
-from trajectories.setpoints import Setpoints, joined, slowed
+from calib.trajectories.approach import straight_approach
+from calib.trajectories.errors import BadInput
+from calib.trajectories.messages import joint_trajectory, to_json, to_yaml
+from calib.trajectories.recall import average, find_periods
+from calib.trajectories.setpoints import Setpoints, joined, slowed
 
 RATE, PERIOD = 500.0, 1000
 V, A, J = (np.full(3, x) for x in (1.5, 4.0, 40.0))

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import calib
-from calib.rooms.cells.virtual_arm import moving_arm, play, record
-from calib.rooms.cells.virtual_cells import lwr4plus_cell
+from calib.simulation.virtual_arm import moving_arm, play, record
+from calib.simulation.virtual_cells import lwr4plus_cell
 
 FIRST = calib.ExcitationSettings(period=6.0, harmonics=4, starts=1, evaluations=60, outlook=False)
 LIMITS = {

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from calib import cli, config
+from calib.apps.compensation import joint_commands
 from calib.apps.controller_programs.targets import pose_values, read_program
 from calib.controllers.table import controller_named
 from calib.data.poses.measurements import Poses
@@ -22,9 +23,8 @@ from calib.procedure.kinematic_stage import inputs
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.robot.kinematics import forward
 from calib.robot.library import load
-from calib.rooms.cells.cell import Cell, SimulatedInstrument, measure, true_poses
-from calib.rooms.cells.virtual_cells import perturbed_cell
-from calib.rooms.compensation import joint_commands
+from calib.simulation.cell import Cell, SimulatedInstrument, measure, true_poses
+from calib.simulation.virtual_cells import perturbed_cell
 from calib.transforms import from_quaternion, from_xyz_rpy, rotation_vector, to_quaternion
 
 SIGMA = 20e-6
@@ -270,7 +270,7 @@ def test_folders_and_words_that_do_not_serve_are_refused(fitted, here, calib):
     (here / "half").mkdir()
     (here / "half" / "robot.toml").write_text((fitted / "robot.toml").read_text())
     for arguments, said in (
-        (("empty", "t.csv"), "no robot.toml"),
+        (("empty", "t.csv"), "give the folder of a fit"),
         (("half", "t.csv"), "covariance.csv"),
         ((fitted, "none.csv"), "none.csv"),
         ((fitted, "t.csv", "--frame", "table"), "seen"),

@@ -23,8 +23,8 @@ from calib.robot.formats import urdf
 from calib.robot.formats.urdf_write import write_new
 from calib.robot.kinematics import forward
 from calib.robot.library import load
-from calib.rooms.cells.cell import SimulatedInstrument, measure
-from calib.rooms.cells.virtual_cells import perturbed_cell
+from calib.simulation.cell import SimulatedInstrument, measure
+from calib.simulation.virtual_cells import perturbed_cell
 from calib.transforms import from_xyz_rpy
 
 ERRORS = {"mean", "rms", "p95", "max"}

@@ -18,8 +18,8 @@ from calib.procedure.kinematic_stage.metrics import FitMetrics
 from calib.procedure.report.geometry_section import iso9283_tables
 from calib.records import read_record
 from calib.robot.library import load
-from calib.rooms.cells.cell import SimulatedInstrument, measure
-from calib.rooms.cells.virtual_cells import perturbed_cell
+from calib.simulation.cell import SimulatedInstrument, measure
+from calib.simulation.virtual_cells import perturbed_cell
 from calib.transforms import from_xyz_rpy
 
 STATION = from_xyz_rpy([1.0, -2.0, 0.5], [0.2, -0.4, 1.0])

@@ -81,7 +81,7 @@ def test_chosen_poses_keep_the_constraints(cell, calib):
 
 
 def test_the_gradients_of_the_constraints_are_those_of_central_differences(cell):
-    from poses.space import central_difference
+    from calib.poses.space import central_difference
 
     Path("c.toml").write_text(CONSTRAINTS)
     q = np.random.default_rng(0).uniform(-1.5, 1.5, (5, 6))

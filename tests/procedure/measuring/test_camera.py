@@ -18,6 +18,7 @@ from calib.data.poses.measurements import Distances, PoseMeasurements
 from calib.data.poses.pose_lists import read_poses
 from calib.errors import UsageError
 from calib.geometry.observability import targets_of
+from calib.poses.space import is_feasible
 from calib.procedure.kinematic_stage import selection
 from calib.procedure.kinematic_stage.settings import SelectionSettings
 from calib.procedure.measuring.pose_limits import read_limits
@@ -26,11 +27,10 @@ from calib.procedure.session.folder import open_session
 from calib.procedure.session.questions import cell_tables
 from calib.robot.calibrated import Deflection
 from calib.robot.library import load
-from calib.rooms.cells import camera_cell as camera
-from calib.rooms.cells.cell import SimulatedInstrument
-from calib.rooms.cells.virtual_cells import rigid, virtual_cell
+from calib.simulation import camera_cell as camera
+from calib.simulation.cell import SimulatedInstrument
+from calib.simulation.virtual_cells import rigid, virtual_cell
 from calib.transforms import from_xyz_rpy, pose
-from poses.space import is_feasible
 
 SILENT = partial(lambda *words: None)
 
@@ -210,7 +210,7 @@ def test_images_beside_another_instrument_are_another_tool_and_their_coverage_is
     from calib.procedure.kinematic_stage.settings import FitSettings
     from calib.procedure.report import fit_report, geometry_figures
     from calib.robot.chain import random_joints
-    from calib.rooms.cells.cell import measure, true_poses
+    from calib.simulation.cell import measure, true_poses
 
     arm, reflector = cell.cell.nominal, pose(None, [0.1, 0.0, 0.1])
     images = replace(

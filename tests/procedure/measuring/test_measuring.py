@@ -9,10 +9,13 @@ import pytest
 from differences import check
 
 import calib
+from calib.apps.viewer.scene import is_run, rehearsed_samples
 from calib.cli import run
 from calib.config import parse
 from calib.errors import UsageError
 from calib.geometry.observability import observation, targets_of
+from calib.poses.candidates import draw_candidates
+from calib.poses.space import is_feasible
 from calib.procedure.measuring import run as measuring
 from calib.procedure.measuring.constraints_file import ConstraintsFile
 from calib.procedure.measuring.pose_limits import Limits, limits_of, read_limits
@@ -21,9 +24,6 @@ from calib.procedure.measuring.run import Exchange, RunSettings, drivable, plan_
 from calib.procedure.session.questions import cell_tables
 from calib.robot.chain import Chain, random_joints
 from calib.robot.library import load
-from calib.rooms.viewer.scene import is_run, rehearsed_samples
-from poses.candidates import draw_candidates
-from poses.space import is_feasible
 
 CELL = """
 [instrument]

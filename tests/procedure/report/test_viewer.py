@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 
 from calib import cli
+from calib.apps.viewer import scene as viewing
+from calib.apps.viewer import viewer
+from calib.apps.viewer.scene import visuals
 from calib.errors import UsageError
 from calib.geometry import installation
 from calib.robot.formats import urdf_write
 from calib.robot.kinematics import forward
 from calib.robot.library import load
-from calib.rooms.cells.cell import SimulatedInstrument, measure
-from calib.rooms.cells.virtual_cells import perturbed_cell
-from calib.rooms.viewer import scene as viewing
-from calib.rooms.viewer import viewer
-from calib.rooms.viewer.scene import visuals
+from calib.simulation.cell import SimulatedInstrument, measure
+from calib.simulation.virtual_cells import perturbed_cell
 
 
 @pytest.fixture(scope="module")

@@ -4,9 +4,9 @@ from pathlib import Path
 import pytest
 from sessions import begin, copy_of, edit, go_on
 
+from calib.apps.cell_demo import demo
 from calib.procedure.session.folder import Session, open_session
-from calib.rooms.cells import demo
-from calib.rooms.cells.virtual_cells import virtual_cell
+from calib.simulation.virtual_cells import virtual_cell
 
 
 @pytest.fixture(scope="session")

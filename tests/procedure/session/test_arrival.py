@@ -17,8 +17,8 @@ from calib.procedure.session.folder import Session
 from calib.procedure.session.geometry_steps import chain_of, read_measured, readback
 from calib.procedure.session.questions import QUESTIONS, checked, with_answer
 from calib.robot.chain import random_joints
-from calib.rooms.cells.cell import measure, wandering
-from calib.rooms.cells.virtual_cells import virtual_cell
+from calib.simulation.cell import measure, wandering
+from calib.simulation.virtual_cells import virtual_cell
 
 CELL = virtual_cell("lwr4plus")
 Q = random_joints(CELL.nominal, 30, 3)

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from without_figures import run
 
+from calib.apps.cell_demo.summary import SECONDS, Telling
 from calib.procedure.session import steps
 from calib.procedure.session.folder import open_session
 from calib.robot.formats import urdf
 from calib.robot.kinematics import forward
 from calib.robot.library import load
-from calib.rooms.cells.summary import SECONDS, Telling
-from calib.rooms.cells.virtual_arm import sensed
+from calib.simulation.virtual_arm import sensed
 
 MAX_LINES, MAX_WIDTH = 25, 60
 

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from calib import cli
+from calib.apps.monitoring import drift_page
+from calib.apps.monitoring.settings import DriftSettings
 from calib.errors import UsageError
 from calib.procedure.findings import level_of
 from calib.procedure.session.drift import trends
 from calib.robot.library import load_calibrated
-from calib.rooms.cells.cell import measure, wandering, write_measured
-from calib.rooms.cells.virtual_cells import perturbed_cell
-from calib.rooms.over_time import drift_page
-from calib.rooms.over_time.settings import DriftSettings
+from calib.simulation.cell import measure, wandering, write_measured
+from calib.simulation.virtual_cells import perturbed_cell
 
 MOVES = 4e-4  # over the measurement [m]
 HOURS = 0.5

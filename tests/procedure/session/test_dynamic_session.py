@@ -13,6 +13,7 @@ from pypdf import PdfReader
 from sessions import begin, copy_of, edit, go_on, kinds
 
 from calib import cli
+from calib.apps.cell_demo import demo
 from calib.data.csv_table import read_header
 from calib.data.recordings.recording_files import read_recording
 from calib.errors import MeasurementError
@@ -22,9 +23,8 @@ from calib.procedure.session import commands, steps
 from calib.procedure.session.dynamics_steps import check_motion, designed_motions
 from calib.procedure.session.folder import Session, open_session, read_state
 from calib.robot.library import load_calibrated
-from calib.rooms.cells import demo
-from calib.rooms.cells.truth import torque_errors
-from calib.rooms.cells.virtual_cells import virtual_cell
+from calib.simulation.truth import torque_errors
+from calib.simulation.virtual_cells import virtual_cell
 
 QUICK = {"period": 6.0, "harmonics": 5, "starts": 1, "evaluations": 100, "repeats": 2, "rate": 250.0}
 

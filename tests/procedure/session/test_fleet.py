@@ -12,10 +12,10 @@ import pytest
 from sessions import edit
 from without_figures import run
 
+from calib.apps.fleet import fleet
 from calib.errors import MeasurementError, NotConverged, TaskLost, Unidentifiable, UsageError, exit_code
 from calib.procedure.session import steps
 from calib.procedure.session.folder import locked, open_session
-from calib.rooms.fleet import fleet
 from calib.workers import Workers
 
 
@@ -107,7 +107,7 @@ def test_what_workers_get_pickles(cells: Path) -> None:
 
 
 def test_exit_codes_by_error() -> None:
-    from poses.errors import NotIdentifiable
+    from calib.poses.errors import NotIdentifiable
 
     assert [exit_code(error) for error in (UsageError("x"), MeasurementError("x", "f"))] == [2, 2]
     assert [exit_code(error) for error in (Unidentifiable("x"), NotConverged("x"))] == [3, 3]

@@ -7,11 +7,11 @@ import numpy as np
 import planted_motion as planted
 import pytest
 
+from calib.apps.studies.method_comparison import FAST_SECONDS, caveats, compare_methods
 from calib.cli import run
 from calib.errors import UsageError
 from calib.procedure.dynamic_stage.identify import overlaps
 from calib.procedure.dynamic_stage.inputs import gather
-from calib.rooms.studies.method_comparison import FAST_SECONDS, caveats, compare_methods
 
 
 def recorded(folder: Path, duration: float = 10.0) -> tuple[Path, Path]:
@@ -68,7 +68,7 @@ def test_none_is_taken_that_predicts_no_better_than_no_model(robot: Path, tmp_pa
 
 
 def test_one_methods_error_costs_no_other_result(robot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    from calib.rooms.studies import method_comparison
+    from calib.apps.studies import method_comparison
 
     def broken(robot, cases, settings, say):
         if settings.method == "tls":

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from planned import CHAIN, WAYPOINTS
 
-from trajectories.errors import BadInput
-from trajectories.timing.path import check_within, extremes, reversals, spline, through
+from calib.trajectories.errors import BadInput
+from calib.trajectories.timing.path import check_within, extremes, reversals, spline, through
 
 EVEN = np.linspace(0, 4, 60)
 

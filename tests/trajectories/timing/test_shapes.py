@@ -7,11 +7,11 @@ from planned import CHAIN, WAYPOINTS, limits, lwr
 from calib.robot.chain import random_joints
 from calib.robot.kinematics import forward, tip_jacobian
 from calib.robot.library import load
-from trajectories.errors import BadInput, NothingFeasible
-from trajectories.timing.lines import line
-from trajectories.timing.path import extremes, spline
-from trajectories.timing.shape import build, count, shorten
-from trajectories.timing.time_scaling import time_optimal
+from calib.trajectories.errors import BadInput, NothingFeasible
+from calib.trajectories.timing.lines import line
+from calib.trajectories.timing.path import extremes, spline
+from calib.trajectories.timing.shape import build, count, shorten
+from calib.trajectories.timing.time_scaling import time_optimal
 
 
 def kinematics(chain):

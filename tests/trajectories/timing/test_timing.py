@@ -7,11 +7,11 @@ from pinocchio_model import model as pinocchio_model
 from planned import CHAIN, WAYPOINTS, Cart, cart_limits, limits, lwr
 
 from calib.robot.chain import random_joints
-from calib.rooms.cells.known_robots import truth
-from trajectories.errors import BadInput, NothingFeasible
-from trajectories.timing.path import spline
-from trajectories.timing.profile import track
-from trajectories.timing.time_scaling import time_optimal
+from calib.simulation.known_robots import truth
+from calib.trajectories.errors import BadInput, NothingFeasible
+from calib.trajectories.timing.path import spline
+from calib.trajectories.timing.profile import track
+from calib.trajectories.timing.time_scaling import time_optimal
 
 LINE = spline([[0.0], [1.5]])
 
@@ -64,7 +64,7 @@ def test_planned_torques_by_pinocchio_keep_the_limits_and_reach_them():
 @pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 8))])
 def test_any_path_is_timed_with_no_limit_crossed_and_some_limit_active(seed):
     """Strong friction and accelerations limited, by turns; the sampling is other than that of the search."""
-    from trajectories.timing.profile import dense
+    from calib.trajectories.timing.profile import dense
 
     rng = np.random.default_rng(seed)
     bounds = limits(acceleration=np.full(7, 8.0)) if seed % 2 else limits()

@@ -1,0 +1,65 @@
+"""Command for a calibration of a simulated robot: demo."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calib.cli.completion import robots
+from calib.cli.shared import Seed, command, exit_failed, reporting
+from calib.errors import UsageError, require
+
+app = typer.Typer()
+
+
+@command(app, "Start")
+def demo(
+    out: Path = Path("calib-demo"),
+    robot: Annotated[str, typer.Option(autocompletion=robots)] = "",
+    hard: bool = False,
+    geometry_only: bool = False,
+    instrument: str = "cmm",
+    guided: bool = False,
+    bring: Path | None = None,
+    seed: Seed = 0,
+    plots: bool = True,
+    verbose: bool = False,
+) -> None:
+    """Calibrate a simulated robot; compare with the hidden truth.
+
+    Example: calib demo --out calib-demo
+
+    Args:
+        out: folder of the session
+        robot: a robot of the library; default tx40
+        hard: the LWR4+, whose hidden errors no model explains well: ends marginal, and says what that means
+        geometry_only: calibrate the geometry only, not the dynamics
+        instrument: cmm, or camera: rendered images of a board
+        guided: stop at each step that an engineer performs
+        bring: session folder: simulate the files that it waits for
+    """
+    from calib.apps.cell_demo import demo as demonstration
+    from calib.apps.cell_demo.summary import paths, reasons
+
+    with reporting() as (say, progress):
+        if bring is not None:
+            demonstration.simulate_next(bring, say)
+            return
+        require(not (hard and robot), f"--robot {robot}: --hard names a robot, too; leave one out", UsageError)
+        found = demonstration.run(
+            out,
+            robot or (demonstration.HARD if hard else demonstration.ROBOT),
+            seed,
+            say,
+            progress,
+            dynamics=not geometry_only,
+            guided=guided,
+            plots=plots,
+            instrument=instrument,
+            verbose=verbose,
+        )
+    if found.asks:
+        say("", *found.asks)
+        return
+    say(demonstration.row("time", found.seconds, "s"), *reasons(found.session), "", *paths(found.session))
+    exit_failed(found.verdict)

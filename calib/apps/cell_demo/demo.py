@@ -1,0 +1,249 @@
+"""The demonstration: a session on a simulated cell, then a comparison with the hidden truth."""
+
+import resource
+import sys
+import time
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from calib import files
+from calib.apps.cell_demo.summary import Telling, row
+from calib.data.poses import IMAGES
+from calib.errors import SessionError, UsageError, command_line, require
+from calib.folders import read_estimate
+from calib.geometry import installation
+from calib.identification.model_file import read_dynamics
+from calib.procedure.session import dynamics_steps, steps
+from calib.procedure.session.commands import asks, new_session
+from calib.procedure.session.dynamics_steps import next_round
+from calib.procedure.session.folder import MARK, ROUND, Say, Session, locked, open_session
+from calib.records import read_lines
+from calib.robot import calibrated, library
+from calib.robot.library import load
+from calib.simulation.camera_cell import CameraCell, limits_of, seen_by_camera, take_pictures
+from calib.simulation.cell import Cell, measure, planned_poses, wandering, write_log, write_measured
+from calib.simulation.truth import TRUTH, position_errors, share_within, torque_errors, true_base
+from calib.simulation.virtual_arm import REST, MovingArm, moving_arm, play, record, sensed
+from calib.simulation.virtual_cells import virtual_cell
+
+FIT, VALIDATION, AGAIN = 40, 20, 3
+DRIFT = 10e-6  # how far the simulated instrument wanders over a series [m]
+ROBOT, HARD = "tx40", "lwr4plus"  # by default; where effects that no model holds are as large as those that some do
+MOTION = {"period": 10.0, "rate": 500.0, "starts": 1, "evaluations": 150, "repeats": 2}  # little effort, for time
+SIMULATED = "simulated cell: {note}; nothing was measured on a robot"
+LOGS = (("training", 2, 240.0), ("validation", 3, 480.0))  # numbers of their noise, how long the arm ran before [s]
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """Result of the demonstration: the session, its verdict ("" where it stopped), and duration.
+
+    Attributes:
+        asks: what to do now, where it stopped for an engineer.
+        nominal, calibrated: errors against the hidden truth, rms [mm]; NaN where it stopped.
+        memory: largest resident set [MB].
+    """
+
+    session: Session
+    verdict: str
+    seconds: float
+    asks: tuple[str, ...] = ()
+    nominal: float = float("nan")
+    calibrated: float = float("nan")
+    memory: float = 0.0
+
+
+def run(
+    folder: Path,
+    robot: str,
+    seed: int,
+    say: Say,
+    progress: Say,
+    *,
+    dynamics: bool = True,
+    guided: bool = False,
+    plots: bool = True,
+    instrument: str = "cmm",
+    verbose: bool = False,
+) -> DemoResult:
+    """Return the result of a session on a simulated robot, compared with its hidden truth.
+
+    Args:
+        folder: new; the session.
+        robot: of the library.
+        seed: of the robot's errors, the noise, the pose selection and the motions.
+        say, progress: lines that stay, and words that pass.
+        dynamics: identify them, too, where the library knows the robot's masses.
+        guided: stop where an engineer would; `simulate_next` then plays his part.
+        plots: whether figures are drawn.
+        instrument: ``cmm``, or ``camera``, which takes rendered images.
+        verbose: say all that the session says, too.
+    """
+    if instrument not in ("cmm", "camera"):
+        raise UsageError(f"--instrument {instrument}: expected cmm or camera")
+    started = time.perf_counter()
+    cell = virtual_cell(robot, seed)
+    if dynamics and cell.nominal.inertias is None:
+        known = ", ".join(name for name in library.names() if load(name).inertias is not None)
+        say(f"geometry only: masses are known of {known}")
+        dynamics = False
+    motion = MOTION | {"torques": "both" if sensed(robot) else "motor"} if dynamics else {}
+    begin = partial(
+        new_session, folder, robot, instrument, poses=FIT, validation=VALIDATION, seed=seed, dynamics=dynamics, **motion
+    )
+    if instrument == "camera":
+        seen = seen_by_camera(cell)
+        cell = seen.cell
+        with limits_of(seen) as limits:
+            begin(limits=limits)
+    else:
+        begin()
+    session = open_session(folder, plots)
+    told = Telling(session, say, progress, verbose)
+    told.said(f"the cell: {cell.note}")
+    with locked(session):
+        waiting = steps.run_next(session, say if guided else told.said, told.progress, "calib demo")
+        while waiting is not None and waiting.kind == steps.WAITING and not guided:
+            _bring_for(session, waiting.step.name, told.said, told.progress)
+            waiting = steps.run_next(session, told.said, told.progress, "calib demo")
+    if waiting is not None:
+        require(guided, f"the demonstration stopped at {waiting.step.name}: {waiting.words}", SessionError)
+        return DemoResult(session, "", time.perf_counter() - started, _stopped(session, waiting))
+    before, after = _compare_with_truth(session, cell, say)
+    if plots:
+        from calib.apps.cell_demo.picture import draw
+
+        draw(session)
+    unit = 2.0**20 if sys.platform == "darwin" else 2.0**10  # the system counts in bytes on macOS, in kB on Linux
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+    return DemoResult(session, session.verdicts().level, time.perf_counter() - started, (), before, after, memory)
+
+
+def _stopped(session: Session, waiting: steps.State) -> tuple[str, ...]:
+    """Return the engineer's instructions, and the command that simulates them."""
+    folder = session.folder
+    return (
+        *asks(session, waiting),
+        f"(or simulate this step: {command_line('demo', '--bring', folder)}; then: {command_line('next', folder)})",
+    )
+
+
+def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, float]:
+    """Return the tool errors [mm] of nominal and calibrated arm against the truth; say and write all errors."""
+    found = installation.read(session.fit.path)
+    before, after, bare = position_errors(cell, found, calibrated.read(session.fit.path).chain)
+    lines = [
+        row("truth", before, "mm true error of the nominal robot"),
+        row("truth", bare, "mm true error of robot.urdf"),
+    ]
+    truth: dict[str, object] = {"position_mm": {"nominal": before, "calibrated": after, "urdf_alone": bare}}
+    notes = [cell.note, f"errors over {TRUTH} poses of the whole joint range, rms"]
+    if session.dynamic:
+        arm = arm_of(session, cell)
+        chain, dynamics = read_dynamics(session.identification.path)
+        torques = torque_errors(cell, arm, dynamics.model, dynamics.values, chain)
+        motion = dynamics_steps.designed_motions(session)[LOGS[0][0]]
+        middle = LOGS[0][2] + REST + motion.period * motion.repeat / 2.0
+        true = true_base(dynamics.model, cell, arm, session.settings.seed, middle)
+        within, count = share_within(true, read_estimate(session.identification.path))
+        notes.append(arm.note)
+        truth |= {"torque_percent": torques.identified, "within_two_sigma": within, "base_parameters": count}
+        lines += [row("truth", torques.identified, "% true torque error on a random motion")]
+        lines += [row("truth", 100.0 * within, "% of parameters are within two sigma")]
+    files.write(session.path("truth.txt"), "\n".join([*notes, *lines]) + "\n")
+    files.write_json(session.path("truth.json"), truth)
+    for line in lines:
+        say(line)
+    return before, after
+
+
+def simulate_next(folder: Path, say: Say) -> None:
+    """Simulate the files that the session in `folder` waits for; compare a finished session with the truth.
+
+    Raises:
+        UsageError: where nothing is waited for, or the session's robot is none of the library.
+    """
+    session = open_session(folder)
+    if session.settings.robot.given not in library.names():
+        raise UsageError(
+            f"{folder} is about {session.settings.robot.given}; the simulated cells are of {', '.join(library.names())}"
+        )
+    with locked(session, say):
+        waiting = next((state for state in steps.states(session) if state.kind not in (steps.DONE, steps.KEPT)), None)
+        step = "" if waiting is None else waiting.step.name
+        if waiting is None and next_round(session) in dynamics_steps.designed_motions(session):
+            step = "record"
+        elif waiting is None:
+            _compare_with_truth(session, _cells_of(session)[0], say)
+            return
+        elif waiting.kind != steps.WAITING:
+            raise UsageError(f"{folder} waits for no files; next: {command_line('next', folder)}")
+        _bring_for(session, step, say)
+    say(f"next: {command_line('next', folder)}")
+
+
+def _cells_of(session: Session) -> tuple[Cell, CameraCell | None]:
+    """Return the virtual cell of a session, and the same cell with its camera (None for other instruments)."""
+    cell = virtual_cell(session.settings.robot.given, session.settings.seed)
+    if session.settings.instrument.measures != IMAGES:
+        return cell, None
+    seen = seen_by_camera(cell)
+    return seen.cell, seen
+
+
+def _bring_for(session: Session, step: str, say: Say, progress: Say = lambda words: None) -> None:
+    """Simulate the files that a step waits for."""
+    seed, (cell, seen) = session.settings.seed, _cells_of(session)
+    if step in ("measure", "validate") and seen is not None:
+        _mark(session, seen.cell.note)
+        for number, name, q in planned_poses(session.folder, cell.nominal):
+            take_pictures(seen, q, session.path(f"3-measured/{name}"), seed=seed + number, say=progress)
+        say("    (the simulated camera takes an image at every pose of both lists)")
+    elif step in ("measure", "validate"):
+        simulate_measurements(session, cell, seed)
+        say("    (the simulated cell measures both lists of poses)")
+    elif step in ("record", "predict"):
+        simulate_recordings(session, arm_of(session, cell), seed)
+        say("    (the simulated arm plays both motions)")
+    else:
+        raise SessionError(f"the demonstration cannot simulate the files that step {step} needs")
+
+
+def arm_of(session: Session, cell: Cell) -> MovingArm:
+    """Return the simulated arm of a session, with its dynamics."""
+    return moving_arm(cell, session.settings.robot.given, session.settings.seed)
+
+
+def simulate_measurements(session: Session, cell: Cell, seed: int) -> None:
+    """Simulate measurements of the planned poses, with three repeated at the end and drift of the CMM."""
+    _mark(session, cell.note)
+    for number, name, q in planned_poses(session.folder, cell.nominal):
+        seen = wandering(measure(cell, q, np.random.default_rng([seed, number]), warm=number * FIT), DRIFT, seed)
+        write_measured(seen, session.path(f"3-measured/{name}.csv"))
+        if name == "measured":
+            again = measure(cell, q[:AGAIN], np.random.default_rng([seed, 7]), warm=len(q))
+            write_measured(wandering(again, DRIFT, seed, begin=1.0), session.path("3-measured/drift.csv"))
+
+
+def _mark(session: Session, note: str) -> None:
+    """Mark a session's files as simulated, for its certificate."""
+    path, line = session.path(MARK), SIMULATED.format(note=note)
+    known = read_lines(path)
+    files.write(path, "\n".join([*known, *([line] if line not in known else [])]) + "\n")
+
+
+def simulate_recordings(session: Session, arm: MovingArm, seed: int) -> None:
+    """Simulate recordings of the designed motions."""
+    _mark(session, arm.note)
+    motions = dynamics_steps.designed_motions(session)
+    rounds = ((name, int(name.removeprefix(ROUND)) + 10, 720.0) for name in motions if name.startswith(ROUND))
+    for name, number, running in (*LOGS, *rounds):
+        if name not in motions:
+            continue
+        t = np.arange(round(motions[name].period * motions[name].rate) + 1) / motions[name].rate
+        reference = play(t, *motions[name].orders(t), motions[name].repeat)
+        recorded = record(arm, reference, np.random.default_rng([seed, number]), running)
+        write_log(recorded, session.path(f"7-recorded/{name}_log.csv"))

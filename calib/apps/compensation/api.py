@@ -1,0 +1,101 @@
+"""Joint commands for nominal targets, in Python: `calib.compensate`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from calib import files
+from calib.api.kinematic import GeometryFit
+from calib.api.rendering import Progress, Shown, saved
+from calib.apps.compensation import joint_commands
+from calib.arguments import checked
+from calib.data.poses.pose_lists import Targets, read_targets
+from calib.errors import CalibError
+from calib.procedure.robot_kinds import joints_of, stage_of
+from calib.records import as_subclass
+
+
+class JointCommands(Shown, joint_commands.Commands):
+    """Joint commands that move the real tool to nominal targets. ``print`` says what is reached and how well."""
+
+    tab = "q reached reason left before sigma expected beyond notes save"
+
+    @checked
+    def save(self, path: str | Path, *, partial: bool = False, overwrite: bool = False) -> Path:
+        """Write the joint commands as CSV; with `partial`, also if some targets were not reached.
+
+        A file that no earlier run left, or that was changed since, is refused unless `overwrite`.
+        """
+        with files.results([(Path(path), (".csv",))], overwrite=overwrite):
+            return joint_commands.write(self, Path(path), partial)
+
+    def __repr__(self) -> str:
+        return f"<JointCommands: {int(self.reached.sum())} of {len(self.q)} targets reached>"
+
+    def __str__(self) -> str:
+        return "\n".join(joint_commands.lines(self))
+
+
+def read_fitted(folder: str | Path) -> joint_commands.Fitted:
+    """Return the fitted arm with its instrument and tools from a fit's folder.
+
+    Raises:
+        UsageError: where it is none, lacks something, or is of a parallel robot.
+    """
+    try:
+        return joint_commands.read(folder)
+    except CalibError:  # looked at again only where reading failed
+        stage_of(folder, "compensation")
+        raise
+
+
+@checked
+def compensate(
+    fitted: GeometryFit | joint_commands.Fitted | str | Path,
+    targets: Targets | str | Path | np.ndarray,
+    *,
+    frame: str = "base",
+    tool: str = "flange",
+    dof: int | None = None,
+    start: Sequence[float] | None = None,
+    tolerance: tuple[float, float] = joint_commands.TOLERANCE,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> JointCommands:
+    """Compute the joint commands that move the real tool to nominal targets.
+
+    Args:
+        fitted: a fit, the folder of one, or what was read of it.
+        targets: CSV file (``calib formats targets``), targets in memory, or an array: poses (m, 4, 4) [m], or nominal
+            joint values (m, n) [rad or m].
+        frame: what the targets are in: ``base`` of the calibrated robot, ``nominal``, or a station's name.
+        tool: what stands there: ``flange``, a tool of the fit, or ``x,y,z[,roll,pitch,yaw]`` [m, rad].
+        dof: how much counts: 6; 5, free to turn about the tool's z; 3, position only; None: as the targets say.
+        start: (n,) joint values [rad or m] near which targets without joints are sought.
+        tolerance: what a command may leave by the calibrated model [m], [rad].
+        seed: of the starts for targets without joints.
+        progress: called with a few words now and then.
+    """
+    if isinstance(fitted, joint_commands.Fitted):
+        found = fitted
+    else:
+        with saved(fitted) as place:
+            found = read_fitted(place)
+    chain = found.nominal.chain
+    if isinstance(targets, str | Path):
+        targets = read_targets(targets, joints_of(chain))
+    commands = joint_commands.computed(
+        found,
+        Targets.of(targets),
+        frame=frame,
+        tool=tool,
+        dof=dof,
+        start=start,
+        tolerance=tolerance,
+        seed=seed,
+        progress=progress,
+    )
+    return as_subclass(commands, JointCommands)

@@ -1,0 +1,234 @@
+"""Where the poses of a controller's program stand: its tools and user frames, read or stated.
+
+A pose P in user frame U for a tool T means, in the description's terms, the flange at  B · U · P · T⁻¹ · F⁻¹  of the
+arm's base, with the controller's base B and flange F (`calib.apps.controller_programs.frames`). Numbers are read from
+the
+program and from files beside it (`calib.apps.controller_programs.languages`), or stated; a frame that is neither is
+named, and
+the program is refused.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from calib.apps.compensation.joint_commands import Fitted
+from calib.apps.controller_programs.frames import Description, base_frame, flange_frame, stated_frame
+from calib.apps.controller_programs.languages import LANGUAGES, ProgramFrames, frames_in
+from calib.apps.controller_programs.targets import Program
+from calib.controllers.table import Controller
+from calib.errors import UsageError, listing
+from calib.transforms import invert, to_xyz_rpy
+
+AGREE = 5e-5  # [m, or as a rotation matrix] a frame that is stated and read in the program may differ by this
+
+
+@dataclass(frozen=True, eq=False)
+class Statements:
+    """What the user states of a program's frames.
+
+    Attributes:
+        tool: ``flange`` (the all-zero tool), a tool of the fit, or ``x,y,z[,roll,pitch,yaw]`` in the controller's
+            flange [m, rad]; None: as the program says.
+        user: ``x,y,z[,roll,pitch,yaw]`` of the user frame in the controller's base; None: as the program says.
+        world, flange: poses (4, 4) of the controller's base in the arm's base, of its flange in the arm's tip.
+        files: texts of further files of the controller, by name.
+    """
+
+    tool: str | None = None
+    user: str | None = None
+    world: np.ndarray | None = None
+    flange: np.ndarray | None = None
+    files: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Poses of a program with one tool and one configuration.
+
+    Attributes:
+        indices: of the targets in the program.
+        tool: as `joint_commands.placements` takes it.
+        users: (m, 4, 4) the user frames in the frame of the targets.
+        poses: (m, 4, 4) of the tool in the frame of the targets [m].
+        configuration: as the program writes it; empty for none.
+    """
+
+    indices: tuple[int, ...]
+    tool: str
+    users: np.ndarray
+    poses: np.ndarray
+    configuration: str
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """All poses of a program in groups, and which frames they stand in, in words."""
+
+    groups: tuple[Group, ...]
+    notes: tuple[str, ...]
+
+
+def placed(fitted: Fitted, program: Program, frame: str, statements: Statements) -> Placed:
+    """Return where the poses of a program stand.
+
+    Args:
+        fitted: the arm.
+        program: with poses.
+        frame: ``base``, ``nominal``, or a station of the fit, which then is the program's user frame.
+        statements: of the user.
+
+    Raises:
+        UsageError: with all frames that are neither read nor stated, and where both say different numbers.
+    """
+    arm = Description.of_fit(fitted.folder, fitted.nominal.chain)
+    said = frames_in(program, statements.files)
+    flange = flange_frame(program.controller, arm, statements.flange)
+    base = base_frame(program.controller, arm, statements.world)
+    names = fitted.cell.tool_names
+    in_station = frame not in ("base", "nominal")
+    measured = statements.tool in names
+    refusals: list[str] = []
+    notes: list[str] = []
+
+    tools: dict[str, str] = dict.fromkeys({setting.tool for setting in said.settings}, statements.tool or "")
+    if not measured:
+        numbers = _completed(program, said, "tool", _stated_tool(statements.tool, names), refusals)
+        if flange.pose is None:
+            refusals.append(f"{flange.name} is {flange.words}")
+        for name, pose in numbers.items() if flange.pose is not None else ():
+            tools[name] = _as_option(flange.pose @ pose)
+            notes.append(f"tool {name or 'active'}: {_in_words(pose)} in {flange}")
+    elif len(tools) > 1:
+        refusals.append(f"--tool states one tool, the program has {listing(sorted(tools), 5)}: --frames FILE")
+
+    users = dict.fromkeys({setting.user for setting in said.settings}, np.eye(4))
+    if in_station and statements.user is not None:
+        refusals.append(f"--user-frame and --frame {frame} both say where the user frame is: state one of them")
+    if in_station:
+        notes.append(f"user frame {listing(sorted(users), 5)}: that of station '{frame}', as calib deliver gives it")
+    else:
+        numbers = _completed(program, said, "user", stated_frame(statements.user, "--user-frame"), refusals)
+        if base.pose is None:
+            refusals.append(f"{base.name} is {base.words}")
+        for name, pose in numbers.items() if base.pose is not None else ():
+            users[name] = base.pose @ pose
+            notes.append(f"user frame {name or 'active'}: {_in_words(pose)} in {base}")
+    if refusals:
+        head = f"{program.path}: its {len(said.settings)} poses stand in frames that are not known; nothing was written"
+        raise UsageError("\n  ".join([head, *refusals]))
+    notes += [f"warning: {each.warning}" for each in (base, flange) if each.warning and not in_station]
+    return Placed(_grouped(program, said, tools, users), tuple(notes))
+
+
+def tool_in_tip(fitted: Fitted, controller: Controller, statements: Statements) -> str:
+    """Return the tool that is stated, as `joint_commands.placements` takes it: for joint targets, which need none.
+
+    Raises:
+        UsageError: for a tool that is none, and where the controller's flange is not known.
+    """
+    names = fitted.cell.tool_names
+    if statements.tool is None or statements.tool in names:
+        return statements.tool or "flange"
+    pose = _stated_tool(statements.tool, names)
+    flange = flange_frame(controller, Description.of_fit(fitted.folder, fitted.nominal.chain), statements.flange)
+    if pose is None or flange.pose is None:
+        raise UsageError(f"--tool {statements.tool}: {flange.name} is {flange.words}")
+    return _as_option(flange.pose @ pose)
+
+
+def _as_option(pose: np.ndarray) -> str:
+    """Return a pose as ``x,y,z,roll,pitch,yaw`` [m, rad]."""
+    return ",".join(f"{value:.12g}" for value in np.hstack(to_xyz_rpy(pose)))
+
+
+def _grouped(
+    program: Program, said: ProgramFrames, tools: Mapping[str, str], users: Mapping[str, np.ndarray]
+) -> tuple[Group, ...]:
+    """Return the poses by tool and configuration, in the order in which these appear."""
+    poses, indices = program.poses(), program.of("pose")
+    members: dict[tuple[str, str], list[int]] = {}
+    for k, setting in enumerate(said.settings):
+        members.setdefault((tools[setting.tool], setting.configuration), []).append(k)
+    groups = []
+    for (tool, configuration), rows in members.items():
+        frames = np.array([users[said.settings[k].user] for k in rows])
+        group = Group(tuple(indices[k] for k in rows), tool, frames, frames @ poses[rows], configuration)
+        groups.append(group)
+    return tuple(groups)
+
+
+def _stated_tool(words: str | None, names: Sequence[str]) -> np.ndarray | None:
+    """Return the tool that is stated, in the controller's flange; None for none."""
+    if words == "flange":
+        return np.eye(4)
+    try:
+        return stated_frame(words, "--tool")
+    except UsageError as error:
+        if words is not None and "," in words:
+            raise
+        known = ", ".join(names)
+        raise UsageError(f"tool {words}: expected flange, a tool of the fit ({known}), or x,y,z[,...]") from error
+
+
+def _completed(
+    program: Program, said: ProgramFrames, kind: str, statement: np.ndarray | None, refusals: list[str]
+) -> dict[str, np.ndarray]:
+    """Return the poses (4, 4) of a program's tools or user frames by name; `refusals` grow by what is not known.
+
+    Args:
+        kind: ``tool`` or ``user``.
+        statement: what the user says; it counts for the frame that has no numbers.
+    """
+    option, label = ("--tool", "tool") if kind == "tool" else ("--user-frame", "user frame")
+    numbers = said.tools if kind == "tool" else said.users
+    lines: dict[str, list[int]] = {}
+    for index, setting in zip(program.of("pose"), said.settings):
+        lines.setdefault(getattr(setting, kind), []).append(program.targets[index].line)
+    missing = [name for name in lines if name not in numbers]
+    result = {name: numbers[name] for name in lines if name in numbers}
+    if statement is not None and len(missing) == 1:
+        return result | {missing[0]: statement}
+    if statement is not None and missing:
+        refusals.append(f"{option} states one {label}, {len(missing)} have no numbers: --frames FILE instead")
+    elif statement is not None:
+        result |= _agreed(option, label, result, statement, refusals)
+    for name in missing:
+        where = f"line {listing(lines[name], 3)}"
+        what = f"{label} {name}" if name else f"the {label} that is active"
+        refusals.append(f"{what} ({where}) has no numbers here: {_ways(program, kind, option)}")
+    return result
+
+
+def _agreed(
+    option: str, label: str, result: dict[str, np.ndarray], statement: np.ndarray, refusals: list[str]
+) -> dict[str, np.ndarray]:
+    """Return nothing new; refuse a statement that differs from the numbers that were read."""
+    for name, pose in result.items():
+        if np.abs(pose - statement).max() > AGREE:
+            words = f"{label} {name} is {_in_words(pose)} in the program's files"
+            refusals.append(f"{option} says {_in_words(statement)}, {words}")
+    return {}
+
+
+def _ways(program: Program, kind: str, option: str) -> str:
+    frame = program.controller.flange if kind == "tool" else program.controller.base
+    state = f"{option} x,y,z[,roll,pitch,yaw] [m, rad], in {frame}"
+    files = LANGUAGES[program.controller.language].files
+    return f"{state}; or --frames FILE ({files})" if files else state
+
+
+def _in_words(pose: np.ndarray) -> str:
+    """Return a frame in millimetres and degrees."""
+    xyz, rpy = to_xyz_rpy(pose)
+    if np.abs(pose - np.eye(4)).max() < 1e-12:
+        return "zero"
+    length = ", ".join(f"{1e3 * value:.6g}" for value in xyz)
+    turn = ", ".join(f"{value:.6g}" for value in np.degrees(rpy))
+    return f"{length} mm" + ("" if np.abs(rpy).max() < 1e-12 else f", roll, pitch, yaw {turn}°")
+
+
+def user_poses(group: Group, poses: np.ndarray) -> np.ndarray:
+    """Return poses (m, 4, 4) of a group's frame in its user frames, as the program has them."""
+    return invert(group.users) @ poses

@@ -1,0 +1,222 @@
+"""Compensation inside a controller's program: ``calib compensate FIT PROGRAM.src --out SENT.src``.
+
+The targets in a program (`calib.apps.controller_programs.targets`) are replaced by ones that bring the real tool to
+where
+they are meant; every other byte stays. A joint target becomes the joint command. A pose becomes the pose that the
+nominal robot, the controller's own model, has at the joint command.
+
+Tool and user frame of a pose are read from the program (`calib.apps.controller_programs.languages`), or stated:
+``--tool``,
+``--user-frame``, ``--frames`` with a file of the controller; else the program is refused. Elbow, wrist and turns are
+those of its configuration (`calib.apps.controller_programs.configurations`); where it says none, of the solution
+nearest to
+``--start``.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib import files
+from calib.apps.compensation.joint_commands import Commands, Fitted, computed, lines, placements
+from calib.apps.compensation.program_frames import Group, Statements, placed, tool_in_tip, user_poses
+from calib.apps.controller_programs.configurations import (
+    Configuration,
+    Postures,
+    configuration_of,
+    has_spherical_wrist,
+    postures,
+)
+from calib.apps.controller_programs.targets import Program, pose_values
+from calib.data.poses.pose_lists import Targets
+from calib.errors import UsageError, listing
+from calib.geometry.installation import see
+from calib.geometry.inverse import Goal
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Commands of some targets of a program: their indices, and the values [controller's units] they get."""
+
+    indices: tuple[int, ...]
+    commands: Commands
+    values: np.ndarray
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class CompensatedProgram:
+    """A program and new targets for it.
+
+    Attributes:
+        program: as it was.
+        parts: commands of its joint targets, and of its poses by tool and configuration.
+        notes: which frames its poses stand in.
+    """
+
+    program: Program
+    parts: tuple[Part, ...]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def values(self) -> list[np.ndarray | None]:
+        """The new numbers of each target in the controller's units; None for a target that is not reached."""
+        values: list[np.ndarray | None] = [None] * len(self.program.targets)
+        for part in self.parts:
+            for index, row, reached in zip(part.indices, part.values, part.commands.reached):
+                values[index] = row if reached else None
+        return values
+
+    @property
+    def lost(self) -> list[str]:
+        """Targets that are not reached, each with its line and the reason."""
+        reasons = {}
+        for part in self.parts:
+            reasons |= dict(zip(part.indices, part.commands.reason))
+        targets = self.program.targets
+        missed = [k for k, value in enumerate(self.values) if value is None]
+        return [f"line {targets[k].line}: {reasons[k]}" for k in missed]
+
+    def lines(self) -> list[str]:
+        """Return the lines for the user."""
+        shown = list(self.notes)
+        for part in self.parts:
+            shown += part.notes
+            if part.commands.reached.any():
+                shown += [line for line in lines(part.commands) if not line.startswith("not reached")]
+        kept = ["not reached, left as it was: " + words for words in self.lost]
+        return [*dict.fromkeys(shown), *kept, *filter(None, [self.program.unread])]
+
+    def write(self, out: Path, partial: bool) -> Path:
+        """Write the program with its new targets.
+
+        Raises:
+            UsageError: where a target is not reached and `partial` does not allow that; nothing is written.
+        """
+        lost, path = self.lost, self.program.path
+        if lost and (not partial or len(lost) == len(self.values)):
+            head = f"{path}: {len(lost)} of {len(self.values)} targets are not reached; nothing was written"
+            advice = "" if len(lost) == len(self.values) else "\nwith --partial, these stay as they are"
+            raise UsageError("\n  ".join([head, *lost]) + advice)
+        return files.write(out, self.program.rewritten(self.values))
+
+
+def compensated(
+    fitted: Fitted,
+    program: Program,
+    *,
+    frame: str = "base",
+    statements: Statements | None = None,
+    start: Sequence[float] | None = None,
+    seed: int = 0,
+    **options: Any,
+) -> CompensatedProgram:
+    """Return a program's new targets.
+
+    Args:
+        fitted: the calibrated arm.
+        program: see `calib.apps.controller_programs.targets.read_program`.
+        frame: as for joint commands; a station: it is the program's user frame.
+        statements: tool and frames that the program does not say.
+        start: (n,) near which the joints of poses are sought [rad]; needed where they have no configuration.
+        seed: of further starts.
+        options: further ones of `joint_commands.computed`.
+
+    Raises:
+        UsageError: for a program of another number of axes, for frames that are not known, and for poses that say no
+            posture, without a start.
+    """
+    statements = statements or Statements()
+    joints, poses = program.of("joints"), program.of("pose")
+    n = fitted.nominal.chain.n
+    if joints and len(program.targets[joints[0]].values) != n:
+        axes = len(program.targets[joints[0]].values)
+        raise UsageError(f"{program.path}: its targets have {axes} axes, the robot has {n} joints")
+    groups, notes = (), ()
+    if poses:
+        where = placed(fitted, program, frame, statements)
+        groups, notes = where.groups, where.notes
+    _check_postures(fitted, program, groups, start)
+    options |= {"frame": frame, "seed": seed}
+    parts = []
+    if joints:
+        targets = Targets(program.joints(), file=str(program.path))
+        commands = computed(fitted, targets, tool=tool_in_tip(fitted, program.controller, statements), **options)
+        parts.append(Part(tuple(joints), commands, program.controller.shown(commands.q)))
+    parts += [_compensated_group(fitted, program, group, start, options) for group in groups]
+    return CompensatedProgram(program, tuple(parts), notes)
+
+
+def _check_postures(fitted: Fitted, program: Program, groups: Sequence[Group], start: Sequence[float] | None) -> None:
+    """Refuse poses whose program says no posture, without a start."""
+    if start is not None:
+        return
+    spherical = has_spherical_wrist(fitted.nominal.chain)
+    silent = [index for group in groups if not (group.configuration and spherical) for index in group.indices]
+    if silent:
+        where = f"{len(silent)} targets (the first in line {program.targets[min(silent)].line})"
+        said = "the program does not say elbow or wrist"
+        if not spherical and any(group.configuration for group in groups):
+            said = "configurations are read for arms whose last three axes meet, which this is not"
+        raise UsageError(
+            f"{program.path}: {where} are poses, and {said}; give joints near them: --start q1,...,qn [rad]"
+        )
+
+
+def _compensated_group(
+    fitted: Fitted, program: Program, group: Group, start: Sequence[float] | None, options: dict[str, Any]
+) -> Part:
+    """Return the commands of poses with one tool and configuration."""
+    kind, frame, seed = program.controller, options["frame"], options["seed"]
+    model = placements(fitted, frame, group.tool)[0]
+    chain = model.chain
+    configuration = configuration_of(kind, group.configuration) if has_spherical_wrist(chain) else None
+    targets = replace(Targets.of(group.poses), file=str(program.path))
+    if configuration is None:
+        commands, notes = computed(fitted, targets, tool=group.tool, start=start, **options), ()
+    else:
+        goal = Goal(model, 6, chain.lower, chain.upper)
+        sought = postures(goal, group.poses, configuration, kind, start, seed)
+        commands = computed(fitted, replace(targets, q=sought.q), tool=group.tool, **options)
+        if start is None:
+            commands = _without(commands, sought.reasons)
+        notes = _posture_notes(program, group, configuration, commands, sought)
+    values = pose_values(kind, user_poses(group, see(model, commands.q).poses()))
+    return Part(group.indices, commands, values, notes)
+
+
+def _without(commands: Commands, reasons: Sequence[str]) -> Commands:
+    """Return commands of which those with a reason are not reached, for that reason."""
+    good = np.array([not reason for reason in reasons])
+    merged = tuple(
+        f"{reason}; --start takes the posture nearest to it" if reason else words
+        for reason, words in zip(reasons, commands.reason)
+    )
+    return replace(commands, reached=commands.reached & good, reason=merged)
+
+
+def _posture_notes(
+    program: Program, group: Group, configuration: Configuration, commands: Commands, sought: Postures
+) -> tuple[str, ...]:
+    """Return notes on poses whose configuration contradicts the start or the pose, and on commands that leave it."""
+    notes = []
+    reached = commands.reached
+    lines = np.array([program.targets[index].line for index in group.indices])
+    unfit = np.array([bool(reason) for reason in sought.reasons])
+    taken = "the posture nearest to --start is taken"
+    notes += [f"warning: line {lines[k]}: {sought.reasons[k]}; {taken}" for k in np.flatnonzero(reached & unfit)]
+    against = lines[reached & sought.contradicted & ~unfit]
+    if len(against):
+        words = f"the posture nearest to --start is not that of {configuration.words}, which is followed"
+        notes.append(f"line {listing(against.tolist(), 5)}: {words}")
+    chain = commands.fitted.nominal.chain
+    crossing = lines[reached & ~unfit & ~configuration.holds(program.controller, chain, commands.q)]
+    if len(crossing):
+        words = (
+            f"the command crosses the boundary of {configuration.words}, which stays in the program: change it there"
+        )
+        notes.append(f"warning: line {listing(crossing.tolist(), 5)}: {words}")
+    return tuple(notes)

@@ -1,0 +1,192 @@
+"""Parallel run of many sessions, one folder per robot; a failed session does not stop the other sessions."""
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+from rich.console import RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from calib import bug_reports, files
+from calib.apps.fleet import stores
+from calib.apps.fleet.stores import LEASE
+from calib.apps.fleet.throughput import Throughput
+from calib.arguments import checked
+from calib.errors import Busy, CalibError, TaskLost, complaint
+from calib.procedure.findings import LEVELS
+from calib.procedure.session.commands import COLOURS, go_on
+from calib.procedure.session.folder import SETTINGS, Say
+from calib.procedure.session.results import folders_of, position_errors, torque_error
+from calib.procedure.session.steps import DONE
+from calib.workers import Workers
+from calib.workers import workers as opened
+
+LOG = "run.log"
+WAITS, BUSY, FAILED = "waits", "busy", "failed"  # what a session comes to, or `DONE`
+
+
+@dataclass(frozen=True)
+class FleetRow:
+    """The outcome of one session: state, verdict, errors and exit code.
+
+    Attributes:
+        folder: of the session.
+        state: `DONE`, `WAITS`, `BUSY` (another command works on it) or `FAILED`.
+        verdict: of a session that is done.
+        words: what it waits for, or what went wrong.
+        asks: what to do at the robot now, in lines.
+        nominal, calibrated: position error on unseen poses, rms [mm]; None where there is none.
+        torque: unexplained on unseen motion [%]; None without dynamics.
+        seconds: of wall time.
+        code: exit code, as `calib next` would have.
+    """
+
+    folder: str
+    state: str
+    verdict: str = ""
+    words: str = ""
+    nominal: float | None = None
+    calibrated: float | None = None
+    torque: float | None = None
+    seconds: float = 0.0
+    code: int = 0
+    asks: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        return "\n".join([self.line(), *(self.asks or remarks([self]))])
+
+    def line(self) -> str:
+        """Return the outcome of the session as a line."""
+        errors = self.nominal is not None and f"{self.nominal:.3g} → {self.calibrated:.3g} mm"
+        torque = self.torque is not None and f"torque {self.torque:.3g} %"
+        words = [word for word in (self.state, self.verdict, errors, torque, f"{self.seconds:.1f} s") if word]
+        return f"{self.folder}: {', '.join(words)}"
+
+
+@checked
+def run_sessions(
+    folders: str | Path | Sequence[str | Path],
+    *,
+    workers: str | int = 1,
+    plots: bool = True,
+    command: str = "calib.run_sessions",
+) -> Iterator[FleetRow]:
+    """Run sessions as far as possible, and yield the outcome of each; failures do not stop the others.
+
+    Args:
+        folders: of the sessions, or their ``session.toml``; one or several. Or addresses of fsspec, with or without
+            wildcards (``s3://bucket/cells/*``): each worker fetches its session, and puts it back.
+        workers: local processes, or the address of a Dask scheduler.
+        plots: whether figures are drawn.
+        command: for the sessions' records.
+
+    Returns:
+        Rows as sessions end: ``folder``, ``state`` (done, waits, busy or failed), ``verdict``; ``print`` says what to
+        do now.
+
+    Raises:
+        UsageError: for a session that is named twice, or where none is.
+    """
+    return run(folders_of(folders, stores.sessions), opened(workers), command, plots)
+
+
+def run(
+    folders: Sequence[Path | str],
+    workers: AbstractContextManager[Workers],
+    command: str,
+    plots: bool = True,
+    pace: Throughput | None = None,
+) -> Iterator[FleetRow]:
+    """Run every session and yield each outcome; workers on other machines need the same folder paths, or addresses."""
+    pace = pace or Throughput()
+    with workers as crew:
+        sent = [one if crew.here or isinstance(one, str) else one.absolute() for one in folders]
+        for number, outcome in pace.completed(crew, partial(run_one, command=command, plots=plots), sent):
+            name = str(folders[number])
+            lost = isinstance(outcome, TaskLost)
+            yield FleetRow(name, FAILED, words=str(outcome), code=2) if lost else replace(outcome, folder=name)
+
+
+def run_one(folder: Path | str, command: str = "calib run", plots: bool = True, lease: float = LEASE) -> FleetRow:
+    """Run one session as far as possible, and write its output to ``run.log``. It raises nothing but Ctrl-C.
+
+    Args:
+        folder: of the session, or its address.
+        command: for the record.
+        plots: whether figures are drawn.
+        lease: see `calib.apps.fleet.stores`.
+    """
+    if isinstance(folder, Path):
+        return _run_here(folder, command, plots)
+    started = time.perf_counter()
+    try:
+        with stores.held(folder, lease) as copy:
+            outcome = _run_here(copy, command, plots)
+    except CalibError as error:
+        state = BUSY if isinstance(error, Busy) else FAILED
+        outcome = FleetRow(folder, state, words=str(error), code=2)
+    return replace(outcome, folder=folder, seconds=time.perf_counter() - started)
+
+
+def _run_here(folder: Path, command: str, plots: bool) -> FleetRow:
+    started, said = time.perf_counter(), []
+    try:
+        outcome = _go_on(folder, said.append, command, plots)
+    except Exception as error:  # a robot that fails must not stop the others
+        foreseen = complaint(error)
+        words, code = foreseen or (bug_reports.report(error, command.split()[1:], folder), bug_reports.CODE)
+        said.append(f"failed: {words}")
+        outcome = FleetRow(str(folder), BUSY if isinstance(error, Busy) else FAILED, words=words, code=code)
+    if (folder / SETTINGS).exists() and outcome.state != BUSY:  # the log is of the command that works on it
+        with suppress(CalibError):  # a full disk, a folder that cannot be written: said already
+            files.write(folder / LOG, "\n".join(said) + "\n")
+    return replace(outcome, seconds=time.perf_counter() - started)
+
+
+def _go_on(folder: Path, say: Say, command: str, plots: bool) -> FleetRow:
+    stop = go_on(folder, say, lambda words: None, command, plots=plots)
+    session = stop.session
+    if stop.waiting is not None:
+        for words in stop.lines[1:]:
+            say(words)
+        words = f"{stop.waiting.words} (step {stop.waiting.step.name}); instructions are in {LOG}"
+        return FleetRow(str(folder), WAITS, words=words, asks=stop.lines[1:])
+    errors, torque = position_errors(session) or (None, None), torque_error(session)
+    return FleetRow(str(folder), DONE, stop.verdict, "", *errors, torque, code=1 if stop.verdict == "fail" else 0)
+
+
+def table(outcomes: Sequence[FleetRow]) -> RenderableType:
+    """Return the summary table, a line per robot: rms errors on unseen poses, and on unseen motion."""
+    found = Table("session", "state", "verdict", box=None, pad_edge=False)
+    for name in ("nominal mm", "calibrated mm", "torque %", "s"):
+        found.add_column(name, justify="right", no_wrap=True)
+    names = [Path(one.folder).resolve().name for one in outcomes]
+    for one, name in zip(outcomes, names):
+        state, verdict = (Text(x, COLOURS.get(x, "yellow")) if x else "" for x in (one.state, one.verdict))
+        numbers = ["" if x is None else f"{x:.3g}" for x in (one.nominal, one.calibrated, one.torque)]
+        shown = name if names.count(name) == 1 else one.folder
+        found.add_row(Text(shown), state, verdict, *numbers, f"{one.seconds:.1f}")
+    return found
+
+
+def remarks(outcomes: Sequence[FleetRow]) -> Iterator[str]:
+    """Yield a line for each incomplete session: the missing file, or the error."""
+    for one in outcomes:
+        if one.state != DONE:
+            said = {WAITS: f"{one.folder} waits for ", FAILED: f"{one.folder} failed: "}.get(one.state, "")
+            yield f"{said}{one.words}"
+
+
+def summary(outcomes: Sequence[FleetRow], seconds: float) -> str:
+    """Return one line with the number of sessions for each state and verdict."""
+    counts = {state: sum(one.state == state for one in outcomes) for state in (DONE, WAITS, BUSY, FAILED)}
+    judged = {level: sum(one.verdict == level for one in outcomes) for level in LEVELS}
+    words = ", ".join(f"{count} {level}" for level, count in judged.items() if count)
+    parts = [f"{counts[DONE]} of {len(outcomes)} done" + (f" ({words})" if words else "")]
+    shown = {WAITS: "waiting", BUSY: BUSY, FAILED: FAILED}
+    parts += [f"{counts[state]} {words}" for state, words in shown.items() if counts[state]]
+    return f"{', '.join(parts)}; {seconds:.1f} s"

@@ -1,0 +1,80 @@
+"""Commands on a robot over time: diff, drift, log."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from calib.apps.monitoring.settings import DiffSettings, DriftSettings
+from calib.cli.completion import Robot
+from calib.cli.shared import command, exit_failed, say
+
+app = typer.Typer()
+Folder = Annotated[
+    Path | None, typer.Option("--out", help="folder for report, table and figures. Default: nothing is written")
+]
+
+
+@command(app, "Geometry")
+def diff(before: str, after: str, settings: DiffSettings, out: Folder = None, plots: bool = True) -> None:
+    """Compare two calibrations of one robot: what changed, in σ, mm and N m. Is it still within tolerance?
+
+    Exit codes: 0 the earlier parameters are still within tolerance, or none is given; 1 they are not.
+
+    Example: calib diff fit2025 fit2026 --tolerance 0.3 --out changes
+
+    Args:
+        before: folder of the earlier fit, identification or session, or the nominal robot
+        after: folder of the later one, or the nominal robot
+    """
+    from calib.apps.monitoring.comparison import robot_change
+
+    found = robot_change.diff(before, after, settings)
+    _shown(found, out, plots)
+
+
+@command(app, "Geometry")
+def drift(
+    robot: Robot,
+    measured: list[Path],
+    settings: DriftSettings,
+    out: Folder = None,
+    plots: bool = True,
+    options: Annotated[Path | None, typer.Option(help="TOML, see calib formats options")] = None,
+    base: str | None = None,
+    tip: str | None = None,
+) -> None:
+    """Show how the target drifts with time and temperature, from poses of ROBOT measured more than once.
+
+    Example: calib drift robot.urdf measured.csv drift.csv --tolerance 0.1
+
+    Args:
+        measured: CSV files (calib formats measurements) with a column time, or temperature
+    """
+    from calib.apps.monitoring import drift_page
+
+    _shown(drift_page.drift(robot, measured, settings, options, base, tip), out, plots)
+
+
+@command(app, "Files and studies")
+def log(sessions: list[Path], out: Folder = None, plots: bool = True, mixed: bool = False) -> None:
+    """List the calibrations of one robot: date, verdict, errors, and what changed since the one before.
+
+    Example: calib log cell2025 cell2026 --out history
+
+    Args:
+        sessions: folders of finished sessions of one robot
+        mixed: take robots of other names or serial numbers for one
+    """
+    from calib.apps.monitoring import log as robot_log
+
+    _shown(robot_log.log(sessions, mixed=mixed), out, plots, result=True)
+
+
+def _shown(found: Any, out: Path | None, plots: bool, result: bool = False) -> None:
+    """Write a result where asked to, print it (tables, too, if they are the `result`), and exit with 1 if it fails."""
+    if out is not None:
+        found.save(out, plots=plots)
+    say(*found.renderables(), result=result)
+    say(*([f"written to {out}"] if out else []))
+    exit_failed(found.section().verdict)

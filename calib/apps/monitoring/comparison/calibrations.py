@@ -1,0 +1,129 @@
+"""A calibration of a robot's geometry that is compared with another one: of a fit's folder, or of a description."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from calib.apps.monitoring.comparison.places import Place, check_same_robot
+from calib.geometry import installation
+from calib.geometry.installation import Installation
+from calib.geometry.observation import layout
+from calib.procedure.kinematic_stage import tables
+from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics
+from calib.robot import calibrated
+from calib.robot.calibrated import CalibratedChain, Deflection
+from calib.robot.chain import Chain
+from calib.robot.library import load_calibrated
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """A calibration of a robot.
+
+    Attributes:
+        name: as the user gave it.
+        robot: the calibrated arm; the nominal one of a description.
+        cell: that arm in its cell, with joint corrections.
+        free, covariance: of steps along the cell's fitted parameters (`calib.geometry.observation`); empty if nominal.
+        learnt: (m, n) the fitted poses [rad or m]; None if nominal.
+        metrics: of the fit; None if nominal.
+        judged: level and reason of its verdict; empty if nominal.
+        rows: errors on unseen poses, else on the fitted ones; None if nominal.
+        tolerance: asked of the fit [m]; None without.
+        serial: of the robot, as its certificate states it; empty if unknown.
+    """
+
+    name: str
+    robot: CalibratedChain
+    cell: Installation
+    free: np.ndarray
+    covariance: np.ndarray
+    learnt: np.ndarray | None = None
+    metrics: FitMetrics | None = None
+    judged: tuple[str, str] = ("", "")
+    rows: ComparedRows | None = None
+    tolerance: float | None = None
+    serial: str = ""
+
+    @property
+    def nominal(self) -> bool:
+        """Whether this is a robot's description, and nothing was fitted."""
+        return self.metrics is None
+
+    @property
+    def chain(self) -> Chain:
+        """The geometry without joint corrections."""
+        return self.robot.chain
+
+    @cached_property
+    def rigid(self) -> tuple[Installation, np.ndarray]:
+        """The cell with the geometry that was fitted without joint corrections, and the covariance (p, p) of its arm.
+
+        The covariance is by the cell's whole parameter vector, zero for what is not of the arm.
+        """
+        cell = replace(self.cell, chain=self.chain, deflection=Deflection())
+        result, arm = np.zeros((len(layout(cell).names),) * 2), len(self.chain.elements)
+        if self.robot.covariance is not None:
+            result[:arm, :arm] = self.robot.covariance
+        return cell, result
+
+    @cached_property
+    def whole(self) -> tuple[Installation, np.ndarray]:
+        """The cell with all that was fitted, and the covariance (p, p) of its whole parameter vector."""
+        result = np.zeros((len(layout(self.cell).names),) * 2)
+        result[np.ix_(self.free, self.free)] = self.covariance
+        return self.cell, result
+
+    @property
+    def left(self) -> float:
+        """Rms error [m] that this calibration leaves on its rows without joint corrections; 0 if nominal."""
+        errors = self.rows and self.rows.judged("urdf").main
+        return 1e-3 * errors.rms if errors else 0.0
+
+
+def read_fits(before: Place, after: Place) -> tuple[Calibration, Calibration]:
+    """Return two calibrations of one robot, read from their folders; one of the two may be nominal.
+
+    Raises:
+        RobotError: where they are of different robots.
+    """
+    given = [read_fit(each) if each.fit else None for each in (before, after)]
+    chain = next(each.chain for each in given if each is not None)
+    one, two = (each or _nominal(place.name, chain) for each, place in zip(given, (before, after)))
+    check_same_robot((one.name, two.name), (one.robot, two.robot))
+    return one, two
+
+
+def read_fit(place: Place) -> Calibration:
+    """Return the calibration in the folder of a fit or a session."""
+    folder, session = place.fit, place.session
+    assert folder is not None
+    metrics, cell = folder.metrics(), installation.read(folder.path)
+    judged = session.validation.metrics() if session and (session.validation.judged).exists() else metrics
+    unseen = [rows for rows in judged.validation.values() if rows.unseen]
+    free, covariance = tables.read_covariance(folder.path, cell)
+    robot = calibrated.read(folder.path)
+    asked = session.settings.fit.tolerance_mm if session else metrics.tolerance_mm
+    return Calibration(
+        place.name,
+        robot,
+        cell,
+        free,
+        covariance,
+        folder.learnt_joints(robot.chain.joints),
+        metrics,
+        (judged.verdict, judged.reason),
+        (unseen or [metrics.fit])[0],
+        1e-3 * asked if asked else None,
+        place.serial,
+    )
+
+
+def _nominal(name: str, like: Chain) -> Calibration:
+    """Return the robot of a description, between a calibrated one's links, as a calibration without covariance."""
+    links = {"base": like.base, "tip": like.tip} if name.endswith(".urdf") else {}
+    robot = CalibratedChain(load_calibrated(name, **links).chain)
+    return Calibration(name, robot, Installation(robot.chain), np.zeros(0, dtype=int), np.zeros((0, 0)))

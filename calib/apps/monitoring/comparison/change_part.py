@@ -1,0 +1,159 @@
+"""A part of a comparison: geometry or dynamics. Verdict, findings, section of the report, numbers; figures differ."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from calib.apps.monitoring.comparison.change_test import ChangeTest
+from calib.errors import Finding, finding
+from calib.procedure.findings import Verdict, lines_of, settle
+from calib.procedure.report.page import Block, Column, KeyFigure, Section, Text, met, table
+from calib.units import SMALL
+
+if TYPE_CHECKING:
+    from calib.procedure.report.charts import Chart
+
+MOST = 12  # parameters shown; all are in the table on disk
+
+
+@dataclass(frozen=True, eq=False)
+class ChangePart(ABC):
+    """What changed of the geometry, or of the dynamics, and whether the earlier parameters are still good enough.
+
+    Attributes:
+        before, after: the calibrations, with ``name``, ``judged`` and ``serial``.
+        found: the test, and more.
+        tolerance: of `today`; None without.
+    """
+
+    kind: ClassVar[str]
+    table: ClassVar[str]
+    captions: ClassVar[Sequence[str]]
+    error_words: ClassVar[str]
+    model_option: ClassVar[str]
+
+    before: Any
+    after: Any
+    found: Any
+    tolerance: float | None
+
+    @property
+    @abstractmethod
+    def today(self) -> float:
+        """What the robot's error would be today with the earlier parameters, in the unit of the tolerance."""
+
+    @property
+    @abstractmethod
+    def words(self) -> str:
+        """What changed, for the verdict's reason."""
+
+    @abstractmethod
+    def own_findings(self) -> list[Finding]:
+        """Return the findings that this kind alone has."""
+
+    @abstractmethod
+    def blocks(self) -> list[Block]:
+        """Return what the section says before and after the table of parameters, which stands third."""
+
+    @abstractmethod
+    def charts(self) -> dict[str, Chart]:
+        """Return the figures, by name."""
+
+    @abstractmethod
+    def shown(self, value: float) -> str:
+        """Return an error as text with its unit."""
+
+    @abstractmethod
+    def numbers(self) -> dict[str, Any]:
+        """Return the numbers that this kind alone has [SI]."""
+
+    @cached_property
+    def noticed(self) -> tuple[Finding, ...]:
+        """Findings, worst first."""
+        return settle([*self.own_findings(), *self._shared_findings()])
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """Whether the earlier parameters are still within tolerance."""
+        figures = f"{self.words}, χ² {self.found.chi2:.3g} on {self.found.freedom}"
+        if self.tolerance:
+            state = "still" if self.today <= self.tolerance else "not"
+            figures = f"{state} within the tolerance of {self.shown(self.tolerance)}: {figures}"
+        return Verdict.of(figures, self.noticed)
+
+    def _shared_findings(self) -> Iterator[Finding]:
+        found: ChangeTest = self.found
+        names = {"before": self.before.name, "after": self.after.name}
+        if found.changed and found.parameters:
+            first = found.parameters[0]
+            code = "one-parameter-changed" if found.alone else "several-parameters-changed"
+            change = plus_minus(first.alone, first.alone_sigma, first.unit)
+            yield finding(code, name=first.name, change=change, left=found.unexplained, rivals=found.rivals)
+        if any(found.extra):
+            earlier, later = found.extra
+            yield finding("combinations-left-out", earlier=earlier, later=later, option=self.model_option, **names)
+        for each in (self.before, self.after):
+            if each.judged[0] == "fail":
+                yield finding("earlier-failed", name=each.name, reason=each.judged[1])
+        if self.before.serial and self.after.serial and self.before.serial != self.after.serial:
+            yield finding("other-serial-number", first=self.before.serial, second=self.after.serial, **names)
+
+    def section(self) -> Section:
+        """Return a report section with verdict, what moved, changed parameters and notes."""
+        allowed = self.shown(self.tolerance) if self.tolerance else ""
+        reached = met(self.today, self.tolerance or 0.0)
+        figure = KeyFigure(self.error_words, "", self.shown(self.today), "", self.basis, allowed, reached)
+        shown = [one for one in self.found.parameters if one.sigma or one.explained][:MOST]
+        note = f"All in {self.table}."
+        first, *rest = self.blocks()
+        parameters = table("Changed parameters, those first that explain most", _PARAMETERS, shown, note)
+        blocks = [first, Text("Notes", lines_of(self.noticed), "note"), *rest, parameters]
+        return Section(f"Change of the {self.kind}", blocks, self.verdict.level, self.verdict.reason, [figure])
+
+    @property
+    @abstractmethod
+    def basis(self) -> str:
+        """On what `today` rests."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the numbers as in ``metrics.json`` [SI]."""
+        found: ChangeTest = self.found
+        return {
+            "verdict": self.verdict.level,
+            "reason": self.verdict.reason,
+            "tolerance": self.tolerance,
+            "today": self.today,
+            "chi2": found.chi2,
+            "freedom": found.freedom,
+            "probability": found.probability,
+            "noticed": self.noticed,
+            **self.numbers(),
+        }
+
+
+def plus_minus(value: float, sigma: float, unit: str) -> str:
+    """Return a change with its σ as text; empty without σ."""
+    factor, printed = SMALL.get(unit, (1.0, unit))
+    return "" if not sigma or np.isnan(sigma) else f"{factor * value:+.3g} ± {factor * sigma:.2g} {printed}"
+
+
+def _value(value: float, unit: str) -> str:
+    factor, printed = SMALL.get(unit, (1.0, unit))
+    return "" if np.isnan(value) else f"{factor * value:.4g} {printed}"
+
+
+_PARAMETERS = [
+    Column("parameter", "{0.name}", number=False),
+    Column("before", lambda one: _value(one.before, one.unit)),
+    Column("after", lambda one: _value(one.after, one.unit)),
+    Column("change", lambda one: plus_minus(one.after - one.before, one.sigma, one.unit)),
+    Column("σ", lambda one: f"{abs(one.after - one.before) / one.sigma:.1f}" if one.sigma else ""),
+    Column("if it changed alone", lambda one: plus_minus(one.alone, one.alone_sigma, one.unit)),
+    Column("χ² explained", lambda one: f"{one.explained:.3g}"),
+]

@@ -1,0 +1,168 @@
+"""Comparison of two calibrations of a robot in Python: `calib.diff`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from calib.api.dynamic import DynamicsModel
+from calib.api.kinematic import GeometryFit
+from calib.api.rendering import Drawn, Judged, saved
+from calib.apps.monitoring import pages
+from calib.apps.monitoring.comparison import geometry_change, torque_change
+from calib.apps.monitoring.comparison.calibrations import read_fits
+from calib.apps.monitoring.comparison.change_part import ChangePart
+from calib.apps.monitoring.comparison.change_test import ParameterChange
+from calib.apps.monitoring.comparison.geometry_change import GeometryChange
+from calib.apps.monitoring.comparison.identifications import read_models, read_states
+from calib.apps.monitoring.comparison.places import Place, place_of
+from calib.apps.monitoring.comparison.tool_part import ToolPart
+from calib.apps.monitoring.comparison.torque_change import DynamicsChange
+from calib.apps.monitoring.comparison.torque_part import TorquePart
+from calib.apps.monitoring.settings import DEFAULT_DIFF, DiffSettings
+from calib.arguments import checked
+from calib.errors import Finding, UsageError, require
+from calib.procedure.findings import LEVELS, Verdict
+from calib.procedure.report.page import Section
+from calib.procedure.robot_kinds import stage_of
+from calib.records import plain
+
+if TYPE_CHECKING:
+    from calib.procedure.report.charts import Chart
+
+TABLES = (ToolPart.table, TorquePart.table)
+
+
+@dataclass(frozen=True, eq=False)
+class RobotChange(Drawn, Judged):
+    """What changed between two calibrations of a robot. ``print`` shows the verdict, what moved, the parameters.
+
+    Attributes:
+        parts: geometry, dynamics, or both.
+    """
+
+    parts: tuple[ChangePart, ...]
+
+    tab = "verdict geometry dynamics noticed plot save to_dict"
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the earlier parameters are still within tolerance: of the worst part."""
+        worst = max(self.parts, key=lambda part: LEVELS.index(part.verdict.level))
+        own = worst.verdict
+        return own if len(self.parts) == 1 else replace(own, reason=f"{worst.kind}: {own.reason}")
+
+    @property
+    def noticed(self) -> tuple[Finding, ...]:
+        """The findings of all parts."""
+        return tuple(one for part in self.parts for one in part.noticed)
+
+    @property
+    def geometry(self) -> GeometryChange | None:
+        """What moved; None where only dynamics are compared."""
+        return self._found("geometry")
+
+    @property
+    def dynamics(self) -> DynamicsChange | None:
+        """What changed of the dynamics; None where only geometries are compared."""
+        return self._found("dynamics")
+
+    def _found(self, kind: str) -> Any:
+        return next((part.found for part in self.parts if part.kind == kind), None)
+
+    def section(self) -> Section:
+        """Return all parts as one report section."""
+        own = [part.section() for part in self.parts]
+        blocks, figures = ([one for each in own for one in getattr(each, name)] for name in ("blocks", "figures"))
+        return Section("Change", blocks, self.verdict.level, self.verdict.reason, figures)
+
+    def charts(self) -> dict[str, Chart]:
+        """Return what the figures show: the tool's motion over the workspace, changes of parameters and torque."""
+        return {name: chart for part in self.parts for name, chart in part.charts().items()}
+
+    @checked
+    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+        """Write a folder: report.html, tables of all parameters, metrics.json, and the figures as PNG."""
+        parts = [
+            pages.ResultPart(
+                part.section(),
+                part.charts() if plots else {},
+                part.captions,
+                (part.table, ParameterChange._fields, part.found.parameters),
+            )
+            for part in self.parts
+        ]
+        one, two, robot = self._names
+        setup = {"earlier": one, "later": two}
+        return pages.save(Path(out), "comparison", f"Change of {robot}", setup, parts, self.to_dict(), TABLES)
+
+    @property
+    def _names(self) -> tuple[str, str, str]:
+        part = self.parts[0]
+        return part.before.name, part.after.name, part.before.robot.chain.name
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the numbers as in ``metrics.json`` [SI]."""
+        before, after, _ = self._names
+        judged = {"verdict": self.verdict.level, "reason": self.verdict.reason}
+        return plain({"before": before, "after": after, **judged} | {one.kind: one.to_dict() for one in self.parts})
+
+    def __repr__(self) -> str:
+        return f"<RobotChange of {self._names[2]}: {self.verdict.level}>"
+
+
+Compared = str | Path | GeometryFit | DynamicsModel
+
+
+@checked
+def diff(before: Compared, after: Compared, settings: DiffSettings = DEFAULT_DIFF) -> RobotChange:
+    """Compare two calibrations of one robot: what changed, and whether the earlier parameters are still good enough.
+
+    Args:
+        before, after: fits, identifications, or their folders or those of sessions: what both have is compared,
+            geometry, dynamics or both; one fit may be compared with the nominal robot (file or name).
+        settings: tolerances, whether base and tool placement count, further motions.
+
+    Returns:
+        ``verdict``, ``geometry`` with the test and the tool's motion, ``dynamics`` with the test and the change of the
+        torque, figures (`plot`), `save`.
+
+    Raises:
+        UsageError: where the two have nothing in common, or a folder holds no calibration.
+        RobotError: where they are of different robots.
+    """
+    with saved(before) as first, saved(after) as second:
+        for place in (first, second):
+            stage_of(place, "diff")
+        one, two = place_of(first), place_of(second)
+        parts = [*_tool_parts(one, two, settings), *_torque_parts(one, two, settings)]
+    if one.nominal and two.nominal:
+        words = f"neither {before} nor {after} is the folder of a fit or of a session; give at least one"
+    else:
+        words = f"nothing to compare: {one.words}, {two.words}"
+    require(parts, words, UsageError)
+    return RobotChange(tuple(parts))
+
+
+def _tool_parts(before: Place, after: Place, settings: DiffSettings) -> list[ChangePart]:
+    if not any(each.fit for each in (before, after)) or not all(each.fit or each.nominal for each in (before, after)):
+        return []
+    one, two = read_fits(before, after)
+    found = geometry_change.compare(one, two, settings)
+    return [ToolPart(one, two, found, settings.tolerance or two.tolerance or one.tolerance, settings)]
+
+
+def _torque_parts(before: Place, after: Place, settings: DiffSettings) -> list[ChangePart]:
+    if not (before.identification and after.identification):
+        return []
+    one, two = read_models(before, after)
+    motions = {**two.motions, **one.motions}
+    for name in settings.motions:
+        states = read_states(Path(name), two.model.n)
+        require(states, f"{name}: no accelerations; expected columns q_…, v_… and a_…", UsageError)
+        motions[name] = states  # type: ignore[assignment]
+    words = f"neither {one.name} nor {two.name} holds a motion without payload; give one with --motion"
+    require(motions, words, UsageError)
+    found = torque_change.compare(one, two, motions)
+    return [TorquePart(one, two, found, settings.torque_tolerance or two.tolerance or one.tolerance or None)]

@@ -1,0 +1,137 @@
+"""Drift during a measurement with its figures, as `calib drift` shows it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from calib.api.rendering import Drawn, Judged
+from calib.apps.monitoring import pages
+from calib.apps.monitoring.settings import DEFAULT_DRIFT, DriftSettings
+from calib.arguments import checked
+from calib.data.poses.fit_options import FitOptions, read_options
+from calib.errors import Finding, UsageError, require
+from calib.procedure.findings import Verdict, lines_of, settle
+from calib.procedure.kinematic_stage import inputs
+from calib.procedure.report.page import Column, Section, Text, table
+from calib.procedure.session.drift import Trend, noise_of_difference, repeats, trends
+from calib.records import plain
+
+if TYPE_CHECKING:
+    from calib.procedure.report.charts import Chart
+
+TABLE = "trends.csv"
+
+
+@dataclass(frozen=True, eq=False)
+class DriftFound(Drawn, Judged):
+    """Drift of the target over a measurement. ``print`` shows verdict, trends and repeated poses.
+
+    Attributes:
+        robot: its name.
+        trends: with time and temperatures.
+        noticed: findings, worst first.
+    """
+
+    robot: str
+    trends: tuple[Trend, ...]
+    noticed: tuple[Finding, ...]
+
+    tab = "trends noticed plot save"
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the drift matters."""
+        words = [f"{each.what}: {1e3 * each.total:.2g} mm in all" for each in self.trends]
+        return Verdict.of("; ".join(words) or "no column of time or temperature", self.noticed)
+
+    def section(self) -> Section:
+        """Return a report section with the trends, and how far repeated poses are apart."""
+        columns = [
+            Column("with", "{0.what}", number=False),
+            Column("poses", "{0.poses}"),
+            Column("visits", "{0.x.size}"),
+            Column("slope", _rate),
+            *(Column(f"{axis} mm", _of_axis(k)) for k, axis in enumerate("xyz")),
+            Column("in all mm", lambda one: f"{1e3 * one.total:.3g}"),
+            Column("σ", lambda one: f"{one.sigmas:.1f}"),
+        ]
+        blocks = [Text("Notes", lines_of(self.noticed), "note"), table("Drift of the target", columns, self.trends)]
+        return Section("Drift", blocks, self.verdict.level, self.verdict.reason)
+
+    def charts(self) -> dict[str, Chart]:
+        """Return what the figures show: the motion of repeated poses' targets, with the slope."""
+        from calib.procedure.report.charts import Chart, Panel, line
+        from calib.procedure.report.style import AFTER, QUIET
+
+        panels = []
+        for each in self.trends:
+            ends = np.array([each.x.min(), each.x.max()])
+            for k, axis in enumerate("xyz"):
+                drawn = 1e3 * each.slope[k] * (ends - each.x.mean())
+                layers = [line(each.x, 1e3 * each.moved[:, k], "o", AFTER), line(ends, drawn, "-", QUIET)]
+                panels.append(Panel(layers, f"{axis} [mm]", f"{each.what} [{each.unit}]"))
+        return {"drift": Chart(panels, 2.2 * len(self.trends), 3)} if panels else {}
+
+    @checked
+    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+        """Write a folder: report.html, trends.csv, metrics.json, and the figure as PNG."""
+        header = ("column", "unit", "x", "dx [mm]", "dy [mm]", "dz [mm]")
+        rows = [(one.what, one.unit, x, *(1e3 * moved)) for one in self.trends for x, moved in zip(one.x, one.moved)]
+        part = pages.ResultPart(
+            self.section(),
+            self.charts() if plots else {},
+            ["Targets of repeated poses less the arm's prediction."],
+            (TABLE, header, rows),
+        )
+        numbers = plain(
+            {"robot": self.robot, "verdict": self.verdict.level, "noticed": self.noticed}
+            | {
+                one.what: {"slope": one.slope, "sigma": one.sigma, "sigmas": one.sigmas, "total": one.total}
+                for one in self.trends
+            }
+        )
+        return pages.save(Path(out), "drift", f"Drift of {self.robot}", {"robot": self.robot}, [part], numbers, [TABLE])
+
+
+def _rate(one: Trend) -> str:
+    return f"{1e3 * one.size:.2g} ± {1e3 * one.sigma:.1g} mm/{one.unit}"
+
+
+def _of_axis(k: int):
+    return lambda one: f"{1e3 * one.slope[k]:+.2g}"
+
+
+def drift(
+    robot: str | Path,
+    measured: Sequence[str | Path],
+    settings: DriftSettings = DEFAULT_DRIFT,
+    options: str | Path | FitOptions | None = None,
+    base: str | None = None,
+    tip: str | None = None,
+) -> DriftFound:
+    """Return how the target drifts with time and temperature, from poses that were measured more than once.
+
+    Args:
+        robot, base, tip: the arm, as of `calib.load`.
+        measured: CSV files with some poses measured several times, and columns ``time`` or ``temperature``; all
+            from one place of the instrument.
+        settings: way that matters, and the instrument's σ.
+        options: as of `fit_geometry`.
+
+    Raises:
+        UsageError: where no pose was measured twice.
+    """
+    chosen = options if isinstance(options, FitOptions) else read_options(None if options is None else Path(options))
+    chain = inputs.load_robot(robot, None, chosen, base=base, tip=tip)[0]
+    blocks = [block for path in measured for block in inputs.read_file(Path(path), chain, chosen)]
+    apart = repeats(chain, blocks[:1], blocks[1:], settings.sigma or 0.0)
+    found = tuple(trends(chain, blocks[:1], blocks[1:], settings.sigma or 0.0))
+    words = "no pose was measured twice: measure the first poses again at the end, into the same or a further file"
+    require(apart or found, words, UsageError)
+    need = settings.tolerance or noise_of_difference(settings.sigma or 0.0)
+    return DriftFound(chain.name, found, settle([*apart, *(one.finding(need) for one in found)]))

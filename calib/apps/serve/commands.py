@@ -1,0 +1,68 @@
+"""Command that serves a session as a web page: serve."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calib.cli.shared import command, say
+from calib.errors import UsageError, refused_as
+
+app = typer.Typer()
+LOCAL = "127.0.0.1"
+
+
+@command(app, "Start")
+def serve(folder: Path, host: str = LOCAL, port: Annotated[int, typer.Option(min=0)] = 8000) -> None:
+    """Serve a session as a web page: what to do now, upload of files with their check, progress, results.
+
+    It stops with Ctrl-C; the session goes on from there.
+
+    Example: calib serve cell
+
+    Args:
+        folder: of the session
+        host: address to listen on. For a tablet 0.0.0.0: whoever has the address with the token that is then printed
+            may read and change this session; the connection is not encrypted
+        port: 0 for any that is free
+    """
+    import secrets
+    import socket
+
+    from calib.procedure.session.folder import open_session
+
+    words = "calib serve needs starlette, uvicorn and python-multipart: pip install 'armature-calib[serve]'"
+    with refused_as(UsageError, ImportError, words):
+        import uvicorn
+
+        from calib.apps.serve.pages import application
+    from calib.apps.serve.work import Work
+
+    open_session(folder)
+    token = "" if host in (LOCAL, "localhost") else secrets.token_urlsafe(16)
+    words = f"cannot listen on {host}, port {port} ({{}}); try another --port"
+    with refused_as(UsageError, (OSError, OverflowError), words):
+        listening = socket.create_server((host, port))
+    work = Work(folder)
+    shown = _own_address() if host == "0.0.0.0" else host
+    address = f"http://{shown}:{listening.getsockname()[1]}/{f'?token={token}' if token else ''}"
+    say(f"{folder}: {address} (Ctrl-C stops)", result=True)
+    try:
+        config = uvicorn.Config(application(work, token, host), log_level="warning", server_header=False)
+        uvicorn.Server(config).run(sockets=[listening])
+    except KeyboardInterrupt:  # uvicorn hands it on once it has stopped
+        pass
+    finally:
+        work.stop()
+
+
+def _own_address() -> str:
+    """Return this computer's address towards other networks, or its name where it has none; nothing is sent."""
+    import socket
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as route:
+        try:
+            route.connect(("192.0.2.1", 9))  # an address of documentation (RFC 5737)
+            return route.getsockname()[0]
+        except OSError:
+            return socket.gethostname()

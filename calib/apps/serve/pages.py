@@ -1,0 +1,226 @@
+"""The pages of a served session, and who may ask for them."""
+
+import atexit
+import hmac
+import ipaddress
+import re
+import socket
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import FileResponse, HTMLResponse, PlainTextResponse, RedirectResponse, Response
+from starlette.routing import Route
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from calib.apps.serve import uploads
+from calib.apps.serve.web_viewer import LOCAL, WebViewer
+from calib.apps.serve.work import CHECK, NEXT, REDO, Work
+from calib.apps.viewer.viewer import FILE as RECORDING
+from calib.errors import CalibError, complaint
+from calib.folders import PAGES
+from calib.procedure.report.templates import filled
+from calib.procedure.session import commands, steps
+from calib.procedure.session.folder import BROUGHT, Session, open_session
+
+HERE = "calib.apps.serve"
+DRIFT = "the first poses measured again at the end, to check for drift (optional)"
+PICTURES = (".png", ".svg")
+OURS = "default-src 'none'; style-src 'unsafe-inline'; script-src 'self'; connect-src 'self'; img-src 'self' data:"
+POLICY = f"{OURS}; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+SANDBOX = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox"  # of files, whoever wrote them
+
+
+class Guard:
+    """Refuses requests without the token, for another host's name (DNS rebinding), and posts of other sites' pages."""
+
+    def __init__(self, app: ASGIApp, token: str, host: str) -> None:
+        self.app, self.token = app, token
+        name = socket.gethostname()
+        self.names = {"localhost", host.lower(), name.lower(), f"{name}.local".lower(), socket.getfqdn().lower()}
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        answer = self._answer(Request(scope)) if scope["type"] == "http" else None
+        await (answer or self.app)(scope, receive, send)
+
+    def _answer(self, request: Request) -> Response | None:
+        """Return what is said in place of a page; None for a request that may pass."""
+        asked, origin = request.headers.get("host", ""), request.headers.get("origin")
+        if not self._is_ours(asked):
+            return PlainTextResponse("This page is not served under that name: use the address printed.", 403)
+        if request.method != "GET" and (
+            (origin is not None and urlsplit(origin).netloc != asked)
+            or request.headers.get("sec-fetch-site", "same-origin") not in ("same-origin", "none")
+        ):
+            return PlainTextResponse("Another site's page asked for this; nothing was changed.", 403)
+        cookie = f"calib-{urlsplit(f'//{asked}').port or 80}"
+        if self.token and not self._knows(request.cookies.get(cookie, "")):
+            if request.method != "GET" or not self._knows(request.query_params.get("token", "")):
+                words = "This page needs its token: open the whole address that calib serve printed."
+                return PlainTextResponse(words, 403)
+            answer = RedirectResponse(request.url.path, 303)
+            answer.set_cookie(cookie, self.token, httponly=True, samesite="strict")
+            return answer
+        return None
+
+    def _is_ours(self, asked: str) -> bool:
+        try:
+            name = urlsplit(f"//{asked}").hostname or ""
+        except ValueError:
+            return False
+        try:
+            ipaddress.ip_address(name)
+            return True  # nobody can rebind a number
+        except ValueError:
+            return name in self.names
+
+    def _knows(self, given: str) -> bool:
+        return hmac.compare_digest(given.encode(), self.token.encode())
+
+
+def application(work: Work, token: str = "", host: str = "127.0.0.1") -> Starlette:
+    """Return the web application of a session.
+
+    Args:
+        work: its worker.
+        token: that every request has to know; empty: none.
+        host: by which it is reached, besides addresses in numbers and this computer's names.
+    """
+    steps.clear_staging(open_session(work.folder))
+    routes = [
+        Route("/", page),
+        Route("/page.js", script),
+        Route("/files/{name:path}", file),
+        Route("/view", view),
+        Route("/next", go_on, methods=["POST"]),
+        Route("/redo/{step}", go_on, methods=["POST"]),
+        Route("/bring/{kind}", bring, methods=["POST"]),
+        Route("/aside/{name:path}", set_aside, methods=["POST"]),
+    ]
+    guard = Middleware(Guard, token=token, host=host)  # type: ignore[arg-type]
+    errors = {CalibError: refused, OSError: refused}
+    made = Starlette(routes=routes, middleware=[guard], exception_handlers=errors)  # type: ignore[arg-type]
+    made.state.work, made.state.view = work, WebViewer()
+    atexit.register(made.state.view.close)
+    return made
+
+
+def refused(request: Request, error: Exception) -> Response:
+    """Return a page with an error's message."""
+    message = (complaint(error) or (str(error), 2))[0]
+    return HTMLResponse(filled(HERE, "refused.html", message=message), 400, {"Content-Security-Policy": POLICY})
+
+
+def page(request: Request) -> Response:
+    """Return the page of the session as it stands."""
+    work: Work = request.app.state.work
+    session = open_session(work.folder)
+    states = steps.states(session)
+    ahead = next((one for one in states if one.kind not in (steps.DONE, steps.KEPT)), None)
+    waits = ahead if ahead is not None and ahead.kind == steps.WAITING else None
+    task, file = commands.asks(session, waits) if waits else ("", "")
+    made = [path for path in _files(session) if path.suffix in PICTURES]
+    values = {
+        "session": session,
+        "states": states,
+        "ahead": ahead,
+        "work": work,
+        "to_bring": file,
+        "tasks": [re.sub(r"^\d+ ", "", line) for line in task.splitlines()],
+        "verdicts": None if ahead else session.verdicts(),
+        "kinds": _kinds(session),
+        "notes": _notes(session),
+        "pages": [name for name in PAGES if session.path(name).exists()],
+        "recording": RECORDING if session.path(RECORDING).exists() else "",
+        "pictures": [_name(session, path) for path in made],
+        "files": [_name(session, path) for path in _files(session)],
+    }
+    headers = {"Content-Security-Policy": POLICY, "Cache-Control": "no-store"}
+    return HTMLResponse(filled(HERE, "page.html", **values), headers=headers)
+
+
+def _notes(session: Session) -> dict[str, tuple[str, ...]]:
+    return {name: one.notes for name, one in steps.read_state(session).steps.items()}
+
+
+def _kinds(session: Session) -> list[tuple[str, str, list[str]]]:
+    """Return the kinds of files that the session takes: name, words, and those that were brought."""
+    words = dict(step.brings for step in steps.steps_of(session))
+    words |= {"drift": DRIFT} if session.geometric else {}
+    return [
+        (kind, words[kind], [_name(session, one) for one in session.brought(kind)]) for kind in BROUGHT if kind in words
+    ]
+
+
+def _name(session: Session, path: Path) -> str:
+    return str(path.relative_to(session.folder))
+
+
+def _files(session: Session) -> list[Path]:
+    """Return the session's files, without hidden ones."""
+    found = sorted(path for path in session.folder.rglob("*") if path.is_file())
+    return [path for path in found if not any(part.startswith(".") for part in path.relative_to(session.folder).parts)]
+
+
+def script(request: Request) -> Response:
+    """Return the page's script, which does nothing that the page could not do without it."""
+    return FileResponse(Path(__file__).with_name("page.js"))
+
+
+def file(request: Request) -> Response:
+    """Return a file of the session's folder."""
+    session = open_session(request.app.state.work.folder)
+    path = session.folder / request.path_params["name"]
+    if path not in _files(session) or not path.resolve().is_relative_to(session.folder.resolve()):
+        return PlainTextResponse("no such file in this session", 404)
+    policy = {} if path.suffix == ".pdf" else {"Content-Security-Policy": SANDBOX}  # viewers of PDF are scripts
+    return FileResponse(path, headers={**policy, "X-Content-Type-Options": "nosniff", "Cache-Control": "no-cache"})
+
+
+def view(request: Request) -> Response:
+    """Lead to the 3-D view of the session's recording; at this computer only, where Rerun's server listens."""
+    recording = open_session(request.app.state.work.folder).path(RECORDING)
+    if not recording.exists():
+        return PlainTextResponse("no recording yet", 404)
+    if request.client is None or request.client.host not in LOCAL:
+        return PlainTextResponse(f"The 3-D view is for the computer that serves; download {RECORDING} here.", 403)
+    return RedirectResponse(request.app.state.view.address_of(recording), 303)
+
+
+def go_on(request: Request) -> Response:
+    """Start a run of `calib next`, or `calib redo`; where one is under way already, none."""
+    work, step = request.app.state.work, request.path_params.get("step", "")
+    if step:
+        steps.find(open_session(work.folder), step)
+    work.ask(REDO if step else NEXT, step)
+    return RedirectResponse("/", 303)
+
+
+async def bring(request: Request) -> Response:
+    """Store uploaded files, and have them checked."""
+    work, kind = request.app.state.work, request.path_params["kind"]
+    session = open_session(work.folder)
+    if kind not in [name for name, _, _ in _kinds(session)]:
+        return PlainTextResponse("this session takes no such files", 404)
+    try:
+        await uploads.receive(session, kind, request.headers.get("content-type", ""), request.stream())
+    except ClientDisconnect:
+        return PlainTextResponse("interrupted; nothing was stored", 400)
+    work.ask(CHECK, kind)
+    return RedirectResponse("/", 303)
+
+
+def set_aside(request: Request) -> Response:
+    """Move what was brought into the folder ``aside`` beside it, where the session does not read it."""
+    work, name = request.app.state.work, request.path_params["name"]
+    session = open_session(work.folder)
+    for kind, _, names in _kinds(session):
+        if name in names:
+            path = session.path(name)
+            aside = path.parent / "aside"
+            aside.mkdir(exist_ok=True)
+            path.replace(aside / f"{len(list(aside.iterdir())) + 1}_{path.name}")
+            work.ask(CHECK, kind)
+    return RedirectResponse("/", 303)

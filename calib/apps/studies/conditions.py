@@ -1,0 +1,345 @@
+"""The study file: compared methods, simulated experiments, and number of runs.
+
+TOML; SI units. Every combination of robot, motion, rate, noise, decimation, cutoff and mismatch is a condition::
+
+    name = "small"                   # of the study, and of its folder's conditions
+    about = "what it is for"         # a sentence for lists
+    robot = ["tx40", "rv2sq"]        # those two: their true inertias, friction and controller are known
+    motion = "designed"              # by calib excite; default random: the best of 20 random Fourier series
+    rate = [200, 50]                 # of the log [Hz]; default 0: the toolbox's, 1000 (tx40) and 140 (rv2sq)
+    decimation = [1, 4]              # one sample in so many is kept, behind the parallel low-pass
+    cutoff = 50.0                    # of the positions' zero-phase Butterworth filter [Hz], or a list; 0: none to speak
+                                     # of (0.8 of the Nyquist frequency)
+    mismatch = "none"                # or a list: geometry (the robot is off its drawing, 0.9 mm, 1.5 mrad and
+                                     # 9 mrad of joint offset rms), calibrated (the same, its geometry fitted first to
+                                     # 40 measured poses), controller (gains believed 30 % off), friction (a Stribeck
+                                     # peak of half Fc that the model lacks), payload (1 kg nobody was told of), clock
+                                     # (torques logged 2 ms late)
+    methods = ["wls", "iv"]          # or "all": calib study --list-methods
+    runs = 20                        # data sets per condition, each with noise of its own
+    runs_loop = 10                   # of methods that simulate the closed loop; default: runs
+    runs_filter = 5                  # of methods that simulate the robot alone (Kalman filters); default: runs
+    runs_of = { iv = 10 }            # for single methods
+    seed = 0                         # number of the first data set
+    duration = 10.0                  # of the motion [s]
+    guess = 0.15                     # relative error of what cloe, clie, Kalman filters and networks start from
+    guesses = 25                     # of these, the same for every data set: such methods run once from each; default 1
+    resimulated = 3                  # data sets whose estimate is simulated once more, for the survey's position error
+    [[noise]]                        # at least one
+    name = "1"                       # ends the names of conditions
+    sigma_q = "1e-4 deg"             # of every encoder, in the loop
+    sigma_tau = 0.05                 # of the logged torque [N m]
+
+In its folder summary.csv holds, of every figure of a method on a condition, the median over runs and, as ``_lower`` and
+``_upper``, the quartiles: each the nearest of the runs' own values, not interpolated between two.
+
+The same data set serves all methods. The 15 conditions of Leboutet et al. (2021), MCS-TX40-1-1 to MCS-RV2SQ-1-5, and
+others come with the toolkit: ``calib study --list``.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from fnmatch import fnmatchcase
+from importlib import resources
+from itertools import product
+from pathlib import Path
+from typing import Annotated, Any
+
+from annotated_types import MinLen
+
+from calib.config import parse, read_toml, strict
+from calib.config_types import Name, OneOf, Real, Spread, Text, Whole
+from calib.errors import UsageError, require, suggestion
+from calib.identification.registry import METHODS, method_named
+
+ROBOTS = ("tx40", "rv2sq")
+MOTIONS = ("random", "designed")
+MISMATCHES = ("none", "geometry", "calibrated", "controller", "friction", "payload", "clock")
+LIBRARY = Path(str(resources.files("calib.apps.studies").joinpath("library")))
+# Raised whenever the trials of all methods change: rows with a lower number do not count. Where one method changes,
+# its `calib.identification.methods.method.Method.version` is raised.
+TRIAL = 1
+
+# Values of fields that came later: they are no part of a digest, so that rows from before these fields count.
+_LATER = {"motion": "random", "rate": 0.0, "guesses": 1}
+_Few = Spread(words="a value, or a list of them")
+Robots = Annotated[
+    tuple[Annotated[str, OneOf(ROBOTS, "simulated robots only; for recordings: calib compare")], ...], _Few
+]
+Wholes = Annotated[tuple[Annotated[int, Whole(1, 100)], ...], _Few]
+Motions = Annotated[tuple[Annotated[str, OneOf(MOTIONS)], ...], _Few]
+Rates = Annotated[tuple[Annotated[float, Real(least=0, most=5000)], ...], _Few]
+Cutoffs = Annotated[tuple[Annotated[float, Real(least=0, words="0 or more, Hz without a unit")], ...], _Few]
+Mismatches = Annotated[tuple[Annotated[str, OneOf(MISMATCHES)], ...], _Few]
+Methods = Annotated[tuple[Name, ...], _Few]
+Count = Annotated[int, Whole(0, 1_000_000)]
+
+
+@strict
+@dataclass(frozen=True)
+class Noise:
+    """Noise of encoders [rad] and logged torques [N m], with a name."""
+
+    name: Name
+    sigma_q: Annotated[float, Real(least=0, most=0.1, unit="rad", quantity="angle")]
+    sigma_tau: Annotated[float, Real(least=0, quantity="torque")]
+
+
+@strict
+@dataclass(frozen=True)
+class StudyFile:
+    """Content of a study file; one field per key."""
+
+    name: Name
+    noise: Annotated[tuple[Noise, ...], MinLen(1)]
+    robot: Robots
+    about: Text = ""
+    motion: Motions = ("random",)
+    rate: Rates = (0.0,)
+    decimation: Wholes = (1,)
+    cutoff: Cutoffs = (50.0,)
+    mismatch: Mismatches = ("none",)
+    methods: Methods = ("all",)
+    runs: Count = 20
+    runs_loop: Count | None = None
+    runs_filter: Count | None = None
+    runs_of: Mapping[str, Count] = field(default_factory=dict)
+    seed: Count = 0
+    duration: Annotated[float, Real(least=2.0, most=600.0, unit="s")] = 10.0
+    guess: Annotated[float, Real(least=0, most=10.0)] = 0.15
+    guesses: Annotated[int, Whole(1, 1000)] = 1
+    resimulated: Count = 3
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One experiment, without the seed of its noise.
+
+    Attributes:
+        name: what people call it; no part of what it is.
+        robot: one of `ROBOTS`.
+        sigma_q, sigma_tau: [rad] in the loop, [N m] of the log.
+        decimation: factor of the parallel decimation.
+        cutoff: of the positions' filter [Hz]; 0 for none.
+        mismatch: what is believed wrongly, one of `MISMATCHES`.
+        duration: [s].
+        guess: relative error of the parameters that methods start from which ask for some.
+        resimulated: data sets below it get the survey's position error.
+        motion: one of `MOTIONS`, or the folder of a `calib excite`.
+        rate: of the log [Hz]; 0 for the robot's own.
+        guesses: start values of each data set; trial k is of data set k // guesses and guess k % guesses.
+    """
+
+    name: str
+    robot: str
+    sigma_q: float
+    sigma_tau: float
+    decimation: int = 1
+    cutoff: float = 50.0
+    mismatch: str = "none"
+    duration: float = 10.0
+    guess: float = 0.15
+    resimulated: int = 3
+    motion: str = "random"
+    rate: float = 0.0
+    guesses: int = 1
+
+    @property
+    def digest(self) -> str:
+        """Key of the condition's rows in the store; conditions that differ only in name have the same key."""
+        content = asdict(self)
+        del content["name"], content["resimulated"]
+        for key, value in _LATER.items():
+            if content[key] == value:
+                del content[key]
+        text = json.dumps([TRIAL, content], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class Study:
+    """Conditions of a study, and the number of runs of each method on each condition.
+
+    Attributes:
+        name, about: of the study.
+        conditions: all with names of their own.
+        runs: name of a method → number of data sets, for each condition (in their order).
+        seeds: number of the first data set, by condition.
+    """
+
+    name: str
+    about: str
+    conditions: tuple[Condition, ...]
+    runs: tuple[Mapping[str, int], ...]
+    seeds: tuple[int, ...]
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """All methods of the study, in the registry's order."""
+        names = set().union(*self.runs)
+        return tuple(name for name in METHODS if name in names)
+
+
+def shipped() -> dict[str, Path]:
+    """Return the study files shipped with the toolkit, by name."""
+    return {path.stem: path for path in sorted(LIBRARY.glob("*.toml"))}
+
+
+def read_study(files: Sequence[str | Path], methods: Sequence[str] | None = None, runs: int | None = None) -> Study:
+    """Return the study of one or several files.
+
+    Args:
+        files: paths, names of shipped ones, or patterns of these (``MCS-*``).
+        methods, runs: in place of the files'.
+
+    Raises:
+        UsageError: for a file that cannot be one, a method's name misspelt, two conditions of one name.
+    """
+    for name in methods or ():
+        method_named(name)
+    study_files = [_parse(path) for path in _paths(files)]
+    conditions: list[Condition] = []
+    counts: list[Mapping[str, int]] = []
+    seeds: list[int] = []
+    for study in study_files:
+        for condition in _expanded(study):
+            conditions.append(condition)
+            counts.append(_counts(study, methods, runs))
+            seeds.append(study.seed)
+    names = [condition.name for condition in conditions]
+    for name in names:
+        if names.count(name) > 1:
+            raise UsageError(
+                f"two conditions are named '{name}': state each value once, and give noises (and studies of "
+                "several files) different names"
+            )
+    _check_cutoffs(conditions)
+    name, about = study_files[0].name, study_files[0].about
+    if len(study_files) > 1:
+        name = f"{len(study_files)} studies"
+        about = ", ".join(study.name for study in study_files)
+    return Study(name, about, tuple(conditions), tuple(counts), tuple(seeds))
+
+
+def _check_cutoffs(conditions: Sequence[Condition]) -> None:
+    """Refuse cutoff frequencies at or above half the logging rate.
+
+    Raises:
+        UsageError: for a cut-off that the robot's log is sampled too slowly for.
+    """
+    from calib.simulation import known_robots  # slow to load
+
+    for condition in conditions:
+        rate = condition.rate or float(known_robots.truth(condition.robot)["control"]["sampling"])
+        limit = 0.5 * rate
+        if condition.cutoff >= limit:
+            raise UsageError(
+                f"{condition.name}: cutoff: expected less than {limit:g} Hz, half the rate of the {condition.robot}'s "
+                f"log, found {condition.cutoff:g}; 0 is unfiltered"
+            )
+
+
+def _paths(files: Sequence[str | Path]) -> list[Path]:
+    """Return the paths of study files, from paths, names of shipped studies, and patterns of these; each once."""
+    library = shipped()
+    paths: list[Path] = []
+    for text in map(str, files):
+        if Path(text).exists() or text.endswith(".toml"):
+            paths.append(Path(text))
+            continue
+        matches = [path for name, path in library.items() if fnmatchcase(name.lower(), text.lower())]
+        message = f"no study '{text}'{suggestion(text, library)}: give a file, or a name of calib study --list"
+        require(matches, message, UsageError)
+        paths += matches
+    require(paths, "no study given: name a file, or a study of calib study --list", UsageError)
+    return list(dict.fromkeys(paths))
+
+
+def _parse(path: Path) -> StudyFile:
+    """Return the study of a file.
+
+    Raises:
+        UsageError: see `calib.config.parse`; methods that there are none of.
+    """
+    study = parse(StudyFile, read_toml(path), str(path))
+    for name in study.methods:
+        if name != "all":
+            _check_method(path, "methods", name)
+    for name in study.runs_of:
+        _check_method(path, "runs_of", name)
+    return study
+
+
+def _check_method(path: Path, key: str, name: str) -> None:
+    advice = f"{suggestion(name, METHODS)}; calib study --list-methods"
+    require(name in METHODS, f"{path}: {key}: there is no method '{name}'{advice}", UsageError)
+
+
+def _expanded(study: StudyFile) -> list[Condition]:
+    """Return the conditions of a study: all combinations of its values, each with a name."""
+    axes: dict[str, tuple[Any, ...]] = {
+        "robot": study.robot,
+        "motion": study.motion,
+        "rate": study.rate,
+        "noise": study.noise,
+        "decimation": study.decimation,
+        "cutoff": study.cutoff,
+        "mismatch": study.mismatch,
+    }
+    varied = [axis for axis, values in axes.items() if len(values) > 1]
+    conditions = []
+    for combination in product(*axes.values()):
+        values = dict(zip(axes, combination))
+        parts = [_name_part(axis, values[axis]) for axis in varied]
+        noise = values.pop("noise")
+        condition = Condition(
+            "-".join([study.name, *parts]),
+            sigma_q=noise.sigma_q,
+            sigma_tau=noise.sigma_tau,
+            duration=study.duration,
+            guess=study.guess,
+            guesses=study.guesses,
+            resimulated=study.resimulated,
+            **values,
+        )
+        conditions.append(condition)
+    return conditions
+
+
+def _name_part(axis: str, value: Any) -> str:
+    """Return how a value appears in the name of its condition."""
+    if axis == "cutoff":
+        return f"{value:g}Hz" if value else "unfiltered"
+    if axis == "rate":
+        return f"{value:g}Hz" if value else "own"
+    if axis == "decimation":
+        return f"r{value}"
+    if isinstance(value, Noise):
+        return value.name
+    return str(value)
+
+
+def _counts(study: StudyFile, methods: Sequence[str] | None, runs: int | None) -> dict[str, int]:
+    """Return the number of runs of each method; `methods` and `runs` in place of the file's."""
+    if "all" in study.methods:
+        names = list(METHODS)
+    else:
+        names = list(study.methods)
+    if methods is not None:
+        names = list(methods)
+    if runs is not None:
+        return dict.fromkeys(names, runs)
+    return {name: _runs_of(study, name) for name in names}
+
+
+def _runs_of(study: StudyFile, name: str) -> int:
+    """Return the number of runs that a file states for a method, or for its kind."""
+    method = METHODS[name]
+    kind_runs = None
+    if method.needs_controller:
+        kind_runs = study.runs_loop
+    elif method.needs_simulation:
+        kind_runs = study.runs_filter
+    return study.runs_of.get(name, study.runs if kind_runs is None else kind_runs)

@@ -1,0 +1,134 @@
+"""Running the missing trials of a study: tasks go to workers, rows to the store as they arrive."""
+
+import math
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+from calib.apps.fleet.throughput import Throughput
+from calib.apps.studies.conditions import Study
+from calib.apps.studies.store import RowStore
+from calib.apps.studies.trial import Trials, grouped, run_trials
+from calib.errors import TaskLost
+from calib.identification.registry import method_named
+from calib.workers import Workers
+
+# Shortest time between two messages on progress [s].
+MESSAGE_INTERVAL = 1.0
+
+
+@dataclass
+class Progress:
+    """Progress of a study's command.
+
+    Attributes:
+        total: trials that this command has to run.
+        done, failed: that have ended; of these without an estimate.
+        lost: that no worker brought back.
+        spent: seconds of each trial that has ended, by method.
+        remaining_trials: number of trials that have not ended, by method.
+        seconds: since it began.
+        pace: of each worker.
+    """
+
+    total: int
+    done: int = 0
+    failed: int = 0
+    lost: int = 0
+    spent: dict[str, list[float]] = field(default_factory=dict)
+    remaining_trials: Counter = field(default_factory=Counter)
+    pace: Throughput = field(default_factory=Throughput)
+    began: float = field(default_factory=time.monotonic)
+
+    @property
+    def seconds(self) -> float:
+        return time.monotonic() - self.began
+
+    @property
+    def remaining(self) -> float:
+        """Estimated remaining time [s], from each method's mean time so far and the number of trials in parallel."""
+        if not self.spent or self.seconds <= 0:
+            return float("nan")
+        mean_seconds = {name: sum(seconds) / len(seconds) for name, seconds in self.spent.items()}
+        worked = sum(sum(seconds) for seconds in self.spent.values())
+        mean = worked / max(self.done, 1)
+        to_work = 0.0
+        for name, count in self.remaining_trials.items():
+            to_work += count * mean_seconds.get(name, mean)
+        return to_work * self.seconds / max(worked, 1e-9)
+
+    def __str__(self) -> str:
+        rate = 60 * self.done / max(self.seconds, 1e-9)
+        message = f"{self.done} of {self.total} trials, {rate:.0f} a minute"
+        if self.failed:
+            message += f", {self.failed} without an estimate"
+        if self.lost:
+            message += f", {self.lost} lost"
+        remaining = self.remaining
+        if not math.isnan(remaining) and self.total != self.done:
+            message += f"; {span(remaining)} to go"
+        return message
+
+
+def span(seconds: float) -> str:
+    """Return a duration as text: 40 s, 12 min, 3.1 h."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+def _missing(study: Study, store: RowStore) -> Iterator[Trials]:
+    """Yield the tasks that have no rows in the store, data set by data set over all conditions.
+
+    Methods that take no start values run once per data set, the others from each guess.
+    """
+    data_sets = max((max(runs.values(), default=0) for runs in study.runs), default=0)
+    for number in range(data_sets):
+        for condition, runs, first in zip(study.conditions, study.runs, study.seeds):
+            digest = condition.digest
+            methods = [method_named(name) for name, count in runs.items() if number < count]
+            for guess in range(condition.guesses):
+                seed = (first + number) * condition.guesses + guess
+                missing = []
+                for method in methods:
+                    runs_here = method.takes_start or guess == 0
+                    if runs_here and not store.holds((digest, method.name, seed)):
+                        missing.append(method.name)
+                yield from grouped(condition, missing, seed)
+
+
+def run(study: Study, store: RowStore, workers: Workers, say: Callable[[Progress], None]) -> Progress:
+    """Run the missing trials of a study; each row is stored as soon as it arrives.
+
+    Args:
+        say: called with how far it is, now and then.
+
+    Raises:
+        CalibError: where rows cannot be kept, or the workers are gone.
+    """
+    tasks = list(_missing(study, store))
+    progress = Progress(sum(len(task.methods) for task in tasks))
+    for task in tasks:
+        progress.remaining_trials.update(task.methods)
+    last_message = 0.0
+    for number, rows in progress.pace.completed(workers, run_trials, tasks):
+        methods = tasks[number].methods
+        progress.remaining_trials.subtract(methods)
+        if isinstance(rows, TaskLost):
+            progress.lost += len(methods)
+        else:
+            store.append(rows)
+            progress.done += len(rows)
+            for row in rows:
+                progress.failed += not row.found
+                if math.isnan(row.seconds):
+                    seconds = 0.0
+                else:
+                    seconds = row.seconds
+                progress.spent.setdefault(row.method, []).append(seconds)
+        if time.monotonic() - last_message > MESSAGE_INTERVAL:
+            last_message = time.monotonic()
+            say(progress)
+    say(progress)
+    return progress

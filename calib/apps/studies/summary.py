@@ -1,0 +1,243 @@
+"""Summaries of trials: figures of merit of each method on each condition, and which methods differ significantly.
+
+Failures count: a trial without an estimate has an infinite error, in medians and in comparisons. Methods are compared
+on the same data sets, pair by pair, by the sign test (Conover 1999, section 3.4), since errors of two methods on one
+data set go together and their distributions have long tails; of several guesses the first one is compared.
+
+The rule: of the methods that give an estimate in at least `RELIABLE` of the trials, those whose torque error on unseen
+motion cannot be distinguished from the best one's (`LEVEL`), or larger by no more than `SLACK` in the median data set,
+are as good as the best; a method of fewer than `MIN_DATA_SETS` runs is listed and takes no part. Of these one is
+taken that is cheap: no more than `ALIKE` times the processor time of the cheapest, and of such the first in rank.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import binomtest
+
+from calib.apps.studies.conditions import Condition, Study
+from calib.apps.studies.trial import TrialRow
+
+# The rule's shares and factor (our choices), see above.
+RELIABLE, LEVEL, SLACK, ALIKE = 0.95, 0.05, 0.05, 2.0
+# Common data sets below which the sign test cannot tell at 5 %.
+MIN_DATA_SETS = 6
+# Error of a trial without an estimate.
+FAILED_ERROR = float("inf")
+FIGURES = (
+    "torque_error",
+    "torque_worst",
+    "beta_error",
+    "beta_distance",
+    "beta_sigma",
+    "coverage",
+    "survey_tau",
+    "survey_q",
+    "iterations",
+    "simulations",
+    "cpu",
+    "seconds",
+)
+# Of these a trial without an estimate has an infinite one.
+ERROR_FIGURES = ("torque_error", "torque_worst", "beta_error", "beta_distance")
+
+
+class Quartiles(NamedTuple):
+    """Median and quartiles of a figure over runs; a failed run counts as an infinite error."""
+
+    median: float
+    lower: float
+    upper: float
+
+
+@dataclass(frozen=True)
+class MethodSummary:
+    """Summary of one method on one condition.
+
+    Attributes:
+        trials: number of its rows; failures: status → how many of them gave no estimate.
+        examples: status → data set and message of the first of these.
+        figures: name of a figure (`FIGURES`) → its spread.
+        rank: by the median torque error, from 1.
+        as_good: not distinguishable from the best, or within `SLACK` of it, and reliable.
+        chosen: the one of those to take.
+        p: of the sign test against the best; NaN for the best itself.
+    """
+
+    method: str
+    trials: int
+    failures: Mapping[str, int]
+    examples: Mapping[str, str]
+    figures: Mapping[str, Quartiles]
+    rank: int = 0
+    as_good: bool = False
+    chosen: bool = False
+    p: float = float("nan")
+
+    @property
+    def enough(self) -> bool:
+        """Whether the runs suffice to distinguish the method from others."""
+        return self.trials >= MIN_DATA_SETS
+
+    @property
+    def estimates(self) -> bool:
+        """Whether the median torque error is finite, so not a failure."""
+        return bool(np.isfinite(self.figures["torque_error"].median))
+
+    @property
+    def reliable(self) -> bool:
+        return sum(self.failures.values()) <= (1.0 - RELIABLE) * self.trials
+
+
+@dataclass(frozen=True)
+class ConditionSummary:
+    """Summaries of all methods on one condition, best first."""
+
+    condition: Condition
+    methods: tuple[MethodSummary, ...]
+
+    @property
+    def chosen(self) -> MethodSummary | None:
+        """The recommended method; None if none is reliable."""
+        return next((method for method in self.methods if method.chosen), None)
+
+    @property
+    def best(self) -> MethodSummary | None:
+        """The best method with enough runs and an estimate; None without any."""
+        return next((method for method in self.methods if method.enough and method.estimates), None)
+
+    @property
+    def why_none(self) -> str:
+        """Reason why no method is recommended; "" if one is, or without rows."""
+        if self.chosen or not self.methods:
+            return ""
+        if not any(method.enough for method in self.methods):
+            return f"fewer than {MIN_DATA_SETS} runs of each method are too few: --runs {MIN_DATA_SETS} or more"
+        return f"no method of {MIN_DATA_SETS} runs or more gives an estimate in {RELIABLE:.0%} of its trials"
+
+
+def summarise(study: Study, rows: Iterable[TrialRow]) -> list[ConditionSummary]:
+    """Return the summary of each condition of a study, over all methods that have rows.
+
+    Rows of other conditions do not count, nor do those of a method that has changed since.
+
+    Methods that the study no longer asks for stay in the summary while their rows are stored.
+    """
+    by_digest: dict[str, dict[str, list[TrialRow]]] = {}
+    for row in rows:
+        if row.current:
+            by_digest.setdefault(row.digest, {}).setdefault(row.method, []).append(row)
+    summaries = []
+    for condition, runs in zip(study.conditions, study.runs):
+        by_method = by_digest.get(condition.digest, {})
+        # Methods of the study first, in its order; each once.
+        names = dict.fromkeys((*runs, *by_method))
+        summaries.append(_ranked(condition, {name: by_method[name] for name in names if name in by_method}))
+    return summaries
+
+
+def _ranked(condition: Condition, rows: Mapping[str, Sequence[TrialRow]]) -> ConditionSummary:
+    """Return the summary of a condition from the rows of each method."""
+    if not rows:
+        return ConditionSummary(condition, ())
+    summaries = []
+    errors: dict[str, dict[int, float]] = {}
+    for name, method_rows in rows.items():
+        summaries.append(_summary(name, method_rows))
+        errors[name] = {}
+        for row in method_rows:
+            # Of several guesses the first is compared.
+            if row.seed % condition.guesses == 0:
+                if row.found:
+                    errors[name][row.seed] = row.torque_error
+                else:
+                    errors[name][row.seed] = FAILED_ERROR
+    summaries.sort(key=lambda method: (not method.reliable, method.figures["torque_error"].median))
+    best = next((method for method in summaries if method.enough), None)
+    ranked = []
+    for rank, method in enumerate(summaries, 1):
+        if best is None or method is best or not method.enough:
+            as_good = method is best and method.reliable and method.estimates
+            ranked.append(replace(method, rank=rank, as_good=as_good))
+            continue
+        p = sign_test(errors[method.method], errors[best.method])
+        within_slack = _median_ratio(errors[method.method], errors[best.method]) <= 1.0 + SLACK
+        as_good = method.reliable and best.reliable and (within_slack or p > LEVEL)
+        ranked.append(replace(method, rank=rank, as_good=as_good, p=p))
+    cheapest = min((method.figures["cpu"].median for method in ranked if method.as_good), default=0.0)
+    chosen = None
+    for method in ranked:
+        # Also true for a time that is NaN.
+        cheap = not method.figures["cpu"].median > ALIKE * cheapest
+        if method.as_good and cheap:
+            chosen = method
+            break
+    return ConditionSummary(condition, tuple(replace(method, chosen=method is chosen) for method in ranked))
+
+
+def _pairs(errors: Mapping[int, float], reference: Mapping[int, float]) -> list[tuple[float, float]]:
+    """Return the errors of two methods on the data sets of both."""
+    return [(errors[seed], reference[seed]) for seed in errors.keys() & reference.keys()]
+
+
+def _median_ratio(errors: Mapping[int, float], reference: Mapping[int, float]) -> float:
+    """Return the median ratio of two methods' errors on the same data sets; infinite without common data sets."""
+    ratios = []
+    for error, reference_error in _pairs(errors, reference):
+        if np.isfinite(reference_error):
+            ratios.append(error / max(reference_error, 1e-300))
+    if ratios:
+        return float(np.median(ratios))
+    return float("inf")
+
+
+def _seed(row: TrialRow) -> int:
+    return row.seed
+
+
+def _summary(name: str, rows: Sequence[TrialRow]) -> MethodSummary:
+    failures = Counter(row.status for row in rows if not row.found)
+    examples = {}
+    for status in failures:
+        same_status = [row for row in rows if row.status == status]
+        first = min(same_status, key=_seed)
+        examples[status] = f"data set {first.seed}: {first.message}"
+    figures = {}
+    for figure in FIGURES:
+        values = [float(getattr(row, figure)) for row in rows if row.found]
+        if figure in ERROR_FIGURES:
+            values += [FAILED_ERROR] * (len(rows) - len(values))
+        figures[figure] = spread(values)
+    return MethodSummary(name, len(rows), failures, examples, figures)
+
+
+def spread(values: Sequence[float]) -> Quartiles:
+    """Return median and quartiles of the values without NaN; NaN if none remain."""
+    numbers = np.sort([value for value in values if not math.isnan(value)])
+    if len(numbers) == 0:
+        return Quartiles(float("nan"), float("nan"), float("nan"))
+    with np.errstate(invalid="ignore"):
+        lower, upper = np.quantile(numbers, [0.25, 0.75], method="nearest")
+    return Quartiles(float(np.median(numbers)), float(lower), float(upper))
+
+
+def sign_test(errors: Mapping[int, float], reference: Mapping[int, float]) -> float:
+    """Return the two-sided p value of the sign test between the errors of two methods.
+
+    Args:
+        errors, reference: seed → error; seeds in both count, ties do not.
+
+    Returns:
+        1 where fewer than `MIN_DATA_SETS` data sets distinguish them.
+    """
+    larger = smaller = 0
+    for error, reference_error in _pairs(errors, reference):
+        larger += error > reference_error
+        smaller += error < reference_error
+    if larger + smaller < MIN_DATA_SETS:
+        return 1.0
+    return float(binomtest(larger, larger + smaller).pvalue)

@@ -1,0 +1,376 @@
+"""Design of an exciting motion of a parallel robot, by the search for serial arms in platform coordinates."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib import files
+from calib.api.motions import ExcitationDesign, Sampled
+from calib.errors import UsageError, one_of, require
+from calib.folders import METRICS, check_target, write_staged
+from calib.identification.identify_options import IdentifySettings
+from calib.parallel.design_goal import Purpose, foretold, of_folder, of_options, purpose_of, read_model, whole
+from calib.parallel.mechanism.closure import ClosedRobot
+from calib.parallel.mechanism.parallel_model import ParallelModel, PlatformRegressor
+from calib.parallel.mechanism.parallel_robot import ParallelRobot
+from calib.parallel.mechanism.velocities import LoopMotion
+from calib.parallel.robots import ParallelMechanism, refuse_unread
+from calib.procedure.excitation import coefficients, folder, prediction
+from calib.procedure.excitation.coefficients import PLANNED
+from calib.procedure.excitation.design import INSTANTS, search_motion
+from calib.procedure.excitation.goals import GUARD
+from calib.procedure.excitation.inputs import ExcitationInputs
+from calib.procedure.excitation.limits import MotionBounds, MotionLimits
+from calib.procedure.excitation.settings import COARSE, DEFAULT_DESIGN, ExcitationSettings
+from calib.records import field_values
+from calib.robot.calibrated import COVARIANCE, ROBOT
+from calib.robot.chain import Joint
+from calib.robot.tables import dumps
+from calib.trajectories.basis import SampledMotion
+from calib.trajectories.constraints import BoxLimit, MotionConstraint, TwoSided
+from calib.trajectories.design.verify import dense_motion
+from calib.trajectories.setpoints import Setpoints
+from calib.units import headings
+
+# instants over the period while searching
+SAMPLES = 100
+READ = (
+    "period",
+    "harmonics",
+    "drives",
+    "starts",
+    "evaluations",
+    "seed",
+    "rate",
+    "outlook",
+    "goals",
+    "hard",
+    "loads",
+    "columns",
+)  # of the settings
+GOALS = ("raw", "normalised", "logdet", "smallest")
+FIGURES = "plot_*.png"
+MOTION = (ROBOT, COVARIANCE, METRICS, PLANNED, coefficients.NAME, prediction.NAME, FIGURES)
+
+
+@dataclass(frozen=True, eq=False)
+class _ActuatorLimit(TwoSided):
+    """Limit of each actuator's torque |τ| ≤ τ_max, or speed |q̇| ≤ v_max.
+
+    Attributes:
+        plan: takes platform coordinates to the robot's motion.
+        of: the motion of N samples -> (N, n), what is limited.
+        limits: (n,), finite; rows: names of the n actuators.
+        name, unit: of the limit.
+    """
+
+    plan: PlatformRegressor
+    of: Callable[[LoopMotion], np.ndarray]
+    limits: np.ndarray
+    rows: tuple[str, ...] = ()
+    name: str = "torque"
+    unit: str = "N m"
+    joints: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "joints", np.arange(len(self.limits)))
+
+    @property
+    def scale(self) -> np.ndarray:
+        return np.tile(self.limits, 2)
+
+    def values(self, motion: SampledMotion) -> np.ndarray:
+        values = self.of(self.plan.motion(motion.q, motion.v, motion.a))
+        return np.concatenate([values - self.limits, -values - self.limits], axis=1)
+
+    def slopes(self, motion: SampledMotion, weights: np.ndarray) -> np.ndarray:
+        k = len(self.limits)
+        result = np.zeros((4, *motion.q.shape))
+        # Weights of the upper limits less those of the lower ones.
+        net = weights[:, :k] - weights[:, k:]
+        result[:3] = self.plan.slopes(motion.q, motion.v, motion.a, self.of, net)
+        return result
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class ParallelExcitation(ExcitationDesign):
+    """An exciting motion of a parallel robot; the fields of the design refer to the platform's coordinates.
+
+    Attributes:
+        robot: with its file.
+        plan: takes platform coordinates to the robot's motion and torques.
+    """
+
+    robot: ParallelMechanism
+    plan: PlatformRegressor
+
+    def orders(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return x, v, a (N, r) of the platform's coordinates at times (N,) [s]; the motion repeats."""
+        family = self.family
+        motion = dense_motion(family, self.found.x, np.mod(times, family.period))
+        return motion.q, motion.v, motion.a
+
+    def sampled(self, rate: float | None = None) -> Sampled:
+        """Return t (N,) [s] and q, v, a (N, n) of the actuators over one period at `rate` [Hz], ends included."""
+        track = self._actuators(folder.one_period(self, rate))
+        return track.times, track.q, track.v, track.a
+
+    def _actuators(self, track: Setpoints) -> Setpoints:
+        """Return the setpoints of the actuators (q, v, a, torques) for setpoints of the platform."""
+        motion = self.plan.motion(track.q, track.v, track.a)
+        actuated = self.robot.chain.actuated
+        q = motion.posture.q[:, actuated]
+        v = motion.v[:, actuated]
+        a = motion.a[:, actuated]
+        return Setpoints(track.rate, q, v, a, self._torques(motion))
+
+    def _torques(self, motion: LoopMotion) -> np.ndarray:
+        """Return the torques of the actuators (N, n), each of the load under which it is largest."""
+        torques = self.plan.torques(motion).reshape(len(motion.v), -1, self.robot.chain.n)
+        heaviest = np.abs(torques).argmax(axis=1, keepdims=True)
+        return np.take_along_axis(torques, heaviest, axis=1)[:, 0]
+
+    @property
+    def peaks(self) -> tuple[np.ndarray, np.ndarray]:
+        """Largest torque of each actuator (n,) [N m or N] and acceleration of each platform coordinate (r,)."""
+        x, v, a = self.orders(self.period / INSTANTS * np.arange(INSTANTS))
+        torques = self._torques(self.plan.motion(x, v, a))
+        return np.abs(torques).max(axis=0), np.abs(a).max(axis=0)
+
+    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+        """Write the result folder of `calib excite`: one period at the controller's rate, and the actuators' series."""
+        from calib.procedure.report import motion_figures
+
+        period_motion = folder.one_period(self)
+        bounds = self.inputs.limits.bounds
+
+        def write_series(target: Path) -> None:
+            series = coefficients.table(self._series(), ROBOT, bounds.lines())
+            files.write(target / coefficients.NAME, dumps(series))
+            if self.predicted:
+                prediction.write(self.predicted, target)
+            if plots:
+                motion_figures.write_design(self, target)
+
+        track = self._actuators(period_motion)
+        return write_motion(self.robot, Path(out), track, period_motion.q, bounds, self.to_dict(), write_series)
+
+    def _series(self, max_error: float = 1e-8, samples: int = 2048) -> coefficients.Periodic:
+        """Return the periodic motion of the actuators as Fourier series.
+
+        Args:
+            max_error: by which the series may leave the motion [rad or m].
+            samples: over the period, of which the series are made.
+        """
+        x, _, _ = self.orders(self.period / samples * np.arange(samples))
+        robot = self.robot.chain
+        q = self.robot.mechanism.place(x).q[:, robot.actuated]
+        lines = np.fft.rfft(q, axis=0) / samples
+        # What the harmonics from each on add to the motion, at most.
+        from_last = np.cumsum(2.0 * np.abs(lines[::-1]), axis=0)
+        remainder = from_last[::-1].max(axis=1)
+        last = 1 + max(1, int((remainder[1:] > max_error).sum()))
+        series = []
+        for line in lines.T:
+            sines = -2.0 * line[1:last].imag
+            cosines = 2.0 * line[1:last].real
+            series.append(np.concatenate([[line[0].real], sines, cosines]))
+        kinds = tuple(joint.kind for joint in robot.joints)
+        rate = self.settings.rate
+        return coefficients.Periodic(robot.joint_names, kinds, self.period, rate, 1, "fourier", tuple(series))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the metrics of ``metrics.json``."""
+        torque, acceleration = self.peaks
+        return super().to_dict() | {
+            "robot": self.robot.chain.name,
+            "peak_torque": torque.tolist(),
+            "peak_acceleration": acceleration.tolist(),
+        }
+
+    def __repr__(self) -> str:
+        return f"<ParallelExcitation for {self.robot.chain.name}: {self.period:g} s>"
+
+    def __str__(self) -> str:
+        torques, _ = self.peaks
+        peaks = [f"{name} {torque:.3g}" for name, torque in zip(self.robot.chain.joint_names, torques)]
+        return f"{super().__str__()}\npeak torques: {', '.join(peaks)}"
+
+
+def excite_parallel(
+    robot: ParallelMechanism,
+    settings: ExcitationSettings,
+    *,
+    model: Path | None = None,
+    options: IdentifySettings | str | Path | None = None,
+    after: Path | None = None,
+    map: Callable = map,
+    progress: Callable[[str], None] | None = None,
+) -> ParallelExcitation:
+    """Return an exciting motion of a parallel robot within the torque limits and platform box of its file.
+
+    Args:
+        settings: period, harmonics, drives, loads, columns, goals (`GOALS`), starts, evaluations, seed, rate; the
+            others are for serial arms.
+        model: folder of an identification of the same robot, which predicts the torques and whose drive terms are to
+            be identified; None: the file's inertias.
+        options: of the identification that will follow: rows, drives, friction of passive joints, payloads.
+        after: folder of an identification that the motion shall add to; it is the model, too.
+
+    Raises:
+        UsageError: for options that only serial arms know.
+    """
+    refuse_unread(settings, DEFAULT_DESIGN, READ)
+    for text in (*settings.goals, *settings.hard):
+        one_of(text.partition("=")[0], GOALS, "goals: of a parallel robot", UsageError)
+    require(after is None or model is None, "after: its folder is also the model; leave --model out", UsageError)
+    folder = model or after
+    if options is None and after is None and not settings.loads and not settings.columns:
+        parallel_model, values = read_model(robot, folder, settings.drives or "Fv Fc off")
+        return design_parallel(robot, parallel_model, values, settings, map=map, progress=progress)
+    require(
+        options is None or folder is None,
+        f"{folder} already states rows, drives and payloads; leave the options out",
+        UsageError,
+    )
+    if folder is None:
+        parallel_model, values, loads, notes = of_options(robot, options, settings)
+    else:
+        parallel_model, values, loads, notes = of_folder(robot, folder, settings)
+    purpose = purpose_of(parallel_model, values, loads, notes, settings, folder, after)
+    design = design_parallel(robot, parallel_model, values, settings, purpose=purpose, map=map, progress=progress)
+    return design if after is None else foretold(design)
+
+
+def design_parallel(
+    robot: ParallelMechanism,
+    model: ParallelModel,
+    values: np.ndarray,
+    settings: ExcitationSettings,
+    *,
+    acceleration: np.ndarray | None = None,
+    purpose: Purpose | None = None,
+    map: Callable = map,
+    progress: Callable[[str], None] | None = None,
+) -> ParallelExcitation:
+    """Return a motion of the platform, optimised to identify the base parameters of a parallel robot.
+
+    The determinant of the information is optimised, rows in units of what equal noise of all torques makes of them at
+    home; `GUARD` of the torque limits stays free.
+
+    Args:
+        model: of the robot, with what it carries and the preload of redundant actuators.
+        values: (p,) parameters that predict the actuators' torques.
+        settings: period, harmonics, starts, evaluations, seed, rate.
+        acceleration: (r,) limits of the coordinates' second derivatives; infinite where there is none.
+        purpose: what the motion is designed for; None: all base parameters, on the platform's coordinates.
+
+    Raises:
+        UsageError: where nothing limits an actuator's speed or torque.
+        NothingFeasible: naming the limit that stands in the way.
+    """
+    mechanism = model.mechanism
+    parallel_robot = model.mechanism.robot
+    bounds = actuator_bounds(mechanism)
+    purpose = purpose or whole(model, values)
+    plan: Any = purpose.model.exact
+    rows = getattr(plan, "row_names", parallel_robot.joint_names)
+    coordinates = tuple(f"platform {name}" for name in parallel_robot.freedom)
+    constraints: list[MotionConstraint] = [BoxLimit(0, parallel_robot.lower, parallel_robot.upper, rows=coordinates)]
+    if acceleration is not None:
+        constraints.append(BoxLimit(2, -acceleration, acceleration, rows=coordinates))
+    torque_limits = np.resize((1.0 - GUARD) * bounds.torque, len(rows))
+    constraints.append(_ActuatorLimit(plan, plan.torques, torque_limits, rows))
+    names = parallel_robot.joint_names
+    constraints.append(_ActuatorLimit(plan, plan.speeds, bounds.velocity, names, "velocity", "rad/s"))
+    platform: Any = _PlatformAxes(parallel_robot)
+    free = np.full(parallel_robot.r, np.inf)
+    limits = MotionLimits(tuple(constraints), bounds, free, None, 0.0, None, None, ())
+    excited = replace(purpose.model, values=None, covariance=None)
+    inputs = ExcitationInputs(platform, limits, excited, {}, purpose.columns, purpose.prior)
+    goals = settings.goals or ("logdet",)
+    harmonics = settings.harmonics or COARSE
+    design_settings = replace(settings, goals=goals, harmonics=harmonics, samples=SAMPLES)
+    design = search_motion(inputs, design_settings, map, progress)
+    return ParallelExcitation(**field_values(design), robot=robot, plan=plan)
+
+
+@dataclass(frozen=True)
+class _PlatformAxes:
+    """The coordinates of a platform as the joints of an arm, whose motion is searched for."""
+
+    robot: ParallelRobot
+
+    @property
+    def name(self) -> str:
+        return self.robot.name
+
+    @property
+    def n(self) -> int:
+        return self.robot.r
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        return self.robot.freedom
+
+    @property
+    def joints(self) -> tuple[Joint, ...]:
+        return tuple(Joint(name, "revolute" if "r" in name else "prismatic") for name in self.robot.freedom)
+
+
+def actuator_bounds(mechanism: ClosedRobot) -> MotionBounds:
+    """Return the limits of the actuators: speeds and efforts of the robot's file.
+
+    Raises:
+        UsageError: where nothing limits one.
+    """
+    joints = mechanism.robot.joints
+    velocity = np.array([joint.velocity for joint in joints])
+    effort = np.array([joint.effort for joint in joints])
+    free = np.full(len(joints), np.inf)
+    origin: dict[str, str] = dict.fromkeys(("velocity", "torque"), "robot's file")
+    location = "in the robot's file: velocity and effort of the actuated joints"
+    return MotionBounds(mechanism.robot.name, joints, velocity, free, effort, origin, location)
+
+
+def check_motion_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
+    """Raise an error if an output folder has other content or contains an input file."""
+    check_target(out, MOTION, (METRICS, PLANNED), "motion", inputs)
+
+
+def write_motion(
+    robot: ParallelMechanism,
+    out: Path,
+    track: Setpoints,
+    coordinates: np.ndarray,
+    bounds: MotionBounds,
+    metrics: dict[str, Any],
+    write_files: Callable[[Path], None],
+) -> Path:
+    """Write the folder of a motion: ``robot.toml``, ``motion.csv``, ``metrics.json`` and what `write_files` adds.
+
+    Args:
+        track: of the actuators; coordinates: (N, r) of the platform; both stand in ``motion.csv``.
+        bounds: which the motion keeps; they stand at the head of the file.
+    """
+    parts = {"q": track.q, "v": track.v, "tau": track.tau}
+    names = []
+    for name in robot.chain.freedom:
+        unit = "rad" if name.startswith("r") else "m"
+        names.append(f"{name} [{unit}]")
+    for part in parts:
+        names += headings(part, robot.chain.joints)
+    table = np.hstack([track.times[:, None], coordinates, *parts.values()])
+
+    def write(folder: Path) -> None:
+        robot.write(folder)
+        bounds.check(track)
+        files.write_numbers(folder / PLANNED, ["t [s]", *names], table, notes=bounds.lines())
+        write_files(folder)
+        files.write_json(folder / METRICS, metrics)
+
+    check_motion_target(out, [robot.source])
+    return write_staged(out, MOTION, write)

@@ -1,0 +1,287 @@
+"""Identification of a parallel robot from encoders and motor torques: platform, actuator or power rows."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import fields, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.api.dynamic import DynamicsModel
+from calib.data.recordings.recording import Recording
+from calib.dynamics.regressor_model import RegressorModel
+from calib.errors import Finding, UsageError, finding
+from calib.estimation.whiteness import inflation
+from calib.identification.checks.recorded_motion import DesignedMotion
+from calib.identification.friction.passivity import MIN_ENERGY_SHARE
+from calib.identification.identify import Identification, identify_model
+from calib.identification.identify_options import IdentifyOptions
+from calib.identification.loop import per_joint
+from calib.identification.methods.method import Method
+from calib.identification.registry import METHODS, method_named
+from calib.identification.rows import Case
+from calib.identification.settings import IdentificationSettings
+from calib.parallel.geometry_share import propagate
+from calib.parallel.identical_legs import legs_differ
+from calib.parallel.mechanism.closure import ClosedRobot
+from calib.parallel.mechanism.parallel_model import PLATFORM, ParallelModel, make_parallel_model, rows_named
+from calib.parallel.mechanism.velocities import loop_jacobians, overconstraint
+from calib.parallel.robots import ParallelMechanism, refuse_unread
+from calib.procedure.dynamic_stage.identify import Assessment, Errors, ModelFindings, errors_of
+from calib.procedure.dynamic_stage.inputs import IdentificationInputs, gather
+from calib.procedure.dynamic_stage.verdict import (
+    excitation_notes,
+    friction_drives,
+    judge,
+    motion_findings,
+    parameter_findings,
+    resting_parameters,
+    with_duration,
+    with_prior,
+)
+from calib.procedure.findings import Verdict, lines_of, settle
+from calib.records import field_values
+from calib.workers.threads import one_blas_thread
+
+# settings
+OF_ARMS = {"couplings", "terms", "gravity", "payload_values"}
+# methods that simulate any robot
+SIMULATED = ("iv", "didim", "pc-iv", "pc-didim", "cloe", "clie")
+# of a recording, at which redundant encoders are compared
+MAX_SAMPLES = 200
+
+Recorded = str | Path | Recording
+
+
+class ParallelDynamics(DynamicsModel):
+    """Identified dynamics of a parallel robot, as `calib.identify_dynamics` returns them."""
+
+    @one_blas_thread()
+    def torques(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+        """Return the torques of all rows (N, rows) for a motion q, v, a (N, n) of the actuated joints, without payload.
+
+        Torques of the actuators [N m or N]; of redundant ones the forces on the platform's coordinates they share; or
+        their power [W]: as the model was identified.
+        """
+        dynamics: Any = self.found.dynamics
+        q = np.asarray(q, dtype=float)
+        v = np.asarray(v, dtype=float)
+        a = np.asarray(a, dtype=float)
+        return dynamics.model.torque(dynamics.values, q, v, a, ())
+
+
+def identify_parallel(
+    robot: ParallelMechanism,
+    recordings: Sequence[Recorded],
+    validate: Sequence[Recorded] = (),
+    *,
+    options: IdentifyOptions | None = None,
+    method: str | None = None,
+    friction: str | None = None,
+    seed: int = 0,
+    designed: Sequence[DesignedMotion] = (),
+    on_read: Callable[[IdentificationInputs], None] | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> ParallelDynamics:
+    """Return the identified dynamics of a parallel robot from recordings of its actuated joints, with a verdict.
+
+    Args:
+        recordings, validate: files with a cut if wanted, or recordings in memory.
+        options: filters, payloads, drives, method; ``rows``: motor (on the platform's coordinates where actuators are
+            redundant) or power; ``passive``: friction of the passive joints.
+        method, friction: in place of the options'.
+        designed: motions of `calib excite`, the reference of recordings that have none, for options with a [loop].
+
+    Raises:
+        UsageError: for options that only serial arms know.
+        MeasurementError: for recordings that cannot be right.
+    """
+    options = options or IdentifyOptions()
+    mechanism = robot.mechanism
+    row_kind = options.settings.torque_rows.name
+    rows = rows_named(mechanism, "" if row_kind == "motor" else row_kind)
+    settings = replace(options.settings, torque_rows=rows, seed=seed)
+    if method is not None:
+        settings = replace(settings, method=method)
+    if friction is not None:
+        settings = replace(settings, friction=friction)
+    options = replace(options, settings=settings)
+    refuse_options_of_arms(settings, options)
+    inputs = gather(robot, recordings, validate, options=options, seed=seed, designed=designed, progress=progress)
+    if on_read is not None:
+        on_read(inputs)
+    model = model_of(mechanism, settings)
+    identification: Any = identify_model(model, inputs.cases, settings, cad=model.known_parameters(), progress=progress)
+    noticed = [*_payloads(model, identification, inputs.cases)]
+    if settings.identical_legs:
+        noticed += legs_differ(identification, inputs.cases)
+    if mechanism.robot.redundant:
+        noticed.append(finding("torques-projected", actuators=mechanism.robot.n, freedoms=mechanism.robot.r))
+        preloads = [_preload(mechanism, inputs, case) for case in inputs.cases]
+        means = []
+        for preload in preloads:
+            noticed += preload
+            means.append([item.values["mean"] for item in preload])
+        mean = np.mean(means, axis=0)
+        preloaded = replace(model, preload=tuple(mean.tolist()))
+        identification = replace(identification, dynamics=replace(identification.dynamics, model=preloaded))
+    noticed = (*parameter_findings(identification), *identification.loop.findings, *settle(noticed))
+    findings = ModelFindings(resting_parameters(identification), noticed=noticed)
+    assessment = assess(inputs, identification, findings)
+    carried = None
+    if robot.covariance is not None:
+        if progress is not None:
+            progress("the geometry's share of the covariance")
+        carried = propagate(identification, robot.covariance, inputs.cases, partial(actuator_torques, inputs), progress)
+    return ParallelDynamics(
+        **field_values(assessment),
+        inputs=inputs,
+        found=identification,
+        findings=findings,
+        carried=carried,
+        seed=settings.seed,
+    )
+
+
+def model_of(mechanism: ClosedRobot, settings: IdentificationSettings) -> ParallelModel:
+    """Return the model of a robot that the settings ask for, with their torque rows."""
+    v0 = per_joint(settings.v0, 1, "v0")[0]
+    return make_parallel_model(
+        mechanism,
+        settings.sets,
+        v0,
+        settings.torque_rows,
+        tuple(settings.payloads),
+        settings.passive,
+        settings.identical_legs,
+    )
+
+
+def actuator_torques(inputs: IdentificationInputs, case: Case) -> np.ndarray:
+    """Return the torques (N, n) of the actuators in a recording [N m or N; A where no gain is known]."""
+    gains = inputs.currents.for_motion(case.motion, inputs.options.file_settings(case.motion.file))
+    return np.asarray(case.motion.effort if gains is None else case.motion.effort * gains)
+
+
+def _preload(mechanism: ClosedRobot, inputs: IdentificationInputs, case: Case) -> list[Finding]:
+    """Return findings on the overconstraint of redundant actuators in a recording: mean with sigma, and spread."""
+    jacobians = loop_jacobians(mechanism, mechanism.locate(case.motion.q))
+    forces = overconstraint(mechanism, jacobians, actuator_torques(inputs, case))
+    forces = case.motion.in_band(forces)[:: case.motion.decimator.factor]
+    unit = "N m"
+    if mechanism.robot.joints[0].kind == "prismatic":
+        unit = "N"
+    findings = []
+    for number, force in enumerate(forces.T, 1):
+        mean = force.mean()
+        spread = force.std()
+        # Neighbouring samples are alike: of the mean, the number of independent ones counts.
+        sigma = spread * np.sqrt(inflation(force) / len(force))
+        values = {"mean": mean, "spread": spread, "unit": unit, "sigma": sigma}
+        findings.append(finding("preload", file=case.name, number=number, **values))
+    return findings
+
+
+def assess(
+    inputs: IdentificationInputs, identification: Identification[RegressorModel], findings: ModelFindings
+) -> Assessment:
+    """Return the prediction errors of a model on all recordings, with the verdict and its findings."""
+    model = identification.dynamics.model
+    cases = inputs.cases
+    unseen = inputs.unseen
+    assert isinstance(model, ParallelModel)
+    errors = errors_of(inputs, identification.dynamics)
+    verdict, rules = _judged(model, identification, cases, errors)
+    motion = motion_findings(errors.validation, errors.repeated)
+    encoders = settle(_encoders(model.mechanism, (*cases, *unseen)))
+    noticed = (*rules, *motion, *findings.noticed, *encoders)
+    notes = (*lines_of(noticed), *excitation_notes(errors.excitation), *findings.notes)
+    return Assessment(**field_values(errors), verdict=verdict, warnings=notes, noticed=noticed)
+
+
+def _judged(
+    model: ParallelModel, identification: Identification[RegressorModel], cases: Sequence[Case], errors: Errors
+) -> tuple[Verdict, list[Finding]]:
+    drives = friction_drives(_driven_joints(model, identification, cases), "a payload that the options do not name")
+    if drives:
+        return Verdict.of("", drives), drives
+    labels = identification.settings.torque_rows.titles(model.mechanism.robot.joint_names)
+    kind = "platform" if model.torque_rows.name == PLATFORM else "joint"
+    figures, rules = judge(errors.fit, errors.proofs, errors.repeated, errors.excitation, labels, kind)
+    verdict = with_prior(Verdict.of(figures, rules), resting_parameters(identification))
+    return with_duration(verdict, errors.excitation), rules
+
+
+def _driven_joints(
+    model: ParallelModel, identification: Identification[RegressorModel], cases: Sequence[Case]
+) -> tuple[str, ...]:
+    """Return the names of joints whose identified friction would drive the motion: a wrong sign of power."""
+    joints = [joint.name for leg in model.mechanism.robot.legs for joint in leg.chain.joints]
+    dissipative = [column.form.dissipative for column in model.columns]
+    friction = np.array([False] * model.inertial + dissipative)
+    values = np.where(friction, identification.dynamics.values, 0.0)
+    energy = np.zeros(len(joints))
+    total = 0.0
+    for case in cases:
+        step = max(1, len(case.motion) // (10 * MAX_SAMPLES))
+        v = case.motion.v[::step]
+        motion = model.moved(case.motion.q[::step], v, case.motion.a[::step])
+        target = case.target[::step]
+        # Speeds that the target's forces act along; of power rows the target is the power.
+        speeds: np.ndarray | float = 1.0
+        if case.torque_rows.name == PLATFORM:
+            speeds = motion.rate
+        elif target.shape[1] == model.n:
+            speeds = v
+        total += np.abs((target * speeds).sum(axis=1)).sum()
+        energy += (model.tree_torque(values, motion) * motion.v).sum(axis=0)
+    return tuple(name for name, joint_energy in zip(joints, energy) if joint_energy < MIN_ENERGY_SHARE * total)
+
+
+def refuse_options_of_arms(settings: IdentificationSettings, options: IdentifyOptions) -> None:
+    """Raise an error for settings and options that apply to serial arms only."""
+    read = {field.name for field in fields(settings)} - OF_ARMS
+    refuse_unread(settings, IdentificationSettings(), read, options.source)
+    if settings.friction not in ("auto", "standard"):
+        raise UsageError(f"friction = '{settings.friction}': a parallel robot has standard friction only (Fv Fc off)")
+    method = method_named(settings.method)
+    if _of_arms(method):
+        activity = "simulates" if method.needs_simulation else "differentiates the torques of"
+        accepted = ", ".join(name for name, candidate in METHODS.items() if not _of_arms(candidate))
+        raise UsageError(f"method '{method.name}' {activity} a serial arm; parallel robots take {accepted}")
+
+
+def _of_arms(method: Method) -> bool:
+    """Return whether a method requires the model of a serial arm."""
+    return method.name in ("ml", "gtls") or (method.needs_simulation and method.name not in SIMULATED)
+
+
+def _encoders(mechanism: ClosedRobot, cases: Sequence[Case]) -> Iterator[Finding]:
+    """Yield findings on contradictory redundant encoders, and on columns of passive joints that are not used."""
+    robot = mechanism.robot
+    passive = [joint.name for leg in robot.legs for joint in leg.chain.joints if joint.name not in robot.joint_names]
+    for case in cases:
+        q = case.motion.q[:: max(1, len(case.motion) // MAX_SAMPLES)]
+        difference = 0.0
+        if robot.redundant:
+            closed_q = mechanism.locate(q).q[:, robot.actuated]
+            difference = float(np.sqrt(np.mean((q - closed_q) ** 2)))
+        yield finding("encoders-contradict", file=case.name, count=robot.n, rms=difference)
+        unread = " ".join(note for note in case.motion.notes if note.startswith("not read: "))
+        unread_names = [name for name in passive if name in unread]
+        if unread_names:
+            yield finding("passive-joints-unread", file=case.name, joints=unread_names)
+
+
+def _payloads(model: ParallelModel, identification: Identification[Any], cases: Sequence[Case]) -> Iterator[Finding]:
+    """Yield findings on each payload: always or never attached in the recordings, or identified with negative mass."""
+    estimate = identification.fitted.estimate
+    masses = dict(zip(identification.base.names, zip(estimate.values, estimate.sigma)))
+    for label in model.payloads:
+        on = sum(label in case.carried for case in cases)
+        if on in (0, len(cases)):
+            yield finding("payload-always" if on else "payload-never", label=label)
+        elif f"M{label}" in masses:
+            mass, sigma = masses[f"M{label}"]
+            yield finding("payload-absent", label=label, mass=mass, sigma=sigma, sigmas=-mass / sigma)

@@ -1,0 +1,188 @@
+"""The report of a parallel robot's fit in the form of a serial arm's, so that certificate and figures are the same."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from calib.estimation.estimate import Estimate
+from calib.folders import REPORT
+from calib.geometry.accuracy import Errors
+from calib.parallel.mechanism.geometric_fit import LEFT_OUT, LoopFit, LoopParameter
+from calib.parallel.mechanism.parallel_robot import ParallelRobot
+from calib.parallel.robots import ParallelMechanism
+from calib.procedure.findings import Verdict
+from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics
+from calib.procedure.kinematic_stage.settings import FitSettings
+from calib.procedure.report import fit_report
+from calib.procedure.report.fit_report import CorrelatedPair, FittedParameter, Report, RowErrors
+
+
+class ReportedFit(Protocol):
+    """What a report says of `calib.parallel.loop_fit.ParallelFit`."""
+
+    @property
+    def nominal(self) -> ParallelMechanism: ...
+    @property
+    def files(self) -> tuple[Path, ...]: ...
+    @property
+    def fit(self) -> LoopFit: ...
+    @property
+    def errors(self) -> np.ndarray: ...
+    @property
+    def unseen(self) -> Mapping[str, np.ndarray]: ...
+    @property
+    def settings(self) -> FitSettings: ...
+    @property
+    def estimate(self) -> Estimate: ...
+    @property
+    def verdict(self) -> Verdict: ...
+    @property
+    def measured(self) -> bool: ...
+
+
+# the one model of a parallel robot's geometry
+MODEL = "loops"
+# correlation of two parameters from which on a report states it (our choice)
+CORRELATED = 0.9
+
+
+def report_of(fit: ReportedFit) -> Report:
+    """Return the report of a fit: errors by set of rows, verdict, constants of the loops with their sigmas.
+
+    Encoders that contradict each other measure neither position nor orientation: of readings alone it states no errors.
+    """
+    robot = fit.nominal.chain
+    estimate = fit.estimate
+    parameters = []
+    for parameter, change, sigma in zip(fit.fit.parameters, estimate.values.tolist(), estimate.sigma.tolist()):
+        nominal = _nominal_value(robot, parameter)
+        value = nominal + change
+        relative = _relative(sigma, value)
+        parameters.append(FittedParameter(parameter.name, parameter.unit, nominal, value, sigma, relative, "arm"))
+    sets = [_row_errors(fit, "fit", fit.errors)]
+    for name, errors in _unseen(fit).items():
+        sets.append(_row_errors(fit, name, errors))
+    prismatic = [joint.kind == "prismatic" for joint in robot.joints]
+    correlations = [CorrelatedPair(*pair) for pair in estimate.strong_correlations(CORRELATED)]
+    return Report(
+        schema=fit_report.SCHEMA,
+        robot=robot.name,
+        base="base",
+        tip="platform",
+        joints=robot.joint_names,
+        prismatic=tuple(prismatic),
+        metrics=_metrics(fit),
+        parameters=tuple(parameters),
+        kept=(),
+        correlations=tuple(correlations),
+        correlated=fit_report.most_correlated(estimate.names, estimate.covariance),
+        singular_values=(),
+        rank=0,
+        sets=tuple(sets),
+        noise={"position": None, "orientation": None},
+        files=_files(fit),
+        source=str(fit.nominal.source),
+    )
+
+
+def write(fit: ReportedFit, folder: Path, plots: bool) -> None:
+    """Write ``report.json``, figures (if `plots`) and its certificate into a fit's folder."""
+    from calib.procedure.report.certificate import results
+    from calib.procedure.report.charts import saved
+    from calib.procedure.report.geometry_figures import captioned
+
+    report = report_of(fit)
+    fit_report.write(report, folder / REPORT)
+    drawn = {}
+    if plots:
+        drawn = saved(captioned(report), folder)
+    results.write_fit(report, drawn, folder)
+
+
+def _metrics(fit: ReportedFit) -> FitMetrics:
+    verdict = fit.verdict
+    tolerance = fit.settings.tolerance
+    tolerance_mm = None if tolerance is None else 1e3 * tolerance
+    not_identifiable: tuple[str, ...] = ()
+    if fit.fit.vague:
+        not_identifiable = (f"hardly identified by these poses: {', '.join(fit.fit.vague)}",)
+    validation = {name: _compared(fit, errors) for name, errors in _unseen(fit).items()}
+    return FitMetrics(
+        validation=validation,
+        verdict=verdict.level,
+        reason=verdict.reason,
+        warnings=(),
+        code=verdict.code,
+        advice=verdict.advice,
+        fit=_compared(fit, fit.errors, unseen=False, parameters=len(fit.fit.parameters)),
+        model=MODEL,
+        ladder=(),
+        seed=fit.settings.seed,
+        tolerance_mm=tolerance_mm,
+        not_identifiable=not_identifiable,
+        outliers=(),
+    )
+
+
+def _unseen(fit: ReportedFit) -> dict[str, np.ndarray]:
+    """Return the errors of both robots on rows that were not fitted, by the names that reports have for them."""
+    renamed = {LEFT_OUT: fit_report.CROSS_VALIDATED}
+    return {renamed.get(name, name): errors for name, errors in fit.unseen.items()}
+
+
+def _compared(fit: ReportedFit, errors: np.ndarray, unseen: bool = True, parameters: int = 0) -> ComparedRows:
+    """Return the statistics of the errors (2, m, k) of both robots on some rows."""
+    nominal, calibrated = errors
+    statistics = _errors(fit, nominal).summary(), _errors(fit, calibrated).summary()
+    return ComparedRows(errors.shape[1], "the file's own", *statistics, unseen=unseen, parameters=parameters)
+
+
+def _errors(fit: ReportedFit, joint_errors: np.ndarray) -> Errors:
+    """Return the sizes of errors (m, k) by kind; none where no coordinate of the platform was measured."""
+    if not fit.measured:
+        return Errors(None, None, None)
+    places = fit.nominal.chain.selected < 3
+    position = None
+    if places.any():
+        position = np.linalg.norm(joint_errors[:, places], axis=1)
+    orientation = None
+    if (~places).any():
+        orientation = np.linalg.norm(joint_errors[:, ~places], axis=1)
+    return Errors(position, orientation, None)
+
+
+def _row_errors(fit: ReportedFit, name: str, errors: np.ndarray) -> RowErrors:
+    nominal, calibrated = errors
+    return RowErrors(name, name != "fit", errors.shape[1], _sizes(fit, nominal), _sizes(fit, calibrated))
+
+
+def _sizes(fit: ReportedFit, errors: np.ndarray) -> dict[str, tuple[float, ...]]:
+    """Return the sizes of errors (m, k) of one robot by kind, of those that were measured."""
+    sizes = _errors(fit, errors)
+    by_kind = {}
+    if sizes.position is not None:
+        by_kind["position"] = tuple(sizes.position.tolist())
+    if sizes.orientation is not None:
+        by_kind["orientation"] = tuple(sizes.orientation.tolist())
+    return by_kind
+
+
+def _nominal_value(robot: ParallelRobot, parameter: LoopParameter) -> float:
+    """Return a constant's nominal value; 0 for a displacement of a leg's base or attachment."""
+    if parameter.part == "element":
+        return float(robot.legs[parameter.leg].chain.elements[parameter.index].value)
+    return 0.0
+
+
+def _relative(sigma: float, value: float) -> float | None:
+    return 100.0 * sigma / abs(value) if value else None
+
+
+def _files(fit: ReportedFit) -> tuple[fit_report.FileRow, ...]:
+    roles = {fit.nominal.source: "nominal robot"} | dict.fromkeys(fit.files, "measured")
+    rows = [fit_report.file_row(path.name, role, path) for path, role in roles.items() if path.is_file()]
+    return tuple(rows)

@@ -1,0 +1,155 @@
+"""Compiled kernels (numba) of closed loops: the legs at given postures.
+
+A leg is read from the arrays of its `Bodies`, ``links`` and ``constants``, every frame turned so that its joint's axis
+is z; ``tail`` (4, 4) takes its last frame to its end. The platform is at ``pose`` (4, 4); c of a leg's six equations
+are held. Loops over elements instead of array expressions: numba takes several times as long to compile the latter, and
+every array has one kind (C order, of the widest leg), so that each kernel is compiled once.
+"""
+
+import numpy as np
+from numba import njit
+
+from calib.dynamics.kernels import OPTIONS
+
+KIND, SCALE, REVOLUTE = 1, 12, 1
+
+
+@njit(**OPTIONS)
+def invert(A, out):
+    """Write A⁻¹ (n, n) by Gauss and Jordan with row pivots, overwriting A; a zero pivot is made tiny."""
+    n = A.shape[0]
+    for i in range(n):
+        for j in range(n):
+            out[i, j] = 1.0 if i == j else 0.0
+    for j in range(n):
+        best = j
+        for i in range(j + 1, n):
+            if abs(A[i, j]) > abs(A[best, j]):
+                best = i
+        if best != j:
+            for k in range(n):
+                A[j, k], A[best, k] = A[best, k], A[j, k]
+                out[j, k], out[best, k] = out[best, k], out[j, k]
+        pivot = A[j, j]
+        if abs(pivot) < 1e-200:
+            pivot = 1e-200
+        for k in range(n):
+            A[j, k] /= pivot
+            out[j, k] /= pivot
+        for i in range(n):
+            factor = A[i, j]
+            if i != j and factor != 0.0:
+                for k in range(n):
+                    A[i, k] -= factor * A[j, k]
+                    out[i, k] -= factor * out[j, k]
+
+
+@njit(**OPTIONS)
+def one_leg(links, constants, tail, attachment, held, q, pose, full, inverse, carried, gap, lever, frame):
+    """Write one leg at one posture; see `calib.parallel.mechanism.closure.LegLinks`.
+
+    Args:
+        held: c.
+        full: (6, n), inverse (n, c), carried (c, 6), zero on entry, gap (c,), lever (3,), or wider;
+            frame (4, 6 + 3 n) to work in, or wider.
+    """
+    n = q.shape[0]
+    r, o, place = frame[:3, :3], frame[3, :3], frame[:3, 3:6]
+    for i in range(3):
+        o[i] = 0.0
+        for k in range(3):
+            r[i, k] = 1.0 if i == k else 0.0
+    for j in range(n):
+        for i in range(3):
+            for k in range(3):
+                total = 0.0
+                for m in range(3):
+                    total += r[i, m] * constants[j, 4 * m + k]
+                place[i, k] = total
+            o[i] += r[i, 0] * constants[j, 3] + r[i, 1] * constants[j, 7] + r[i, 2] * constants[j, 11]
+        amount = constants[j, SCALE] * q[j]
+        for i in range(3):
+            frame[i, 6 + j] = o[i]
+        if links[j, KIND] == REVOLUTE:
+            cosine, sine = np.cos(amount), np.sin(amount)
+            for i in range(3):
+                r[i, 0] = cosine * place[i, 0] + sine * place[i, 1]
+                r[i, 1] = cosine * place[i, 1] - sine * place[i, 0]
+                r[i, 2] = place[i, 2]
+                full[i, j], full[3 + i, j] = 0.0, constants[j, SCALE] * place[i, 2]
+        else:
+            for i in range(3):
+                for k in range(3):
+                    r[i, k] = place[i, k]
+                o[i] += amount * place[i, 2]
+                full[i, j], full[3 + i, j] = constants[j, SCALE] * place[i, 2], 0.0
+    for i in range(3):
+        lever[i] = pose[i, 0] * attachment[0, 3] + pose[i, 1] * attachment[1, 3] + pose[i, 2] * attachment[2, 3]
+        o[i] += r[i, 0] * tail[0, 3] + r[i, 1] * tail[1, 3] + r[i, 2] * tail[2, 3]
+        gap[i] = o[i] - pose[i, 3] - lever[i]
+        carried[i, i] = 1.0
+    carried[0, 4], carried[1, 5], carried[2, 3] = lever[2], lever[0], lever[1]
+    carried[0, 5], carried[1, 3], carried[2, 4] = -lever[1], -lever[2], -lever[0]
+    for j in range(n):
+        if links[j, KIND] == REVOLUTE:
+            x, y, z = o[0] - frame[0, 6 + j], o[1] - frame[1, 6 + j], o[2] - frame[2, 6 + j]
+            full[0, j] = full[4, j] * z - full[5, j] * y
+            full[1, j] = full[5, j] * x - full[3, j] * z
+            full[2, j] = full[3, j] * y - full[4, j] * x
+    if held == 6:
+        for i in range(3):
+            carried[3 + i, 3 + i] = 1.0
+        for i in range(3):  # orientations: ends in `place`, attachment in `r`, then the skew part of end · attachmentᵀ
+            for k in range(3):
+                place[i, k] = r[i, 0] * tail[0, k] + r[i, 1] * tail[1, k] + r[i, 2] * tail[2, k]
+        for i in range(3):
+            for k in range(3):
+                r[i, k] = 0.0
+                for m in range(3):
+                    r[i, k] += pose[i, m] * attachment[m, k]
+        for i in range(3):
+            a, b = (i + 1) % 3, (i + 2) % 3
+            total = 0.0
+            for m in range(3):
+                total += place[b, m] * r[a, m] - place[a, m] * r[b, m]
+            gap[3 + i] = 0.5 * total
+    square = np.empty((n, n))
+    for i in range(n):
+        for k in range(n):
+            total = 0.0
+            for m in range(held):
+                total += full[m, i] * full[m, k]
+            square[i, k] = total if held > n else full[i, k]
+    back = np.empty((n, n))
+    invert(square, back)
+    for i in range(n):
+        for m in range(held):
+            if held > n:
+                total = 0.0
+                for k in range(n):
+                    total += back[i, k] * full[m, k]
+                inverse[i, m] = total
+            else:
+                inverse[i, m] = back[i, m]
+
+
+@njit(**OPTIONS)
+def legs(links, constants, tail, attachment, q, pose, full, inverse, carried, gap, lever):
+    """Write one leg at N postures: q (N, n), pose (N, 4, 4); arrays as in `one_leg`, with a leading axis N."""
+    frame = np.empty((4, 6 + 3 * q.shape[1]))
+    for s in range(q.shape[0]):
+        one_leg(
+            links,
+            constants,
+            tail,
+            attachment,
+            gap.shape[1],
+            q[s],
+            pose[s],
+            full[s],
+            inverse[s],
+            carried[s],
+            gap[s],
+            lever[s],
+            frame,
+        )

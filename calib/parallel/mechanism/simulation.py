@@ -1,0 +1,180 @@
+"""Simulation of a parallel robot with known parameters in closed loop, for methods that simulate recordings' loops.
+
+    M(x) v̇ + h(x, v) = J_p^invᵀ tau,    v̇ of the platform's coordinates, tau held for one control period,
+
+M and h with all legs, drives and payloads (`simulation_kernels`): the robot that `ParallelModel` describes. Each
+actuator has a controller of its own (`calib.identification.closed_loop.controllers`); those of redundant ones share the
+force as their errors have it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from calib.dynamics import rigid_body
+from calib.dynamics.drives import DriveTerm
+from calib.errors import CannotSimulate, UsageError, require
+from calib.identification.closed_loop.controllers import Reference
+from calib.identification.closed_loop.simulation import Sensing, SimulatedRun, failure, sample_ticks
+from calib.identification.loop import Controller
+from calib.parallel.mechanism.closure import compiled
+from calib.parallel.mechanism.velocities import loop_jacobians
+from calib.records import frozen
+
+# [rad or m] between encoders and reference at which a run has diverged
+FAR = 0.3
+# drive terms that can be simulated, and their places
+SHAPES = {"acceleration": 0, "velocity": 1, "sign": 2, "one": 3}
+
+
+@dataclass(frozen=True, eq=False)
+class ParallelPlant:
+    """A parallel robot to simulate, in place of a serial arm's `calib.identification.closed_loop.simulation.Plant`.
+
+    Attributes:
+        model: `ParallelModel` of the robot with its drive terms, which makes this robot; parameters (p,) of it.
+        carried: payloads on board; None: all.
+    """
+
+    model: Any
+    parameters: np.ndarray
+    carried: Collection[str] | None = None
+
+    @property
+    def terms(self) -> tuple[DriveTerm, ...]:
+        """Drive terms of the last parameters."""
+        return self.model.columns
+
+    def with_parameters(self, parameters: np.ndarray) -> ParallelPlant:
+        """Return the robot with other parameters."""
+        return replace(self, parameters=parameters)
+
+    def carrying(self, carried: Collection[str]) -> ParallelPlant:
+        """Return the robot with these payloads on board."""
+        return replace(self, carried=carried)
+
+    def joint_noise(self, noise: np.ndarray) -> np.ndarray:
+        """Return the velocity noise (n_t,) of all joints from that of the actuated ones; see `ParallelModel`."""
+        return self.model.joint_noise(noise)
+
+    def inertia_diagonal(self, q: np.ndarray) -> np.ndarray:
+        """Refuse gains that follow an inertia: redundant actuators have none of their own."""
+        raise UsageError("[loop] design is for serial arms only; state the gains as they are")
+
+    def feed_forward(self, reference: Reference) -> np.ndarray:
+        """Return the actuators' torques (N, n) along a reference, of redundant ones of least norm with the preload."""
+        motion = self.model.moved(reference.q, reference.v, reference.a)
+        return self.model.actuator_torques(self.parameters, motion, self.carried)
+
+    def run(
+        self,
+        controller: Controller,
+        reference: Reference,
+        sensing: Sensing | None = None,
+        seed: int | np.random.Generator = 0,
+        mixing: np.ndarray | None = None,
+    ) -> SimulatedRun:
+        """Return the simulated motion of the robot that follows a reference of its actuators.
+
+        Args:
+            sensing: white noise of encoders and logged torques, and control periods per sample.
+            mixing: (N, n, n) by which the feedback of all actuators is multiplied: a controller in other coordinates.
+
+        Raises:
+            NotConverged: where the loop is unstable; `CannotSimulate` for an inertia that is not positive definite.
+        """
+        from calib.parallel.mechanism import simulation_kernels
+
+        mechanism = self.model.mechanism
+        sensing = sensing or Sensing()
+        n = self.model.n
+        rng = np.random.default_rng(seed)
+        shape = reference.q.shape
+        encoder = rng.normal(size=shape) * sensing.sigma_q
+        heard = rng.normal(size=shape) * sensing.sigma_tau
+        start = mechanism.locate(reference.q[:1])
+        rate = np.linalg.pinv(loop_jacobians(mechanism, start).readings[0]) @ reference.v[0]
+        out = np.empty((3, *shape))
+        period = reference.period
+        if mixing is None:
+            mixing = np.empty((0, n, n))
+        status, reached = simulation_kernels.run(
+            _robot(self.model),
+            self._values(),
+            np.array(start.q[0]),
+            np.array(start.pose[0]),
+            rate,
+            np.ascontiguousarray(mixing),
+            controller.rows,
+            reference.sampled(controller.ahead),
+            encoder,
+            period,
+            controller.smoothing(period),
+            controller.delay,
+            FAR,
+            out,
+        )
+        if status != simulation_kernels.FINE:
+            raise failure(status, reached * period)
+        tick = sample_ticks(len(out[0]), sensing.every)
+        ticks = tick.astype(int)
+        spline = CubicSpline(np.arange(len(out[0])), out[0])
+        q = spline(tick, 0) / period**0
+        v = spline(tick, 1) / period**1
+        a = spline(tick, 2) / period**2
+        t = reference.t[0] + tick * period
+        measured = q + encoder[ticks]
+        torque = out[2, ticks]
+        return SimulatedRun(t, frozen(q), v, a, frozen(measured), frozen(torque + heard[ticks]), torque)
+
+    def _values(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the parameters of legs, platform and drives as `simulation_kernels.run` takes them."""
+        model = self.model
+        values = self.parameters
+        drives = np.zeros((int(model.mechanism.robot.starts[-1]), 5))
+        drives[:, 4] = 1.0
+        # Without terms the slice is of all parameters, and the loop has no round.
+        for term, value in zip(model.terms, model.spread(values)[-len(model.terms) :]):
+            require(term.shape in SHAPES, f"term '{term.name}' ({term.shape}) cannot be simulated", UsageError)
+            drives[term.joint, SHAPES[term.shape]] += value
+            if term.shape == "sign":
+                require(term.settings[0] > 0.0, f"'{term.name}' cannot be simulated without v0 above 0", CannotSimulate)
+                drives[term.joint, 4] = term.settings[0]
+        legs = zip(model.legs, model.leg_parameters(values))
+        bodies_values = [rigid_body.kernel_parameters(bodies, parameters) for (bodies, *_), parameters in legs]
+        return _stacked(bodies_values), model.platform_parameters(values, self.carried), drives
+
+
+def _robot(model: Any) -> tuple:
+    """Return the arrays that describe a robot to `simulation_kernels.run`."""
+    robot = model.mechanism.robot
+    legs = [compiled(leg) for leg in robot.legs]
+    links = _stacked([bodies.links for bodies, _ in legs])
+    constants = _stacked([bodies.constants for bodies, _ in legs])
+    tails = _stacked([tail for _, tail in legs])
+    attachments = _stacked([leg.attachment for leg in robot.legs])
+    return (
+        frozen(links, np.int64),
+        frozen(constants),
+        frozen(tails),
+        frozen(attachments),
+        robot.starts,
+        np.array([leg.held for leg in robot.legs]),
+        robot.selected,
+        robot.actuated,
+        robot.gravity,
+        model.mechanism.fixed,
+    )
+
+
+def _stacked(arrays: list[np.ndarray]) -> np.ndarray:
+    """Return arrays stacked along a new first axis, each padded with zeros to the largest shape."""
+    result = np.zeros((len(arrays), *np.max([array.shape for array in arrays], axis=0)))
+    for k, array in enumerate(arrays):
+        result[(k, *map(slice, array.shape))] = array
+    return result

@@ -1,0 +1,346 @@
+"""Compiled closed loop (numba): a parallel robot under a sampled controller of its actuators, midpoint rule in between.
+
+The platform's coordinates are integrated, the legs follow, their gaps closed on the way; notation of `closure_kernels`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from calib.dynamics.kernels import OPTIONS, add, cross, dot, increase, inertia_times, inverse_dynamics, scaled, three
+from calib.identification.closed_loop.loop_kernels import (
+    DIVERGED,
+    FINE,
+    MAX_STEPS,
+    MIDPOINT_STEP,
+    SINGULAR,
+    STIFF,
+    STIFF_REACH,
+    command,
+    factorise,
+    substitute,
+)
+from calib.parallel.mechanism.closure_kernels import SCALE, invert, one_leg
+
+
+@njit(**OPTIONS)
+def _add(A, x, out):
+    """Add A x to `out`."""
+    for i in range(A.shape[0]):
+        for k in range(A.shape[1]):
+            out[i] += A[i, k] * x[k]
+
+
+@njit(**OPTIONS)
+def _platform(body, pose, turn, gravity, M, h):
+    """Write the platform's inertia M (6, 6), zero on entry, and its wrench h (6,) where the twist does not change."""
+    w, g = (turn[0], turn[1], turn[2]), (gravity[0], gravity[1], gravity[2])
+    rows = (three(pose, 0, 0), three(pose, 1, 0), three(pose, 2, 0))
+    moments = body[6], body[7], body[8]
+    S = dot(rows[0], moments), dot(rows[1], moments), dot(rows[2], moments)
+    for i in range(3):
+        M[i, i] = body[9]
+        for k in range(3):
+            M[3 + i, 3 + k] = dot(rows[i], inertia_times(body, rows[k]))
+    spin = dot(three(M, 3, 3), w), dot(three(M, 4, 3), w), dot(three(M, 5, 3), w)
+    h[0], h[1], h[2] = add(cross(w, cross(w, S)), scaled(-body[9], g))
+    h[3], h[4], h[5] = add(cross(w, spin), cross(g, S))
+    M[0, 4] = M[4, 0] = S[2]
+    M[1, 5] = M[5, 1] = S[0]
+    M[2, 3] = M[3, 2] = S[1]
+    M[0, 5] = M[5, 0] = -S[1]
+    M[1, 3] = M[3, 1] = -S[2]
+    M[2, 4] = M[4, 2] = -S[0]
+
+
+@njit(**OPTIONS)
+def _bent(full, v, turn, lever, leg, shift):
+    """Add to row `leg` of `shift` (L, 6) that of a leg's acceleration equations J q̈ = G ṫ - shift, see `velocities`."""
+    w, t = (0.0, 0.0, 0.0), (turn[0], turn[1], turn[2])
+    for j in range(v.shape[0]):
+        moved = scaled(v[j], (full[0, j], full[1, j], full[2, j]))
+        turned = scaled(v[j], (full[3, j], full[4, j], full[5, j]))
+        increase(shift, leg, 3, cross(w, turned))
+        increase(shift, leg, 0, cross(add(scaled(2.0, w), turned), moved))
+        w = add(w, turned)
+    increase(shift, leg, 0, cross(t, cross(three(lever, leg, 0), t)))
+
+
+@njit(**OPTIONS)
+def _freedoms(full, inverse, carried, held, starts, selected, D, back):
+    """Write D (6, r), the twists that all legs can follow, and `back` (L, 6, 6), t_0 = Σ_k back[k] e_k; zero on entry.
+
+    The legs' equations J q̇ = G t - e leave (1 - J J⁺) (G t - e) = 0; of it the twist's other parts by least squares,
+    the selected ones of t_0 being zero (`calib.parallel.mechanism.closure.twists`).
+    """
+    L, r = starts.shape[0] - 1, selected.shape[0]
+    others = np.empty(6 - r, np.int64)
+    count = 0
+    for i in range(6):
+        free = True
+        for k in range(r):
+            free = free and selected[k] != i
+        if free:
+            others[count] = i
+            count += 1
+    square, mixed = np.zeros((6 - r, 6 - r)), np.zeros((6 - r, r))
+    rows, across = np.zeros((L, 6, 6)), np.zeros((L, 6, 6))
+    for leg in range(L):
+        n, c = starts[leg + 1] - starts[leg], held[leg]
+        for i in range(c):
+            across[leg, i, i] = 1.0
+            for m in range(c):
+                for j in range(n):
+                    across[leg, i, m] -= full[leg, i, j] * inverse[leg, j, m]
+        for i in range(c):
+            for m in range(c):
+                for a in range(6):
+                    rows[leg, i, a] += across[leg, i, m] * carried[leg, m, a]
+        for a in range(6 - r):
+            for i in range(c):
+                for b in range(6 - r):
+                    square[a, b] += rows[leg, i, others[a]] * rows[leg, i, others[b]]
+                for b in range(r):
+                    mixed[a, b] += rows[leg, i, others[a]] * rows[leg, i, selected[b]]
+    solved = np.empty((6 - r, 6 - r))
+    invert(square, solved)
+    for b in range(r):
+        D[selected[b], b] = 1.0
+        for a in range(6 - r):
+            for k in range(6 - r):
+                D[others[a], b] -= solved[a, k] * mixed[k, b]
+    for leg in range(L):
+        for k in range(6 - r):
+            for m in range(held[leg]):
+                through = 0.0
+                for i in range(held[leg]):
+                    through += rows[leg, i, others[k]] * across[leg, i, m]
+                for a in range(6 - r):
+                    back[leg, others[a], m] += solved[a, k] * through
+
+
+@njit(**OPTIONS)
+def _follow(held, inverse, carried, gap, mend, D, q, J):
+    """Move a leg's joints q (n,) after the platform's step `mend` (6,), and write J (n, r), q̇ = J v; zero on entry."""
+    for m in range(held):
+        missing = -gap[m]
+        for a in range(6):
+            missing += carried[m, a] * mend[a]
+        for j in range(q.shape[0]):
+            q[j] += inverse[j, m] * missing
+            for a in range(6):
+                for i in range(D.shape[1]):
+                    J[j, i] += inverse[j, m] * carried[m, a] * D[a, i]
+
+
+@njit(**OPTIONS)
+def _leg_share(links, constants, parameters, drives, held, inverse, carried, shift, still, q, rates, tau, J, M, h):
+    """Add a leg's share to the inertia M (r, r) and to the force h (r,) where the twist changes by `still`.
+
+    Args:
+        drives: (n, 5); q, rates, tau: (n,); J: (n, r) of its joints.
+    """
+    n, r = q.shape[0], h.shape[0]
+    rows = np.zeros((6, n + 1, n))  # of the motion, and of the same with one joint accelerating by one more
+    amount, cosine, sine, v, a, need = rows[0], rows[1], rows[2], rows[3], rows[4], rows[5]
+    for j in range(n):
+        amount[:, j], v[:, j] = constants[j, SCALE] * q[j], rates[j]
+        cosine[:, j], sine[:, j] = np.cos(amount[0, j]), np.sin(amount[0, j])
+        for m in range(held):
+            bent = -shift[m]
+            for b in range(6):
+                bent += carried[m, b] * still[b]
+            a[:, j] += inverse[j, m] * bent
+        a[j + 1, j] += 1.0
+    inverse_dynamics(links, constants, parameters, amount, cosine, sine, v, a, need)
+    inertia = (need[1:] - need[0]).T + np.diag(drives[:, 0])
+    for j in range(n):
+        need[0, j] += drives[j, 0] * a[0, j] + drives[j, 1] * v[0, j] + drives[j, 3] - tau[j]
+        need[0, j] += drives[j, 2] * np.tanh(v[0, j] / drives[j, 4])
+    for i in range(r):
+        for j in range(n):
+            h[i] += J[j, i] * need[0, j]
+            for k in range(n):
+                for m in range(r):
+                    M[i, m] += J[j, i] * inertia[j, k] * J[k, m]
+
+
+@njit(**OPTIONS)
+def _accelerate(robot, values, q, pose, rate, tau, rates, twist, change):
+    """Write v̇ (r,) into `change`, q̇ (n_t,) into `rates`, t (6,) into `twist`; close the gaps in q and pose on the way.
+
+    Returns a bound [1/s] on the fastest decay of friction near standstill, the trace of M⁻¹ Jᵀ D J with the signs'
+    steepest slopes D, or -1 where M is not positive definite.
+
+    Args:
+        robot: of L legs of B bodies or fewer: links (L, B, 4 + B), constants (L, B + 1, 13), tails and attachments
+            (L, 4, 4), starts, held, selected, actuated, gravity, and whether the platform's twist is always the
+            selected parts alone.
+        values: parameters of the legs' bodies (L, 10 B), of the platform (10,), drives (n_t, 5) Ia Fv Fc off and v0.
+        q: (n_t,); pose: (4, 4) of the platform; rate: (r,); tau: (n,) of the actuators.
+    """
+    links, constants, tails, attachments, starts, held, selected, actuated, gravity, fixed = robot
+    parameters, body, drives = values
+    r, n_t, L, most = rate.shape[0], q.shape[0], starts.shape[0] - 1, links.shape[1]
+    full, inverse, carried = np.zeros((L, 6, most)), np.zeros((L, most, 6)), np.zeros((L, 6, 6))
+    gap, lever, shift, back = np.zeros((L, 6)), np.zeros((L, 3)), np.zeros((L, 6)), np.zeros((L, 6, 6))
+    frame, D, J = np.zeros((4, 6 + 3 * most)), np.zeros((6, r)), np.zeros((n_t, r))
+    M, whole = np.zeros((r, r)), np.zeros((6, 6))
+    mend, still, wrench, h, torque = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(r), np.zeros(n_t)
+    for leg in range(L):
+        one_leg(
+            links[leg],
+            constants[leg],
+            tails[leg],
+            attachments[leg],
+            held[leg],
+            q[starts[leg] : starts[leg + 1]],
+            pose,
+            full[leg],
+            inverse[leg],
+            carried[leg],
+            gap[leg],
+            lever[leg],
+            frame,
+        )
+    if fixed:
+        for i in range(r):
+            D[selected[i], i] = 1.0
+    else:
+        _freedoms(full, inverse, carried, held, starts, selected, D, back)
+        for leg in range(L):
+            _add(back[leg], gap[leg], mend)
+        _turn(1.0, mend, pose, pose)
+    for i in range(6):
+        twist[i] = 0.0
+    _add(D, rate, twist)
+    for i in range(n_t):
+        rates[i] = 0.0
+    for j in range(actuated.shape[0]):
+        torque[actuated[j]] = tau[j]
+    for leg in range(L):
+        first, last = starts[leg], starts[leg + 1]
+        _follow(held[leg], inverse[leg], carried[leg], gap[leg], mend, D, q[first:last], J[first:last])
+        _add(J[first:last], rate, rates[first:last])
+        _bent(full[leg], rates[first:last], twist[3:], lever, leg, shift)
+        _add(back[leg], shift[leg], still)
+    for leg in range(L):
+        first, last = starts[leg], starts[leg + 1]
+        _leg_share(
+            links[leg],
+            constants[leg],
+            parameters[leg],
+            drives[first:last],
+            held[leg],
+            inverse[leg],
+            carried[leg],
+            shift[leg],
+            still,
+            q[first:last],
+            rates[first:last],
+            torque[first:last],
+            J[first:last],
+            M,
+            h,
+        )
+    _platform(body, pose, twist[3:], gravity, whole, wrench)
+    _add(whole, still, wrench)
+    for i in range(r):
+        for a in range(6):
+            h[i] += D[a, i] * wrench[a]
+            for b in range(6):
+                for m in range(r):
+                    M[i, m] += D[a, i] * whole[a, b] * D[b, m]
+    for i in range(r):
+        change[i] = -h[i]
+    if not factorise(M):
+        return -1.0
+    substitute(M, change)
+    decay = 0.0
+    for j in range(n_t):
+        slope = drives[j, 1]
+        if abs(rates[j]) < STIFF_REACH * drives[j, 4]:
+            slope += drives[j, 2] / drives[j, 4]
+        if slope != 0.0:
+            for i in range(r):
+                h[i] = J[j, i]
+            substitute(M, h)
+            for i in range(r):
+                decay += abs(slope * J[j, i] * h[i])
+    return decay
+
+
+@njit(**OPTIONS)
+def _turn(factor, twist, pose, out):
+    """Write a pose moved by `factor` times a twist (6,): p += v, R = Exp(ω) R (Rodrigues); `out` may be `pose`."""
+    x, y, z = factor * twist[3], factor * twist[4], factor * twist[5]
+    angle = np.sqrt(x * x + y * y + z * z)
+    one = np.sin(angle) / angle if angle > 1e-12 else 1.0
+    two = 0.5 * (np.sin(0.5 * angle) / (0.5 * angle)) ** 2 if angle > 1e-12 else 0.5
+    for k in range(3):
+        a, b, c = pose[0, k], pose[1, k], pose[2, k]
+        dx, dy, dz = y * c - z * b, z * a - x * c, x * b - y * a
+        out[0, k] = a + one * dx + two * (y * dz - z * dy)
+        out[1, k] = b + one * dy + two * (z * dx - x * dz)
+        out[2, k] = c + one * dz + two * (x * dy - y * dx)
+        out[k, 3] = pose[k, 3] + factor * twist[k]
+
+
+@njit(**OPTIONS)
+def run(robot, values, q, pose, rate, mixing, gains, reference, encoder, period, smoothing, late, far, out):
+    """Run the loop: measure, command, hold the torque for one period, integrate. Return (status, period reached).
+
+    Args:
+        robot, values: see `_accelerate`.
+        q, pose, rate: the state at the beginning, overwritten.
+        mixing: (N, n, n) that the feedback is multiplied by; none: (0, n, n).
+        gains: (6, n) of the actuators' controller, reference (4, N, n): see `loop_kernels.closed_loop`.
+        encoder: (N, n) noise of the readings.
+        far: distance from the reference [rad or m] at which a run has diverged.
+        out: (3, N, n) true and measured positions, torque held from instant to instant.
+    """
+    actuated, n, r = robot[7], robot[7].shape[0], rate.shape[0]
+    q2, pose2, rate2 = q.copy(), pose.copy(), rate.copy()
+    rates, change, twist = np.zeros(q.shape[0]), np.zeros(r), np.zeros(6)
+    speed, read, before, integral = reference[1, 0].copy(), np.zeros(n), np.zeros(n), np.zeros(n)
+    wish, tau, waiting = np.zeros(n), np.zeros(n), np.zeros((late + 1, n))
+    for k in range(reference.shape[1]):
+        for j in range(n):
+            read[j] = q2[actuated[j]] + encoder[k, j]
+            if not abs(reference[0, k, j] - read[j]) < far:
+                return DIVERGED, k
+            if k:
+                speed[j] += smoothing * ((read[j] - before[j]) / period - speed[j])
+            before[j] = read[j]
+        command(gains, reference[0, k], reference[1, k], read, speed, integral, period, wish)
+        for j in range(n):
+            asked = reference[2, k, j] + (0.0 if mixing.shape[0] else wish[j])
+            for m in range(n * (mixing.shape[0] > 0)):
+                asked += mixing[k, j, m] * wish[m]
+            held = min(max(asked, -gains[4, j]), gains[4, j])
+            if held != asked and (reference[0, k, j] - read[j]) * asked > 0.0:
+                integral[j] -= period * (reference[0, k, j] - read[j])  # no winding up against the limit
+            waiting[k % (late + 1), j] = held
+            tau[j] = waiting[(k + 1) % (late + 1) if k >= late else 0, j]
+            out[0, k, j], out[1, k, j], out[2, k, j] = q2[actuated[j]], read[j], tau[j]
+        left, span = period, 0.0
+        while left > 1e-9 * period:
+            for half in range(2):  # one call, which the compiler joins into this loop: two take it twice as long
+                decay = _accelerate(robot, values, q2, pose2, rate2, tau, rates, twist, change)
+                if decay < 0.0:
+                    return SINGULAR, k
+                if not half:
+                    pieces = int(left * decay / MIDPOINT_STEP) + 1
+                    if pieces * period > 2 * MAX_STEPS * left:
+                        return STIFF, k
+                    span = left / pieces
+                    q[:], pose[:], rate[:] = q2, pose2, rate2
+                length = span if half else 0.5 * span
+                for i in range(q.shape[0]):
+                    q2[i] = q[i] + length * rates[i]
+                for i in range(r):
+                    rate2[i] = rate[i] + length * change[i]
+                _turn(length, twist, pose, pose2)
+            left -= span
+    return FINE, reference.shape[1]

@@ -1,0 +1,143 @@
+"""Parallel robots for the commands, loaded by name or from a file (`calib.procedure.robot_kinds.Mechanism`)."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from calib.errors import UsageError
+from calib.folders import read_covariance, write_covariance
+from calib.parallel.mechanism import parallel_robot
+from calib.parallel.mechanism.closure import ClosedRobot, closed
+from calib.parallel.mechanism.geometric_fit import LoopCovariance
+from calib.parallel.mechanism.parallel_robot import ParallelRobot
+from calib.robot.calibrated import COVARIANCE, ROBOT
+
+if TYPE_CHECKING:
+    from calib.dynamics.base import Base
+    from calib.identification.prediction import Dynamics
+    from calib.parallel.mechanism.parallel_model import ParallelModel
+
+INSTEAD = {
+    "choosing poses": "choose poses manually, spread over its workspace",
+    "diff": "compare the values and sigmas of both folders' estimate.csv",
+    "calib.read_poses": "calib.fit_geometry takes its files",
+    "compensation": "use the calibrated robot.toml in its controller",
+    "limits": "state velocity, effort, lower and upper in its file",
+    "drives": "identify a model with its drives, and name it",
+    "poses": "pose selection does not support it",
+    "export to single files": "give --into FOLDER",
+    "urdf": "robot.urdf is written anew",
+}  # of commands and arguments that there are not
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ParallelMechanism:
+    """A parallel robot whose loops close at home, and the file that describes it.
+
+    Attributes:
+        mechanism: the robot, prepared for closing its loops.
+        source: its file.
+        covariance: of its loops' constants, as a fit states it; None: the geometry is taken as exact.
+    """
+
+    mechanism: ClosedRobot
+    source: Path
+    covariance: LoopCovariance | None = None
+    kind = "parallel robot"
+    instead = INSTEAD
+
+    @property
+    def chain(self) -> ParallelRobot:
+        """The robot in place of a serial `Chain`: names, limits and number of the actuated joints."""
+        return self.mechanism.robot
+
+    def write(self, folder: Path) -> None:
+        """Write the robot as ``robot.toml`` into a folder, with the covariance of its geometry if known."""
+        parallel_robot.write(folder / ROBOT, self.mechanism.robot, f"from {self.source}")
+        self.write_covariance(folder)
+
+    def write_covariance(self, folder: Path) -> None:
+        """Write the covariance of the geometry, if known, as ``chain_covariance.csv`` into a folder."""
+        if self.covariance is not None:
+            write_covariance(folder / COVARIANCE, self.covariance.names, self.covariance.matrix)
+
+    def model_table(self, dynamics: Dynamics[ParallelModel], base: Base, unit: str) -> dict[str, Any]:
+        """Return the model as the content of ``dynamics.json``; `calib.parallel.design_goal.read_model` reads it."""
+        # slow to load, as are the others; finding a robot needs none
+        from calib.dynamics.base import expressions
+        from calib.dynamics.shapes import V0
+        from calib.folders import COVARIANCE as OF_PARAMETERS
+        from calib.identification.model_file import regrouping
+
+        model = dynamics.model
+        return {
+            "robot": ROBOT,
+            "kind": model.torque_rows.name,
+            "unit": unit,
+            "payloads": list(model.payloads),
+            "preload": model.preload,
+            "identical_legs": model.identical_legs,
+            "v0": next((term.settings[0] for term in model.terms if term.shape == "sign"), V0),
+            "values": dict(zip(model.single.names, model.spread(dynamics.values).tolist())),
+            "base": dict(zip(base.names, expressions(base))),
+            "regrouping": regrouping(base),
+            "covariance": OF_PARAMETERS,
+        }
+
+    def __repr__(self) -> str:
+        robot = self.mechanism.robot
+        return (
+            f"<ParallelMechanism {robot.name}: {len(robot.legs)} legs, {robot.n} actuators, {robot.r} freedoms "
+            f"({', '.join(robot.freedom)})>"
+        )
+
+    def __str__(self) -> str:
+        return repr(self)[1:-1].replace("ParallelMechanism", self.kind)
+
+
+def find(robot: object) -> ParallelMechanism | None:
+    """Return the parallel robot of a TOML file, a folder with one, or a library name; None for any other robot.
+
+    Raises:
+        RobotError: for a file that contradicts itself, loops that do not close at home.
+    """
+    if not isinstance(robot, (str, Path)):
+        return None
+    if Path(robot).is_dir():
+        path = Path(robot) / ROBOT
+    else:
+        path = Path(robot)
+    if not path.is_file():
+        path = parallel_robot.library().get(str(robot))
+    elif path.suffix != ".toml" or not parallel_robot.is_parallel(path):
+        return None
+    if path is None:
+        return None
+    beside = path.with_name(COVARIANCE)
+    if path.name == ROBOT and beside.is_file():
+        covariance = LoopCovariance(*read_covariance(beside))
+    else:
+        covariance = None
+    return ParallelMechanism(closed(parallel_robot.read(path)), path, covariance)
+
+
+def refuse_unread(settings: Any, plain: Any, read: Collection[str], where: object = "") -> None:
+    """Raise an error for settings that a stage does not use, unless their values are default or False.
+
+    Args:
+        settings, plain: dataclasses of one type: the given values, and the defaults.
+        read: names of the fields that the stage reads.
+        where: the file that contains them.
+
+    Raises:
+        UsageError: naming the first.
+    """
+    for field in fields(settings):
+        value = getattr(settings, field.name)
+        if field.name not in read and value is not False and value != getattr(plain, field.name):
+            prefix = f"{where}: " if where else ""
+            quoted = f" '{value}'" if isinstance(value, str) else ""
+            raise UsageError(f"{prefix}{field.name}{quoted} is for serial arms only, not for this kind of robot")

@@ -1,1 +1,0 @@
-"""Optional packages of the toolkit: the core works without them (`calib.extensions`)."""

@@ -1,3 +1,0 @@
-"""Virtual cells with known truth: robots, instruments and errors for demonstrations, studies and tests."""
-
-OFFERS = {"commands": "commands:app"}

@@ -1,0 +1,216 @@
+"""A simulated robot cell with known true parameters: the arm, and the instrument that measures it.
+
+    y_i = S_true · arm_true(q_i + δ(q_i)) · X_true · noise,     q_recorded = q_i + encoder noise,
+
+δ being what no rigid geometry holds: compliance under gravity and gear harmonics, which a richer model can, and what
+none can (`unmodelled`). With LEDs on the base the instrument
+sees the base, too, and reports the tool in the base LEDs' frame: B_i⁻¹ y_i, so that both frames' noises count and the
+base's orientation noise acts with the lever between the two.
+
+Writing simulated measurements and logs as CSV files for `calib`.
+"""
+
+import io
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib import files
+from calib.data.poses.measurements import Poses, Positions
+from calib.data.poses.pose_lists import read_poses
+from calib.data.recordings.recording import Recording
+from calib.data.schema import Joints
+from calib.geometry.installation import Installation, see
+from calib.records import shaped
+from calib.robot.calibrated import evaluate
+from calib.robot.chain import Chain, joint_kinds
+from calib.robot.kinematics import gravity_torques
+from calib.simulation.unmodelled import PositionErrors, displacements, drooping
+from calib.transforms import invert, pose
+
+
+@dataclass(frozen=True)
+class SimulatedInstrument:
+    """An instrument that measures frames (or points) with white noise.
+
+    Attributes:
+        name: for messages and certificates.
+        position_sigma: per axis [m].
+        orientation_sigma: about each axis [rad]; None where it sees points only.
+        drift: how far the instrument wanders over one series [m], evenly with the row number.
+        outlier_share: share of rows with a gross error.
+        outlier_size: length of a gross error [m].
+        encoder_sigma: of the recorded joint values [rad or m].
+        base_frame: pose (4, 4) of the base LEDs in the arm's base; None where there are none.
+    """
+
+    name: str = "optical CMM"
+    position_sigma: float = 60e-6
+    orientation_sigma: float | None = 0.2e-3
+    drift: float = 0.0
+    outlier_share: float = 0.0
+    outlier_size: float = 5e-3
+    encoder_sigma: float = 1e-5
+    base_frame: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """A cell with one station and one tool.
+
+    Attributes:
+        nominal: what the engineer takes the arm to be.
+        truth: what it is, where it stands, what the tool is, and how its joints deflect; hidden from a calibration.
+        instrument: what measures.
+        note: what the truth is made of, in a sentence.
+        unmodelled: errors that no parameter of a calibration holds.
+    """
+
+    nominal: Chain
+    truth: Installation
+    instrument: SimulatedInstrument = field(default_factory=SimulatedInstrument)
+    note: str = ""
+    unmodelled: PositionErrors = field(default_factory=PositionErrors)
+
+
+def true_poses(cell: Cell, q: np.ndarray, warm: float = np.inf) -> np.ndarray:
+    """Return the tool's poses (m, 4, 4) in the station's frame, without noise.
+
+    Args:
+        cell: the cell.
+        q: (m, n) joint values in the order in which the arm takes them [rad or m].
+        warm: how many poses the arm has moved to before; infinite for a warm arm.
+    """
+    q = shaped(q, (None, cell.truth.chain.n), "joint values")
+    arm = cell.truth.chain
+    torque = np.zeros(q.shape) if arm.inertias is None else gravity_torques(arm, q)
+    bases = evaluate(cell.truth.deflection, q, torque)
+    beyond = displacements(cell.unmodelled, arm, q, torque, warm)
+    seen = see(cell.truth, q, bases=bases, displacements=beyond).poses()
+    return drooping(cell.unmodelled, arm, seen, cell.truth.stations[0])
+
+
+def measure(
+    cell: Cell, q: np.ndarray, seed: int | np.random.Generator = 0, file: str = "simulated", warm: float = np.inf
+) -> Positions:
+    """Return one simulated measurement of each pose q (m, n) [rad or m], in this order.
+
+    Args:
+        cell: the cell.
+        q: where the robot is sent; the encoders' reading of it is what is recorded.
+        seed: of the noise.
+        file: the name the measurement carries.
+        warm: how many poses the arm has moved to before; infinite for a warm arm.
+
+    Returns:
+        Poses (or positions), with the sigmas that the instrument's maker states, drift and outliers not included.
+    """
+    rng, instrument = np.random.default_rng(seed), cell.instrument
+    seen = _noisy(true_poses(cell, q, warm=warm), instrument, rng)
+    sigma, sigma_rotation = _stated(instrument, np.zeros((len(q), 3)))
+    if instrument.base_frame is not None:
+        base = cell.truth.stations[0] @ instrument.base_frame
+        seen = invert(_noisy(np.broadcast_to(base, seen.shape), instrument, rng)) @ seen
+        sigma, sigma_rotation = _stated(instrument, seen[:, :3, 3], frames=2)
+    seen[:, :3, 3] += _gross_errors(instrument, len(q), rng)
+    common: dict[str, Any] = {
+        "sigma": sigma,
+        "station": cell.truth.station_names[0],
+        "tool_names": cell.truth.tool_names,
+        "file": file,
+    }
+    q, names = np.asarray(q) + rng.normal(0.0, instrument.encoder_sigma, np.shape(q)), cell.nominal.joint_names
+    if instrument.orientation_sigma is None:
+        return Positions(q, names, seen[:, :3, 3], **common)
+    turns = Rotation.from_matrix(seen[:, :3, :3]).as_quat(canonical=True)
+    return Poses(q, names, seen[:, :3, 3], turns, sigma_rotation=sigma_rotation, **common)
+
+
+def wandering(measured: Positions, drift: float, seed: int, begin: float = 0.0) -> Positions:
+    """Return measured positions with an instrument drift added: `drift` [m] from `begin` (0 to 1) to the end.
+
+    The direction is the seed's, so that several series can share it.
+    """
+    direction = np.random.default_rng([seed, 5]).standard_normal(3)
+    way = np.linspace(begin, 1.0, len(measured))[:, None] * direction / np.linalg.norm(direction)
+    return replace(measured, position=measured.position + drift * way)
+
+
+def _noisy(poses: np.ndarray, instrument: SimulatedInstrument, rng: np.random.Generator) -> np.ndarray:
+    """Return measured poses (m, 4, 4): noise along and about the instrument's axes."""
+    m = len(poses)
+    turn = Rotation.from_rotvec(rng.normal(0.0, instrument.orientation_sigma or 0.0, (m, 3))).as_matrix()
+    shift = rng.normal(0.0, instrument.position_sigma, (m, 3))
+    return pose(turn @ poses[:, :3, :3], poses[:, :3, 3] + shift)
+
+
+def _stated(instrument: SimulatedInstrument, lever: np.ndarray, frames: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Return the σ of position [m] and orientation [rad] that the instrument's maker states, each (m, 3).
+
+    Seen from a noisy base frame at the distance l, σ_x² = 2 σ_p² + σ_r² (l_y² + l_z²), and so on.
+    """
+    turning = instrument.orientation_sigma or 0.0
+    across = (lever**2).sum(axis=1, keepdims=True) - lever**2
+    sigma = np.sqrt(frames * instrument.position_sigma**2 + turning**2 * across)
+    return sigma, np.full(lever.shape, turning * np.sqrt(frames))
+
+
+def _gross_errors(instrument: SimulatedInstrument, m: int, rng: np.random.Generator) -> np.ndarray:
+    """Return the position errors (m, 3) [m] of m rows from drift and outliers."""
+    directions = rng.normal(size=(m + 1, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    wandering = instrument.drift * np.linspace(0.0, 1.0, m)[:, None] * directions[-1]
+    hit = rng.uniform(size=m) < instrument.outlier_share
+    return wandering + instrument.outlier_size * hit[:, None] * directions[:-1]
+
+
+def planned_poses(folder: Path, arm: Chain) -> Iterator[tuple[int, str, np.ndarray]]:
+    """Yield the pose lists planned by the session in `folder` for an arm: number, name when measured, q (m, n)."""
+    joints = Joints(arm.joint_names, joint_kinds(arm))
+    for number, (plan, name) in enumerate((("poses", "measured"), ("validation_poses", "validation_measured"))):
+        if (path := folder / f"2-poses/{plan}.csv").exists():
+            yield number, name, read_poses(path, joints)
+
+
+def write_measured(measured: Positions, path: str | Path, degrees: bool = True) -> Path:
+    """Write poses or positions as CSV: joints in deg, positions in mm, as controllers and instruments give them.
+
+    Args:
+        measured: positions or poses of one target; every joint revolute where `degrees`.
+        path: of the file.
+        degrees: False for SI units throughout.
+    """
+    angle, length, unit = (180.0 / np.pi, 1e3, ("deg", "mm")) if degrees else (1.0, 1.0, ("rad", "m"))
+    columns = [angle * measured.q, length * measured.position]
+    header = [f"{name} [{unit[0]}]" for name in measured.joint_names] + [f"{axis} [{unit[1]}]" for axis in "xyz"]
+    if isinstance(measured, Poses):
+        columns.append(measured.quaternion)
+        header += ["qx", "qy", "qz", "qw"]
+    if measured.sigma is not None:
+        columns.append(length * measured.sigma)
+        header += [f"sigma_{axis} [{unit[1]}]" for axis in "xyz"]
+    if isinstance(measured, Poses) and measured.sigma_rotation is not None:
+        columns.append(measured.sigma_rotation)
+        header += [f"sigma_r{axis} [rad]" for axis in "xyz"]
+    return files.write_numbers(path, header, np.hstack(columns))
+
+
+def write_log(recording: Recording, path: str | Path, degrees: bool = True) -> Path:
+    """Write a recording as CSV: ``t [s]``, ``q_joint [deg]``, ``tau_joint [Nm]`` and, of sensors, ``tau_link_joint``.
+
+    Seven digits, as controllers log.
+    """
+    angle, unit = (180.0 / np.pi, "deg") if degrees else (1.0, "rad")
+    series = [("q", angle * recording.q, unit), ("tau", recording.effort, "Nm")]
+    if recording.tau_link is not None:
+        series.append(("tau_link", recording.tau_link, "Nm"))
+    header = ["t [s]", *(f"{key}_{name} [{unit}]" for key, _, unit in series for name in recording.joint_names)]
+    table = np.hstack([recording.t[:, None], *(values for _, values, _ in series)])
+    text = io.StringIO()
+    text.write(",".join(header) + "\n")
+    np.savetxt(text, table, fmt=["%.4f"] + ["%.7g"] * (table.shape[1] - 1), delimiter=",")
+    return files.write(path, text.getvalue())

@@ -1,0 +1,129 @@
+"""Exported parallel robots: other programs close the loops of the files and find our accelerations."""
+
+import json
+import os
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from calib import cli
+from calib.dynamics.pseudo_inertia import ball
+from calib.errors import UsageError
+from calib.parallel.export import OpenedRobot, export_parallel
+from calib.parallel.mechanism import parallel_robot
+from calib.parallel.mechanism.parallel_model import along, make_parallel_model
+from calib.parallel.mechanism.velocities import distributed
+from calib.parallel.robots import find
+from calib.procedure.export.identified import Drives
+
+NAMES = ("dualv", "fivebar", "stewart")
+
+
+def opened(name: str) -> OpenedRobot:
+    """Return a robot with bodies that can exist, viscous friction and motor inertia left out."""
+    model = make_parallel_model(find(name).mechanism, ("",))
+    rng = np.random.default_rng(0)
+    bodies = np.array([ball(m, 0.1, c) for m, c in zip(rng.uniform(1, 2, 40), rng.uniform(-0.1, 0.1, (40, 3)))])
+    n = int(model.mechanism.robot.starts[-1])
+    drives = Drives(np.zeros((n, 4)), (), np.zeros((0, 4)))
+    return OpenedRobot(model, bodies[: len(model.labels)].ravel(), drives)
+
+
+def moved(robot: OpenedRobot, t: np.ndarray):
+    """Return a motion from rest at home and the actuators' torques that it needs."""
+    own, f = robot.mechanism.robot, 2.0 * np.pi * (1 + np.arange(robot.mechanism.robot.r) % 2)
+    wave = f * t[:, None]
+    size = 0.15 * own.upper
+    motion = along(robot.mechanism, size * (1 - np.cos(wave)), size * f * np.sin(wave), size * f**2 * np.cos(wave))
+    return motion, distributed(robot.mechanism, motion.jacobians, robot.model.platform_force(robot.values, motion, ()))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_pinocchio_closes_the_urdf_by_the_yaml_and_accelerates_alike(name):
+    """Contact dynamics of the URDF's tree with the pairs of ``robot.yaml`` as constraints give the motion's q̈."""
+    robot = opened(name)
+    motion, tau = moved(robot, np.array([0.1, 0.3]))
+    model = pin.buildModelFromXML(robot.urdf())
+    model.gravity = pin.Motion(np.array(robot.mechanism.robot.gravity), np.zeros(3))
+    table = dict(line.split(": ", 1) for line in robot.closures().splitlines() if ": [" in line)
+    contacts = pin.StdVec_RigidConstraintModel()
+    for (end, held), kind in zip(json.loads(table["closed_loop"]), json.loads(table["type"])):
+        a, b = (model.frames[model.getFrameId(one)] for one in (end, held))
+        kind = pin.ContactType.CONTACT_6D if kind == "6d" else pin.ContactType.CONTACT_3D
+        contacts.append(pin.RigidConstraintModel(kind, model, a.parentJoint, a.placement, b.parentJoint, b.placement))
+    data, home = model.createData(), np.linalg.inv(robot.mechanism.robot.home)
+    joints = [model.joints[model.getJointId(one.name)] for one in robot.joints]
+    motors = [model.joints[model.getJointId(one)].idx_v for one in json.loads(table["name_mot"])]
+    for m in range(2):
+        q, v, forces = pin.neutral(model), np.zeros(model.nv), np.zeros(model.nv)
+        for joint, value, speed in zip(joints, motion.posture.q[m], motion.v[m]):
+            q[joint.idx_q : joint.idx_q + joint.nq] = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
+            v[joint.idx_v] = speed
+        if name == "stewart":
+            pose = motion.posture.pose[m]
+            q[-7:] = pin.SE3ToXYZQUAT(pin.SE3(home @ pose))
+            v[-6:] = np.kron(np.eye(2), pose[:3, :3].T) @ motion.twist[m]
+        forces[motors] = tau[m]
+        datas = pin.StdVec_RigidConstraintData()
+        datas.extend([one.createData() for one in contacts])
+        pin.initConstraintDynamics(model, data, contacts, datas)
+        settings = pin.ProximalSettings(1e-14, 1e-10, 1000)
+        found = pin.constraintDynamics(model, data, q, v, forces, contacts, datas, settings)
+        np.testing.assert_allclose(
+            found[[joint.idx_v for joint in joints]], motion.a[m], atol=1e-6 * np.abs(motion.a).max()
+        )
+
+
+PLAYED = """
+import json, sys, mujoco, numpy as np
+for step, text, names, tau in json.load(sys.stdin):
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_forward(model, data)
+    start = np.abs(data.efc_pos).max()
+    for forces in tau:
+        data.ctrl[:] = forces
+        mujoco.mj_step(model, data)
+    print(json.dumps([start, np.abs(data.efc_pos).max(), [data.joint(name).qpos[0] for name in names]]))
+"""
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_mujoco_moves_as_planned_the_closer_the_shorter_its_steps(name):
+    """Played from home without control, the torques of a motion lead to it with an error in proportion to the step.
+
+    In an interpreter that has MuJoCo: CALIB_MUJOCO=/path/to/python.
+    """
+    interpreter = os.environ.get("CALIB_MUJOCO")
+    if not interpreter:
+        pytest.skip("MuJoCo is not part of the environment: set CALIB_MUJOCO to a python that has it")
+    robot, given, wanted = opened(name), [], []
+    for step in (1e-3, 1e-4):
+        text = robot.mjcf().replace('"0.002 1"', f'"{2 * step} 1"').replace('"0.001"', f'"{step}"')
+        motion, tau = moved(robot, step * np.arange(round(0.3 / step) + 1))
+        given.append([step, text, [joint.name for joint in robot.joints], tau[:-1].tolist()])
+        wanted.append(motion.posture.q[-1])
+    ran = subprocess.run(
+        [interpreter, "-c", PLAYED], input=json.dumps(given), capture_output=True, text=True, check=True
+    )
+    found = [json.loads(line) for line in ran.stdout.splitlines()]
+    assert all(start < 1e-9 and end < 1e-4 for start, end, _ in found)  # the loops are closed and stay so
+    errors = [np.abs(np.array(q) - own).max() for (_, _, q), own in zip(found, wanted)]
+    assert errors[1] < 0.15 * errors[0] and errors[1] < 1e-3
+
+
+def test_masses_are_needed_and_the_folder_of_a_result(tmp_path, capsys):
+    robot = find("fivebar")
+    assert cli.run(["export", "fivebar", "--into", str(tmp_path / "a")]) == 2
+    assert "give the folder of a fit or of an identification" in capsys.readouterr().err
+    (tmp_path / "estimate.csv").write_text("name,unit,value,sigma\n")
+    chain = robot.chain
+
+    parallel_robot.write(tmp_path / "robot.toml", replace(chain, platform=None))
+    with pytest.raises(UsageError, match="has no inertias"):
+        export_parallel(find(str(tmp_path)), tmp_path, tmp_path / "b")
+    assert not (tmp_path / "b").exists()

@@ -1,0 +1,26 @@
+"""A user's own modules may have any name: scripts beside a poses.py, robot.py or data.py work."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+NAMES = ("poses", "trajectories", "robot", "data", "geometry", "files", "errors", "units")
+SCRIPT = """
+import poses, trajectories, robot, data
+import calib
+arm = calib.load("tx40")
+chosen = calib.select_poses(arm, 12, calib.SelectionSettings(candidates=40))
+assert len(chosen.q) == 12 and poses.MINE and robot.MINE
+assert calib.design_excitation.__module__ == "calib.api.motions"
+import calib.trajectories.recall
+from calib.cli import run
+raise SystemExit(run(["formats", "mdh"]))
+"""
+
+
+def test_a_folder_with_a_users_modules(tmp_path: Path):
+    for name in NAMES:
+        (tmp_path / f"{name}.py").write_text("MINE = True\n")
+    (tmp_path / "script.py").write_text(SCRIPT)
+    done = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
