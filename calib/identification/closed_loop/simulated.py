@@ -126,7 +126,9 @@ class _Simulated(Method):
                 held=identification.constrained,
                 instruments=identification.rows,
             )
-            return LoopEstimate(**field_values(result), loops=loops, instrumental=identification)
+            # `plain` may be the estimate of another loop, whose results are replaced.
+            values = field_values(result) | {"loops": loops, "instrumental": identification}
+            return LoopEstimate(**values)
 
         return attempted_in_loop(self.name, problem, loops, estimate)
 
