@@ -38,6 +38,11 @@ def shielded(text: str) -> str:
     return text if text[:1] not in _FORMULA or is_number(text) else f"'{text}"
 
 
+def field_values(record: Any) -> dict[str, Any]:
+    """Return the values of a dataclass's fields by name, as they are: for a record of a class that has more fields."""
+    return {field.name: getattr(record, field.name) for field in fields(record) if field.init}
+
+
 def plain_text(cell: str) -> str:
     """Return the original text of a cell written by `shielded`."""
     return cell[1:] if cell[:1] == "'" and cell[1:2] in _FORMULA else cell

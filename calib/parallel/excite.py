@@ -1,7 +1,7 @@
 """Design of an exciting motion of a parallel robot, by the search for serial arms in platform coordinates."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from calib.procedure.excitation.goals import GUARD
 from calib.procedure.excitation.inputs import ExcitationInputs
 from calib.procedure.excitation.limits import MotionBounds, MotionLimits
 from calib.procedure.excitation.settings import COARSE, DEFAULT_DESIGN, ExcitationSettings
+from calib.records import field_values
 from calib.robot.calibrated import COVARIANCE, ROBOT
 from calib.robot.chain import Joint
 from calib.robot.tables import dumps
@@ -169,7 +170,8 @@ class ParallelExcitation(ExcitationDesign):
         q = self.robot.mechanism.place(x).q[:, robot.actuated]
         lines = np.fft.rfft(q, axis=0) / samples
         # What the harmonics from each on add to the motion, at most.
-        remainder = np.cumsum(2.0 * np.abs(lines[::-1]), axis=0)[::-1].max(axis=1)
+        from_last = np.cumsum(2.0 * np.abs(lines[::-1]), axis=0)
+        remainder = from_last[::-1].max(axis=1)
         last = 1 + max(1, int((remainder[1:] > max_error).sum()))
         series = []
         for line in lines.T:
@@ -293,8 +295,7 @@ def design_parallel(
     harmonics = settings.harmonics or COARSE
     design_settings = replace(settings, goals=goals, harmonics=harmonics, samples=SAMPLES)
     design = search_motion(inputs, design_settings, map, progress)
-    design_fields = {field.name: getattr(design, field.name) for field in fields(design) if field.init}
-    return ParallelExcitation(**design_fields, robot=robot, plan=plan)
+    return ParallelExcitation(**field_values(design), robot=robot, plan=plan)
 
 
 @dataclass(frozen=True)

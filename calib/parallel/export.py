@@ -25,7 +25,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 from xml.etree import ElementTree as ET
 
@@ -152,7 +151,8 @@ class OpenedRobot:
     @property
     def home(self) -> dict[str, float]:
         """Values of all joints at which the loops close with the platform at home [rad or m]."""
-        return dict(zip((joint.name for joint in self.joints), self.mechanism.home.q[0].tolist()))
+        names = [joint.name for joint in self.joints]
+        return dict(zip(names, self.mechanism.home.q[0].tolist()))
 
     def rows(self, values: np.ndarray) -> list[np.ndarray]:
         """Return values (n_t, …) of all joints, by leg."""
@@ -173,7 +173,8 @@ class OpenedRobot:
             ET.SubElement(inertial, "origin", xyz=numbers_text(centre), rpy="0 0 0")
             ET.SubElement(inertial, "mass", value=repr(mass))
             names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-            ET.SubElement(inertial, "inertia", {name: repr(float(x)) for name, x in zip(names, moments)})
+            values = [repr(float(moment)) for moment in moments]
+            ET.SubElement(inertial, "inertia", dict(zip(names, values)))
             add_joint(root, "platform_floating", "floating", "base", PLATFORM, self.mechanism.robot.home)
         for leg in self.closing:
             ET.SubElement(root, "link", name=f"{leg.name}_attachment")
@@ -249,6 +250,27 @@ class _Source:
     notes: tuple[str, ...]
 
 
+@dataclass(frozen=True, eq=False)
+class _ArmBodies:
+    """The bodies of a parallel robot as those of an arm: how many, of how many joints, labels, and joint of each."""
+
+    count: int
+    n: int
+    labels: tuple[str, ...]
+    coordinates: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class _ArmModel:
+    """What `find_possible` reads of the model of an arm."""
+
+    bodies: _ArmBodies
+    columns: tuple[Any, ...]
+    names: tuple[str, ...]
+    inertial: int
+    torque_rows: Any
+
+
 def _side_by_side(model: ParallelModel, bodies: np.ndarray | None) -> tuple[Any, Any]:
     """Return the bodies of a model in the form that `find_possible` reads of serial arms: parameters and labels alone.
 
@@ -271,14 +293,8 @@ def _side_by_side(model: ParallelModel, bodies: np.ndarray | None) -> tuple[Any,
     chain = Chain(model.mechanism.robot.name, joints, elements, inertias=rows)
     coordinates = np.array([*range(count), *[-1] * len(model.payloads)])
     n = int(model.mechanism.robot.starts[-1])
-    model_ = SimpleNamespace(
-        bodies=SimpleNamespace(count=len(labels), n=n, labels=labels, coordinates=coordinates),
-        columns=model.columns,
-        names=model.names,
-        inertial=model.inertial,
-        torque_rows=model.torque_rows,
-    )
-    return chain, model_
+    arm_bodies = _ArmBodies(len(labels), n, labels, coordinates)
+    return chain, _ArmModel(arm_bodies, model.columns, model.names, model.inertial, model.torque_rows)
 
 
 def _next_frames(leg: Leg) -> np.ndarray:
@@ -462,14 +478,18 @@ def _check(opened: OpenedRobot, text: str, where: str, postures: int = 5) -> Non
         for model in parts:
             forces[m] += _forces(opened, model, motion, m, frames)
         for leg in opened.closing:
-            ends = (frames[f"{leg.name}_end" + "_tip" * mjcf], frames[f"{leg.name}_attachment"])
-            gap = invert(ends[0]) @ ends[1] - np.eye(4)
-            gap_size = max(gap_size, float(np.abs(gap if leg.end == "rigid" else gap[:, 3]).max()))
+            end_name = f"{leg.name}_end_tip" if mjcf else f"{leg.name}_end"
+            gap = invert(frames[end_name]) @ frames[f"{leg.name}_attachment"] - np.eye(4)
+            # A leg that ends in a point holds the position alone.
+            if leg.end != "rigid":
+                gap = gap[:, 3]
+            gap_size = max(gap_size, float(np.abs(gap).max()))
     if gap_size > MAX_DIFFERENCE:
         raise RobotError(
             f"{where}: loops stay {gap_size:.2g} m (or rad) open when Pinocchio reads it; nothing was written"
         )
-    off = float(np.abs(forces - expected).max()) / max(1.0, float(np.abs(expected).max()))
+    largest = max(1.0, float(np.abs(expected).max()))
+    off = float(np.abs(forces - expected).max()) / largest
     if off > MAX_DIFFERENCE:
         raise RobotError(f"{where}: forces differ by {off:.2g} of the largest when Pinocchio reads it; nothing written")
 
@@ -511,7 +531,8 @@ def _forces(opened: OpenedRobot, model: Any, motion: LoopMotion, m: int, frames:
                 q[joint.idx_q : joint.idx_q + joint.nq] = [value]
             else:
                 q[joint.idx_q : joint.idx_q + joint.nq] = [np.cos(value), np.sin(value)]
-            v[joint.idx_v], a[joint.idx_v] = motion.v[m, j], motion.a[m, j]
+            v[joint.idx_v] = motion.v[m, j]
+            a[joint.idx_v] = motion.a[m, j]
             J[joint.idx_v] = motion.jacobians.joints[m, j]
     for k, joint in enumerate(model.joints):
         if joint.nv == 6:
@@ -523,13 +544,13 @@ def _forces(opened: OpenedRobot, model: Any, motion: LoopMotion, m: int, frames:
             else:
                 placed = np.eye(4)
             q[joint.idx_q : joint.idx_q + 7] = pin.SE3ToXYZQUAT(pin.SE3(invert(placed) @ pose))
-            v[drive], a[drive], J[drive] = (
-                turn @ motion.twist[m],
-                turn @ motion.change[m],
-                turn @ motion.jacobians.platform[m],
-            )
+            v[drive] = turn @ motion.twist[m]
+            a[drive] = turn @ motion.change[m]
+            J[drive] = turn @ motion.jacobians.platform[m]
             # Pinocchio's accelerations are spatial
-            a[drive] -= [*np.cross(v[drive][3:], v[drive][:3]), 0.0, 0.0, 0.0]
+            linear, angular = np.split(v[drive], 2)
+            a[drive] -= [*np.cross(angular, linear), 0.0, 0.0, 0.0]
     pin.framesForwardKinematics(model, data, q)
-    frames.update({frame.name: data.oMf[k].homogeneous.copy() for k, frame in enumerate(model.frames)})
+    for k, frame in enumerate(model.frames):
+        frames[frame.name] = data.oMf[k].homogeneous.copy()
     return J.T @ pin.rnea(model, data, q, v, a)

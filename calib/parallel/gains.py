@@ -90,7 +90,8 @@ def drive_gains(
         units = ("",) * matrix.shape[2]
         rows.append(replace(row_set, matrix=matrix, target=target, names=unknowns, units=units))
         squares.append(np.mean(J**2, axis=0))
-        noises.append(np.mean((case.target - motion.in_band(case.target)) ** 2, axis=0))
+        out_of_band = case.target - motion.in_band(case.target)
+        noises.append(np.mean(out_of_band**2, axis=0))
     noise = np.mean(noises, axis=0) + 1e-12 * np.mean(noises)
     squares = noise * np.mean(squares, axis=0)
     folds = max(settings.folds, 2 * len(cases))
@@ -139,7 +140,8 @@ def _total_least_squares(
     factors /= size
     matrix = factors[:, :, :-1]
     target = factors[:, :, -1]
-    x = np.linalg.lstsq(matrix.reshape(-1, matrix.shape[2]), target.ravel(), rcond=1e-12)[0]
+    flat = matrix.reshape(-1, matrix.shape[2])
+    x = np.linalg.lstsq(flat, target.ravel(), rcond=1e-12)[0]
     tau = residual_inflation(rows, x / size[:-1])
     max_rounds = 100
     for _ in range(max_rounds):
@@ -148,7 +150,8 @@ def _total_least_squares(
         residual = matrix @ x - target
         weigh = 1.0 / np.sqrt(scatter * tau)[:, None]
         slopes = matrix.copy()
-        slopes[:, :, :n] -= residual[:, :, None] * (gain * squares / scatter[:, None] / size[:n])[:, None]
+        share = gain * squares / scatter[:, None] / size[:n]
+        slopes[:, :, :n] -= residual[:, :, None] * share[:, None]
         flat = (slopes * weigh[:, :, None]).reshape(-1, len(x))
         weighted = (residual * weigh).ravel()
         step = np.linalg.lstsq(flat, -weighted, rcond=1e-12)[0]

@@ -41,6 +41,7 @@ from calib.procedure.dynamic_stage.verdict import (
     with_prior,
 )
 from calib.procedure.findings import Verdict, lines_of, settle
+from calib.records import field_values
 from calib.workers.threads import one_blas_thread
 
 # settings
@@ -64,8 +65,10 @@ class ParallelDynamics(DynamicsModel):
         their power [W]: as the model was identified.
         """
         dynamics: Any = self.found.dynamics
-        states = [np.asarray(q, dtype=float), np.asarray(v, dtype=float), np.asarray(a, dtype=float)]
-        return dynamics.model.torque(dynamics.values, *states, ())
+        q = np.asarray(q, dtype=float)
+        v = np.asarray(v, dtype=float)
+        a = np.asarray(a, dtype=float)
+        return dynamics.model.torque(dynamics.values, q, v, a, ())
 
 
 def identify_parallel(
@@ -132,7 +135,12 @@ def identify_parallel(
             progress("the geometry's share of the covariance")
         carried = propagate(identification, robot.covariance, inputs.cases, partial(actuator_torques, inputs), progress)
     return ParallelDynamics(
-        **vars(assessment), inputs=inputs, found=identification, findings=findings, carried=carried, seed=settings.seed
+        **field_values(assessment),
+        inputs=inputs,
+        found=identification,
+        findings=findings,
+        carried=carried,
+        seed=settings.seed,
     )
 
 
@@ -170,9 +178,8 @@ def _preload(mechanism: ClosedRobot, inputs: IdentificationInputs, case: Case) -
         spread = force.std()
         # Neighbouring samples are alike: of the mean, the number of independent ones counts.
         sigma = spread * np.sqrt(inflation(force) / len(force))
-        findings.append(
-            finding("preload", file=case.name, number=number, mean=mean, spread=spread, unit=unit, sigma=sigma)
-        )
+        values = {"mean": mean, "spread": spread, "unit": unit, "sigma": sigma}
+        findings.append(finding("preload", file=case.name, number=number, **values))
     return findings
 
 
@@ -186,14 +193,11 @@ def assess(
     assert isinstance(model, ParallelModel)
     errors = errors_of(inputs, identification.dynamics)
     verdict, rules = _judged(model, identification, cases, errors)
-    noticed = (
-        *rules,
-        *motion_findings(errors.validation, errors.repeated),
-        *findings.noticed,
-        *settle(_encoders(model.mechanism, (*cases, *unseen))),
-    )
+    motion = motion_findings(errors.validation, errors.repeated)
+    encoders = settle(_encoders(model.mechanism, (*cases, *unseen)))
+    noticed = (*rules, *motion, *findings.noticed, *encoders)
     notes = (*lines_of(noticed), *excitation_notes(errors.excitation), *findings.notes)
-    return Assessment(**vars(errors), verdict=verdict, warnings=notes, noticed=noticed)
+    return Assessment(**field_values(errors), verdict=verdict, warnings=notes, noticed=noticed)
 
 
 def _judged(
@@ -214,7 +218,8 @@ def _driven_joints(
 ) -> tuple[str, ...]:
     """Return the names of joints whose identified friction would drive the motion: a wrong sign of power."""
     joints = [joint.name for leg in model.mechanism.robot.legs for joint in leg.chain.joints]
-    friction = np.array([False] * model.inertial + [column.form.dissipative for column in model.columns])
+    dissipative = [column.form.dissipative for column in model.columns]
+    friction = np.array([False] * model.inertial + dissipative)
     values = np.where(friction, identification.dynamics.values, 0.0)
     energy = np.zeros(len(joints))
     total = 0.0

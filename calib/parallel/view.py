@@ -83,9 +83,14 @@ class Picture:
         turned = np.full((len(q), 3), np.nan)
         places = [calibrated[:, :3, 3]] * 3
         if robot.freedom[0] in table:
-            at = np.column_stack([table.numbers("" + name, DIMENSIONS[name]) for name in robot.freedom])
-            after = np.column_stack([table.numbers("d" + name, DIMENSIONS[name]) for name in robot.freedom])
-            before = np.column_stack([table.numbers("nominal d" + name, DIMENSIONS[name]) for name in robot.freedom])
+
+            def columns(prefix: str) -> np.ndarray:
+                coordinates = [table.numbers(prefix + name, DIMENSIONS[name]) for name in robot.freedom]
+                return np.column_stack(coordinates)
+
+            at = columns("")
+            after = columns("d")
+            before = columns("nominal d")
             measured_pose = pose_of(self.mechanism, at)
             nominal = pose_of(self.mechanism, at - before)
             still = pose_of(self.mechanism, at - after)

@@ -17,6 +17,7 @@ from calib.identification.methods.estimators import CONSISTENT, CONSTRAINED
 from calib.identification.methods.least_squares import WLS
 from calib.identification.methods.method import IdentificationProblem, Method, MethodEstimate, attempted
 from calib.identification.methods.parameter_constraints import constraints_of
+from calib.records import field_values
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -50,7 +51,7 @@ def attempted_in_loop(
     estimate = attempted(method, problem, run)
     if isinstance(estimate, LoopEstimate):
         return estimate
-    return LoopEstimate(**vars(estimate), loops=loops)
+    return LoopEstimate(**field_values(estimate), loops=loops)
 
 
 @dataclass(frozen=True)
@@ -125,7 +126,9 @@ class _Simulated(Method):
                 held=identification.constrained,
                 instruments=identification.rows,
             )
-            return LoopEstimate(**{**vars(result), "loops": loops, "instrumental": identification})
+            # `plain` may be the estimate of another loop, whose results are replaced.
+            values = field_values(result) | {"loops": loops, "instrumental": identification}
+            return LoopEstimate(**values)
 
         return attempted_in_loop(self.name, problem, loops, estimate)
 

@@ -246,9 +246,9 @@ class BelievedRobot:
             return simulate_differences(plant, controller, reference, self.columns, self.steps, every)
         sensitivities = simulate_tangents(plant, controller, reference, self.columns, every, relative)
         carried = self.carried(case)
-        return replace(
-            sensitivities, **{name: vars(sensitivities)[name] * carried for name in ("by_q", "by_v", "by_torque")}
-        )
+        by_q = sensitivities.by_q * carried
+        by_v = sensitivities.by_v * carried
+        return replace(sensitivities, by_q=by_q, by_v=by_v, by_torque=sensitivities.by_torque * carried)
 
     def carried(self, case: Case) -> np.ndarray:
         """Return a factor (p,) per parameter of a serial arm: 0 for payloads not attached in a case, otherwise 1."""

@@ -151,10 +151,10 @@ class ParallelModel:
             size = self.legs[0][2].stop
             starts = self.mechanism.robot.starts
             first[: size * len(self.legs)] %= size
-            inertias = [
-                (term.joint, k) for k, term in enumerate(self.terms, self._bodies) if term.name.startswith("Ia")
-            ]
-            motors = {joint: k for joint, k in inertias if joint is not None}
+            motors = {}
+            for k, term in enumerate(self.terms, self._bodies):
+                if term.name.startswith("Ia") and term.joint is not None:
+                    motors[term.joint] = k
             for joint, k in motors.items():
                 first[k] = motors.get(joint % int(starts[1]), k)
         return first
@@ -404,7 +404,8 @@ class ParallelModel:
     def joint_noise(self, noise: np.ndarray) -> np.ndarray:
         """Return the velocity noise (n_t,) of all joints at home from that of the actuated ones (n,)."""
         at_home = loop_jacobians(self.mechanism, self.mechanism.home)
-        return np.sqrt((at_home.joints[0] @ np.linalg.pinv(at_home.readings[0])) ** 2 @ noise**2)
+        by_reading = at_home.joints[0] @ np.linalg.pinv(at_home.readings[0])
+        return np.sqrt(by_reading**2 @ noise**2)
 
     def load_cases(self) -> Loads:
         if self.payloads:
@@ -538,7 +539,8 @@ def _twist_of(mechanism: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarra
     angles, rates, changes = full[:, :, 3:]
     Rz = Rotation.from_euler("z", angles[:, 2:]).as_matrix()
     Rzy = Rz @ Rotation.from_euler("y", angles[:, 1:2]).as_matrix()
-    axes = np.stack([Rzy[:, :, 0], Rz[:, :, 1], np.broadcast_to([0.0, 0.0, 1.0], (len(x), 3))], axis=2)
+    vertical = np.broadcast_to([0.0, 0.0, 1.0], (len(x), 3))
+    axes = np.stack([Rzy[:, :, 0], Rz[:, :, 1], vertical], axis=2)
     yaw = rates[:, 2:] * axes[:, :, 2]
     pitch = rates[:, 1:2] * axes[:, :, 1]
     roll = rates[:, :1] * axes[:, :, 0]
@@ -593,7 +595,8 @@ class PlatformRegressor:
 
     def motion(self, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> LoopMotion:
         """Return the motion of all joints for x, v, a (N, r); x is clipped to the robot's box."""
-        return _moving(self.model.mechanism, *(series.tobytes() for series in (self._reachable(x), v, a)))
+        reachable = self._reachable(x)
+        return _moving(self.model.mechanism, reachable.tobytes(), v.tobytes(), a.tobytes())
 
     def regressor(self, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return W (N, r, b) in the selected columns."""
@@ -624,7 +627,8 @@ class PlatformRegressor:
         return np.clip(x, robot.lower - spare, robot.upper + spare)
 
     def _columns(self, motion: LoopMotion) -> np.ndarray:
-        return self.model.platform_regressor(motion, self.carried).transpose(2, 1, 0)[self.columns].transpose(2, 1, 0)
+        regressor = self.model.platform_regressor(motion, self.carried)
+        return regressor.transpose(2, 1, 0)[self.columns].transpose(2, 1, 0)
 
     def slopes(
         self, x: np.ndarray, v: np.ndarray, a: np.ndarray, of: Callable[[LoopMotion], np.ndarray], weights: np.ndarray
@@ -636,7 +640,7 @@ class PlatformRegressor:
         """
         within = self._reachable(x)
         result = np.empty((3, *x.shape))
-        pairs = _beside(self.model.mechanism, *(series.tobytes() for series in (within, v, a)))
+        pairs = _beside(self.model.mechanism, within.tobytes(), v.tobytes(), a.tobytes())
         for k, (raised, lowered) in enumerate(pairs):
             order, j = divmod(k, x.shape[1])
             change = ((of(raised) - of(lowered)) * weights).reshape(len(x), -1)

@@ -111,9 +111,9 @@ def _attachment_bias(links: LegLinks, twist: np.ndarray) -> np.ndarray:
     """Return the attachment's acceleration (N, c) at ṫ = 0: ω × (ω × lever); its angular part is zero."""
     result = np.zeros(links.gap.shape)
     turn = twist[:, 3:]
-    result[:, :3] = (
-        turn * np.einsum("ni,ni->n", turn, links.lever)[:, None] - links.lever * np.sum(turn**2, axis=1)[:, None]
-    )
+    along = np.einsum("ni,ni->n", turn, links.lever)[:, None]
+    speed_squared = np.sum(turn**2, axis=1)[:, None]
+    result[:, :3] = turn * along - links.lever * speed_squared
     return result
 
 
@@ -126,17 +126,19 @@ def _end_bias(links: LegLinks, v: np.ndarray) -> np.ndarray:
     w = np.zeros((len(v), 3))
     result = np.zeros(links.full.shape[:2])
     for j in range(v.shape[1]):
-        lever = links.full[:, :3, j] * v[:, j : j + 1]
-        turned = links.full[:, 3:, j] * v[:, j : j + 1]
-        result[:, :3] += cross(2.0 * w + turned, lever)
-        result[:, 3:] += cross(w, turned)
-        w = w + turned
+        linear = links.full[:, :3, j] * v[:, j : j + 1]
+        angular = links.full[:, 3:, j] * v[:, j : j + 1]
+        result[:, :3] += cross(2.0 * w + angular, linear)
+        result[:, 3:] += cross(w, angular)
+        w = w + angular
     return result[:, : links.gap.shape[1]]
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return a × b (N, 3); ten times as fast as numpy for few samples."""
-    return a[:, [1, 2, 0]] * b[:, [2, 0, 1]] - a[:, [2, 0, 1]] * b[:, [1, 2, 0]]
+    following = [1, 2, 0]
+    preceding = [2, 0, 1]
+    return a[:, following] * b[:, preceding] - a[:, preceding] * b[:, following]
 
 
 def preload_directions(mechanism: ClosedRobot, jacobians: LoopJacobians) -> np.ndarray:
