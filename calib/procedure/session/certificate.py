@@ -334,7 +334,7 @@ STEP = SessionStep(
         SessionFile(VERDICT, without_geometry=True),
         SessionFile(f"4-fit/{REPORT}"),
         SessionFile(f"5-validation/{METRICS}"),
-        ExportedFile("robot.urdf"),
+        ExportedFile(URDF),
         SessionFile(SELECTION, optional=True),
         SessionFile(POSES_CHECKED),
         SessionFile(MOTION_CHECKED),

@@ -45,7 +45,7 @@ from calib.folders import PARAMETERS, STATE, write_staged
 from calib.folders import SESSION as SETTINGS
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.findings import Verdict, Verdicts
-from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
+from calib.procedure.kinematic_stage.folder import IN_SESSION, URDF, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.session.settings import NOTHING, SCHEMA, SessionSettings, check_schema, read_settings, written
 from calib.records import plain
 from calib.result_kinds import refusal
@@ -264,7 +264,7 @@ def create(folder: Path, robot_file: Path, settings: SessionSettings, copied: Ma
     robot_name = f"1-robot/robot{robot_file.suffix}"
     if converter(robot_file):
         robot, _ = text(robot_file)
-        robot_name = "1-robot/robot.urdf"
+        robot_name = f"1-robot/{URDF}"
     created = datetime.now().astimezone().isoformat(timespec="seconds")
     settings = replace(settings, created=created, robot=replace(settings.robot, file=robot_name))
 

@@ -23,6 +23,7 @@ from calib.folders import COVARIANCE, ESTIMATE, METRICS, REPORT
 from calib.identification.model_file import MODEL
 from calib.procedure.excitation.coefficients import NAME as MOTION
 from calib.procedure.findings import Warned
+from calib.procedure.kinematic_stage.folder import URDF
 from calib.procedure.report.templates import versions
 from calib.procedure.session import dynamics_steps, folder, geometry_steps
 from calib.procedure.session.folder import Say, Session, StateFile, StepRecord, read_state
@@ -308,7 +309,7 @@ STEPS = (
         reads=(
             ROBOT,
             FITTED_ROBOT,
-            SessionFile("4-fit/robot.urdf"),
+            SessionFile(f"4-fit/{URDF}"),
             SessionFile(f"5-validation/{METRICS}"),
             SessionFile(f"8-dynamics/{MODEL}"),
             SessionFile(f"8-dynamics/{ESTIMATE}"),
