@@ -154,8 +154,8 @@ def wrong_joints(explanations: Mapping[str, Explanation | None], joints: Sequenc
     return _of_some_level(result)
 
 
-def _joints_of_change(change: Change) -> Sequence[int]:
-    return change.joints
+def _joints_of_change(change: Change) -> tuple[int, ...]:
+    return tuple(change.joints)
 
 
 def impossible(contradiction: Contradiction | None) -> list[Finding]:

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.data.poses import IMAGES, JOINTS, is_image_folder
+from calib.data.images.pixels import Pixels
+from calib.data.poses import JOINTS, is_image_folder
 from calib.data.poses.fit_options import FileOptions, FitOptions, check_files
 from calib.data.poses.measurements import PoseMeasurements, take
 from calib.data.poses.plausible import check_block
@@ -312,7 +313,7 @@ def read_file(
 
     result = []
     for block in blocks:
-        if block.kind == IMAGES:
+        if isinstance(block, Pixels):
             from calib.geometry.camera.camera_guess import complete_camera
 
             block = complete_camera(chain, block, like)

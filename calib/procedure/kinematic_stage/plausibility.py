@@ -9,7 +9,7 @@ from dataclasses import asdict
 import numpy as np
 
 from calib.column_changes import Explanation
-from calib.data.poses import IMAGES
+from calib.data.images.pixels import Pixels
 from calib.data.poses.measurements import PoseMeasurements, take
 from calib.errors import Finding, finding
 from calib.geometry.accuracy import NATURE, errors
@@ -184,7 +184,7 @@ def findings(
 
 def _as_positions(block: PoseMeasurements) -> PoseMeasurements:
     """Return the block; images are replaced by board poses, scaled by the board's square."""
-    if block.kind != IMAGES:
+    if not isinstance(block, Pixels):
         return block
     rows = evenly(len(block), MAX_IMAGES)
     from calib.geometry.camera.camera_guess import pnp_poses

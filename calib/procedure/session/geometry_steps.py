@@ -16,6 +16,7 @@ from scipy.spatial import KDTree
 
 from calib import files
 from calib.data.images.coverage import image_words
+from calib.data.images.pixels import Pixels
 from calib.data.poses import IMAGES
 from calib.data.poses.fit_options import FileOptions, FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
@@ -271,7 +272,7 @@ def notes_on(session: Session, chain: Chain, blocks: Sequence[tuple[str, PoseMea
         remarks = [f"{len(block)} rows of kind {block.kind}{ignored}"]
         if measures == Poses.kind and isinstance(block, Positions) and not isinstance(block, Poses):
             remarks.append("only positions, although the instrument measures poses")
-        if block.kind == IMAGES:
+        if isinstance(block, Pixels):
             remarks.append(image_words(block))
         elif measures == IMAGES:
             remarks.append("contains no images, although the instrument is a camera; the file is fitted nevertheless")

@@ -342,7 +342,7 @@ def _turned(name: str, most: float, text: str, answers: dict[str, str]) -> dict[
     is_camera = (_mounting(answers["mounting"]) == IN_HAND) == (name == "carried")
     if not is_camera:
         axis = -axis
-    rotation, _ = Rotation.align_vectors([axis], [[0.0, 0.0, 1.0]])
+    rotation = Rotation.align_vectors([axis], [[0.0, 0.0, 1.0]])[0]
     xyz, rpy = to_xyz_rpy(pose(rotation.as_matrix(), _lengths(position.strip(), 3, most)))
     return {"xyz": [float(x) for x in xyz], "rpy": [round(float(x), 6) for x in rpy]}
 
