@@ -17,8 +17,8 @@ Sigma = Annotated[float, Real(above=0.0, least=MIN_SIGMA, most=10.0, unit="m or 
 Tolerance = Annotated[float, Real(above=0.0, quantity="length"), Typed(unit="mm")] | None
 Stations = Annotated[str, OneOf(("each", "one"))]
 Deliverable = Annotated[str, OneOf(DELIVERABLES)]
-Index = Annotated[str, OneOf("poses.indices:Index")]
-Method = Annotated[str, OneOf("poses.select:Method")]
+Index = Annotated[str, OneOf("calib.poses.indices:Index")]
+Method = Annotated[str, OneOf("calib.poses.select:Method")]
 
 
 @checked
