@@ -15,7 +15,8 @@ assert calib.design_excitation.__module__ == "calib.api.motions"
 import calib.trajectories.recall
 from calib.cli import run
 assert run(["new", "cell", "--robot", "tx40", "--instrument", "tracker"]) == 0
-assert run(["select", "tx40", "-m", "12", "--candidates", "40", "--method", "local", "--out", "p.csv", "--no-plots"]) == 0
+select = ["select", "tx40", "-m", "12", "--candidates", "40", "--method", "local", "--out", "p.csv", "--no-plots"]
+assert run(select) == 0
 raise SystemExit(run(["formats", "mdh"]))
 """
 
