@@ -37,56 +37,76 @@ def visits(calibrations: str | Path | Sequence[str | Path]) -> Visits:
         UsageError: for a folder that holds no fit, or one given twice; where one or none is left.
     """
     places, unfinished = [place_of(folder, "fleet") for folder in folders_of(calibrations)], list[str]()
-    own: dict[str, list[Visit]] = {}
-    for place in places:
-        waits = place.session and place.session.geometric and not place.fit
-        require(place.fit or waits, f"a fleet's report takes fitted geometries, but {place.words}", UsageError)
-        one = None if waits else read_fit(place)
-        if one is None or (place.session and not one.judged[0]):
-            unfinished.append(place.name)
+    visits_by_arm: dict[str, list[Visit]] = {}
+    for calibration_place in places:
+        waits = calibration_place.session and calibration_place.session.geometric and not calibration_place.fit
+        require(
+            calibration_place.fit or waits,
+            f"a fleet's report takes fitted geometries, but {calibration_place.words}",
+            UsageError,
+        )
+        calibration = None if waits else read_fit(calibration_place)
+        if calibration is None or (calibration_place.session and not calibration.judged[0]):
+            unfinished.append(calibration_place.name)
         else:
-            own.setdefault(one.serial or one.name, []).append((place, one))
-    left = len(places) - len(unfinished)
-    words = f"sessions without a verdict yet: {listing(unfinished)}; {left} of {len(places)} left, nothing to compare"
-    require(left > 1 or not unfinished, f"{words} (calib next, or calib run, goes on with them)", UsageError)
-    unnamed = [one.name for each in own.values() for _, one in each if not one.serial]
+            visits_by_arm.setdefault(calibration.serial or calibration.name, []).append(
+                (calibration_place, calibration)
+            )
+    finished_count = len(places) - len(unfinished)
+    message = f"sessions without a verdict yet: {listing(unfinished)}; {finished_count} of {len(places)} left, nothing to compare"
+    require(
+        finished_count > 1 or not unfinished, f"{message} (calib next, or calib run, goes on with them)", UsageError
+    )
+    unnamed = [
+        calibration.name
+        for arm_visits in visits_by_arm.values()
+        for _, calibration in arm_visits
+        if not calibration.serial
+    ]
     noticed = [finding("sessions-unfinished", sessions=unfinished)] if unfinished else []
     noticed += [finding("arms-without-serial", arms=unnamed)] if len(unnamed) > 1 else []
-    noticed += [_current(arm, each) for arm, each in own.items() if len(each) > 1]
-    return Visits({arm: [one for _, one in _in_time(each)] for arm, each in own.items()}, tuple(noticed))
+    noticed += [_current(arm, arm_visits) for arm, arm_visits in visits_by_arm.items() if len(arm_visits) > 1]
+    return Visits(
+        {arm: [calibration for _, calibration in _in_time(arm_visits)] for arm, arm_visits in visits_by_arm.items()},
+        tuple(noticed),
+    )
 
 
-def _dates(own: Sequence[Visit]) -> tuple[str, list[date]]:
+def _dates(arm_visits: Sequence[Visit]) -> tuple[str, list[date]]:
     """Return what the dates of one arm's calibrations are of, and the dates; none where some are not known.
 
     Dates of measurement where any is stated, else those on which the sessions were made.
     """
-    settings = [place.session.settings for place, _ in own if place.session]
-    stated = [one.certificate.measured_on for one in settings]
-    what, texts = ("measurement", stated) if any(stated) else ("the session", [one.created for one in settings])
+    settings = [visit_place.session.settings for visit_place, _ in arm_visits if visit_place.session]
+    measured_dates = [session_settings.certificate.measured_on for session_settings in settings]
+    source, texts = (
+        ("measurement", measured_dates)
+        if any(measured_dates)
+        else ("the session", [session_settings.created for session_settings in settings])
+    )
     with suppress(ValueError):
-        found = [datetime.fromisoformat(text).date() for text in texts]
-        return what, found if len(found) == len(own) else []
-    return what, []
+        parsed = [datetime.fromisoformat(text).date() for text in texts]
+        return source, parsed if len(parsed) == len(arm_visits) else []
+    return source, []
 
 
-def _in_time(own: Sequence[Visit]) -> list[Visit]:
+def _in_time(arm_visits: Sequence[Visit]) -> list[Visit]:
     """Return one arm's calibrations, earliest first; those of one day, and those without dates, as they were given."""
-    _, dates = _dates(own)
-    return [own[k] for k in sorted(range(len(own)), key=dates.__getitem__)] if dates else list(own)
+    _, dates = _dates(arm_visits)
+    return [arm_visits[k] for k in sorted(range(len(arm_visits)), key=dates.__getitem__)] if dates else list(arm_visits)
 
 
-def _current(arm: str, own: Sequence[Visit]) -> Finding:
+def _current(arm: str, arm_visits: Sequence[Visit]) -> Finding:
     """Return which of one arm's calibrations is taken as the current one, and why."""
-    what, dates = _dates(own)
-    current, given = _in_time(own)[-1][1].name, own[-1][1].name
+    source, dates = _dates(arm_visits)
+    current, last = _in_time(arm_visits)[-1][1].name, arm_visits[-1][1].name
     dated = dates.count(max(dates)) == 1 if dates else False
     return finding(
         "current-calibration",
         arm=arm,
         current=current,
         date=str(max(dates)) if dated else "",
-        how=f"date of {what}" if dated else "the order given",
-        last=given if given != current else "",
+        how=f"date of {source}" if dated else "the order given",
+        last=last if last != current else "",
         needed="" if dated else "measured_on",
     )

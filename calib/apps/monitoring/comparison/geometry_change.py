@@ -82,13 +82,13 @@ class _Seen:
 
     def motion(self, where: str, covariance: np.ndarray) -> ToolMotion:
         """Return the targets' motion, and what the covariance (p, p) of the parameters' change lets expect of it."""
-        way, turn = (np.linalg.norm(each, axis=0) for each in self.change.reshape(2, 3, -1))
-        return ToolMotion(where, self.q, self.points, way, turn / LEVER, self.size(_root(covariance).T))
+        distance, turn = (np.linalg.norm(component, axis=0) for component in self.change.reshape(2, 3, -1))
+        return ToolMotion(where, self.q, self.points, distance, turn / LEVER, self.size(_root(covariance).T))
 
     def size(self, steps: np.ndarray) -> float:
         """Return the rms motion [m] of the targets by independent steps (k, p) of the parameters."""
-        moved = (steps @ self.rows).reshape(len(steps), 6, len(self.q))[:, :3]
-        return float(np.sqrt(np.sum(moved**2) / len(self.q)))
+        displacements = (steps @ self.rows).reshape(len(steps), 6, len(self.q))[:, :3]
+        return float(np.sqrt(np.sum(displacements**2) / len(self.q)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,15 +114,17 @@ class _Pair:
     def see(self, q: np.ndarray) -> _Seen:
         """Return the targets at joint values q (m, n) [rad or m]."""
         cell = self.cells[0]
-        bases = [evaluate(each.deflection, q) if each.deflection.terms else None for each in self.cells]
-        one, two = (see(each, q, 0, 0, base) for each, base in zip(self.cells, bases))
-        turned = rotation_vector(two.poses()[:, :3, :3] @ np.swapaxes(one.poses()[:, :3, :3], 1, 2))
-        change = np.concatenate([two.point - one.point, LEVER * turned.T]).reshape(1, -1)
-        columns = target_jacobian(cell, one, np.append(self.taken_up, self.free), 0, np.zeros(len(q), int), bases[0])
+        bases = [evaluate(cell_.deflection, q) if cell_.deflection.terms else None for cell_ in self.cells]
+        sight_before, sight_after = (see(cell_, q, 0, 0, base) for cell_, base in zip(self.cells, bases))
+        turned = rotation_vector(sight_after.poses()[:, :3, :3] @ np.swapaxes(sight_before.poses()[:, :3, :3], 1, 2))
+        change = np.concatenate([sight_after.point - sight_before.point, LEVER * turned.T]).reshape(1, -1)
+        columns = target_jacobian(
+            cell, sight_before, np.append(self.taken_up, self.free), 0, np.zeros(len(q), int), bases[0]
+        )
         columns[:, 3:] *= LEVER
         columns = np.concatenate([columns.reshape(len(columns), -1), change])
         columns = project_out(columns, np.arange(len(self.taken_up))) if len(self.taken_up) else columns
-        return _Seen(q, one.point.T, columns[len(self.taken_up) : -1], columns[-1])
+        return _Seen(q, sight_before.point.T, columns[len(self.taken_up) : -1], columns[-1])
 
 
 def compare(before: Calibration, after: Calibration, settings: DiffSettings) -> GeometryChange:
@@ -132,25 +134,25 @@ def compare(before: Calibration, after: Calibration, settings: DiffSettings) -> 
         UsageError: where base or tool shall count, and are not known of both.
     """
     pair, chain = _pair(before, after, settings), before.chain
-    learnt = [each.learnt for each in (before, after) if each.learnt is not None]
-    require(learnt, f"{before.name}, {after.name}: no residuals.csv with fitted rows; fit again", UsageError)
-    seen = pair.see(np.concatenate([each[:: max(1, -(-len(each) // MAX_POSES))] for each in learnt]))
-    found, combinations = _tested(pair, seen)
+    fitted_joints = [item.learnt for item in (before, after) if item.learnt is not None]
+    require(fitted_joints, f"{before.name}, {after.name}: no residuals.csv with fitted rows; fit again", UsageError)
+    sight = pair.see(np.concatenate([item[:: max(1, -(-len(item) // MAX_POSES))] for item in fitted_joints]))
+    test, combinations = _tested(pair, sight)
     total, sizes = np.add(*pair.covariances), np.linalg.norm(combinations, axis=0)
     changes, steps = list[ParameterChange](), np.zeros((chain.n, len(pair.change)))
-    for k, (element, one, two) in enumerate(zip(chain.elements, chain.values, after.chain.values)):
+    for k, (element, value_before, value_after) in enumerate(zip(chain.elements, chain.values, after.chain.values)):
         steps[min(element.owner, chain.n - 1), k] = pair.change[k]
-        alone, sigma = found.alone(k, sizes[k] > PARALLEL * sizes.max()), float(np.sqrt(total[k, k]))
-        changes.append(ParameterChange(element.name, element.unit, one, two, sigma, *alone))
-    changes.sort(key=lambda each: -each.explained)
-    motions = [seen.motion("poses of the fits", total)]
+        change_alone, sigma = test.alone(k, sizes[k] > PARALLEL * sizes.max()), float(np.sqrt(total[k, k]))
+        changes.append(ParameterChange(element.name, element.unit, value_before, value_after, sigma, *change_alone))
+    changes.sort(key=lambda item: -item.explained)
+    motions = [sight.motion("poses of the fits", total)]
     motions.append(pair.see(random_joints(chain, MAX_POSES, settings.seed)).motion("random poses within limits", total))
-    by_joint = tuple((name, seen.size(step[None])) for name, step in zip(chain.joint_names, steps))
+    by_joint = tuple((name, sight.size(step[None])) for name, step in zip(chain.joint_names, steps))
     return GeometryChange(
-        found.chi2,
-        len(found.difference),
+        test.chi2,
+        len(test.difference),
         tuple(changes),
-        found.extra,
+        test.extra,
         by_joint,
         tuple(motions),
         frame_changes(before, after),
@@ -160,73 +162,88 @@ def compare(before: Calibration, after: Calibration, settings: DiffSettings) -> 
 def corrected_motion(before: Calibration, after: Calibration, settings: DiffSettings) -> float:
     """Return the rms motion [m] of the target at the poses of the later fit, with the joint corrections of both."""
     pair, rigid = _pair(before, after, settings), (before.cell, after.cell)
-    whole = tuple(replace(one, chain=two.chain, deflection=two.deflection) for one, two in zip(pair.cells, rigid))
+    cells_with_corrections = tuple(
+        replace(cell, chain=corrected.chain, deflection=corrected.deflection)
+        for cell, corrected in zip(pair.cells, rigid)
+    )
     none = np.zeros(0, dtype=int)
     q = before.learnt if after.learnt is None else after.learnt
     assert q is not None
-    return replace(pair, cells=whole, free=none).see(q).motion("", np.zeros((0, 0))).rms
+    return replace(pair, cells=cells_with_corrections, free=none).see(q).motion("", np.zeros((0, 0))).rms
 
 
 def frame_changes(before: Calibration, after: Calibration) -> dict[str, np.ndarray]:
     """Return the motions (6,) [m, rad] of ``base`` and ``tool`` between two fits; empty for a nominal robot."""
     if before.nominal or after.nominal:
         return {}
-    one, two = ((each.cell.stations[s], each.cell.tools[t]) for each, s, t in _places(before, after))
-    return {name: _step(a, b) for name, a, b in zip(("base", "tool"), one, two)}
+    frames_before, frames_after = (
+        (calibration.cell.stations[s], calibration.cell.tools[t]) for calibration, s, t in _places(before, after)
+    )
+    return {name: _step(a, b) for name, a, b in zip(("base", "tool"), frames_before, frames_after)}
 
 
-def _step(one: np.ndarray, two: np.ndarray) -> np.ndarray:
+def _step(T_first: np.ndarray, T_second: np.ndarray) -> np.ndarray:
     """Return the step (6,) that leads from one placement to the other, along and about the first one's own axes."""
-    way = invert(one) @ two
-    return np.concatenate([way[:3, 3], rotation_vector(way[:3, :3])])
+    step = invert(T_first) @ T_second
+    return np.concatenate([step[:3, 3], rotation_vector(step[:3, :3])])
 
 
 def _places(before: Calibration, after: Calibration) -> list[tuple[Calibration, int, int]]:
     """Return the calibrations with the numbers of the station and the tool that are compared: of one name, or first."""
-    found = []
+    indices = []
     for kind in ("station_names", "tool_names"):
-        one, two = (getattr(each.cell, kind) for each in (before, after))
-        shared = [name for name in one if name in two]
-        found.append((one.index(shared[0]), two.index(shared[0])) if shared else (0, 0))
-    return [(each, station, tool) for each, station, tool in zip((before, after), *found)]
+        names_before, names_after = (getattr(calibration.cell, kind) for calibration in (before, after))
+        shared = [name for name in names_before if name in names_after]
+        indices.append((names_before.index(shared[0]), names_after.index(shared[0])) if shared else (0, 0))
+    return [(calibration, station, tool) for calibration, station, tool in zip((before, after), *indices)]
 
 
 def _pair(before: Calibration, after: Calibration, settings: DiffSettings) -> _Pair:
     counts = {"base": settings.same_base, "tool": settings.same_tool}
-    told = " and ".join(name for name, each in counts.items() if each)
-    if told:
-        words = f"a nominal robot has no {told} placement; compare two fits"
-        require(not (before.nominal or after.nominal), f"same {told}: {words}", UsageError)
-        words = "one fit has joint corrections that the other has not; fit both with the same --model"
-        require(before.cell.deflection.terms == after.cell.deflection.terms, f"same {told}: {words}", UsageError)
+    counted_names = " and ".join(name for name, calibration_ in counts.items() if calibration_)
+    if counted_names:
+        message = f"a nominal robot has no {counted_names} placement; compare two fits"
+        require(not (before.nominal or after.nominal), f"same {counted_names}: {message}", UsageError)
+        message = "one fit has joint corrections that the other has not; fit both with the same --model"
+        require(
+            before.cell.deflection.terms == after.cell.deflection.terms, f"same {counted_names}: {message}", UsageError
+        )
     cells, covariances, arm = [], [], len(before.chain.elements)
     tool = (before if after.nominal else after).cell.tools[0]
-    for each, station, target in _places(before, after):
-        cell, covariance = each.whole if told else each.rigid
+    for calibration_, station, target in _places(before, after):
+        cell, covariance = calibration_.whole if counted_names else calibration_.rigid
         sections = np.split(np.arange(len(covariance)), np.cumsum(layout_counts(cell))[:-1])
         frames = sections[1][6 * station : 6 * station + 6], sections[2][6 * target : 6 * target + 6]
         index = np.concatenate([sections[0], *frames, sections[4]])
         covariances.append(covariance[np.ix_(index, index)])
-        own = cell.stations[station] if counts["base"] else np.eye(4), cell.tools[target] if counts["tool"] else tool
-        cells.append(replace(cell, stations=own[0][None], tools=own[1][None], optics=NoOptics()))
-    steps = [_step(one[0], two[0]) for one, two in zip(*((cell.stations, cell.tools) for cell in cells))]
+        placements = (
+            cell.stations[station] if counts["base"] else np.eye(4),
+            cell.tools[target] if counts["tool"] else tool,
+        )
+        cells.append(replace(cell, stations=placements[0][None], tools=placements[1][None], optics=NoOptics()))
+    steps = [_step(first[0], second[0]) for first, second in zip(*((cell.stations, cell.tools) for cell in cells))]
     terms = [np.asarray(cell.deflection.coefficients) for cell in cells]
     change = np.concatenate([after.chain.values - before.chain.values, *steps, terms[1] - terms[0]])
-    if told:
+    if counted_names:
         change[:arm] = cells[1].chain.values - cells[0].chain.values
-    left_out = np.repeat([not each for each in counts.values()], 6)
+    left_out = np.repeat([not calibration_ for calibration_ in counts.values()], 6)
     taken_up = arm + np.flatnonzero(left_out)
     free = np.setdiff1d(np.arange(len(change)), taken_up)
-    one, two = (each[np.ix_(free, free)] for each in covariances)
-    return _Pair((cells[0], cells[1]), taken_up, free, change[free], (one, two))
+    first, second = (calibration_[np.ix_(free, free)] for calibration_ in covariances)
+    return _Pair((cells[0], cells[1]), taken_up, free, change[free], (first, second))
 
 
-def _tested(pair: _Pair, seen: _Seen) -> tuple[Tested, np.ndarray]:
+def _tested(pair: _Pair, sight: _Seen) -> tuple[Tested, np.ndarray]:
     """Return the test of the combinations that the poses show, and what each parameter does to those tested (k, p)."""
-    _, size, shown = np.linalg.svd(seen.rows.T, full_matrices=False)
-    shown = shown[size > SHOWN * size[0]]
-    spans = [span(shown[:, np.diag(each) > 0.0]) for each in pair.covariances]
-    return tested(shown @ pair.change, [shown @ each @ shown.T for each in pair.covariances], spans, shown)
+    _, size, directions = np.linalg.svd(sight.rows.T, full_matrices=False)
+    directions = directions[size > SHOWN * size[0]]
+    spans = [span(directions[:, np.diag(covariance) > 0.0]) for covariance in pair.covariances]
+    return tested(
+        directions @ pair.change,
+        [directions @ covariance @ directions.T for covariance in pair.covariances],
+        spans,
+        directions,
+    )
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:
