@@ -56,23 +56,40 @@ def spread(robots: Sequence[CalibratedChain]) -> tuple[ParameterSpread, ...]:
         UsageError: where no fit states its covariance.
     """
     chain = nominal_of(robots[0])
-    covariances = [np.zeros((len(chain.values),) * 2) if r.covariance is None else r.covariance for r in robots]
-    fitted = np.array([np.diag(covariance_) > 0.0 for covariance_ in covariances])
-    where = np.flatnonzero(fitted.any(axis=0))
-    require(len(where), "no fit of these arms states the covariance of its geometry; fit them again", UsageError)
+    covariances = []
+    for robot in robots:
+        covariance = robot.covariance
+        if covariance is None:
+            covariance = np.zeros((len(chain.values),) * 2)
+        covariances.append(covariance)
+    fitted = np.array([np.diag(covariance) > 0.0 for covariance in covariances])
+    columns = np.flatnonzero(fitted.any(axis=0))
+    require(len(columns), "no fit of these arms states the covariance of its geometry; fit them again", UsageError)
+
     data = []
-    for robot, covariance, fitted_here in zip(robots, covariances, fitted[:, where]):
-        k = where[fitted_here]
+    for robot, covariance, fitted_in_arm in zip(robots, covariances, fitted[:, columns]):
+        k = columns[fitted_in_arm]
         information = np.linalg.inv(covariance[np.ix_(k, k)])
-        data.append((fitted_here, information, information @ (robot.chain.values - chain.values)[k]))
-    _, family = np.unique(families(Installation(chain))[where], return_inverse=True)
+        deviations = (robot.chain.values - chain.values)[k]
+        data.append((fitted_in_arm, information, information @ deviations))
+    _, family = np.unique(families(Installation(chain))[columns], return_inverse=True)
     mean, sigma = _most_probable(data, family)
-    count = fitted[:, where].sum(axis=0)
+    count = fitted[:, columns].sum(axis=0)
     width = np.maximum(sigma * np.sqrt(1.0 + 1.0 / (count + 1)), MIN_WIDTH)
-    rows = zip(where, count, mean, sigma, width)
-    return tuple(
-        ParameterSpread(chain.names[k], chain.elements[k].unit, int(n), *map(float, figures)) for k, n, *figures in rows
-    )
+
+    parameters = []
+    for row, k in enumerate(columns):
+        parameters.append(
+            ParameterSpread(
+                name=chain.names[k],
+                unit=chain.elements[k].unit,
+                arms=int(count[row]),
+                mean=float(mean[row]),
+                sigma=float(sigma[row]),
+                width=float(width[row]),
+            )
+        )
+    return tuple(parameters)
 
 
 def _most_probable(

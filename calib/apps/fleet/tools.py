@@ -60,17 +60,19 @@ def _use(name: str, tool_uses: Mapping[str, tuple[str, np.ndarray, float]]) -> T
     other_arms = [arm for arm in tool_uses if arm not in arms]
     if len(arms) < MIN_ARMS[0] or len(other_arms) < MIN_ARMS[1]:
         return ToolUse(name, arms)
-    positions, errors = (
-        [np.array([tool_uses[arm][1] for arm in group]) for group in (arms, other_arms)],
-        [np.log([[max(tool_uses[arm][2], 1e-9)] for arm in group]) for group in (arms, other_arms)],
+    groups = (arms, other_arms)
+    positions = [np.array([tool_uses[arm][1] for arm in group]) for group in groups]
+    errors = [np.log([[max(tool_uses[arm][2], 1e-9)] for arm in group]) for group in groups]
+    displacement = np.median(positions[0], axis=0) - np.median(positions[1], axis=0)
+    log_ratio = np.median(errors[0], axis=0) - np.median(errors[1], axis=0)
+    return ToolUse(
+        tool=name,
+        arms=arms,
+        moved=float(np.linalg.norm(displacement)),
+        moved_sigmas=_sigmas(displacement, positions),
+        times=float(np.exp(log_ratio[0])),
+        times_sigmas=float(np.copysign(_sigmas(log_ratio, errors), log_ratio[0])),
     )
-    displacement, times = (
-        np.median(with_tool, axis=0) - np.median(without_tool, axis=0)
-        for with_tool, without_tool in (positions, errors)
-    )
-    sigmas = [_sigmas(step, groups) for step, groups in ((displacement, positions), (times, errors))]
-    factor, signed = float(np.exp(times[0])), float(np.copysign(sigmas[1], times[0]))
-    return ToolUse(name, arms, float(np.linalg.norm(displacement)), sigmas[0], factor, signed)
 
 
 def _sigmas(step: np.ndarray, groups: Sequence[np.ndarray]) -> float:

@@ -1,7 +1,6 @@
 """Calibrations of a fleet by arm: which are finished, which are of one arm, and in what order of time."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from datetime import date, datetime
 from pathlib import Path
@@ -36,40 +35,44 @@ def visits(calibrations: str | Path | Sequence[str | Path]) -> Visits:
     Raises:
         UsageError: for a folder that holds no fit, or one given twice; where one or none is left.
     """
-    places, unfinished = [place_of(folder, "fleet") for folder in folders_of(calibrations)], list[str]()
+    places = [place_of(folder, "fleet") for folder in folders_of(calibrations)]
+    unfinished: list[str] = []
     visits_by_arm: dict[str, list[Visit]] = {}
-    for calibration_place in places:
-        waits = calibration_place.session and calibration_place.session.geometric and not calibration_place.fit
-        require(
-            calibration_place.fit or waits,
-            f"a fleet's report takes fitted geometries, but {calibration_place.words}",
-            UsageError,
-        )
-        calibration = None if waits else read_fit(calibration_place)
-        if calibration is None or (calibration_place.session and not calibration.judged[0]):
-            unfinished.append(calibration_place.name)
-        else:
-            visits_by_arm.setdefault(calibration.serial or calibration.name, []).append(
-                (calibration_place, calibration)
-            )
+    for source in places:
+        session = source.session
+        waits = session and session.geometric and not source.fit
+        require(source.fit or waits, f"a fleet's report takes fitted geometries, but {source.words}", UsageError)
+        if waits:
+            unfinished.append(source.name)
+            continue
+        calibration = read_fit(source)
+        if session and not calibration.judged[0]:
+            unfinished.append(source.name)
+            continue
+        arm = calibration.serial or calibration.name
+        visits_by_arm.setdefault(arm, []).append((source, calibration))
+
     finished_count = len(places) - len(unfinished)
-    message = f"sessions without a verdict yet: {listing(unfinished)}; {finished_count} of {len(places)} left, nothing to compare"
-    require(
-        finished_count > 1 or not unfinished, f"{message} (calib next, or calib run, goes on with them)", UsageError
-    )
-    unnamed = [
-        calibration.name
-        for arm_visits in visits_by_arm.values()
-        for _, calibration in arm_visits
-        if not calibration.serial
-    ]
-    noticed = [finding("sessions-unfinished", sessions=unfinished)] if unfinished else []
-    noticed += [finding("arms-without-serial", arms=unnamed)] if len(unnamed) > 1 else []
-    noticed += [_current(arm, arm_visits) for arm, arm_visits in visits_by_arm.items() if len(arm_visits) > 1]
-    return Visits(
-        {arm: [calibration for _, calibration in _in_time(arm_visits)] for arm, arm_visits in visits_by_arm.items()},
-        tuple(noticed),
-    )
+    counts = f"{finished_count} of {len(places)} left, nothing to compare"
+    message = f"sessions without a verdict yet: {listing(unfinished)}; {counts}"
+    enough = finished_count > 1 or not unfinished
+    require(enough, f"{message} (calib next, or calib run, goes on with them)", UsageError)
+
+    unnamed = []
+    current = []
+    by_arm = {}
+    for arm, arm_visits in visits_by_arm.items():
+        unnamed += [calibration.name for _, calibration in arm_visits if not calibration.serial]
+        if len(arm_visits) > 1:
+            current.append(_current(arm, arm_visits))
+        by_arm[arm] = [calibration for _, calibration in _in_time(arm_visits)]
+
+    noticed = []
+    if unfinished:
+        noticed.append(finding("sessions-unfinished", sessions=unfinished))
+    if len(unnamed) > 1:
+        noticed.append(finding("arms-without-serial", arms=unnamed))
+    return Visits(by_arm, (*noticed, *current))
 
 
 def _dates(arm_visits: Sequence[Visit]) -> tuple[str, list[date]]:
@@ -77,36 +80,49 @@ def _dates(arm_visits: Sequence[Visit]) -> tuple[str, list[date]]:
 
     Dates of measurement where any is stated, else those on which the sessions were made.
     """
-    settings = [visit_place.session.settings for visit_place, _ in arm_visits if visit_place.session]
-    measured_dates = [session_settings.certificate.measured_on for session_settings in settings]
-    source, texts = (
-        ("measurement", measured_dates)
-        if any(measured_dates)
-        else ("the session", [session_settings.created for session_settings in settings])
-    )
-    with suppress(ValueError):
-        parsed = [datetime.fromisoformat(text).date() for text in texts]
-        return source, parsed if len(parsed) == len(arm_visits) else []
-    return source, []
+    settings = [source.session.settings for source, _ in arm_visits if source.session]
+    dated_thing = "measurement"
+    texts = [session_settings.certificate.measured_on for session_settings in settings]
+    if not any(texts):
+        dated_thing = "the session"
+        texts = [session_settings.created for session_settings in settings]
+    try:
+        dates = [datetime.fromisoformat(text).date() for text in texts]
+    except ValueError:
+        return dated_thing, []
+    if len(dates) != len(arm_visits):
+        return dated_thing, []
+    return dated_thing, dates
 
 
 def _in_time(arm_visits: Sequence[Visit]) -> list[Visit]:
     """Return one arm's calibrations, earliest first; those of one day, and those without dates, as they were given."""
     _, dates = _dates(arm_visits)
-    return [arm_visits[k] for k in sorted(range(len(arm_visits)), key=dates.__getitem__)] if dates else list(arm_visits)
+    if not dates:
+        return list(arm_visits)
+    order = sorted(range(len(arm_visits)), key=dates.__getitem__)
+    return [arm_visits[k] for k in order]
 
 
 def _current(arm: str, arm_visits: Sequence[Visit]) -> Finding:
     """Return which of one arm's calibrations is taken as the current one, and why."""
-    source, dates = _dates(arm_visits)
-    current, last = _in_time(arm_visits)[-1][1].name, arm_visits[-1][1].name
-    dated = dates.count(max(dates)) == 1 if dates else False
+    dated_thing, dates = _dates(arm_visits)
+    current = _in_time(arm_visits)[-1][1].name
+    last = arm_visits[-1][1].name
+    date_text = ""
+    reason = "the order given"
+    needed = "measured_on"
+    if dates:
+        latest = max(dates)
+        date_text = str(latest)
+        # Two calibrations of the latest day are in the order given.
+        if dates.count(latest) == 1:
+            reason = f"date of {dated_thing}"
+            needed = ""
+        else:
+            date_text = ""
+    if last == current:
+        last = ""
     return finding(
-        "current-calibration",
-        arm=arm,
-        current=current,
-        date=str(max(dates)) if dated else "",
-        how=f"date of {source}" if dated else "the order given",
-        last=last if last != current else "",
-        needed="" if dated else "measured_on",
+        "current-calibration", arm=arm, current=current, date=date_text, how=reason, last=last, needed=needed
     )

@@ -122,7 +122,7 @@ class Tested:
         return float(self.difference @ self.difference)
 
     def alone(self, k: int, identifiable: bool = True) -> tuple[float, float, float]:
-        """Return change, σ and explained χ² of parameter k if it changed alone; NaN, NaN and 0 if it is not `identifiable`."""
+        """Return change, σ and explained χ² of parameter k if it changed alone; NaN, NaN, 0 if not `identifiable`."""
         size = float(np.linalg.norm(self.columns[:, k]))
         if not identifiable or not size:
             return np.nan, np.nan, 0.0
