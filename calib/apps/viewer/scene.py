@@ -4,10 +4,9 @@ A folder is that of a fit, an identification, an excitation, a planned motion, o
 All points are in the base of the arm that is drawn; its meshes are those of the URDF's ``<visual>`` elements.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -217,47 +216,56 @@ def read(folder: str | Path, robot: str | None = None) -> Scene:
         refuse_option(folder, "robot of these poses unknown; give --robot")
     chain, source = _arm(folder, robot)
     meshes, notes = _meshes(chain, source)
-    fits = [fit_folder for fit_folder in (folder, folder / IN_SESSION) if FitFolder(fit_folder).residuals.is_file()]
-    motions = [path for name in (coefficients.SAMPLES, coefficients.PLANNED) for path in _below(folder, name)]
-    torques = [path for path in _below(folder, "torques_*.csv") if not (path.parent / "unseen").is_dir()]
-    plans = [folder] if is_csv else sorted(folder.glob("2-poses/*.csv"))
-    scene = Scene(
-        folder.resolve().stem if is_csv else folder.resolve().name,
-        chain,
-        tuple(meshes),
-        _nonempty(
-            _joined(_measured(fit_folder, chain), ValidationFolder(folder / VALIDATED).errors) for fit_folder in fits
-        ),
-        _nonempty(sizes for fit_folder in fits for sizes in _unplaced(fit_folder, chain)),
-        tuple(
-            (path.stem, read_poses(path, Joints(chain.joint_names, _kinds(chain))))
-            for path in plans
-            if chain and not is_run(path)
-        ),
-        (
-            *(
-                Played(path.stem, *rehearsed_samples(path, chain))
-                for path in plans
-                if isinstance(chain, Chain) and is_run(path)
-            ),
-            *(_played(path, folder) for path in motions),
-        ),
-        tuple(_torques(path, folder, chain) for path in torques),
-        tuple(notes),
-    )
-    content = scene.measured or scene.sizes or scene.chosen or scene.played or scene.torques
+    fit_folders = [path for path in (folder, folder / IN_SESSION) if FitFolder(path).residuals.is_file()]
+    measured: list[Measured] = []
+    sizes: list[ErrorSizes] = []
+    for fit_folder in fit_folders:
+        errors = ValidationFolder(folder / VALIDATED).errors
+        measured.append(_joined(_measured(fit_folder, chain), errors))
+    for fit_folder in fit_folders:
+        sizes += _unplaced(fit_folder, chain)
+
+    chosen: list[tuple[str, np.ndarray]] = []
+    played: list[Played] = []
+    plans = [folder]
+    if not is_csv:
+        plans = sorted(folder.glob("2-poses/*.csv"))
+    for path in plans:
+        if chain and not is_run(path):
+            joints = Joints(chain.joint_names, _kinds(chain))
+            chosen.append((path.stem, read_poses(path, joints)))
+    for path in plans:
+        if isinstance(chain, Chain) and is_run(path):
+            t, q = rehearsed_samples(path, chain)
+            played.append(Played(path.stem, t, q))
+    for name in (coefficients.SAMPLES, coefficients.PLANNED):
+        played += [_played(path, folder) for path in _below(folder, name)]
+
+    # A folder that also holds unseen motions shows those alone.
+    torque_files = [path for path in _below(folder, "torques_*.csv") if not (path.parent / "unseen").is_dir()]
+    torques = [_torques(path, folder, chain) for path in torque_files]
+
+    resolved = folder.resolve()
+    title = resolved.name
+    if is_csv:
+        title = resolved.stem
+    measured = [poses for poses in measured if len(poses.q)]
+    sizes = [rows for rows in sizes if len(rows.q)]
+    content = measured or sizes or chosen or played or torques
     require(content, refusal(folder, "view"), UsageError)
     if chain is None:
-        note = "no robot is shown: the folder does not name one; give --robot"
-        return replace(scene, notes=(*scene.notes, note))
-    return scene
-
-
-_Rows = TypeVar("_Rows", Measured, ErrorSizes)
-
-
-def _nonempty(parts: Iterable[_Rows]) -> tuple[_Rows, ...]:
-    return tuple(part for part in parts if len(part.q))
+        notes.append("no robot is shown: the folder does not name one; give --robot")
+    return Scene(
+        title=title,
+        chain=chain,
+        meshes=tuple(meshes),
+        measured=tuple(measured),
+        sizes=tuple(sizes),
+        chosen=tuple(chosen),
+        played=tuple(played),
+        torques=tuple(torques),
+        notes=tuple(notes),
+    )
 
 
 def _below(folder: Path, pattern: str) -> list[Path]:
@@ -444,7 +452,11 @@ def _needed(table: Table, letter: str, path: Path) -> np.ndarray:
 
 def _name(path: Path, folder: Path) -> str:
     parent = path.parent
-    return path.stem if parent == folder else f"{parent.name}" if path.stem != "torques_1" else f"{parent.name} torques"
+    if parent == folder:
+        return path.stem
+    if path.stem == "torques_1":
+        return f"{parent.name} torques"
+    return parent.name
 
 
 def strips(chain: Chain | Drawn, q: np.ndarray) -> list[np.ndarray]:

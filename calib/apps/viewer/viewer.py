@@ -114,22 +114,32 @@ def about(scene: Scene) -> str:
     """Return the text shown next to the plots."""
     lines = [f"# {scene.title}"]
     for measured in scene.measured:
-        sizes = [1e3 * np.linalg.norm(measured.seen - p, axis=1) for p in (measured.nominal, measured.calibrated)]
-        for label, selection in (("fitted", ~measured.unseen), ("unseen", measured.unseen)):
-            if selection.any():
-                rms = [float(np.sqrt(np.mean(size[selection] ** 2))) for size in sizes]
-                text = f"{rms[0]:.3f} mm rms nominal (orange), {rms[1]:.3f} mm calibrated (green)"
-                lines.append(f"{int(selection.sum())} {label} poses: {text}")
-        scale = measured.arrow_scale(scene.chain) if scene.chain else 1.0
-        text = "from the target's position by the arm's model to the measured one."
-        lines.append(f"**Arrows are {scale:g} times as long as the errors**; {text}")
-    lines += [line for sizes in scene.sizes for line in _size_lines(sizes)]
-    lines += [f"pose plan *{name}*: {len(q)} poses" for name, q in scene.chosen]
-    lines += [f"motion *{part.name}*: {part.t[-1]:.1f} s" for part in scene.played]
-    lines += [
-        f"torques *{part.name}*: measured orange, predicted green, and residuals [N·m, N]" for part in scene.torques
-    ]
-    return "\n\n".join([*lines, *(f"note: {note}" for note in scene.notes)])
+        nominal_mm = 1e3 * np.linalg.norm(measured.seen - measured.nominal, axis=1)
+        calibrated_mm = 1e3 * np.linalg.norm(measured.seen - measured.calibrated, axis=1)
+        for label, rows in (("fitted", ~measured.unseen), ("unseen", measured.unseen)):
+            if rows.any():
+                nominal = f"{_rms(nominal_mm[rows]):.3f} mm rms nominal (orange)"
+                calibrated = f"{_rms(calibrated_mm[rows]):.3f} mm calibrated (green)"
+                lines.append(f"{int(rows.sum())} {label} poses: {nominal}, {calibrated}")
+        scale = 1.0
+        if scene.chain:
+            scale = measured.arrow_scale(scene.chain)
+        meaning = "from the target's position by the arm's model to the measured one."
+        lines.append(f"**Arrows are {scale:g} times as long as the errors**; {meaning}")
+    for sizes in scene.sizes:
+        lines += _size_lines(sizes)
+    for name, q in scene.chosen:
+        lines.append(f"pose plan *{name}*: {len(q)} poses")
+    for motion in scene.played:
+        lines.append(f"motion *{motion.name}*: {motion.t[-1]:.1f} s")
+    for torques in scene.torques:
+        lines.append(f"torques *{torques.name}*: measured orange, predicted green, and residuals [N·m, N]")
+    lines += [f"note: {note}" for note in scene.notes]
+    return "\n\n".join(lines)
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def _size_lines(sizes: ErrorSizes) -> Iterator[str]:
@@ -325,27 +335,37 @@ def _blueprint(scene: Scene) -> Any:
     elif scene.sizes:
         tabs.append(rrb.TimeSeriesView(origin="errors", name="error of each row [mm]"))
     if scene.played:
-        contents = [[f"+ /motion/{kind}/**", f"+ /limits/{kind}/**"] for kind in ("position", "velocity")]
-        views = [
-            rrb.TimeSeriesView(
-                origin="/", contents=contents_, name=f"{kind} [rad{unit} or m{unit}], limits in red", plot_legend=silent
+        views = []
+        for kind, unit in (("position", ""), ("velocity", "/s")):
+            view = rrb.TimeSeriesView(
+                origin="/",
+                contents=[f"+ /motion/{kind}/**", f"+ /limits/{kind}/**"],
+                name=f"{kind} [rad{unit} or m{unit}], limits in red",
+                plot_legend=silent,
             )
-            for contents_, kind, unit in zip(contents, ("position", "velocity"), ("", "/s"))
-        ]
+            views.append(view)
         tabs.append(rrb.Vertical(*views, name="motion"))
     if scene.torques:
-        row_names = dict.fromkeys(name for recording in scene.torques for name in recording.rows)
-        plots = [
-            rrb.TimeSeriesView(origin=f"torques/{_part(name)}", name=name, plot_legend=silent) for name in row_names
-        ]
-        residual_view = rrb.TimeSeriesView(origin="residuals", name="measured minus predicted")
-        tabs.append(rrb.Vertical(rrb.Grid(*plots, grid_columns=2), residual_view, row_shares=[3, 1], name="torques"))
+        names: dict[str, None] = {}  # in order of appearance
+        for torques in scene.torques:
+            names.update(dict.fromkeys(torques.rows))
+        plots = []
+        for name in names:
+            plot = rrb.TimeSeriesView(origin=f"torques/{_part(name)}", name=name, plot_legend=silent)
+            plots.append(plot)
+        grid = rrb.Grid(*plots, grid_columns=2)
+        residuals = rrb.TimeSeriesView(origin="residuals", name="measured minus predicted")
+        tabs.append(rrb.Vertical(grid, residuals, row_shares=[3, 1], name="torques"))
     picture = rrb.Spatial3DView(origin="world", name="robot, nominal orange, calibrated green")
     right = rrb.Tabs(*tabs, active_tab=int(bool(scene.measured and scene.chosen)))
     text = rrb.TextDocumentView(origin="about", name="what is shown")
+    left = rrb.Vertical(picture, text, row_shares=[4, 1])
+    timeline = "pose"
+    if scene.chosen or scene.played or scene.torques:
+        timeline = "time"
     return rrb.Blueprint(
-        rrb.Horizontal(rrb.Vertical(picture, text, row_shares=[4, 1]), right, column_shares=[3, 2]),
-        rrb.TimePanel(timeline="time" if scene.chosen or scene.played or scene.torques else "pose", state="collapsed"),
+        rrb.Horizontal(left, right, column_shares=[3, 2]),
+        rrb.TimePanel(timeline=timeline, state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
         auto_views=False,
