@@ -1,6 +1,7 @@
 """Parallel run of many sessions, one folder per robot; a failed session does not stop the other sessions."""
 
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
@@ -61,9 +62,14 @@ class FleetRow:
 
     def line(self) -> str:
         """Return the outcome of the session as a line."""
-        errors = self.nominal is not None and f"{self.nominal:.3g} → {self.calibrated:.3g} mm"
-        torque = self.torque is not None and f"torque {self.torque:.3g} %"
-        parts = [part for part in (self.state, self.verdict, errors, torque, f"{self.seconds:.1f} s") if part]
+        parts = [self.state]
+        if self.verdict:
+            parts.append(self.verdict)
+        if self.nominal is not None:
+            parts.append(f"{self.nominal:.3g} → {self.calibrated:.3g} mm")
+        if self.torque is not None:
+            parts.append(f"torque {self.torque:.3g} %")
+        parts.append(f"{self.seconds:.1f} s")
         return f"{self.folder}: {', '.join(parts)}"
 
 
@@ -166,27 +172,45 @@ def table(outcomes: Sequence[FleetRow]) -> RenderableType:
         summary_table.add_column(name, justify="right", no_wrap=True)
     names = [Path(row.folder).resolve().name for row in outcomes]
     for row, name in zip(outcomes, names):
-        state, verdict = (Text(x, COLOURS.get(x, "yellow")) if x else "" for x in (row.state, row.verdict))
-        numbers = ["" if x is None else f"{x:.3g}" for x in (row.nominal, row.calibrated, row.torque)]
-        label = name if names.count(name) == 1 else row.folder
-        summary_table.add_row(Text(label), state, verdict, *numbers, f"{row.seconds:.1f}")
+        label = name
+        if names.count(name) > 1:
+            label = row.folder
+        cells: list[Text | str] = [Text(label)]
+        for word in (row.state, row.verdict):
+            cell: Text | str = ""
+            if word:
+                cell = Text(word, COLOURS.get(word, "yellow"))
+            cells.append(cell)
+        for number in (row.nominal, row.calibrated, row.torque):
+            printed = ""
+            if number is not None:
+                printed = f"{number:.3g}"
+            cells.append(printed)
+        cells.append(f"{row.seconds:.1f}")
+        summary_table.add_row(*cells)
     return summary_table
 
 
 def remarks(outcomes: Sequence[FleetRow]) -> Iterator[str]:
     """Yield a line for each incomplete session: the missing file, or the error."""
+    beginnings = {WAITS: "{} waits for ", FAILED: "{} failed: "}
     for row in outcomes:
-        if row.state != DONE:
-            beginning = {WAITS: f"{row.folder} waits for ", FAILED: f"{row.folder} failed: "}.get(row.state, "")
-            yield f"{beginning}{row.words}"
+        if row.state == DONE:
+            continue
+        beginning = beginnings.get(row.state, "").format(row.folder)
+        yield f"{beginning}{row.words}"
 
 
 def summary(outcomes: Sequence[FleetRow], seconds: float) -> str:
     """Return one line with the number of sessions for each state and verdict."""
-    counts = {state: sum(row.state == state for row in outcomes) for state in (DONE, WAITS, BUSY, FAILED)}
-    verdict_counts = {level: sum(row.verdict == level for row in outcomes) for level in LEVELS}
-    verdict_text = ", ".join(f"{count} {level}" for level, count in verdict_counts.items() if count)
-    parts = [f"{counts[DONE]} of {len(outcomes)} done" + (f" ({verdict_text})" if verdict_text else "")]
-    state_labels = {WAITS: "waiting", BUSY: BUSY, FAILED: FAILED}
-    parts += [f"{counts[state]} {verdict_text}" for state, verdict_text in state_labels.items() if counts[state]]
+    states = Counter(row.state for row in outcomes)
+    verdicts = Counter(row.verdict for row in outcomes)
+    done = f"{states[DONE]} of {len(outcomes)} done"
+    levels = [f"{verdicts[level]} {level}" for level in LEVELS if verdicts[level]]
+    if levels:
+        done += f" ({', '.join(levels)})"
+    parts = [done]
+    for state, label in ((WAITS, "waiting"), (BUSY, BUSY), (FAILED, FAILED)):
+        if states[state]:
+            parts.append(f"{states[state]} {label}")
     return f"{', '.join(parts)}; {seconds:.1f} s"

@@ -33,12 +33,16 @@ class Throughput:
         ranked = sorted(self.spent.items(), key=lambda item: len(item[1]))
         if len(ranked) < 2:
             return []
-        lines = [
-            f"worker {name}: {len(seconds)} tasks, {len(seconds) / minutes:.3g} a minute, {sum(seconds) / len(seconds):.2g} s each"
-            for name, seconds in ranked[:limit]
-        ]
+        lines = []
+        for name, seconds in ranked[:limit]:
+            count = len(seconds)
+            pace = count / minutes
+            mean = sum(seconds) / count
+            lines.append(f"worker {name}: {count} tasks, {pace:.3g} a minute, {mean:.2g} s each")
         omitted = len(ranked) - limit
-        return [*lines, f"{omitted} more workers, faster than these"] if omitted > 0 else lines
+        if omitted > 0:
+            lines.append(f"{omitted} more workers, faster than these")
+        return lines
 
 
 def _signed(function: Callable[[Any], Any], task: Any) -> tuple[Any, str, float]:
