@@ -92,14 +92,16 @@ class DriftFound(Drawn, Judged):
             ["Targets of repeated poses less the arm's prediction."],
             (TABLE, header, rows),
         )
-        numbers = plain(
-            {"robot": self.robot, "verdict": self.verdict.level, "noticed": self.noticed}
-            | {
-                trend.what: {"slope": trend.slope, "sigma": trend.sigma, "sigmas": trend.sigmas, "total": trend.total}
-                for trend in self.trends
+        numbers: dict[str, object] = {"robot": self.robot, "verdict": self.verdict.level, "noticed": self.noticed}
+        for trend in self.trends:
+            numbers[trend.what] = {
+                "slope": trend.slope,
+                "sigma": trend.sigma,
+                "sigmas": trend.sigmas,
+                "total": trend.total,
             }
-        )
-        return pages.save(Path(out), "drift", f"Drift of {self.robot}", {"robot": self.robot}, [part], numbers, [TABLE])
+        title = f"Drift of {self.robot}"
+        return pages.save(Path(out), "drift", title, {"robot": self.robot}, [part], plain(numbers), [TABLE])
 
 
 def _rate(trend: Trend) -> str:

@@ -90,11 +90,16 @@ def read_fits(before: Place, after: Place) -> tuple[Calibration, Calibration]:
     Raises:
         RobotError: where they are of different robots.
     """
-    calibrations = [read_fit(calibration) if calibration.fit else None for calibration in (before, after)]
-    chain = next(calibration.chain for calibration in calibrations if calibration is not None)
-    earlier, later = (
-        calibration or _nominal(place.name, chain) for calibration, place in zip(calibrations, (before, after))
-    )
+    earlier = later = None
+    if before.fit:
+        earlier = read_fit(before)
+    if after.fit:
+        later = read_fit(after)
+    if earlier is None:
+        assert later is not None
+        earlier = _nominal(before.name, later.chain)
+    elif later is None:
+        later = _nominal(after.name, earlier.chain)
     check_same_robot((earlier.name, later.name), (earlier.robot, later.robot))
     return earlier, later
 

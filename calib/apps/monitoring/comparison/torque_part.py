@@ -42,7 +42,8 @@ class TorquePart(ChangePart):
     @property
     def words(self) -> str:
         change = self.judged
-        return f"the torque changed by {change.rms:.3g} {self.unit} rms (σ lets expect {_rms(change.expected):.2g} {self.unit})"
+        expected = f"σ lets expect {_rms(change.expected):.2g} {self.unit}"
+        return f"the torque changed by {change.rms:.3g} {self.unit} rms ({expected})"
 
     @property
     def unit(self) -> str:
