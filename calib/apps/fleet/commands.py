@@ -37,11 +37,11 @@ def run(sessions: list[str], workers: str = "1", plots: bool = True) -> None:
             say(outcome.line())
             progress(f"{len(outcomes)} of {len(folders)} sessions")
     places = [str(folder) for folder in folders]
-    outcomes.sort(key=lambda one: places.index(one.folder))
+    outcomes.sort(key=lambda outcome_: places.index(outcome_.folder))
     say(runs.table(outcomes), result=True)
     say(*runs.remarks(outcomes), *pace.lines())
     say(runs.summary(outcomes, time.perf_counter() - started))
-    if code := max(one.code for one in outcomes):
+    if code := max(outcome_.code for outcome_ in outcomes):
         raise typer.Exit(code)
 
 
@@ -66,9 +66,9 @@ def fleet(calibrations: list[Path], out: Path | None = None) -> None:
     """
     from calib.apps.fleet.report import report_fleet
 
-    found = report_fleet(calibrations)
+    report = report_fleet(calibrations)
     if out is not None:
-        found.save(out)
-    say(*found.renderables(), result=True)
+        report.save(out)
+    say(*report.renderables(), result=True)
     say(*([f"written to {out}"] if out else []))
-    exit_failed(found.verdict.level)
+    exit_failed(report.verdict.level)

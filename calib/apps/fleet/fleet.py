@@ -1,6 +1,7 @@
 """Parallel run of many sessions, one folder per robot; a failed session does not stop the other sessions."""
 
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
@@ -61,10 +62,15 @@ class FleetRow:
 
     def line(self) -> str:
         """Return the outcome of the session as a line."""
-        errors = self.nominal is not None and f"{self.nominal:.3g} → {self.calibrated:.3g} mm"
-        torque = self.torque is not None and f"torque {self.torque:.3g} %"
-        words = [word for word in (self.state, self.verdict, errors, torque, f"{self.seconds:.1f} s") if word]
-        return f"{self.folder}: {', '.join(words)}"
+        parts = [self.state]
+        if self.verdict:
+            parts.append(self.verdict)
+        if self.nominal is not None:
+            parts.append(f"{self.nominal:.3g} → {self.calibrated:.3g} mm")
+        if self.torque is not None:
+            parts.append(f"torque {self.torque:.3g} %")
+        parts.append(f"{self.seconds:.1f} s")
+        return f"{self.folder}: {', '.join(parts)}"
 
 
 @checked
@@ -104,7 +110,7 @@ def run(
     """Run every session and yield each outcome; workers on other machines need the same folder paths, or addresses."""
     pace = pace or Throughput()
     with workers as crew:
-        sent = [one if crew.here or isinstance(one, str) else one.absolute() for one in folders]
+        sent = [folder if crew.here or isinstance(folder, str) else folder.absolute() for folder in folders]
         for number, outcome in pace.completed(crew, partial(run_one, command=command, plots=plots), sent):
             name = str(folders[number])
             lost = isinstance(outcome, TaskLost)
@@ -133,60 +139,78 @@ def run_one(folder: Path | str, command: str = "calib run", plots: bool = True, 
 
 
 def _run_here(folder: Path, command: str, plots: bool) -> FleetRow:
-    started, said = time.perf_counter(), []
+    started, messages = time.perf_counter(), []
     try:
-        outcome = _go_on(folder, said.append, command, plots)
+        outcome = _go_on(folder, messages.append, command, plots)
     except Exception as error:  # a robot that fails must not stop the others
         foreseen = complaint(error)
-        words, code = foreseen or (bug_reports.report(error, command.split()[1:], folder), bug_reports.CODE)
-        said.append(f"failed: {words}")
-        outcome = FleetRow(str(folder), BUSY if isinstance(error, Busy) else FAILED, words=words, code=code)
+        message, code = foreseen or (bug_reports.report(error, command.split()[1:], folder), bug_reports.CODE)
+        messages.append(f"failed: {message}")
+        outcome = FleetRow(str(folder), BUSY if isinstance(error, Busy) else FAILED, words=message, code=code)
     if (folder / SETTINGS).exists() and outcome.state != BUSY:  # the log is of the command that works on it
         with suppress(CalibError):  # a full disk, a folder that cannot be written: said already
-            files.write(folder / LOG, "\n".join(said) + "\n")
+            files.write(folder / LOG, "\n".join(messages) + "\n")
     return replace(outcome, seconds=time.perf_counter() - started)
 
 
 def _go_on(folder: Path, say: Say, command: str, plots: bool) -> FleetRow:
-    stop = go_on(folder, say, lambda words: None, command, plots=plots)
+    stop = go_on(folder, say, lambda text: None, command, plots=plots)
     session = stop.session
     if stop.waiting is not None:
-        for words in stop.lines[1:]:
-            say(words)
-        words = f"{stop.waiting.words} (step {stop.waiting.step.name}); instructions are in {LOG}"
-        return FleetRow(str(folder), WAITS, words=words, asks=stop.lines[1:])
+        for text in stop.lines[1:]:
+            say(text)
+        text = f"{stop.waiting.words} (step {stop.waiting.step.name}); instructions are in {LOG}"
+        return FleetRow(str(folder), WAITS, words=text, asks=stop.lines[1:])
     errors, torque = position_errors(session) or (None, None), torque_error(session)
     return FleetRow(str(folder), DONE, stop.verdict, "", *errors, torque, code=1 if stop.verdict == "fail" else 0)
 
 
 def table(outcomes: Sequence[FleetRow]) -> RenderableType:
     """Return the summary table, a line per robot: rms errors on unseen poses, and on unseen motion."""
-    found = Table("session", "state", "verdict", box=None, pad_edge=False)
+    summary_table = Table("session", "state", "verdict", box=None, pad_edge=False)
     for name in ("nominal mm", "calibrated mm", "torque %", "s"):
-        found.add_column(name, justify="right", no_wrap=True)
-    names = [Path(one.folder).resolve().name for one in outcomes]
-    for one, name in zip(outcomes, names):
-        state, verdict = (Text(x, COLOURS.get(x, "yellow")) if x else "" for x in (one.state, one.verdict))
-        numbers = ["" if x is None else f"{x:.3g}" for x in (one.nominal, one.calibrated, one.torque)]
-        shown = name if names.count(name) == 1 else one.folder
-        found.add_row(Text(shown), state, verdict, *numbers, f"{one.seconds:.1f}")
-    return found
+        summary_table.add_column(name, justify="right", no_wrap=True)
+    names = [Path(row.folder).resolve().name for row in outcomes]
+    for row, name in zip(outcomes, names):
+        label = name
+        if names.count(name) > 1:
+            label = row.folder
+        cells: list[Text | str] = [Text(label)]
+        for word in (row.state, row.verdict):
+            cell: Text | str = ""
+            if word:
+                cell = Text(word, COLOURS.get(word, "yellow"))
+            cells.append(cell)
+        for number in (row.nominal, row.calibrated, row.torque):
+            printed = ""
+            if number is not None:
+                printed = f"{number:.3g}"
+            cells.append(printed)
+        cells.append(f"{row.seconds:.1f}")
+        summary_table.add_row(*cells)
+    return summary_table
 
 
 def remarks(outcomes: Sequence[FleetRow]) -> Iterator[str]:
     """Yield a line for each incomplete session: the missing file, or the error."""
-    for one in outcomes:
-        if one.state != DONE:
-            said = {WAITS: f"{one.folder} waits for ", FAILED: f"{one.folder} failed: "}.get(one.state, "")
-            yield f"{said}{one.words}"
+    beginnings = {WAITS: "{} waits for ", FAILED: "{} failed: "}
+    for row in outcomes:
+        if row.state == DONE:
+            continue
+        beginning = beginnings.get(row.state, "").format(row.folder)
+        yield f"{beginning}{row.words}"
 
 
 def summary(outcomes: Sequence[FleetRow], seconds: float) -> str:
     """Return one line with the number of sessions for each state and verdict."""
-    counts = {state: sum(one.state == state for one in outcomes) for state in (DONE, WAITS, BUSY, FAILED)}
-    judged = {level: sum(one.verdict == level for one in outcomes) for level in LEVELS}
-    words = ", ".join(f"{count} {level}" for level, count in judged.items() if count)
-    parts = [f"{counts[DONE]} of {len(outcomes)} done" + (f" ({words})" if words else "")]
-    shown = {WAITS: "waiting", BUSY: BUSY, FAILED: FAILED}
-    parts += [f"{counts[state]} {words}" for state, words in shown.items() if counts[state]]
+    states = Counter(row.state for row in outcomes)
+    verdicts = Counter(row.verdict for row in outcomes)
+    done = f"{states[DONE]} of {len(outcomes)} done"
+    levels = [f"{verdicts[level]} {level}" for level in LEVELS if verdicts[level]]
+    if levels:
+        done += f" ({', '.join(levels)})"
+    parts = [done]
+    for state, label in ((WAITS, "waiting"), (BUSY, BUSY), (FAILED, FAILED)):
+        if states[state]:
+            parts.append(f"{states[state]} {label}")
     return f"{', '.join(parts)}; {seconds:.1f} s"

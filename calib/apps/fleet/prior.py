@@ -56,23 +56,40 @@ def spread(robots: Sequence[CalibratedChain]) -> tuple[ParameterSpread, ...]:
         UsageError: where no fit states its covariance.
     """
     chain = nominal_of(robots[0])
-    covariances = [np.zeros((len(chain.values),) * 2) if r.covariance is None else r.covariance for r in robots]
-    fitted = np.array([np.diag(one) > 0.0 for one in covariances])
-    where = np.flatnonzero(fitted.any(axis=0))
-    require(len(where), "no fit of these arms states the covariance of its geometry; fit them again", UsageError)
+    covariances = []
+    for robot in robots:
+        covariance = robot.covariance
+        if covariance is None:
+            covariance = np.zeros((len(chain.values),) * 2)
+        covariances.append(covariance)
+    fitted = np.array([np.diag(covariance) > 0.0 for covariance in covariances])
+    columns = np.flatnonzero(fitted.any(axis=0))
+    require(len(columns), "no fit of these arms states the covariance of its geometry; fit them again", UsageError)
+
     data = []
-    for robot, covariance, own in zip(robots, covariances, fitted[:, where]):
-        k = where[own]
+    for robot, covariance, fitted_in_arm in zip(robots, covariances, fitted[:, columns]):
+        k = columns[fitted_in_arm]
         information = np.linalg.inv(covariance[np.ix_(k, k)])
-        data.append((own, information, information @ (robot.chain.values - chain.values)[k]))
-    _, family = np.unique(families(Installation(chain))[where], return_inverse=True)
+        deviations = (robot.chain.values - chain.values)[k]
+        data.append((fitted_in_arm, information, information @ deviations))
+    _, family = np.unique(families(Installation(chain))[columns], return_inverse=True)
     mean, sigma = _most_probable(data, family)
-    count = fitted[:, where].sum(axis=0)
+    count = fitted[:, columns].sum(axis=0)
     width = np.maximum(sigma * np.sqrt(1.0 + 1.0 / (count + 1)), MIN_WIDTH)
-    rows = zip(where, count, mean, sigma, width)
-    return tuple(
-        ParameterSpread(chain.names[k], chain.elements[k].unit, int(n), *map(float, each)) for k, n, *each in rows
-    )
+
+    parameters = []
+    for row, k in enumerate(columns):
+        parameters.append(
+            ParameterSpread(
+                name=chain.names[k],
+                unit=chain.elements[k].unit,
+                arms=int(count[row]),
+                mean=float(mean[row]),
+                sigma=float(sigma[row]),
+                width=float(width[row]),
+            )
+        )
+    return tuple(parameters)
 
 
 def _most_probable(
@@ -80,19 +97,19 @@ def _most_probable(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return μ (k,) and τ (k,) of each arm's (fitted parameters, C⁻¹, C⁻¹ x̂) by expectation maximisation."""
     mean, variance = np.zeros(len(family)), np.full(len(family), 1e-4)
-    count = np.sum([own for own, _, _ in data], axis=0)
+    count = np.sum([fitted for fitted, _, _ in data], axis=0)
     max_updates, settled = 500, 1e-4  # of τ² (our choice)
     for _ in range(max_updates):
-        total, square, seen = np.zeros_like(mean), np.zeros_like(mean), list[tuple[np.ndarray, np.ndarray]]()
-        for own, information, pull in data:
-            spread = np.linalg.inv(information + np.diag(1.0 / variance[own]))
-            found = spread @ (pull + mean[own] / variance[own])
-            total[own] += found
-            square[own] += np.diag(spread)
-            seen.append((own, found))
+        total, square, estimates = np.zeros_like(mean), np.zeros_like(mean), list[tuple[np.ndarray, np.ndarray]]()
+        for fitted, information, pull in data:
+            spread = np.linalg.inv(information + np.diag(1.0 / variance[fitted]))
+            estimate = spread @ (pull + mean[fitted] / variance[fitted])
+            total[fitted] += estimate
+            square[fitted] += np.diag(spread)
+            estimates.append((fitted, estimate))
         mean, before = total / (count + 1), variance
-        for own, found in seen:
-            square[own] += (found - mean[own]) ** 2
+        for fitted, estimate in estimates:
+            square[fitted] += (estimate - mean[fitted]) ** 2
         square += mean**2  # of the nominal
         pooled = np.bincount(family, square) / np.bincount(family, count)
         variance = np.maximum((FAMILY * pooled[family] + square) / (FAMILY + count), MIN_WIDTH**2)
@@ -101,18 +118,18 @@ def _most_probable(
     return mean, np.sqrt(variance)
 
 
-def expected_arm(robots: Sequence[CalibratedChain], found: Sequence[ParameterSpread]) -> CalibratedChain:
+def expected_arm(robots: Sequence[CalibratedChain], parameters: Sequence[ParameterSpread]) -> CalibratedChain:
     """Return the arm that the next one of this type is expected to be, of the nominal one that `robots` share."""
     nominal = nominal_of(robots[0])
-    moved = {one.name: one.mean for one in found}
-    values = nominal.values + np.array([moved.get(name, 0.0) for name in nominal.names])
+    means = {parameter.name: parameter.mean for parameter in parameters}
+    values = nominal.values + np.array([means.get(name, 0.0) for name in nominal.names])
     return replace(robots[0], chain=nominal.with_values(values), nominal=nominal, covariance=None, corrections=None)
 
 
-def write(folder: Path, robots: Sequence[CalibratedChain], found: Sequence[ParameterSpread]) -> Path:
+def write(folder: Path, robots: Sequence[CalibratedChain], parameters: Sequence[ParameterSpread]) -> Path:
     """Write the prior for `calib fit`: ``robot.toml``, the expected arm, and the options with its widths."""
     folder.mkdir(parents=True, exist_ok=True)
-    calibrated.write(folder, expected_arm(robots, found), comment=f"mean of {len(robots)} arms")
-    lines = [f'"{one.name}" = {one.width:.4g}' for one in found]
+    calibrated.write(folder, expected_arm(robots, parameters), comment=f"mean of {len(robots)} arms")
+    lines = [f'"{parameter.name}" = {parameter.width:.4g}' for parameter in parameters]
     files.write(folder / OPTIONS, "\n".join(["[prior]", *lines, ""]))
     return folder

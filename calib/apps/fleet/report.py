@@ -56,7 +56,7 @@ class ArmType:
     @property
     def plausible(self) -> list[Calibration]:
         """The arms that `parameters` are of."""
-        return [one for one in self.arms if one.name not in (*self.failed, *self.odd)]
+        return [arm for arm in self.arms if arm.name not in (*self.failed, *self.odd)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,19 +80,19 @@ class FleetReport(Judged):
         """Return the report's section."""
         drift = [
             Column("arm", "{0[0]}", number=False),
-            Column("from", lambda one: Path(one[1].parts[0].before.name).name, False),
-            Column("to", lambda one: Path(one[1].parts[0].after.name).name, False),
-            Column("tool moved, mm rms", lambda one: f"{1e3 * _moved(one[1]).rms:.3g}"),
-            Column("σ of that", lambda one: f"{1e3 * _moved(one[1]).expected:.2g}"),
-            Column("p", lambda one: f"{one[1].geometry.probability:.1g}"),
+            Column("from", lambda arm_type: Path(arm_type[1].parts[0].before.name).name, False),
+            Column("to", lambda arm_type: Path(arm_type[1].parts[0].after.name).name, False),
+            Column("tool moved, mm rms", lambda arm_type: f"{1e3 * _moved(arm_type[1]).rms:.3g}"),
+            Column("σ of that", lambda arm_type: f"{1e3 * _moved(arm_type[1]).expected:.2g}"),
+            Column("p", lambda arm_type: f"{arm_type[1].geometry.probability:.1g}"),
             Column("", "{0[1].verdict.level}", number=False),
         ]
         blocks: list[Block] = [
             Text("Notes", lines_of(self.noticed), "note"),
             table("Arms calibrated more than once", drift, self.changes),
         ]
-        for one in self.types:
-            blocks += _tables(one)
+        for arm_type in self.types:
+            blocks += _tables(arm_type)
         return Section("Fleet", blocks, self.verdict.level, self.verdict.reason)
 
     @checked
@@ -101,32 +101,32 @@ class FleetReport(Judged):
         out = Path(out)
         folders.check_target(out, OURS, (folders.METRICS,), "fleet report")
         folders.write_staged(out, OURS, self._write)
-        for one in self.types:
-            if one.parameters:
-                prior.write(out / PRIOR / one.name, [each.robot for each in one.plausible], one.parameters)
+        for arm_type in self.types:
+            if arm_type.parameters:
+                prior.write(out / PRIOR / arm_type.name, [arm.robot for arm in arm_type.plausible], arm_type.parameters)
         return out
 
     def _write(self, folder: Path) -> None:
         from calib.procedure.report.certificate.record import report
         from calib.procedure.report.certificate.rendering import html
 
-        count = sum(len(one.arms) for one in self.types)
+        count = sum(len(arm_type.arms) for arm_type in self.types)
         files.write(folder / PAGE, html(report("Fleet", f"{count} arms", (), [self.section()])))
         files.write_json(folder / folders.METRICS, self.to_dict())
 
     def to_dict(self) -> dict[str, Any]:
         """Return the numbers as in ``metrics.json`` [SI]."""
         types = {
-            one.name: {
-                "arms": [each.name for each in one.arms],
-                "failed": one.failed,
-                "odd": one.odd,
-                "parameters": one.parameters,
-                "tools": one.tools,
+            item.name: {
+                "arms": [calibration.name for calibration in item.arms],
+                "failed": item.failed,
+                "odd": item.odd,
+                "parameters": item.parameters,
+                "tools": item.tools,
             }
-            for one in self.types
+            for item in self.types
         }
-        changes = [{"arm": arm} | one.to_dict() for arm, one in self.changes]
+        changes = [{"arm": arm} | item.to_dict() for arm, item in self.changes]
         return plain(
             {
                 "verdict": self.verdict.level,
@@ -138,7 +138,7 @@ class FleetReport(Judged):
         )
 
 
-def _tables(one: ArmType) -> list[Block]:
+def _tables(arm_type: ArmType) -> list[Block]:
     def cell(name: str) -> Column:
         return Column(name, lambda row: small(getattr(row, name), row.unit, 3))
 
@@ -147,7 +147,7 @@ def _tables(one: ArmType) -> list[Block]:
         Column("arms", "{0.arms}"),
         *map(cell, ("mean", "sigma", "width")),
     ]
-    used = [
+    tool_columns = [
         Column("tool", "{0.tool}", number=False),
         Column("arms", lambda row: f"{len(row.arms)}"),
         Column("from the others' mm", lambda row: f"{1e3 * row.moved:.3g}"),
@@ -162,11 +162,11 @@ def _tables(one: ArmType) -> list[Block]:
         Column("rms mm", lambda row: f"{1e3 * row.left:.3g}"),
     ]
     note = "Deviations from nominal; the next arm is expected within width of the mean."
-    compared = [row for row in one.tools if row.moved is not None]
+    compared = [row for row in arm_type.tools if row.moved is not None]
     return [
-        table(f"Arms of type {one.name}", arms, one.arms, most=20),
-        table(f"Tools of {one.name}", used, compared),
-        table(f"Parameters of {one.name}", parameters, one.parameters, note),
+        table(f"Arms of type {arm_type.name}", arms, arm_type.arms, most=20),
+        table(f"Tools of {arm_type.name}", tool_columns, compared),
+        table(f"Parameters of {arm_type.name}", parameters, arm_type.parameters, note),
     ]
 
 
@@ -184,55 +184,76 @@ def report_fleet(calibrations: str | Path | Sequence[str | Path]) -> FleetReport
     Raises:
         UsageError: for a folder that holds no fit, or one given twice; where unfinished sessions leave one or none.
     """
-    given = visits(calibrations)
-    by_arm = given.by_arm
-    usable = {arm: [one for one in own if not _failed(one)] for arm, own in by_arm.items()}
-    changes = [(arm, diff(one.name, two.name)) for arm, own in usable.items() for one, two in pairwise(own)]
+    fleet_visits = visits(calibrations)
+    by_arm = fleet_visits.by_arm
+    usable = {
+        arm: [calibration for calibration in calibrations_of_arm if not _failed(calibration)]
+        for arm, calibrations_of_arm in by_arm.items()
+    }
+    changes = [
+        (arm, diff(calibration.name, later.name))
+        for arm, calibrations_of_arm in usable.items()
+        for calibration, later in pairwise(calibrations_of_arm)
+    ]
     types: list[list[Calibration]] = []
-    for own in by_arm.values():
-        alike = next((each for each in types if _same(each[0], own[-1])), None)
+    for calibrations_of_arm in by_arm.values():
+        alike = next((arms for arms in types if _same(arms[0], calibrations_of_arm[-1])), None)
         if alike is None:
             types.append(alike := [])
-        alike.append(own[-1])
-    names = [each[0].chain.name for each in types]
+        alike.append(calibrations_of_arm[-1])
+    names = [arms[0].chain.name for arms in types]
     labels = [name if names.count(name) == 1 else f"{name}_{k + 1}" for k, name in enumerate(names)]
-    made = tuple(_arm_type(label, each) for label, each in zip(labels, types))
-    earlier = [_failure(one, 0.0) for own in by_arm.values() for one in own[:-1] if _failed(one)]
-    noticed = settle([*given.noticed, *_findings(made, changes), *earlier])
-    failed = sum(len(one.failed) for one in made)
-    parts = [f"{counted(len(by_arm), 'arm')} of {counted(len(made), 'type')}", failed and f"{failed} failed"]
-    words = ", ".join(filter(None, [*parts, f"{len(changes)} calibrated again"]))
-    return FleetReport(made, tuple(changes), noticed, Verdict.of(words, noticed))
+    arm_types = tuple(_arm_type(label, arms) for label, arms in zip(labels, types))
+    earlier = [
+        _failure(calibration, 0.0)
+        for calibrations_of_arm in by_arm.values()
+        for calibration in calibrations_of_arm[:-1]
+        if _failed(calibration)
+    ]
+    noticed = settle([*fleet_visits.noticed, *_findings(arm_types, changes), *earlier])
+    failed = sum(len(calibration.failed) for calibration in arm_types)
+    parts = [f"{counted(len(by_arm), 'arm')} of {counted(len(arm_types), 'type')}", failed and f"{failed} failed"]
+    summary = ", ".join(filter(None, [*parts, f"{len(changes)} calibrated again"]))
+    return FleetReport(arm_types, tuple(changes), noticed, Verdict.of(summary, noticed))
 
 
-def _failed(one: Calibration) -> bool:
-    return one.judged[0] == "fail"
+def _failed(calibration: Calibration) -> bool:
+    return calibration.judged[0] == "fail"
 
 
-def _failure(one: Calibration, share: float) -> Finding:
+def _failure(calibration: Calibration, share: float) -> Finding:
     """Return that a fit failed, and why; `share`: of the arms of its type whose fits did."""
-    return finding("arm-failed", arm=one.name, reason=one.judged[1], share=share)
+    return finding("arm-failed", arm=calibration.name, reason=calibration.judged[1], share=share)
 
 
-def _same(one: Calibration, two: Calibration) -> bool:
+def _same(first: Calibration, second: Calibration) -> bool:
     with suppress(RobotError):
-        check_same_robot((one.name, two.name), (one.robot, two.robot))
+        check_same_robot((first.name, second.name), (first.robot, second.robot))
         return True
     return False
 
 
 def _arm_type(name: str, arms: Sequence[Calibration]) -> ArmType:
-    failed = tuple(one.name for one in arms if _failed(one))
-    odd = tuple(one.name for one in arms if one.name not in failed and _farthest(one)[1] > 1.0)
-    sound = [one.robot for one in arms if one.name not in (*failed, *odd) and one.robot.covariance is not None]
-    used = {one.name: (one.cell.tool_names[0], one.cell.tools[0][:3, 3], one.left) for one in arms}
-    return ArmType(name, tuple(arms), failed, odd, prior.spread(sound) if sound else (), tuple(tools(used)))
+    failed = tuple(calibration.name for calibration in arms if _failed(calibration))
+    odd = tuple(
+        calibration.name for calibration in arms if calibration.name not in failed and _farthest(calibration)[1] > 1.0
+    )
+    sound = [
+        calibration.robot
+        for calibration in arms
+        if calibration.name not in (*failed, *odd) and calibration.robot.covariance is not None
+    ]
+    tool_uses = {
+        calibration.name: (calibration.cell.tool_names[0], calibration.cell.tools[0][:3, 3], calibration.left)
+        for calibration in arms
+    }
+    return ArmType(name, tuple(arms), failed, odd, prior.spread(sound) if sound else (), tuple(tools(tool_uses)))
 
 
-def _farthest(one: Calibration) -> tuple[str, float]:
+def _farthest(calibration: Calibration) -> tuple[str, float]:
     """Return the parameter farthest from nominal, and how far in what is plausible (`PLAUSIBLE`)."""
-    nominal = one.robot.nominal or one.chain
-    sizes = np.abs(one.chain.values - nominal.values) / [PLAUSIBLE[unit] for unit in nominal.units]
+    nominal = calibration.robot.nominal or calibration.chain
+    sizes = np.abs(calibration.chain.values - nominal.values) / [PLAUSIBLE[unit] for unit in nominal.units]
     k = int(sizes.argmax())
     return nominal.names[k], float(sizes[k])
 
@@ -243,24 +264,30 @@ def _moved(change: RobotChange) -> ToolMotion:
 
 
 def _findings(types: Sequence[ArmType], changes: Sequence[tuple[str, RobotChange]]) -> list[Finding]:
-    found = [
-        finding("arm-drifts", arm=arm, moved=_moved(one).rms, reason=one.verdict.reason)
-        for arm, one in changes
-        if one.verdict.level in ("marginal", "fail")
+    findings = [
+        finding("arm-drifts", arm=arm, moved=_moved(arm_type).rms, reason=arm_type.verdict.reason)
+        for arm, arm_type in changes
+        if arm_type.verdict.level in ("marginal", "fail")
     ]
-    for one in types:
-        found += [_failure(arm, len(one.failed) / len(one.arms)) for arm in one.arms if arm.name in one.failed]
-        found += [
+    for arm_type in types:
+        findings += [
+            _failure(arm, len(arm_type.failed) / len(arm_type.arms))
+            for arm in arm_type.arms
+            if arm.name in arm_type.failed
+        ]
+        findings += [
             finding("arm-marginal", arm=arm.name, reason=arm.judged[1])
-            for arm in one.arms
+            for arm in arm_type.arms
             if arm.judged[0] == "marginal"
         ]
-        if len(one.tools) == 1 and len(one.arms) >= sum(MIN_ARMS):
-            at = np.array([arm.cell.tools[0][:3, 3] for arm in one.plausible or one.arms])
+        if len(arm_type.tools) == 1 and len(arm_type.arms) >= sum(MIN_ARMS):
+            at = np.array([arm.cell.tools[0][:3, 3] for arm in arm_type.plausible or arm_type.arms])
             away = np.linalg.norm(at - np.median(at, axis=0), axis=1).max()
-            found.append(finding("tools-unnamed", type=one.name, tool=one.tools[0].tool, away=away))
-        found += [
-            finding("unlike-its-type", arm=arm.name, name=_farthest(arm)[0]) for arm in one.arms if arm.name in one.odd
+            findings.append(finding("tools-unnamed", type=arm_type.name, tool=arm_type.tools[0].tool, away=away))
+        findings += [
+            finding("unlike-its-type", arm=arm.name, name=_farthest(arm)[0])
+            for arm in arm_type.arms
+            if arm.name in arm_type.odd
         ]
-        found += [each for tool in one.tools for each in tool.findings()]
-    return found
+        findings += [tool_finding for tool in arm_type.tools for tool_finding in tool.findings()]
+    return findings

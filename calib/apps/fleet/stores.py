@@ -30,9 +30,9 @@ PASSING = (".part", ".lock")  # suffixes of files that stay where they are
 LEASE = 20.0  # [s] that a claim may go unchanged (our choice)
 
 
-def is_address(place: object) -> bool:
+def is_address(path: object) -> bool:
     """Return whether `place` is an address, and no path."""
-    return "://" in str(place)
+    return "://" in str(path)
 
 
 def sessions(address: str) -> list[str]:
@@ -41,9 +41,9 @@ def sessions(address: str) -> list[str]:
         return []
     files, root = _opened(address)
     with refused_as(UsageError, Exception, f"{address} cannot be read: {{}}"):
-        found = sorted(files.glob(f"{root}/{SESSION}"))
-    require(found, f"{address}: no session is there ({SESSION})", UsageError)
-    return [files.unstrip_protocol(path.rpartition("/")[0]) for path in found]
+        session_paths = sorted(files.glob(f"{root}/{SESSION}"))
+    require(session_paths, f"{address}: no session is there ({SESSION})", UsageError)
+    return [files.unstrip_protocol(path.rpartition("/")[0]) for path in session_paths]
 
 
 @contextmanager
@@ -59,9 +59,9 @@ def held(address: str, lease: float = LEASE) -> Iterator[Path]:
     files, root = _opened(address)
     with refused_as(CalibError, Exception, f"cannot read or write {address}: {{}}; run the same command again"):
         claim = _Claim(files, address, f"{root}/{CLAIM}", lease)
-    with TemporaryDirectory(prefix="calib-") as place:
+    with TemporaryDirectory(prefix="calib-") as temporary_folder:
         try:
-            copy = _Copy(files, root, Path(place) / root.rpartition("/")[2], claim)
+            copy = _Copy(files, root, Path(temporary_folder) / root.rpartition("/")[2], claim)
             stop, keeper = Event(), Thread(target=lambda: copy.keep(stop, lease / 4.0), daemon=True)
             keeper.start()
             try:
@@ -76,8 +76,8 @@ def held(address: str, lease: float = LEASE) -> Iterator[Path]:
 
 
 def _opened(address: str) -> tuple[Any, str]:
-    words = f"{address}: {{}}; for addresses: pip install 'armature-calib[cluster]' and the storage's package"
-    with refused_as(UsageError, (ImportError, ValueError), words):
+    message = f"{address}: {{}}; for addresses: pip install 'armature-calib[cluster]' and the storage's package"
+    with refused_as(UsageError, (ImportError, ValueError), message):
         from fsspec.core import url_to_fs
 
         files, root = url_to_fs(address.rstrip("/"))
@@ -95,10 +95,10 @@ class _Claim:
         except FileExistsError:
             before = self._read()
             time.sleep(lease)
-            now = self._read()
+            after = self._read()
             # empty: its holder is just renewing it
-            if now is not None and now != before:
-                holder = (now or before or "another process").partition(" (")[0]
+            if after is not None and after != before:
+                holder = (after or before or "another process").partition(" (")[0]
                 raise Busy(f"{address} is busy: {holder} works on it; wait for it to end") from None
             self._write("overwrite")
 
@@ -116,8 +116,8 @@ class _Claim:
     def renew(self) -> None:
         """Show that this process is alive; raise if another one took over."""
         holder = self._read() or ""
-        words = f"{self.address} was taken over by {holder or 'nobody'}; nothing more was written there"
-        require(holder.startswith(self.owner), words)
+        message = f"{self.address} was taken over by {holder or 'nobody'}; nothing more was written there"
+        require(holder.startswith(self.owner), message)
         self.beats += 1
         self._write("overwrite")
 
@@ -144,14 +144,14 @@ class _Copy:
 
     def _now(self) -> dict[str, tuple[int, int]]:
         """Return what tells whether a file has changed, by name."""
-        found = (path for path in self.folder.rglob("*") if path.is_file() and path.suffix not in PASSING)
+        paths = (path for path in self.folder.rglob("*") if path.is_file() and path.suffix not in PASSING)
         return {
-            path.relative_to(self.folder).as_posix(): (path.stat().st_mtime_ns, path.stat().st_size) for path in found
+            path.relative_to(self.folder).as_posix(): (path.stat().st_mtime_ns, path.stat().st_size) for path in paths
         }
 
-    def keep(self, stop: Event, every: float) -> None:
+    def keep(self, stop: Event, period: float) -> None:
         """Renew the claim and put back what changed until `stop`; what goes wrong is said when the work ends."""
-        while not stop.wait(every):
+        while not stop.wait(period):
             try:
                 self.put_back()
             except Exception:
@@ -160,14 +160,14 @@ class _Copy:
     def put_back(self) -> None:
         """Write what changed, `LAST` last."""
         self.claim.renew()
-        now = self._now()
-        changed = [name for name in now if now[name] != self.known.get(name)]
+        state = self._now()
+        changed = [name for name in state if state[name] != self.known.get(name)]
         for name in sorted(changed, key=lambda name: name in LAST):
-            place = f"{self.root}/{name}"
-            self.files.makedirs(place.rpartition("/")[0], exist_ok=True)
-            self.files.put_file(str(self.folder / name), f"{place}.part")
-            self.files.mv(f"{place}.part", place)
-            self.known[name] = now[name]
-        for name in self.known.keys() - now.keys():
+            target = f"{self.root}/{name}"
+            self.files.makedirs(target.rpartition("/")[0], exist_ok=True)
+            self.files.put_file(str(self.folder / name), f"{target}.part")
+            self.files.mv(f"{target}.part", target)
+            self.known[name] = state[name]
+        for name in self.known.keys() - state.keys():
             self.files.rm_file(f"{self.root}/{name}")
             del self.known[name]

@@ -27,18 +27,22 @@ class Throughput:
             self.spent.setdefault(worker, []).append(seconds)
             yield number, result
 
-    def lines(self, most: int = 8) -> list[str]:
+    def lines(self, limit: int = 8) -> list[str]:
         """Return a line per worker, the slowest first; none for a single worker."""
         minutes = max((time.monotonic() - self.began) / 60.0, 1e-9)
-        ranked = sorted(self.spent.items(), key=lambda one: len(one[1]))
+        ranked = sorted(self.spent.items(), key=lambda item: len(item[1]))
         if len(ranked) < 2:
             return []
-        lines = [
-            f"worker {name}: {len(own)} tasks, {len(own) / minutes:.3g} a minute, {sum(own) / len(own):.2g} s each"
-            for name, own in ranked[:most]
-        ]
-        more = len(ranked) - most
-        return [*lines, f"{more} more workers, faster than these"] if more > 0 else lines
+        lines = []
+        for name, seconds in ranked[:limit]:
+            count = len(seconds)
+            pace = count / minutes
+            mean = sum(seconds) / count
+            lines.append(f"worker {name}: {count} tasks, {pace:.3g} a minute, {mean:.2g} s each")
+        omitted = len(ranked) - limit
+        if omitted > 0:
+            lines.append(f"{omitted} more workers, faster than these")
+        return lines
 
 
 def _signed(function: Callable[[Any], Any], task: Any) -> tuple[Any, str, float]:

@@ -45,29 +45,34 @@ class ToolUse:
         return [finding("bad-tool", tool=self.tool, arms=self.arms, moved=bent, times=loose)]
 
 
-def tools(used: Mapping[str, tuple[str, np.ndarray, float]]) -> list[ToolUse]:
+def tools(tool_uses: Mapping[str, tuple[str, np.ndarray, float]]) -> list[ToolUse]:
     """Return what each tool's arms show.
 
     Args:
         used: arm → (tool, its position (3,) in the tip's frame [m], rms error of the calibrated arm [m]).
     """
-    names = sorted({tool for tool, _, _ in used.values()})
-    return [_use(name, used) for name in names]
+    names = sorted({tool for tool, _, _ in tool_uses.values()})
+    return [_use(name, tool_uses) for name in names]
 
 
-def _use(name: str, used: Mapping[str, tuple[str, np.ndarray, float]]) -> ToolUse:
-    arms = tuple(arm for arm, (tool, _, _) in used.items() if tool == name)
-    others = [arm for arm in used if arm not in arms]
-    if len(arms) < MIN_ARMS[0] or len(others) < MIN_ARMS[1]:
+def _use(name: str, tool_uses: Mapping[str, tuple[str, np.ndarray, float]]) -> ToolUse:
+    arms = tuple(arm for arm, (tool, _, _) in tool_uses.items() if tool == name)
+    other_arms = [arm for arm in tool_uses if arm not in arms]
+    if len(arms) < MIN_ARMS[0] or len(other_arms) < MIN_ARMS[1]:
         return ToolUse(name, arms)
-    positions, errors = (
-        [np.array([used[arm][1] for arm in group]) for group in (arms, others)],
-        [np.log([[max(used[arm][2], 1e-9)] for arm in group]) for group in (arms, others)],
+    groups = (arms, other_arms)
+    positions = [np.array([tool_uses[arm][1] for arm in group]) for group in groups]
+    errors = [np.log([[max(tool_uses[arm][2], 1e-9)] for arm in group]) for group in groups]
+    displacement = np.median(positions[0], axis=0) - np.median(positions[1], axis=0)
+    log_ratio = np.median(errors[0], axis=0) - np.median(errors[1], axis=0)
+    return ToolUse(
+        tool=name,
+        arms=arms,
+        moved=float(np.linalg.norm(displacement)),
+        moved_sigmas=_sigmas(displacement, positions),
+        times=float(np.exp(log_ratio[0])),
+        times_sigmas=float(np.copysign(_sigmas(log_ratio, errors), log_ratio[0])),
     )
-    moved, times = (np.median(own, axis=0) - np.median(rest, axis=0) for own, rest in (positions, errors))
-    sigmas = [_sigmas(step, groups) for step, groups in ((moved, positions), (times, errors))]
-    factor, signed = float(np.exp(times[0])), float(np.copysign(sigmas[1], times[0]))
-    return ToolUse(name, arms, float(np.linalg.norm(moved)), sigmas[0], factor, signed)
 
 
 def _sigmas(step: np.ndarray, groups: Sequence[np.ndarray]) -> float:
@@ -76,10 +81,10 @@ def _sigmas(step: np.ndarray, groups: Sequence[np.ndarray]) -> float:
     The scatter is that of the arms (n, k) about the median of their own group, as if all of it were along the
     difference: a tool's position scatters most along the last axis, where it cannot be told from the arm's last link.
     """
-    away = [np.sort(np.linalg.norm(one - np.median(one, axis=0), axis=1)) for one in groups]
-    typical = np.median(np.concatenate([one[1:] for one in away]))  # without the arm that is the median itself
-    freedom = sum(len(one) - 1 for one in groups)
+    away = [np.sort(np.linalg.norm(group - np.median(group, axis=0), axis=1)) for group in groups]
+    typical = np.median(np.concatenate([group[1:] for group in away]))  # without the arm that is the median itself
+    freedom = sum(len(group) - 1 for group in groups)
     variance = np.sum(np.minimum(np.concatenate(away), FAR * typical) ** 2) / freedom
-    of_medians = sum(np.pi / (2.0 * (len(one) - 1) + np.pi) for one in groups)  # in variances of one arm, if normal
+    of_medians = sum(np.pi / (2.0 * (len(group) - 1) + np.pi) for group in groups)  # in variances of one arm, if normal
     square = float(step @ step) / max(variance, MIN_SCATTER**2) / of_medians
     return float(stats.norm.isf(max(stats.f.sf(square, 1, WORTH * freedom), 1e-300) / 2.0))

@@ -1,7 +1,6 @@
 """Calibrations of a fleet by arm: which are finished, which are of one arm, and in what order of time."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from datetime import date, datetime
 from pathlib import Path
@@ -36,57 +35,94 @@ def visits(calibrations: str | Path | Sequence[str | Path]) -> Visits:
     Raises:
         UsageError: for a folder that holds no fit, or one given twice; where one or none is left.
     """
-    places, unfinished = [place_of(folder, "fleet") for folder in folders_of(calibrations)], list[str]()
-    own: dict[str, list[Visit]] = {}
-    for place in places:
-        waits = place.session and place.session.geometric and not place.fit
-        require(place.fit or waits, f"a fleet's report takes fitted geometries, but {place.words}", UsageError)
-        one = None if waits else read_fit(place)
-        if one is None or (place.session and not one.judged[0]):
-            unfinished.append(place.name)
-        else:
-            own.setdefault(one.serial or one.name, []).append((place, one))
-    left = len(places) - len(unfinished)
-    words = f"sessions without a verdict yet: {listing(unfinished)}; {left} of {len(places)} left, nothing to compare"
-    require(left > 1 or not unfinished, f"{words} (calib next, or calib run, goes on with them)", UsageError)
-    unnamed = [one.name for each in own.values() for _, one in each if not one.serial]
-    noticed = [finding("sessions-unfinished", sessions=unfinished)] if unfinished else []
-    noticed += [finding("arms-without-serial", arms=unnamed)] if len(unnamed) > 1 else []
-    noticed += [_current(arm, each) for arm, each in own.items() if len(each) > 1]
-    return Visits({arm: [one for _, one in _in_time(each)] for arm, each in own.items()}, tuple(noticed))
+    places = [place_of(folder, "fleet") for folder in folders_of(calibrations)]
+    unfinished: list[str] = []
+    visits_by_arm: dict[str, list[Visit]] = {}
+    for source in places:
+        session = source.session
+        waits = session and session.geometric and not source.fit
+        require(source.fit or waits, f"a fleet's report takes fitted geometries, but {source.words}", UsageError)
+        if waits:
+            unfinished.append(source.name)
+            continue
+        calibration = read_fit(source)
+        if session and not calibration.judged[0]:
+            unfinished.append(source.name)
+            continue
+        arm = calibration.serial or calibration.name
+        visits_by_arm.setdefault(arm, []).append((source, calibration))
+
+    finished_count = len(places) - len(unfinished)
+    counts = f"{finished_count} of {len(places)} left, nothing to compare"
+    message = f"sessions without a verdict yet: {listing(unfinished)}; {counts}"
+    enough = finished_count > 1 or not unfinished
+    require(enough, f"{message} (calib next, or calib run, goes on with them)", UsageError)
+
+    unnamed = []
+    current = []
+    by_arm = {}
+    for arm, arm_visits in visits_by_arm.items():
+        unnamed += [calibration.name for _, calibration in arm_visits if not calibration.serial]
+        if len(arm_visits) > 1:
+            current.append(_current(arm, arm_visits))
+        by_arm[arm] = [calibration for _, calibration in _in_time(arm_visits)]
+
+    noticed = []
+    if unfinished:
+        noticed.append(finding("sessions-unfinished", sessions=unfinished))
+    if len(unnamed) > 1:
+        noticed.append(finding("arms-without-serial", arms=unnamed))
+    return Visits(by_arm, (*noticed, *current))
 
 
-def _dates(own: Sequence[Visit]) -> tuple[str, list[date]]:
+def _dates(arm_visits: Sequence[Visit]) -> tuple[str, list[date]]:
     """Return what the dates of one arm's calibrations are of, and the dates; none where some are not known.
 
     Dates of measurement where any is stated, else those on which the sessions were made.
     """
-    settings = [place.session.settings for place, _ in own if place.session]
-    stated = [one.certificate.measured_on for one in settings]
-    what, texts = ("measurement", stated) if any(stated) else ("the session", [one.created for one in settings])
-    with suppress(ValueError):
-        found = [datetime.fromisoformat(text).date() for text in texts]
-        return what, found if len(found) == len(own) else []
-    return what, []
+    settings = [source.session.settings for source, _ in arm_visits if source.session]
+    dated_thing = "measurement"
+    texts = [session_settings.certificate.measured_on for session_settings in settings]
+    if not any(texts):
+        dated_thing = "the session"
+        texts = [session_settings.created for session_settings in settings]
+    try:
+        dates = [datetime.fromisoformat(text).date() for text in texts]
+    except ValueError:
+        return dated_thing, []
+    if len(dates) != len(arm_visits):
+        return dated_thing, []
+    return dated_thing, dates
 
 
-def _in_time(own: Sequence[Visit]) -> list[Visit]:
+def _in_time(arm_visits: Sequence[Visit]) -> list[Visit]:
     """Return one arm's calibrations, earliest first; those of one day, and those without dates, as they were given."""
-    _, dates = _dates(own)
-    return [own[k] for k in sorted(range(len(own)), key=dates.__getitem__)] if dates else list(own)
+    _, dates = _dates(arm_visits)
+    if not dates:
+        return list(arm_visits)
+    order = sorted(range(len(arm_visits)), key=dates.__getitem__)
+    return [arm_visits[k] for k in order]
 
 
-def _current(arm: str, own: Sequence[Visit]) -> Finding:
+def _current(arm: str, arm_visits: Sequence[Visit]) -> Finding:
     """Return which of one arm's calibrations is taken as the current one, and why."""
-    what, dates = _dates(own)
-    current, given = _in_time(own)[-1][1].name, own[-1][1].name
-    dated = dates.count(max(dates)) == 1 if dates else False
+    dated_thing, dates = _dates(arm_visits)
+    current = _in_time(arm_visits)[-1][1].name
+    last = arm_visits[-1][1].name
+    date_text = ""
+    reason = "the order given"
+    needed = "measured_on"
+    if dates:
+        latest = max(dates)
+        date_text = str(latest)
+        # Two calibrations of the latest day are in the order given.
+        if dates.count(latest) == 1:
+            reason = f"date of {dated_thing}"
+            needed = ""
+        else:
+            date_text = ""
+    if last == current:
+        last = ""
     return finding(
-        "current-calibration",
-        arm=arm,
-        current=current,
-        date=str(max(dates)) if dated else "",
-        how=f"date of {what}" if dated else "the order given",
-        last=given if given != current else "",
-        needed="" if dated else "measured_on",
+        "current-calibration", arm=arm, current=current, date=date_text, how=reason, last=last, needed=needed
     )

@@ -29,8 +29,8 @@ def diff(before: str, after: str, settings: DiffSettings, out: Folder = None, pl
     """
     from calib.apps.monitoring.comparison import robot_change
 
-    found = robot_change.diff(before, after, settings)
-    _shown(found, out, plots)
+    change = robot_change.diff(before, after, settings)
+    _shown(change, out, plots)
 
 
 @command(app, "Geometry")
@@ -71,10 +71,10 @@ def log(sessions: list[Path], out: Folder = None, plots: bool = True, mixed: boo
     _shown(robot_log.log(sessions, mixed=mixed), out, plots, result=True)
 
 
-def _shown(found: Any, out: Path | None, plots: bool, result: bool = False) -> None:
+def _shown(outcome: Any, out: Path | None, plots: bool, result: bool = False) -> None:
     """Write a result where asked to, print it (tables, too, if they are the `result`), and exit with 1 if it fails."""
     if out is not None:
-        found.save(out, plots=plots)
-    say(*found.renderables(), result=result)
+        outcome.save(out, plots=plots)
+    say(*outcome.renderables(), result=result)
     say(*([f"written to {out}"] if out else []))
-    exit_failed(found.section().verdict)
+    exit_failed(outcome.section().verdict)

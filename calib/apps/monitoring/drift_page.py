@@ -46,8 +46,8 @@ class DriftFound(Drawn, Judged):
     @property
     def verdict(self) -> Verdict:
         """Whether the drift matters."""
-        words = [f"{each.what}: {1e3 * each.total:.2g} mm in all" for each in self.trends]
-        return Verdict.of("; ".join(words) or "no column of time or temperature", self.noticed)
+        totals = [f"{trend.what}: {1e3 * trend.total:.2g} mm in all" for trend in self.trends]
+        return Verdict.of("; ".join(totals) or "no column of time or temperature", self.noticed)
 
     def section(self) -> Section:
         """Return a report section with the trends, and how far repeated poses are apart."""
@@ -57,8 +57,8 @@ class DriftFound(Drawn, Judged):
             Column("visits", "{0.x.size}"),
             Column("slope", _rate),
             *(Column(f"{axis} mm", _of_axis(k)) for k, axis in enumerate("xyz")),
-            Column("in all mm", lambda one: f"{1e3 * one.total:.3g}"),
-            Column("σ", lambda one: f"{one.sigmas:.1f}"),
+            Column("in all mm", lambda trend: f"{1e3 * trend.total:.3g}"),
+            Column("σ", lambda trend: f"{trend.sigmas:.1f}"),
         ]
         blocks = [Text("Notes", lines_of(self.noticed), "note"), table("Drift of the target", columns, self.trends)]
         return Section("Drift", blocks, self.verdict.level, self.verdict.reason)
@@ -69,41 +69,47 @@ class DriftFound(Drawn, Judged):
         from calib.procedure.report.style import AFTER, QUIET
 
         panels = []
-        for each in self.trends:
-            ends = np.array([each.x.min(), each.x.max()])
+        for trend in self.trends:
+            ends = np.array([trend.x.min(), trend.x.max()])
             for k, axis in enumerate("xyz"):
-                drawn = 1e3 * each.slope[k] * (ends - each.x.mean())
-                layers = [line(each.x, 1e3 * each.moved[:, k], "o", AFTER), line(ends, drawn, "-", QUIET)]
-                panels.append(Panel(layers, f"{axis} [mm]", f"{each.what} [{each.unit}]"))
+                drawn = 1e3 * trend.slope[k] * (ends - trend.x.mean())
+                layers = [line(trend.x, 1e3 * trend.moved[:, k], "o", AFTER), line(ends, drawn, "-", QUIET)]
+                panels.append(Panel(layers, f"{axis} [mm]", f"{trend.what} [{trend.unit}]"))
         return {"drift": Chart(panels, 2.2 * len(self.trends), 3)} if panels else {}
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write a folder: report.html, trends.csv, metrics.json, and the figure as PNG."""
         header = ("column", "unit", "x", "dx [mm]", "dy [mm]", "dz [mm]")
-        rows = [(one.what, one.unit, x, *(1e3 * moved)) for one in self.trends for x, moved in zip(one.x, one.moved)]
+        rows = [
+            (trend.what, trend.unit, x, *(1e3 * displacement))
+            for trend in self.trends
+            for x, displacement in zip(trend.x, trend.moved)
+        ]
         part = pages.ResultPart(
             self.section(),
             self.charts() if plots else {},
             ["Targets of repeated poses less the arm's prediction."],
             (TABLE, header, rows),
         )
-        numbers = plain(
-            {"robot": self.robot, "verdict": self.verdict.level, "noticed": self.noticed}
-            | {
-                one.what: {"slope": one.slope, "sigma": one.sigma, "sigmas": one.sigmas, "total": one.total}
-                for one in self.trends
+        numbers: dict[str, object] = {"robot": self.robot, "verdict": self.verdict.level, "noticed": self.noticed}
+        for trend in self.trends:
+            numbers[trend.what] = {
+                "slope": trend.slope,
+                "sigma": trend.sigma,
+                "sigmas": trend.sigmas,
+                "total": trend.total,
             }
-        )
-        return pages.save(Path(out), "drift", f"Drift of {self.robot}", {"robot": self.robot}, [part], numbers, [TABLE])
+        title = f"Drift of {self.robot}"
+        return pages.save(Path(out), "drift", title, {"robot": self.robot}, [part], plain(numbers), [TABLE])
 
 
-def _rate(one: Trend) -> str:
-    return f"{1e3 * one.size:.2g} ± {1e3 * one.sigma:.1g} mm/{one.unit}"
+def _rate(trend: Trend) -> str:
+    return f"{1e3 * trend.size:.2g} ± {1e3 * trend.sigma:.1g} mm/{trend.unit}"
 
 
 def _of_axis(k: int):
-    return lambda one: f"{1e3 * one.slope[k]:+.2g}"
+    return lambda trend: f"{1e3 * trend.slope[k]:+.2g}"
 
 
 def drift(
@@ -129,9 +135,11 @@ def drift(
     chosen = options if isinstance(options, FitOptions) else read_options(None if options is None else Path(options))
     chain = inputs.load_robot(robot, None, chosen, base=base, tip=tip)[0]
     blocks = [block for path in measured for block in inputs.read_file(Path(path), chain, chosen)]
-    apart = repeats(chain, blocks[:1], blocks[1:], settings.sigma or 0.0)
-    found = tuple(trends(chain, blocks[:1], blocks[1:], settings.sigma or 0.0))
-    words = "no pose was measured twice: measure the first poses again at the end, into the same or a further file"
-    require(apart or found, words, UsageError)
+    repeat_findings = repeats(chain, blocks[:1], blocks[1:], settings.sigma or 0.0)
+    trends_found = tuple(trends(chain, blocks[:1], blocks[1:], settings.sigma or 0.0))
+    message = "no pose was measured twice: measure the first poses again at the end, into the same or a further file"
+    require(repeat_findings or trends_found, message, UsageError)
     need = settings.tolerance or noise_of_difference(settings.sigma or 0.0)
-    return DriftFound(chain.name, found, settle([*apart, *(one.finding(need) for one in found)]))
+    return DriftFound(
+        chain.name, trends_found, settle([*repeat_findings, *(trend.finding(need) for trend in trends_found)])
+    )

@@ -77,15 +77,19 @@ class LogLine:
     @property
     def parameter(self) -> str:
         """That parameter with its change and σ."""
-        one = self.first
-        return f"{one.name} {plus_minus(one.alone, one.alone_sigma, one.unit)}" if one else ""
+        change = self.first
+        return f"{change.name} {plus_minus(change.alone, change.alone_sigma, change.unit)}" if change else ""
 
     def row(self, robot: str) -> tuple[object, ...]:
         """Return the cells of `HEADER`."""
-        one = self.first
-        change = (one.name, one.alone, one.alone_sigma, one.unit) if one else ("", None, None, "")
-        errors, moved = self.errors or (None, None), self.moved or (None, None)
-        return self.folder, self.date, robot, self.serial, self.verdict, *errors, self.torque, *moved, *change
+        parameter = self.first
+        change = (
+            (parameter.name, parameter.alone, parameter.alone_sigma, parameter.unit)
+            if parameter
+            else ("", None, None, "")
+        )
+        errors, motion = self.errors or (None, None), self.moved or (None, None)
+        return self.folder, self.date, robot, self.serial, self.verdict, *errors, self.torque, *motion, *change
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,10 +105,13 @@ class RobotLog(Drawn, Judged):
         """Return a report section with a line per calibration."""
         columns = [
             *(Column(name, f"{{0.{name}}}", number=False) for name in ("date", "folder", "serial", "verdict")),
-            Column("nominal mm", lambda one: f"{one.errors[0]:.3g}" if one.errors else ""),
-            Column("calibrated mm", lambda one: f"{one.errors[1]:.3g}" if one.errors else ""),
-            Column("torque %", lambda one: "" if one.torque is None else f"{one.torque:.3g}"),
-            Column("tool moved mm", lambda one: f"{one.moved[0]:.3g} (σ {one.moved[1]:.2g})" if one.moved else ""),
+            Column("nominal mm", lambda log_line: f"{log_line.errors[0]:.3g}" if log_line.errors else ""),
+            Column("calibrated mm", lambda log_line: f"{log_line.errors[1]:.3g}" if log_line.errors else ""),
+            Column("torque %", lambda log_line: "" if log_line.torque is None else f"{log_line.torque:.3g}"),
+            Column(
+                "tool moved mm",
+                lambda log_line: f"{log_line.moved[0]:.3g} (σ {log_line.moved[1]:.2g})" if log_line.moved else "",
+            ),
             Column("most by", "{0.parameter}", number=False),
         ]
         return Section("Log", [table(f"Calibrations of {self.robot}", columns, self.lines)])
@@ -114,22 +121,26 @@ class RobotLog(Drawn, Judged):
         from calib.procedure.report.charts import Chart, Panel, line
         from calib.procedure.report.style import AFTER, BEFORE
 
-        dates, panels = [one.date for one in self.lines], []
+        dates, panels = [log_line.date for log_line in self.lines], []
         values = {
-            "error on unseen poses [mm]": [one.errors[1] if one.errors else np.nan for one in self.lines],
-            "the tool moved since the one before [mm]": [one.moved[0] if one.moved else np.nan for one in self.lines],
+            "error on unseen poses [mm]": [
+                log_line.errors[1] if log_line.errors else np.nan for log_line in self.lines
+            ],
+            "the tool moved since the one before [mm]": [
+                log_line.moved[0] if log_line.moved else np.nan for log_line in self.lines
+            ],
         }
-        expected = [one.moved[1] if one.moved else np.nan for one in self.lines]
-        for title, own in values.items():
-            layers = [line(range(len(own)), own, "o-", AFTER, label="found")]
+        expected = [log_line.moved[1] if log_line.moved else np.nan for log_line in self.lines]
+        for title, series in values.items():
+            layers = [line(range(len(series)), series, "o-", AFTER, label="found")]
             if "moved" in title:
-                layers.append(line(range(len(own)), expected, "+", BEFORE, label="σ lets expect"))
+                layers.append(line(range(len(series)), expected, "+", BEFORE, label="σ lets expect"))
             panels.append(Panel(layers, title, xnames=dates))
         return {"log": Chart(panels, 2.6, 2)}
 
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write a folder: report.html, log.csv, metrics.json, and the figure as PNG."""
-        rows = [one.row(self.robot) for one in self.lines]
+        rows = [log_line.row(self.robot) for log_line in self.lines]
         charts = self.charts() if plots else {}
         part = pages.ResultPart(self.section(), charts, ["Errors, and motion of the tool."], (TABLE, HEADER, rows))
         numbers = plain({"robot": self.robot, "lines": [dict(zip(HEADER, row)) for row in rows]})
@@ -149,33 +160,35 @@ def log(folders: Sequence[str | Path], *, mixed: bool = False) -> RobotLog:
         RobotError: where their nominal geometries differ.
         SessionError: for a session that has not come to a verdict.
     """
-    found = sorted((open_session(Path(each)) for each in folders_of(folders)), key=lambda one: one.settings.created)
-    for what, of in (("robots", lambda one: one.settings.name), ("serial numbers", _serial)):
-        names = list(dict.fromkeys(filter(None, map(of, found))))
-        words = f"the sessions are of other {what} ({', '.join(names)}); --mixed takes them for one robot"
-        require(len(names) < 2 or mixed, words, UsageError)
-    for one in found:
-        done = one.path("verdict.json").exists()
-        words = f"{one.folder} has no verdict yet: {command_line('next', one.folder)}"
-        require(done, words, SessionError)
+    sessions = sorted(
+        (open_session(Path(path)) for path in folders_of(folders)), key=lambda session: session.settings.created
+    )
+    for attribute, of in (("robots", lambda session: session.settings.name), ("serial numbers", _serial)):
+        names = list(dict.fromkeys(filter(None, map(of, sessions))))
+        message = f"the sessions are of other {attribute} ({', '.join(names)}); --mixed takes them for one robot"
+        require(len(names) < 2 or mixed, message, UsageError)
+    for session in sessions:
+        finished = session.path("verdict.json").exists()
+        message = f"{session.folder} has no verdict yet: {command_line('next', session.folder)}"
+        require(finished, message, SessionError)
     lines, last = list[LogLine](), None
-    for one in found:
+    for session in sessions:
         change = None
-        if (one.fit.path / METRICS).exists() and one.geometric:
-            change = last and diff(last, one.folder).geometry
-            last = one.folder
+        if (session.fit.path / METRICS).exists() and session.geometric:
+            change = last and diff(last, session.folder).geometry
+            last = session.folder
         lines.append(
             LogLine(
-                str(one.folder),
-                one.settings.created[:10],
-                _serial(one),
-                one.verdicts().level,
-                position_errors(one),
-                torque_error(one),
+                str(session.folder),
+                session.settings.created[:10],
+                _serial(session),
+                session.verdicts().level,
+                position_errors(session),
+                torque_error(session),
                 change or None,
             )
         )
-    return RobotLog(found[-1].settings.name, tuple(lines))
+    return RobotLog(sessions[-1].settings.name, tuple(lines))
 
 
 def _serial(session: Session) -> str:

@@ -39,9 +39,9 @@ def save(
     Raises:
         UsageError: for a folder that holds something else.
     """
-    ours = (*tables, PAGE, folders.METRICS, PICTURE.format("*"))
-    folders.check_target(out, ours, (folders.METRICS, PAGE), kind)
-    return folders.write_staged(out, ours, lambda folder: _write(folder, title, setup, parts, numbers))
+    file_names = (*tables, PAGE, folders.METRICS, PICTURE.format("*"))
+    folders.check_target(out, file_names, (folders.METRICS, PAGE), kind)
+    return folders.write_staged(out, file_names, lambda folder: _write(folder, title, setup, parts, numbers))
 
 
 def _write(folder: Path, title: str, setup: Mapping[str, str], parts: Sequence[ResultPart], numbers: Any) -> None:
@@ -51,13 +51,13 @@ def _write(folder: Path, title: str, setup: Mapping[str, str], parts: Sequence[R
 
     sections = list[Section]()
     for part in parts:
-        drawn = {name: picture(chart, words) for (name, chart), words in zip(part.charts.items(), part.captions)}
-        for name, one in drawn.items():
-            files.write(folder / PICTURE.format(name), one.image)
+        drawn = {name: picture(chart, caption) for (name, chart), caption in zip(part.charts.items(), part.captions)}
+        for name, drawing in drawn.items():
+            files.write(folder / PICTURE.format(name), drawing.image)
         blocks = [*part.section.blocks, Pictures("", list(drawn.values()))]
         sections.append(replace(part.section, blocks=blocks))
         name, header, rows = part.table
         files.write_table(folder / name, header, rows)
-    entries = [Entry(*each) for each in setup.items()]
+    entries = [Entry(*fields) for fields in setup.items()]
     files.write(folder / PAGE, html(report(title, " to ".join(setup.values()), entries, sections)))
     files.write_json(folder / folders.METRICS, numbers)

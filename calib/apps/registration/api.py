@@ -46,12 +46,12 @@ class Placed(NamedTuple):
     def __str__(self) -> str:
         turn = Rotation.from_matrix(self.pose[:3, :3])
         position, angles = 1e3 * self.pose[:3, 3], turn.as_euler("xyz") / DEG
-        place = ", ".join(_stated(each, 1e3 * sigma, 3) for each, sigma in zip(position, self.sigma[:3]))
+        position_text = ", ".join(_stated(value, 1e3 * sigma, 3) for value, sigma in zip(position, self.sigma[:3]))
         if np.isnan(self.sigma[3:]).all():
-            return f"{self.name}: x y z {place} mm; orientation not identifiable"
-        turns = ", ".join(_stated(each, sigma / DEG, 3) for each, sigma in zip(angles, self.sigma[3:]))
-        quaternion = ", ".join(f"{each:.6f}" for each in turn.as_quat(canonical=True))
-        return f"{self.name}: x y z {place} mm; roll pitch yaw {turns} deg; quaternion x y z w {quaternion}"
+            return f"{self.name}: x y z {position_text} mm; orientation not identifiable"
+        turns = ", ".join(_stated(value, sigma / DEG, 3) for value, sigma in zip(angles, self.sigma[3:]))
+        quaternion = ", ".join(f"{value:.6f}" for value in turn.as_quat(canonical=True))
+        return f"{self.name}: x y z {position_text} mm; roll pitch yaw {turns} deg; quaternion x y z w {quaternion}"
 
 
 class Placements(GeometryFit):
@@ -65,25 +65,27 @@ class Placements(GeometryFit):
         fit, chain = self.selection.fit, self.robot.chain
         cell, carried = fit.cell, self.inputs.fit[0].carried[0]
         standing = {"camera": "board", "board": "camera"}.get(carried, "instrument")
-        found = list[Placed]()
+        frames = list[Placed]()
         for name, pose in zip(cell.tool_names, cell.tools):
             turned = np.kron(np.eye(2), pose[:3, :3])  # the fit's small motions are along the frame's own axes
-            found.append(Placed(f"{carried} '{name}' in {chain.tip}", pose, _sigma(fit.estimate, name, turned)))
+            frames.append(Placed(f"{carried} '{name}' in {chain.tip}", pose, _sigma(fit.estimate, name, turned)))
         for name, pose in zip(cell.station_names, cell.stations) if self.inputs.fit[0].has_instrument else ():
             turned, back = np.kron(np.eye(2), pose[:3, :3]), invert(pose)
-            found.append(Placed(f"base in {standing} '{name}'", pose, _sigma(fit.estimate, name, turned)))
-            moved = -np.eye(6)  # of the inverse: -dp - dr × t, and -dr
-            moved[:3, 3:] = np.cross(back[:3, 3], np.eye(3)).T
-            found.append(Placed(f"{standing} '{name}' in {chain.base}", back, _sigma(fit.estimate, name, moved)))
-        return tuple(found)
+            frames.append(Placed(f"base in {standing} '{name}'", pose, _sigma(fit.estimate, name, turned)))
+            inverse_jacobian = -np.eye(6)  # of the inverse: -dp - dr × t, and -dr
+            inverse_jacobian[:3, 3:] = np.cross(back[:3, 3], np.eye(3)).T
+            frames.append(
+                Placed(f"{standing} '{name}' in {chain.base}", back, _sigma(fit.estimate, name, inverse_jacobian))
+            )
+        return tuple(frames)
 
     def lines(self, *first: str) -> Iterator[Any]:
         """Yield what a command prints: the frames whose names begin with one of `first`, and the verdict."""
         poses = self.fit.poses
         yield str(self.verdict)
-        yield from (str(each) for each in self.placed if each.name.startswith(first))
-        left = 1e3 * self.fit.errors[1].rms
-        yield f"{poses} poses, {left:.3g} mm rms residual; σ follows from it, the arm's random errors included"
+        yield from (str(frame) for frame in self.placed if frame.name.startswith(first))
+        rms_mm = 1e3 * self.fit.errors[1].rms
+        yield f"{poses} poses, {rms_mm:.3g} mm rms residual; σ follows from it, the arm's random errors included"
         yield from self.warnings
         if poses < USUAL_POSES:
             yield f"{poses} poses are few: measure {USUAL_POSES}, with the wrist turned by 90° and more between them"
@@ -95,12 +97,12 @@ class Placements(GeometryFit):
 def _sigma(estimate: Estimate, name: str, jacobian: np.ndarray) -> np.ndarray:
     """Return the standard deviations (6,) of J times the six small motions of a frame; NaN where not identified."""
     names = [f"{name}.{axis}" for axis in FRAME_AXES]
-    known = [each in estimate.names for each in names]
-    index = [estimate.names.index(each) for each in names if each in estimate.names]
+    identified = [parameter in estimate.names for parameter in names]
+    index = [estimate.names.index(parameter) for parameter in names if parameter in estimate.names]
     covariance = np.full((6, 6), np.nan)
-    covariance[np.ix_(known, known)] = estimate.covariance[np.ix_(index, index)]
-    used = jacobian != 0.0
-    size = [row[use] @ covariance[np.ix_(use, use)] @ row[use] for row, use in zip(jacobian, used)]
+    covariance[np.ix_(identified, identified)] = estimate.covariance[np.ix_(index, index)]
+    nonzero = jacobian != 0.0
+    size = [row[use] @ covariance[np.ix_(use, use)] @ row[use] for row, use in zip(jacobian, nonzero)]
     return np.sqrt(np.array(size))
 
 
@@ -129,22 +131,26 @@ def tool(
     Returns:
         The fit: ``placed`` has the frames with σ, ``verdict`` the verdict.
     """
-    asked = FitSettings(model="frames", holdout=settings.holdout, tolerance=settings.tolerance)
-    found = fit_geometry(robot, measured, asked, options=options, base=base, tip=tip, progress=progress)
-    return as_subclass(found, Placements)
+    fit_settings = FitSettings(model="frames", holdout=settings.holdout, tolerance=settings.tolerance)
+    fit = fit_geometry(robot, measured, fit_settings, options=options, base=base, tip=tip, progress=progress)
+    return as_subclass(fit, Placements)
 
 
-def base(robot: Arm, measured: Several, settings: PlacementSettings = DEFAULT_PLACEMENT, **more: Any) -> Placements:
+def base(
+    robot: Arm, measured: Several, settings: PlacementSettings = DEFAULT_PLACEMENT, **arguments: Any
+) -> Placements:
     """Calibrate the base: the arm's placement in the instrument's frame, from a dozen measured poses.
 
     It is the fit of `tool`, with the same arguments (robot, measured, settings, and more by their names).
     """
-    return tool(robot, measured, settings, **more)
+    return tool(robot, measured, settings, **arguments)
 
 
-def hand_eye(robot: Arm, measured: Several, settings: PlacementSettings = DEFAULT_PLACEMENT, **more: Any) -> Placements:
+def hand_eye(
+    robot: Arm, measured: Several, settings: PlacementSettings = DEFAULT_PLACEMENT, **arguments: Any
+) -> Placements:
     """Calibrate camera and board, one carried by the arm and the other beside it, from a dozen images.
 
     It is the fit of `tool`, with the same arguments (robot, measured, settings, and more by their names).
     """
-    return tool(robot, measured, settings, **more)
+    return tool(robot, measured, settings, **arguments)

@@ -71,20 +71,20 @@ def hand_eye(
 
 def _place(
     verb: str,
-    shown: tuple[str, ...],
+    frame_names: tuple[str, ...],
     robot: str,
     measured: list[Path],
     settings: PlacementSettings,
     out: Path | None,
-    **more: Any,
+    **options: Any,
 ) -> None:
     from calib.apps.registration import api
 
     if out is not None:
-        check_destination("fit", robot, out, [more["options"], *measured])
+        check_destination("fit", robot, out, [options["options"], *measured])
     with progress() as show:
-        found = getattr(api, verb)(robot, measured, settings, progress=show, **more)
+        fit = getattr(api, verb)(robot, measured, settings, progress=show, **options)
         if out is not None:
-            found.save(out)
-    say(*found.lines(*shown), *([f"written to {out}"] if out else []))
-    exit_failed(found.verdict.level)
+            fit.save(out)
+    say(*fit.lines(*frame_names), *([f"written to {out}"] if out else []))
+    exit_failed(fit.verdict.level)

@@ -37,8 +37,8 @@ def view(
         raise UsageError("nothing to do: give --save FILE.rrd, or omit --no-spawn")
     scene = None
     if save:
-        inside = folder.iterdir() if folder.is_dir() else ()
-        read = [folder, robot, *(path for path in inside if path.suffix != ".rrd")]
+        entries = folder.iterdir() if folder.is_dir() else ()
+        read = [folder, robot, *(path for path in entries if path.suffix != ".rrd")]
         with results([(save, (".rrd",))], read, overwrite):
             scene = viewer.write(folder, save, robot)
         size = f"{1e-6 * save.stat().st_size:.1f} MB"

@@ -4,10 +4,9 @@ A folder is that of a fit, an identification, an excitation, a planned motion, o
 All points are in the base of the arm that is drawn; its meshes are those of the URDF's ``<visual>`` elements.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -60,7 +59,7 @@ class Drawn(Protocol):
         """Return titles and units of an identification's torque rows, by the ``kind`` of ``dynamics.json``."""
         ...
 
-    def measured(self, place: Path) -> tuple[np.ndarray, ...]:
+    def measured(self, folder: Path) -> tuple[np.ndarray, ...]:
         """Return the poses of a fit's folder, in the order of `Measured`."""
         ...
 
@@ -81,7 +80,7 @@ def visuals(path: str | Path) -> tuple[list[Visual], list[str]]:
     Read from our own parsed XML, not by yourdfpy: one capsule, or one ``<visual>`` without geometry, makes that refuse
     the whole file (ValueError, TypeError), and ``package://`` is resolved as for collision shapes, see `find_mesh`.
     """
-    places, found, missing = list(Path(path).resolve().parents), [], []
+    places, meshes, missing = list(Path(path).resolve().parents), [], []
     for link, visual, mesh in urdf_meshes(path, "visual"):
         name = mesh.attributes.get("filename", "")
         file = find_mesh(name, places)
@@ -89,8 +88,8 @@ def visuals(path: str | Path) -> tuple[list[Visual], list[str]]:
             missing.append(name)
             continue
         scale = numbers(mesh, "scale", str(path), "1 1 1")
-        found.append(Visual(link.attributes.get("name", ""), file, origin(visual, str(path)), scale))
-    return found, missing
+        meshes.append(Visual(link.attributes.get("name", ""), file, origin(visual, str(path)), scale))
+    return meshes, missing
 
 
 FRAMES = 50.0  # positions of the arm per second of motion; our choice
@@ -119,9 +118,9 @@ class Measured:
         """Return the factor 1, 2 or 5 · 10^k that makes the larger arrows about a tenth of the arm long."""
         span = float(np.ptp(strips(chain, self.q)[0][:, -1], axis=0).max()) or 1.0
         large = float(np.quantile(np.linalg.norm(self.seen - self.nominal, axis=1), 0.9)) or 1e-3
-        wanted = 0.1 * span / large
+        target = 0.1 * span / large
         steps = np.array([f * 10.0**k for k in range(7) for f in (1.0, 2.0, 5.0)])
-        return float(steps[np.argmin(np.abs(np.log(steps / wanted)))])
+        return float(steps[np.argmin(np.abs(np.log(steps / target)))])
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,51 +210,62 @@ def read(folder: str | Path, robot: str | None = None) -> Scene:
         UsageError: where there is nothing to see.
     """
     folder = Path(folder)
-    one = folder.is_file() and folder.suffix == ".csv"
-    require(one or folder.is_dir(), f"{folder} is neither folder nor CSV; give a fit, session or motion", UsageError)
-    if one and robot is None:
+    is_csv = folder.is_file() and folder.suffix == ".csv"
+    require(is_csv or folder.is_dir(), f"{folder} is neither folder nor CSV; give a fit, session or motion", UsageError)
+    if is_csv and robot is None:
         refuse_option(folder, "robot of these poses unknown; give --robot")
     chain, source = _arm(folder, robot)
     meshes, notes = _meshes(chain, source)
-    fits = [place for place in (folder, folder / IN_SESSION) if FitFolder(place).residuals.is_file()]
-    motions = [path for name in (coefficients.SAMPLES, coefficients.PLANNED) for path in _below(folder, name)]
-    torques = [path for path in _below(folder, "torques_*.csv") if not (path.parent / "unseen").is_dir()]
-    plans = [folder] if one else sorted(folder.glob("2-poses/*.csv"))
-    scene = Scene(
-        folder.resolve().stem if one else folder.resolve().name,
-        chain,
-        tuple(meshes),
-        _nonempty(_joined(_measured(place, chain), ValidationFolder(folder / VALIDATED).errors) for place in fits),
-        _nonempty(sizes for place in fits for sizes in _unplaced(place, chain)),
-        tuple(
-            (path.stem, read_poses(path, Joints(chain.joint_names, _kinds(chain))))
-            for path in plans
-            if chain and not is_run(path)
-        ),
-        (
-            *(
-                Played(path.stem, *rehearsed_samples(path, chain))
-                for path in plans
-                if isinstance(chain, Chain) and is_run(path)
-            ),
-            *(_played(path, folder) for path in motions),
-        ),
-        tuple(_torques(path, folder, chain) for path in torques),
-        tuple(notes),
-    )
-    shown = scene.measured or scene.sizes or scene.chosen or scene.played or scene.torques
-    require(shown, refusal(folder, "view"), UsageError)
+    fit_folders = [path for path in (folder, folder / IN_SESSION) if FitFolder(path).residuals.is_file()]
+    measured: list[Measured] = []
+    sizes: list[ErrorSizes] = []
+    for fit_folder in fit_folders:
+        errors = ValidationFolder(folder / VALIDATED).errors
+        measured.append(_joined(_measured(fit_folder, chain), errors))
+    for fit_folder in fit_folders:
+        sizes += _unplaced(fit_folder, chain)
+
+    chosen: list[tuple[str, np.ndarray]] = []
+    played: list[Played] = []
+    plans = [folder]
+    if not is_csv:
+        plans = sorted(folder.glob("2-poses/*.csv"))
+    for path in plans:
+        if chain and not is_run(path):
+            joints = Joints(chain.joint_names, _kinds(chain))
+            chosen.append((path.stem, read_poses(path, joints)))
+    for path in plans:
+        if isinstance(chain, Chain) and is_run(path):
+            t, q = rehearsed_samples(path, chain)
+            played.append(Played(path.stem, t, q))
+    for name in (coefficients.SAMPLES, coefficients.PLANNED):
+        played += [_played(path, folder) for path in _below(folder, name)]
+
+    # A folder that also holds unseen motions shows those alone.
+    torque_files = [path for path in _below(folder, "torques_*.csv") if not (path.parent / "unseen").is_dir()]
+    torques = [_torques(path, folder, chain) for path in torque_files]
+
+    resolved = folder.resolve()
+    title = resolved.name
+    if is_csv:
+        title = resolved.stem
+    measured = [poses for poses in measured if len(poses.q)]
+    sizes = [rows for rows in sizes if len(rows.q)]
+    content = measured or sizes or chosen or played or torques
+    require(content, refusal(folder, "view"), UsageError)
     if chain is None:
-        words = "no robot is shown: the folder does not name one; give --robot"
-        return replace(scene, notes=(*scene.notes, words))
-    return scene
-
-
-_Rows = TypeVar("_Rows", Measured, ErrorSizes)
-
-
-def _nonempty(parts: Iterable[_Rows]) -> tuple[_Rows, ...]:
-    return tuple(part for part in parts if len(part.q))
+        notes.append("no robot is shown: the folder does not name one; give --robot")
+    return Scene(
+        title=title,
+        chain=chain,
+        meshes=tuple(meshes),
+        measured=tuple(measured),
+        sizes=tuple(sizes),
+        chosen=tuple(chosen),
+        played=tuple(played),
+        torques=tuple(torques),
+        notes=tuple(notes),
+    )
 
 
 def _below(folder: Path, pattern: str) -> list[Path]:
@@ -269,12 +279,14 @@ def _arm(folder: Path, robot: str | None) -> tuple[Chain | Drawn | None, Path | 
         return stage.run(), None
     if robot is not None:
         return load(robot), resolve(robot)
-    for place in (folder / calibrated.ROBOT, folder / IN_SESSION / calibrated.ROBOT, folder / coefficients.ARM):
-        if place.is_file():
-            known = calibrated.read(place)
-            return known.complete, Path(known.source) if known.source and Path(known.source).is_file() else None
-    for place in sorted(folder.glob("1-robot/robot.*")):
-        return load(str(place)), place
+    for path in (folder / calibrated.ROBOT, folder / IN_SESSION / calibrated.ROBOT, folder / coefficients.ARM):
+        if path.is_file():
+            robot_file = calibrated.read(path)
+            return robot_file.complete, Path(robot_file.source) if robot_file.source and Path(
+                robot_file.source
+            ).is_file() else None
+    for path in sorted(folder.glob("1-robot/robot.*")):
+        return load(str(path)), path
     try:
         name = read_toml(folder / coefficients.NAME).get("robot", "")
     except CalibError:
@@ -290,36 +302,36 @@ def _meshes(chain: Chain | Drawn | None, source: Path | None) -> tuple[list[Visu
     """Return the meshes of the moving links, and a note on missing meshes."""
     if not isinstance(chain, Chain) or source is None or not is_urdf(source) or not chain.links:
         return [], []
-    found, missing = visuals(source)
-    known = [one for one in found if one.link in (chain.base, *chain.links)]
-    words = (
+    meshes, missing = visuals(source)
+    drawn_meshes = [mesh for mesh in meshes if mesh.link in (chain.base, *chain.links)]
+    note = (
         f"{len(missing)} meshes of {source.name} were not found, e.g. {missing[0]}: links are lines" if missing else ""
     )
-    return known, [words] if words else []
+    return drawn_meshes, [note] if note else []
 
 
-def _measured(place: Path, chain: Chain | Drawn | None) -> Measured:
+def _measured(folder: Path, chain: Chain | Drawn | None) -> Measured:
     """Return the measured positions of ``residuals.csv``, with the predictions of both arms."""
     if isinstance(chain, Drawn):
-        return Measured(*chain.measured(place))
-    after, before = installation.read_arms(place)
-    table = read_table(FitFolder(place).residuals)
+        return Measured(*chain.measured(folder))
+    after, before = installation.read_arms(folder)
+    table = read_table(FitFolder(folder).residuals)
     table = table.where(_placed(table, after))
     q = np.column_stack([table.numbers(joint.name, "joint") for joint in after.chain.joints])
     miss, turned = _triples(table, "d", "length"), np.full((len(q), 3), np.nan)
     if "drx" in table:
         turned = _triples(table, "dr", "angle")
-    seen, nominal, modelled = (np.zeros((len(q), 3)) for _ in range(3))
+    positions_seen, nominal, modelled = (np.zeros((len(q), 3)) for _ in range(3))
     stations, tools = np.array(table.texts("station")), np.array(table.texts("tool"))
     for station, tool in sorted(set(zip(stations.tolist(), tools.tolist()))):
-        own = np.flatnonzero((stations == station) & (tools == tool))
+        rows = np.flatnonzero((stations == station) & (tools == tool))
         s, t = after.station_names.index(station), after.tool_names.index(tool)
         base = invert(after.stations[s])
-        modelled[own] = _points(after, q[own], s, t) @ base[:3, :3].T + base[:3, 3]
-        seen[own] = modelled[own] + miss[own] @ base[:3, :3].T
+        modelled[rows] = _points(after, q[rows], s, t) @ base[:3, :3].T + base[:3, 3]
+        positions_seen[rows] = modelled[rows] + miss[rows] @ base[:3, :3].T
         drawn = before if station in before.station_names else replace(after, chain=before.chain)
-        nominal[own] = _points(drawn, q[own], s, t) @ base[:3, :3].T + base[:3, 3]
-    return Measured(q, seen, nominal, modelled, np.array(table.texts("set")) != "fit", turned)
+        nominal[rows] = _points(drawn, q[rows], s, t) @ base[:3, :3].T + base[:3, 3]
+    return Measured(q, positions_seen, nominal, modelled, np.array(table.texts("set")) != "fit", turned)
 
 
 def _placed(table: Table, cell: Installation) -> np.ndarray:
@@ -328,12 +340,12 @@ def _placed(table: Table, cell: Installation) -> np.ndarray:
     return positions & np.isin(table.texts("station"), cell.station_names)
 
 
-def _unplaced(place: Path, chain: Chain | Drawn | None) -> list[ErrorSizes]:
+def _unplaced(folder: Path, chain: Chain | Drawn | None) -> list[ErrorSizes]:
     """Return the errors of the rows of ``residuals.csv`` that `_measured` leaves out, by their kind."""
     if isinstance(chain, Drawn):
         return []
-    cell = installation.read(place)
-    table = read_table(FitFolder(place).residuals)
+    cell = installation.read(folder)
+    table = read_table(FitFolder(folder).residuals)
     left_out = table.where(~_placed(table, cell))
     measured = ~np.isnan(left_out.numbers("dx", "length", gaps=True))
     result = []
@@ -376,9 +388,15 @@ def _joined(fitted: Measured, errors: Path) -> Measured:
     if not isinstance(table, Table) or "x" not in table:  # written by an earlier version
         return fitted
     table = table.where(~np.isnan(table.numbers("x", "length", gaps=True)))
-    seen, *away = (_triples(table, head, "length") for head in ("", "to_nominal_", "to_calibrated_"))
+    positions_seen, *away = (_triples(table, head, "length") for head in ("", "to_nominal_", "to_calibrated_"))
     q = np.column_stack([table.numbers(name, "joint") for name in table.header[2 : 2 + fitted.q.shape[1]]])
-    unseen = q, seen, *(seen + one for one in away), np.ones(len(q), dtype=bool), np.full((len(q), 3), np.nan)
+    unseen = (
+        q,
+        positions_seen,
+        *(positions_seen + displacement for displacement in away),
+        np.ones(len(q), dtype=bool),
+        np.full((len(q), 3), np.nan),
+    )
     return Measured(*map(np.concatenate, zip(vars(fitted).values(), unseen)))
 
 
@@ -398,14 +416,14 @@ def _seconds(table: Table) -> np.ndarray:
 
 def _torques(path: Path, folder: Path, chain: Chain | Drawn | None) -> Torques:
     table = read_table(path)
-    measured, predicted = (_needed(table, what, path) for what in ("measured", "predicted"))
+    measured, predicted = (_needed(table, name, path) for name in ("measured", "predicted"))
     rows, units = _torque_rows(path.parent, chain, measured.shape[1])
     return Torques(_name(path, folder), rows, units, _seconds(table), measured, predicted, table.block("q"))
 
 
-def _torque_rows(place: Path, chain: Chain | Drawn | None, count: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _torque_rows(folder_: Path, chain: Chain | Drawn | None, count: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the labels and units of an identification's torque rows."""
-    for folder in (IdentificationFolder(place), IdentificationFolder(place.parent)):
+    for folder in (IdentificationFolder(folder_), IdentificationFolder(folder_.parent)):
         if chain is None or not folder.model.is_file():
             continue
         table = model_file.read_table(folder.path)
@@ -426,15 +444,19 @@ def _torque_rows(place: Path, chain: Chain | Drawn | None, count: int) -> tuple[
 
 def _needed(table: Table, letter: str, path: Path) -> np.ndarray:
     """Return the required columns letter_joint of a file as (N, n)."""
-    found = table.block(letter)
-    if found is None:
+    block = table.block(letter)
+    if block is None:
         raise UsageError(f"{path} has no columns {letter}_joint …; was it written by this toolkit?")
-    return found
+    return block
 
 
 def _name(path: Path, folder: Path) -> str:
     parent = path.parent
-    return path.stem if parent == folder else f"{parent.name}" if path.stem != "torques_1" else f"{parent.name} torques"
+    if parent == folder:
+        return path.stem
+    if path.stem == "torques_1":
+        return f"{parent.name} torques"
+    return parent.name
 
 
 def strips(chain: Chain | Drawn, q: np.ndarray) -> list[np.ndarray]:

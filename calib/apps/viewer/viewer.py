@@ -31,8 +31,8 @@ class _Rerun:
     """The package rerun, loaded at first use."""
 
     def __getattr__(self, name: str) -> Any:
-        words = "Rerun is not installed here (no version for Macs with Intel processors): pip install rerun-sdk"
-        with refused_as(UsageError, ImportError, words):
+        message = "Rerun is not installed here (no version for Macs with Intel processors): pip install rerun-sdk"
+        with refused_as(UsageError, ImportError, message):
             import rerun
         return getattr(rerun, name)
 
@@ -48,8 +48,8 @@ def write(folder: str | Path, path: str | Path, robot: str | None = None) -> Sce
     """
     path = Path(path)
     scene = viewing.read(folder, robot)
-    with tempfile.TemporaryDirectory() as place:
-        temporary = Path(place) / "scene.rrd"
+    with tempfile.TemporaryDirectory() as temporary_folder:
+        temporary = Path(temporary_folder) / "scene.rrd"
         recording = rr.RecordingStream(files.MAKER, recording_id=scene.title)
         recording.save(temporary, default_blueprint=_blueprint(scene))
         _send(recording, scene)
@@ -114,22 +114,32 @@ def about(scene: Scene) -> str:
     """Return the text shown next to the plots."""
     lines = [f"# {scene.title}"]
     for measured in scene.measured:
-        sizes = [1e3 * np.linalg.norm(measured.seen - p, axis=1) for p in (measured.nominal, measured.calibrated)]
-        for label, some in (("fitted", ~measured.unseen), ("unseen", measured.unseen)):
-            if some.any():
-                rms = [float(np.sqrt(np.mean(size[some] ** 2))) for size in sizes]
-                words = f"{rms[0]:.3f} mm rms nominal (orange), {rms[1]:.3f} mm calibrated (green)"
-                lines.append(f"{int(some.sum())} {label} poses: {words}")
-        scale = measured.arrow_scale(scene.chain) if scene.chain else 1.0
-        words = "from the target's position by the arm's model to the measured one."
-        lines.append(f"**Arrows are {scale:g} times as long as the errors**; {words}")
-    lines += [line for sizes in scene.sizes for line in _size_lines(sizes)]
-    lines += [f"pose plan *{name}*: {len(q)} poses" for name, q in scene.chosen]
-    lines += [f"motion *{one.name}*: {one.t[-1]:.1f} s" for one in scene.played]
-    lines += [
-        f"torques *{one.name}*: measured orange, predicted green, and residuals [N·m, N]" for one in scene.torques
-    ]
-    return "\n\n".join([*lines, *(f"note: {note}" for note in scene.notes)])
+        nominal_mm = 1e3 * np.linalg.norm(measured.seen - measured.nominal, axis=1)
+        calibrated_mm = 1e3 * np.linalg.norm(measured.seen - measured.calibrated, axis=1)
+        for label, rows in (("fitted", ~measured.unseen), ("unseen", measured.unseen)):
+            if rows.any():
+                nominal = f"{_rms(nominal_mm[rows]):.3f} mm rms nominal (orange)"
+                calibrated = f"{_rms(calibrated_mm[rows]):.3f} mm calibrated (green)"
+                lines.append(f"{int(rows.sum())} {label} poses: {nominal}, {calibrated}")
+        scale = 1.0
+        if scene.chain:
+            scale = measured.arrow_scale(scene.chain)
+        meaning = "from the target's position by the arm's model to the measured one."
+        lines.append(f"**Arrows are {scale:g} times as long as the errors**; {meaning}")
+    for sizes in scene.sizes:
+        lines += _size_lines(sizes)
+    for name, q in scene.chosen:
+        lines.append(f"pose plan *{name}*: {len(q)} poses")
+    for motion in scene.played:
+        lines.append(f"motion *{motion.name}*: {motion.t[-1]:.1f} s")
+    for torques in scene.torques:
+        lines.append(f"torques *{torques.name}*: measured orange, predicted green, and residuals [N·m, N]")
+    lines += [f"note: {note}" for note in scene.notes]
+    return "\n\n".join(lines)
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def _size_lines(sizes: ErrorSizes) -> Iterator[str]:
@@ -145,9 +155,9 @@ def _size_lines(sizes: ErrorSizes) -> Iterator[str]:
         )
 
 
-def _poses(name: str, count: int, start: float, some: np.ndarray | None = None) -> list[Any]:
+def _poses(name: str, count: int, start: float, selection: np.ndarray | None = None) -> list[Any]:
     """Return the time columns of `count` poses, or `some` of them: the common clock from `start` [s], and a counter."""
-    steps = np.arange(1, count + 1) if some is None else some + 1
+    steps = np.arange(1, count + 1) if selection is None else selection + 1
     return [rr.TimeColumn("time", duration=start + EACH * steps), rr.TimeColumn(name, sequence=steps)]
 
 
@@ -160,45 +170,45 @@ def _measured(recording: Any, scene: Scene, measured: Measured, start: float) ->
     recording.log("world/seen", rr.Points3D(measured.seen, radii=0.006, colors=SEEN), static=True)
     for name, points, colour in (("nominal", measured.nominal, BEFORE), ("calibrated", measured.calibrated, AFTER)):
         errors = scale * (measured.seen - points)
-        place = f"world/errors_times_{scale:g}/{name}"
-        recording.log(place, rr.Arrows3D(vectors=errors, origins=points, colors=colour, radii=0.004), static=True)
+        entity = f"world/errors_times_{scale:g}/{name}"
+        recording.log(entity, rr.Arrows3D(vectors=errors, origins=points, colors=colour, radii=0.004), static=True)
         recording.log(f"world/tool/{name}", rr.Points3D(points, radii=0.006, colors=colour), static=True)
         size = 1e3 * np.linalg.norm(measured.seen - points, axis=1)
         _series(recording, f"errors/{name}", index, size, f"{name} [mm]", colour)
-    left = 1e3 * (measured.seen - measured.calibrated)
+    residual_mm = 1e3 * (measured.seen - measured.calibrated)
     for k, axis in enumerate("xyz"):
-        _series(recording, f"axes/position/{axis}", index, left[:, k], f"{axis} in the arm's base [mm]")
-    known = np.flatnonzero(np.isfinite(measured.turned).all(axis=1))
-    if len(known):
-        some = _poses("pose", len(measured.q), start, known)
-        turned = 1e3 * measured.turned[known]
+        _series(recording, f"axes/position/{axis}", index, residual_mm[:, k], f"{axis} in the arm's base [mm]")
+    measured_rows = np.flatnonzero(np.isfinite(measured.turned).all(axis=1))
+    if len(measured_rows):
+        index_measured = _poses("pose", len(measured.q), start, measured_rows)
+        turned = 1e3 * measured.turned[measured_rows]
         size = np.linalg.norm(turned, axis=1)
-        _series(recording, "turns/calibrated", some, size, "orientation, calibrated [mrad]", AFTER)
+        _series(recording, "turns/calibrated", index_measured, size, "orientation, calibrated [mrad]", AFTER)
         for k, axis in enumerate("xyz"):
-            _series(recording, f"axes/orientation/{axis}", some, turned[:, k], f"about {axis} [mrad]")
+            _series(recording, f"axes/orientation/{axis}", index_measured, turned[:, k], f"about {axis} [mrad]")
     if measured.unseen.any():
-        kept = np.where(measured.unseen, 1.0, 0.0)
-        _series(recording, "errors/unseen", index, kept, "1: unseen, 0: fitted", SEEN)
-    here = rr.Points3D.columns(
+        is_unseen = np.where(measured.unseen, 1.0, 0.0)
+        _series(recording, "errors/unseen", index, is_unseen, "1: unseen, 0: fitted", SEEN)
+    pose_columns = rr.Points3D.columns(
         positions=measured.seen, radii=np.full(len(measured.q), 0.015), colors=np.tile(SEEN, (len(measured.q), 1))
     )
-    recording.send_columns("world/pose", indexes=index, columns=here)
+    recording.send_columns("world/pose", indexes=index, columns=pose_columns)
     _arm(recording, scene, index, measured.q)
     return start + EACH * len(measured.q) + GAP
 
 
 def _sizes(recording: Any, scene: Scene, sizes: ErrorSizes, start: float) -> float:
     """Log the sizes of errors row by row, with the arm at each; return the start time of the next part [s]."""
-    place = "errors" if sizes.kind == "position" else f"errors/{sizes.kind}"
+    entity = "errors" if sizes.kind == "position" else f"errors/{sizes.kind}"
     for name, size, colour in (("nominal", sizes.nominal, BEFORE), ("calibrated", sizes.calibrated, AFTER)):
-        known = np.flatnonzero(np.isfinite(size))
-        if len(known):
-            index = _poses("row", len(sizes.q), start, known)
-            _series(recording, f"{place}/{name}", index, 1e3 * size[known], f"{name} [mm]", colour)
+        finite_rows = np.flatnonzero(np.isfinite(size))
+        if len(finite_rows):
+            index = _poses("row", len(sizes.q), start, finite_rows)
+            _series(recording, f"{entity}/{name}", index, 1e3 * size[finite_rows], f"{name} [mm]", colour)
     index = _poses("row", len(sizes.q), start)
     if sizes.unseen.any():
-        kept = np.where(sizes.unseen, 1.0, 0.0)
-        _series(recording, f"{place}/unseen", index, kept, "1: unseen, 0: fitted", SEEN)
+        is_unseen = np.where(sizes.unseen, 1.0, 0.0)
+        _series(recording, f"{entity}/unseen", index, is_unseen, "1: unseen, 0: fitted", SEEN)
     _arm(recording, scene, index, sizes.q)
     return start + EACH * len(sizes.q) + GAP
 
@@ -219,14 +229,14 @@ def _chosen(recording: Any, scene: Scene, chain: Chain | Drawn, name: str, q: np
 def _played(recording: Any, scene: Scene, played: Played, start: float) -> float:
     """Log a motion with its limits from `start` on [s], and return the start time of the next part."""
     t = start + played.t - played.t[0]
-    some = viewing.thinned(played.t)
-    index = [rr.TimeColumn("time", duration=t[some])]
+    samples = viewing.thinned(played.t)
+    index = [rr.TimeColumn("time", duration=t[samples])]
     names = scene.chain.joint_names if scene.chain is not None else [f"q{k + 1}" for k in range(played.q.shape[1])]
     ends = [rr.TimeColumn("time", duration=t[[0, -1]])]
     for j, name in enumerate(names):
-        _series(recording, f"motion/position/{_part(name)}", index, played.q[some, j], name)
+        _series(recording, f"motion/position/{_part(name)}", index, played.q[samples, j], name)
         if played.v is not None:
-            _series(recording, f"motion/velocity/{_part(name)}", index, played.v[some, j], name)
+            _series(recording, f"motion/velocity/{_part(name)}", index, played.v[samples, j], name)
         if scene.chain is None:
             continue
         joint = scene.chain.joints[j]
@@ -237,7 +247,7 @@ def _played(recording: Any, scene: Scene, played: Played, start: float) -> float
             for sign, side in ((-1.0, "lower"), (1.0, "upper")):
                 value = sign * joint.velocity
                 _series(recording, f"limits/velocity/{_part(name)}/{side}", ends, [value] * 2, f"{name} {side}", LIMIT)
-    _arm(recording, scene, index, played.q[some])
+    _arm(recording, scene, index, played.q[samples])
     return float(t[-1]) + GAP
 
 
@@ -251,8 +261,8 @@ def _torques(recording: Any, scene: Scene, torques: Torques, start: float) -> fl
         _series(recording, f"torques/{_part(name)}/predicted", index, predicted, f"predicted [{unit}]", AFTER)
         _series(recording, f"residuals/{_part(name)}", index, measured - predicted, f"{name} [{unit}]")
     if torques.q is not None:
-        some = viewing.thinned(torques.t)
-        _arm(recording, scene, [rr.TimeColumn("time", duration=t[some])], torques.q[some])
+        samples = viewing.thinned(torques.t)
+        _arm(recording, scene, [rr.TimeColumn("time", duration=t[samples])], torques.q[samples])
     return float(t[-1]) + GAP
 
 
@@ -300,11 +310,11 @@ def _arm(recording: Any, scene: Scene, index: list[Any], q: np.ndarray) -> None:
 def _meshes(recording: Any, scene: Scene) -> None:
     """Log the meshes, each once, under the frame of its link."""
     for number, mesh in enumerate(scene.meshes):
-        place = f"world/robot/links/{_part(mesh.link)}/mesh_{number}"
+        entity = f"world/robot/links/{_part(mesh.link)}/mesh_{number}"
         placed = rr.Transform3D(
             translation=mesh.placement[:3, 3], quaternion=to_quaternion(mesh.placement), scale=mesh.scale
         )
-        recording.log(place, placed, rr.Asset3D(path=mesh.file), static=True)
+        recording.log(entity, placed, rr.Asset3D(path=mesh.file), static=True)
 
 
 def _blueprint(scene: Scene) -> Any:
@@ -325,25 +335,37 @@ def _blueprint(scene: Scene) -> Any:
     elif scene.sizes:
         tabs.append(rrb.TimeSeriesView(origin="errors", name="error of each row [mm]"))
     if scene.played:
-        contents = [[f"+ /motion/{kind}/**", f"+ /limits/{kind}/**"] for kind in ("position", "velocity")]
-        views = [
-            rrb.TimeSeriesView(
-                origin="/", contents=words, name=f"{kind} [rad{unit} or m{unit}], limits in red", plot_legend=silent
+        views = []
+        for kind, unit in (("position", ""), ("velocity", "/s")):
+            view = rrb.TimeSeriesView(
+                origin="/",
+                contents=[f"+ /motion/{kind}/**", f"+ /limits/{kind}/**"],
+                name=f"{kind} [rad{unit} or m{unit}], limits in red",
+                plot_legend=silent,
             )
-            for words, kind, unit in zip(contents, ("position", "velocity"), ("", "/s"))
-        ]
+            views.append(view)
         tabs.append(rrb.Vertical(*views, name="motion"))
     if scene.torques:
-        each = dict.fromkeys(name for one in scene.torques for name in one.rows)
-        plots = [rrb.TimeSeriesView(origin=f"torques/{_part(name)}", name=name, plot_legend=silent) for name in each]
-        rest = rrb.TimeSeriesView(origin="residuals", name="measured minus predicted")
-        tabs.append(rrb.Vertical(rrb.Grid(*plots, grid_columns=2), rest, row_shares=[3, 1], name="torques"))
+        names: dict[str, None] = {}  # in order of appearance
+        for torques in scene.torques:
+            names.update(dict.fromkeys(torques.rows))
+        plots = []
+        for name in names:
+            plot = rrb.TimeSeriesView(origin=f"torques/{_part(name)}", name=name, plot_legend=silent)
+            plots.append(plot)
+        grid = rrb.Grid(*plots, grid_columns=2)
+        residuals = rrb.TimeSeriesView(origin="residuals", name="measured minus predicted")
+        tabs.append(rrb.Vertical(grid, residuals, row_shares=[3, 1], name="torques"))
     picture = rrb.Spatial3DView(origin="world", name="robot, nominal orange, calibrated green")
     right = rrb.Tabs(*tabs, active_tab=int(bool(scene.measured and scene.chosen)))
     text = rrb.TextDocumentView(origin="about", name="what is shown")
+    left = rrb.Vertical(picture, text, row_shares=[4, 1])
+    timeline = "pose"
+    if scene.chosen or scene.played or scene.torques:
+        timeline = "time"
     return rrb.Blueprint(
-        rrb.Horizontal(rrb.Vertical(picture, text, row_shares=[4, 1]), right, column_shares=[3, 2]),
-        rrb.TimePanel(timeline="time" if scene.chosen or scene.played or scene.torques else "pose", state="collapsed"),
+        rrb.Horizontal(left, right, column_shares=[3, 2]),
+        rrb.TimePanel(timeline=timeline, state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
         auto_views=False,

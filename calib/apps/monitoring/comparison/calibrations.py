@@ -90,11 +90,18 @@ def read_fits(before: Place, after: Place) -> tuple[Calibration, Calibration]:
     Raises:
         RobotError: where they are of different robots.
     """
-    given = [read_fit(each) if each.fit else None for each in (before, after)]
-    chain = next(each.chain for each in given if each is not None)
-    one, two = (each or _nominal(place.name, chain) for each, place in zip(given, (before, after)))
-    check_same_robot((one.name, two.name), (one.robot, two.robot))
-    return one, two
+    earlier = later = None
+    if before.fit:
+        earlier = read_fit(before)
+    if after.fit:
+        later = read_fit(after)
+    if earlier is None:
+        assert later is not None
+        earlier = _nominal(before.name, later.chain)
+    elif later is None:
+        later = _nominal(after.name, earlier.chain)
+    check_same_robot((earlier.name, later.name), (earlier.robot, later.robot))
+    return earlier, later
 
 
 def read_fit(place: Place) -> Calibration:
@@ -102,11 +109,11 @@ def read_fit(place: Place) -> Calibration:
     folder, session = place.fit, place.session
     assert folder is not None
     metrics, cell = folder.metrics(), installation.read(folder.path)
-    judged = session.validation.metrics() if session and (session.validation.judged).exists() else metrics
-    unseen = [rows for rows in judged.validation.values() if rows.unseen]
+    verdict_metrics = session.validation.metrics() if session and (session.validation.judged).exists() else metrics
+    unseen = [rows for rows in verdict_metrics.validation.values() if rows.unseen]
     free, covariance = tables.read_covariance(folder.path, cell)
     robot = calibrated.read(folder.path)
-    asked = session.settings.fit.tolerance_mm if session else metrics.tolerance_mm
+    tolerance_mm = session.settings.fit.tolerance_mm if session else metrics.tolerance_mm
     return Calibration(
         place.name,
         robot,
@@ -115,9 +122,9 @@ def read_fit(place: Place) -> Calibration:
         covariance,
         folder.learnt_joints(robot.chain.joints),
         metrics,
-        (judged.verdict, judged.reason),
+        (verdict_metrics.verdict, verdict_metrics.reason),
         (unseen or [metrics.fit])[0],
-        1e-3 * asked if asked else None,
+        1e-3 * tolerance_mm if tolerance_mm else None,
         place.serial,
     )
 

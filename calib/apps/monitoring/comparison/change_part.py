@@ -88,19 +88,19 @@ class ChangePart(ABC):
         return Verdict.of(figures, self.noticed)
 
     def _shared_findings(self) -> Iterator[Finding]:
-        found: ChangeTest = self.found
+        change_test: ChangeTest = self.found
         names = {"before": self.before.name, "after": self.after.name}
-        if found.changed and found.parameters:
-            first = found.parameters[0]
-            code = "one-parameter-changed" if found.alone else "several-parameters-changed"
+        if change_test.changed and change_test.parameters:
+            first = change_test.parameters[0]
+            code = "one-parameter-changed" if change_test.alone else "several-parameters-changed"
             change = plus_minus(first.alone, first.alone_sigma, first.unit)
-            yield finding(code, name=first.name, change=change, left=found.unexplained, rivals=found.rivals)
-        if any(found.extra):
-            earlier, later = found.extra
+            yield finding(code, name=first.name, change=change, left=change_test.unexplained, rivals=change_test.rivals)
+        if any(change_test.extra):
+            earlier, later = change_test.extra
             yield finding("combinations-left-out", earlier=earlier, later=later, option=self.model_option, **names)
-        for each in (self.before, self.after):
-            if each.judged[0] == "fail":
-                yield finding("earlier-failed", name=each.name, reason=each.judged[1])
+        for calibration in (self.before, self.after):
+            if calibration.judged[0] == "fail":
+                yield finding("earlier-failed", name=calibration.name, reason=calibration.judged[1])
         if self.before.serial and self.after.serial and self.before.serial != self.after.serial:
             yield finding("other-serial-number", first=self.before.serial, second=self.after.serial, **names)
 
@@ -109,11 +109,13 @@ class ChangePart(ABC):
         allowed = self.shown(self.tolerance) if self.tolerance else ""
         reached = met(self.today, self.tolerance or 0.0)
         figure = KeyFigure(self.error_words, "", self.shown(self.today), "", self.basis, allowed, reached)
-        shown = [one for one in self.found.parameters if one.sigma or one.explained][:MOST]
+        parameters_shown = [parameter for parameter in self.found.parameters if parameter.sigma or parameter.explained][
+            :MOST
+        ]
         note = f"All in {self.table}."
-        first, *rest = self.blocks()
-        parameters = table("Changed parameters, those first that explain most", _PARAMETERS, shown, note)
-        blocks = [first, Text("Notes", lines_of(self.noticed), "note"), *rest, parameters]
+        first, *remaining_blocks = self.blocks()
+        parameters = table("Changed parameters, those first that explain most", _PARAMETERS, parameters_shown, note)
+        blocks = [first, Text("Notes", lines_of(self.noticed), "note"), *remaining_blocks, parameters]
         return Section(f"Change of the {self.kind}", blocks, self.verdict.level, self.verdict.reason, [figure])
 
     @property
@@ -123,15 +125,15 @@ class ChangePart(ABC):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the numbers as in ``metrics.json`` [SI]."""
-        found: ChangeTest = self.found
+        change_test: ChangeTest = self.found
         return {
             "verdict": self.verdict.level,
             "reason": self.verdict.reason,
             "tolerance": self.tolerance,
             "today": self.today,
-            "chi2": found.chi2,
-            "freedom": found.freedom,
-            "probability": found.probability,
+            "chi2": change_test.chi2,
+            "freedom": change_test.freedom,
+            "probability": change_test.probability,
             "noticed": self.noticed,
             **self.numbers(),
         }
@@ -150,10 +152,13 @@ def _value(value: float, unit: str) -> str:
 
 _PARAMETERS = [
     Column("parameter", "{0.name}", number=False),
-    Column("before", lambda one: _value(one.before, one.unit)),
-    Column("after", lambda one: _value(one.after, one.unit)),
-    Column("change", lambda one: plus_minus(one.after - one.before, one.sigma, one.unit)),
-    Column("σ", lambda one: f"{abs(one.after - one.before) / one.sigma:.1f}" if one.sigma else ""),
-    Column("if it changed alone", lambda one: plus_minus(one.alone, one.alone_sigma, one.unit)),
-    Column("χ² explained", lambda one: f"{one.explained:.3g}"),
+    Column("before", lambda parameter: _value(parameter.before, parameter.unit)),
+    Column("after", lambda parameter: _value(parameter.after, parameter.unit)),
+    Column("change", lambda parameter: plus_minus(parameter.after - parameter.before, parameter.sigma, parameter.unit)),
+    Column(
+        "σ",
+        lambda parameter: f"{abs(parameter.after - parameter.before) / parameter.sigma:.1f}" if parameter.sigma else "",
+    ),
+    Column("if it changed alone", lambda parameter: plus_minus(parameter.alone, parameter.alone_sigma, parameter.unit)),
+    Column("χ² explained", lambda parameter: f"{parameter.explained:.3g}"),
 ]

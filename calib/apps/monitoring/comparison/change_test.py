@@ -70,8 +70,8 @@ class ChangeTest:
         """
         if self.freedom == 0:
             return 1.0
-        tried = [each.explained for each in self.parameters if each.explained]
-        single = max(len(tried), 1) * chi2.sf(max(tried, default=0.0), 1)
+        explained = [parameter.explained for parameter in self.parameters if parameter.explained]
+        single = max(len(explained), 1) * chi2.sf(max(explained, default=0.0), 1)
         return min(2.0 * float(min(chi2.sf(self.chi2, self.freedom), single)), 1.0)
 
     @property
@@ -98,7 +98,7 @@ class ChangeTest:
     def rivals(self) -> tuple[str, ...]:
         """The parameters whose change explains the difference about as well as that of the first one."""
         best = self.parameters[0].explained
-        return tuple(each.name for each in self.parameters[1:] if each.explained > best - AS_WELL)
+        return tuple(parameter.name for parameter in self.parameters[1:] if parameter.explained > best - AS_WELL)
 
     def suffices(self, explained: float, count: int) -> bool:
         """Return whether what `count` parameters explain of χ² leaves no more than chance."""
@@ -121,10 +121,10 @@ class Tested:
     def chi2(self) -> float:
         return float(self.difference @ self.difference)
 
-    def alone(self, k: int, known: bool = True) -> tuple[float, float, float]:
-        """Return change, σ and explained χ² of parameter k if it changed alone; NaN, NaN and 0 if it is not `known`."""
+    def alone(self, k: int, identifiable: bool = True) -> tuple[float, float, float]:
+        """Return change, σ and explained χ² of parameter k if it changed alone; NaN, NaN, 0 if not `identifiable`."""
         size = float(np.linalg.norm(self.columns[:, k]))
-        if not known or not size:
+        if not identifiable or not size:
             return np.nan, np.nan, 0.0
         along = float(self.columns[:, k] @ self.difference)
         return along / size**2, 1.0 / size, (along / size) ** 2
@@ -133,9 +133,9 @@ class Tested:
         """Return the steps (p,) of several parameters that explain most, the χ² that they explain, and their number."""
         columns, steps = self.columns[:, chosen], np.zeros(self.columns.shape[1])
         size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-        found, _, rank, _ = np.linalg.lstsq(columns / size, self.difference, rcond=SPAN)
-        steps[chosen] = found / size
-        return steps, float(np.sum((columns / size @ found) ** 2)), int(rank)
+        scaled_steps, _, rank, _ = np.linalg.lstsq(columns / size, self.difference, rcond=SPAN)
+        steps[chosen] = scaled_steps / size
+        return steps, float(np.sum((columns / size @ scaled_steps) ** 2)), int(rank)
 
 
 def tested(
@@ -150,20 +150,20 @@ def tested(
         columns: (s, p) what each parameter does to the combinations.
     """
     extra = [np.zeros((len(change), 0))] * 2
-    fitted = [each for each in spans if each.shape[1]]
+    fitted = [basis for basis in spans if basis.shape[1]]
     if len(fitted) == 2:
-        extra = [span(own - other @ (other.T @ own)) for own, other in (spans, spans[::-1])]
-        for place, beyond in enumerate(extra):
-            gain = np.linalg.lstsq(beyond.T @ covariances[place] @ beyond, beyond.T @ covariances[place])[0].T
-            change = change - gain @ (beyond.T @ change)
-            covariances[place] = covariances[place] - gain @ beyond.T @ covariances[place]
+        extra = [span(basis_ - other_basis @ (other_basis.T @ basis_)) for basis_, other_basis in (spans, spans[::-1])]
+        for index, surplus in enumerate(extra):
+            gain = np.linalg.lstsq(surplus.T @ covariances[index] @ surplus, surplus.T @ covariances[index])[0].T
+            change = change - gain @ (surplus.T @ change)
+            covariances[index] = covariances[index] - gain @ surplus.T @ covariances[index]
     nothing = np.zeros((len(change), 0))
-    together, beyond = span(np.hstack([nothing, *fitted])), np.hstack(extra)
-    kept = span(together - beyond @ (beyond.T @ together))
-    values, vectors = np.linalg.eigh(kept.T @ np.add(*covariances) @ kept)
-    whiten = (vectors / np.sqrt(np.maximum(values, 1e-14 * values.max(initial=0.0)))).T @ kept.T
+    together, surplus = span(np.hstack([nothing, *fitted])), np.hstack(extra)
+    common = span(together - surplus @ (surplus.T @ together))
+    values, vectors = np.linalg.eigh(common.T @ np.add(*covariances) @ common)
+    whiten = (vectors / np.sqrt(np.maximum(values, 1e-14 * values.max(initial=0.0)))).T @ common.T
     counts = extra[0].shape[1], extra[1].shape[1]
-    return Tested(whiten @ change, whiten @ columns, counts), kept.T @ columns
+    return Tested(whiten @ change, whiten @ columns, counts), common.T @ columns
 
 
 def span(columns: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ are tested (`calib.apps.monitoring.comparison.change_test`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -82,13 +83,16 @@ class _Seen:
 
     def motion(self, where: str, covariance: np.ndarray) -> ToolMotion:
         """Return the targets' motion, and what the covariance (p, p) of the parameters' change lets expect of it."""
-        way, turn = (np.linalg.norm(each, axis=0) for each in self.change.reshape(2, 3, -1))
-        return ToolMotion(where, self.q, self.points, way, turn / LEVER, self.size(_root(covariance).T))
+        motions = self.change.reshape(2, 3, -1)
+        distances = np.linalg.norm(motions[0], axis=0)
+        turns = np.linalg.norm(motions[1], axis=0) / LEVER
+        expected = self.size(_root(covariance).T)
+        return ToolMotion(where, self.q, self.points, distances, turns, expected)
 
     def size(self, steps: np.ndarray) -> float:
         """Return the rms motion [m] of the targets by independent steps (k, p) of the parameters."""
-        moved = (steps @ self.rows).reshape(len(steps), 6, len(self.q))[:, :3]
-        return float(np.sqrt(np.sum(moved**2) / len(self.q)))
+        displacements = (steps @ self.rows).reshape(len(steps), 6, len(self.q))[:, :3]
+        return float(np.sqrt(np.sum(displacements**2) / len(self.q)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,16 +117,27 @@ class _Pair:
 
     def see(self, q: np.ndarray) -> _Seen:
         """Return the targets at joint values q (m, n) [rad or m]."""
-        cell = self.cells[0]
-        bases = [evaluate(each.deflection, q) if each.deflection.terms else None for each in self.cells]
-        one, two = (see(each, q, 0, 0, base) for each, base in zip(self.cells, bases))
-        turned = rotation_vector(two.poses()[:, :3, :3] @ np.swapaxes(one.poses()[:, :3, :3], 1, 2))
-        change = np.concatenate([two.point - one.point, LEVER * turned.T]).reshape(1, -1)
-        columns = target_jacobian(cell, one, np.append(self.taken_up, self.free), 0, np.zeros(len(q), int), bases[0])
+        earlier, later = self.cells
+        base_before = base_after = None
+        if earlier.deflection.terms:
+            base_before = evaluate(earlier.deflection, q)
+        if later.deflection.terms:
+            base_after = evaluate(later.deflection, q)
+        before = see(earlier, q, 0, 0, base_before)
+        after = see(later, q, 0, 0, base_after)
+        rotation_before = before.poses()[:, :3, :3]
+        rotation_after = after.poses()[:, :3, :3]
+        turns = rotation_vector(rotation_after @ np.swapaxes(rotation_before, 1, 2))
+        change = np.concatenate([after.point - before.point, LEVER * turns.T]).reshape(1, -1)
+
+        count = len(self.taken_up)
+        parameters = np.append(self.taken_up, self.free)
+        columns = target_jacobian(earlier, before, parameters, 0, np.zeros(len(q), int), base_before)
         columns[:, 3:] *= LEVER
         columns = np.concatenate([columns.reshape(len(columns), -1), change])
-        columns = project_out(columns, np.arange(len(self.taken_up))) if len(self.taken_up) else columns
-        return _Seen(q, one.point.T, columns[len(self.taken_up) : -1], columns[-1])
+        if count:
+            columns = project_out(columns, np.arange(count))
+        return _Seen(q, before.point.T, columns[count:-1], columns[-1])
 
 
 def compare(before: Calibration, after: Calibration, settings: DiffSettings) -> GeometryChange:
@@ -131,102 +146,156 @@ def compare(before: Calibration, after: Calibration, settings: DiffSettings) -> 
     Raises:
         UsageError: where base or tool shall count, and are not known of both.
     """
-    pair, chain = _pair(before, after, settings), before.chain
-    learnt = [each.learnt for each in (before, after) if each.learnt is not None]
-    require(learnt, f"{before.name}, {after.name}: no residuals.csv with fitted rows; fit again", UsageError)
-    seen = pair.see(np.concatenate([each[:: max(1, -(-len(each) // MAX_POSES))] for each in learnt]))
-    found, combinations = _tested(pair, seen)
-    total, sizes = np.add(*pair.covariances), np.linalg.norm(combinations, axis=0)
-    changes, steps = list[ParameterChange](), np.zeros((chain.n, len(pair.change)))
-    for k, (element, one, two) in enumerate(zip(chain.elements, chain.values, after.chain.values)):
+    pair = _pair(before, after, settings)
+    chain = before.chain
+    fitted_joints = []
+    for calibration in (before, after):
+        joints = calibration.learnt
+        if joints is not None:
+            stride = max(1, -(-len(joints) // MAX_POSES))
+            fitted_joints.append(joints[::stride])
+    require(fitted_joints, f"{before.name}, {after.name}: no residuals.csv with fitted rows; fit again", UsageError)
+    sight = pair.see(np.concatenate(fitted_joints))
+
+    test, combinations = _tested(pair, sight)
+    covariance = np.add(*pair.covariances)
+    sizes = np.linalg.norm(combinations, axis=0)
+    changes: list[ParameterChange] = []
+    steps = np.zeros((chain.n, len(pair.change)))
+    for k, element in enumerate(chain.elements):
+        # An element behind the last joint counts as the last joint's.
         steps[min(element.owner, chain.n - 1), k] = pair.change[k]
-        alone, sigma = found.alone(k, sizes[k] > PARALLEL * sizes.max()), float(np.sqrt(total[k, k]))
-        changes.append(ParameterChange(element.name, element.unit, one, two, sigma, *alone))
-    changes.sort(key=lambda each: -each.explained)
-    motions = [seen.motion("poses of the fits", total)]
-    motions.append(pair.see(random_joints(chain, MAX_POSES, settings.seed)).motion("random poses within limits", total))
-    by_joint = tuple((name, seen.size(step[None])) for name, step in zip(chain.joint_names, steps))
+        if_alone = test.alone(k, sizes[k] > PARALLEL * sizes.max())
+        sigma = float(np.sqrt(covariance[k, k]))
+        values = chain.values[k], after.chain.values[k]
+        changes.append(ParameterChange(element.name, element.unit, *values, sigma, *if_alone))
+    changes.sort(key=lambda change: -change.explained)
+
+    at_fits = sight.motion("poses of the fits", covariance)
+    random = pair.see(random_joints(chain, MAX_POSES, settings.seed))
+    at_random = random.motion("random poses within limits", covariance)
+    by_joint = tuple((name, sight.size(step[None])) for name, step in zip(chain.joint_names, steps))
     return GeometryChange(
-        found.chi2,
-        len(found.difference),
-        tuple(changes),
-        found.extra,
-        by_joint,
-        tuple(motions),
-        frame_changes(before, after),
+        chi2=test.chi2,
+        freedom=len(test.difference),
+        parameters=tuple(changes),
+        extra=test.extra,
+        by_joint=by_joint,
+        motions=(at_fits, at_random),
+        frames=frame_changes(before, after),
     )
 
 
 def corrected_motion(before: Calibration, after: Calibration, settings: DiffSettings) -> float:
     """Return the rms motion [m] of the target at the poses of the later fit, with the joint corrections of both."""
-    pair, rigid = _pair(before, after, settings), (before.cell, after.cell)
-    whole = tuple(replace(one, chain=two.chain, deflection=two.deflection) for one, two in zip(pair.cells, rigid))
-    none = np.zeros(0, dtype=int)
-    q = before.learnt if after.learnt is None else after.learnt
+    pair = _pair(before, after, settings)
+    earlier, later = pair.cells
+    cells = (
+        replace(earlier, chain=before.cell.chain, deflection=before.cell.deflection),
+        replace(later, chain=after.cell.chain, deflection=after.cell.deflection),
+    )
+    no_parameter = np.zeros(0, dtype=int)
+    q = after.learnt
+    if q is None:
+        q = before.learnt
     assert q is not None
-    return replace(pair, cells=whole, free=none).see(q).motion("", np.zeros((0, 0))).rms
+    sight = replace(pair, cells=cells, free=no_parameter).see(q)
+    return sight.motion("", np.zeros((0, 0))).rms
 
 
 def frame_changes(before: Calibration, after: Calibration) -> dict[str, np.ndarray]:
     """Return the motions (6,) [m, rad] of ``base`` and ``tool`` between two fits; empty for a nominal robot."""
     if before.nominal or after.nominal:
         return {}
-    one, two = ((each.cell.stations[s], each.cell.tools[t]) for each, s, t in _places(before, after))
-    return {name: _step(a, b) for name, a, b in zip(("base", "tool"), one, two)}
+    station_before, station_after = _compared(before.cell.station_names, after.cell.station_names)
+    tool_before, tool_after = _compared(before.cell.tool_names, after.cell.tool_names)
+    return {
+        "base": _step(before.cell.stations[station_before], after.cell.stations[station_after]),
+        "tool": _step(before.cell.tools[tool_before], after.cell.tools[tool_after]),
+    }
 
 
-def _step(one: np.ndarray, two: np.ndarray) -> np.ndarray:
+def _step(T_first: np.ndarray, T_second: np.ndarray) -> np.ndarray:
     """Return the step (6,) that leads from one placement to the other, along and about the first one's own axes."""
-    way = invert(one) @ two
-    return np.concatenate([way[:3, 3], rotation_vector(way[:3, :3])])
+    step = invert(T_first) @ T_second
+    return np.concatenate([step[:3, 3], rotation_vector(step[:3, :3])])
 
 
-def _places(before: Calibration, after: Calibration) -> list[tuple[Calibration, int, int]]:
-    """Return the calibrations with the numbers of the station and the tool that are compared: of one name, or first."""
-    found = []
-    for kind in ("station_names", "tool_names"):
-        one, two = (getattr(each.cell, kind) for each in (before, after))
-        shared = [name for name in one if name in two]
-        found.append((one.index(shared[0]), two.index(shared[0])) if shared else (0, 0))
-    return [(each, station, tool) for each, station, tool in zip((before, after), *found)]
+def _compared(names_before: Sequence[str], names_after: Sequence[str]) -> tuple[int, int]:
+    """Return the numbers of the two stations, or tools, that are compared: of the first common name, or the first."""
+    for name in names_before:
+        if name in names_after:
+            return names_before.index(name), names_after.index(name)
+    return 0, 0
 
 
 def _pair(before: Calibration, after: Calibration, settings: DiffSettings) -> _Pair:
-    counts = {"base": settings.same_base, "tool": settings.same_tool}
-    told = " and ".join(name for name, each in counts.items() if each)
-    if told:
-        words = f"a nominal robot has no {told} placement; compare two fits"
-        require(not (before.nominal or after.nominal), f"same {told}: {words}", UsageError)
-        words = "one fit has joint corrections that the other has not; fit both with the same --model"
-        require(before.cell.deflection.terms == after.cell.deflection.terms, f"same {told}: {words}", UsageError)
-    cells, covariances, arm = [], [], len(before.chain.elements)
-    tool = (before if after.nominal else after).cell.tools[0]
-    for each, station, target in _places(before, after):
-        cell, covariance = each.whole if told else each.rigid
-        sections = np.split(np.arange(len(covariance)), np.cumsum(layout_counts(cell))[:-1])
-        frames = sections[1][6 * station : 6 * station + 6], sections[2][6 * target : 6 * target + 6]
-        index = np.concatenate([sections[0], *frames, sections[4]])
+    counted_frames = []
+    if settings.same_base:
+        counted_frames.append("base")
+    if settings.same_tool:
+        counted_frames.append("tool")
+    if counted_frames:
+        frames = " and ".join(counted_frames)
+        message = f"same {frames}: a nominal robot has no {frames} placement; compare two fits"
+        require(not (before.nominal or after.nominal), message, UsageError)
+        message = "one fit has joint corrections that the other has not; fit both with the same --model"
+        alike = before.cell.deflection.terms == after.cell.deflection.terms
+        require(alike, f"same {frames}: {message}", UsageError)
+
+    common_tool = after.cell.tools[0]
+    if after.nominal:
+        common_tool = before.cell.tools[0]
+    stations = _compared(before.cell.station_names, after.cell.station_names)
+    tools = _compared(before.cell.tool_names, after.cell.tool_names)
+    cells: list[Installation] = []
+    covariances = []
+    for calibration, station, tool in zip((before, after), stations, tools):
+        if counted_frames:
+            cell, covariance = calibration.whole
+        else:
+            cell, covariance = calibration.rigid
+        ends = np.cumsum(layout_counts(cell))[:-1]
+        sections = np.split(np.arange(len(covariance)), ends)
+        base_section = sections[1][6 * station : 6 * station + 6]
+        tool_section = sections[2][6 * tool : 6 * tool + 6]
+        index = np.concatenate([sections[0], base_section, tool_section, sections[4]])
         covariances.append(covariance[np.ix_(index, index)])
-        own = cell.stations[station] if counts["base"] else np.eye(4), cell.tools[target] if counts["tool"] else tool
-        cells.append(replace(cell, stations=own[0][None], tools=own[1][None], optics=NoOptics()))
-    steps = [_step(one[0], two[0]) for one, two in zip(*((cell.stations, cell.tools) for cell in cells))]
-    terms = [np.asarray(cell.deflection.coefficients) for cell in cells]
-    change = np.concatenate([after.chain.values - before.chain.values, *steps, terms[1] - terms[0]])
-    if told:
-        change[:arm] = cells[1].chain.values - cells[0].chain.values
-    left_out = np.repeat([not each for each in counts.values()], 6)
+        T_station = np.eye(4)
+        if settings.same_base:
+            T_station = cell.stations[station]
+        T_tool = common_tool
+        if settings.same_tool:
+            T_tool = cell.tools[tool]
+        cells.append(replace(cell, stations=T_station[None], tools=T_tool[None], optics=NoOptics()))
+
+    earlier, later = cells
+    base_step = _step(earlier.stations[0], later.stations[0])
+    tool_step = _step(earlier.tools[0], later.tools[0])
+    terms_step = np.asarray(later.deflection.coefficients) - np.asarray(earlier.deflection.coefficients)
+    arm_step = after.chain.values - before.chain.values
+    change = np.concatenate([arm_step, base_step, tool_step, terms_step])
+    arm = len(before.chain.elements)
+    if counted_frames:
+        change[:arm] = later.chain.values - earlier.chain.values
+
+    left_out = np.repeat([not settings.same_base, not settings.same_tool], 6)
     taken_up = arm + np.flatnonzero(left_out)
     free = np.setdiff1d(np.arange(len(change)), taken_up)
-    one, two = (each[np.ix_(free, free)] for each in covariances)
-    return _Pair((cells[0], cells[1]), taken_up, free, change[free], (one, two))
+    block = np.ix_(free, free)
+    return _Pair((earlier, later), taken_up, free, change[free], (covariances[0][block], covariances[1][block]))
 
 
-def _tested(pair: _Pair, seen: _Seen) -> tuple[Tested, np.ndarray]:
+def _tested(pair: _Pair, sight: _Seen) -> tuple[Tested, np.ndarray]:
     """Return the test of the combinations that the poses show, and what each parameter does to those tested (k, p)."""
-    _, size, shown = np.linalg.svd(seen.rows.T, full_matrices=False)
-    shown = shown[size > SHOWN * size[0]]
-    spans = [span(shown[:, np.diag(each) > 0.0]) for each in pair.covariances]
-    return tested(shown @ pair.change, [shown @ each @ shown.T for each in pair.covariances], spans, shown)
+    _, size, directions = np.linalg.svd(sight.rows.T, full_matrices=False)
+    directions = directions[size > SHOWN * size[0]]
+    covariances = []
+    spans = []
+    for covariance in pair.covariances:
+        covariances.append(directions @ covariance @ directions.T)
+        spans.append(span(directions[:, np.diag(covariance) > 0.0]))
+    return tested(directions @ pair.change, covariances, spans, directions)
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:

@@ -91,12 +91,12 @@ def read_models(before: Place, after: Place) -> tuple[Identified, Identified]:
         UsageError: where their torques are of different kinds.
         RobotError: where they are of different robots.
     """
-    one, two = _read(before), _read(after)
-    check_same_robot((one.name, two.name), (one.robot, two.robot))
-    kinds = [(each.unit, each.model.torque_rows.name) for each in (one, two)]
-    words = f"{one.name} and {two.name}: torques of {{}} and of {{}} cannot be compared; identify both alike"
-    require(kinds[0] == kinds[1], words.format(*(" in ".join(kind[::-1]) for kind in kinds)), UsageError)
-    return one, two
+    earlier, later = _read(before), _read(after)
+    check_same_robot((earlier.name, later.name), (earlier.robot, later.robot))
+    kinds = [(model.unit, model.model.torque_rows.name) for model in (earlier, later)]
+    message = f"{earlier.name} and {later.name}: torques of {{}} and of {{}} cannot be compared; identify both alike"
+    require(kinds[0] == kinds[1], message.format(*(" in ".join(kind[::-1]) for kind in kinds)), UsageError)
+    return earlier, later
 
 
 def _read(place: Place) -> Identified:
@@ -111,7 +111,7 @@ def _read(place: Place) -> Identified:
         for name, row in table["regrouping"].items()
     }
     units = dict(zip(standard, dynamics.model.units))
-    judged, tables = folder.judged, {f"{place.name}/{path.name}": path for path in folder.torques}
+    verdict, tables = folder.judged, {f"{place.name}/{path.name}": path for path in folder.torques}
     motions = {name: read_states(path, dynamics.model.n) for name, path in tables.items()}
     return Identified(
         place.name,
@@ -124,7 +124,7 @@ def _read(place: Place) -> Identified:
         regrouping,
         {name: states for name, states in motions.items() if states},
         table.get("unit", TORQUE),
-        (judged.verdict, judged.reason),
+        (verdict.verdict, verdict.reason),
         session.settings.dynamics.tolerance_percent if session else 0.0,
         place.serial,
     )
@@ -148,7 +148,7 @@ def read_states(path: Path, joints: int) -> MotionStates | None:
     q, v, a, measured = (table.block(name) for name in ("q", "v", "a", "measured"))
     if q is None or v is None or a is None:
         return None
-    words = f"{path}: columns q_…, v_… and a_… of {joints} joints each are needed"
-    require({each.shape[1] for each in (q, v, a)} == {joints}, words, UsageError)
+    message = f"{path}: columns q_…, v_… and a_… of {joints} joints each are needed"
+    require({block.shape[1] for block in (q, v, a)} == {joints}, message, UsageError)
     t = table.numbers("t", None) if "t" in table.header else np.arange(len(q), dtype=float)
     return MotionStates(t, (q, v, a), measured)

@@ -48,27 +48,27 @@ class Place:
     @property
     def words(self) -> str:
         """What it holds, in a clause."""
-        held = [name for name, one in (("geometry", self.fit), ("dynamics", self.identification)) if one]
-        if held or not self.session:
-            return f"{self.name} holds {' and '.join(held) or 'the nominal robot'}"
+        contents = [name for name, result in (("geometry", self.fit), ("dynamics", self.identification)) if result]
+        if contents or not self.session:
+            return f"{self.name} holds {' and '.join(contents) or 'the nominal robot'}"
         return f"{self.name} holds no result yet ({command_line('next', self.name)})"
 
 
-def place_of(given: str | Path, verb: str = "diff") -> Place:
+def place_of(source: str | Path, verb: str = "diff") -> Place:
     """Return what a calibration is read from; what is no folder counts as a description.
 
     Raises:
         UsageError: for a folder of something else.
     """
-    path, name = Path(given), str(given)
+    path, name = Path(source), str(source)
     if not path.is_dir():
         return Place(name)
     if (path / SESSION).exists():
         session = open_session(path)
         fit, model = session.fit, session.identification
         fitted = session.geometric and (fit.path / METRICS).exists() and (fit.path / COVARIANCE).exists()
-        known = session.dynamic and model.numbers.exists() and model.unseen.report.exists()
-        return Place(name, session, fit if fitted else None, model if known else None)
+        identified = session.dynamic and model.numbers.exists() and model.unseen.report.exists()
+        return Place(name, session, fit if fitted else None, model if identified else None)
     if (path / MODEL).exists():
         return Place(name, None, None, IdentificationFolder(path))
     fitted = (path / METRICS).exists() and FitFolder(path).robot.exists()
@@ -78,22 +78,28 @@ def place_of(given: str | Path, verb: str = "diff") -> Place:
 
 def check_same_robot(names: tuple[str, str], robots: tuple[CalibratedChain, CalibratedChain]) -> None:
     """Raise `RobotError` for two calibrations whose nominal descriptions differ."""
-    first, second = (each.nominal or each.chain for each in robots)
-    both = f"{names[0]} and {names[1]} are of different robots"
-    for what in ("joint_names", "names"):
-        mine, other = getattr(first, what), getattr(second, what)
-        strange = [name for name in (*mine, *other) if (name in mine) != (name in other)]
-        kind = "joints" if what == "joint_names" else "parameters"
-        words = f"{both} ({first.name}, {second.name}): {kind} {listing(strange, 5)} exist in one of them only"
-        require(mine == other, words if strange else f"{both}: their {kind} are in another order", RobotError)
-    away = np.abs(first.values - second.values)
-    away = np.maximum(away, [np.abs(_placed(a) - _placed(b)).max() for a, b in zip(first.elements, second.elements)])
-    moved = [name for name, size in zip(first.names, away) if size > SAME]
+    first, second = (robot.nominal or robot.chain for robot in robots)
+    beginning = f"{names[0]} and {names[1]} are of different robots"
+    for attribute in ("joint_names", "names"):
+        first_names, second_names = getattr(first, attribute), getattr(second, attribute)
+        strange = [name for name in (*first_names, *second_names) if (name in first_names) != (name in second_names)]
+        kind = "joints" if attribute == "joint_names" else "parameters"
+        message = f"{beginning} ({first.name}, {second.name}): {kind} {listing(strange, 5)} exist in one of them only"
+        require(
+            first_names == second_names,
+            message if strange else f"{beginning}: their {kind} are in another order",
+            RobotError,
+        )
+    difference = np.abs(first.values - second.values)
+    difference = np.maximum(
+        difference, [np.abs(_placed(a) - _placed(b)).max() for a, b in zip(first.elements, second.elements)]
+    )
+    differing = [name for name, size in zip(first.names, difference) if size > SAME]
     tail = np.abs(first.tail - second.tail).max()
-    ends = f"{both}: one ends at {first.tip}, the other at {second.tip}; fit one of them again with --tip"
-    require(moved or tail <= SAME or first.tip == second.tip, ends, RobotError)
-    words = f"{both}: the nominal {listing(moved or ['tip'], 5)} differ; fit both from one description"
-    require(not moved and tail <= SAME, words, RobotError)
+    ends = f"{beginning}: one ends at {first.tip}, the other at {second.tip}; fit one of them again with --tip"
+    require(differing or tail <= SAME or first.tip == second.tip, ends, RobotError)
+    message = f"{beginning}: the nominal {listing(differing or ['tip'], 5)} differ; fit both from one description"
+    require(not differing and tail <= SAME, message, RobotError)
 
 
 def _placed(element: Element) -> np.ndarray:

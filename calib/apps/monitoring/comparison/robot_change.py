@@ -50,13 +50,13 @@ class RobotChange(Drawn, Judged):
     def verdict(self) -> Verdict:
         """Whether the earlier parameters are still within tolerance: of the worst part."""
         worst = max(self.parts, key=lambda part: LEVELS.index(part.verdict.level))
-        own = worst.verdict
-        return own if len(self.parts) == 1 else replace(own, reason=f"{worst.kind}: {own.reason}")
+        verdict = worst.verdict
+        return verdict if len(self.parts) == 1 else replace(verdict, reason=f"{worst.kind}: {verdict.reason}")
 
     @property
     def noticed(self) -> tuple[Finding, ...]:
         """The findings of all parts."""
-        return tuple(one for part in self.parts for one in part.noticed)
+        return tuple(finding_ for part in self.parts for finding_ in part.noticed)
 
     @property
     def geometry(self) -> GeometryChange | None:
@@ -73,8 +73,10 @@ class RobotChange(Drawn, Judged):
 
     def section(self) -> Section:
         """Return all parts as one report section."""
-        own = [part.section() for part in self.parts]
-        blocks, figures = ([one for each in own for one in getattr(each, name)] for name in ("blocks", "figures"))
+        sections = [part.section() for part in self.parts]
+        blocks, figures = (
+            [item for section in sections for item in getattr(section, name)] for name in ("blocks", "figures")
+        )
         return Section("Change", blocks, self.verdict.level, self.verdict.reason, figures)
 
     def charts(self) -> dict[str, Chart]:
@@ -93,8 +95,8 @@ class RobotChange(Drawn, Judged):
             )
             for part in self.parts
         ]
-        one, two, robot = self._names
-        setup = {"earlier": one, "later": two}
+        earlier, later, robot = self._names
+        setup = {"earlier": earlier, "later": later}
         return pages.save(Path(out), "comparison", f"Change of {robot}", setup, parts, self.to_dict(), TABLES)
 
     @property
@@ -133,36 +135,38 @@ def diff(before: Compared, after: Compared, settings: DiffSettings = DEFAULT_DIF
         RobotError: where they are of different robots.
     """
     with saved(before) as first, saved(after) as second:
-        for place in (first, second):
-            stage_of(place, "diff")
-        one, two = place_of(first), place_of(second)
-        parts = [*_tool_parts(one, two, settings), *_torque_parts(one, two, settings)]
-    if one.nominal and two.nominal:
-        words = f"neither {before} nor {after} is the folder of a fit or of a session; give at least one"
+        for path in (first, second):
+            stage_of(path, "diff")
+        earlier, later = place_of(first), place_of(second)
+        parts = [*_tool_parts(earlier, later, settings), *_torque_parts(earlier, later, settings)]
+    if earlier.nominal and later.nominal:
+        message = f"neither {before} nor {after} is the folder of a fit or of a session; give at least one"
     else:
-        words = f"nothing to compare: {one.words}, {two.words}"
-    require(parts, words, UsageError)
+        message = f"nothing to compare: {earlier.words}, {later.words}"
+    require(parts, message, UsageError)
     return RobotChange(tuple(parts))
 
 
 def _tool_parts(before: Place, after: Place, settings: DiffSettings) -> list[ChangePart]:
-    if not any(each.fit for each in (before, after)) or not all(each.fit or each.nominal for each in (before, after)):
+    if not any(side.fit for side in (before, after)) or not all(side.fit or side.nominal for side in (before, after)):
         return []
-    one, two = read_fits(before, after)
-    found = geometry_change.compare(one, two, settings)
-    return [ToolPart(one, two, found, settings.tolerance or two.tolerance or one.tolerance, settings)]
+    earlier, later = read_fits(before, after)
+    change = geometry_change.compare(earlier, later, settings)
+    return [ToolPart(earlier, later, change, settings.tolerance or later.tolerance or earlier.tolerance, settings)]
 
 
 def _torque_parts(before: Place, after: Place, settings: DiffSettings) -> list[ChangePart]:
     if not (before.identification and after.identification):
         return []
-    one, two = read_models(before, after)
-    motions = {**two.motions, **one.motions}
+    earlier, later = read_models(before, after)
+    motions = {**later.motions, **earlier.motions}
     for name in settings.motions:
-        states = read_states(Path(name), two.model.n)
+        states = read_states(Path(name), later.model.n)
         require(states, f"{name}: no accelerations; expected columns q_…, v_… and a_…", UsageError)
         motions[name] = states  # type: ignore[assignment]
-    words = f"neither {one.name} nor {two.name} holds a motion without payload; give one with --motion"
-    require(motions, words, UsageError)
-    found = torque_change.compare(one, two, motions)
-    return [TorquePart(one, two, found, settings.torque_tolerance or two.tolerance or one.tolerance or None)]
+    message = f"neither {earlier.name} nor {later.name} holds a motion without payload; give one with --motion"
+    require(motions, message, UsageError)
+    change = torque_change.compare(earlier, later, motions)
+    return [
+        TorquePart(earlier, later, change, settings.torque_tolerance or later.tolerance or earlier.tolerance or None)
+    ]

@@ -42,8 +42,8 @@ class ToolPart(ChangePart):
 
     @property
     def words(self) -> str:
-        moved = self.found.motions[0]
-        return f"the tool moved by {1e3 * moved.rms:.3g} mm rms (σ lets expect {1e3 * moved.expected:.2g} mm)"
+        motion = self.found.motions[0]
+        return f"the tool moved by {1e3 * motion.rms:.3g} mm rms (σ lets expect {1e3 * motion.expected:.2g} mm)"
 
     @property
     def basis(self) -> str:
@@ -53,51 +53,54 @@ class ToolPart(ChangePart):
         return f"{1e3 * value:.3g} mm"
 
     def own_findings(self) -> list[Finding]:
-        one, two, found, result = self.before, self.after, self.found, list[Finding]()
-        moved, left = found.motions[0], max(one.left, two.left)
+        before, after, change_test, result = self.before, self.after, self.found, list[Finding]()
+        motion, residual = change_test.motions[0], max(before.left, after.left)
         if self.tolerance:
-            result.append(finding("outgrown", times=self.today / self.tolerance, today=self.today, after=two.name))
-            wide = found.motions[1]
+            result.append(finding("outgrown", times=self.today / self.tolerance, today=self.today, after=after.name))
+            wide = change_test.motions[1]
             times = np.sqrt(max(wide.rms**2 - wide.expected**2, 0.0)) / self.tolerance
             result.append(finding("outgrown-elsewhere", times=times, moved=wide.rms, expected=wide.expected))
-        beyond = moved.rms / max(left, 1e-12)
-        if not found.freedom:
-            result.append(finding("arm-not-tested", names=[one.name, two.name]))
+        ratio = motion.rms / max(residual, 1e-12)
+        if not change_test.freedom:
+            result.append(finding("arm-not-tested", names=[before.name, after.name]))
         result.append(
             finding(
                 "arm-changed",
-                sigmas=found.sigmas,
-                beyond=0.0 if self.tolerance else beyond,
-                probability=found.probability,
-                left=left if beyond <= 1.0 else None,
+                sigmas=change_test.sigmas,
+                beyond=0.0 if self.tolerance else ratio,
+                probability=change_test.probability,
+                left=residual if ratio <= 1.0 else None,
             )
         )
-        corrected, counts = [each.name for each in (one, two) if each.cell.deflection.terms], self.settings
+        corrected, counts = (
+            [calibration.name for calibration in (before, after) if calibration.cell.deflection.terms],
+            self.settings,
+        )
         if corrected and not (counts.same_base or counts.same_tool):
-            whole = geometry_change.corrected_motion(one, two, counts)
-            result.append(finding("corrections-not-compared", names=corrected, moved=whole))
-        held: Mapping[str, bool] = {"base": counts.same_base, "tool": counts.same_tool}
-        for name, step in found.frames.items():
-            if not held[name]:
+            corrected_rms = geometry_change.corrected_motion(before, after, counts)
+            result.append(finding("corrections-not-compared", names=corrected, moved=corrected_rms))
+        counted: Mapping[str, bool] = {"base": counts.same_base, "tool": counts.same_tool}
+        for name, step in change_test.frames.items():
+            if not counted[name]:
                 size = {"way": np.linalg.norm(step[:3]), "turn": np.linalg.norm(step[3:])}
-                what = {"base": "the base in the instrument's frame", "tool": "the tool on the flange"}[name]
-                result.append(finding("placed-again", what=what, option=f"--same-{name}", **size))
+                frame = {"base": "the base in the instrument's frame", "tool": "the tool on the flange"}[name]
+                result.append(finding("placed-again", what=frame, option=f"--same-{name}", **size))
         return result
 
     def blocks(self) -> list[Block]:
         joints = self.before.chain.joints
         motions = [
             Column("target's motion at", "{0.where}", number=False),
-            Column("poses", lambda one: f"{len(one.q)}"),
-            Column("median mm", lambda one: f"{1e3 * np.median(one.position):.3g}"),
-            Column("rms mm", lambda one: f"{1e3 * one.rms:.3g}"),
-            Column("σ of that mm", lambda one: f"{1e3 * one.expected:.2g}"),
-            Column("worst mm", lambda one: f"{1e3 * one.position.max():.3g}"),
-            Column("median mrad", lambda one: f"{1e3 * np.median(one.orientation):.3g}"),
-            Column("worst mrad", lambda one: f"{1e3 * one.orientation.max():.3g}"),
-            Column("worst at", lambda one: _joints(one, joints), number=False),
+            Column("poses", lambda motion: f"{len(motion.q)}"),
+            Column("median mm", lambda motion: f"{1e3 * np.median(motion.position):.3g}"),
+            Column("rms mm", lambda motion: f"{1e3 * motion.rms:.3g}"),
+            Column("σ of that mm", lambda motion: f"{1e3 * motion.expected:.2g}"),
+            Column("worst mm", lambda motion: f"{1e3 * motion.position.max():.3g}"),
+            Column("median mrad", lambda motion: f"{1e3 * np.median(motion.orientation):.3g}"),
+            Column("worst mrad", lambda motion: f"{1e3 * motion.orientation.max():.3g}"),
+            Column("worst at", lambda motion: _joints(motion, joints), number=False),
         ]
-        by_joint = [Column("joint", "{0[0]}", number=False), Column("rms mm", lambda one: f"{1e3 * one[1]:.3g}")]
+        by_joint = [Column("joint", "{0[0]}", number=False), Column("rms mm", lambda motion: f"{1e3 * motion[1]:.3g}")]
         return [
             Text("Motion", self._motion()),
             table("Motion of the tool", motions, self.found.motions),
@@ -106,15 +109,17 @@ class ToolPart(ChangePart):
 
     def _motion(self) -> list[str]:
         """Return sentences on the target's motion: how far, where most, and by which joint."""
-        found = self.found
-        joint, most = max(found.by_joint, key=lambda one: one[1])
+        change_test = self.found
+        joint, joint_rms = max(change_test.by_joint, key=lambda motion: motion[1])
         lines = [
-            f"{one.where} ({len(one.q)}): the tool moved by {1e3 * np.median(one.position):.3g} mm (median), "
-            f"{1e3 * one.position.max():.3g} mm (worst, at {_joints(one, self.before.chain.joints)}), "
-            f"and turned by {1e3 * np.median(one.orientation):.3g} and {1e3 * one.orientation.max():.3g} mrad"
-            for one in found.motions
+            f"{motion.where} ({len(motion.q)}): the tool moved by {1e3 * np.median(motion.position):.3g} mm (median), "
+            f"{1e3 * motion.position.max():.3g} mm (worst, at {_joints(motion, self.before.chain.joints)}), "
+            f"and turned by {1e3 * np.median(motion.orientation):.3g} and {1e3 * motion.orientation.max():.3g} mrad"
+            for motion in change_test.motions
         ]
-        return [*lines, f"most of it comes from {joint}: {1e3 * most:.3g} mm rms"] if found.changed else lines
+        return (
+            [*lines, f"most of it comes from {joint}: {1e3 * joint_rms:.3g} mm rms"] if change_test.changed else lines
+        )
 
     def charts(self) -> dict[str, Chart]:
         from calib.procedure.report.geometry_figures import error_map, parameter_changes
@@ -122,9 +127,11 @@ class ToolPart(ChangePart):
         motion = self.found.motions[0]
         arm = {element.name: k for k, element in enumerate(self.before.chain.elements)}
         rows = [
-            FittedParameter(one.name, one.unit, one.before, one.after, one.sigma, None, "arm")
-            for one in sorted(self.found.parameters, key=lambda one: arm[one.name])
-            if one.sigma
+            FittedParameter(
+                parameter.name, parameter.unit, parameter.before, parameter.after, parameter.sigma, None, "arm"
+            )
+            for parameter in sorted(self.found.parameters, key=lambda parameter: arm[parameter.name])
+            if parameter.sigma
         ]
         result = {"map": error_map(motion.points, motion.position, words="the tool moved by up to {}")}
         if rows:
@@ -133,17 +140,17 @@ class ToolPart(ChangePart):
 
     def numbers(self) -> dict[str, Any]:
         motions = {
-            one.where: {
-                "poses": len(one.q),
-                "rms": one.rms,
-                "expected": one.expected,
-                "median": float(np.median(one.position)),
-                "worst": float(one.position.max()),
-                "worst_at": one.q[one.position.argmax()],
-                "turn_median": float(np.median(one.orientation)),
-                "turn_worst": float(one.orientation.max()),
+            motion.where: {
+                "poses": len(motion.q),
+                "rms": motion.rms,
+                "expected": motion.expected,
+                "median": float(np.median(motion.position)),
+                "worst": float(motion.position.max()),
+                "worst_at": motion.q[motion.position.argmax()],
+                "turn_median": float(np.median(motion.orientation)),
+                "turn_worst": float(motion.orientation.max()),
             }
-            for one in self.found.motions
+            for motion in self.found.motions
         }
         return {"motions": motions, "by_joint": dict(self.found.by_joint)}
 
@@ -151,5 +158,5 @@ class ToolPart(ChangePart):
 def _joints(motion: ToolMotion, joints: Any) -> str:
     """Return the joint values of the worst pose."""
     worst = motion.q[motion.position.argmax()]
-    shown = (JOINT[one.kind] for one in joints)
-    return ", ".join(f"{factor * value:.0f} {unit}" for (factor, unit), value in zip(shown, worst))
+    factors_and_units = (JOINT[joint.kind] for joint in joints)
+    return ", ".join(f"{factor * value:.0f} {unit}" for (factor, unit), value in zip(factors_and_units, worst))

@@ -88,48 +88,48 @@ class DynamicsChange(ChangeTest):
 def compare(before: Identified, after: Identified, motions: dict[str, MotionStates]) -> DynamicsChange:
     """Return what changed between two models of one robot, the torque over motions."""
     keys = list(dict.fromkeys([*before.keys, *after.keys]))
-    values, covariances = zip(*(_spread(each, keys) for each in (before, after)))
+    values, covariances = zip(*(_spread(model, keys) for model in (before, after)))
     sigma = np.sqrt(np.diag(np.add(*covariances)))
     unit = np.where(sigma > 0.0, sigma, 1.0)
-    spans = [np.eye(len(keys))[:, np.diag(each) > 0.0] for each in covariances]
+    spans = [np.eye(len(keys))[:, np.diag(model) > 0.0] for model in covariances]
     standard = _standard(before, after, keys)
     columns = np.column_stack([column for _, _, column in standard]) / unit[:, None]
-    scaled = [each / np.outer(unit, unit) for each in covariances]
-    found, _ = tested((values[1] - values[0]) / unit, scaled, spans, columns)
+    scaled = [model / np.outer(unit, unit) for model in covariances]
+    test, _ = tested((values[1] - values[0]) / unit, scaled, spans, columns)
     changes = []
     for k in _apart(columns, len(keys)):
-        own = (values[0][k], values[1][k], sigma[k]) if k < len(keys) else (np.nan, np.nan, 0.0)
+        values_and_sigma = (values[0][k], values[1][k], sigma[k]) if k < len(keys) else (np.nan, np.nan, 0.0)
         name, kind, _ = standard[k]
-        changes.append(ParameterChange(name, kind, *own, *found.alone(k)))
-    changes.sort(key=lambda each: -each.explained)
+        changes.append(ParameterChange(name, kind, *values_and_sigma, *test.alone(k)))
+    changes.sort(key=lambda model: -model.explained)
     names = [standard_name(name, after.model.names) for name, _, _ in standard]
     torques = tuple(_torque(name, states, before, after) for name, states in motions.items())
-    parts = _parts(found, after.model, names, next(iter(motions.values())))
-    return DynamicsChange(found.chi2, len(found.difference), tuple(changes), found.extra, parts, torques)
+    parts = _parts(test, after.model, names, next(iter(motions.values())))
+    return DynamicsChange(test.chi2, len(test.difference), tuple(changes), test.extra, parts, torques)
 
 
 def _spread(model: Identified, keys: list[Hashable]) -> tuple[np.ndarray, np.ndarray]:
     """Return the values (s,) and the covariance (s, s) of a model's parameters among all that either has."""
-    place = [keys.index(key) for key in model.keys]
+    indices = [keys.index(key) for key in model.keys]
     values, covariance = np.zeros(len(keys)), np.zeros((len(keys),) * 2)
-    values[place], covariance[np.ix_(place, place)] = model.values, model.covariance
+    values[indices], covariance[np.ix_(indices, indices)] = model.values, model.covariance
     return values, covariance
 
 
 def _standard(before: Identified, after: Identified, keys: list[Hashable]) -> list[tuple[str, str, np.ndarray]]:
     """Return name, unit, and what it does to the s combinations (s,), of each of these and of regrouped parameters."""
-    known = {
-        key: (name, unit) for each in (before, after) for key, name, unit in zip(each.keys, each.names, each.units)
+    name_and_unit = {
+        key: (name, unit) for model in (before, after) for key, name, unit in zip(model.keys, model.names, model.units)
     }
-    found = [(*known[key], column) for key, column in zip(keys, np.eye(len(keys)))]
-    own = {key if isinstance(key, str) else key[0] for key in keys}  # type: ignore[index]
+    rows = [(*name_and_unit[key], column) for key, column in zip(keys, np.eye(len(keys)))]
+    names_present = {key if isinstance(key, str) else key[0] for key in keys}  # type: ignore[index]
     units = dict(zip(after.model.names, after.model.units))
-    for name in dict.fromkeys(name for row in after.regrouping.values() for name in row if name not in own):
+    for name in dict.fromkeys(name for row in after.regrouping.values() for name in row if name not in names_present):
         column = np.zeros(len(keys))
         for key, row in after.regrouping.items():
             column[keys.index(key)] = row.get(name, 0.0)
-        found.append((name, units[name], column))
-    return found
+        rows.append((name, units[name], column))
+    return rows
 
 
 def _apart(columns: np.ndarray, first: int) -> list[int]:
@@ -143,17 +143,17 @@ def _apart(columns: np.ndarray, first: int) -> list[int]:
     return chosen
 
 
-def _parts(found: Tested, arm: IdentificationModel, names: list[str], states: MotionStates) -> tuple[PartChange, ...]:
+def _parts(test: Tested, arm: IdentificationModel, names: list[str], states: MotionStates) -> tuple[PartChange, ...]:
     """Return each joint's friction and each link's body with what it explains."""
-    place, result = {name: k for k, name in enumerate(arm.names)}, []
-    for part, own in {**_frictions(arm), **_links(arm)}.items():
-        chosen = np.array([k for k, name in enumerate(names) if name in own], dtype=int)
+    column_of, result = {name: k for k, name in enumerate(arm.names)}, []
+    for part, members in {**_frictions(arm), **_links(arm)}.items():
+        chosen = np.array([k for k, name in enumerate(names) if name in members], dtype=int)
         if len(chosen):
-            steps, explained, count = found.together(chosen)
+            steps, explained, count = test.together(chosen)
             change = np.zeros(arm.p)
-            change[[place[names[k]] for k in chosen]] = steps[chosen]
+            change[[column_of[names[k]] for k in chosen]] = steps[chosen]
             result.append(PartChange(part, explained, count, _rms(arm.torque(change, *states.motion, ()))))
-    return tuple(sorted(result, key=lambda each: -each.explained))
+    return tuple(sorted(result, key=lambda part_change: -part_change.explained))
 
 
 def _frictions(model: IdentificationModel) -> dict[str, set[str]]:
@@ -167,16 +167,23 @@ def _links(model: IdentificationModel) -> dict[str, set[str]]:
 
 
 def _torque(name: str, states: MotionStates, before: Identified, after: Identified) -> TorqueChange:
-    one, two = (each.model.torque(each.dynamics.values, *states.motion, ()) for each in (before, after))
+    torque_before, torque_after = (
+        model.model.torque(model.dynamics.values, *states.motion, ()) for model in (before, after)
+    )
     variances = [
-        parameter_variances(each.dynamics, each.columns, each.covariance, *states.motion, ())
-        for each in (before, after)
+        parameter_variances(model.dynamics, model.columns, model.covariance, *states.motion, ())
+        for model in (before, after)
     ]
     unexplained, measured = None, states.measured
     if measured is not None:
-        left = [100.0 * float(np.linalg.norm(measured - each) / np.linalg.norm(measured)) for each in (one, two)]
-        unexplained = left[0], left[1]
-    return TorqueChange(name, states.t, two - one, np.sqrt(np.add(*variances)), two, unexplained)
+        residual_percent = [
+            100.0 * float(np.linalg.norm(measured - model) / np.linalg.norm(measured))
+            for model in (torque_before, torque_after)
+        ]
+        unexplained = residual_percent[0], residual_percent[1]
+    return TorqueChange(
+        name, states.t, torque_after - torque_before, np.sqrt(np.add(*variances)), torque_after, unexplained
+    )
 
 
 def _rms(values: np.ndarray) -> float:

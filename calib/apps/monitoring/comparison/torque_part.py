@@ -30,8 +30,10 @@ class TorquePart(ChangePart):
     @cached_property
     def judged(self) -> TorqueChange:
         """The motion that `today` rests on: of those measured for the later model the worst."""
-        mine = [one for one in self.found.torques if one.unexplained and one.where in self.after.motions]
-        return max(mine or self.found.torques, key=lambda one: (one.unexplained or (0.0,))[0])
+        measured_changes = [
+            change for change in self.found.torques if change.unexplained and change.where in self.after.motions
+        ]
+        return max(measured_changes or self.found.torques, key=lambda change: (change.unexplained or (0.0,))[0])
 
     @property
     def today(self) -> float:
@@ -39,10 +41,9 @@ class TorquePart(ChangePart):
 
     @property
     def words(self) -> str:
-        one = self.judged
-        return (
-            f"the torque changed by {one.rms:.3g} {self.unit} rms (σ lets expect {_rms(one.expected):.2g} {self.unit})"
-        )
+        change = self.judged
+        expected = f"σ lets expect {_rms(change.expected):.2g} {self.unit}"
+        return f"the torque changed by {change.rms:.3g} {self.unit} rms ({expected})"
 
     @property
     def unit(self) -> str:
@@ -56,32 +57,38 @@ class TorquePart(ChangePart):
         return f"{value:.3g} %"
 
     def own_findings(self) -> list[Finding]:
-        found, one, result = self.found, self.judged, list[Finding]()
+        change_test, change, result = self.found, self.judged, list[Finding]()
         if self.tolerance:
             times = self.today / self.tolerance
             result.append(finding("model-outgrown", times=times, today=self.today, after=self.after.name))
-        left = 1e-2 * min(one.unexplained) * _rms(one.torque) if one.unexplained else 0.0
-        beyond = one.rms / max(left, 1e-12)
+        residual_torque = 1e-2 * min(change.unexplained) * _rms(change.torque) if change.unexplained else 0.0
+        ratio = change.rms / max(residual_torque, 1e-12)
         result.append(
             finding(
                 "dynamics-changed",
-                sigmas=found.sigmas,
-                beyond=0.0 if self.tolerance else beyond,
+                sigmas=change_test.sigmas,
+                beyond=0.0 if self.tolerance else ratio,
                 unit=self.unit,
-                probability=found.probability,
-                left=left if beyond <= 1.0 else None,
+                probability=change_test.probability,
+                left=residual_torque if ratio <= 1.0 else None,
             )
         )
-        if found.changed and not found.alone and found.part:
-            part = found.part
+        if change_test.changed and not change_test.alone and change_test.part:
+            part = change_test.part
             result.append(
-                finding("part-changed", name=part.name, share=part.explained / found.chi2, rms=part.rms, unit=self.unit)
+                finding(
+                    "part-changed",
+                    name=part.name,
+                    share=part.explained / change_test.chi2,
+                    rms=part.rms,
+                    unit=self.unit,
+                )
             )
         return result
 
     def blocks(self) -> list[Block]:
         unit, names = self.unit, self.after.rows
-        rows = [(one, j) for one in self.found.torques for j in range(len(names))]
+        rows = [(change, j) for change in self.found.torques for j in range(len(names))]
         torques = [
             Column("motion", lambda row: row[0].where, number=False),
             Column("torque of", lambda row: names[row[1]], number=False),
@@ -97,28 +104,28 @@ class TorquePart(ChangePart):
             Column(f"torque if it changed alone, rms {unit}", "{0.rms:.3g}"),
         ]
         return [
-            Text("Torque", [self._words(one) for one in self.found.torques]),
+            Text("Torque", [self._words(change) for change in self.found.torques]),
             table("Change of the torque", torques, rows),
             table("What one joint's friction or one link's body explains", parts, self.found.parts, most=6),
         ]
 
-    def _words(self, one: TorqueChange) -> str:
-        words = f"{one.where}: the torque changed by {one.rms:.3g} {self.unit} rms"
-        if one.unexplained:
-            earlier, later = one.unexplained
-            words += f"; the earlier model leaves {earlier:.3g} % of it unexplained, the later one {later:.3g} %"
-        return words
+    def _words(self, change: TorqueChange) -> str:
+        text = f"{change.where}: the torque changed by {change.rms:.3g} {self.unit} rms"
+        if change.unexplained:
+            earlier, later = change.unexplained
+            text += f"; the earlier model leaves {earlier:.3g} % of it unexplained, the later one {later:.3g} %"
+        return text
 
     def charts(self) -> dict[str, Chart]:
         from calib.procedure.report.charts import Chart, Panel, line
         from calib.procedure.report.style import AFTER, QUIET
 
-        one, panels = self.judged, []
+        change, panels = self.judged, []
         for j, name in enumerate(self.after.rows):
-            band = [line(one.t, sign * 2.0 * one.expected[:, j], "--", QUIET, 0.6) for sign in (-1.0, 1.0)]
-            lines = [line(one.t, one.change[:, j], "-", AFTER, 0.7), *band]
-            panels.append(Panel(lines, f"{name} [{self.unit}]", "time [s]", xlim=(one.t[0], one.t[-1])))
-        return {"torque": Chart(panels, 0.7 + 0.95 * -(-len(panels) // 2), 2, title=one.where, shared="x")}
+            band = [line(change.t, sign * 2.0 * change.expected[:, j], "--", QUIET, 0.6) for sign in (-1.0, 1.0)]
+            lines = [line(change.t, change.change[:, j], "-", AFTER, 0.7), *band]
+            panels.append(Panel(lines, f"{name} [{self.unit}]", "time [s]", xlim=(change.t[0], change.t[-1])))
+        return {"torque": Chart(panels, 0.7 + 0.95 * -(-len(panels) // 2), 2, title=change.where, shared="x")}
 
     def numbers(self) -> dict[str, Any]:
         torques = {
