@@ -63,18 +63,18 @@ class Controller:
     def matrix(self, n: int) -> np.ndarray:
         """Return the matrix (n, n) from a description's joints to those that the controller shows."""
         coupling = np.eye(n)
-        for axis, other, way in self.coupled:
-            if max(axis, other) <= n:
-                coupling[axis - 1, other - 1] = way
+        for axis, partner, sign in self.coupled:
+            if max(axis, partner) <= n:
+                coupling[axis - 1, partner - 1] = sign
         return np.array(self.signs or [1] * n)[:, None] * coupling
 
     def shown(self, q: np.ndarray) -> np.ndarray:
         """Return the joints (…, n) [rad] of a description as the controller shows them, in its unit."""
         return q @ self.matrix(q.shape[-1]).T / ANGLES[self.unit]
 
-    def described(self, shown: np.ndarray) -> np.ndarray:
+    def described(self, controller_values: np.ndarray) -> np.ndarray:
         """Return the joints (…, n) of a description from those that the controller shows, in the same unit."""
-        return shown @ np.linalg.inv(self.matrix(shown.shape[-1])).T
+        return controller_values @ np.linalg.inv(self.matrix(controller_values.shape[-1])).T
 
     @property
     def metres(self) -> float:
@@ -86,16 +86,13 @@ class Controller:
 def controllers() -> dict[str, Controller]:
     """Return all controllers by name."""
     table = tomllib.loads(shipped_text("calib.controllers", "controllers.toml"))
-    return {
-        name: parse(
-            Controller, (table[entry["like"]] if "like" in entry else {}) | _own(entry), f"controllers.toml: {name}"
-        )
-        for name, entry in table.items()
-    }
-
-
-def _own(entry: Mapping[str, object]) -> dict[str, object]:
-    return {key: value for key, value in entry.items() if key != "like"}
+    result = {}
+    for name, entry in table.items():
+        # an entry that is like another one takes over all keys that it does not have
+        inherited = table[entry["like"]] if "like" in entry else {}
+        keys = {key: value for key, value in entry.items() if key != "like"}
+        result[name] = parse(Controller, inherited | keys, f"controllers.toml: {name}")
+    return result
 
 
 def controller_named(name: str) -> Controller:
@@ -109,11 +106,11 @@ def controller_named(name: str) -> Controller:
 
 def check_controller(name: str, axes: int, pulses: Sequence[float] = ()) -> None:
     """Refuse an unknown name, a controller that takes no arm of so many axes, and one whose pulses are not given."""
-    found = controller_named(name)
-    allowed = " or ".join(map(str, found.axes))
-    require(not allowed or axes in found.axes, f"{axes} joints; {found.title} takes {allowed}", UsageError)
-    words = f"{found.title} needs the pulses per degree of each of {axes} axes: calib program --pulse"
-    require(not found.pulses or (len(pulses) == axes and all(pulses)), words, UsageError)
+    controller = controller_named(name)
+    allowed = " or ".join(map(str, controller.axes))
+    require(not allowed or axes in controller.axes, f"{axes} joints; {controller.title} takes {allowed}", UsageError)
+    message = f"{controller.title} needs the pulses per degree of each of {axes} axes: calib program --pulse"
+    require(not controller.pulses or (len(pulses) == axes and all(pulses)), message, UsageError)
 
 
 def controller_of(path: Path, name: str = "") -> Controller:
@@ -124,18 +121,18 @@ def controller_of(path: Path, name: str = "") -> Controller:
     """
     if name:
         return controller_named(name)
-    for each in controllers().values():
-        if path.suffix.lower() in each.suffixes:
-            return each
-    known = ", ".join(suffix for each in controllers().values() for suffix in each.suffixes)
-    raise UsageError(f"{path}: no program of a known controller: expected a suffix of {known}")
+    for controller in controllers().values():
+        if path.suffix.lower() in controller.suffixes:
+            return controller
+    suffixes = ", ".join(suffix for controller in controllers().values() for suffix in controller.suffixes)
+    raise UsageError(f"{path}: no program of a known controller: expected a suffix of {suffixes}")
 
 
-def as_described(name: str, shown: np.ndarray) -> np.ndarray:
+def as_described(name: str, controller_values: np.ndarray) -> np.ndarray:
     """Return a description's joints, or their speeds (…, n), from those that a controller shows, in the same unit."""
-    return controller_named(name).described(shown)
+    return controller_named(name).described(controller_values)
 
 
-def motors_as_described(name: str, shown: np.ndarray) -> np.ndarray:
+def motors_as_described(name: str, controller_values: np.ndarray) -> np.ndarray:
     """Return motors' torques or currents (…, n) with the description's signs; coupled axes do not change a motor."""
-    return shown * np.array(controller_named(name).signs or 1.0)
+    return controller_values * np.array(controller_named(name).signs or 1.0)

@@ -46,7 +46,7 @@ def demo(
             demonstration.simulate_next(bring, say)
             return
         require(not (hard and robot), f"--robot {robot}: --hard names a robot, too; leave one out", UsageError)
-        found = demonstration.run(
+        result = demonstration.run(
             out,
             robot or (demonstration.HARD if hard else demonstration.ROBOT),
             seed,
@@ -58,8 +58,8 @@ def demo(
             instrument=instrument,
             verbose=verbose,
         )
-    if found.asks:
-        say("", *found.asks)
+    if result.asks:
+        say("", *result.asks)
         return
-    say(demonstration.row("time", found.seconds, "s"), *reasons(found.session), "", *paths(found.session))
-    exit_failed(found.verdict)
+    say(demonstration.row("time", result.seconds, "s"), *reasons(result.session), "", *paths(result.session))
+    exit_failed(result.verdict)

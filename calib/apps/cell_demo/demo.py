@@ -87,28 +87,28 @@ def run(
     started = time.perf_counter()
     cell = virtual_cell(robot, seed)
     if dynamics and cell.nominal.inertias is None:
-        known = ", ".join(name for name in library.names() if load(name).inertias is not None)
-        say(f"geometry only: masses are known of {known}")
+        supported = ", ".join(name for name in library.names() if load(name).inertias is not None)
+        say(f"geometry only: masses are known of {supported}")
         dynamics = False
     motion = MOTION | {"torques": "both" if sensed(robot) else "motor"} if dynamics else {}
     begin = partial(
         new_session, folder, robot, instrument, poses=FIT, validation=VALIDATION, seed=seed, dynamics=dynamics, **motion
     )
     if instrument == "camera":
-        seen = seen_by_camera(cell)
-        cell = seen.cell
-        with limits_of(seen) as limits:
+        camera_cell = seen_by_camera(cell)
+        cell = camera_cell.cell
+        with limits_of(camera_cell) as limits:
             begin(limits=limits)
     else:
         begin()
     session = open_session(folder, plots)
-    told = Telling(session, say, progress, verbose)
-    told.said(f"the cell: {cell.note}")
+    teller = Telling(session, say, progress, verbose)
+    teller.said(f"the cell: {cell.note}")
     with locked(session):
-        waiting = steps.run_next(session, say if guided else told.said, told.progress, "calib demo")
+        waiting = steps.run_next(session, say if guided else teller.said, teller.progress, "calib demo")
         while waiting is not None and waiting.kind == steps.WAITING and not guided:
-            _bring_for(session, waiting.step.name, told.said, told.progress)
-            waiting = steps.run_next(session, told.said, told.progress, "calib demo")
+            _bring_for(session, waiting.step.name, teller.said, teller.progress)
+            waiting = steps.run_next(session, teller.said, teller.progress, "calib demo")
     if waiting is not None:
         require(guided, f"the demonstration stopped at {waiting.step.name}: {waiting.words}", SessionError)
         return DemoResult(session, "", time.perf_counter() - started, _stopped(session, waiting))
@@ -133,8 +133,8 @@ def _stopped(session: Session, waiting: steps.State) -> tuple[str, ...]:
 
 def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, float]:
     """Return the tool errors [mm] of nominal and calibrated arm against the truth; say and write all errors."""
-    found = installation.read(session.fit.path)
-    before, after, bare = position_errors(cell, found, calibrated.read(session.fit.path).chain)
+    cell_fit = installation.read(session.fit.path)
+    before, after, bare = position_errors(cell, cell_fit, calibrated.read(session.fit.path).chain)
     lines = [
         row("truth", before, "mm true error of the nominal robot"),
         row("truth", bare, "mm true error of robot.urdf"),
@@ -190,17 +190,17 @@ def _cells_of(session: Session) -> tuple[Cell, CameraCell | None]:
     cell = virtual_cell(session.settings.robot.given, session.settings.seed)
     if session.settings.instrument.measures != IMAGES:
         return cell, None
-    seen = seen_by_camera(cell)
-    return seen.cell, seen
+    camera_cell = seen_by_camera(cell)
+    return camera_cell.cell, camera_cell
 
 
-def _bring_for(session: Session, step: str, say: Say, progress: Say = lambda words: None) -> None:
+def _bring_for(session: Session, step: str, say: Say, progress: Say = lambda text: None) -> None:
     """Simulate the files that a step waits for."""
-    seed, (cell, seen) = session.settings.seed, _cells_of(session)
-    if step in ("measure", "validate") and seen is not None:
-        _mark(session, seen.cell.note)
+    seed, (cell, camera_cell) = session.settings.seed, _cells_of(session)
+    if step in ("measure", "validate") and camera_cell is not None:
+        _mark(session, camera_cell.cell.note)
         for number, name, q in planned_poses(session.folder, cell.nominal):
-            take_pictures(seen, q, session.path(f"3-measured/{name}"), seed=seed + number, say=progress)
+            take_pictures(camera_cell, q, session.path(f"3-measured/{name}"), seed=seed + number, say=progress)
         say("    (the simulated camera takes an image at every pose of both lists)")
     elif step in ("measure", "validate"):
         simulate_measurements(session, cell, seed)
@@ -221,25 +221,27 @@ def simulate_measurements(session: Session, cell: Cell, seed: int) -> None:
     """Simulate measurements of the planned poses, with three repeated at the end and drift of the CMM."""
     _mark(session, cell.note)
     for number, name, q in planned_poses(session.folder, cell.nominal):
-        seen = wandering(measure(cell, q, np.random.default_rng([seed, number]), warm=number * FIT), DRIFT, seed)
-        write_measured(seen, session.path(f"3-measured/{name}.csv"))
+        measured = wandering(measure(cell, q, np.random.default_rng([seed, number]), warm=number * FIT), DRIFT, seed)
+        write_measured(measured, session.path(f"3-measured/{name}.csv"))
         if name == "measured":
-            again = measure(cell, q[:AGAIN], np.random.default_rng([seed, 7]), warm=len(q))
-            write_measured(wandering(again, DRIFT, seed, begin=1.0), session.path("3-measured/drift.csv"))
+            repeated = measure(cell, q[:AGAIN], np.random.default_rng([seed, 7]), warm=len(q))
+            write_measured(wandering(repeated, DRIFT, seed, begin=1.0), session.path("3-measured/drift.csv"))
 
 
 def _mark(session: Session, note: str) -> None:
     """Mark a session's files as simulated, for its certificate."""
     path, line = session.path(MARK), SIMULATED.format(note=note)
-    known = read_lines(path)
-    files.write(path, "\n".join([*known, *([line] if line not in known else [])]) + "\n")
+    marks = list(read_lines(path))
+    if line not in marks:
+        marks.append(line)
+    files.write(path, "\n".join(marks) + "\n")
 
 
 def simulate_recordings(session: Session, arm: MovingArm, seed: int) -> None:
     """Simulate recordings of the designed motions."""
     _mark(session, arm.note)
     motions = dynamics_steps.designed_motions(session)
-    rounds = ((name, int(name.removeprefix(ROUND)) + 10, 720.0) for name in motions if name.startswith(ROUND))
+    rounds = [(name, int(name.removeprefix(ROUND)) + 10, 720.0) for name in motions if name.startswith(ROUND)]
     for name, number, running in (*LOGS, *rounds):
         if name not in motions:
             continue

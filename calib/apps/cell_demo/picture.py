@@ -22,7 +22,9 @@ HEIGHT = 2.5  # [in]
 
 def draw(session: Session) -> None:
     """Draw the picture of a finished session into its folder."""
-    panels = [_cell(session), _errors(session), *([_torque(session)] if session.dynamic else [])]
+    panels = [_cell(session), _errors(session)]
+    if session.dynamic:
+        panels.append(_torque(session))
     files.write(session.path(PICTURE), picture(Chart(panels, HEIGHT, len(panels)), "").image)
 
 
@@ -38,8 +40,8 @@ def _cell(session: Session) -> Panel:
     scale, arm = measured.arrow_scale(chain), _seen_from(scene.skeleton(chain, measured.q))
     x, y = arm[int(np.argmax(arm[:, -1, 1] + np.abs(arm[:, -1, 0])))].T
     layers = [line(x, y, colour=QUIET, width=5.0), line(x, y, "o", colour=INK, size=4.0)]
-    for found, colour in ((measured.nominal, BEFORE), (measured.calibrated, AFTER)):
-        ends = measured.seen + scale * (found - measured.seen)
+    for points, colour in ((measured.nominal, BEFORE), (measured.calibrated, AFTER)):
+        ends = measured.seen + scale * (points - measured.seen)
         strokes = np.stack([_seen_from(measured.seen), _seen_from(ends), np.full((len(ends), 2), np.nan)], axis=1)
         layers.append(line(strokes[..., 0].ravel(), strokes[..., 1].ravel(), colour=colour, width=1.4))
     return Panel(layers, f"{len(measured.q)} poses, errors × {scale:g}", "[m]", "[m]", equal=True, ticks=5)
@@ -47,17 +49,20 @@ def _cell(session: Session) -> Panel:
 
 def _errors(session: Session) -> Panel:
     """Return the histogram of the errors of nominal robot and robot.urdf on unseen poses."""
-    (rows,) = (one for one in fit_report.read(session.validation.report).sets if one.unseen)
-    one, two = (np.array(sizes["position"]) for sizes in (rows.nominal, rows.urdf_alone or rows.calibrated))
+    (rows,) = (rows_set for rows_set in fit_report.read(session.validation.report).sets if rows_set.unseen)
+    nominal = np.array(rows.nominal["position"])
+    urdf = np.array((rows.urdf_alone or rows.calibrated)["position"])
     before, after = position_errors(session) or (np.nan, np.nan)
-    return replace(error_histogram(one, two).panels[0], title=f"unseen poses: {before:.2f} → {after:.2f} mm")
+    return replace(error_histogram(nominal, urdf).panels[0], title=f"unseen poses: {before:.2f} → {after:.2f} mm")
 
 
 def _torque(session: Session) -> Panel:
     """Return the largest joint's torque on the unseen motion: measured, predicted, residual."""
     unseen = session.identification.unseen.read()
     curves = unseen.curves[0]
-    t, measured, predicted = (np.array(each, dtype=float).T for each in (curves.t, curves.measured, curves.predicted))
+    t = np.array(curves.t, dtype=float).T
+    measured = np.array(curves.measured, dtype=float).T
+    predicted = np.array(curves.predicted, dtype=float).T
     j = int(np.argmax(np.linalg.norm(measured, axis=0)))
     low, high = measured[:, j].min(), measured[:, j].max()
     above = high + 0.1 * (high - low)
@@ -70,8 +75,8 @@ def _torque(session: Session) -> Panel:
         layers.append(line(t, values[:, j], colour=colour, width=width))
         layers.append(text(name, t[0] + at * (t[-1] - t[0]), above, (0, 0), colour))
     title, y = f"{torque_error(session):.1f} % of torque unexplained", f"{unseen.rows[j]} [{unseen.units[j]}]"
-    known = prediction(session.path(session.export))
-    if known is not None:
+    outcome = prediction(session.path(session.export))
+    if outcome is not None:
         # of the exported robot, in brackets of the identified model
-        title = f"{known.exported:.1f} % ({torque_error(session):.1f} %) unexplained"
+        title = f"{outcome.exported:.1f} % ({torque_error(session):.1f} %) unexplained"
     return Panel(layers, title, "unseen motion [s]", y, xlim=(t[0], t[-1]), ylim=(1.1 * low, 1.1 * above))

@@ -36,16 +36,16 @@ SECONDS = {  # of processor time, about, by which the share done is told
 }
 
 
-def row(name: str, number: float, words: str) -> str:
+def row(name: str, number: float, meaning: str) -> str:
     """Return a line of the summary: whose number, the number with three digits, what it is."""
-    return f"{name:<11} {number:>6.3g} {words}"
+    return f"{name:<11} {number:>6.3g} {meaning}"
 
 
 def _exported(session: Session) -> tuple[float, str]:
-    known, out = prediction(session.path(session.export)), session.path(session.export)
-    if known is None:
+    outcome, out = prediction(session.path(session.export)), session.path(session.export)
+    if outcome is None:
         return len(list(out.iterdir())), "files for other programs"
-    return known.exported, "% unexplained by the exported robot"
+    return outcome.exported, "% unexplained by the exported robot"
 
 
 def _minutes(session: Session) -> float:
@@ -94,46 +94,46 @@ class Telling:
 
     def said(self, *lines: str) -> None:
         """Tell what the session says: of a step that is done its line, once, and if verbose all its words."""
-        for words in lines:
-            step = words.partition(":")[0].rpartition(" ")[2]
-            if words[:1].isdigit() and step in NUMBERS:
-                told = row(step, *NUMBERS[step](self.session))
-                self.say(*({told} - self._told))
-                self._told.add(told)
+        for line in lines:
+            step = line.partition(":")[0].rpartition(" ")[2]
+            if line[:1].isdigit() and step in NUMBERS:
+                summary_line = row(step, *NUMBERS[step](self.session))
+                self.say(*({summary_line} - self._told))
+                self._told.add(summary_line)
             if self.verbose:
-                self.say(f"    - {words.strip()}")
+                self.say(f"    - {line.strip()}")
 
-    def progress(self, words: str) -> None:
+    def progress(self, text: str) -> None:
         """Show the stage, the share done and the time left; `words`: a stage's purpose, or what it does."""
-        now, steps = time.perf_counter(), steps_of(self.session)
+        moment, steps = time.perf_counter(), steps_of(self.session)
         purposes = {step.purpose: step.name for step in steps}
-        if words in purposes:
-            self._step, self._entered = purposes[words], now
+        if text in purposes:
+            self._step, self._entered = purposes[text], moment
         names = list(purposes.values())
         before = sum(SECONDS.get(name, 0.0) for name in names[: names.index(self._step)])
         pace = (self._entered - self.began) / before if before else 1.0
-        total, own = sum(SECONDS.get(name, 0.0) for name in names), SECONDS.get(self._step, 0.0)
-        done = before + min((now - self._entered) / pace, 0.95 * own)
+        total, step_seconds = sum(SECONDS.get(name, 0.0) for name in names), SECONDS.get(self._step, 0.0)
+        finished = before + min((moment - self._entered) / pace, 0.95 * step_seconds)
         stage = steps[names.index(self._step)].purpose
-        words = f"{done / total:.0%} done, {(total - done) * pace:.0f} s left: {stage}"
-        self.show(words[: get_terminal_size().columns - 3])  # the spinner and the cursor need the rest
+        text = f"{finished / total:.0%} done, {(total - finished) * pace:.0f} s left: {stage}"
+        self.show(text[: get_terminal_size().columns - 3])  # the spinner and the cursor need the rest
 
 
 def reasons(session: Session) -> Iterator[str]:
     """Yield what a verdict other than pass means, and the commands that explain its reasons."""
-    found: list[ValidationMetrics | UnseenReport] = [session.validation.metrics()]
-    found += [session.identification.unseen.read()] if session.dynamic else []
-    for stage, one in zip(("geometry", "dynamics"), found):
-        if one.verdict != "pass":
-            yield f"{stage}: {one.verdict}; why: {command_line('explain', one.code)}"
-    if "marginal" in (one.verdict for one in found):
+    reports: list[ValidationMetrics | UnseenReport] = [session.validation.metrics()]
+    reports += [session.identification.unseen.read()] if session.dynamic else []
+    for stage, report in zip(("geometry", "dynamics"), reports):
+        if report.verdict != "pass":
+            yield f"{stage}: {report.verdict}; why: {command_line('explain', report.code)}"
+    if "marginal" in (report.verdict for report in reports):
         yield "marginal: better than nominal, but a check has a doubt;"
         yield "read the reasons before you use it."
 
 
 def paths(session: Session) -> list[str]:
     """Return the five files to look at."""
-    found = {
+    candidates = {
         "session": SETTINGS,
         "certificate": CERTIFICATE,
         "robot": f"{session.export}/{URDF}",
@@ -142,5 +142,5 @@ def paths(session: Session) -> list[str]:
         "truth": "truth.txt",
         "fit": "4-fit",
     }
-    there = [f"{name:<11} {path}" for name, file in found.items() if (path := session.path(file)).exists()]
-    return [*there[1:5], there[0]]
+    existing = [f"{name:<11} {path}" for name, file in candidates.items() if (path := session.path(file)).exists()]
+    return [*existing[1:5], existing[0]]

@@ -80,15 +80,15 @@ def compensate(
         progress: called with a few words now and then.
     """
     if isinstance(fitted, joint_commands.Fitted):
-        found = fitted
+        calibrated = fitted
     else:
-        with saved(fitted) as place:
-            found = read_fitted(place)
-    chain = found.nominal.chain
+        with saved(fitted) as path:
+            calibrated = read_fitted(path)
+    chain = calibrated.nominal.chain
     if isinstance(targets, str | Path):
         targets = read_targets(targets, joints_of(chain))
     commands = joint_commands.computed(
-        found,
+        calibrated,
         Targets.of(targets),
         frame=frame,
         tool=tool,

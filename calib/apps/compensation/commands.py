@@ -70,13 +70,13 @@ def compensate(
 
     may = numbers(tolerance, 2, "--tolerance")
     fitted = api.read_fitted(folder)
-    whole = read_program(targets, controller) if controller or is_program(targets) else None
-    if whole is not None and targets.suffix.lower() in whole.controller.saved:
-        words = (
+    program = read_program(targets, controller) if controller or is_program(targets) else None
+    if program is not None and targets.suffix.lower() in program.controller.saved:
+        message = (
             "lists registers that the controller saved, no program: compensate the program, or calib program --for csv"
         )
-        raise UsageError(f"{targets}: {words}")
-    written = [(out, (".csv",) if whole is None else (targets.suffix,))]
+        raise UsageError(f"{targets}: {message}")
+    written = [(out, (".csv",) if program is None else (targets.suffix,))]
     files.check_results(written, [targets, *results(fitted.folder)], overwrite)
     options: dict[str, Any] = {
         "frame": frame,
@@ -85,19 +85,21 @@ def compensate(
         "seed": seed,
         "start": numbers(start, fitted.nominal.chain.n, "--start") if start else None,
     }
-    if whole is None and (user_frame or frames or world or flange):
+    if program is None and (user_frame or frames or world or flange):
         raise UsageError("--user-frame, --frames, --world and --flange are for programs; a CSV stands in --frame")
     with progress() as show:
-        if whole is not None:
+        if program is not None:
             texts = {str(path): text_of(path) for path in frames or ()}
             poses = stated_frame(world, "--world"), stated_frame(flange, "--flange")
             statements = Statements(tool, user_frame, *poses, texts)
-            made = compensated(fitted, whole, **options, statements=statements, progress=show)
+            compensated_program = compensated(fitted, program, **options, statements=statements, progress=show)
             with files.results(written, overwrite=overwrite):
-                made.write(out, partial)
-            say(*made.lines(), f"{len(made.values) - len(made.lost)} of {len(made.values)} targets written to {out}")
+                compensated_program.write(out, partial)
+            count = len(compensated_program.values)
+            reached = count - len(compensated_program.lost)
+            say(*compensated_program.lines(), f"{reached} of {count} targets written to {out}")
             return
-        found = api.compensate(fitted, targets, tool=tool or "flange", **options, progress=show)
-    found.save(out, partial=partial, overwrite=overwrite)
-    say(str(found))
-    say(f"{int(found.reached.sum())} of {len(found.q)} commands written to {out}")
+        result = api.compensate(fitted, targets, tool=tool or "flange", **options, progress=show)
+    result.save(out, partial=partial, overwrite=overwrite)
+    say(str(result))
+    say(f"{int(result.reached.sum())} of {len(result.q)} commands written to {out}")

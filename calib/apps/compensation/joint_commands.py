@@ -47,6 +47,7 @@ SINGULAR = 0.02  # singular values of the Jacobian, smallest over largest
 ASTRAY = 0.01  # further from a target than this no singularity is to blame [m]
 LIMIT_TOLERANCE = 1e-9  # [rad or m]
 STARTS = 24  # random starts for each target without joints
+COMPONENTS = {6: "position and orientation", 5: "position and the direction of the tool's z axis", 3: "position only"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,19 +125,24 @@ def read(folder: str | Path) -> Fitted:
         UsageError: where it is none, or lacks something.
     """
     session, fit = Path(folder), FitFolder(Path(folder))
-    inside, proof = FitFolder(session / IN_SESSION), ValidationFolder(session / VALIDATED)
-    fit = inside if inside.robot.is_file() and not fit.robot.is_file() else fit
+    in_session, proof = FitFolder(session / IN_SESSION), ValidationFolder(session / VALIDATED)
+    fit = in_session if in_session.robot.is_file() and not fit.robot.is_file() else fit
     identified = IdentificationFolder(fit.path).model.is_file()
     if identified or not fit.robot.is_file():
         raise UsageError(refusal(session, "compensate"))
     cell, nominal = installation.read_arms(fit.path)
     free, covariance = read_covariance(fit.path, cell)
-    own = fit.metrics()
-    judged = proof.metrics() if proof.judged.is_file() else own
-    rms = [1e-3 * one.calibrated.main.rms for one in (own.fit, *judged.validation.values()) if one.calibrated.main]
-    unseen, fitted = max(rms[1:], default=None), rms[0] if rms else None
-    learnt, known = fit.learnt_joints(cell.chain.joints), None if own.findings is None else own.findings.discrepancy
-    return Fitted(fit.path, cell, nominal, free, covariance, unseen, fitted, learnt, known)
+    metrics = fit.metrics()
+    judged_metrics = proof.metrics() if proof.judged.is_file() else metrics
+    accuracies = [metrics.fit.calibrated, *(errors.calibrated for errors in judged_metrics.validation.values())]
+    rms = [1e-3 * accuracy.main.rms for accuracy in accuracies if accuracy.main]
+    unseen = max(rms[1:], default=None)
+    fitted = rms[0] if rms else None
+    fitted_joints = fit.learnt_joints(cell.chain.joints)
+    discrepancy = None
+    if metrics.findings is not None:
+        discrepancy = metrics.findings.discrepancy
+    return Fitted(fit.path, cell, nominal, free, covariance, unseen, fitted, fitted_joints, discrepancy)
 
 
 def placements(fitted: Fitted, frame: str = "base", tool: str = "flange") -> tuple[Installation, Installation]:
@@ -150,7 +156,7 @@ def placements(fitted: Fitted, frame: str = "base", tool: str = "flange") -> tup
         UsageError: for a frame or tool that the fit does not have.
     """
     cell, nominal = fitted.cell, fitted.nominal
-    where = _tool(cell, tool)
+    tool_pose = _tool(cell, tool)
     if frame == "base":
         stations, behind = (np.eye(4), np.eye(4)), np.eye(4)
     else:
@@ -160,13 +166,13 @@ def placements(fitted: Fitted, frame: str = "base", tool: str = "flange") -> tup
         behind = nominal.tools[t] @ invert(cell.tools[t])  # the nominal robot's flange need not be the calibrated one's
         if frame == "nominal":
             stations = np.eye(4), invert(stations[0]) @ stations[1]
-    tools = behind @ where, where
+    tools = behind @ tool_pose, tool_pose
     arms = replace(nominal, deflection=Deflection()), cell
-    one, two = (
+    nominal_arm, calibrated_arm = (
         replace(arm, stations=s[None], tools=t[None], station_names=(frame,), tool_names=(tool,))
         for arm, s, t in zip(arms, stations, tools)
     )
-    return one, two
+    return nominal_arm, calibrated_arm
 
 
 def _station(fitted: Fitted, frame: str) -> int:
@@ -228,31 +234,31 @@ def computed(
         UsageError: for a tolerance that is none, and a start beyond the limits.
     """
     if not (np.isfinite(tolerance).all() and min(tolerance) > 0.0):
-        given = f"{1e3 * tolerance[0]:g} mm, {1e3 * tolerance[1]:g} mrad"
-        raise UsageError(f"tolerance {given}: expected two numbers above 0")
-    say = progress or (lambda words: None)
-    one, two = placements(fitted, frame, tool)
-    count, note = _dof(targets, one.chain, dof)
-    lower, upper = one.chain.lower, one.chain.upper
-    before, after = Goal(one, count, lower, upper), Goal(two, count, lower, upper)
+        text = f"{1e3 * tolerance[0]:g} mm, {1e3 * tolerance[1]:g} mrad"
+        raise UsageError(f"tolerance {text}: expected two numbers above 0")
+    say = progress or (lambda message: None)
+    nominal_cell, calibrated_cell = placements(fitted, frame, tool)
+    count, note = _dof(targets, nominal_cell.chain, dof)
+    lower, upper = nominal_cell.chain.lower, nominal_cell.chain.upper
+    before, after = Goal(nominal_cell, count, lower, upper), Goal(calibrated_cell, count, lower, upper)
     if start is not None and not _inside(before, np.asarray(start)):
         raise UsageError(f"start {list(start)}: outside the joints' limits {lower.tolist()} to {upper.tolist()}")
     say("the nominal robot at the targets")
     poses, q0 = _reference(before, targets, start, seed)
     say("the calibrated robot")
-    held, q = np.clip(q0, lower, upper), _followed(after, poses, q0)
-    left, missed = (_sizes(inverse.differences(after, each, poses)) for each in (q, held))
-    reached = _within(left, tolerance) & _inside(before, q0)
+    start_q, q = np.clip(q0, lower, upper), _followed(after, poses, q0)
+    residual, missed = (_sizes(inverse.differences(after, joint_values, poses)) for joint_values in (q, start_q))
+    reached = _within(residual, tolerance) & _inside(before, q0)
     singular = inverse.conditions(after, q0) < SINGULAR
-    beyond = np.zeros(q.shape, bool) if fitted.learnt is None else np.atleast_2d(outside(q, fitted.learnt))
-    reason = tuple(_reason(one.chain, *row) for row in zip(reached, beyond, q0, q, left, singular))
+    extrapolated = np.zeros(q.shape, bool) if fitted.learnt is None else np.atleast_2d(outside(q, fitted.learnt))
+    reason = tuple(_reason(nominal_cell.chain, *row) for row in zip(reached, extrapolated, q0, q, residual, singular))
     say("sigmas")
     sigma, expected = _predicted_sigmas(fitted, q, frame, tool, after)
     notes = (_frame_note(fitted, frame), finding("at-targets", tool=tool), note, *_turn_note(fitted, count))
-    own = None
+    arm_error = None
     if frame == "base" and fitted.placed:
         placed, real = placements(fitted, "nominal", tool)
-        own = _sizes(inverse.differences(replace(after, cell=real), held, see(placed, held).poses()))
+        arm_error = _sizes(inverse.differences(replace(after, cell=real), start_q, see(placed, start_q).poses()))
     return Commands(
         targets,
         fitted,
@@ -260,14 +266,14 @@ def computed(
         q0,
         reached,
         reason,
-        left,
+        residual,
         missed,
         sigma,
         expected,
-        beyond,
+        extrapolated,
         count,
         tuple(lines_of(notes)),
-        own,
+        arm_error,
     )
 
 
@@ -278,23 +284,26 @@ def _inside(goal: Goal, q: np.ndarray) -> np.ndarray:
 def _followed(goal: Goal, poses: np.ndarray, start: np.ndarray) -> np.ndarray:
     """Return joint values (m, n) near `start` that reach the poses; near a singularity they stay close to `start`."""
     q = inverse.nearest(goal, poses, np.clip(start, goal.lower, goal.upper), inverse.reach(goal, poses, start))
-    far = np.flatnonzero(np.abs(q - start).max(axis=1, initial=0.0) > MAX_CORRECTION)
-    q[far] = inverse.held_back(goal, poses[far], start[far], MAX_CORRECTION)
+    excessive = np.flatnonzero(np.abs(q - start).max(axis=1, initial=0.0) > MAX_CORRECTION)
+    q[excessive] = inverse.held_back(goal, poses[excessive], start[excessive], MAX_CORRECTION)
     return q
 
 
-def _dof(targets: Targets, chain: Chain, asked: int | None) -> tuple[int, Finding]:
+def _dof(targets: Targets, chain: Chain, requested: int | None) -> tuple[int, Finding]:
     """Return the number of pose components (6, 5 or 3) that targets determine, and the finding on it."""
     oriented = targets.rotation is not None or (targets.q is not None and targets.position is None)
-    given, able = 6 if oriented else 3, 6 if chain.n >= 6 else 5 if chain.n == 5 else 3
-    if asked not in (None, *inverse.DOF):
-        raise UsageError(f"dof {asked}: expected 6, 5 (free to turn about the tool's z), or 3")
-    if asked is not None and asked > given:
-        raise UsageError(f"{targets.file}: the targets have no orientation; dof {asked} needs columns qx, qy, qz, qw")
-    dof = asked or min(given, able)
-    what = {6: "position and orientation", 5: "position and the direction of the tool's z axis", 3: "position only"}
-    joints = chain.n if asked is None and able < given else None
-    return dof, finding("what-counts", what=what[dof], joints=joints)
+    available = 6 if oriented else 3
+    able = 3
+    if chain.n >= 5:
+        able = min(chain.n, 6)
+    if requested not in (None, *inverse.DOF):
+        raise UsageError(f"dof {requested}: expected 6, 5 (free to turn about the tool's z), or 3")
+    if requested is not None and requested > available:
+        columns = "qx, qy, qz, qw"
+        raise UsageError(f"{targets.file}: the targets have no orientation; dof {requested} needs columns {columns}")
+    dof = requested or min(available, able)
+    joints = chain.n if requested is None and able < available else None
+    return dof, finding("what-counts", what=COMPONENTS[dof], joints=joints)
 
 
 def _reference(goal: Goal, targets: Targets, start: Sequence[float] | None, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -304,23 +313,23 @@ def _reference(goal: Goal, targets: Targets, start: Sequence[float] | None, seed
         return see(goal.cell, targets.q).poses(), np.array(targets.q)
     poses = pose(targets.rotation, targets.position)
     if targets.q is not None:
-        found = inverse.reach(goal, poses, targets.q)
-        return poses, inverse.nearest(goal, poses, np.clip(targets.q, goal.lower, goal.upper), found)
+        reached = inverse.reach(goal, poses, targets.q)
+        return poses, inverse.nearest(goal, poses, np.clip(targets.q, goal.lower, goal.upper), reached)
     lower, upper = goal.cell.chain.sampling_limits()
     middle = 0.5 * (lower + upper) if start is None else np.asarray(start, dtype=float)
-    others = np.random.default_rng(seed).uniform(lower, upper, (STARTS, len(lower)))
-    return poses, _sought(goal, poses, middle, others)
+    starts = np.random.default_rng(seed).uniform(lower, upper, (STARTS, len(lower)))
+    return poses, _sought(goal, poses, middle, starts)
 
 
-def _sought(goal: Goal, poses: np.ndarray, start: np.ndarray, others: np.ndarray) -> np.ndarray:
+def _sought(goal: Goal, poses: np.ndarray, start: np.ndarray, starts: np.ndarray) -> np.ndarray:
     """Return the nominal robot's joint positions (m, n): of several solutions, the one nearest to `start`."""
     best, cost = np.tile(start, (len(poses), 1)), np.full(len(poses), np.inf)
-    for first in (start, *others):
+    for first in (start, *starts):
         q = inverse.reach(goal, poses, np.tile(first, (len(poses), 1)))
         met = _within(_sizes(inverse.differences(goal, q, poses)), TOLERANCE)
-        far = np.where(met, np.abs(q - start).max(axis=1), np.inf)
-        better = far < cost
-        best[better], cost[better] = q[better], far[better]
+        travel = np.where(met, np.abs(q - start).max(axis=1), np.inf)
+        better = travel < cost
+        best[better], cost[better] = q[better], travel[better]
     return best
 
 
@@ -336,20 +345,26 @@ def _within(sizes: np.ndarray, tolerance: tuple[float, float]) -> np.ndarray:
 
 
 def _reason(
-    chain: Chain, good: bool, beyond: np.ndarray, nominal: np.ndarray, q: np.ndarray, left: np.ndarray, singular: bool
+    chain: Chain,
+    good: bool,
+    extrapolated: np.ndarray,
+    nominal: np.ndarray,
+    q: np.ndarray,
+    residual: np.ndarray,
+    singular: bool,
 ) -> str:
     """Return why a target is not reached, or which of its joint values are outside the measured range; else ""."""
     if good:
-        names = [name for name, out in zip(chain.joint_names, beyond) if out]
+        names = [name for name, out in zip(chain.joint_names, extrapolated) if out]
         return sentence(finding("command-extrapolates", joints=names)) if names else ""
-    rest = {"left": left[0], "turn": None if np.isnan(left[1]) else left[1]}
+    figures = {"left": residual[0], "turn": None if np.isnan(residual[1]) else residual[1]}
     for name, value, low, high in zip(chain.joint_names, nominal, chain.lower, chain.upper):
         if not low - LIMIT_TOLERANCE <= value <= high + LIMIT_TOLERANCE:
             return sentence(finding("target-outside-limits", joint=name, value=value, low=low, high=high))
     if at := [name for name, v, j in zip(chain.joint_names, q, chain.joints) if v <= j.lower or v >= j.upper]:
-        return sentence(finding("at-limit", joints=at, **rest))
-    code = "near-singularity" if singular and left[0] < ASTRAY else "out-of-reach"
-    return sentence(finding(code, most=MAX_CORRECTION, **rest))
+        return sentence(finding("at-limit", joints=at, **figures))
+    code = "near-singularity" if singular and residual[0] < ASTRAY else "out-of-reach"
+    return sentence(finding(code, most=MAX_CORRECTION, **figures))
 
 
 def _predicted_sigmas(
@@ -367,13 +382,13 @@ def _predicted_sigmas(
         cell = replace(cell, tools=np.repeat(goal.cell.tools, len(cell.tools), axis=0))
     poses = PoseMeasurements(q, cell.chain.joint_names, torque=None if goal.torques is None else goal.torques(q))
     station = -1 if frame == "base" else _station(fitted, frame)
-    own = pose_sigmas(cell, poses, free, covariance, station, number)
-    own[:, 1] = np.nan if goal.dof == 3 else own[:, 1]
+    parameter_sigma = pose_sigmas(cell, poses, free, covariance, station, number)
+    parameter_sigma[:, 1] = np.nan if goal.dof == 3 else parameter_sigma[:, 1]
     if fitted.learnt is None or fitted.discrepancy is None:
-        return own, np.full((len(q), 2), np.nan)
+        return parameter_sigma, np.full((len(q), 2), np.nan)
     errors = ErrorModel(cell, free, covariance, fitted.learnt, fitted.discrepancy)
     sigma = errors.position_sigma(poses, station, number)
-    return own, np.column_stack([sigma, fitted.discrepancy.radius * sigma])
+    return parameter_sigma, np.column_stack([sigma, fitted.discrepancy.radius * sigma])
 
 
 def _frame_note(fitted: Fitted, frame: str) -> Finding:
@@ -414,8 +429,10 @@ COLUMNS = (
 def _unreached(commands: Commands) -> list[str]:
     """Return one line for each target that is not reached, with the reason; at most `SHOWN` lines."""
     lost = np.flatnonzero(~commands.reached)
-    more = [f"{len(lost) - SHOWN} more"] if len(lost) > SHOWN else []
-    return [*(f"target {k + 1}: {commands.reason[k]}" for k in lost[:SHOWN]), *more]
+    result = [f"target {k + 1}: {commands.reason[k]}" for k in lost[:SHOWN]]
+    if len(lost) > SHOWN:
+        result.append(f"{len(lost) - SHOWN} more")
+    return result
 
 
 def write(commands: Commands, out: Path, partial: bool = False) -> Path:
@@ -433,13 +450,13 @@ def write(commands: Commands, out: Path, partial: bool = False) -> Path:
     names = targets.columns or fitted.cell.chain.joint_names
     q = np.where(commands.reached[:, None], commands.q / (targets.factors or 1.0), np.nan)
     unseen = np.full(count, np.nan if fitted.unseen is None else fitted.unseen)
-    known = np.full(count, np.nan) if fitted.learnt is None else commands.beyond.any(axis=1)
+    extrapolated = np.full(count, np.nan) if fitted.learnt is None else commands.beyond.any(axis=1)
     sizes = 1e3 * np.column_stack([commands.left, commands.before, commands.sigma, unseen, commands.expected])
+    statuses = np.where(commands.reached, "reached", "not reached").tolist()
+    columns = zip(q, statuses, sizes, extrapolated.astype(float), commands.reason)
     rows = [
-        (k, *joints, "reached" if good else "not reached", *cells, beyond, reason)
-        for k, (joints, good, cells, beyond, reason) in enumerate(
-            zip(q, commands.reached, sizes, known.astype(float), commands.reason), 1
-        )
+        (k, *joints, status, *cells, outside_range, reason)
+        for k, (joints, status, cells, outside_range, reason) in enumerate(columns, 1)
     ]
     return files.write_table(out, ["row", *names, "status", *COLUMNS, "reason"], rows)
 
@@ -448,23 +465,24 @@ def lines(commands: Commands) -> list[str]:
     """Return the lines for the user: frames, targets that are not reached, errors before and after."""
     good, targets, fitted = commands.reached, commands.targets, commands.fitted
     result = [*commands.notes, *targets.notes]
-    result += [f"ignored columns of {targets.file}: {', '.join(targets.ignored)}"] if targets.ignored else []
-    result += [f"not reached: {words}" for words in _unreached(commands)]
-    before, left, sigma, own = (
-        None if each is None else _pair(np.sqrt(np.mean(each[good] ** 2, axis=0)))
-        for each in (commands.before, commands.left, commands.sigma, commands.own)
-    )
-    found = [
-        finding("compensated", count=int(good.sum()), before=before, own=own, left=left, sigma=sigma),
+    if targets.ignored:
+        result.append(f"ignored columns of {targets.file}: {', '.join(targets.ignored)}")
+    result += [f"not reached: {reason}" for reason in _unreached(commands)]
+    before = _rms_pair(commands.before[good])
+    residual = _rms_pair(commands.left[good])
+    sigma = _rms_pair(commands.sigma[good])
+    arm_error = None if commands.own is None else _rms_pair(commands.own[good])
+    findings = [
+        finding("compensated", count=int(good.sum()), before=before, own=arm_error, left=residual, sigma=sigma),
         _expectation(commands),
     ]
     out = commands.beyond & good[:, None]
     if out.any():
         names = [fitted.cell.chain.joint_names[j] for j in np.unique(np.nonzero(out)[1])]
         count = int(out.any(axis=1).sum())
-        found.append(finding("commands-extrapolate", count=count, of=int(good.sum()), joints=names))
-    most = np.abs(commands.q - commands.nominal)[good].max(initial=0.0)
-    return [*result, *lines_of([*found, finding("joints-move", most=most)])]
+        findings.append(finding("commands-extrapolate", count=count, of=int(good.sum()), joints=names))
+    largest_move = np.abs(commands.q - commands.nominal)[good].max(initial=0.0)
+    return [*result, *lines_of([*findings, finding("joints-move", most=largest_move)])]
 
 
 def _expectation(commands: Commands) -> Finding:
@@ -479,6 +497,8 @@ def _expectation(commands: Commands) -> Finding:
     return finding(code, unseen=unseen)
 
 
-def _pair(values: np.ndarray) -> str:
+def _rms_pair(errors: np.ndarray) -> str:
+    """Return the rms of errors (m, 2) in position [m] and orientation [rad], for the user."""
+    values = np.sqrt(np.mean(errors**2, axis=0))
     turn = "" if np.isnan(values[1]) else f" and {1e3 * values[1]:.3g} mrad"
     return f"{1e3 * values[0]:.3g} mm{turn}"

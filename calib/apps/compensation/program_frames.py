@@ -83,7 +83,7 @@ def placed(fitted: Fitted, program: Program, frame: str, statements: Statements)
         UsageError: with all frames that are neither read nor stated, and where both say different numbers.
     """
     arm = Description.of_fit(fitted.folder, fitted.nominal.chain)
-    said = frames_in(program, statements.files)
+    frames = frames_in(program, statements.files)
     flange = flange_frame(program.controller, arm, statements.flange)
     base = base_frame(program.controller, arm, statements.world)
     names = fitted.cell.tool_names
@@ -92,34 +92,39 @@ def placed(fitted: Fitted, program: Program, frame: str, statements: Statements)
     refusals: list[str] = []
     notes: list[str] = []
 
-    tools: dict[str, str] = dict.fromkeys({setting.tool for setting in said.settings}, statements.tool or "")
+    tools: dict[str, str] = dict.fromkeys({setting.tool for setting in frames.settings}, statements.tool or "")
     if not measured:
-        numbers = _completed(program, said, "tool", _stated_tool(statements.tool, names), refusals)
+        numbers = _completed(program, frames, "tool", _stated_tool(statements.tool, names), refusals)
         if flange.pose is None:
-            refusals.append(f"{flange.name} is {flange.words}")
-        for name, pose in numbers.items() if flange.pose is not None else ():
+            refusals.append(f"{flange.name} is {flange.basis}")
+        named_poses = numbers.items() if flange.pose is not None else ()
+        for name, pose in named_poses:
             tools[name] = _as_option(flange.pose @ pose)
             notes.append(f"tool {name or 'active'}: {_in_words(pose)} in {flange}")
     elif len(tools) > 1:
         refusals.append(f"--tool states one tool, the program has {listing(sorted(tools), 5)}: --frames FILE")
 
-    users = dict.fromkeys({setting.user for setting in said.settings}, np.eye(4))
+    users = dict.fromkeys({setting.user for setting in frames.settings}, np.eye(4))
     if in_station and statements.user is not None:
         refusals.append(f"--user-frame and --frame {frame} both say where the user frame is: state one of them")
     if in_station:
         notes.append(f"user frame {listing(sorted(users), 5)}: that of station '{frame}', as calib deliver gives it")
     else:
-        numbers = _completed(program, said, "user", stated_frame(statements.user, "--user-frame"), refusals)
+        numbers = _completed(program, frames, "user", stated_frame(statements.user, "--user-frame"), refusals)
         if base.pose is None:
-            refusals.append(f"{base.name} is {base.words}")
-        for name, pose in numbers.items() if base.pose is not None else ():
+            refusals.append(f"{base.name} is {base.basis}")
+        named_poses = numbers.items() if base.pose is not None else ()
+        for name, pose in named_poses:
             users[name] = base.pose @ pose
             notes.append(f"user frame {name or 'active'}: {_in_words(pose)} in {base}")
     if refusals:
-        head = f"{program.path}: its {len(said.settings)} poses stand in frames that are not known; nothing was written"
+        count = len(frames.settings)
+        head = f"{program.path}: its {count} poses stand in frames that are not known; nothing was written"
         raise UsageError("\n  ".join([head, *refusals]))
-    notes += [f"warning: {each.warning}" for each in (base, flange) if each.warning and not in_station]
-    return Placed(_grouped(program, said, tools, users), tuple(notes))
+    if not in_station:
+        warnings = [base.warning, flange.warning]
+        notes += [f"warning: {warning}" for warning in warnings if warning]
+    return Placed(_grouped(program, frames, tools, users), tuple(notes))
 
 
 def tool_in_tip(fitted: Fitted, controller: Controller, statements: Statements) -> str:
@@ -134,7 +139,7 @@ def tool_in_tip(fitted: Fitted, controller: Controller, statements: Statements) 
     pose = _stated_tool(statements.tool, names)
     flange = flange_frame(controller, Description.of_fit(fitted.folder, fitted.nominal.chain), statements.flange)
     if pose is None or flange.pose is None:
-        raise UsageError(f"--tool {statements.tool}: {flange.name} is {flange.words}")
+        raise UsageError(f"--tool {statements.tool}: {flange.name} is {flange.basis}")
     return _as_option(flange.pose @ pose)
 
 
@@ -144,36 +149,36 @@ def _as_option(pose: np.ndarray) -> str:
 
 
 def _grouped(
-    program: Program, said: ProgramFrames, tools: Mapping[str, str], users: Mapping[str, np.ndarray]
+    program: Program, program_frames: ProgramFrames, tools: Mapping[str, str], users: Mapping[str, np.ndarray]
 ) -> tuple[Group, ...]:
     """Return the poses by tool and configuration, in the order in which these appear."""
     poses, indices = program.poses(), program.of("pose")
     members: dict[tuple[str, str], list[int]] = {}
-    for k, setting in enumerate(said.settings):
+    for k, setting in enumerate(program_frames.settings):
         members.setdefault((tools[setting.tool], setting.configuration), []).append(k)
     groups = []
     for (tool, configuration), rows in members.items():
-        frames = np.array([users[said.settings[k].user] for k in rows])
+        frames = np.array([users[program_frames.settings[k].user] for k in rows])
         group = Group(tuple(indices[k] for k in rows), tool, frames, frames @ poses[rows], configuration)
         groups.append(group)
     return tuple(groups)
 
 
-def _stated_tool(words: str | None, names: Sequence[str]) -> np.ndarray | None:
+def _stated_tool(statement: str | None, names: Sequence[str]) -> np.ndarray | None:
     """Return the tool that is stated, in the controller's flange; None for none."""
-    if words == "flange":
+    if statement == "flange":
         return np.eye(4)
     try:
-        return stated_frame(words, "--tool")
+        return stated_frame(statement, "--tool")
     except UsageError as error:
-        if words is not None and "," in words:
+        if statement is not None and "," in statement:
             raise
-        known = ", ".join(names)
-        raise UsageError(f"tool {words}: expected flange, a tool of the fit ({known}), or x,y,z[,...]") from error
+        expected = f"expected flange, a tool of the fit ({', '.join(names)}), or x,y,z[,...]"
+        raise UsageError(f"tool {statement}: {expected}") from error
 
 
 def _completed(
-    program: Program, said: ProgramFrames, kind: str, statement: np.ndarray | None, refusals: list[str]
+    program: Program, frames: ProgramFrames, kind: str, statement: np.ndarray | None, refusals: list[str]
 ) -> dict[str, np.ndarray]:
     """Return the poses (4, 4) of a program's tools or user frames by name; `refusals` grow by what is not known.
 
@@ -182,9 +187,9 @@ def _completed(
         statement: what the user says; it counts for the frame that has no numbers.
     """
     option, label = ("--tool", "tool") if kind == "tool" else ("--user-frame", "user frame")
-    numbers = said.tools if kind == "tool" else said.users
+    numbers = frames.tools if kind == "tool" else frames.users
     lines: dict[str, list[int]] = {}
-    for index, setting in zip(program.of("pose"), said.settings):
+    for index, setting in zip(program.of("pose"), frames.settings):
         lines.setdefault(getattr(setting, kind), []).append(program.targets[index].line)
     missing = [name for name in lines if name not in numbers]
     result = {name: numbers[name] for name in lines if name in numbers}
@@ -195,9 +200,9 @@ def _completed(
     elif statement is not None:
         result |= _agreed(option, label, result, statement, refusals)
     for name in missing:
-        where = f"line {listing(lines[name], 3)}"
-        what = f"{label} {name}" if name else f"the {label} that is active"
-        refusals.append(f"{what} ({where}) has no numbers here: {_ways(program, kind, option)}")
+        location = f"line {listing(lines[name], 3)}"
+        subject = f"{label} {name}" if name else f"the {label} that is active"
+        refusals.append(f"{subject} ({location}) has no numbers here: {_ways(program, kind, option)}")
     return result
 
 
@@ -207,8 +212,8 @@ def _agreed(
     """Return nothing new; refuse a statement that differs from the numbers that were read."""
     for name, pose in result.items():
         if np.abs(pose - statement).max() > AGREE:
-            words = f"{label} {name} is {_in_words(pose)} in the program's files"
-            refusals.append(f"{option} says {_in_words(statement)}, {words}")
+            difference = f"{label} {name} is {_in_words(pose)} in the program's files"
+            refusals.append(f"{option} says {_in_words(statement)}, {difference}")
     return {}
 
 

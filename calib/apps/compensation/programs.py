@@ -82,13 +82,13 @@ class CompensatedProgram:
 
     def lines(self) -> list[str]:
         """Return the lines for the user."""
-        shown = list(self.notes)
+        notes = list(self.notes)
         for part in self.parts:
-            shown += part.notes
+            notes += part.notes
             if part.commands.reached.any():
-                shown += [line for line in lines(part.commands) if not line.startswith("not reached")]
-        kept = ["not reached, left as it was: " + words for words in self.lost]
-        return [*dict.fromkeys(shown), *kept, *filter(None, [self.program.unread])]
+                notes += [line for line in lines(part.commands) if not line.startswith("not reached")]
+        missed = ["not reached, left as it was: " + reason for reason in self.lost]
+        return [*dict.fromkeys(notes), *missed, *filter(None, [self.program.unread])]
 
     def write(self, out: Path, partial: bool) -> Path:
         """Write the program with its new targets.
@@ -137,8 +137,8 @@ def compensated(
         raise UsageError(f"{program.path}: its targets have {axes} axes, the robot has {n} joints")
     groups, notes = (), ()
     if poses:
-        where = placed(fitted, program, frame, statements)
-        groups, notes = where.groups, where.notes
+        placement = placed(fitted, program, frame, statements)
+        groups, notes = placement.groups, placement.notes
     _check_postures(fitted, program, groups, start)
     options |= {"frame": frame, "seed": seed}
     parts = []
@@ -157,12 +157,12 @@ def _check_postures(fitted: Fitted, program: Program, groups: Sequence[Group], s
     spherical = has_spherical_wrist(fitted.nominal.chain)
     silent = [index for group in groups if not (group.configuration and spherical) for index in group.indices]
     if silent:
-        where = f"{len(silent)} targets (the first in line {program.targets[min(silent)].line})"
-        said = "the program does not say elbow or wrist"
+        location = f"{len(silent)} targets (the first in line {program.targets[min(silent)].line})"
+        cause = "the program does not say elbow or wrist"
         if not spherical and any(group.configuration for group in groups):
-            said = "configurations are read for arms whose last three axes meet, which this is not"
+            cause = "configurations are read for arms whose last three axes meet, which this is not"
         raise UsageError(
-            f"{program.path}: {where} are poses, and {said}; give joints near them: --start q1,...,qn [rad]"
+            f"{program.path}: {location} are poses, and {cause}; give joints near them: --start q1,...,qn [rad]"
         )
 
 
@@ -192,8 +192,8 @@ def _without(commands: Commands, reasons: Sequence[str]) -> Commands:
     """Return commands of which those with a reason are not reached, for that reason."""
     good = np.array([not reason for reason in reasons])
     merged = tuple(
-        f"{reason}; --start takes the posture nearest to it" if reason else words
-        for reason, words in zip(reasons, commands.reason)
+        f"{reason}; --start takes the posture nearest to it" if reason else former
+        for reason, former in zip(reasons, commands.reason)
     )
     return replace(commands, reached=commands.reached & good, reason=merged)
 
@@ -206,17 +206,17 @@ def _posture_notes(
     reached = commands.reached
     lines = np.array([program.targets[index].line for index in group.indices])
     unfit = np.array([bool(reason) for reason in sought.reasons])
-    taken = "the posture nearest to --start is taken"
-    notes += [f"warning: line {lines[k]}: {sought.reasons[k]}; {taken}" for k in np.flatnonzero(reached & unfit)]
+    outcome = "the posture nearest to --start is taken"
+    notes += [f"warning: line {lines[k]}: {sought.reasons[k]}; {outcome}" for k in np.flatnonzero(reached & unfit)]
     against = lines[reached & sought.contradicted & ~unfit]
     if len(against):
-        words = f"the posture nearest to --start is not that of {configuration.words}, which is followed"
-        notes.append(f"line {listing(against.tolist(), 5)}: {words}")
+        message = f"the posture nearest to --start is not that of {configuration.text}, which is followed"
+        notes.append(f"line {listing(against.tolist(), 5)}: {message}")
     chain = commands.fitted.nominal.chain
     crossing = lines[reached & ~unfit & ~configuration.holds(program.controller, chain, commands.q)]
     if len(crossing):
-        words = (
-            f"the command crosses the boundary of {configuration.words}, which stays in the program: change it there"
+        message = (
+            f"the command crosses the boundary of {configuration.text}, which stays in the program: change it there"
         )
-        notes.append(f"warning: line {listing(crossing.tolist(), 5)}: {words}")
+        notes.append(f"warning: line {listing(crossing.tolist(), 5)}: {message}")
     return tuple(notes)

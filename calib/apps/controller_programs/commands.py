@@ -42,24 +42,20 @@ def program(
     from calib.errors import UsageError, require
 
     if listed:
-        for name, each in controllers().items():
-            say(
-                f"{name}: {each.title}, {', '.join(place.format(name='NAME') for place in each.files.values())}",
-                result=True,
-            )
-            say(
-                f"    takes: {each.takes}", f"    closed: {each.closed}", f"    checked by: {each.checked}", result=True
-            )
+        for name, row in controllers().items():
+            file_names = ", ".join(pattern.format(name="NAME") for pattern in row.files.values())
+            say(f"{name}: {row.title}, {file_names}", result=True)
+            say(f"    takes: {row.takes}", f"    closed: {row.closed}", f"    checked by: {row.checked}", result=True)
         return
-    known = ", ".join((*controllers(), CSV))
-    require(poses is not None and controller, f"give a list of poses and its controller: --for {known}", UsageError)
+    names = ", ".join((*controllers(), CSV))
+    require(poses is not None and controller, f"give a list of poses and its controller: --for {names}", UsageError)
     assert poses is not None
     poses = motion_file(poses)
     beside = poses.with_suffix(".csv") if controller == CSV else poses.with_name(poses.name.partition(".")[0])
     target = out or beside
     texts = program_files(poses, target, controller, settings, source)
-    if (source or is_program(poses)) and (words := read_program(poses, source).unread):
-        say(words)
+    if (source or is_program(poses)) and (warning := read_program(poses, source).unread):
+        say(warning)
     with files.results([(path, ()) for path in texts], [poses], overwrite):
         say(*(f"written to {files.write(path, text)}" for path, text in texts.items()))
 

@@ -47,13 +47,13 @@ class Configuration:
     """What a program says of the posture at a pose.
 
     Attributes:
-        words: as the program has it.
+        text: as the program has it.
         before, elbow, wrist: +1 or -1 of wrist centre, elbow and axis 5 (see the module); 0 where not said.
         ranges: joint (from 0) → least and largest angle that the controller shows [rad].
         upright: posture [rad] in which `before` and `elbow` are +1.
     """
 
-    words: str
+    text: str
     before: int = 0
     elbow: int = 0
     wrist: int = 0
@@ -66,10 +66,10 @@ class Configuration:
 
     def agrees(self, chain: Chain, q: np.ndarray) -> np.ndarray:
         """Return which of some postures (m, n) [rad] have the signs that are said (m,); turns are not looked at."""
-        stood, said = signs_at(chain, q, np.array(self.upright)), np.array(self.signs())
-        return np.all((said == 0) | (stood == 0) | (stood == said), axis=1)
+        stood, signs = signs_at(chain, q, np.array(self.upright)), np.array(self.signs())
+        return np.all((signs == 0) | (stood == 0) | (stood == signs), axis=1)
 
-    def wrapped(self, controller: Controller, goal: Goal, q: np.ndarray, near: np.ndarray) -> np.ndarray:
+    def wrapped(self, controller: Controller, goal: Goal, q: np.ndarray, reference: np.ndarray) -> np.ndarray:
         """Return postures (m, n) with whole turns added: within limits and ranges, and else nearest to `near`.
 
         A posture that no turns bring into the ranges is NaN.
@@ -77,23 +77,23 @@ class Configuration:
         lower, upper = np.broadcast_to(goal.lower, q.shape), np.broadcast_to(goal.upper, q.shape)
         best = np.full(q.shape, np.nan)
         for joint in range(q.shape[1]):
-            least, largest = self.ranges.get(joint, (-np.inf, np.inf))
+            smallest, largest = self.ranges.get(joint, (-np.inf, np.inf))
             cost = np.full(len(q), np.inf)
             for turns in WRAPS if goal.cell.chain.joints[joint].kind == "revolute" else (0,):
                 angle = q[:, joint] + TURN * turns
-                inside = (angle >= lower[:, joint] - 1e-9) & (angle <= upper[:, joint] + 1e-9)
-                inside &= (angle >= least - SLACK) & (angle <= largest + SLACK)
-                away = np.where(inside, np.abs(angle - near[joint]), np.inf)
+                allowed = (angle >= lower[:, joint] - 1e-9) & (angle <= upper[:, joint] + 1e-9)
+                allowed &= (angle >= smallest - SLACK) & (angle <= largest + SLACK)
+                away = np.where(allowed, np.abs(angle - reference[joint]), np.inf)
                 closer = away < cost
                 best[closer, joint], cost[closer] = angle[closer], away[closer]
         return best
 
     def holds(self, controller: Controller, chain: Chain, q: np.ndarray) -> np.ndarray:
         """Return which postures (m, n) [rad] have the signs and the turns that are said (m,)."""
-        inside = self.agrees(chain, q)
-        for joint, (least, largest) in self.ranges.items():
-            inside &= (q[:, joint] >= least - SLACK) & (q[:, joint] <= largest + SLACK)
-        return inside
+        allowed = self.agrees(chain, q)
+        for joint, (smallest, largest) in self.ranges.items():
+            allowed &= (q[:, joint] >= smallest - SLACK) & (q[:, joint] <= largest + SLACK)
+        return allowed
 
 
 def has_spherical_wrist(chain: Chain) -> bool:
@@ -109,41 +109,49 @@ def has_spherical_wrist(chain: Chain) -> bool:
     return max(float(np.abs(distance).max()) for distance in beside) < MEETING
 
 
-def configuration_of(controller: Controller, words: str) -> Configuration | None:
+def configuration_of(controller: Controller, text: str) -> Configuration | None:
     """Return the configuration that a program says (`calib.apps.controller_programs.languages.Setting`); None for
     none."""
     readers = {"tp": _tp, "krl": _krl, "rapid": _rapid}
     reader = readers.get(controller.language)
-    return reader(words.split(), controller) if reader and words else None
+    return reader(text.split(), controller) if reader and text else None
 
 
-def _tp(words: Sequence[str], controller: Controller) -> Configuration:
-    letters = {word.upper() for word in words if word.isalpha()}
-    turns = [int(word) for word in words if not word.isalpha()]
-    before = 1 if "T" in letters else -1 if "B" in letters else 0
-    elbow = 0 if before < 0 else 1 if "U" in letters else -1 if "D" in letters else 0
-    wrist = -1 if "N" in letters else 1 if "F" in letters else 0
+def _tp(fields: Sequence[str], controller: Controller) -> Configuration:
+    letters = {entry.upper() for entry in fields if entry.isalpha()}
+    turns = [int(entry) for entry in fields if not entry.isalpha()]
+    before = _sign_of(letters, "T", "B")
+    # behind axis 1 it is not known which elbow U and D mean
+    elbow = 0 if before < 0 else _sign_of(letters, "U", "D")
+    wrist = -_sign_of(letters, "N", "F")
     ranges = {0: (-np.pi, np.pi)}
     for joint, turn in zip((3, 4, 5), turns):
         ranges[joint] = (TURN * turn - np.pi, TURN * turn + np.pi)
-    return Configuration(f"CONFIG {' '.join(words)}", before, elbow, wrist, ranges)
+    return Configuration(f"CONFIG {' '.join(fields)}", before, elbow, wrist, ranges)
 
 
-def _krl(words: Sequence[str], controller: Controller) -> Configuration:
-    status, turn = int(words[1]), int(words[3])
+def _sign_of(letters: set[str], positive: str, negative: str) -> int:
+    """Return +1 or -1 by the letter that is among the letters; 0 where neither is."""
+    if positive in letters:
+        return 1
+    return -1 if negative in letters else 0
+
+
+def _krl(fields: Sequence[str], controller: Controller) -> Configuration:
+    status, turn = int(fields[1]), int(fields[3])
     signs = [-1 if status & 1 else 1, 1 if status & 2 else -1, -1 if status & 4 else 1]
     ranges = {k: (-np.inf, 0.0) if turn >> k & 1 else (0.0, np.inf) for k in range(6)}
     home = (0.0, -np.pi / 2, np.pi / 2, 0.0, 0.0, 0.0)
-    return Configuration(" ".join(words), signs[0], signs[1], signs[2], ranges, home)
+    return Configuration(" ".join(fields), signs[0], signs[1], signs[2], ranges, home)
 
 
-def _rapid(words: Sequence[str], controller: Controller) -> Configuration:
-    quarters = [int(word) for word in words]
+def _rapid(fields: Sequence[str], controller: Controller) -> Configuration:
+    quarters = [int(entry) for entry in fields]
     ranges = {k: (np.pi / 2 * q, np.pi / 2 * (q + 1)) for k, q in zip((0, 3, 5), quarters)}
     by_cfx = 0 if controller.coupled else 1
     cfx = quarters[3]
     signs = [by_cfx * (-1 if cfx & bit else 1) for bit in (4, 2, 1)]
-    return Configuration(f"confdata [{', '.join(words)}]", signs[0], signs[1], signs[2], ranges)
+    return Configuration(f"confdata [{', '.join(fields)}]", signs[0], signs[1], signs[2], ranges)
 
 
 def signs_at(chain: Chain, q: np.ndarray, upright: np.ndarray) -> np.ndarray:
@@ -262,11 +270,11 @@ def postures(
 
 
 def _agreeing(
-    goal: Goal, configuration: Configuration, controller: Controller, reached: np.ndarray, near: np.ndarray
+    goal: Goal, configuration: Configuration, controller: Controller, reached: np.ndarray, reference: np.ndarray
 ) -> np.ndarray:
     """Return the distinct postures of some (k, n) that have a configuration, whole turns added as it says."""
     fitting = reached[configuration.agrees(goal.cell.chain, reached)]
-    wrapped = configuration.wrapped(controller, goal, fitting, near)
+    wrapped = configuration.wrapped(controller, goal, fitting, reference)
     wrapped = wrapped[np.isfinite(wrapped).all(axis=1)]
     distinct: list[np.ndarray] = []
     for q in wrapped:
@@ -280,21 +288,21 @@ def _objection(
 ) -> str:
     """Return why the posture of a configuration is none, or not the only one; else an empty text."""
     if not len(agreeing) and configuration.agrees(chain, reached).any():
-        return f"{configuration.words} has no posture at this pose: none within the joints' limits has its turns"
+        return f"{configuration.text} has no posture at this pose: none within the joints' limits has its turns"
     if not len(agreeing):
         signs = np.unique(signs_at(chain, reached, np.array(configuration.upright)), axis=0)
-        stood = "; ".join(", ".join(_words(row)) for row in signs)
-        said = ", ".join(_words(np.array(configuration.signs()))) or "turns only"
-        return f"{configuration.words} ({said}) is no posture at this pose; the arm reaches it with {stood}"
+        stood = "; ".join(", ".join(_sign_labels(row)) for row in signs)
+        required = ", ".join(_sign_labels(np.array(configuration.signs()))) or "turns only"
+        return f"{configuration.text} ({required}) is no posture at this pose; the arm reaches it with {stood}"
     if len(agreeing) > 1 and not started:
-        return f"{configuration.words} leaves {len(agreeing)} postures"
+        return f"{configuration.text} leaves {len(agreeing)} postures"
     return ""
 
 
-def _words(signs: np.ndarray) -> list[str]:
+def _sign_labels(signs: np.ndarray) -> list[str]:
     """Return signs of wrist centre, elbow and axis 5 in words; nothing for 0."""
-    words = (("before axis 1", "behind axis 1"), ("elbow as upright", "elbow bent back"), ("axis 5 > 0", "axis 5 < 0"))
-    return [pair[0 if sign > 0 else 1] for sign, pair in zip(signs, words) if sign]
+    labels = (("before axis 1", "behind axis 1"), ("elbow as upright", "elbow bent back"), ("axis 5 > 0", "axis 5 < 0"))
+    return [pair[0 if sign > 0 else 1] for sign, pair in zip(signs, labels) if sign]
 
 
 def _met(goal: Goal, q: np.ndarray, poses: np.ndarray) -> np.ndarray:

@@ -82,21 +82,21 @@ def _stood(
 ) -> Iterator[str]:
     """Yield the lines of one frame: its numbers in the controller's frame, and which frames they relate."""
     if frame.pose is None:
-        yield f"  {name}: not printed, since {frame.name} is {frame.words}"
+        yield f"  {name}: not printed, since {frame.name} is {frame.basis}"
         return
     yield f"  {name}: {_written(form, controller, invert(frame.pose) @ pose, index)}"
     yield f"    is {name} in {frame}"
 
 
-def _written(form: str, controller: Controller, pose: np.ndarray, place: int) -> str:
+def _written(form: str, controller: Controller, pose: np.ndarray, index: int) -> str:
     values = (number(value, DECIMALS[controller.length]) for value in pose_values(controller, pose[None])[0])
-    return form.format(*values, n=place)
+    return form.format(*values, n=index)
 
 
 def _mastering(robot: CalibratedChain, controller: Controller) -> Iterator[str]:
     """Yield the offset of each axis in the controller's unit, to add to what it shows."""
     chain, before = robot.chain, nominal_of(robot)
-    moved = [(chain.elements[k].value - before.elements[k].value) / chain.elements[k].ratio for k in chain.moving]
-    for axis, value in enumerate(controller.shown(np.array(moved)), 1):
-        kept = "" if value else " (kept at nominal)"
-        yield f"  axis {axis}: true angle = shown angle {value:+.5f} {controller.unit}{kept}"
+    offsets = [(chain.elements[k].value - before.elements[k].value) / chain.elements[k].ratio for k in chain.moving]
+    for axis, value in enumerate(controller.shown(np.array(offsets)), 1):
+        note = "" if value else " (kept at nominal)"
+        yield f"  axis {axis}: true angle = shown angle {value:+.5f} {controller.unit}{note}"

@@ -40,17 +40,17 @@ class ControllerFrame:
     Attributes:
         name: what the controller calls it.
         pose: (4, 4) in the arm's base, or in its tip; None where it is not known.
-        words: by what it is known, or why not and what to state.
+        basis: by what it is known, or why not and what to state.
         warning: what speaks against it; else empty.
     """
 
     name: str
     pose: np.ndarray | None
-    words: str
+    basis: str
     warning: str = ""
 
     def __str__(self) -> str:
-        return f"{self.name} ({self.words})"
+        return f"{self.name} ({self.basis})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,24 +113,24 @@ def _fixed_to(tree: UrdfTree, link: str) -> tuple[str, np.ndarray]:
     return link, pose
 
 
-def stated_frame(words: str | None, option: str) -> np.ndarray | None:
+def stated_frame(statement: str | None, option: str) -> np.ndarray | None:
     """Return the pose (4, 4) that an option states as ``x,y,z[,roll,pitch,yaw]`` [m, rad]; None for no words.
 
     Raises:
         UsageError: for other than three or six finite numbers, and for positions that can only be millimetres.
     """
-    if words is None:
+    if statement is None:
         return None
     try:
-        values = [plain_number(part) for part in words.split(",")]
+        values = [plain_number(part) for part in statement.split(",")]
     except ValueError:
         values = []
     if len(values) not in (3, 6) or not np.isfinite(values).all():
-        count = len(words.split(","))
+        count = len(statement.split(","))
         expected = "x,y,z or x,y,z,roll,pitch,yaw [m, rad], separated by commas"
-        raise UsageError(f"{option} {words}: expected {expected}; found {count} values")
+        raise UsageError(f"{option} {statement}: expected {expected}; found {count} values")
     if np.abs(values[:3]).max() > FARTHEST:
-        raise UsageError(f"{option} {words}: {max(values[:3], key=abs):g} m is too far for a robot; are these mm?")
+        raise UsageError(f"{option} {statement}: {max(values[:3], key=abs):g} m is too far for a robot; are these mm?")
     return from_xyz_rpy(values[:3], values[3:] or [0.0, 0.0, 0.0])
 
 
@@ -153,16 +153,16 @@ def base_frame(controller: Controller, arm: Description, statement: np.ndarray |
     state = f"state it: --world x,y,z[,roll,pitch,yaw], its pose in '{chain.base}' [m, rad]"
     if not arm.has(link):
         if ruled is None or not footed:
-            why = rule if ruled is None else f"no link '{foot}' whose axes it would have"
-            return ControllerFrame(name, None, f"not known: no link '{link}', and {why}; {state}")
+            reason = rule if ruled is None else f"no link '{foot}' whose axes it would have"
+            return ControllerFrame(name, None, f"not known: no link '{link}', and {reason}; {state}")
         return ControllerFrame(name, ruled, rule)
     pose = arm.pose(link, chain.base)
     if pose is None:
         joint = arm.moving_joint(link)
         return ControllerFrame(name, None, f"not known: link '{link}' moves with joint '{joint}'; {state}")
     if not footed and ruled is not None and _differs(pose, ruled):
-        words = f"not known: link '{link}' is the description's root, and {name} stands {rule}; {state}"
-        return ControllerFrame(name, None, words)
+        basis = f"not known: link '{link}' is the description's root, and {name} stands {rule}; {state}"
+        return ControllerFrame(name, None, basis)
     against = arm.pose(link, foot) if footed else None
     where = _relation(pose, chain.base) if against is None else _relation(against, foot)
     warning = ""
@@ -187,8 +187,8 @@ def flange_frame(controller: Controller, arm: Description, statement: np.ndarray
             return ControllerFrame(name, None, f"not known: link '{link}' is not fixed to '{chain.tip}'; {state}")
         pose = pose @ from_xyz_rpy([0.0, 0.0, 0.0], np.radians(turn or (0.0, 0.0, 0.0)))
         if _off_axis(chain, pose) > STRAIGHT:
-            words = f"not known: z of link '{link}' is not along the last axis, as a flange's is; {state}"
-            return ControllerFrame(name, None, words)
+            basis = f"not known: z of link '{link}' is not along the last axis, as a flange's is; {state}"
+            return ControllerFrame(name, None, basis)
         by = f"link {link}" + (", turned as this controller's" if turn else "")
         return ControllerFrame(name, pose, by)
     return ControllerFrame(name, None, f"not known: no link 'tool0' or 'flange' in the description; {state}")
@@ -252,28 +252,28 @@ def _differs(first: np.ndarray, second: np.ndarray) -> bool:
 def _relation(pose: np.ndarray, link: str) -> str:
     """Return in words where a frame stands against a link."""
     xyz, rpy = to_xyz_rpy(pose)
-    turned, moved = np.abs(rpy) > 1e-9, np.abs(xyz) > 1e-9
-    if not turned.any() and not moved.any():
+    turned, shifted = np.abs(rpy) > 1e-9, np.abs(xyz) > 1e-9
+    if not turned.any() and not shifted.any():
         return f"at {link}"
-    if not turned.any() and not moved[:2].any():
+    if not turned.any() and not shifted[:2].any():
         return f"{abs(xyz[2]):.6g} m {'above' if xyz[2] > 0 else 'below'} {link}"
-    words = []
-    if moved.any():
-        words.append(f"at {', '.join(f'{value:.6g}' for value in xyz)} m in {link}")
+    parts = []
+    if shifted.any():
+        parts.append(f"at {', '.join(f'{value:.6g}' for value in xyz)} m in {link}")
     if turned.any() and not turned[:2].any():
-        words.append(f"{'' if words else link + ' '}turned by {np.degrees(rpy[2]):.6g}° about z")
+        parts.append(f"{'' if parts else link + ' '}turned by {np.degrees(rpy[2]):.6g}° about z")
     elif turned.any():
         angles = ", ".join(f"{value:.6g}" for value in np.degrees(rpy))
-        words.append(f"{'' if words else link + ' '}turned by roll, pitch, yaw {angles}°")
-    return ", ".join(words)
+        parts.append(f"{'' if parts else link + ' '}turned by roll, pitch, yaw {angles}°")
+    return ", ".join(parts)
 
 
-def check_known(frames: list[ControllerFrame], what: str) -> None:
+def check_known(frames: list[ControllerFrame], heading: str) -> None:
     """Refuse to go on where a frame is not known, with all that is to be stated.
 
     Raises:
-        UsageError: with `what` cannot be said, and for each frame what to state.
+        UsageError: with `heading`, and for each frame what to state.
     """
-    missing = [f"  {frame.name} is {frame.words}" for frame in frames if frame.pose is None]
+    missing = [f"  {frame.name} is {frame.basis}" for frame in frames if frame.pose is None]
     if missing:
-        raise UsageError("\n".join([what, *missing]))
+        raise UsageError("\n".join([heading, *missing]))

@@ -108,7 +108,7 @@ class Language:
         """Return a text of the same length with blanks in place of comments."""
         if not self.comment:
             return text
-        return re.sub(f"{self.comment}[^\n]*", lambda found: " " * len(found[0]), text)
+        return re.sub(f"{self.comment}[^\n]*", lambda match: " " * len(match[0]), text)
 
 
 def _frame(form: str) -> str:
@@ -205,15 +205,15 @@ def _krl_active(text: str, position: int) -> tuple[str, str]:
         if match[3]:
             active[match[3].upper()] = _krl_name(match[3].upper(), match[4])
             continue
-        words = re.sub(r"\s+", "", match[2])
-        numbered = re.fullmatch(r"(?i)(TOOL|BASE)_DATA\[0*(\d+)\]", words)
+        expression = re.sub(r"\s+", "", match[2])
+        numbered = re.fullmatch(r"(?i)(TOOL|BASE)_DATA\[0*(\d+)\]", expression)
         kind = match[1].upper()
         if numbered:
             active[kind] = _krl_name(numbered[1].upper(), numbered[2])
         elif re.fullmatch(_KRL_FRAME, match[2].strip()):
             active[kind] = f"${kind} of line {text.count(chr(10), 0, match.start()) + 1}"
         else:
-            active[kind] = words.upper()
+            active[kind] = expression.upper()
     return active["TOOL"], active["BASE"]
 
 
@@ -221,9 +221,9 @@ def _krl_name(kind: str, number: str) -> str:
     return f"{kind.upper()}_DATA[{int(number)}]"
 
 
-def _binary(words: str) -> int:
+def _binary(literal: str) -> int:
     """Return the number of ``2`` or of ``B010``."""
-    return int(words[1:], 2) if words[:1].upper() == "B" else int(words)
+    return int(literal[1:], 2) if literal[:1].upper() == "B" else int(literal)
 
 
 def _krl_numbers(text: str, controller: Controller) -> tuple[Frames, Frames]:
@@ -262,8 +262,8 @@ def _rapid_setting(text: str, target: Target) -> Setting:
         statement = text[end : text.find(";", end)]
         return Setting(*_rapid_frames(statement), configuration)
     moves = re.finditer(rf"(?i)\bMove\w+\b([^;]*?\b{declared[1]}\b[^;]*);", text)
-    used = {_rapid_frames(move[1]) for move in moves}
-    return Setting(*_either(used), configuration)
+    frame_names = {_rapid_frames(move[1]) for move in moves}
+    return Setting(*_either(frame_names), configuration)
 
 
 def _rapid_frames(statement: str) -> tuple[str, str]:

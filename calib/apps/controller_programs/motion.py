@@ -29,9 +29,9 @@ def motion_file(path: Path) -> Path:
     if not path.is_dir():
         return path
     names = (RUN, PLANNED, SAMPLES)
-    found = [path / name for name in names if (path / name).is_file()]
-    require(found, refusal(path, "program"), UsageError)
-    return found[0]
+    paths = [path / name for name in names if (path / name).is_file()]
+    require(paths, refusal(path, "program"), UsageError)
+    return paths[0]
 
 
 def is_motion(path: Path) -> bool:
@@ -62,9 +62,12 @@ def setpoints(path: Path, controller: Controller) -> tuple[np.ndarray, list[str]
 
 def stream_values(controller: Controller, q: np.ndarray) -> dict[str, Any]:
     """Return what the templates of streams print of setpoints (k, n) [rad]."""
-    shown = controller.shown(q)
-    rows, relative = (
-        [[number(value, controller.decimals) for value in row] for row in values]
-        for values in (shown, shown - shown[0])
-    )
+    controller_values = controller.shown(q)
+    rows = _formatted(controller_values, controller)
+    relative = _formatted(controller_values - controller_values[0], controller)
     return {"rows": rows, "relative": relative, "cycle": controller.cycle, "unit": controller.unit}
+
+
+def _formatted(values: np.ndarray, controller: Controller) -> list[list[str]]:
+    """Return values (k, n) as text with the controller's decimals."""
+    return [[number(value, controller.decimals) for value in row] for row in values]

@@ -43,17 +43,17 @@ def joints_in(path: Path, source: str = "") -> tuple[np.ndarray, list[str]]:
         UsageError: for sliding joints, and where no column is a joint.
     """
     if source or is_program(path):
-        found = read_program(path, source)
-        require(found.of("joints"), f"{path}: its targets are poses of the tool, not joints", UsageError)
-        q = found.joints()
+        program = read_program(path, source)
+        require(program.of("joints"), f"{path}: its targets are poses of the tool, not joints", UsageError)
+        q = program.joints()
         return q, [f"q{k + 1}" for k in range(q.shape[1])]
     table = read_table(path)
-    named = [(name, unit.lower()) for name, unit in zip(table.header, table.units) if name not in OURS]
-    sliding = [name for name, unit in named if unit in LENGTHS]
+    column_units = [(name, unit.lower()) for name, unit in zip(table.header, table.units) if name not in OURS]
+    sliding = [name for name, unit in column_units if unit in LENGTHS]
     require(not sliding, f"{path}: programs have turning joints only; {', '.join(sliding)} slides", UsageError)
-    names = [name for name, unit in named if unit in ANGLES]
-    words = f"{path}: no column of joint angles, as 'joint1 [deg]'; found {', '.join(table.header)}"
-    require(names, words, UsageError)
+    names = [name for name, unit in column_units if unit in ANGLES]
+    message = f"{path}: no column of joint angles, as 'joint1 [deg]'; found {', '.join(table.header)}"
+    require(names, message, UsageError)
     return read_poses(path, names), names
 
 
@@ -63,8 +63,8 @@ def joints_table(path: Path, source: str = "") -> Table:
     So do the joints that a controller kept: a UR's log, a KUKA's ``.dat``, a FANUC's ``POSREG.VA``.
     """
     q, names = joints_in(path, source)
-    found = read_program(path, source) if source or is_program(path) else None
-    numbers = np.array([found.targets[k].number for k in found.of("joints")] if found else [0])
+    program = read_program(path, source) if source or is_program(path) else None
+    numbers = np.array([program.targets[k].number for k in program.of("joints")] if program else [0])
     numbered = {"pose": numbers} if numbers.all() else {}
     rows = np.arange(1, len(q) + 1)
     cells = (*numbered.values(), *(q / ANGLES["deg"]).T)
@@ -96,7 +96,8 @@ def program_files(
         return {out: "\n".join([",".join(header), *rows, ""])}
     controller, stem = controller_named(name), out.stem
     if not re.fullmatch(controller.names, stem):
-        raise UsageError(f"{out}: '{stem}' is no name for a program of {controller.title}: {_words(controller.names)}")
+        rule = _name_rule(controller.names)
+        raise UsageError(f"{out}: '{stem}' is no name for a program of {controller.title}: {rule}")
     q, names = setpoints(path, controller) if moving else joints_in(path, source)
     check_controller(name, q.shape[1], settings.pulses)
     if settings.output is not None and not controller.outputs:
@@ -104,7 +105,7 @@ def program_files(
     values = stream_values(controller, q) if moving else {"poses": _poses(controller, q, settings)}
     values |= {"name": stem, "joints": names, "head": _head(controller, names, moving), **vars(settings)}
     templates = controller.stream if moving else controller.files
-    paths = _targets(out, [place.format(name=stem) for place in templates.values()], controller)
+    paths = _targets(out, [pattern.format(name=stem) for pattern in templates.values()], controller)
     return {path: _template(file).render(values) for path, file in zip(paths, templates)}
 
 
@@ -116,8 +117,8 @@ def _targets(out: Path, names: list[str], controller: Controller) -> list[Path]:
     if len(names) == 1:
         return [out]
     suffixes = [path.suffix for path in usual]
-    words = f"{out}: {controller.title} takes {', '.join(suffixes)}, written together; end the name in {suffixes[0]}"
-    require(out.suffix.lower() in suffixes, words, UsageError)
+    message = f"{out}: {controller.title} takes {', '.join(suffixes)}, written together; end the name in {suffixes[0]}"
+    require(out.suffix.lower() in suffixes, message, UsageError)
     return usual
 
 
@@ -128,27 +129,34 @@ def write_program(path: Path, out: Path, name: str) -> list[Path]:
 
 def _poses(controller: Controller, q: np.ndarray, settings: ProgramSettings) -> list[list[str]]:
     """Return poses (m, n) [rad] as a controller's programs have them."""
-    shown = controller.shown(q) * (np.array(settings.pulses) if controller.pulses else 1.0)
-    return [[number(value, controller.decimals) for value in row] for row in shown]
+    values = controller.shown(q) * (np.array(settings.pulses) if controller.pulses else 1.0)
+    return [[number(value, controller.decimals) for value in row] for row in values]
 
 
 def _head(controller: Controller, names: list[str], moving: bool) -> list[str]:
     """Return what stands at a program's head: what is not checked, and whose joints these are."""
-    way = {1: "+", -1: "-"}
-    coupled = [
-        f"axis {axis} = {names[axis - 1]} {way[sign]} {names[other - 1]}" for axis, other, sign in controller.coupled
+    joints = f"Joints: {', '.join(names)}"
+    for axis, partner, sign in controller.coupled:
+        operator = {1: "+", -1: "-"}[sign]
+        joints += f"; axis {axis} = {names[axis - 1]} {operator} {names[partner - 1]}"
+    if moving:
+        return ["Not run on a real controller.", "Simulate first, then run at low override.", f"{joints}."]
+    head = [
+        f"Not run on a real controller; checked by {controller.checked}.",
+        "Simulate first, then run at low override, one pose at a time.",
+        f"{joints}.",
     ]
-    return [
-        "Not run on a real controller" + ("." if moving else f"; checked by {controller.checked}."),
-        "Simulate first, then run at low override" + ("." if moving else ", one pose at a time."),
-        f"Joints: {', '.join(names)}" + "".join(f"; {each}" for each in coupled) + ".",
-        *([f"Joints read at each pose: {controller.keeps}."] if controller.keeps and not moving else []),
-    ]
+    if controller.keeps:
+        head.append(f"Joints read at each pose: {controller.keeps}.")
+    return head
 
 
-def _words(pattern: str) -> str:
+def _name_rule(pattern: str) -> str:
+    rule = "letters, digits and _, a letter first"
     longest = re.search(r"\{0,(\d+)\}", pattern)
-    return "letters, digits and _, a letter first" + (f", at most {int(longest[1]) + 1}" if longest else "")
+    if longest is None:
+        return rule
+    return f"{rule}, at most {int(longest[1]) + 1}"
 
 
 @cache

@@ -58,7 +58,7 @@ class Program:
 
     def of(self, kind: str) -> list[int]:
         """Return the indices of the targets of a kind."""
-        return [k for k, each in enumerate(self.targets) if each.kind == kind]
+        return [k for k, target in enumerate(self.targets) if target.kind == kind]
 
     @property
     def moves(self) -> int:
@@ -68,18 +68,18 @@ class Program:
     @property
     def unread(self) -> str:
         """Warning where motion statements have no target here, with the first of their lines; else empty."""
-        known = {each.line for each in self.targets}
-        lines = [line for line in _lines_of_moves(self.text, self.controller) if line not in known]
+        target_lines = {target.line for target in self.targets}
+        lines = [line for line in _lines_of_moves(self.text, self.controller) if line not in target_lines]
         if self.moves <= len(self.targets) or not lines:
             return ""
-        place = f"line {listing(lines, 3)}"
-        words = "relative moves, and targets that are computed, named or incomplete, are not read"
-        return f"warning: {self.moves} moves, {len(self.targets)} targets: {words} ({place})"
+        location = f"line {listing(lines, 3)}"
+        reason = "relative moves, and targets that are computed, named or incomplete, are not read"
+        return f"warning: {self.moves} moves, {len(self.targets)} targets: {reason} ({location})"
 
     def joints(self) -> np.ndarray:
         """Return the joint targets (m, n) as joints of a description [rad]."""
-        shown = [self.targets[k].values for k in self.of("joints")]
-        return self.controller.described(np.array(shown) * ANGLES[self.controller.unit])
+        values = [self.targets[k].values for k in self.of("joints")]
+        return self.controller.described(np.array(values) * ANGLES[self.controller.unit])
 
     def poses(self) -> np.ndarray:
         """Return the pose targets (m, 4, 4) [m]."""
@@ -87,13 +87,13 @@ class Program:
 
     def rewritten(self, values: Sequence[np.ndarray | None]) -> bytes:
         """Return the program with other numbers in its targets, in the controller's units; None leaves a target."""
-        text, parts, place = self.text, [], 0
+        text, parts, position = self.text, [], 0
         for target, new in zip(self.targets, values, strict=True):
             for (begin, end), was, value in zip(target.spans, target.values, [] if new is None else new):
                 decimals = max(self.controller.decimals, len(text[begin:end].partition(".")[2]))
-                parts += [text[place:begin], text[begin:end] if value == was else number(value, decimals)]
-                place = end
-        return "".join([*parts, text[place:]]).encode(ENCODING)
+                parts += [text[position:begin], text[begin:end] if value == was else number(value, decimals)]
+                position = end
+        return "".join([*parts, text[position:]]).encode(ENCODING)
 
 
 def number(value: float, decimals: int) -> str:
@@ -131,8 +131,8 @@ def _rotation(turn: str, values: np.ndarray) -> Rotation:
 
 def _order(turn: str) -> tuple[str, bool]:
     """Return the axes of a pose's angles as SciPy names them, and whether the angles are in degrees."""
-    axes, how, *unit = turn.split()
-    return axes.upper() if how == "moving" else axes, unit != ["rad"]
+    axes, axes_kind, *unit = turn.split()
+    return axes.upper() if axes_kind == "moving" else axes, unit != ["rad"]
 
 
 def is_program(path: Path) -> bool:
@@ -167,29 +167,35 @@ def read_program(path: Path, controller: str = "") -> Program:
     """
     kind = controller_of(path, controller)
     text = text_of(path)
-    found = [each for name in ("joints", "pose") for each in _found(text, name, kind)]
-    if not found:
+    targets = [target for name in ("joints", "pose") for target in _targets_of_kind(text, name, kind)]
+    if not targets:
         moves = listing(_lines_of_moves(text, kind), 3)
-        words = f"has no targets with all their numbers, as {kind.title} writes them"
-        raise MeasurementError(words + (f"; its moves are in line {moves}" if moves else "; nor any moves"), path)
-    return Program(path, kind, text, tuple(sorted(found, key=lambda each: each.spans[0])))
+        message = f"has no targets with all their numbers, as {kind.title} writes them"
+        moves_message = f"; its moves are in line {moves}" if moves else "; nor any moves"
+        raise MeasurementError(message + moves_message, path)
+    return Program(path, kind, text, tuple(sorted(targets, key=lambda target: target.spans[0])))
 
 
 def _matches(text: str, pattern: str, comment: str) -> list[re.Match[str]]:
     """Return what matches a pattern outside comments."""
-    found = re.finditer(pattern.replace("NUM", NUMBER), text) if pattern else ()
-    return [
-        one for one in found if not comment or comment not in text[text.rfind("\n", 0, one.start()) + 1 : one.start()]
-    ]
+    matches = re.finditer(pattern.replace("NUM", NUMBER), text) if pattern else ()
+    if not comment:
+        return list(matches)
+    outside_comments = []
+    for match in matches:
+        line_start = text.rfind("\n", 0, match.start()) + 1
+        if comment not in text[line_start : match.start()]:
+            outside_comments.append(match)
+    return outside_comments
 
 
 def _lines_of_moves(text: str, controller: Controller) -> list[int]:
     """Return the lines of the motion statements, from 1."""
-    found = _matches(text, controller.moves, controller.comment)
-    return [text.count("\n", 0, one.end()) + 1 for one in found]
+    matches = _matches(text, controller.moves, controller.comment)
+    return [text.count("\n", 0, match.end()) + 1 for match in matches]
 
 
-def _found(text: str, kind: str, controller: Controller) -> list[Target]:
+def _targets_of_kind(text: str, kind: str, controller: Controller) -> list[Target]:
     targets = []
     for match in _matches(text, getattr(controller, kind), controller.comment):
         places = range(1, len(match.groups()) + 1)

@@ -56,73 +56,73 @@ class Step:
         Args:
             log_time: of the step by the controller's clock, about [s].
         """
-        found = list[tuple[float, str]]()
+        candidates = list[tuple[float, str]]()
         for file, size, about in ((stream, self.size, self.time), (log, -self.size, log_time)):
             reach = abs(self.size) + (file.t[-1] - file.t[0]) / TRIED
-            count, apart = np.diff(file.rows), np.diff(file.t)
-            off = np.abs(apart - count * np.median(apart / count) - size) / abs(size)
+            count, intervals = np.diff(file.rows), np.diff(file.t)
+            off = np.abs(intervals - count * np.median(intervals / count) - size) / abs(size)
             off[np.abs(file.t[1:] - about) > reach] = np.inf
             k = int(np.argmin(off))
             row = file.rows[k + 1] if size > 0.0 else file.rows[k] + 1  # rows that go back were left out
-            found.append((float(off[k]), f"{Path(file.file).name}: row {row}, t = {file.t[k + 1]:.3f} s"))
-        least, place = min(found)
-        if least < STAMPED:
-            return place
+            candidates.append((float(off[k]), f"{Path(file.file).name}: row {row}, t = {file.t[k + 1]:.3f} s"))
+        smallest, location = min(candidates)
+        if smallest < STAMPED:
+            return location
         return f"{Path(stream.file).name}: t = {self.time:.2f} s, {Path(log.file).name}: t = {log_time:.2f} s, about"
 
 
-def find_step(seen: Equations) -> tuple[Step | None, float]:
+def find_step(equations: Equations) -> tuple[Step | None, float]:
     """Return the step that stands out most, None where there is none, and by how much the clock leaves its line [s].
 
     The second is 0 where a line is as good as a polygon.
     """
-    begin, end = float(seen.t.min()), float(seen.t.max())
+    begin, end = float(equations.t.min()), float(equations.t.max())
     knots = np.linspace(begin, end, KNOTS)
-    hats = np.array([np.interp(seen.t, knots, row) for row in np.eye(KNOTS)[1:-1]])
-    left, *columns = _projected(seen, list(hats))
-    bends, _, _, _ = np.linalg.lstsq(np.array(columns).T, left)
-    rest = float(np.sum((left - bends @ columns) ** 2))
-    smooth, corners = float(left @ left) - rest, np.array([0.0, *bends, 0.0])
+    hats = np.array([np.interp(equations.t, knots, row) for row in np.eye(KNOTS)[1:-1]])
+    errors, *columns = _projected(equations, list(hats))
+    bends, _, _, _ = np.linalg.lstsq(np.array(columns).T, errors)
+    remainder = float(np.sum((errors - bends @ columns) ** 2))
+    smooth, corners = float(errors @ errors) - remainder, np.array([0.0, *bends, 0.0])
     away = float(np.abs(corners - np.polyval(np.polyfit(knots - begin, corners, 1), knots - begin)).max())
-    certain = smooth > CERTAIN[1] ** 2 * rest / (len(seen.late) - seen.matrix.shape[1])
+    certain = smooth > CERTAIN[1] ** 2 * remainder / (len(equations.late) - equations.matrix.shape[1])
     for beside, sigmas in zip((hats[:0], hats), CERTAIN):
-        times, apart = np.linspace(begin, end, TRIED + 2, retstep=True)
-        best = _best(seen, times[1:-1], beside)[0]
-        step, explained = _best(seen, np.linspace(best.time - apart, best.time + apart, CLOSER), beside)
+        times, spacing = np.linspace(begin, end, TRIED + 2, retstep=True)
+        best = _best(equations, times[1:-1], beside)[0]
+        step, explained = _best(equations, np.linspace(best.time - spacing, best.time + spacing, CLOSER), beside)
         if abs(step.size) > max(MIN_STEP, sigmas * step.sigma) and (len(beside) or explained > smooth):
             return step, away
     return None, away if certain else 0.0
 
 
-def _best(seen: Equations, times: np.ndarray, beside: np.ndarray) -> tuple[Step, float]:
+def _best(equations: Equations, times: np.ndarray, beside: np.ndarray) -> tuple[Step, float]:
     """Return the most certain of steps at `times` (k,), and the sum of squares that it explains.
 
     Args:
         beside: (n, rows) other changes of the offset [s] that are free.
     """
-    left, *columns = _projected(seen, [*beside, *(seen.t > times[:, None])])
-    others, columns = np.array(columns[: len(beside)]), np.array(columns[len(beside) :])
+    errors, *columns = _projected(equations, [*beside, *(equations.t > times[:, None])])
+    other_columns, columns = np.array(columns[: len(beside)]), np.array(columns[len(beside) :])
     if len(beside):
-        base = np.linalg.qr(others.T)[0]
-        left, columns = left - base @ (base.T @ left), columns - (columns @ base) @ base.T
+        base = np.linalg.qr(other_columns.T)[0]
+        errors, columns = errors - base @ (base.T @ errors), columns - (columns @ base) @ base.T
     power = np.maximum(np.sum(columns**2, axis=1), 1e-300)
-    size = columns @ left / power
+    size = columns @ errors / power
     explained = size**2 * power
     k = int(np.argmax(explained))
-    free = len(seen.late) - seen.matrix.shape[1] - seen.play.shape[1] - len(beside) - 1
-    rest = float(left @ left - explained[k]) / max(free, 1)
-    return Step(float(times[k]), float(size[k]), float(np.sqrt(rest / power[k]))), float(explained[k])
+    free = len(equations.late) - equations.matrix.shape[1] - equations.play.shape[1] - len(beside) - 1
+    variance = float(errors @ errors - explained[k]) / max(free, 1)
+    return Step(float(times[k]), float(size[k]), float(np.sqrt(variance / power[k]))), float(explained[k])
 
 
-def _projected(seen: Equations, changes: list[np.ndarray]) -> np.ndarray:
+def _projected(equations: Equations, changes: list[np.ndarray]) -> np.ndarray:
     """Return what all that is free cannot explain of the data (first row), and of changes (rows,) of the offset."""
-    rows, joints = seen.play.shape
+    rows, joints = equations.play.shape
     prior = np.eye(joints) / BACKLASH
-    play = np.concatenate([seen.play, np.zeros((len(seen.wanted) - rows, joints)), prior])
-    matrix = np.column_stack([np.pad(seen.matrix, ((0, joints), (0, 0))), play])
+    play = np.concatenate([equations.play, np.zeros((len(equations.wanted) - rows, joints)), prior])
+    matrix = np.column_stack([np.pad(equations.matrix, ((0, joints), (0, 0))), play])
     matrix /= np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
     sought = np.zeros((1 + len(changes), len(matrix)))
-    sought[0, : len(seen.wanted)] = seen.wanted
-    sought[1:, :rows] = np.array(changes) * seen.late
+    sought[0, : len(equations.wanted)] = equations.wanted
+    sought[1:, :rows] = np.array(changes) * equations.late
     inverse = np.linalg.pinv(matrix.T @ matrix, 1e-13, hermitian=True)
     return sought - sought @ matrix @ inverse @ matrix.T

@@ -96,13 +96,13 @@ class Run:
         """Return the log's joints (m, n) at the times of rows, or a derivative; outside the log those of its ends."""
         return self._path(np.clip(clock.controller(self.stream.t[rows]), *self.log.t[[0, -1]]), order)
 
-    def known(self, clock: Clock, most: int | None = None) -> np.ndarray:
+    def known(self, clock: Clock, count: int | None = None) -> np.ndarray:
         """Return the rows, or as many of them evenly, whose times are between two of the log that are no gap apart."""
         t, log = clock.controller(self.stream.t), self.log
         after = np.clip(np.searchsorted(log.t, t), 1, len(log.t) - 1)
-        near = log.t[after] - log.t[after - 1] <= log.gap
-        rows = np.flatnonzero(near & (t >= log.t[0]) & (t <= log.t[-1]))
-        return rows[evenly(len(rows), most)] if most else rows
+        bridged = log.t[after] - log.t[after - 1] <= log.gap
+        rows = np.flatnonzero(bridged & (t >= log.t[0]) & (t <= log.t[-1]))
+        return rows[evenly(len(rows), count)] if count else rows
 
     def lines(self) -> list[str]:
         """Return what is to be said of both files."""
@@ -119,26 +119,27 @@ def begin(chain: Chain, run: Run) -> tuple[Installation, Clock, tuple[float, ...
     Raises:
         MeasurementError: where no offset brings the points onto the nominal arm's path.
     """
-    found, middle = list[tuple[float, Clock, Installation]](), float(run.stream.t[[0, -1]].mean())
+    starts, middle = list[tuple[float, Clock, Installation]](), float(run.stream.t[[0, -1]].mean())
     for offset in _offsets(chain, run):
         clock = Clock(offset, middle=middle)
         if len(rows := run.known(clock, PLACED)) < PLACED / 3:
             continue
         cell, clock, _ = fitted(install(chain, [run.at(clock, rows)]), run, rows, clock, arm=False)
         sizes = np.sort(np.linalg.norm(residuals(cell, run, rows, clock)[:3], axis=0))
-        found.append((float(np.sqrt(np.mean(sizes[: TRIMMED * len(rows) // 100] ** 2))), clock, cell))
-    least = min((each[0] for each in found), default=np.inf)
+        starts.append((float(np.sqrt(np.mean(sizes[: TRIMMED * len(rows) // 100] ** 2))), clock, cell))
+    best_misfit = min((start[0] for start in starts), default=np.inf)
     spread = float(np.linalg.norm(run.points.position.std(axis=0)))
-    if least > min(MAX_RATIO * spread, MAX_MISFIT * chain.stretched_length()):
+    if best_misfit > min(MAX_RATIO * spread, MAX_MISFIT * chain.stretched_length()):
         refuse_data(
             run.stream.file,
             f"at no offset of the clocks its points are on the path of the nominal arm by {run.log.file} (the best "
-            f"leaves {1e3 * least:.3g} mm of a motion of {1e3 * spread:.3g} mm): is it the log of this motion, and of "
-            f"this robot, did instrument and target stay in place, and did no clock jump? ({'; '.join(run.lines())})",
+            f"leaves {1e3 * best_misfit:.3g} mm of a motion of {1e3 * spread:.3g} mm): is it the log of this "
+            "motion, and of this robot, did instrument and target stay in place, and did no clock jump? "
+            f"({'; '.join(run.lines())})",
         )
-    alike = [each for each in found if each[0] < RIVAL * least]
-    _, clock, cell = max(alike, key=lambda each: len(run.known(each[1])))
-    rivals = {round(other.offset, 2) for _, other, _ in alike if abs(other.offset - clock.offset) > APART}
+    alike = [start for start in starts if start[0] < RIVAL * best_misfit]
+    _, clock, cell = max(alike, key=lambda start: len(run.known(start[1])))
+    rivals = {round(rival.offset, 2) for _, rival, _ in alike if abs(rival.offset - clock.offset) > APART}
     return cell, Clock(clock.offset, middle=middle), tuple(sorted(rivals))
 
 
@@ -146,18 +147,22 @@ def _offsets(chain: Chain, run: Run) -> list[float]:
     """Return offsets of the clocks [s] at which the speeds of the arm and of the points go together."""
     arm = forward(chain, _even(run.log))
     turns = np.linalg.norm(rotation_vector(invert(arm[:-1])[:, :3, :3] @ arm[1:, :3, :3]), axis=1)
-    ways, theirs = (np.linalg.norm(np.diff(p, axis=0), axis=1) for p in (arm[:, :3, 3], _even(run.stream)[:, :3]))
-    lags = GRID * correlation_lags(len(theirs), len(ways)) + run.stream.t[0] - run.log.t[0]
-    shared = np.round(correlate(np.ones(len(theirs)), np.ones(len(ways))))
-    possible, found = shared > OVERLAP * min(len(theirs), len(ways)), list[float]()
+    arm_steps, point_steps = (
+        np.linalg.norm(np.diff(p, axis=0), axis=1) for p in (arm[:, :3, 3], _even(run.stream)[:, :3])
+    )
+    lags = GRID * correlation_lags(len(point_steps), len(arm_steps)) + run.stream.t[0] - run.log.t[0]
+    shared = np.round(correlate(np.ones(len(point_steps)), np.ones(len(arm_steps))))
+    possible, offsets = shared > OVERLAP * min(len(point_steps), len(arm_steps)), list[float]()
     for lever in LEVERS:
-        alike = _alike(_cut(theirs), _cut(np.hypot(ways, lever * turns))) * np.sqrt(shared / shared.max())
+        alike = _alike(_cut(point_steps), _cut(np.hypot(arm_steps, lever * turns))) * np.sqrt(shared / shared.max())
         alike[~possible] = -np.inf
         for _ in range(PEAKS):
             best = float(lags[int(np.argmax(alike))])
             alike[np.abs(lags - best) < APART] = -np.inf
-            found.append(best)
-    return [one for k, one in enumerate(found) if all(abs(one - other) > APART / 2 for other in found[:k])]
+            offsets.append(best)
+    return [
+        offset for k, offset in enumerate(offsets) if all(abs(offset - earlier) > APART / 2 for earlier in offsets[:k])
+    ]
 
 
 def _even(stream: Stream) -> np.ndarray:
@@ -171,13 +176,13 @@ def _cut(speed: np.ndarray) -> np.ndarray:
     return np.minimum(speed, 2.0 * np.quantile(speed, 0.95)) - np.median(speed)
 
 
-def _alike(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+def _alike(series_a: np.ndarray, series_b: np.ndarray) -> np.ndarray:
     """Return the correlation coefficient of two series where they overlap, at every lag."""
-    here, there = np.ones(len(one)), np.ones(len(other))
-    count = np.maximum(np.round(correlate(here, there)), 1.0)
-    mean, its = correlate(one, there) / count, correlate(here, other) / count
-    power = (correlate(one**2, there) / count - mean**2) * (correlate(here, other**2) / count - its**2)
-    return (correlate(one, other) / count - mean * its) / np.sqrt(np.maximum(power, 1e-6 * power.max()))
+    ones_a, ones_b = np.ones(len(series_a)), np.ones(len(series_b))
+    count = np.maximum(np.round(correlate(ones_a, ones_b)), 1.0)
+    mean, mean_b = correlate(series_a, ones_b) / count, correlate(ones_a, series_b) / count
+    power = (correlate(series_a**2, ones_b) / count - mean**2) * (correlate(ones_a, series_b**2) / count - mean_b**2)
+    return (correlate(series_a, series_b) / count - mean * mean_b) / np.sqrt(np.maximum(power, 1e-6 * power.max()))
 
 
 def residuals(cell: Installation, run: Run, rows: np.ndarray, clock: Clock) -> np.ndarray:
@@ -216,58 +221,58 @@ def fitted(
     guess = np.concatenate(sizes)
     group = np.repeat([-1, *range(len(families) + 1), -1], [len(free), *map(len, families), played, 2])
     free = np.concatenate([free, table.index("deflection")])
-    known, spread = np.isfinite(guess), np.full(len(guess), np.inf)
+    has_prior, spread = np.isfinite(guess), np.full(len(guess), np.inf)
     for _ in range(ROUNDS):
         (block,) = prepare(cell, [run.at(clock, rows)])
-        now, turned = observe(cell, block, free), observe(cell, block, moving)
+        parts, turned = observe(cell, block, free), observe(cell, block, moving)
         pulled = np.zeros(len(guess))
         pulled[: len(free)], pulled[-1] = (parameter_values(start) - parameter_values(cell))[free], -clock.drift
         side = np.sign(run.joints(clock, rows, 1).T)[:, None]
-        left, slopes, plays, lates = list[np.ndarray](), list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
-        for part, joints, speed in zip(now, turned, np.split(velocities(cell, run, rows, clock), len(now))):
+        weighted, slopes, plays, lates = list[np.ndarray](), list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
+        for part, joints, speed in zip(parts, turned, np.split(velocities(cell, run, rows, clock), len(parts))):
             sigma = max(robust.spread(part.value), 1e-9)
             weight = np.sqrt(robust.weights(np.sqrt(np.mean(part.value**2, axis=0)) / sigma, loss)) / sigma
-            left.append((weight * part.value).ravel())
+            weighted.append((weight * part.value).ravel())
             plays.append((weight * side * joints.jacobian).reshape(len(moving), -1).T)
             lates.append((weight * -speed).ravel())
             columns = np.concatenate([part.jacobian, [-speed, -t * speed]])
             columns = (weight * columns).reshape(len(columns), -1).T
             slopes.append(np.hstack([columns[:, :-2], plays[-1][:, :played], columns[:, -2:]]))
-        prior = _sized(np.concatenate(slopes), np.concatenate(left), pulled, guess, group) if arm else guess
-        matrix = np.concatenate([*slopes, np.diag(1.0 / prior)[known]])
-        wanted = np.concatenate([*left, (pulled / prior)[known]])
+        prior = _sized(np.concatenate(slopes), np.concatenate(weighted), pulled, guess, group) if arm else guess
+        matrix = np.concatenate([*slopes, np.diag(1.0 / prior)[has_prior]])
+        target = np.concatenate([*weighted, (pulled / prior)[has_prior]])
         size = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
         matrix /= size
         inverse = np.linalg.pinv(matrix.T @ matrix, 1e-13, hermitian=True)
-        change = inverse @ (matrix.T @ wanted)
-        rest = float(np.sum((wanted - matrix @ change) ** 2)) / max(len(wanted) - len(guess), 1)
-        spread = np.sqrt(rest * np.diag(inverse)) / size
+        change = inverse @ (matrix.T @ target)
+        variance = float(np.sum((target - matrix @ change) ** 2)) / max(len(target) - len(guess), 1)
+        spread = np.sqrt(variance * np.diag(inverse)) / size
         change /= size
         cell = step(cell, free, change[: len(free)])
         clock = replace(clock, offset=clock.offset + change[-2], drift=clock.drift + change[-1])
         if abs(change[-2]) < SETTLED:
             break
-    late = np.concatenate(lates)
-    times = np.tile(run.stream.t[rows], len(late) // len(rows))
-    seen = Equations(matrix, wanted, late, np.concatenate(plays), times)
-    return cell, replace(clock, sigma=float(spread[-2]), drift_sigma=float(spread[-1])), seen
+    offset_slope = np.concatenate(lates)
+    times = np.tile(run.stream.t[rows], len(offset_slope) // len(rows))
+    equations = Equations(matrix, target, offset_slope, np.concatenate(plays), times)
+    return cell, replace(clock, sigma=float(spread[-2]), drift_sigma=float(spread[-1])), equations
 
 
 def _sized(
-    matrix: np.ndarray, wanted: np.ndarray, pulled: np.ndarray, guess: np.ndarray, group: np.ndarray
+    matrix: np.ndarray, target: np.ndarray, pulled: np.ndarray, guess: np.ndarray, group: np.ndarray
 ) -> np.ndarray:
     """Return the prior standard deviations (p,), those of a family of terms by the factor that is most probable.
 
     Args:
-        matrix, wanted: whitened rows of the data, (rows, p) and (rows,).
+        matrix, target: whitened rows of the data, (rows, p) and (rows,).
         pulled: (p,) the prior's mean minus the present values.
         guess: (p,) prior standard deviations as they were guessed.
         group: (p,) number of a term's family; -1 for other columns.
     """
-    others = group < 0
-    held = others & np.isfinite(guess)
-    rows = np.concatenate([matrix, np.diag(1.0 / guess)[held]])
-    whole = np.concatenate([wanted - matrix @ np.where(others, 0.0, pulled), (pulled / guess)[held]])
-    unit = np.where(others, 1.0 / np.maximum(np.linalg.norm(rows, axis=0), 1e-300), guess)
-    found = relevance(gram(whole, rows * unit), group, np.ones(len(unit)))
-    return np.where(others, guess, np.clip(found.ridge, *TERM_SIZES) * guess)
+    ungrouped = group < 0
+    prior_rows = ungrouped & np.isfinite(guess)
+    rows = np.concatenate([matrix, np.diag(1.0 / guess)[prior_rows]])
+    data = np.concatenate([target - matrix @ np.where(ungrouped, 0.0, pulled), (pulled / guess)[prior_rows]])
+    unit = np.where(ungrouped, 1.0 / np.maximum(np.linalg.norm(rows, axis=0), 1e-300), guess)
+    evidence = relevance(gram(data, rows * unit), group, np.ones(len(unit)))
+    return np.where(ungrouped, guess, np.clip(evidence.ridge, *TERM_SIZES) * guess)

@@ -14,10 +14,10 @@ NAMES = ("name", "point", "pointname", "pointid", "pose", "poseid", "id", "label
 CLOCKS = ("t", "time", "timestamp", "datetime")
 
 
-def column_of(table: Table, known: Sequence[str]) -> str:
-    """Return the table's first column that has one of the `known` names, in any spelling; "" without any."""
+def column_of(table: Table, names: Sequence[str]) -> str:
+    """Return the table's first column that has one of the `names`, in any spelling; "" without any."""
     plain = {re.sub(r"[^a-z0-9]", "", name.lower()): name for name in reversed(table.header)}
-    return next((plain[name] for name in known if name in plain), "")
+    return next((plain[name] for name in names if name in plain), "")
 
 
 @dataclass(frozen=True, eq=False)

@@ -95,22 +95,36 @@ def join(
         if arm is None:
             raise UsageError("by motion the clocks are found from the nominal arm's path: give --robot")
         return join_streams(Path(joints), Path(points), arm.complete)
-    own = joints_table(Path(joints)) if is_program(Path(joints)) else read_table(joints)
-    return _joined(own, read_table(points), by, arm and arm.complete)
+    joint_table = joints_table(Path(joints)) if is_program(Path(joints)) else read_table(joints)
+    return _joined(joint_table, read_table(points), by, arm and arm.complete)
 
 
 def _joined(joints: Table, points: Table, by: str, chain: Chain | None) -> Joined:
-    named, timed = ([column_of(table, known) for table in (joints, points)] for known in (NAMES, CLOCKS))
-    possible = {"name": all(named), "time": all(timed), "row": len(joints) == len(points), "geometry": bool(chain)}
-    by = by or next((way for way, holds in possible.items() if holds), "")
-    words = "both files need a column of names (name, pose, id …)", "of times (t)", "as many rows", "give --robot"
+    name_columns, time_columns = (
+        [column_of(table, column_names) for table in (joints, points)] for column_names in (NAMES, CLOCKS)
+    )
+    possible = {
+        "name": all(name_columns),
+        "time": all(time_columns),
+        "row": len(joints) == len(points),
+        "geometry": bool(chain),
+    }
+    by = by or next((method for method, holds in possible.items() if holds), "")
+    requirements = (
+        "both files need a column of names (name, pose, id …)",
+        "of times (t)",
+        "as many rows",
+        "give --robot",
+    )
     counts = f"{len(joints)} rows of joints, {len(points)} points"
-    require(by and possible[by], f"{counts} cannot be joined{by and f' by {by}'}: {', or '.join(words)}", UsageError)
-    keys, notes = {*named, *timed}, ()
+    require(
+        by and possible[by], f"{counts} cannot be joined{by and f' by {by}'}: {', or '.join(requirements)}", UsageError
+    )
+    keys, notes = {*name_columns, *time_columns}, ()
     if by == "time":
-        joints, pose, notes = _at_times(joints, points, *timed)
+        joints, pose, notes = _at_times(joints, points, *time_columns)
     else:
-        pose = _same_names(joints, points, *named) if by == "name" else np.arange(len(points))
+        pose = _same_names(joints, points, *name_columns) if by == "name" else np.arange(len(points))
         require(by != "name" or (pose >= 0).any(), f"{points.file}: no name is one of {joints.file}", MeasurementError)
     if chain is not None and by != "time":
         q = Sheet(joints).joints(chain.joint_names)[0]
@@ -122,30 +136,34 @@ def _joined(joints: Table, points: Table, by: str, chain: Chain | None) -> Joine
 
 
 def ordered(
-    chain: Chain, q: np.ndarray, points: Table, stated: dict[str, np.ndarray], sheet: Sheet | None = None
+    chain: Chain, q: np.ndarray, points: Table, candidates: dict[str, np.ndarray], sheet: Sheet | None = None
 ) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return which of the poses q (n, joints) each point belongs to, -1 for none, and notes on it.
 
     Args:
-        stated: orders to try first, in words → (m,) index of each point's pose.
+        candidates: orders to try first, in words → (m,) index of each point's pose.
         sheet: the points with the options for reading them.
 
     Raises:
         MeasurementError: where no order explains the points.
     """
     position = _positions(sheet or Sheet(points))
-    seen = np.flatnonzero(np.isfinite(position).all(axis=1))
-    few = f"{len(seen)} points are too few to find their poses by the robot's geometry (at least {MIN_POINTS})"
-    if len(seen) < MIN_POINTS:
-        how, pose = next(((how, pose) for how, pose in stated.items() if (pose >= 0).all()), ("", seen))
-        require(how, f"{few}: name them (a column 'pose' with the pose's number)", MeasurementError, points.file)
-        return pose, (f"{len(pose)} points, {how}; {few}",)
-    spread = PoseMeasurements.of(q[seen % len(q)], position[seen], joint_names=chain.joint_names, file=points.file)
+    measured = np.flatnonzero(np.isfinite(position).all(axis=1))
+    few = f"{len(measured)} points are too few to find their poses by the robot's geometry (at least {MIN_POINTS})"
+    if len(measured) < MIN_POINTS:
+        origin, pose = next(
+            ((origin, pose) for origin, pose in candidates.items() if (pose >= 0).all()), ("", measured)
+        )
+        require(origin, f"{few}: name them (a column 'pose' with the pose's number)", MeasurementError, points.file)
+        return pose, (f"{len(pose)} points, {origin}; {few}",)
+    spread = PoseMeasurements.of(
+        q[measured % len(q)], position[measured], joint_names=chain.joint_names, file=points.file
+    )
     check_scale(spread, chain)  # says which unit explains points that spread too far
-    found = find_order(chain, q, position[seen], {how: pose[seen] for how, pose in stated.items()})
+    found = find_order(chain, q, position[measured], {origin: pose[measured] for origin, pose in candidates.items()})
     if found is None:
         order, advice = "any order", ""
-        if len(seen) < MIN_FOUND:
+        if len(measured) < MIN_FOUND:
             order, advice = (
                 "their order",
                 f" With {MIN_FOUND} points or more any order is found; else name them (a column 'pose')",
@@ -153,57 +171,61 @@ def ordered(
         limit = 1e3 * MAX_MISFIT * chain.stretched_length()
         refuse_data(
             points.file,
-            f"its {len(seen)} points are not those of these {len(q)} poses in {order} (within {limit:.0f} mm of the "
-            f"nominal arm): is it this robot and this list, and did instrument and target stay in place?{advice}",
+            f"its {len(measured)} points are not those of these {len(q)} poses in {order} (within {limit:.0f} mm of "
+            f"the nominal arm): is it this robot and this list, and did instrument and target stay in place?{advice}",
         )
     pose = np.full(len(position), -1)
-    pose[seen] = found.pose
-    notes = [f"{len(seen)} points, {found.how} ({1e3 * found.rms:.2g} mm rms from the nominal arm)"]
-    if len(strange := seen[found.pose < 0]):
+    pose[measured] = found.pose
+    notes = [f"{len(measured)} points, {found.how} ({1e3 * found.rms:.2g} mm rms from the nominal arm)"]
+    if len(strange := measured[found.pose < 0]):
         notes.append(f"belonging to no pose, left out: rows {listing(points.rows[strange])}")
     if found.rivals:
-        doubtful = seen[list(found.rivals)]
+        doubtful = measured[list(found.rivals)]
         pose[doubtful] = -1
         notes.append(f"poses too close together to tell apart, left out: rows {listing(points.rows[doubtful])}")
     return pose, tuple(notes)
 
 
 def merged(
-    joints: Table, points: Table, pose: np.ndarray, notes: Sequence[str], keys: Sequence[str], told: bool = True
+    joints: Table, points: Table, pose: np.ndarray, notes: Sequence[str], keys: Sequence[str], name_missing: bool = True
 ) -> Joined:
     """Return the joints' rows with the points (m,) of each, several readings of one pose averaged.
 
     Args:
         pose: (m,) index of each point's row of joints; -1 for none.
         keys: columns by which they were joined, left out.
-        told: whether a note names the poses without a point.
+        name_missing: whether a note names the poses without a point.
     """
     position, label = _positions(Sheet(points)), _labels(joints)
     groups = {int(k): np.flatnonzero(pose == k) for k in np.unique(pose[pose >= 0])}
     missing, stray = [label[k] for k in range(len(joints)) if k not in groups], points.rows[pose < 0]
-    groups, apart = _consistent(position, groups, label, points)
+    groups, inconsistent = _consistent(position, groups, label, points)
     require(groups, f"{points.file}: none of its {len(points)} points is left", MeasurementError)
-    notes = [*notes, *apart]
-    if missing and told:
+    notes = [*notes, *inconsistent]
+    if missing and name_missing:
         notes.append(f"without a point: {len(missing)} of {len(joints)} poses: {listing(missing)}")
     if len(stray):
         notes.append(f"points left out: rows {listing(stray)}")
-    kept, count = np.array(list(groups), dtype=int), np.array([[len(rows)] for rows in groups.values()])
-    mine = [name for name in points.header if name not in keys]
-    own = [name for name in joints.header if name not in keys and name not in mine]
-    columns = {name: joints.cells[joints.index(name)][kept] for name in own}
-    columns |= {name: _averaged(points, name, groups, position) for name in mine}
-    units = [table.units[table.index(name)] for table, names in ((joints, own), (points, mine)) for name in names]
+    pose_rows, count = np.array(list(groups), dtype=int), np.array([[len(rows)] for rows in groups.values()])
+    point_names = [name for name in points.header if name not in keys]
+    joint_names = [name for name in joints.header if name not in keys and name not in point_names]
+    columns = {name: joints.cells[joints.index(name)][pose_rows] for name in joint_names}
+    columns |= {name: _averaged(points, name, groups, position) for name in point_names}
+    units = [
+        table.units[table.index(name)]
+        for table, names in ((joints, joint_names), (points, point_names))
+        for name in names
+    ]
     if repeats := int(count.sum() - len(count)):
         squares = sum(((position[rows] - position[rows].mean(axis=0)) ** 2).sum(axis=0) for rows in groups.values())
         sigma = 1e3 * np.sqrt(squares / repeats)
         notes.append(f"{counted(repeats, 'repeated reading')} averaged, σ of one {np.mean(sigma):.2g} mm per axis")
-        if repeats >= MIN_REPEATS and not any(name.startswith("sigma") for name in mine) and np.all(sigma):
+        if repeats >= MIN_REPEATS and not any(name.startswith("sigma") for name in point_names) and np.all(sigma):
             columns |= dict(zip(SIGMA.names, (sigma / np.sqrt(count)).T))
             units += ["mm"] * 3
-    labels = np.array([label[k] for k in kept], dtype=object)
+    labels = np.array([label[k] for k in pose_rows], dtype=object)
     header, cells = ("pose", *columns), (labels, *columns.values())
-    return Joined(Table(points.file, header, ("", *units), cells, kept + 1), kept, tuple(notes))
+    return Joined(Table(points.file, header, ("", *units), cells, pose_rows + 1), pose_rows, tuple(notes))
 
 
 def _positions(sheet: Sheet) -> np.ndarray:
@@ -219,11 +241,12 @@ def _consistent(
     """Return the groups of readings without those whose readings contradict each other, and what is to be said."""
     wide = {k: float(pdist(position[rows]).max()) for k, rows in groups.items() if len(rows) > 1}
     bound = max(MAX_APART, TIMES_USUAL * float(np.median(list(wide.values()))) if len(wide) > 2 else 0.0)
-    torn = {k: apart for k, apart in wide.items() if apart > bound}
-    said = [
-        finding("readings-apart", pose=label[k], apart=apart, rows=points.rows[groups[k]]) for k, apart in torn.items()
+    torn = {k: distance for k, distance in wide.items() if distance > bound}
+    findings = [
+        finding("readings-apart", pose=label[k], apart=distance, rows=points.rows[groups[k]])
+        for k, distance in torn.items()
     ]
-    return {k: rows for k, rows in groups.items() if k not in torn}, lines_of(said)
+    return {k: rows for k, rows in groups.items() if k not in torn}, lines_of(findings)
 
 
 def _averaged(points: Table, name: str, groups: dict[int, np.ndarray], position: np.ndarray) -> np.ndarray:
@@ -241,14 +264,14 @@ def _labels(joints: Table) -> list[str]:
     return joints.texts(name) if name else [str(row) for row in joints.rows]
 
 
-def _same_names(joints: Table, points: Table, one: str, other: str) -> np.ndarray:
+def _same_names(joints: Table, points: Table, joint_column: str, point_column: str) -> np.ndarray:
     """Return the row of joints (m,) with each point's name, -1 without one."""
-    theirs, ours = points.texts(other), joints.texts(one)
+    point_names, joint_names = points.texts(point_column), joints.texts(joint_column)
     for plain in (_plain, _number):
-        places = {plain(text): k for k, text in enumerate(ours)}
+        places = {plain(text): k for k, text in enumerate(joint_names)}
         if len(places) < len(joints):
-            refuse_data(joints.file, "has a name twice: each pose needs a name of its own", one)
-        if (pose := np.array([places.get(plain(text), -1) for text in theirs])).max() >= 0:
+            refuse_data(joints.file, "has a name twice: each pose needs a name of its own", joint_column)
+        if (pose := np.array([places.get(plain(text), -1) for text in point_names])).max() >= 0:
             break
     return pose
 
@@ -263,29 +286,33 @@ def _number(text: str) -> str:
     return (re.findall(r"\d+", text) or [text])[-1].lstrip("0")
 
 
-def _at_times(joints: Table, points: Table, one: str, other: str) -> tuple[Table, np.ndarray, tuple[str, ...]]:
+def _at_times(
+    joints: Table, points: Table, joint_column: str, point_column: str
+) -> tuple[Table, np.ndarray, tuple[str, ...]]:
     """Return the joints at the times of the points, which of them stood still (m,), and notes."""
-    t, at = _seconds(joints, one), _seconds(points, other)
+    t, at = _seconds(joints, joint_column), _seconds(points, point_column)
     if unsorted := next((k for k, (a, b) in enumerate(pairwise(t)) if b <= a), None):
-        joints.fail("the times do not increase", one, unsorted + 1)
-    inside = (at >= t[0]) & (at <= t[-1])
-    if inside.mean() < 0.5:
-        words = f"its points are of {at.min():.10g} to {at.max():.10g} s, the joints of {t[0]:.10g} to {t[-1]:.10g} s"
+        joints.fail("the times do not increase", joint_column, unsorted + 1)
+    in_log = (at >= t[0]) & (at <= t[-1])
+    if in_log.mean() < 0.5:
+        message = f"its points are of {at.min():.10g} to {at.max():.10g} s, the joints of {t[0]:.10g} to {t[-1]:.10g} s"
         refuse_data(
-            points.file, f"{words}: are both times of the same clock? Otherwise join by motion, row or name", other
+            points.file,
+            f"{message}: are both times of the same clock? Otherwise join by motion, row or name",
+            point_column,
         )
-    names = [name for name in joints.header if name != one and joints.cells[joints.index(name)].dtype == float]
+    names = [name for name in joints.header if name != joint_column and joints.cells[joints.index(name)].dtype == float]
     values = np.column_stack([joints.numbers(name, None) for name in names])
     around = np.stack([_interpolated(at + shift, t, values) for shift in np.linspace(-STANDSTILL, STANDSTILL, 5)])
     still = (np.ptp(around, axis=0) <= MAX_MOTION * np.ptp(values, axis=0) + 1e-12).all(axis=1)
     units = tuple(joints.units[joints.index(name)] for name in names)
-    found = Table(joints.file, tuple(names), units, tuple(around[2].T), points.rows)
+    interpolated = Table(joints.file, tuple(names), units, tuple(around[2].T), points.rows)
     notes = [f"{len(points)} points, joined by time with a log of {t[-1] - t[0]:.4g} s"]
-    if (moving := inside & ~still).any():
+    if (moving := in_log & ~still).any():
         notes.append(f"measured while the arm moved: rows {listing(points.rows[moving])}")
-    if not inside.all():
-        notes.append(f"outside the log: rows {listing(points.rows[~inside])}")
-    return found, np.where(inside & still, np.arange(len(at)), -1), tuple(notes)
+    if not in_log.all():
+        notes.append(f"outside the log: rows {listing(points.rows[~in_log])}")
+    return interpolated, np.where(in_log & still, np.arange(len(at)), -1), tuple(notes)
 
 
 def _interpolated(at: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -57,32 +57,32 @@ class Order:
         return float(np.sqrt(np.mean(self.error[self.pose >= 0] ** 2)))
 
 
-def find_order(chain: Chain, q: np.ndarray, points: np.ndarray, stated: dict[str, np.ndarray]) -> Order | None:
+def find_order(chain: Chain, q: np.ndarray, points: np.ndarray, candidates: dict[str, np.ndarray]) -> Order | None:
     """Return which of the poses q (n, joints) each of the points (m, 3) [m] belongs to; None if no order explains them.
 
     Args:
         chain: the nominal arm.
-        stated: orders to try first, in words → (m,) index of each point's pose, -1 where it does not say.
+        candidates: orders to try first, in words → (m,) index of each point's pose, -1 where it does not say.
     """
     arm, limit = forward(chain, q), MAX_MISFIT * chain.stretched_length()
-    for how, pose in stated.items():
-        known = np.flatnonzero(pose >= 0)
-        predicted = _predicted(chain, q, points, pose, known) if len(known) >= MIN_POINTS else None
-        if predicted is None or np.median(np.linalg.norm(predicted[pose[known]] - points[known], axis=1)) > limit:
+    for origin, pose in candidates.items():
+        assigned = np.flatnonzero(pose >= 0)
+        predicted = _predicted(chain, q, points, pose, assigned) if len(assigned) >= MIN_POINTS else None
+        if predicted is None or np.median(np.linalg.norm(predicted[pose[assigned]] - points[assigned], axis=1)) > limit:
             continue
-        found = _refined(chain, q, points, pose, limit, prefer=pose)
-        if found is not None and np.mean(found.pose[pose >= 0] == pose[pose >= 0]) > 0.5:
-            return Order(found.pose, found.error, how=how)
+        order = _refined(chain, q, points, pose, limit, prefer=pose)
+        if order is not None and np.mean(order.pose[pose >= 0] == pose[pose >= 0]) > 0.5:
+            return Order(order.pose, order.error, how=origin)
     good = list[Order]()
     for tools in (_tools(arm, points), TOOLS):
         for pose in _by_distances(arm, points, tools) if not good and len(points) >= MIN_FOUND else ():
-            if (found := _refined(chain, q, points, pose, limit)) is not None:
-                good.append(found)
-                if np.mean(found.pose >= 0) > 0.9:
+            if (order := _refined(chain, q, points, pose, limit)) is not None:
+                good.append(order)
+                if np.mean(order.pose >= 0) > 0.9:
                     break
     if not good:
         return None
-    best = max(good, key=lambda each: (int((each.pose >= 0).sum()), -each.rms))
+    best = max(good, key=lambda candidate: (int((candidate.pose >= 0).sum()), -candidate.rms))
     return Order(best.pose, best.error, best.rivals, "found from the nominal geometry")
 
 
@@ -91,31 +91,31 @@ def _refined(
 ) -> Order | None:
     """Return the order that a first order leads to, None if most of the points then belong to no pose."""
     for _ in range(MAX_ROUNDS):
-        known = np.flatnonzero(pose >= 0)
-        if len(known) < MIN_POINTS or (predicted := _predicted(chain, q, points, pose, known)) is None:
+        assigned = np.flatnonzero(pose >= 0)
+        if len(assigned) < MIN_POINTS or (predicted := _predicted(chain, q, points, pose, assigned)) is None:
             return None
         cost = cdist(points, predicted)
-        bound = max(limit, 3.0 * float(np.median(cost[known, pose[known]])))  # wide at first
+        bound = max(limit, 3.0 * float(np.median(cost[assigned, pose[assigned]])))  # wide at first
         before, pose = pose, _assigned(cost, bound, prefer)
         if np.array_equal(before, pose):
             break
-    near = np.argmin(cost, axis=1)
-    pose = np.where((pose < 0) & (cost.min(axis=1) < limit), near, pose)  # read again
+    nearest = np.argmin(cost, axis=1)
+    pose = np.where((pose < 0) & (cost.min(axis=1) < limit), nearest, pose)  # read again
     error = cost[np.arange(len(points)), pose]
     pose = np.where(error < limit, pose, -1)
     if np.mean(pose >= 0) < 0.5:
         return None
-    found = Order(pose, error)
-    others = np.where(np.arange(len(q)) == pose[:, None], np.inf, cost).min(axis=1)
-    doubtful = (pose >= 0) & (others < np.maximum(AMBIGUOUS * found.rms, error))
+    order = Order(pose, error)
+    other_cost = np.where(np.arange(len(q)) == pose[:, None], np.inf, cost).min(axis=1)
+    doubtful = (pose >= 0) & (other_cost < np.maximum(AMBIGUOUS * order.rms, error))
     return Order(pose, error, tuple(np.flatnonzero(doubtful).tolist()))
 
 
 def _predicted(
-    chain: Chain, q: np.ndarray, points: np.ndarray, pose: np.ndarray, known: np.ndarray
+    chain: Chain, q: np.ndarray, points: np.ndarray, pose: np.ndarray, assigned: np.ndarray
 ) -> np.ndarray | None:
-    """Return the points (n, 3) of all poses after placing instrument and target by the `known` points."""
-    block = PoseMeasurements.of(q[pose[known]], points[known], joint_names=chain.joint_names)
+    """Return the points (n, 3) of all poses after placing instrument and target by the `assigned` points."""
+    block = PoseMeasurements.of(q[pose[assigned]], points[assigned], joint_names=chain.joint_names)
     try:
         cell = install(chain, [block])
     except CalibError:
@@ -148,10 +148,10 @@ def _by_distances(arm: np.ndarray, points: np.ndarray, tools: Iterable[np.ndarra
             if not len(poses):
                 continue
             placed = _moved(points[triple], predicted[poses], points)
-            near = cdist(placed[:, few].reshape(-1, 3), predicted).min(axis=1).reshape(len(placed), -1)
-            score = np.median(near, axis=1)
+            nearest = cdist(placed[:, few].reshape(-1, 3), predicted).min(axis=1).reshape(len(placed), -1)
+            score = np.median(nearest, axis=1)
             scored += [(float(score[k]), placed[k], predicted) for k in np.argsort(score)[:KEPT]]
-    scored.sort(key=lambda one: one[0])
+    scored.sort(key=lambda start: start[0])
     for _, placed, predicted in scored[:KEPT]:
         yield _assigned(cdist(placed, predicted), np.inf, None)
 
@@ -159,14 +159,14 @@ def _by_distances(arm: np.ndarray, points: np.ndarray, tools: Iterable[np.ndarra
 def _tools(arm: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
     """Return offsets (3,) of the target in the tip's frame [m] with which distances between points agree best."""
     share = np.linspace(0.02, 0.98, 60)
-    seen = np.quantile(pdist(points), share)
+    measured = np.quantile(pdist(points), share)
 
-    def apart(tool: np.ndarray) -> float:
-        return float(np.mean(np.abs(np.quantile(pdist(arm[:, :3, 3] + arm[:, :3, :3] @ tool), share) - seen)))
+    def misfit(tool: np.ndarray) -> float:
+        return float(np.mean(np.abs(np.quantile(pdist(arm[:, :3, 3] + arm[:, :3, :3] @ tool), share) - measured)))
 
     starts = 0.15 * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
-    found = [minimize(apart, start, method="Nelder-Mead", options={"maxfev": 150}) for start in starts]
-    return [np.zeros(3), *(one.x for one in sorted(found, key=lambda one: one.fun)[: STARTS - 1])]
+    optima = [minimize(misfit, start, method="Nelder-Mead", options={"maxfev": 150}) for start in starts]
+    return [np.zeros(3), *(optimum.x for optimum in sorted(optima, key=lambda optimum: optimum.fun)[: STARTS - 1])]
 
 
 def _wide_triples(points: np.ndarray, rng: np.random.Generator) -> Iterator[np.ndarray]:
@@ -180,9 +180,9 @@ def _similar(between: np.ndarray, triangle: np.ndarray, bound: float, rng: np.ra
     """Return triples (k, 3) of poses whose distances differ by less than `bound` from those of a triangle (3, 3)."""
     ab, ac, bc = pdist(triangle)
     a, b = np.nonzero(np.abs(between - ab) < bound)
-    most = max(MAX_TRIPLES * 50 // len(between), 1)
-    if len(a) > most:
-        keep = rng.permutation(len(a))[:most]
+    max_pairs = max(MAX_TRIPLES * 50 // len(between), 1)
+    if len(a) > max_pairs:
+        keep = rng.permutation(len(a))[:max_pairs]
         a, b = a[keep], b[keep]
     pair, c = np.nonzero((np.abs(between[a] - ac) < bound) & (np.abs(between[b] - bc) < bound))
     return np.column_stack([a[pair], b[pair], c])[:MAX_TRIPLES]

@@ -52,11 +52,11 @@ def read_planned(path: Path, chain: Chain, options: FileOptions) -> list[PoseMea
         for name, unit in zip(points.header, points.units)
     )
     keys = [name for name in [column_of(points, NAMES)] if name]
-    joined = merged(plan, replace(points, units=units), pose, notes, keys, told=False)
+    joined = merged(plan, replace(points, units=units), pose, notes, keys, name_missing=False)
     (block,) = read_measurements(joined.table, joints_of(chain), replace(options, units={}))
     sigma = _stop_sigma(chain, block.q)
-    said = finding("joints-planned", sigma=np.sqrt(np.mean(3.0 * sigma**2)))
-    block = replace(block, notes=(*lines_of([said]), *joined.notes, *block.notes))
+    note = finding("joints-planned", sigma=np.sqrt(np.mean(3.0 * sigma**2)))
+    block = replace(block, notes=(*lines_of([note]), *joined.notes, *block.notes))
     if isinstance(block, Positions) and block.sigma is not None:
         block = replace(block, sigma=np.hypot(block.sigma, sigma[:, None]))
     return [block]
@@ -64,22 +64,22 @@ def read_planned(path: Path, chain: Chain, options: FileOptions) -> list[PoseMea
 
 def _stated(points: Table, count: int) -> dict[str, np.ndarray]:
     """Return the orders that the file itself may state, in words → (m,) index of the pose."""
-    numbers, stated = np.arange(len(points)), dict[str, np.ndarray]()
+    numbers, orders = np.arange(len(points)), dict[str, np.ndarray]()
     starts = range(max(count - len(points), 0) + 1) if len(points) >= MIN_POINTS else ()
     for start in starts:  # a run that was interrupted goes on somewhere
-        how = f"in the order of the list{f' from pose {start + 1} on' if start else ''}"
-        stated[how] = np.where(numbers + start < count, numbers + start, -1)
+        origin = f"in the order of the list{f' from pose {start + 1} on' if start else ''}"
+        orders[origin] = np.where(numbers + start < count, numbers + start, -1)
     if name := column_of(points, NAMES):
-        found = [re.findall(r"\d+", text)[-1:] for text in points.texts(name)]
-        named = np.array([int(digits[0]) - 1 if digits else -1 for digits in found])
-        stated = {"by the numbers in their names": np.where(named < count, named, -1)} | stated
-    return stated
+        digit_lists = [re.findall(r"\d+", text)[-1:] for text in points.texts(name)]
+        numbered = np.array([int(digits[0]) - 1 if digits else -1 for digits in digit_lists])
+        orders = {"by the numbers in their names": np.where(numbered < count, numbered, -1)} | orders
+    return orders
 
 
 def _stop_sigma(chain: Chain, q: np.ndarray) -> np.ndarray:
     """Return the standard deviation (m,) [m] per axis of the tip's position from `SIGMA_JOINT` at each joint."""
-    moved = [
+    differences = [
         forward(chain, q + STEP * axis)[:, :3, 3] - forward(chain, q - STEP * axis)[:, :3, 3]
         for axis in np.eye(chain.n)
     ]
-    return SIGMA_JOINT * np.sqrt(np.sum(np.square(moved), axis=(0, 2)) / 3.0) / (2.0 * STEP)
+    return SIGMA_JOINT * np.sqrt(np.sum(np.square(differences), axis=(0, 2)) / 3.0) / (2.0 * STEP)

@@ -60,14 +60,16 @@ class Stream:
 
     def lines(self) -> list[str]:
         """Return what is to be said of the file's rows."""
-        apart = np.diff(self.t)
-        reasons = [f"{count} {why}" for why, count in self.dropped.items() if count]
-        found = [f"{Path(self.file).name}: {self.read} rows, {self.t[-1] - self.t[0]:.4g} s"]
+        intervals = np.diff(self.t)
+        reasons = [f"{count} {reason}" for reason, count in self.dropped.items() if count]
+        lines = [f"{Path(self.file).name}: {self.read} rows, {self.t[-1] - self.t[0]:.4g} s"]
         if reasons:
-            found[0] += f"; left out: {', '.join(reasons)}"
-        if gaps := int((apart > self.gap).sum()):
-            found.append(f"{Path(self.file).name}: {counted(gaps, 'gap')} not bridged, the longest {apart.max():.3g} s")
-        return found
+            lines[0] += f"; left out: {', '.join(reasons)}"
+        if gaps := int((intervals > self.gap).sum()):
+            lines.append(
+                f"{Path(self.file).name}: {counted(gaps, 'gap')} not bridged, the longest {intervals.max():.3g} s"
+            )
+        return lines
 
 
 @dataclass(frozen=True)
@@ -96,31 +98,31 @@ def read_stream(path: Path, kind: Kind) -> Stream:
         MeasurementError: for a file without times, one that was measured at stops, one whose clock was restarted, and
             one of which most rows cannot be used.
     """
-    parts, dropped, last, every, read = list[tuple[np.ndarray, ...]](), Counter[str](), -np.inf, 0, 0
+    parts, dropped, last, stride, read = list[tuple[np.ndarray, ...]](), Counter[str](), -np.inf, 0, 0
     jumps, latest = list[tuple[int, float, float]](), np.nan
     for table in _pieces(path):
-        t, values, whole = _piece(table, kind)
-        before = np.maximum.accumulate(np.concatenate([[last], np.where(whole, t, -np.inf)]))
-        ahead = whole & (t > before[:-1])
-        dropped.update({DAMAGED: int((~whole).sum()), LATE: int((whole & ~ahead).sum())})
+        t, values, sound = _piece(table, kind)
+        before = np.maximum.accumulate(np.concatenate([[last], np.where(sound, t, -np.inf)]))
+        ahead = sound & (t > before[:-1])
+        dropped.update({DAMAGED: int((~sound).sum()), LATE: int((sound & ~ahead).sum())})
         last, read = before[-1], read + len(t)
-        own = np.concatenate([[latest], t[whole]])
-        far = np.flatnonzero(np.abs(np.diff(own)) > RESTART)
-        jumps += zip(table.rows[whole][far].tolist(), own[far].tolist(), own[far + 1].tolist())
-        latest = own[-1]
-        if not every and ahead.sum() > 1:
-            every = max(int(kind.resolution / _step(t[ahead], table) + 0.01), 1)
-        held = ahead & ((table.rows - 1) % max(every, 1) == 0)
-        parts.append((t[held], values[held], table.rows[held]))
+        times = np.concatenate([[latest], t[sound]])
+        jump_rows = np.flatnonzero(np.abs(np.diff(times)) > RESTART)
+        jumps += zip(table.rows[sound][jump_rows].tolist(), times[jump_rows].tolist(), times[jump_rows + 1].tolist())
+        latest = times[-1]
+        if not stride and ahead.sum() > 1:
+            stride = max(int(kind.resolution / _step(t[ahead], table) + 0.01), 1)
+        thinned = ahead & ((table.rows - 1) % max(stride, 1) == 0)
+        parts.append((t[thinned], values[thinned], table.rows[thinned]))
         if sum(len(part[0]) for part in parts) > HELD:
-            every *= 2
-            parts = [tuple(own[(part[2] - 1) % every == 0] for own in part) for part in parts]
+            stride *= 2
+            parts = [tuple(times[(part[2] - 1) % stride == 0] for times in part) for part in parts]
     _refuse_restart(path, [*jumps, (read + 1, np.nan, -np.inf)])
     if read - sum(dropped.values()) < max(MIN_ROWS, read / 2):
-        said = ", ".join(f"{count} {why}" for why, count in dropped.items() if count)
-        words = f"only {read - sum(dropped.values())} of {read} rows can be used{said and f' ({said})'}"
-        refuse_data(path, f"{words}: is it a stream, and one recording?")
-    t, values, rows = (np.concatenate(each) for each in zip(*(part for part in parts if len(part[0]))))
+        reasons = ", ".join(f"{count} {reason}" for reason, count in dropped.items() if count)
+        message = f"only {read - sum(dropped.values())} of {read} rows can be used{reasons and f' ({reasons})'}"
+        refuse_data(path, f"{message}: is it a stream, and one recording?")
+    t, values, rows = (np.concatenate(columns) for columns in zip(*(part for part in parts if len(part[0]))))
     return Stream(str(path), t, values, rows, float(np.median(np.diff(t))), read, dropped)
 
 
@@ -132,47 +134,47 @@ def _refuse_restart(path: Path, jumps: Sequence[tuple[int, float, float]]) -> No
     """
     for (row, before, after), (end, _, then) in pairwise(jumps):
         if after < before and then < before - RESTART and end - row >= MIN_ROWS:
-            words = f"its times go back from {before:.3f} to {after:.3f} s and run on from there: the clock restarted"
-            refuse_data(path, f"{words}. Split the file there, and join each part on its own", row=row)
+            message = f"its times go back from {before:.3f} to {after:.3f} s and run on from there: the clock restarted"
+            refuse_data(path, f"{message}. Split the file there, and join each part on its own", row=row)
 
 
 def _piece(table: Table, kind: Kind) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return times (m,) [s] and values (m, k) [SI] of a table, and which rows (m,) can be."""
     clock, names = _clock(table), kind.names(table)
     t = table.cells[table.index(clock)] * table.factor(table.index(clock), TIMES, "")
-    whole = np.ones(len(t), dtype=bool)
+    sound_rows = np.ones(len(t), dtype=bool)
     for cells in (t, *(table.cells[table.index(name)] for name in names)):
-        whole &= np.isfinite(cells)
-    whole[1:-1] &= ~((t[1:-1] > t[2:]) & (t[2:] > t[:-2]))  # one time too late, not all that follow
-    own = kind.values(table.where(whole))
-    sound = kind.sound(own)
-    if len(own) and sound.mean() < 0.5:
-        kind.refuse(table.where(whole), own)
-    values = np.full((len(t), own.shape[1]), np.nan)
-    values[whole] = own
-    whole[whole] = sound
-    return t, values, whole
+        sound_rows &= np.isfinite(cells)
+    sound_rows[1:-1] &= ~((t[1:-1] > t[2:]) & (t[2:] > t[:-2]))  # one time too late, not all that follow
+    sound_values = kind.values(table.where(sound_rows))
+    sound = kind.sound(sound_values)
+    if len(sound_values) and sound.mean() < 0.5:
+        kind.refuse(table.where(sound_rows), sound_values)
+    values = np.full((len(t), sound_values.shape[1]), np.nan)
+    values[sound_rows] = sound_values
+    sound_rows[sound_rows] = sound
+    return t, values, sound_rows
 
 
 def _clock(table: Table) -> str:
-    found = f"found {listing(table.header)}. What was measured at stops is joined by name, time or row"
-    words = f"has no column of times ({', '.join(CLOCKS)}); {found}"
-    require(clock := column_of(table, CLOCKS), words, MeasurementError, table.file)
+    found_columns = f"found {listing(table.header)}. What was measured at stops is joined by name, time or row"
+    message = f"has no column of times ({', '.join(CLOCKS)}); {found_columns}"
+    require(clock := column_of(table, CLOCKS), message, MeasurementError, table.file)
     return clock
 
 
 def _step(t: np.ndarray, table: Table) -> float:
     """Return the time between rows [s]; refuse a file that was measured at stops."""
     step = float(np.median(np.diff(t)))
-    words = f"its rows are {step:.3g} s apart, a stream's {SLOWEST:g} s at most. Is t in ms ('t [ms]')?"
+    message = f"its rows are {step:.3g} s apart, a stream's {SLOWEST:g} s at most. Is t in ms ('t [ms]')?"
     if step > SLOWEST:
-        refuse_data(table.file, f"{words} What was measured at stops is joined by name, time or row", _clock(table))
+        refuse_data(table.file, f"{message} What was measured at stops is joined by name, time or row", _clock(table))
     return step
 
 
 def _pieces(path: Path) -> Iterator[Table]:
     """Yield the table at `path` in pieces of at most `PIECE` rows; what is no number is NaN, and a date its seconds."""
-    done = 0
+    first_row = 0
     with (
         refused_as(MeasurementError, UnicodeDecodeError, "is no UTF-8 text ({}): is the copy complete?", path),
         opened(path, True) as (lines, separator, cells),
@@ -180,12 +182,12 @@ def _pieces(path: Path) -> Iterator[Table]:
         names, units = split_units(cells)
         body = (line for line in lines if (text := line.strip()) and text[0] != "#")
         while block := list(islice(body, PIECE)):
-            found = plain_rows(block, separator, len(names))
-            if found is None:
-                found = np.array([_row(line, separator, len(names)) for line in block])
-            yield Table(str(path), names, units, tuple(found.T), np.arange(done, done + len(found)) + 1)
-            done += len(found)
-    require(done, "has a header but no data rows", MeasurementError, path)
+            numbers = plain_rows(block, separator, len(names))
+            if numbers is None:
+                numbers = np.array([_row(line, separator, len(names)) for line in block])
+            yield Table(str(path), names, units, tuple(numbers.T), np.arange(first_row, first_row + len(numbers)) + 1)
+            first_row += len(numbers)
+    require(first_row, "has a header but no data rows", MeasurementError, path)
 
 
 def _row(line: str, separator: str, width: int) -> list[float]:

@@ -76,62 +76,66 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
         MeasurementError: where the files are no streams, the arm hardly moves, or the two do not belong together.
     """
     log, stream = read_stream(log_file, _joints(chain)), _fresh(read_stream(file, _target()))
-    for each, k, unit in ((log, chain.n, ""), (stream, 3, " m")):
-        most = float(np.ptp(each.values[:, :k], axis=0).max())
-        words = f"hardly moves (by {most:.2g}{unit}), and without motion no clock is found: is the unit right?"
-        require(most > MIN_MOTION, words, MeasurementError, each.file)
+    for recording, k, unit in ((log, chain.n, ""), (stream, 3, " m")):
+        travel = float(np.ptp(recording.values[:, :k], axis=0).max())
+        message = f"hardly moves (by {travel:.2g}{unit}), and without motion no clock is found: is the unit right?"
+        require(travel > MIN_MOTION, message, MeasurementError, recording.file)
     turn = stream.values[:, 3:] if stream.values.shape[1] > 3 else None
     q, names = np.zeros((len(stream.t), chain.n)), chain.joint_names
     run = Run(log, stream, PoseMeasurements.of(q, stream.values[:, :3], turn, joint_names=names, file=str(file)))
     nominal, clock, rivals = begin(chain, run)
-    cell, clock, seen = fitted(nominal, run, run.known(clock, FITTED), clock)
-    step, wander = find_step(seen)
+    cell, clock, equations = fitted(nominal, run, run.known(clock, FITTED), clock)
+    step, wander = find_step(equations)
     if step or wander > MAX_WANDER:
         _refuse(step, wander, run, clock)
-    kept, left, velocity, said = _usable(cell, run, clock)
-    tau, sigma = max(inflation(row) for row in left), robust.spread(left[:3])
-    chosen, apart = _thinned(stream.t[kept], run.joints(clock, kept), stream.step * (1.0 + 1.5 * (tau - 1.0)))
-    rows, rest = kept[chosen], max(float(autocorrelation(row, 1)[0]) for row in left[:, chosen])
-    found: dict[str, Any] = {
+    usable, errors, velocity, findings = _usable(cell, run, clock)
+    tau, sigma = max(inflation(row) for row in errors), robust.spread(errors[:3])
+    chosen, spacing = _thinned(stream.t[usable], run.joints(clock, usable), stream.step * (1.0 + 1.5 * (tau - 1.0)))
+    rows, neighbour_correlation = usable[chosen], max(float(autocorrelation(row, 1)[0]) for row in errors[:, chosen])
+    figures: dict[str, Any] = {
         "sigma": sigma,
         "correlation": tau * stream.step,
         "factor": float(np.sqrt(tau)),
-        "left": rest,
+        "left": neighbour_correlation,
     }
-    known = apart | found | {"factor": found["factor"] if found["factor"] > WORTH_SAYING else None}
-    thinned = finding("stream-thinned", taken=len(rows), of=len(kept), step=stream.step, **known)
+    stated_figures = spacing | figures | {"factor": figures["factor"] if figures["factor"] > WORTH_SAYING else None}
+    thinned = finding("stream-thinned", taken=len(rows), of=len(usable), step=stream.step, **stated_figures)
     if len(rows) < MIN_ROWS:
-        words = "too few rows are independent: did a clock jump, or instrument or target move? Else measure for longer"
-        refuse_data(file, f"{words}, over more of the workspace ({'; '.join([*run.lines(), *lines_of([thinned])])})")
+        message = (
+            "too few rows are independent: did a clock jump, or instrument or target move? Else measure for longer"
+        )
+        refuse_data(file, f"{message}, over more of the workspace ({'; '.join([*run.lines(), *lines_of([thinned])])})")
     few = rows[evenly(len(rows), FITTED)]
     _, clock, _ = fitted(nominal, run, few, clock, play=True)
-    alike = float(np.sqrt((1.0 + max(rest, 0.0)) / (1.0 - max(rest, 0.0))))  # of neighbours, for what changes slowly
+    alike = float(
+        np.sqrt((1.0 + max(neighbour_correlation, 0.0)) / (1.0 - max(neighbour_correlation, 0.0)))
+    )  # of neighbours, for what changes slowly
     clock = replace(clock, sigma=alike * clock.sigma, drift_sigma=alike * clock.drift_sigma)
-    late = clock.sigma * float(np.sqrt(np.mean(np.sum(velocity**2, axis=0))))
-    words = (
+    position_error = clock.sigma * float(np.sqrt(np.mean(np.sum(velocity**2, axis=0))))
+    message = (
         f"the offset of its clock is known to {1e3 * clock.sigma:.2g} ms only, in which the target moves by "
-        f"{1e3 * late:.2g} mm (noise {1e3 * sigma:.2g} mm): measure for longer, each way forth and back"
+        f"{1e3 * position_error:.2g} mm (noise {1e3 * sigma:.2g} mm): measure for longer, each way forth and back"
     )
-    require(late < sigma, words, MeasurementError, file)
-    said += [finding("stream-repeats", offsets=rivals)] if rivals else []
-    said += [finding("stream-wanders", away=wander)] if wander else []
+    require(position_error < sigma, message, MeasurementError, file)
+    findings += [finding("stream-repeats", offsets=rivals)] if rivals else []
+    findings += [finding("stream-wanders", away=wander)] if wander else []
     first = stream.t[0] - float(clock.controller(stream.t[:1])[0])
     ppm = {"ppm": 1e6 * clock.drift, "ppm_sigma": 1e6 * clock.drift_sigma}
-    said += [finding("stream-clock", first=first, **vars(clock) | ppm)]
-    notes = (*run.lines(), *lines_of([*said, thinned]))
+    findings += [finding("stream-clock", first=first, **vars(clock) | ppm)]
+    notes = (*run.lines(), *lines_of([*findings, thinned]))
     table = _table(chain, run.joints(clock, rows), stream, rows, velocities(cell, run, rows, clock)[:3])
-    return Streamed(table, stream.rows[rows] - 1, notes, clock, **found)
+    return Streamed(table, stream.rows[rows] - 1, notes, clock, **figures)
 
 
 def _refuse(step: Step | None, wander: float, run: Run, clock: Clock) -> NoReturn:
     """Refuse recordings in which a clock steps, or wanders."""
     if step is None:
-        words = f"the clocks' offset leaves a line of offset and drift by {1e3 * wander:.2g} ms"
-        refuse_data(run.stream.file, f"{words}: cut the file into shorter parts, and join each part on its own")
+        message = f"the clocks' offset leaves a line of offset and drift by {1e3 * wander:.2g} ms"
+        refuse_data(run.stream.file, f"{message}: cut the file into shorter parts, and join each part on its own")
     size = f"{1e3 * step.size:+.3g} ± {1e3 * step.sigma:.2g} ms"
-    words = f"the instrument's clock steps by {size} against the controller's"
-    place = step.place(run.log, run.stream, float(clock.controller(np.array(step.time))))
-    refuse_data(run.stream.file, f"{words} ({place}): cut the file there, and join each part on its own")
+    message = f"the instrument's clock steps by {size} against the controller's"
+    location = step.place(run.log, run.stream, float(clock.controller(np.array(step.time))))
+    refuse_data(run.stream.file, f"{message} ({location}): cut the file there, and join each part on its own")
 
 
 def _usable(cell: Installation, run: Run, clock: Clock) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Finding]]:
@@ -139,29 +143,31 @@ def _usable(cell: Installation, run: Run, clock: Clock) -> tuple[np.ndarray, np.
 
     Residuals have the variance σ² across the motion, and σ² + v² σ_t² along it.
     """
-    stream, kept = run.stream, run.known(clock)
-    left = residuals(cell, run, kept, clock)
-    near = (np.abs(left) < OUTLIER * np.array([[robust.spread(row)] for row in left])).all(axis=0)
-    stream.dropped["outside the log or in its gaps"] = len(stream.t) - len(kept)
-    stream.dropped["far from the arm's path"] = int((~near).sum())
-    kept, left = kept[near], left[:, near]
-    velocity = np.gradient(stream.values[kept, :3], stream.t[kept], axis=0).T
+    stream, usable = run.stream, run.known(clock)
+    errors = residuals(cell, run, usable, clock)
+    consistent = (np.abs(errors) < OUTLIER * np.array([[robust.spread(row)] for row in errors])).all(axis=0)
+    stream.dropped["outside the log or in its gaps"] = len(stream.t) - len(usable)
+    stream.dropped["far from the arm's path"] = int((~consistent).sum())
+    usable, errors = usable[consistent], errors[:, consistent]
+    velocity = np.gradient(stream.values[usable, :3], stream.t[usable], axis=0).T
     speed = np.linalg.norm(velocity, axis=0)
-    along = (left[:3] * velocity).sum(axis=0) / np.maximum(speed, 1e-9)
-    across = (np.sum(left[:3] ** 2, axis=0) - along**2) / 2.0
-    late = np.sqrt(max(float(np.sum(speed**2 * (along**2 - across)) / np.sum(speed**4)), 1e-24))
+    along = (errors[:3] * velocity).sum(axis=0) / np.maximum(speed, 1e-9)
+    across = (np.sum(errors[:3] ** 2, axis=0) - along**2) / 2.0
+    time_sigma = np.sqrt(max(float(np.sum(speed**2 * (along**2 - across)) / np.sum(speed**4)), 1e-24))
     sigma = float(np.sqrt(across.mean()))
-    slow = speed * late <= sigma
+    slow = speed * time_sigma <= sigma
     stream.dropped["too fast"] = int((~slow).sum())
-    said = [] if slow.all() else [finding("stream-fast", speed=sigma / late, late=late, sigma=sigma)]
-    return kept[slow], left[:, slow], velocity[:, slow], said
+    findings = [] if slow.all() else [finding("stream-fast", speed=sigma / time_sigma, late=time_sigma, sigma=sigma)]
+    return usable[slow], errors[:, slow], velocity[:, slow], findings
 
 
 def _joints(chain: Chain) -> Kind:
     """Return how a log's joints are read."""
     robot = joints_of(chain)
     travel = max_travel(robot.kinds)
-    low, high = (np.where(np.isfinite(own), own, side * travel) for own, side in ((robot.lower, -1), (robot.upper, 1)))
+    low, high = (
+        np.where(np.isfinite(limit), limit, side * travel) for limit, side in ((robot.lower, -1), (robot.upper, 1))
+    )
 
     def names(table: Table) -> tuple[str, ...]:
         return Sheet(table).find_joints(robot.names)
@@ -179,9 +185,9 @@ def _target() -> Kind:
     """Return how an instrument's positions [m], and its quaternions where it has some, are read."""
 
     def names(table: Table) -> tuple[str, ...]:
-        found = Sheet(table).family(POSITION.names)
-        require(found, f"has no x, y, z; found {', '.join(table.header)}", MeasurementError, table.file)
-        return (*found, *Sheet(table).family(QUATERNION.names))
+        position_columns = Sheet(table).family(POSITION.names)
+        require(position_columns, f"has no x, y, z; found {', '.join(table.header)}", MeasurementError, table.file)
+        return (*position_columns, *Sheet(table).family(QUATERNION.names))
 
     def values(table: Table) -> np.ndarray:
         return np.column_stack([table.numbers(name, "" if k > 2 else "length") for k, name in enumerate(names(table))])
@@ -206,22 +212,28 @@ def _fresh(stream: Stream) -> Stream:
     return replace(stream, t=stream.t[new], values=stream.values[new], rows=stream.rows[new])
 
 
-def _thinned(t: np.ndarray, q: np.ndarray, apart: float) -> tuple[np.ndarray, dict[str, float | None]]:
-    """Return the indices of times t (m,) at least `apart` [s], between which one of the joints q (m, n) moves.
+def _thinned(t: np.ndarray, q: np.ndarray, min_interval: float) -> tuple[np.ndarray, dict[str, float | None]]:
+    """Return the indices of times t (m,) at least `min_interval` [s], between which one of the joints q (m, n) moves.
 
     Second: `apart`, the median time between them [s], and what made it longer: `most` rows, or that a joint `moved`.
     """
     step, full = float(np.median(np.diff(t))), float(t[-1] - t[0]) / MAX_ROWS
-    capped, apart, found, after, ahead = full > 0.999 * apart, max(0.999 * apart, full), [0], 0, 64
-    while (after := max(after, int(np.searchsorted(t, t[found[-1]] + apart)))) < len(t):
-        moved = np.flatnonzero(np.abs(q[after : after + ahead] - q[found[-1]]).max(axis=1) > MOVED)
-        found += (after + moved[:1]).tolist()
-        after += 0 if len(moved) else ahead
-    rows = np.array(found)
-    taken = float(np.median(np.diff(t[rows]))) if len(rows) > 1 else apart
-    still = taken > apart + 1.5 * step
-    most, moved = MAX_ROWS if capped and not still else None, 1e3 * MOVED if still else None
-    return rows, {"apart": taken, "most": most, "moved": moved}
+    capped, min_interval, chosen, after, ahead = (
+        full > 0.999 * min_interval,
+        max(0.999 * min_interval, full),
+        [0],
+        0,
+        64,
+    )
+    while (after := max(after, int(np.searchsorted(t, t[chosen[-1]] + min_interval)))) < len(t):
+        moving = np.flatnonzero(np.abs(q[after : after + ahead] - q[chosen[-1]]).max(axis=1) > MOVED)
+        chosen += (after + moving[:1]).tolist()
+        after += 0 if len(moving) else ahead
+    rows = np.array(chosen)
+    interval = float(np.median(np.diff(t[rows]))) if len(rows) > 1 else min_interval
+    still = interval > min_interval + 1.5 * step
+    max_rows, moving = MAX_ROWS if capped and not still else None, 1e3 * MOVED if still else None
+    return rows, {"apart": interval, "most": max_rows, "moved": moving}
 
 
 def _table(chain: Chain, q: np.ndarray, stream: Stream, rows: np.ndarray, velocity: np.ndarray) -> Table:
@@ -231,5 +243,5 @@ def _table(chain: Chain, q: np.ndarray, stream: Stream, rows: np.ndarray, veloci
     header = ("time", *chain.joint_names, *POSITION.names, *turn, *LATE.names)
     cells = (stream.t[rows], *(q * [factor for factor, _ in units]).T, *(1e3 * stream.values[rows, :3]).T)
     cells += (*stream.values[rows, 3:].T, *(1e3 * velocity))
-    named = ("s", *(unit for _, unit in units), *("mm",) * 3, *("",) * len(turn), *("mm/s",) * 3)
-    return Table(stream.file, header, named, cells, stream.rows[rows])
+    column_units = ("s", *(unit for _, unit in units), *("mm",) * 3, *("",) * len(turn), *("mm/s",) * 3)
+    return Table(stream.file, header, column_units, cells, stream.rows[rows])

@@ -31,8 +31,8 @@ def serve(folder: Path, host: str = LOCAL, port: Annotated[int, typer.Option(min
 
     from calib.procedure.session.folder import open_session
 
-    words = "calib serve needs starlette, uvicorn and python-multipart: pip install 'armature-calib[serve]'"
-    with refused_as(UsageError, ImportError, words):
+    message = "calib serve needs starlette, uvicorn and python-multipart: pip install 'armature-calib[serve]'"
+    with refused_as(UsageError, ImportError, message):
         import uvicorn
 
         from calib.apps.serve.pages import application
@@ -40,12 +40,12 @@ def serve(folder: Path, host: str = LOCAL, port: Annotated[int, typer.Option(min
 
     open_session(folder)
     token = "" if host in (LOCAL, "localhost") else secrets.token_urlsafe(16)
-    words = f"cannot listen on {host}, port {port} ({{}}); try another --port"
-    with refused_as(UsageError, (OSError, OverflowError), words):
+    message = f"cannot listen on {host}, port {port} ({{}}); try another --port"
+    with refused_as(UsageError, (OSError, OverflowError), message):
         listening = socket.create_server((host, port))
     work = Work(folder)
-    shown = _own_address() if host == "0.0.0.0" else host
-    address = f"http://{shown}:{listening.getsockname()[1]}/{f'?token={token}' if token else ''}"
+    address_host = _own_address() if host == "0.0.0.0" else host
+    address = f"http://{address_host}:{listening.getsockname()[1]}/{f'?token={token}' if token else ''}"
     say(f"{folder}: {address} (Ctrl-C stops)", result=True)
     try:
         config = uvicorn.Config(application(work, token, host), log_level="warning", server_header=False)

@@ -47,27 +47,27 @@ class Guard:
 
     def _answer(self, request: Request) -> Response | None:
         """Return what is said in place of a page; None for a request that may pass."""
-        asked, origin = request.headers.get("host", ""), request.headers.get("origin")
-        if not self._is_ours(asked):
+        requested_host, origin = request.headers.get("host", ""), request.headers.get("origin")
+        if not self._is_ours(requested_host):
             return PlainTextResponse("This page is not served under that name: use the address printed.", 403)
         if request.method != "GET" and (
-            (origin is not None and urlsplit(origin).netloc != asked)
+            (origin is not None and urlsplit(origin).netloc != requested_host)
             or request.headers.get("sec-fetch-site", "same-origin") not in ("same-origin", "none")
         ):
             return PlainTextResponse("Another site's page asked for this; nothing was changed.", 403)
-        cookie = f"calib-{urlsplit(f'//{asked}').port or 80}"
+        cookie = f"calib-{urlsplit(f'//{requested_host}').port or 80}"
         if self.token and not self._knows(request.cookies.get(cookie, "")):
             if request.method != "GET" or not self._knows(request.query_params.get("token", "")):
-                words = "This page needs its token: open the whole address that calib serve printed."
-                return PlainTextResponse(words, 403)
+                message = "This page needs its token: open the whole address that calib serve printed."
+                return PlainTextResponse(message, 403)
             answer = RedirectResponse(request.url.path, 303)
             answer.set_cookie(cookie, self.token, httponly=True, samesite="strict")
             return answer
         return None
 
-    def _is_ours(self, asked: str) -> bool:
+    def _is_ours(self, requested_host: str) -> bool:
         try:
-            name = urlsplit(f"//{asked}").hostname or ""
+            name = urlsplit(f"//{requested_host}").hostname or ""
         except ValueError:
             return False
         try:
@@ -76,8 +76,8 @@ class Guard:
         except ValueError:
             return name in self.names
 
-    def _knows(self, given: str) -> bool:
-        return hmac.compare_digest(given.encode(), self.token.encode())
+    def _knows(self, token: str) -> bool:
+        return hmac.compare_digest(token.encode(), self.token.encode())
 
 
 def application(work: Work, token: str = "", host: str = "127.0.0.1") -> Starlette:
@@ -101,10 +101,10 @@ def application(work: Work, token: str = "", host: str = "127.0.0.1") -> Starlet
     ]
     guard = Middleware(Guard, token=token, host=host)  # type: ignore[arg-type]
     errors = {CalibError: refused, OSError: refused}
-    made = Starlette(routes=routes, middleware=[guard], exception_handlers=errors)  # type: ignore[arg-type]
-    made.state.work, made.state.view = work, WebViewer()
-    atexit.register(made.state.view.close)
-    return made
+    app = Starlette(routes=routes, middleware=[guard], exception_handlers=errors)  # type: ignore[arg-type]
+    app.state.work, app.state.view = work, WebViewer()
+    atexit.register(app.state.view.close)
+    return app
 
 
 def refused(request: Request, error: Exception) -> Response:
@@ -118,10 +118,10 @@ def page(request: Request) -> Response:
     work: Work = request.app.state.work
     session = open_session(work.folder)
     states = steps.states(session)
-    ahead = next((one for one in states if one.kind not in (steps.DONE, steps.KEPT)), None)
+    ahead = next((state for state in states if state.kind not in (steps.DONE, steps.KEPT)), None)
     waits = ahead if ahead is not None and ahead.kind == steps.WAITING else None
     task, file = commands.asks(session, waits) if waits else ("", "")
-    made = [path for path in _files(session) if path.suffix in PICTURES]
+    pictures = [path for path in _files(session) if path.suffix in PICTURES]
     values = {
         "session": session,
         "states": states,
@@ -134,7 +134,7 @@ def page(request: Request) -> Response:
         "notes": _notes(session),
         "pages": [name for name in PAGES if session.path(name).exists()],
         "recording": RECORDING if session.path(RECORDING).exists() else "",
-        "pictures": [_name(session, path) for path in made],
+        "pictures": [_name(session, path) for path in pictures],
         "files": [_name(session, path) for path in _files(session)],
     }
     headers = {"Content-Security-Policy": POLICY, "Cache-Control": "no-store"}
@@ -142,16 +142,20 @@ def page(request: Request) -> Response:
 
 
 def _notes(session: Session) -> dict[str, tuple[str, ...]]:
-    return {name: one.notes for name, one in steps.read_state(session).steps.items()}
+    return {name: record.notes for name, record in steps.read_state(session).steps.items()}
 
 
 def _kinds(session: Session) -> list[tuple[str, str, list[str]]]:
     """Return the kinds of files that the session takes: name, words, and those that were brought."""
-    words = dict(step.brings for step in steps.steps_of(session))
-    words |= {"drift": DRIFT} if session.geometric else {}
-    return [
-        (kind, words[kind], [_name(session, one) for one in session.brought(kind)]) for kind in BROUGHT if kind in words
-    ]
+    labels = dict(step.brings for step in steps.steps_of(session))
+    if session.geometric:
+        labels["drift"] = DRIFT
+    kinds = []
+    for kind in BROUGHT:
+        if kind in labels:
+            paths = [_name(session, path) for path in session.brought(kind)]
+            kinds.append((kind, labels[kind], paths))
+    return kinds
 
 
 def _name(session: Session, path: Path) -> str:
@@ -160,8 +164,8 @@ def _name(session: Session, path: Path) -> str:
 
 def _files(session: Session) -> list[Path]:
     """Return the session's files, without hidden ones."""
-    found = sorted(path for path in session.folder.rglob("*") if path.is_file())
-    return [path for path in found if not any(part.startswith(".") for part in path.relative_to(session.folder).parts)]
+    paths = sorted(path for path in session.folder.rglob("*") if path.is_file())
+    return [path for path in paths if not any(part.startswith(".") for part in path.relative_to(session.folder).parts)]
 
 
 def script(request: Request) -> Response:

@@ -25,21 +25,21 @@ def targets(session: Session, kind: str, names: list[str]) -> list[Path]:
     """
     folder, prefix = BROUGHT[kind]
     plain = [name.replace("\\", "/").rpartition("/")[2].lstrip(".") for name in names]
-    require(
-        all(plain) and len(set(plain)) == len(plain), "two files of one name, or one without: rename them", UsageError
-    )
+    distinct = all(plain) and len(set(plain)) == len(plain)
+    require(distinct, "two files of one name, or one without: rename them", UsageError)
     default = "_".join(filter(None, (prefix, "measured" if folder == "3-measured" else "log")))
     if BAG in plain or (folder == "3-measured" and session.settings.instrument.measures == IMAGES):
         return [session.path(folder) / default / name for name in plain]
-    others = tuple(start for where, start in BROUGHT.values() if where == folder and start not in ("", prefix))
+    other_prefixes = tuple(start for where, start in BROUGHT.values() if where == folder and start not in ("", prefix))
     for name in plain:
         suffixes = LOGS if folder == "7-recorded" else (".csv",)
-        words = f"{name}: expected {' or '.join(suffixes)}; nothing was stored"
-        require(name.lower().endswith(suffixes), words, UsageError)
-        taken = next((start for start in others if name.lower().startswith(start)), "")
-        words = f"{name}: a name that begins with '{taken}' says other files; upload it there, or rename it"
-        require(not taken, words, UsageError)
-    return [session.path(folder) / (name if name.lower().startswith(prefix) else f"{prefix}_{name}") for name in plain]
+        message = f"{name}: expected {' or '.join(suffixes)}; nothing was stored"
+        require(name.lower().endswith(suffixes), message, UsageError)
+        for start in other_prefixes:
+            message = f"{name}: a name that begins with '{start}' says other files; upload it there, or rename it"
+            require(not name.lower().startswith(start), message, UsageError)
+    stored_names = [name if name.lower().startswith(prefix) else f"{prefix}_{name}" for name in plain]
+    return [session.path(folder) / name for name in stored_names]
 
 
 async def receive(session: Session, kind: str, content_type: str, chunks: AsyncIterator[bytes]) -> list[Path]:
@@ -63,15 +63,15 @@ async def receive(session: Session, kind: str, content_type: str, chunks: AsyncI
         except (FormParserError, ValueError) as error:
             raise UsageError(f"the upload is not a form with files ({error}); nothing was stored") from error
         finally:
-            for one in arrived:
-                one.close()
-        there = [one for one in arrived if one.size]
-        require(there, "no file was chosen, or it is empty", UsageError)
-        names = [(one.file_name or b"").decode(errors="replace") for one in there]
+            for upload in arrived:
+                upload.close()
+        uploaded = [upload for upload in arrived if upload.size]
+        require(uploaded, "no file was chosen, or it is empty", UsageError)
+        names = [(upload.file_name or b"").decode(errors="replace") for upload in uploaded]
         places = targets(session, kind, names)
-        for one, place in zip(there, places):
-            place.parent.mkdir(exist_ok=True)
-            written = Path(os.fsdecode(one.actual_file_name or b""))
+        for upload, target in zip(uploaded, places):
+            target.parent.mkdir(exist_ok=True)
+            written = Path(os.fsdecode(upload.actual_file_name or b""))
             written.chmod(0o666 & ~files.umask())
-            os.replace(written, place)
+            os.replace(written, target)
     return places

@@ -30,8 +30,8 @@ class WebViewer:
         Raises:
             CalibError: where Rerun does not start.
         """
-        now = recording, recording.stat().st_mtime_ns
-        if self.process is None or self.process.poll() is not None or self.shown != now:
+        version = recording, recording.stat().st_mtime_ns
+        if self.process is None or self.process.poll() is not None or self.shown != version:
             self.close()
             pages, data = _free_ports(2)
             ports = ["--bind", HERE, "--web-viewer-port", str(pages), "--port", str(data)]
@@ -40,7 +40,7 @@ class WebViewer:
             self.process = subprocess.Popen(command, stdout=quiet, stderr=quiet, start_new_session=True)
             require(_answers(pages), f"Rerun's viewer does not start; try: calib view {recording.parent}", CalibError)
             source = quote(f"rerun+http://{HERE}:{data}/proxy", safe="")
-            self.shown, self.address = now, f"http://{HERE}:{pages}/?url={source}"
+            self.shown, self.address = version, f"http://{HERE}:{pages}/?url={source}"
         return self.address
 
     def close(self) -> None:
@@ -53,8 +53,8 @@ class WebViewer:
 
 def _free_ports(count: int) -> list[int]:
     with ExitStack() as stack:
-        found = [stack.enter_context(socket.create_server((HERE, 0))) for _ in range(count)]
-        return [one.getsockname()[1] for one in found]
+        servers = [stack.enter_context(socket.create_server((HERE, 0))) for _ in range(count)]
+        return [server.getsockname()[1] for server in servers]
 
 
 def _answers(port: int) -> bool:

@@ -72,11 +72,13 @@ class Work:
     def ask(self, task: str, subject: str = "") -> bool:
         """Queue a job and return True; return False where a run is under way, or this check is queued."""
         with self._lock:
-            known = [*self._waiting, *([self.current] if self.current and task != CHECK else [])]
-            if any(
-                (task != CHECK and one.task != CHECK) or (one.task, one.subject) == (task, subject) for one in known
-            ):
-                return False
+            jobs = list(self._waiting)
+            if self.current and task != CHECK:
+                jobs.append(self.current)
+            for job in jobs:
+                is_run = task != CHECK and job.task != CHECK
+                if is_run or (job.task, job.subject) == (task, subject):
+                    return False
             self._waiting.append(Job(task, subject))
             if self.current is None:
                 self._begin()
@@ -94,11 +96,11 @@ class Work:
     def _listen(self, job: Job, heard: Connection, process: Any) -> None:
         with suppress(EOFError, OSError):
             while True:
-                kind, words = heard.recv()
+                kind, text = heard.recv()
                 if kind == "line":
-                    job.lines.append(words)
+                    job.lines.append(text)
                 else:
-                    setattr(job, kind, words)
+                    setattr(job, kind, text)
         process.join()
         if process.exitcode and not job.problem:
             job.problem = INTERRUPTED
@@ -126,7 +128,7 @@ def _run(telling: Connection, folder: Path, task: str, subject: str) -> None:
     from calib.procedure.session.commands import go_on
 
     def tell(kind: str) -> Callable[[object], None]:
-        return lambda words: telling.send((kind, str(words)))
+        return lambda text: telling.send((kind, str(text)))
 
     Thread(target=end_with_parent, daemon=True).start()
     typed = command_line("serve", folder)

@@ -57,7 +57,7 @@ def test_the_posture_is_found_again(data, name, file):
         configuration = configuration_of(controller, written(name, chain, q))
         assert configuration is not None
         answer = postures(goal, forward(chain, q[None]), configuration, controller)
-        assert answer.reasons == ("",), configuration.words
+        assert answer.reasons == ("",), configuration.text
         np.testing.assert_allclose(answer.q[0], q, atol=1e-5)
 
 

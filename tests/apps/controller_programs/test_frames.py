@@ -121,7 +121,7 @@ def test_a_base_that_moves_is_not_the_controllers():
         ),
     )
     frame = base_frame(controller_named("fanuc"), arm_of(moving))
-    assert frame.pose is None and "'base' moves with joint 'slide'" in frame.words and "--world" in frame.words
+    assert frame.pose is None and "'base' moves with joint 'slide'" in frame.basis and "--world" in frame.basis
 
 
 def test_a_base_elsewhere_than_the_controllers_rule_is_warned_of():
@@ -143,7 +143,7 @@ def test_a_flange_alone_is_turned_as_the_controllers():
 def test_a_tool_frame_across_the_last_axis_is_no_flange():
     crooked = changed(('rpy="3.141592653589793 -1.5707963267948966 0"', 'rpy="0 0 0"'))
     frame = flange_frame(controller_named("fanuc"), arm_of(crooked))
-    assert frame.pose is None and "not along the last axis" in frame.words and "--flange" in frame.words
+    assert frame.pose is None and "not along the last axis" in frame.basis and "--flange" in frame.basis
 
 
 def test_every_controller_says_where_its_frames_stand_and_by_whom():
