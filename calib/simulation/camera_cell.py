@@ -95,16 +95,16 @@ def camera_cell(
         reach_of_arm: how far the arm's workspace reaches [m]; None to find out.
     """
     arm = cell.truth.chain
-    far = reach_of_arm or _reach(arm)
+    reach = reach_of_arm or _reach(arm)
     middle = 0.5 * np.array([*board.extent, 0.0])
     optics = Optics((lens,), ("camera",), (shape or BoardShape(),), ("board",))
     if mounting == IN_HAND:  # the board lies on a table beside the base, facing up
-        place = pose(Rotation.from_euler("x", np.pi), np.array([0.55 * far, 0.0, 0.0])) @ pose(None, -middle)
-        station, names = invert(place), ("board", "camera")
+        board_pose = pose(Rotation.from_euler("x", np.pi), np.array([0.55 * reach, 0.0, 0.0])) @ pose(None, -middle)
+        station, names = invert(board_pose), ("board", "camera")
         tool = pose(Rotation.from_euler("xyz", [0.05, -0.1, 0.6]), [0.04, 0.02, 0.06])
     else:  # the camera stands beyond the workspace and looks at the base's axis
-        eye = np.array([1.2 * far, -0.15 * far, 0.65 * far])
-        station, names = invert(_looking(eye, np.array([0.35 * far, 0.0, 0.35 * far]))), ("camera", "board")
+        eye = np.array([1.2 * reach, -0.15 * reach, 0.65 * reach])
+        station, names = invert(_looking(eye, np.array([0.35 * reach, 0.0, 0.35 * reach]))), ("camera", "board")
         tool = pose(Rotation.from_euler("xyz", [0.1, 0.15, 0.3]), [0.02, 0.03, 0.05]) @ pose(None, -middle)
     truth = Installation(
         arm, station[None], tool[None], names[:1], names[1:], deflection=cell.truth.deflection, optics=optics
@@ -125,19 +125,19 @@ def _looking(eye: np.ndarray, at: np.ndarray) -> np.ndarray:
     return pose(np.column_stack([right, np.cross(ahead, right), ahead]), eye)
 
 
-def board_poses(found: CameraCell, q: np.ndarray) -> np.ndarray:
+def board_poses(camera: CameraCell, q: np.ndarray) -> np.ndarray:
     """Return the board's true poses (m, 4, 4) in the camera's frame."""
-    poses = true_poses(found.cell, q)
-    return invert(poses) if found.mounting == IN_HAND else poses
+    poses = true_poses(camera.cell, q)
+    return invert(poses) if camera.mounting == IN_HAND else poses
 
 
 def views(
-    found: CameraCell, count: int, seed: int | np.random.Generator = 0, sought: Views | None = None
+    camera: CameraCell, count: int, seed: int | np.random.Generator = 0, sought: Views | None = None
 ) -> np.ndarray:
     """Return random joint values (count, n) at which the camera sees the board.
 
     Args:
-        found: the cell.
+        camera: the cell.
         count: how many.
         seed: of the draw.
         sought: which views.
@@ -145,55 +145,59 @@ def views(
     Raises:
         CannotSimulate: where hardly any are found.
     """
-    sought, arm = sought or Views(), found.cell.nominal
-    near, far = sought.distance if found.mounting == IN_HAND else (2.0 * sought.distance[0], 3.0 * sought.distance[1])
-    cell = replace(found.cell.truth, chain=arm, deflection=Deflection())
-    view = CameraView(cell, found.board, found.mounting, sought.tilt, (near, far), 0.0)
+    sought, arm = sought or Views(), camera.cell.nominal
+    min_distance, max_distance = (
+        sought.distance if camera.mounting == IN_HAND else (2.0 * sought.distance[0], 3.0 * sought.distance[1])
+    )
+    cell = replace(camera.cell.truth, chain=arm, deflection=Deflection())
+    view = CameraView(cell, camera.board, camera.mounting, sought.tilt, (min_distance, max_distance), 0.0)
 
-    least = len(corners(found.board)) if sought.whole else 12
-    q = view.draw(count, lambda each: visible(found, each).sum(axis=1) >= least, *arm.sampling_limits(), seed)
+    min_corners = len(corners(camera.board)) if sought.whole else 12
+    q = view.draw(
+        count, lambda candidates: visible(camera, candidates).sum(axis=1) >= min_corners, *arm.sampling_limits(), seed
+    )
     if len(q) < count:
         raise CannotSimulate(f"the camera sees the board at hardly any posture of the arm ({len(q)} of {count} found)")
     return q
 
 
-def visible(found: CameraCell, q: np.ndarray) -> np.ndarray:
+def visible(camera: CameraCell, q: np.ndarray) -> np.ndarray:
     """Return whether each corner is visible to the camera at joint values q (m, n): (m, K) bool."""
-    poses = board_poses(found, q)
-    flat = _points(found, poses).reshape(-1, 3)
+    poses = board_poses(camera, q)
+    flat = _points(camera, poses).reshape(-1, 3)
     facing = np.einsum("mi,mi->m", poses[:, :3, 2], poses[:, :3, 3]) > 0.0
-    return found.lens.in_sight(flat, 6.0).reshape(len(q), len(corners(found.board))) & facing[:, None]
+    return camera.lens.in_sight(flat, 6.0).reshape(len(q), len(corners(camera.board))) & facing[:, None]
 
 
-def _points(found: CameraCell, poses: np.ndarray) -> np.ndarray:
-    table = shaped_points(found.board, found.shape, corners(found.board))
+def _points(camera: CameraCell, poses: np.ndarray) -> np.ndarray:
+    table = shaped_points(camera.board, camera.shape, corners(camera.board))
     return np.einsum("mij,kj->mki", poses[:, :3, :3], table) + poses[:, None, :3, 3]
 
 
 def photograph(
-    found: CameraCell, q: np.ndarray, noise: float = 0.05, seed: int | np.random.Generator = 0, file: str = "images"
+    camera: CameraCell, q: np.ndarray, noise: float = 0.05, seed: int | np.random.Generator = 0, file: str = "images"
 ) -> Pixels:
     """Return simulated images at q (m, n): projected corners with white noise [px]; the lens is left unknown.
 
     The recorded joints carry the encoders' noise.
     """
-    rng, names = np.random.default_rng(seed), found.cell.truth
-    seen, points = visible(found, q), _points(found, board_poses(found, q))
-    flat = np.where(seen.reshape(-1, 1), points.reshape(-1, 3), [0.0, 0.0, 1.0])
-    pixel = found.lens.project(flat).reshape(*seen.shape, 2)
-    pixel = np.where(seen[:, :, None], pixel + rng.normal(0.0, noise, pixel.shape), np.nan)
-    own = q + rng.normal(0.0, found.cell.instrument.encoder_sigma, q.shape)
+    rng, names = np.random.default_rng(seed), camera.cell.truth
+    in_view, points = visible(camera, q), _points(camera, board_poses(camera, q))
+    flat = np.where(in_view.reshape(-1, 1), points.reshape(-1, 3), [0.0, 0.0, 1.0])
+    pixel = camera.lens.project(flat).reshape(*in_view.shape, 2)
+    pixel = np.where(in_view[:, :, None], pixel + rng.normal(0.0, noise, pixel.shape), np.nan)
+    recorded = q + rng.normal(0.0, camera.cell.instrument.encoder_sigma, q.shape)
     free = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
     return Pixels(
-        own,
-        found.cell.nominal.joint_names,
+        recorded,
+        camera.cell.nominal.joint_names,
         pixel,
-        found.board,
+        camera.board,
         None,
-        sigma=np.full(seen.shape, max(noise, 1e-3)),
+        sigma=np.full(in_view.shape, max(noise, 1e-3)),
         station=names.station_names[0],
         tool_names=names.tool_names,
-        size=found.lens.size,
+        size=camera.lens.size,
         file=file,
         free=free,
         names=tuple(f"{k + 1:04}.png" for k in range(len(q))),
@@ -201,7 +205,7 @@ def photograph(
 
 
 def take_pictures(
-    found: CameraCell,
+    camera: CameraCell,
     q: np.ndarray,
     folder: Path,
     imaging: Imaging | None = None,
@@ -212,7 +216,7 @@ def take_pictures(
     """Write rendered images at q (m, n) into a folder with ``joints.csv`` and ``board.toml``.
 
     Args:
-        found: the cell.
+        camera: the cell.
         q: joint values [rad or m]; recorded with the encoders' noise.
         folder: to write into.
         imaging: light, focus and noise.
@@ -223,20 +227,20 @@ def take_pictures(
     from calib.data.images.images import write_image
     from calib.simulation.rendered_camera import render
 
-    boards.write_board(found.board, folder / BOARD)
+    boards.write_board(camera.board, folder / BOARD)
     rng = np.random.default_rng([seed, 11])
-    recorded = q + rng.normal(0.0, found.cell.instrument.encoder_sigma, q.shape)
+    recorded = q + rng.normal(0.0, camera.cell.instrument.encoder_sigma, q.shape)
     names = [f"{k + 1:04}.png" for k in range(len(q))]
     for k, name in enumerate(names):
         if say:
             say(f"rendering {folder.name}/{name}")
-        way = q[k : k + 1]
+        exposure_joints = q[k : k + 1]
         if moving is not None and moving[k].any():
-            way = q[k] + np.linspace(-0.5, 0.5, 7)[:, None] * moving[k]
-        poses, noise = board_poses(found, way), np.random.default_rng([seed, k])
-        write_image(folder / name, render(found.board, found.lens, poses, imaging, noise, found.shape))
-    units = [JOINT[joint.kind] for joint in found.cell.nominal.joints]
-    heads = [f"{each} [{unit}]" for each, (_, unit) in zip(found.cell.nominal.joint_names, units)]
+            exposure_joints = q[k] + np.linspace(-0.5, 0.5, 7)[:, None] * moving[k]
+        poses, noise = board_poses(camera, exposure_joints), np.random.default_rng([seed, k])
+        write_image(folder / name, render(camera.board, camera.lens, poses, imaging, noise, camera.shape))
+    units = [JOINT[joint.kind] for joint in camera.cell.nominal.joints]
+    heads = [f"{joint_name} [{unit}]" for joint_name, (_, unit) in zip(camera.cell.nominal.joint_names, units)]
     rows = [[name, *map(float, row * [factor for factor, _ in units])] for name, row in zip(names, recorded)]
     files.write_table(folder / JOINTS, ["image", *heads], rows)
     return folder
@@ -261,12 +265,14 @@ def seen_by_camera(cell: Cell) -> CameraCell:
 
 
 @contextmanager
-def limits_of(found: CameraCell) -> Iterator[Path]:
+def limits_of(camera: CameraCell) -> Iterator[Path]:
     """Yield a constraints file with the camera's approximate placement, next to its lens and board files."""
-    truth, middle = found.cell.truth, pose(None, 0.5 * np.array([*found.board.extent, 0.0]))
+    truth, middle = camera.cell.truth, pose(None, 0.5 * np.array([*camera.board.extent, 0.0]))
     places = {"carried": truth.tools[0], "stands": invert(truth.stations[0]) @ middle}
-    stated = {name: [np.round(part, DIGITS).tolist() for part in to_xyz_rpy(place)] for name, place in places.items()}
+    placements = {
+        name: [np.round(part, DIGITS).tolist() for part in to_xyz_rpy(frame)] for name, frame in places.items()
+    }
     with tempfile.TemporaryDirectory(prefix="calib-demo-", ignore_cleanup_errors=True) as folder:
-        write_lens(found.lens, Path(folder, "camera.yaml"))
-        boards.write_board(found.board, Path(folder, BOARD))
-        yield files.write(Path(folder, "limits.toml"), LIMITS.format(**stated))
+        write_lens(camera.lens, Path(folder, "camera.yaml"))
+        boards.write_board(camera.board, Path(folder, BOARD))
+        yield files.write(Path(folder, "limits.toml"), LIMITS.format(**placements))

@@ -89,9 +89,9 @@ def true_poses(cell: Cell, q: np.ndarray, warm: float = np.inf) -> np.ndarray:
     arm = cell.truth.chain
     torque = np.zeros(q.shape) if arm.inertias is None else gravity_torques(arm, q)
     bases = evaluate(cell.truth.deflection, q, torque)
-    beyond = displacements(cell.unmodelled, arm, q, torque, warm)
-    seen = see(cell.truth, q, bases=bases, displacements=beyond).poses()
-    return drooping(cell.unmodelled, arm, seen, cell.truth.stations[0])
+    unmodelled_errors = displacements(cell.unmodelled, arm, q, torque, warm)
+    tool_poses = see(cell.truth, q, bases=bases, displacements=unmodelled_errors).poses()
+    return drooping(cell.unmodelled, arm, tool_poses, cell.truth.stations[0])
 
 
 def measure(
@@ -110,13 +110,13 @@ def measure(
         Poses (or positions), with the sigmas that the instrument's maker states, drift and outliers not included.
     """
     rng, instrument = np.random.default_rng(seed), cell.instrument
-    seen = _noisy(true_poses(cell, q, warm=warm), instrument, rng)
+    measured = _noisy(true_poses(cell, q, warm=warm), instrument, rng)
     sigma, sigma_rotation = _stated(instrument, np.zeros((len(q), 3)))
     if instrument.base_frame is not None:
         base = cell.truth.stations[0] @ instrument.base_frame
-        seen = invert(_noisy(np.broadcast_to(base, seen.shape), instrument, rng)) @ seen
-        sigma, sigma_rotation = _stated(instrument, seen[:, :3, 3], frames=2)
-    seen[:, :3, 3] += _gross_errors(instrument, len(q), rng)
+        measured = invert(_noisy(np.broadcast_to(base, measured.shape), instrument, rng)) @ measured
+        sigma, sigma_rotation = _stated(instrument, measured[:, :3, 3], frames=2)
+    measured[:, :3, 3] += _gross_errors(instrument, len(q), rng)
     common: dict[str, Any] = {
         "sigma": sigma,
         "station": cell.truth.station_names[0],
@@ -125,9 +125,9 @@ def measure(
     }
     q, names = np.asarray(q) + rng.normal(0.0, instrument.encoder_sigma, np.shape(q)), cell.nominal.joint_names
     if instrument.orientation_sigma is None:
-        return Positions(q, names, seen[:, :3, 3], **common)
-    turns = Rotation.from_matrix(seen[:, :3, :3]).as_quat(canonical=True)
-    return Poses(q, names, seen[:, :3, 3], turns, sigma_rotation=sigma_rotation, **common)
+        return Positions(q, names, measured[:, :3, 3], **common)
+    turns = Rotation.from_matrix(measured[:, :3, :3]).as_quat(canonical=True)
+    return Poses(q, names, measured[:, :3, 3], turns, sigma_rotation=sigma_rotation, **common)
 
 
 def wandering(measured: Positions, drift: float, seed: int, begin: float = 0.0) -> Positions:
@@ -136,8 +136,8 @@ def wandering(measured: Positions, drift: float, seed: int, begin: float = 0.0) 
     The direction is the seed's, so that several series can share it.
     """
     direction = np.random.default_rng([seed, 5]).standard_normal(3)
-    way = np.linspace(begin, 1.0, len(measured))[:, None] * direction / np.linalg.norm(direction)
-    return replace(measured, position=measured.position + drift * way)
+    displacement = np.linspace(begin, 1.0, len(measured))[:, None] * direction / np.linalg.norm(direction)
+    return replace(measured, position=measured.position + drift * displacement)
 
 
 def _noisy(poses: np.ndarray, instrument: SimulatedInstrument, rng: np.random.Generator) -> np.ndarray:

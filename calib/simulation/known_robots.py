@@ -103,21 +103,21 @@ def trapezoidal(
 
 def _move(start, stop, velocity, acceleration, rate) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return one move with s(t) from 0 to 1: ramps of r seconds, T seconds in all, peak velocity 1 / (T - r)."""
-    far = np.abs(stop - start)
-    ramp = float(np.max(velocity / acceleration, where=far > 0, initial=1.0 / rate))
-    cruise = max(float(np.max(far / velocity)), float(np.max(far / acceleration)) / ramp)
+    distance = np.abs(stop - start)
+    ramp = float(np.max(velocity / acceleration, where=distance > 0, initial=1.0 / rate))
+    cruise = max(float(np.max(distance / velocity)), float(np.max(distance / acceleration)) / ramp)
     ramp = max(ramp, 2.0 / rate)
     total = max(cruise, ramp) + ramp
     t = np.arange(1, int(np.ceil(total * rate)) + 1) / rate
-    peak, late = 1.0 / (total - ramp), np.maximum(total - t, 0.0)
+    peak, remaining = 1.0 / (total - ramp), np.maximum(total - t, 0.0)
     s = np.where(
         t < ramp,
         0.5 * peak * t**2 / ramp,
-        np.where(late < ramp, 1 - 0.5 * peak * late**2 / ramp, peak * (t - ramp / 2)),
+        np.where(remaining < ramp, 1 - 0.5 * peak * remaining**2 / ramp, peak * (t - ramp / 2)),
     )
-    rate_ = np.where(t < ramp, peak * t / ramp, np.where(late < ramp, peak * late / ramp, peak))
-    change = np.where(t < ramp, peak / ramp, np.where((late < ramp) & (late > 0), -peak / ramp, 0.0))
-    return start + np.outer(s, stop - start), np.outer(rate_, stop - start), np.outer(change, stop - start)
+    speed = np.where(t < ramp, peak * t / ramp, np.where(remaining < ramp, peak * remaining / ramp, peak))
+    change = np.where(t < ramp, peak / ramp, np.where((remaining < ramp) & (remaining > 0), -peak / ramp, 0.0))
+    return start + np.outer(s, stop - start), np.outer(speed, stop - start), np.outer(change, stop - start)
 
 
 SIDED = ("Ia", "Fvl", "Fcl", "offl", "Fvm", "Fcm", "offm")  # drive terms of a joint with a torque sensor
@@ -136,20 +136,20 @@ def plant(name: str, coupled: bool = False, offset: np.ndarray | None = None) ->
         coupled: with the TX40's wrist coupling: Ia6 on both rows, Fvm6, Fcm6.
         offset: (n,) torque offsets, terms ``off1`` …; None for none.
     """
-    chain, known = description.read(library.path(name)), truth(name)
-    own = "Ia Fv Fc" if offset is None else "Ia Fv Fc off"
-    values = {key: known["drives"][key] for key in ("Ia", "Fv", "Fc")}
+    chain, true_values = description.read(library.path(name)), truth(name)
+    drive_terms = "Ia Fv Fc" if offset is None else "Ia Fv Fc off"
+    values = {key: true_values["drives"][key] for key in ("Ia", "Fv", "Fc")}
     values["off"] = np.zeros(chain.n) if offset is None else offset
-    terms = list(drives.standard([own] * chain.n, known["drives"]["v0"]))
-    amounts = [values[key][joint] for joint in range(chain.n) for key in own.split()]
+    terms = list(drives.standard([drive_terms] * chain.n, true_values["drives"]["v0"]))
+    amounts = [values[key][joint] for joint in range(chain.n) for key in drive_terms.split()]
     if coupled:
-        link = known["coupling"]
+        link = true_values["coupling"]
         first, second = (joint - 1 for joint in link["joints"])
-        gear = drives.coupled(first, second, known["drives"]["v0"])
-        place = next(k for k, one in enumerate(terms) if one.shape == "acceleration" and one.joint == second)
+        gear = drives.coupled(first, second, true_values["drives"]["v0"])
+        coupled_index = next(k for k, term in enumerate(terms) if term.shape == "acceleration" and term.joint == second)
         # one motor inertia: Iam6 is Ia6, which acts on row 5 by a6 and on row 6 by a5 + a6
-        both = ((first, ((second, 1.0),)), (second, ((first, 1.0), (second, 1.0))))
-        terms[place] = replace(terms[place], acts=both)
+        both_rows = ((first, ((second, 1.0),)), (second, ((first, 1.0), (second, 1.0))))
+        terms[coupled_index] = replace(terms[coupled_index], acts=both_rows)
         terms += gear[1:]
         amounts += [link["Fvm"], link["Fcm"]]
     return Plant(bodies_of(chain), tuple(terms), np.concatenate([standard_parameters(chain), amounts]))
@@ -157,8 +157,8 @@ def plant(name: str, coupled: bool = False, offset: np.ndarray | None = None) ->
 
 def controller(name: str) -> Controller:
     """Return the published PD controller of the TX40 or RV-2SQ."""
-    known = truth(name)["control"]
-    return pd(np.array(known["kp"]), np.array(known["kd"]), np.array(known.get("limit", np.inf)))
+    gains = truth(name)["control"]
+    return pd(np.array(gains["kp"]), np.array(gains["kd"]), np.array(gains.get("limit", np.inf)))
 
 
 def model(plant: Plant) -> IdentificationModel:

@@ -63,10 +63,10 @@ def render(
         shape: of the print: scale and bending.
     """
     imaging, rng = imaging or Imaging(), np.random.default_rng(seed)
-    several = np.atleast_3d(poses.T).T.reshape(-1, 4, 4)
+    exposure_poses = np.atleast_3d(poses.T).T.reshape(-1, 4, 4)
     image = np.zeros(lens.size[::-1], dtype=np.float32)
-    for pose in several:
-        image += _reflectance(board, lens, pose, imaging.background, shape or BoardShape()) / len(several)
+    for pose in exposure_poses:
+        image += _reflectance(board, lens, pose, imaging.background, shape or BoardShape()) / len(exposure_poses)
     if imaging.defocus > 0.0:
         image = cv2.GaussianBlur(image, (0, 0), imaging.defocus)
     across = np.linspace(-0.5, 0.5, lens.size[0], dtype=np.float32)[None]
@@ -81,19 +81,19 @@ def _reflectance(board: Board, lens: Lens, pose: np.ndarray, background: float, 
     """Return the reflectance image (height, width) of one board pose, averaged over each pixel."""
     result = np.full(lens.size[::-1], background, dtype=np.float32)
     outline = _outline(board)
-    seen = shaped_points(board, shape, outline) @ pose[:3, :3].T + pose[:3, 3]
-    if np.any(seen[:, 2] < 0.02):
+    outline_camera = shaped_points(board, shape, outline) @ pose[:3, :3].T + pose[:3, 3]
+    if np.any(outline_camera[:, 2] < 0.02):
         return result
-    pixel = lens.project(seen)
+    pixel = lens.project(outline_camera)
     low = np.maximum(np.floor(pixel.min(axis=0)) - 2, 0).astype(int)
     high = np.minimum(np.ceil(pixel.max(axis=0)) + 3, lens.size).astype(int)
     if np.any(high <= low):
         return result
-    scale = SUB * float(np.max(lens.values[:2]) / seen[:, 2].min())
+    scale = SUB * float(np.max(lens.values[:2]) / outline_camera[:, 2].min())
     level = int(np.ceil(np.log(scale) / np.log(1.25)))
     sheet, per_metre = _sheet_at(board, level), 1.25**level
-    place = _on_sheet(board, lens, pose, shape, low, high)
-    x, y = (((place[:, :, axis] + PAPER) * per_metre - 0.5).astype(np.float32) for axis in (0, 1))
+    board_points = _on_sheet(board, lens, pose, shape, low, high)
+    x, y = (((board_points[:, :, axis] + PAPER) * per_metre - 0.5).astype(np.float32) for axis in (0, 1))
     fine = cv2.remap(sheet, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=background)
     size = high - low
     result[low[1] : high[1], low[0] : high[0]] = cv2.resize(fine, tuple(size.tolist()), interpolation=cv2.INTER_AREA)

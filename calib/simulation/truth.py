@@ -47,8 +47,8 @@ def position_errors(cell: Cell, calibrated: Installation, urdf: Chain) -> tuple[
         station=calibrated.station_names[0],
         tool_names=calibrated.tool_names[:1],
     )
-    nominal, alone = (polish_frames(install(chain, [block]), [block]).cell for chain in (cell.nominal, urdf))
-    before, after, bare = (_rms(arm, block) for arm in (nominal, calibrated, alone))
+    nominal, urdf_cell = (polish_frames(install(chain, [block]), [block]).cell for chain in (cell.nominal, urdf))
+    before, after, bare = (_rms(arm, block) for arm in (nominal, calibrated, urdf_cell))
     return before, after, bare
 
 
@@ -109,9 +109,9 @@ def share_within(true: Mapping[str, float], estimate: Sequence[EstimateRow]) -> 
         true: values by name, as `true_base` returns; parameters without one, or without sigma, are not counted.
         estimate: with sigmas; an R behind a name (regrouped) is not part of it.
     """
-    rows = [(true[name], one) for one in estimate if (name := one.name.removesuffix("R")) in true]
-    inside = [abs(one.value - value) < 2 * one.sigma for value, one in rows if one.sigma]
-    return (float(np.mean(inside)) if inside else 0.0), len(inside)
+    rows = [(true[name], row) for row in estimate if (name := row.name.removesuffix("R")) in true]
+    within = [abs(row.value - value) < 2 * row.sigma for value, row in rows if row.sigma]
+    return (float(np.mean(within)) if within else 0.0), len(within)
 
 
 def true_base(
@@ -122,18 +122,20 @@ def true_base(
     Friction is that of an arm in steady sliding that has moved for the time `running` [s], infinite for a warm one:
     friction with memory, all of it slipping, is Coulomb friction.
     """
-    fallen = arm.unmodelled.warming * (1.0 - np.exp(-running / WARM_TIME))
-    known = dict(zip((*arm.plant.bodies.names, *(one.name for one in arm.plant.terms)), arm.plant.parameters))
+    warming = arm.unmodelled.warming * (1.0 - np.exp(-running / WARM_TIME))
+    parameters = dict(zip((*arm.plant.bodies.names, *(term.name for term in arm.plant.terms)), arm.plant.parameters))
     for j in range(arm.chain.n):
-        for name, more in (("Fv", 0.0), ("Fc", arm.unmodelled.memory)):
-            known[f"{name}m{j + 1}"] += (more - fallen) * (known[f"{name}l{j + 1}"] + known[f"{name}m{j + 1}"])
+        for name, change in (("Fv", 0.0), ("Fc", arm.unmodelled.memory)):
+            parameters[f"{name}m{j + 1}"] += (change - warming) * (
+                parameters[f"{name}l{j + 1}"] + parameters[f"{name}m{j + 1}"]
+            )
         for name in ("Fv", "Fc", "off"):  # whole drives, where the model does not part motor and link
-            known[f"{name}{j + 1}"] = known[f"{name}l{j + 1}"] + known[f"{name}m{j + 1}"]
-    names = tuple(name for name in model.names if name in known)
-    terms = tuple(one for one in model.terms if one.name in names)
+            parameters[f"{name}{j + 1}"] = parameters[f"{name}l{j + 1}"] + parameters[f"{name}m{j + 1}"]
+    names = tuple(name for name in model.names if name in parameters)
+    terms = tuple(term for term in model.terms if term.name in names)
     bare = [replace(model, bodies=bodies_of(chain), terms=terms) for chain in (cell.nominal, arm.chain)]
     lower, upper = arm.chain.sampling_limits()
     samples = bases.random_samples(bare[0], seed=seed, lower=lower, upper=upper)
     base = bases.find(bare[1], samples, nominal=bare[0])
     plain = (base.standard[k] for k in base.kept)  # what is regrouped on one geometry need not be on another
-    return dict(zip(plain, base.transform @ np.array([known[name] for name in bare[1].names])))
+    return dict(zip(plain, base.transform @ np.array([parameters[name] for name in bare[1].names])))

@@ -32,10 +32,10 @@ TEETH = 100  # N
 CABLE = 0.5  # [rad]
 
 
-def _named(parts: Sequence[tuple[float, str]]) -> str:
+def _named(effects: Sequence[tuple[float, str]]) -> str:
     """Return the names of all effects with a size above 0, as the end of a sentence; empty without any."""
-    named = ", ".join(words for size, words in parts if size)
-    return f"; unmodelled: {named}" if named else ""
+    names = ", ".join(description for size, description in effects if size)
+    return f"; unmodelled: {names}" if names else ""
 
 
 @dataclass(frozen=True)
@@ -82,13 +82,13 @@ def displacements(
     """
     rng = np.random.default_rng([errors.seed, 11])
     phases = rng.uniform(0.0, 2.0 * np.pi, (2, chain.n))
-    size = np.array([1.0 if joint.kind == "revolute" else 0.3 for joint in chain.joints])
-    following = q[:, (np.arange(chain.n) + 1) % chain.n]
+    joint_scale = np.array([1.0 if joint.kind == "revolute" else 0.3 for joint in chain.joints])
+    next_joint = q[:, (np.arange(chain.n) + 1) % chain.n]
     load = torque / _largest_load(chain)
     side = np.sign(np.diff(q, axis=0, prepend=0.0))
-    own = errors.gear * (np.sin(2.0 * q + following + phases[0]) + load * np.sin(3.0 * q + phases[1]))
+    gear_error = errors.gear * (np.sin(2.0 * q + next_joint + phases[0]) + load * np.sin(3.0 * q + phases[1]))
     result = np.zeros((len(chain.elements), len(q)))
-    result[chain.moving] = (size * (own - errors.backlash * side)).T
+    result[chain.moving] = (joint_scale * (gear_error - errors.backlash * side)).T
     lengths = np.array([element.axis[0] == "t" for element in chain.elements])
     heat = 1.0 - np.exp(-(warm + np.arange(len(q))) / WARM_POSES)
     result[lengths] += errors.growth * np.outer(chain.values[lengths], heat)
@@ -111,10 +111,10 @@ def drooping(errors: PositionErrors, chain: Chain, poses: np.ndarray, base: np.n
         poses: (m, 4, 4) of the tool in the station's frame [m].
         base: (4, 4) of the arm's base in the station's frame.
     """
-    give = np.random.default_rng([errors.seed, 13]).uniform(0.2, 1.0, 3)
+    droop_direction = np.random.default_rng([errors.seed, 13]).uniform(0.2, 1.0, 3)
     down = base[:3, :3] @ (chain.gravity / max(float(np.linalg.norm(chain.gravity)), 1e-9))
     result, turn = poses.copy(), poses[:, :3, :3]
-    result[:, :3, 3] += errors.droop * np.einsum("mij,j,mkj,k->mi", turn, give, turn, down)
+    result[:, :3, 3] += errors.droop * np.einsum("mij,j,mkj,k->mi", turn, droop_direction, turn, down)
     return result
 
 

@@ -66,8 +66,8 @@ class MovingArm:
 
     def link_torque(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the noise-free torques (N, n) on the output side of the gears [N m or N]."""
-        whole = IdentificationModel(self.plant.bodies, self.plant.terms)
-        shared = np.isin(whole.names, self.link.names)
+        motor_model = IdentificationModel(self.plant.bodies, self.plant.terms)
+        shared = np.isin(motor_model.names, self.link.names)
         model = np.einsum("kij,j->ki", self.link.regressor(q, v, a), self.plant.parameters[shared])
         return model + self.unmodelled.cable_torques(q, self.effort)
 
@@ -97,7 +97,7 @@ def moving_arm(cell: Cell, robot: str, seed: int = 0, unmodelled: TorqueErrors =
     values, source = _drives(robot, nominal, effort)
     plant = Plant(bodies_of(chain), tuple(terms), np.concatenate([standard_parameters(chain), values.ravel()]))
     share = np.array([KNOWN if name[:1] == "F" else 1.0 for name in known_robots.SIDED])
-    told = np.concatenate([standard_parameters(nominal), (values * share).ravel()])
+    believed_parameters = np.concatenate([standard_parameters(nominal), (values * share).ravel()])
     inertia = plant.inertia_diagonal(random_joints(chain, 200, 0))
     omega = 2 * np.pi * BANDWIDTH
     sensors = sensed(robot)
@@ -110,7 +110,7 @@ def moving_arm(cell: Cell, robot: str, seed: int = 0, unmodelled: TorqueErrors =
         chain,
         plant,
         IdentificationModel(plant.bodies, plant.terms, LINK),
-        Plant(bodies_of(nominal), tuple(terms), told),
+        Plant(bodies_of(nominal), tuple(terms), believed_parameters),
         replace(pd(omega**2 * inertia, 2 * DAMPING * omega * inertia), cutoff=CUTOFF),
         effort,
         note,
@@ -158,8 +158,8 @@ def record(
     slow = replace(reference, a=0.0 * reference.a)
     controller = arm.gains.with_feedforward(feed_forward(arm.believed, slow))
     sensing = Sensing(SIGMA_Q, push=arm.unmodelled.push * arm.effort, push_band=PUSH_BAND)
-    beyond = _unmodelled(arm, reference.q, reference.v, reference.a, running + reference.t)
-    run = simulate(arm.plant, controller, reference, sensing, rng, push=-beyond)
+    unmodelled = _unmodelled(arm, reference.q, reference.v, reference.a, running + reference.t)
+    run = simulate(arm.plant, controller, reference, sensing, rng, push=-unmodelled)
     noise = [sigma * arm.effort * rng.normal(size=run.q.shape) for sigma in (SIGMA_LINK, SIGMA_MOTOR)]
     link = _held(arm.link_torque(run.q, run.v, run.a)) + noise[0] if arm.sensors else None
     motor = _held(run.torque) + noise[1]
@@ -185,15 +185,15 @@ def _modelled(arm: MovingArm, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np
 
 def _unmodelled(arm: MovingArm, q: np.ndarray, v: np.ndarray, a: np.ndarray, t: np.ndarray) -> np.ndarray:
     """Return the torques (N, n) of unmodelled effects [N m or N]; t (N,) is the time since the cold start [s]."""
-    parameters = dict(zip((one.name for one in arm.plant.terms), arm.plant.parameters[arm.plant.inertial :]))
+    parameters = dict(zip((term.name for term in arm.plant.terms), arm.plant.parameters[arm.plant.inertial :]))
     viscous, coulomb = (
         np.array([parameters[f"{name}l{j + 1}"] + parameters[f"{name}m{j + 1}"] for j in range(arm.chain.n)])
         for name in ("Fv", "Fc")
     )
     friction = viscous * v + coulomb * np.sign(v)
     drive = _modelled(arm, q, v, a) if arm.unmodelled.ripple else np.zeros_like(q)
-    beyond = gear_torques(arm.unmodelled, q, drive, coulomb, friction, t)
-    return beyond + arm.unmodelled.cable_torques(q, arm.effort)
+    gear_torque = gear_torques(arm.unmodelled, q, drive, coulomb, friction, t)
+    return gear_torque + arm.unmodelled.cable_torques(q, arm.effort)
 
 
 def _drives(robot: str, chain: Chain, effort: np.ndarray) -> tuple[np.ndarray, str]:

@@ -53,15 +53,15 @@ class Board:
     def __post_init__(self) -> None:
         if max(self.columns, self.rows) > 100:
             raise ValueError(f"{self.columns} x {self.rows} squares: the limit is 100 per row")
-        least, most = {"charuco": (0.3, 0.9), "apriltag": (0.05, 2.0)}.get(self.kind, (0.0, np.inf))
-        if not least * self.square <= self.marker <= most * self.square:
-            what = "side of a marker" if self.kind == "charuco" else "gap between two tags"
+        min_share, max_share = {"charuco": (0.3, 0.9), "apriltag": (0.05, 2.0)}.get(self.kind, (0.0, np.inf))
+        if not min_share * self.square <= self.marker <= max_share * self.square:
+            quantity = "side of a marker" if self.kind == "charuco" else "gap between two tags"
             raise ValueError(
-                f"marker = {self.marker:g}: the {what} must be between {least:g} and {most:g} of "
+                f"marker = {self.marker:g}: the {quantity} must be between {min_share:g} and {max_share:g} of "
                 f"square = {self.square:g}"
             )
-        words = f"{self.columns} x {self.rows} squares look the same upside down: take an even and an odd number"
-        require(self.kind != "chessboard" or (self.columns + self.rows) % 2 == 1, words, ValueError)
+        message = f"{self.columns} x {self.rows} squares look the same upside down: take an even and an odd number"
+        require(self.kind != "chessboard" or (self.columns + self.rows) % 2 == 1, message, ValueError)
         if self.kind == "chessboard" and min(self.columns, self.rows) < 4:
             raise ValueError("a chessboard needs at least 4 squares in each direction")
         if self.tags > (count := DICTIONARIES.get(self.dictionary, self.tags)):
@@ -84,8 +84,8 @@ class Board:
     @property
     def words(self) -> str:
         """Short description of the board."""
-        what = {"charuco": "ChArUco", "chessboard": "chessboard", "apriltag": "AprilTag grid"}[self.kind]
-        return f"{what} {self.columns} x {self.rows}, {1e3 * self.square:g} mm"
+        kind_name = {"charuco": "ChArUco", "chessboard": "chessboard", "apriltag": "AprilTag grid"}[self.kind]
+        return f"{kind_name} {self.columns} x {self.rows}, {1e3 * self.square:g} mm"
 
 
 def corners(board: Board) -> np.ndarray:
@@ -93,8 +93,8 @@ def corners(board: Board) -> np.ndarray:
     if board.kind == "apriltag":
         pitch, side = board.square + board.marker, board.square
         first = [(column * pitch, row * pitch) for row in range(board.rows) for column in range(board.columns)]
-        own = [(0.0, 0.0), (side, 0.0), (side, side), (0.0, side)]
-        return np.array([(x + a, y + b, 0.0) for x, y in first for a, b in own])
+        tag_corners = [(0.0, 0.0), (side, 0.0), (side, side), (0.0, side)]
+        return np.array([(x + a, y + b, 0.0) for x, y in first for a, b in tag_corners])
     across, down = np.meshgrid(np.arange(1, board.columns), np.arange(1, board.rows))
     return board.square * np.column_stack([across.ravel(), down.ravel(), np.zeros(across.size)])
 

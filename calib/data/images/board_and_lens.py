@@ -51,24 +51,24 @@ def board_poses(lens: Lens, board: Board, pixel: np.ndarray) -> BoardPoses:
     """
     table = corners(board)
     sight = rays(lens, pixel.reshape(-1, 2)).reshape(pixel.shape)
-    start = np.array([_from_homography(table, each) for each in sight])
-    one, two = (_refine(lens, table, pixel, guess) for guess in (start, _tilted_back(start, table)))
-    worse = (two.rms < one.rms)[:, None, None]
+    start = np.array([_from_homography(table, image_rays) for image_rays in sight])
+    upright, tilted = (_refine(lens, table, pixel, guess) for guess in (start, _tilted_back(start, table)))
+    worse = (tilted.rms < upright.rms)[:, None, None]
     return BoardPoses(
-        np.where(worse, two.poses, one.poses),
-        np.fmin(one.rms, two.rms),
-        np.where(worse, two.information, one.information),
+        np.where(worse, tilted.poses, upright.poses),
+        np.fmin(upright.rms, tilted.rms),
+        np.where(worse, tilted.information, upright.information),
     )
 
 
 def _from_homography(table: np.ndarray, sight: np.ndarray) -> np.ndarray:
-    seen = np.flatnonzero(~np.isnan(sight[:, 0]))
-    ray = sight[seen]
-    if len(seen) < MIN_SEEN:
+    visible = np.flatnonzero(~np.isnan(sight[:, 0]))
+    ray = sight[visible]
+    if len(visible) < MIN_SEEN:
         return pose(None, [0.0, 0.0, 1.0])
-    middle, size = table[seen, :2].mean(axis=0), table[seen, :2].std() + 1e-9
-    flat = np.column_stack([(table[seen, :2] - middle) / size, np.ones(len(seen))])
-    rows = np.zeros((2 * len(seen), 9))
+    middle, size = table[visible, :2].mean(axis=0), table[visible, :2].std() + 1e-9
+    flat = np.column_stack([(table[visible, :2] - middle) / size, np.ones(len(visible))])
+    rows = np.zeros((2 * len(visible), 9))
     rows[0::2, :3] = rows[1::2, 3:6] = flat
     rows[:, 6:] = -ray.reshape(-1, 1) * np.repeat(flat, 2, axis=0)
     plane = np.linalg.svd(rows, full_matrices=False)[2][-1].reshape(3, 3) @ np.diag([1 / size, 1 / size, 1.0])
@@ -93,9 +93,9 @@ def _tilted_back(poses: np.ndarray, table: np.ndarray) -> np.ndarray:
 
 def _refine(lens: Lens, table: np.ndarray, pixel: np.ndarray, poses: np.ndarray) -> BoardPoses:
     """Return the poses that minimise each image's reprojection error, by damped Gauss–Newton from given poses."""
-    seen = ~np.isnan(pixel[:, :, 0])
+    visible = ~np.isnan(pixel[:, :, 0])
     damping = np.full(len(poses), 1e-6)
-    cost, gradient, information = _normal(lens, table, pixel, seen, poses)
+    cost, gradient, information = _normal(lens, table, pixel, visible, poses)
     for _ in range(STEPS):
         scale = np.sqrt(np.einsum("mii->mi", information)) + 1e-9
         system = information / (scale[:, :, None] * scale[:, None, :]) + damping[:, None, None] * np.eye(6)
@@ -104,22 +104,22 @@ def _refine(lens: Lens, table: np.ndarray, pixel: np.ndarray, poses: np.ndarray)
         trial[:, :3, :3] = Rotation.from_rotvec(step[:, 3:]).as_matrix() @ poses[:, :3, :3]
         trial[:, :3, 3] += step[:, :3]
         trial[:, 2, 3] = np.maximum(trial[:, 2, 3], 0.01)
-        found = _normal(lens, table, pixel, seen, trial)
-        better = found[0] < cost
-        settled = np.all(cost - found[0] <= SETTLED * cost)
+        trial_normal = _normal(lens, table, pixel, visible, trial)
+        better = trial_normal[0] < cost
+        settled = np.all(cost - trial_normal[0] <= SETTLED * cost)
         poses = np.where(better[:, None, None], trial, poses)
-        cost, gradient = np.where(better, found[0], cost), np.where(better[:, None], found[1], gradient)
-        information = np.where(better[:, None, None], found[2], information)
+        cost, gradient = np.where(better, trial_normal[0], cost), np.where(better[:, None], trial_normal[1], gradient)
+        information = np.where(better[:, None, None], trial_normal[2], information)
         damping = np.clip(np.where(better, damping / 10.0, damping * 30.0), 1e-9, 1e6)
         if settled and better.any():
             break
-    count = seen.sum(axis=1)
+    count = visible.sum(axis=1)
     rms = np.sqrt(cost / np.maximum(2.0 * count - 6.0, 1.0))
     return BoardPoses(poses, np.where(count >= MIN_SEEN, rms, np.nan), information)
 
 
 def _normal(
-    lens: Lens, table: np.ndarray, pixel: np.ndarray, seen: np.ndarray, poses: np.ndarray
+    lens: Lens, table: np.ndarray, pixel: np.ndarray, visible: np.ndarray, poses: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return ‖r‖² (m,), Jᵀr (m, 6) and JᵀJ (m, 6, 6) of each image; J with respect to the board's twist [v; ω]."""
     turned = np.einsum("mij,kj->mki", poses[:, :3, :3], table)
@@ -127,8 +127,8 @@ def _normal(
     aside = np.maximum(np.linalg.norm(point[:, :, :2], axis=2), 1e-3)
     point[:, :, 2] = np.maximum(point[:, :, 2], 0.3 * aside)
     flat, by_point, _ = lens.project_with_slopes(point.reshape(-1, 3))
-    residual = np.where(seen[:, :, None], pixel - flat.reshape(pixel.shape), 0.0)
-    by_point = np.where(seen[:, :, None, None], by_point.reshape(*pixel.shape, 3), 0.0)
+    residual = np.where(visible[:, :, None], pixel - flat.reshape(pixel.shape), 0.0)
+    by_point = np.where(visible[:, :, None, None], by_point.reshape(*pixel.shape, 3), 0.0)
     slope = np.concatenate([by_point, np.cross(turned[:, :, None, :], by_point)], axis=3).reshape(len(poses), -1, 6)
     error = residual.reshape(len(poses), -1)
     return np.sum(error**2, axis=1), np.einsum("mrk,mr->mk", slope, error), np.einsum("mrk,mrl->mkl", slope, slope)
@@ -165,30 +165,32 @@ def estimate_lens(
         )
     max_images = 30  # images that a first lens is found from (our choice)
     good = good[evenly(len(good), max_images)]
-    own = pixel[good]
-    found, rms, matrix = _fitted(board, own, size, model)
-    if rms > BENT and model == "pinhole" and (other := _fitted(board, own, size, "fisheye")[1]) < BENT * rms:
-        refuse_data(
-            file,
-            f"reprojection error {other:.2f} px with a fisheye lens, {rms:.2f} px with a pinhole: state [camera] "
-            "model = 'fisheye' in the options, or give the lens (camera.yaml)",
-        )
+    sample = pixel[good]
+    lens, rms, matrix = _fitted(board, sample, size, model)
+    if rms > BENT and model == "pinhole":
+        _, fisheye_rms, _ = _fitted(board, sample, size, "fisheye")
+        if fisheye_rms < BENT * rms:
+            refuse_data(
+                file,
+                f"reprojection error {fisheye_rms:.2f} px with a fisheye lens, {rms:.2f} px with a pinhole: state "
+                "[camera] model = 'fisheye' in the options, or give the lens (camera.yaml)",
+            )
     if not rms < WRONG:
         refuse_data(
             file,
             f"reprojection error {rms:.1f} px with the best {model} lens, so no lens explains these images. Were all "
             "taken by one camera, at one focus, of this board?",
         )
-    loose = _focal_sigma(found, matrix, rms)
+    loose = _focal_sigma(lens, matrix, rms)
     max_focal_sigma = 0.01  # relative sigma of the focal length above which images do not tell it (our choice)
     if not loose < max_focal_sigma:
-        known = f"to ±{100 * loose:.2g} % only" if loose < 0.5 else "not at all"
+        accuracy = f"to ±{100 * loose:.2g} % only" if loose < 0.5 else "not at all"
         refuse_data(
             file,
-            f"the focal length is identified {known}: the images show the board from too few directions; tilt it (or "
-            "the camera) by 20 to 45° both ways in a dozen images, or give the lens (camera.yaml)",
+            f"the focal length is identified {accuracy}: the images show the board from too few directions; tilt it "
+            "(or the camera) by 20 to 45° both ways in a dozen images, or give the lens (camera.yaml)",
         )
-    return found
+    return lens
 
 
 def _fitted(board: Board, pixel: np.ndarray, size: tuple[int, int], model: str) -> tuple[Lens, float, np.ndarray]:
@@ -197,7 +199,10 @@ def _fitted(board: Board, pixel: np.ndarray, size: tuple[int, int], model: str) 
     starts = [Lens(model, np.array([f * max(size), f * max(size), *middle, *zero]), size) for f in STARTS]
     max_tried = 8  # images that they are tried on (our choice)
     lens = min(
-        starts, key=lambda each: float(np.nanmean(np.minimum(board_poses(each, board, pixel[:max_tried]).rms, WRONG)))
+        starts,
+        key=lambda candidate: float(
+            np.nanmean(np.minimum(board_poses(candidate, board, pixel[:max_tried]).rms, WRONG))
+        ),
     )
     rows, damping = _beside_poses(lens, board, pixel), 1e-3
     cost = _squares(rows)
@@ -207,14 +212,14 @@ def _fitted(board: Board, pixel: np.ndarray, size: tuple[int, int], model: str) 
         length = np.linalg.norm(matrix, axis=0) + 1e-300
         padded = np.concatenate([matrix / length, np.sqrt(damping) * np.eye(FITTED)])
         step = np.linalg.lstsq(padded, np.append(residual, np.zeros(FITTED)), rcond=None)[0] / length
-        trial = rows
+        trial_rows = rows
         with suppress(CalibError):  # a focal length below zero
-            moved = lens.with_values(lens.values + np.append(step, np.zeros(len(lens.values) - FITTED)))
-            trial = _beside_poses(moved, board, pixel)
-        after = _squares(trial)
+            trial_lens = lens.with_values(lens.values + np.append(step, np.zeros(len(lens.values) - FITTED)))
+            trial_rows = _beside_poses(trial_lens, board, pixel)
+        after = _squares(trial_rows)
         if after < cost:
             settled = cost - after < 1e-6 * cost
-            lens, rows, cost, damping = moved, trial, after, damping / 10.0
+            lens, rows, cost, damping = trial_lens, trial_rows, after, damping / 10.0
             if settled:
                 break
         elif (damping := 10.0 * damping) > 1e6:
@@ -230,11 +235,16 @@ def _squares(rows: np.ndarray) -> float:
 def _beside_poses(lens: Lens, board: Board, pixel: np.ndarray) -> np.ndarray:
     """Return the lens Jacobian and the residuals of all images side by side, with the poses projected out."""
     table, rows = corners(board), []
-    for where, own in zip(board_poses(lens, board, pixel).poses, pixel):
-        seen = ~np.isnan(own[:, 0])
-        turned = table[seen] @ where[:3, :3].T
-        flat, by_point, by_lens = lens.project_with_slopes(turned + where[:3, 3])
-        parts = [by_point, np.cross(turned[:, None], by_point), by_lens[:, :, :FITTED], (own[seen] - flat)[:, :, None]]
+    for board_pose, image_pixels in zip(board_poses(lens, board, pixel).poses, pixel):
+        visible = ~np.isnan(image_pixels[:, 0])
+        turned = table[visible] @ board_pose[:3, :3].T
+        flat, by_point, by_lens = lens.project_with_slopes(turned + board_pose[:3, 3])
+        parts = [
+            by_point,
+            np.cross(turned[:, None], by_point),
+            by_lens[:, :, :FITTED],
+            (image_pixels[visible] - flat)[:, :, None],
+        ]
         rows.append(np.asarray(np.linalg.qr(np.concatenate(parts, axis=2).reshape(-1, 7 + FITTED), mode="r"))[6:, 6:])
     return np.concatenate(rows)
 

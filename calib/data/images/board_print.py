@@ -70,7 +70,7 @@ def raster(board: Board, pixels_per_metre: float, margin: float) -> np.ndarray:
     for x, y, w, h in _black(board):
         shares = []
         for first, length, count in ((y, h, height), (x, w, width)):
-            low, high = ((place + margin) * pixels_per_metre for place in (first, first + length))
+            low, high = ((edge + margin) * pixels_per_metre for edge in (first, first + length))
             cells = np.arange(int(np.floor(low)), min(int(np.ceil(high)), count))
             shares.append((cells, np.clip(np.minimum(cells + 1, high) - np.maximum(cells, low), 0.0, 1.0)))
         (rows, down), (columns, across) = shares
@@ -150,19 +150,19 @@ def pdf(board: Board, size: tuple[float, float]) -> bytes:
 
 def _page(board: Board, size: tuple[float, float]) -> tuple[np.ndarray, list[tuple[float, float, str]]]:
     """Return the black rectangles (N, 4) [m] and the texts of a page: board in the middle, ruler below."""
-    left, top = 0.5 * (size[0] - board.extent[0]), 0.5 * (size[1] - RULER - board.extent[1])
-    boxes = _black(board) + np.array([left, top, 0.0, 0.0])
+    left_edge, top = 0.5 * (size[0] - board.extent[0]), 0.5 * (size[1] - RULER - board.extent[1])
+    boxes = _black(board) + np.array([left_edge, top, 0.0, 0.0])
     length = 0.01 * int(100 * min(board.extent[0], 0.2) + 1e-9)
     base, line_width = size[1] - EDGE - 0.006, 0.0002
-    ticks = [[left - line_width / 2, base, length + line_width, line_width]]
+    ticks = [[left_edge - line_width / 2, base, length + line_width, line_width]]
     for millimetre in range(round(1e3 * length) + 1):
         tick_height = 0.004 if millimetre % 10 == 0 else 0.003 if millimetre % 5 == 0 else 0.002
-        ticks.append([left + 1e-3 * millimetre - line_width / 2, base - tick_height, line_width, tick_height])
+        ticks.append([left_edge + 1e-3 * millimetre - line_width / 2, base - tick_height, line_width, tick_height])
     advice = f"{board.words}, {board.dictionary}: print at 100 %, measure, put it into board.toml"
     texts = [
-        (left, base + 0.0035, "0"),
-        (left + length - 0.006, base + 0.0035, f"{1e3 * length:.0f} mm"),
-        (left + 0.008, base + 0.0035, advice),
+        (left_edge, base + 0.0035, "0"),
+        (left_edge + length - 0.006, base + 0.0035, f"{1e3 * length:.0f} mm"),
+        (left_edge + 0.008, base + 0.0035, advice),
     ]
     return np.concatenate([boxes, ticks]), texts
 

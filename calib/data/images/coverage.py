@@ -12,9 +12,9 @@ def image_words(block: Pixels) -> str:
     """Return a summary sentence of newly read images: corners, mounting, lens, coverage."""
     lens = block.lens
     focal = "" if lens is None else f", focal length {lens.values[0]:.0f} px {'given' if block.known else 'found'}"
-    seen = f"{block.seen.sum(axis=1).mean():.1f} of {block.seen.shape[1]} corners each"
+    corner_counts = f"{block.seen.sum(axis=1).mean():.1f} of {block.seen.shape[1]} corners each"
     carried = "the arm carries the camera" if block.mounting == IN_HAND else "the arm carries the board"
-    return f"{seen}; {carried}{focal}; {coverage_words(block.pixel[block.seen], block.size)}"
+    return f"{corner_counts}; {carried}{focal}; {coverage_words(block.pixel[block.seen], block.size)}"
 
 
 def coverage(pixels: np.ndarray, size: tuple[int, int], weights: np.ndarray | None = None) -> np.ndarray:

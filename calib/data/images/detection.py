@@ -68,8 +68,8 @@ def _coarse(image: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray]:
     nothing = np.zeros(0, dtype=int), np.zeros((0, 2))
     if board.kind == "chessboard":
         inner = board.columns - 1, board.rows - 1
-        done, pixels = cv2.findChessboardCornersSB(image, inner, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
-        if not done:
+        success, pixels = cv2.findChessboardCornersSB(image, inner, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
+        if not success:
             return nothing
         return np.arange(inner[0] * inner[1]), _upright(image, pixels.reshape(-1, 2), board)
     if board.kind == "charuco":

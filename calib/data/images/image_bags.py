@@ -69,12 +69,12 @@ def read_image_bag(
         require(len(parts["q"]) >= 2, few, MeasurementError, path)
         order = np.argsort(parts["stamp"], kind="stable")
         connections = connections_of(reader, IMAGE, image_topic, path, "images", "--image-topic")
-        chosen, own, notes = _at_rest(_image_stamps(reader, connections), parts["stamp"][order], parts["q"][order])
+        chosen, q, notes = _at_rest(_image_stamps(reader, connections), parts["stamp"][order], parts["q"][order])
         require(len(chosen), f"no image was taken with the arm at rest: {'; '.join(notes)}", MeasurementError, path)
         labels = [f"image {k + 1}" for k in chosen]
         images = zip(labels, _images(reader, connections, set(chosen.tolist())))
-        found = detected(images, board, len(labels), None if say is None else lambda k, _, name: say(k, name))
-    return ImageBag(tuple(labels), names, own, found, tuple(notes))
+        detections = detected(images, board, len(labels), None if say is None else lambda k, _, name: say(k, name))
+    return ImageBag(tuple(labels), names, q, detections, tuple(notes))
 
 
 def _image_stamps(reader: Any, connections: list[Any]) -> np.ndarray:
@@ -82,10 +82,10 @@ def _image_stamps(reader: Any, connections: list[Any]) -> np.ndarray:
     return np.array([header_stamp(reader.deserialize(raw, c.msgtype)) or logged for c, logged, raw in messages])
 
 
-def _images(reader: Any, connections: list[Any], wanted: set[int]) -> Any:
+def _images(reader: Any, connections: list[Any], numbers: set[int]) -> Any:
     """Yield the images with the given numbers as 8-bit grey levels, in the bag's order."""
     for number, (connection, _, raw) in enumerate(reader.messages(connections=connections)):
-        if number in wanted:
+        if number in numbers:
             yield _grey(reader.deserialize(raw, connection.msgtype))
 
 
@@ -118,36 +118,38 @@ def _at_rest(images: np.ndarray, stamps: np.ndarray, q: np.ndarray) -> tuple[np.
     before = after - 1
     gap = np.maximum(stamps[after] - stamps[before], 1)
     share = np.clip((images - stamps[before]) / gap, 0.0, 1.0)[:, None]
-    own = q[before] * (1.0 - share) + q[after] * share
+    q_images = q[before] * (1.0 - share) + q[after] * share
     max_delay = 0.1  # an image further from the nearest joint state has none [s]
-    near = np.minimum(np.abs(images - stamps[before]), np.abs(images - stamps[after])) < max_delay * 1e9
+    has_state = np.minimum(np.abs(images - stamps[before]), np.abs(images - stamps[after])) < max_delay * 1e9
     speed = np.abs(q[after] - q[before]).max(axis=1) / (gap * 1e-9)
     max_joint_speed = 2e-3  # of a joint about an image [rad/s or m/s]; our choice
     still = speed < max_joint_speed
-    if not near.all():
-        notes.append(f"{int((~near).sum())} images have no joint state within {max_delay:g} s (do the clocks agree?)")
-    if moving := int((near & ~still).sum()):
+    if not has_state.all():
+        notes.append(
+            f"{int((~has_state).sum())} images have no joint state within {max_delay:g} s (do the clocks agree?)"
+        )
+    if moving := int((has_state & ~still).sum()):
         notes.append(
             f"{moving} images were taken while the arm moved (faster than {1e3 * max_joint_speed:g} mrad/s): left out"
         )
-    kept, stop = [], 0
+    selected, stop = [], 0
     max_apart = 1e-3  # joints of one stop differ by less [rad or m]
     max_per_stop = 3  # images of one stop that are kept
-    for k in np.flatnonzero(near & still):
-        stop = stop + 1 if kept and np.abs(own[k] - own[kept[-1]]).max() < max_apart else 1
+    for k in np.flatnonzero(has_state & still):
+        stop = stop + 1 if selected and np.abs(q_images[k] - q_images[selected[-1]]).max() < max_apart else 1
         if stop <= max_per_stop:
-            kept.append(int(k))
-    if more := int((near & still).sum()) - len(kept):
-        notes.append(f"{more} more images of the same stops were left out ({max_per_stop} of each are kept)")
-    return np.array(kept, dtype=int), own[kept], notes
+            selected.append(int(k))
+    if surplus := int((has_state & still).sum()) - len(selected):
+        notes.append(f"{surplus} more images of the same stops were left out ({max_per_stop} of each are kept)")
+    return np.array(selected, dtype=int), q_images[selected], notes
 
 
-def write_image_folder(found: ImageBag, board: Board, folder: Path) -> Path:
+def write_image_folder(bag: ImageBag, board: Board, folder: Path) -> Path:
     """Write a bag's images as a folder for `calib.data.images.image_folders`."""
     write_board(board, folder / BOARD)
-    rows = [[name, *map(float, joints)] for name, joints in zip(found.names, found.q)]
-    files.write_table(folder / JOINTS, ["image", *(f"{name} [rad]" for name in found.joint_names)], rows)
-    write_corners(folder / CORNERS, found.corners)
+    rows = [[name, *map(float, joints)] for name, joints in zip(bag.names, bag.q)]
+    files.write_table(folder / JOINTS, ["image", *(f"{name} [rad]" for name in bag.joint_names)], rows)
+    write_corners(folder / CORNERS, bag.corners)
     return folder
 
 
@@ -155,8 +157,10 @@ def from_bag(
     bag: Path, board: Path, out: Path, image_topic: str | None, joint_topic: str | None, show: Callable[[str], None]
 ) -> list[str]:
     """Write a bag's corners and joint values into a folder; return a summary as sentences."""
-    made = read_board(board)
-    found = read_image_bag(bag, made, image_topic or "", joint_topic or "", lambda k, name: show(f"image {k}: {name}"))
-    write_image_folder(found, made, out)
-    lines = detection_summary(found.corners, made, found.names)
-    return [*lines, *found.notes, f"written to {out}; calib fit ROBOT {out} --out FOLDER fits it"]
+    printed_board = read_board(board)
+    contents = read_image_bag(
+        bag, printed_board, image_topic or "", joint_topic or "", lambda k, name: show(f"image {k}: {name}")
+    )
+    write_image_folder(contents, printed_board, out)
+    lines = detection_summary(contents.corners, printed_board, contents.names)
+    return [*lines, *contents.notes, f"written to {out}; calib fit ROBOT {out} --out FOLDER fits it"]

@@ -49,12 +49,12 @@ def decode(content: bytes) -> np.ndarray:
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         with quiet():
-            found = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+            pixels = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     except cv2.error as error:
         raise ValueError(str(error)) from error
-    if found is None:
+    if pixels is None:
         raise ValueError("no image format that is known, or cut short")
-    return to_grey(found)
+    return to_grey(pixels)
 
 
 def to_grey(image: np.ndarray) -> np.ndarray:
@@ -72,6 +72,6 @@ def write_image(path: Path, image: np.ndarray) -> Path:
     """Write an image in the format of its suffix."""
     from calib import files
 
-    done, content = cv2.imencode(path.suffix, image)
-    require(done, "cannot be written as an image", MeasurementError, path)
+    success, content = cv2.imencode(path.suffix, image)
+    require(success, "cannot be written as an image", MeasurementError, path)
     return files.write(path, content.tobytes())

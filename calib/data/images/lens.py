@@ -72,10 +72,10 @@ class Lens:
         ahead = points[:, 2] > 1e-6
         safe = np.where(ahead[:, None], points, [0.0, 0.0, 1.0])
         pixel, size = self.project(safe), np.array(self.size)
-        inside = np.all((pixel >= margin) & (pixel <= size - 1 - margin), axis=1)
+        in_image = np.all((pixel >= margin) & (pixel <= size - 1 - margin), axis=1)
         plane = safe[:, :2] / safe[:, 2:]
-        back = rays(self, np.where(inside[:, None], pixel, self.values[2:4]))
-        return ahead & inside & (np.abs(back - plane).max(axis=1) < 1e-6 * (1.0 + np.abs(plane).max(axis=1)))
+        back = rays(self, np.where(in_image[:, None], pixel, self.values[2:4]))
+        return ahead & in_image & (np.abs(back - plane).max(axis=1) < 1e-6 * (1.0 + np.abs(plane).max(axis=1)))
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """Return pixels (N, 2) of points (N, 3) [m] in the camera's frame."""
@@ -116,9 +116,9 @@ def _brown_conrady(plane: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.nda
     columns = [square / below, square**2 / below, None, None, square**3 / below]
     columns += [-scale * square**power / below for power in (1, 2, 3)][: len(k) - 5]
     by_value = np.empty((len(plane), 2, len(k)))
-    for place, column in enumerate(columns):
+    for index, column in enumerate(columns):
         if column is not None:
-            by_value[:, :, place] = plane * column[:, None]
+            by_value[:, :, index] = plane * column[:, None]
     by_value[:, :, 2] = np.stack([2 * a * b, square + 2 * b * b], axis=1)
     by_value[:, :, 3] = np.stack([square + 2 * a * a, 2 * a * b], axis=1)
     return bent, across, by_value
@@ -143,17 +143,17 @@ BEND = {"pinhole": _brown_conrady, "fisheye": _fisheye}
 
 def rays(lens: Lens, pixels: np.ndarray) -> np.ndarray:
     """Return the ray direction (X/Z, Y/Z) (N, 2) of each pixel (N, 2), by Newton's method; NaN without a solution."""
-    wanted = (pixels - lens.values[2:4]) / lens.values[:2]
+    distorted = (pixels - lens.values[2:4]) / lens.values[:2]
     if lens.model == "fisheye":
-        long = np.linalg.norm(wanted, axis=1)
+        long = np.linalg.norm(distorted, axis=1)
         start = np.tan(np.clip(long, 0.0, 1.5)) / np.maximum(long, 1e-12)
-        plane = wanted * start[:, None]
+        plane = distorted * start[:, None]
     else:
-        plane = wanted.copy()
+        plane = distorted.copy()
     iterations = 20  # of the inverse; Newton's, so that a handful does
     for _ in range(iterations):
         bent, across, _ = BEND[lens.model](plane, lens.values[4:])
-        error = bent - wanted
+        error = bent - distorted
         determinant = across[:, 0, 0] * across[:, 1, 1] - across[:, 0, 1] * across[:, 1, 0]
         determinant = np.where(np.abs(determinant) < 1e-9, np.nan, determinant)
         step = np.stack(
@@ -183,19 +183,19 @@ def read_lens(path: str | Path) -> Lens:
     from ruamel.yaml.error import YAMLError
 
     try:
-        found = YAML(typ="safe", pure=True).load(Path(path).read_text(encoding="utf-8"))
+        table = YAML(typ="safe", pure=True).load(Path(path).read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, YAMLError) as error:
         raise MeasurementError(f"cannot be read as YAML ({str(error).splitlines()[0]})", path) from error
-    if not isinstance(found, dict):
+    if not isinstance(table, dict):
         raise MeasurementError("is not a camera_info file: expected image_width, camera_matrix, distortion_model", path)
-    size = (_whole(found, ("image_width", "width"), path), _whole(found, ("image_height", "height"), path))
-    matrix = _numbers(found, ("camera_matrix", "K", "k"), path)
+    size = (_whole(table, ("image_width", "width"), path), _whole(table, ("image_height", "height"), path))
+    matrix = _numbers(table, ("camera_matrix", "K", "k"), path)
     if len(matrix) != 9 or matrix[8] != 1.0 or abs(matrix[1]) > 1e-6 * abs(matrix[0]):
         raise MeasurementError(f"camera_matrix: expected [fx 0 cx 0 fy cy 0 0 1], found {matrix.tolist()}", path)
-    bend = _numbers(found, ("distortion_coefficients", "D", "d"), path)
-    name = str(found.get("distortion_model") or "plumb_bob").lower()
-    words = f"distortion_model '{name}'{suggestion(name, MODELS)} is unknown; expected one of {', '.join(MODELS)}"
-    require(name in MODELS, words, MeasurementError, path)
+    bend = _numbers(table, ("distortion_coefficients", "D", "d"), path)
+    name = str(table.get("distortion_model") or "plumb_bob").lower()
+    message = f"distortion_model '{name}'{suggestion(name, MODELS)} is unknown; expected one of {', '.join(MODELS)}"
+    require(name in MODELS, message, MeasurementError, path)
     allowed = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8,)}.get(name, (4,))
     if len(bend) not in allowed:
         raise MeasurementError(f"distortion_model {name} has {allowed[-1]} coefficients, found {len(bend)}", path)
@@ -204,15 +204,15 @@ def read_lens(path: str | Path) -> Lens:
         return Lens(MODELS[name], np.concatenate([matrix[[0, 4, 2, 5]], full]), size)
 
 
-def _whole(found: dict[str, Any], keys: tuple[str, ...], path: str | Path) -> int:
-    value = next((found[key] for key in keys if key in found), None)
+def _whole(table: dict[str, Any], keys: tuple[str, ...], path: str | Path) -> int:
+    value = next((table[key] for key in keys if key in table), None)
     if not isinstance(value, int) or not 0 < value < 100_000:
         raise MeasurementError(f"{keys[0]}: expected a number of pixels, found {shown(value)}", path)
     return value
 
 
-def _numbers(found: dict[str, Any], keys: tuple[str, ...], path: str | Path) -> np.ndarray:
-    value = next((found[key] for key in keys if key in found), None)
+def _numbers(table: dict[str, Any], keys: tuple[str, ...], path: str | Path) -> np.ndarray:
+    value = next((table[key] for key in keys if key in table), None)
     value = value.get("data") if isinstance(value, dict) else value
     try:
         numbers = np.array(value, dtype=float).ravel()

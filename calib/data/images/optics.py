@@ -192,14 +192,14 @@ class View:
 
     Attributes:
         lens, shape: of the camera and the board.
-        own: (k,) which of their values (the lens's, then the board's) are among the free parameters.
-        place: (k,) where those stand among the f free parameters.
+        in_view: (k,) which of their values (the lens's, then the board's) are among the free parameters.
+        in_free: (k,) where those stand among the f free parameters.
     """
 
     lens: Lens
     shape: BoardShape
-    own: np.ndarray
-    place: np.ndarray
+    in_view: np.ndarray
+    in_free: np.ndarray
 
 
 def shaped_points(board: Board, shape: BoardShape, points: np.ndarray) -> np.ndarray:

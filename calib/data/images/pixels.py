@@ -119,15 +119,23 @@ class Found:
     size: tuple[int, int] = (0, 0)
 
 
-def write_corners(path: Path, found: Found) -> Path:
+def write_corners(path: Path, detections: Found) -> Path:
     """Write detections as ``corners.csv``."""
-    rows: list[list[object]] = [["", "", *found.size, None, None, "size of the images"]]
-    for name, one in found.images.items():
-        if one.problem:
-            rows.append([name, None, None, None, None, one.edge, one.problem])
+    rows: list[list[object]] = [["", "", *detections.size, None, None, "size of the images"]]
+    for name, detection in detections.images.items():
+        if detection.problem:
+            rows.append([name, None, None, None, None, detection.edge, detection.problem])
         rows += [
-            [name, int(k), float(one.pixel[k, 0]), float(one.pixel[k, 1]), float(one.sigma[k]), one.edge, ""]
-            for k in np.flatnonzero(one.seen)
+            [
+                name,
+                int(k),
+                float(detection.pixel[k, 0]),
+                float(detection.pixel[k, 1]),
+                float(detection.sigma[k]),
+                detection.edge,
+                "",
+            ]
+            for k in np.flatnonzero(detection.seen)
         ]
     return files.write_table(path, HEADER, rows)
 
@@ -162,8 +170,8 @@ def read_corners(path: Path, board: Board) -> Found:
                 )
             if problem or not cells.get("corner"):
                 continue
-            k, place = int(cells["corner"]), (float(cells["u"]), float(cells["v"]))
+            k, corner_pixel = int(cells["corner"]), (float(cells["u"]), float(cells["v"]))
         if not 0 <= k < count:
             refuse_data(path, f"corner {k}: the board ({board.words}) has {count}", "corner", number)
-        images[name].pixel[k], images[name].sigma[k] = place, float(cells.get("sigma") or USUAL)
+        images[name].pixel[k], images[name].sigma[k] = corner_pixel, float(cells.get("sigma") or USUAL)
     return Found(images, size)

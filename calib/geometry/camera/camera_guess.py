@@ -47,36 +47,38 @@ class CameraPlacement:
     placed: Placement
 
 
-def complete_camera(chain: Chain, block: Pixels, others: Sequence[PoseMeasurements] = ()) -> Pixels:
+def complete_camera(chain: Chain, block: Pixels, fitted_blocks: Sequence[PoseMeasurements] = ()) -> Pixels:
     """Return a block of images with its lens and mounting; refuse images that contradict the arm's motion.
 
     Args:
         chain: the nominal arm.
         block: of images.
-        others: blocks fitted already; the lens of one with images of this size is taken over.
+        fitted_blocks: blocks fitted already; the lens of one with images of this size is taken over.
 
     Corners that do not fit into their own image, and images that contradict all others, are left out and named.
 
     Raises:
         MeasurementError: where images and joints do not belong together, or the board is not of the stated size.
     """
-    given = block
-    for other in others:
-        if block.lens is None and isinstance(other, Pixels) and other.size == block.size and other.lens is not None:
-            block = replace(block, lens=other.lens, mounting=block.mounting or other.mounting, free=())
+    original = block
+    for fitted in fitted_blocks:
+        if block.lens is None and isinstance(fitted, Pixels) and fitted.size == block.size and fitted.lens is not None:
+            block = replace(block, lens=fitted.lens, mounting=block.mounting or fitted.mounting, free=())
     if block.lens is None:
         if not block.size[0]:
             raise MeasurementError("image size unknown: no lens (camera.yaml) and no image was given", block.file)
         block = replace(block, lens=estimate_lens(block.board, block.pixel, block.size, block.model, block.file))
     arm = forward(chain, block.q)
-    found = place_camera(block, arm)
-    _check_square(block, arm[found.rows], found)
-    block = replace(block, mounting=found.mounting)
+    placement = place_camera(block, arm)
+    _check_square(block, arm[placement.rows], placement)
+    block = replace(block, mounting=placement.mounting)
     poses = _own_poses(block, np.arange(len(block)))
-    strange, words = _strangers(block, arm, found.placed, poses)
+    strange, exclusion_note = _strangers(block, arm, placement.placed, poses)
     if len(strange):  # and once more without them, the lens too
-        kept = take(replace(given, notes=(*given.notes, words)), np.setdiff1d(np.arange(len(block)), strange))
-        return complete_camera(chain, kept, others)
+        consistent = take(
+            replace(original, notes=(*original.notes, exclusion_note)), np.setdiff1d(np.arange(len(block)), strange)
+        )
+        return complete_camera(chain, consistent, fitted_blocks)
     return _without_gross_corners(block, poses)
 
 
@@ -92,8 +94,8 @@ def _own_poses(block: Pixels, rows: np.ndarray, max_at_once: int = 500) -> np.nd
 
     `max_at_once`: images whose corners are looked at together.
     """
-    own, lens = np.array_split(rows, len(rows) // max_at_once + 1), _lens_of(block)
-    return np.concatenate([board_poses(lens, block.board, block.pixel[each]).poses for each in own])
+    row_chunks, lens = np.array_split(rows, len(rows) // max_at_once + 1), _lens_of(block)
+    return np.concatenate([board_poses(lens, block.board, block.pixel[row_chunk]).poses for row_chunk in row_chunks])
 
 
 def _without_gross_corners(block: Pixels, poses: np.ndarray, median_length: float = 1.1774) -> Pixels:
@@ -121,9 +123,9 @@ def _without_gross_corners(block: Pixels, poses: np.ndarray, median_length: floa
     if not len(gone):
         return block
     max_named = 3
-    named = listing((f"corner {k} of {block.name(int(block.rows[row]))}" for row, k in gone), max_named)
-    words = f"{len(gone)} of {before.sum()} corners are outliers in their image, excluded: {named}"
-    return replace(block, notes=(*block.notes, words))
+    corner_names = listing((f"corner {k} of {block.name(int(block.rows[row]))}" for row, k in gone), max_named)
+    note = f"{len(gone)} of {before.sum()} corners are outliers in their image, excluded: {corner_names}"
+    return replace(block, notes=(*block.notes, note))
 
 
 def _strangers(block: Pixels, arm: np.ndarray, placed: Placement, poses: np.ndarray) -> tuple[np.ndarray, str]:
@@ -134,26 +136,28 @@ def _strangers(block: Pixels, arm: np.ndarray, placed: Placement, poses: np.ndar
     """
     lever = float(np.median(np.linalg.norm(poses[:, :3, 3], axis=1)))
 
-    def far(board: np.ndarray) -> np.ndarray:
+    def board_misfit(board: np.ndarray) -> np.ndarray:
         return misfit(arm, seen_target(block.mounting, board), placed.station, placed.tool, lever)
 
-    own = far(poses)
-    most = max(LOST * lever, ODD * float(np.median(own)))
-    strange = np.flatnonzero(own > most)
+    misfits = board_misfit(poses)
+    max_misfit = max(LOST * lever, ODD * float(np.median(misfits)))
+    strange = np.flatnonzero(misfits > max_misfit)
     if not len(strange):
         return strange, ""
-    turned = far(pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3)) @ poses)[strange] <= most
+    turned = board_misfit(pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3)) @ poses)[strange] <= max_misfit
     cause = (
         "they match if turned by 180°; did a program rotate them?"
         if turned.mean() > 0.5
         else "wrong joint values, or was camera or board moved?"
     )
-    words = f"show the board {1e3 * float(np.median(own[strange])):.0f} mm from its place in all other images: {cause}"
-    words += f" ({listing((block.name(int(block.rows[row])) for row in strange), 5)})"
+    description = (
+        f"show the board {1e3 * float(np.median(misfits[strange])):.0f} mm from its place in all other images: {cause}"
+    )
+    description += f" ({listing((block.name(int(block.rows[row])) for row in strange), 5)})"
     max_strange = 0.3  # share of images that may contradict the others, and are left out; more are refused
     if len(strange) > max_strange * len(block):
-        raise MeasurementError(f"{len(strange)} of {len(block)} images {words}", block.file)
-    return strange, f"{len(strange)} image{'s are' if len(strange) > 1 else ' is'} excluded: they {words}"
+        raise MeasurementError(f"{len(strange)} of {len(block)} images {description}", block.file)
+    return strange, f"{len(strange)} image{'s are' if len(strange) > 1 else ' is'} excluded: they {description}"
 
 
 def seen_target(mounting: str, poses: np.ndarray) -> np.ndarray:
@@ -163,12 +167,12 @@ def seen_target(mounting: str, poses: np.ndarray) -> np.ndarray:
 
 def pnp_poses(block: Pixels) -> Poses:
     """Return the images as measured poses: one pose per image, computed from its corners (PnP)."""
-    seen = seen_target(block.mounting, _own_poses(block, np.arange(len(block))))
+    targets = seen_target(block.mounting, _own_poses(block, np.arange(len(block))))
     return Poses(
         block.q,
         block.joint_names,
-        seen[:, :3, 3],
-        to_quaternion(seen),
+        targets[:, :3, 3],
+        to_quaternion(targets),
         station=block.station,
         tool_names=block.tool_names,
         file=block.file,
@@ -189,8 +193,8 @@ def place_camera(block: Pixels, arm: np.ndarray) -> CameraPlacement:
     """
     max_images = 100  # images that it is placed by (our choice)
     rows = evenly(len(block), max_images)
-    found = board_poses(_lens_of(block), block.board, block.pixel[rows])
-    good = np.flatnonzero(np.isfinite(found.rms))
+    pnp = board_poses(_lens_of(block), block.board, block.pixel[rows])
+    good = np.flatnonzero(np.isfinite(pnp.rms))
     min_images = 3  # images that place a camera at all
     if len(good) < min_images:
         raise MeasurementError(
@@ -198,22 +202,22 @@ def place_camera(block: Pixels, arm: np.ndarray) -> CameraPlacement:
             "20 to 40 for a calibration",
             block.file,
         )
-    rows, poses = rows[good], found.poses[good]
+    rows, poses = rows[good], pnp.poses[good]
     lever = float(np.median(np.linalg.norm(poses[:, :3, 3], axis=1)))
     choices = [block.mounting] if block.mounting else [IN_HAND, TO_HAND]
-    tried = {each: place_robustly(arm[rows], seen_target(each, poses), lever) for each in choices}
-    mounting = min(tried, key=lambda each: tried[each].error)
-    _check_pairing(block, arm[rows], poses, choices, tried[mounting], lever)
+    placements = {candidate: place_robustly(arm[rows], seen_target(candidate, poses), lever) for candidate in choices}
+    mounting = min(placements, key=lambda candidate: placements[candidate].error)
+    _check_pairing(block, arm[rows], poses, choices, placements[mounting], lever)
     min_contrast = 3.0  # a mounting is found where the other one's misfit is so many times as large
-    if len(tried) == 2:
-        one, other = sorted(each.error for each in tried.values())
-        if other < min_contrast * one:
+    if len(placements) == 2:
+        smaller, larger = sorted(candidate.error for candidate in placements.values())
+        if larger < min_contrast * smaller:
             raise MeasurementError(
-                f"whether the arm carries the camera or the board cannot be determined ({1e3 * one:.1f} against "
-                f"{1e3 * other:.1f} mm): state in the options [camera] mounting = 'in hand' or 'to hand'",
+                f"whether the arm carries the camera or the board cannot be determined ({1e3 * smaller:.1f} against "
+                f"{1e3 * larger:.1f} mm): state in the options [camera] mounting = 'in hand' or 'to hand'",
                 block.file,
             )
-    return CameraPlacement(rows, poses, mounting, tried[mounting])
+    return CameraPlacement(rows, poses, mounting, placements[mounting])
 
 
 def _check_pairing(
@@ -224,15 +228,15 @@ def _check_pairing(
         return
     max_left = 0.25  # of the misfit is left with the rows shifted: they were
     for shift, mounting in product((-1, 1, -2, 2), mountings):
-        seen = seen_target(mounting, poses)
-        own = slice(max(shift, 0), len(arm) + min(shift, 0)), slice(max(-shift, 0), len(arm) + min(-shift, 0))
-        again = place_robustly(arm[own[0]], seen[own[1]], lever)
-        if again.error < max_left * placed.error:
+        targets = seen_target(mounting, poses)
+        overlap = slice(max(shift, 0), len(arm) + min(shift, 0)), slice(max(-shift, 0), len(arm) + min(-shift, 0))
+        shifted = place_robustly(arm[overlap[0]], targets[overlap[1]], lever)
+        if shifted.error < max_left * placed.error:
             rows = counted(abs(shift), "row")
             raise MeasurementError(
                 f"images and joint values are shifted by {rows}: the median board error is "
                 f"{1e3 * placed.error:.0f} mm as recorded; paired with the joints {rows} "
-                f"{'further down' if shift > 0 else 'further up'} by {1e3 * again.error:.1f} mm; correct the column "
+                f"{'further down' if shift > 0 else 'further up'} by {1e3 * shifted.error:.1f} mm; correct the column "
                 "'image'",
                 block.file,
             )
@@ -245,34 +249,34 @@ def _check_pairing(
         )
 
 
-def _check_square(block: Pixels, arm: np.ndarray, found: CameraPlacement, max_scale_error: float = 0.04) -> None:
+def _check_square(block: Pixels, arm: np.ndarray, placement: CameraPlacement, max_scale_error: float = 0.04) -> None:
     """Raise if the stated square size contradicts the size computed from the arm's motion.
 
     Of B_i = S A_i X with the board's lengths times λ, for fixed rotations, the translations are linear in λ.
 
     `max_scale_error`: relative error of the board's scale that is refused.
     """
-    placed, count = found.placed, len(arm)
-    turn, seen = placed.station[:3, :3], seen_target(found.mounting, found.poses)
+    placed, count = placement.placed, len(arm)
+    turn, targets = placed.station[:3, :3], seen_target(placement.mounting, placement.poses)
     if count < 6:
         return
     rows = np.zeros((count, 3, 7))
-    rows[:, :, 0] = -seen[:, :3, 3]
+    rows[:, :, 0] = -targets[:, :3, 3]
     rows[:, :, 1:4] = turn @ arm[:, :3, :3]
     rows[:, :, 4:] = np.eye(3)
     target = -(arm[:, :3, 3] @ turn.T)
     keep = placed.misfit <= np.quantile(placed.misfit, 0.8)
-    matrix, wanted = rows[keep].reshape(-1, 7), target[keep].ravel()
-    solution, _, rank, _ = np.linalg.lstsq(matrix, wanted, rcond=1e-6)
-    spare = max(len(wanted) - 7, 1)
-    noise = float(np.linalg.norm(matrix @ solution - wanted)) / np.sqrt(spare)
+    matrix, translations = rows[keep].reshape(-1, 7), target[keep].ravel()
+    solution, _, rank, _ = np.linalg.lstsq(matrix, translations, rcond=1e-6)
+    spare = max(len(translations) - 7, 1)
+    noise = float(np.linalg.norm(matrix @ solution - translations)) / np.sqrt(spare)
     sigma = noise * float(np.sqrt(np.linalg.pinv(matrix.T @ matrix)[0, 0]))
     factor = float(solution[0])
     if rank == 7 and abs(factor - 1.0) > max(max_scale_error, 6.0 * sigma) and sigma < 0.1:
-        stated = 1e3 * block.board.square
+        square_mm = 1e3 * block.board.square
         raise MeasurementError(
-            f"a square of the board is {stated * factor:.2f} mm (±{stated * sigma:.2f}) by the arm's motion, "
-            f"{stated:.2f} in board.toml: measure the print and correct board.toml (was it printed at 100 %?)",
+            f"a square of the board is {square_mm * factor:.2f} mm (±{square_mm * sigma:.2f}) by the arm's motion, "
+            f"{square_mm:.2f} in board.toml: measure the print and correct board.toml (was it printed at 100 %?)",
             block.file,
         )
 
@@ -305,10 +309,10 @@ def _guess_frames(
     block: Pixels, arm: np.ndarray, rows: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return station and tool (4, 4) of a block of images, from the arm's poses (m, 4, 4); one may be given."""
-    found = place_camera(block, arm)
+    placement = place_camera(block, arm)
     if station is None and tool is None:
-        return found.placed.station, found.placed.tool
-    seen, own = seen_target(block.mounting, found.poses), arm[found.rows]
+        return placement.placed.station, placement.placed.tool
+    targets, tips = seen_target(block.mounting, placement.poses), arm[placement.rows]
     if station is not None:
-        return station, average_pose(invert(own) @ invert(station) @ seen)
-    return average_pose(seen @ invert(own @ tool)), np.asarray(tool)
+        return station, average_pose(invert(tips) @ invert(station) @ targets)
+    return average_pose(targets @ invert(tips @ tool)), np.asarray(tool)

@@ -65,11 +65,11 @@ class ImageNoise(Frozen):
         """Return this noise for another number of images, with all weights equal to 1."""
         return replace(self, weight=np.ones(images), shared=None)
 
-    def near(self, other: ImageNoise) -> bool:
+    def near(self, noise: ImageNoise) -> bool:
         """Return whether two noise estimates agree, so that the fit is not repeated."""
-        pairs = ((self.factor, other.factor), (self.displacement, other.displacement), (self.turn, other.turn))
+        pairs = ((self.factor, noise.factor), (self.displacement, noise.displacement), (self.turn, noise.turn))
         alike = all(abs(a - b) <= MAX_NOISE_CHANGE * max(a, b) + MIN_NOISE for a, b in pairs)
-        return alike and np.abs(self.weight - other.weight).max(initial=0.0) < 0.05
+        return alike and np.abs(self.weight - noise.weight).max(initial=0.0) < 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,42 +89,40 @@ class OwnPoses:
     spare: np.ndarray
 
 
-def estimate_noise(found: OwnPoses, unknowns: int, loss: str = "none", scale: float | None = None) -> ImageNoise:
+def estimate_noise(fits: OwnPoses, unknowns: int, loss: str = "none", scale: float | None = None) -> ImageNoise:
     """Return the noise of the images, estimated from the residuals of a fit.
 
     Args:
-        found: see there.
+        fits: of a free pose to each image.
         unknowns: parameters fitted to them.
         loss, scale: of a robust fit, for the images' weights.
     """
-    k = len(found.spare)
+    k = len(fits.spare)
     share = max(1.0 - unknowns / max(6 * k, 1), 0.2)
-    use = found.spare > 0
+    use = fits.spare > 0
     factor = 1.0
     if use.any():
-        each = found.within[use] / found.spare[use]
+        variances = fits.within[use] / fits.spare[use]
         robustly = loss != "none"
-        factor = float(np.sqrt(np.median(each) if robustly else found.within[use].sum() / found.spare[use].sum()))
+        factor = float(np.sqrt(np.median(variances) if robustly else fits.within[use].sum() / fits.spare[use].sum()))
     factor = max(factor, 1e-3)
-    covariance = factor**2 * np.linalg.pinv(found.information, hermitian=True)
-    own = np.einsum("kii->ki", covariance)
-    square = found.residual**2
+    covariance = factor**2 * np.linalg.pinv(fits.information, hermitian=True)
+    variances_of_poses = np.einsum("kii->ki", covariance)
+    square = fits.residual**2
     max_ratio = 25.0  # squared residuals beyond so many times their median are taken for it (our choice)
     square = np.minimum(square, max_ratio * np.median(square, axis=0)) / share
-    spread = [_component(square[:, axes], own[:, axes]) for axes in (slice(0, 3), slice(3, 6))]
+    spread = [_component(square[:, axes], variances_of_poses[:, axes]) for axes in (slice(0, 3), slice(3, 6))]
     total = covariance + np.diag(np.repeat(np.square(spread), 3))
-    size = np.sqrt(
-        np.einsum("ki,ki->k", found.residual, np.linalg.solve(total, found.residual[:, :, None])[:, :, 0]) / 6
-    )
+    size = np.sqrt(np.einsum("ki,ki->k", fits.residual, np.linalg.solve(total, fits.residual[:, :, None])[:, :, 0]) / 6)
     return ImageNoise(factor, *spread, weight=robust.weights(size, loss, scale))
 
 
-def _component(square: np.ndarray, known: np.ndarray, max_steps: int = 20) -> float:
+def _component(square: np.ndarray, explained: np.ndarray, max_steps: int = 20) -> float:
     """Return the standard deviation s with E[t²] = s² + known, by maximum likelihood: Σ (t² - s² - c)/(s² + c)² = 0."""
-    value = max(float(np.mean(square - known)), 1e-3 * float(np.median(square)))
+    value = max(float(np.mean(square - explained)), 1e-3 * float(np.median(square)))
     for _ in range(max_steps):
-        weight = 1.0 / (value + known) ** 2
-        value = max(float(np.sum(weight * (square - known)) / np.sum(weight)), 0.0)
+        weight = 1.0 / (value + explained) ** 2
+        value = max(float(np.sum(weight * (square - explained)) / np.sum(weight)), 0.0)
         if value == 0.0:
             break
     return float(np.sqrt(value))
@@ -171,14 +169,14 @@ class PixelPart(Part):
         return np.sqrt(np.bincount(self.index, square)[count > 0] / count[count > 0])
 
     def per_row(self) -> Part:
-        images, place, count = np.unique(self.index, return_inverse=True, return_counts=True)
-        mean = np.array([np.bincount(place, axis / self.depth) / count for axis in self.value])
+        images, image, count = np.unique(self.index, return_inverse=True, return_counts=True)
+        mean = np.array([np.bincount(image, axis / self.depth) / count for axis in self.value])
         flat = np.vstack([mean, np.zeros(len(images))])  # along the line of sight a mean offset says nothing
         return Part("position", np.einsum("mij,jm->im", self.axes[images], flat), self.jacobian[:, :0], None, 0, images)
 
     def row_weights(self, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        images, place, count = np.unique(self.index, return_inverse=True, return_counts=True)
-        mean = np.bincount(place, weight) / count
+        images, image, count = np.unique(self.index, return_inverse=True, return_counts=True)
+        mean = np.bincount(image, weight) / count
         return images, mean if self.noise is None else mean * self.noise.weight[images]
 
     def fill(self, residual: np.ndarray, matrix: np.ndarray, scale: np.ndarray) -> None:
@@ -191,19 +189,22 @@ class PixelPart(Part):
             shared = self._shared_errors(self.noise) if self.noise.shared is None else self.noise.shared
         chunk = 500  # images reduced at once
         for start in range(0, len(images), chunk):
-            own = slice(start, min(start + chunk, len(images)))
-            rows, counts = slice(edges[own.start], edges[own.stop]), np.diff(edges[own.start : own.stop + 1])
+            chunk_images = slice(start, min(start + chunk, len(images)))
+            rows, counts = (
+                slice(edges[chunk_images.start], edges[chunk_images.stop]),
+                np.diff(edges[chunk_images.start : chunk_images.stop + 1]),
+            )
             unit = scale.T[rows, :, None]
             table = np.concatenate([self.local[rows], self.value.T[rows, :, None]], axis=2) / unit
             padded = _padded(table, counts)
             if shared is not None and self.noise is not None:
                 padded = _whitened(padded, _padded(shared[rows] / unit, counts, padded.shape[1]))
-                padded = padded * np.sqrt(self.noise.weight[images[own]])[:, None, None]
+                padded = padded * np.sqrt(self.noise.weight[images[chunk_images]])[:, None, None]
             small = np.asarray(np.linalg.qr(padded, mode="r"))
-            place = slice(own.start * width, own.stop * width)
-            residual[place] = small[:, :, -1].ravel()
-            by_image = self.jacobian[:, :, images[own]].transpose(2, 1, 0)
-            matrix[:, place] = (small[:, :, :-1] @ by_image).reshape(-1, len(self.jacobian)).T
+            reduced_rows = slice(chunk_images.start * width, chunk_images.stop * width)
+            residual[reduced_rows] = small[:, :, -1].ravel()
+            by_image = self.jacobian[:, :, images[chunk_images]].transpose(2, 1, 0)
+            matrix[:, reduced_rows] = (small[:, :, :-1] @ by_image).reshape(-1, len(self.jacobian)).T
 
     def _shared_errors(self, noise: ImageNoise) -> np.ndarray:
         return np.einsum("ncl,nlk->nck", self.local[:, :, :6], self.carried[self.index]) * noise.deviations
@@ -230,20 +231,20 @@ class PixelPart(Part):
 
     def alone(self, sigma: np.ndarray) -> np.ndarray:
         """Return the residuals (2, N) [px] of all corners after a free pose is fitted to each image."""
-        images, place = np.unique(self.index, return_inverse=True)
-        found = self.own_poses(sigma)
-        moved = np.einsum("kij,kj->ki", self.carried[images], found.residual)
-        return self.value - np.einsum("ncl,nl->cn", self.local[:, :, :6], moved[place])
+        images, image = np.unique(self.index, return_inverse=True)
+        fits = self.own_poses(sigma)
+        twists = np.einsum("kij,kj->ki", self.carried[images], fits.residual)
+        return self.value - np.einsum("ncl,nl->cn", self.local[:, :, :6], twists[image])
 
 
 def _padded(table: np.ndarray, counts: np.ndarray, height: int = 0) -> np.ndarray:
     """Return corner rows (N, 2, w) as one block per image (images, height, w), filled up with zeros."""
     width = table.shape[2]
-    most = height // 2 or max(int(counts.max(initial=0)), (width + 1) // 2)
-    padded = np.zeros((len(counts), most, 2, width))
+    max_corners = height // 2 or max(int(counts.max(initial=0)), (width + 1) // 2)
+    padded = np.zeros((len(counts), max_corners, 2, width))
     image = np.repeat(np.arange(len(counts)), counts)
     padded[image, np.arange(len(table)) - np.repeat(np.cumsum(counts) - counts, counts)] = table
-    return padded.reshape(len(counts), 2 * most, width)
+    return padded.reshape(len(counts), 2 * max_corners, width)
 
 
 def _whitened(rows: np.ndarray, shared: np.ndarray) -> np.ndarray:
@@ -263,26 +264,26 @@ def _pixels(measured: Pixels, seen: Seen, jacobian: np.ndarray) -> list[Part]:
         refuse_data(measured.file, "the camera of these images is unknown")
     view, in_hand = seen.view, measured.mounting == IN_HAND
     image, corner = np.nonzero(measured.seen)
-    place, bend = shape_slopes(measured.board, view.shape, corners(measured.board))
+    points, bend = shape_slopes(measured.board, view.shape, corners(measured.board))
     turn = np.moveaxis(seen.rotation, 0, -1).transpose(1, 0, 2)  # (m, 3, 3), columns are the target's axes
     origin = seen.point.T
     if in_hand:  # the target is the camera, in the board's frame
         turn = turn.transpose(0, 2, 1)
         origin = -np.einsum("mij,mj->mi", turn, origin)
-    turned = np.einsum("nij,nj->ni", turn[image], place[corner])
+    turned = np.einsum("nij,nj->ni", turn[image], points[corner])
     point = turned + origin[image]
     aside = np.maximum(np.linalg.norm(point[:, :2], axis=1), 1e-3)
     point[:, 2] = np.maximum(point[:, 2], aside / STEEPEST[view.lens.model])  # of a wild guess, behind the camera
     pixel, by_point, by_lens = view.lens.project_with_slopes(point)
-    local = np.empty((len(image), 2, 6 + len(view.own)))
+    local = np.empty((len(image), 2, 6 + len(view.in_view)))
     local[:, :, :3] = by_point
     local[:, :, 3:6] = np.cross(turned[:, None, :], by_point)  # g · (ω × c) = (c × g) · ω
-    if len(view.own):
+    if len(view.in_view):
         by_shape = by_point @ np.einsum("nij,njs->nis", turn[image], bend[corner])
-        local[:, :, 6:] = np.concatenate([by_lens, by_shape], axis=2)[:, :, view.own]
-    shared = np.zeros((len(jacobian), 6 + len(view.own), len(measured)))
+        local[:, :, 6:] = np.concatenate([by_lens, by_shape], axis=2)[:, :, view.in_view]
+    shared = np.zeros((len(jacobian), 6 + len(view.in_view), len(measured)))
     shared[:, :6] = _twist_of_board(jacobian, turn, origin) if in_hand else jacobian
-    shared[view.place, 6 + np.arange(len(view.own))] = 1.0
+    shared[view.in_free, 6 + np.arange(len(view.in_view))] = 1.0
     value = (measured.pixel[image, corner] - pixel).T
     sigma = None if measured.sigma is None else np.broadcast_to(measured.sigma[image, corner], value.shape)
     depth = np.sqrt(np.abs(np.prod(view.lens.values[:2]))) / point[:, 2]

@@ -38,12 +38,12 @@ class Placement:
         return float(np.median(self.misfit))
 
 
-def place_robustly(arm: np.ndarray, seen: np.ndarray, lever: float) -> Placement:
+def place_robustly(arm: np.ndarray, targets: np.ndarray, lever: float) -> Placement:
     """Return the placement of the closed-form method with the smallest median misfit.
 
     Args:
         arm: (m, 4, 4) poses A_i of the tip in the base.
-        seen: (m, 4, 4) poses B_i of the target in the station's frame.
+        targets: (m, 4, 4) poses B_i of the target in the station's frame.
         lever: what a radian counts in the misfit [m].
     """
     methods: dict[str, Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]] = {
@@ -58,13 +58,13 @@ def place_robustly(arm: np.ndarray, seen: np.ndarray, lever: float) -> Placement
         keep = np.ones(len(arm), dtype=bool)
         for _ in range(rounds):
             try:
-                station, tool = method(arm[keep], seen[keep])
+                station, tool = method(arm[keep], targets[keep])
             except np.linalg.LinAlgError:
                 break
-            found = Placement(name, station, tool, misfit(arm, seen, station, tool, lever))
-            if best is None or found.error < best.error:
-                best = found
-            keep = found.misfit <= np.quantile(found.misfit, kept_share)
+            placement = Placement(name, station, tool, misfit(arm, targets, station, tool, lever))
+            if best is None or placement.error < best.error:
+                best = placement
+            keep = placement.misfit <= np.quantile(placement.misfit, kept_share)
             if keep.sum() < 5:
                 break
     if best is None:
@@ -72,32 +72,32 @@ def place_robustly(arm: np.ndarray, seen: np.ndarray, lever: float) -> Placement
     return best
 
 
-def by_li(arm: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def by_li(arm: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return S and X with B_i = S A_i X, from Z B_i = A_i X, Z = S⁻¹: 12 linear equations a pose in 24 unknowns."""
     m, eye = len(arm), np.eye(3)
-    a, b = arm[:, :3, :3], seen[:, :3, :3]
+    a, b = arm[:, :3, :3], targets[:, :3, :3]
     rows = np.zeros((m, 12, 24))
     # row-major vec: R_A R_X - R_Z R_B = 0;  R_A t_X + t_A - R_Z t_B - t_Z = 0
     rows[:, :9, :9] = np.einsum("mij,kl->mikjl", a, eye).reshape(m, 9, 9)
     rows[:, :9, 9:18] = -np.einsum("ij,mlk->mikjl", eye, b).reshape(m, 9, 9)
-    rows[:, 9:, 9:18] = -np.einsum("ij,mk->mijk", eye, seen[:, :3, 3]).reshape(m, 3, 9)
+    rows[:, 9:, 9:18] = -np.einsum("ij,mk->mijk", eye, targets[:, :3, 3]).reshape(m, 3, 9)
     rows[:, 9:, 18:21], rows[:, 9:, 21:] = a, -eye
     target = np.concatenate([np.zeros((m, 9)), -arm[:, :3, 3]], axis=1)
-    flat, wanted = rows.reshape(-1, 24), target.ravel()
-    solution = np.linalg.lstsq(flat, wanted, rcond=1e-10)[0]
+    flat, constants = rows.reshape(-1, 24), target.ravel()
+    solution = np.linalg.lstsq(flat, constants, rcond=1e-10)[0]
     x, z = (orthonormal(solution[k : k + 9].reshape(3, 3)) for k in (0, 9))
     # the translations again, with proper rotations
-    rest = wanted.reshape(m, 12)[:, 9:] - rows[:, 9:, 9:18] @ z.ravel()
-    shift = np.linalg.lstsq(rows[:, 9:, 18:].reshape(-1, 6), rest.ravel(), rcond=1e-10)[0]
+    translations = constants.reshape(m, 12)[:, 9:] - rows[:, 9:, 9:18] @ z.ravel()
+    shift = np.linalg.lstsq(rows[:, 9:, 18:].reshape(-1, 6), translations.ravel(), rcond=1e-10)[0]
     return invert(pose(z, shift[3:])), pose(x, shift[:3])
 
 
-def by_park_martin(arm: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def by_park_martin(arm: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return S and X; with M = A_i⁻¹ A_j and N = B_i⁻¹ B_j, M X = X N: log R_M = R_X log R_N, then t_X linearly."""
     order = np.argsort(Rotation.from_matrix(arm[:, :3, :3]).as_rotvec()[:, 0])
     first, second = order, np.roll(order, max(1, len(order) // 2))
-    m, n = invert(arm[first]) @ arm[second], invert(seen[first]) @ seen[second]
-    turns = [Rotation.from_matrix(each[:, :3, :3]).as_rotvec() for each in (m, n)]
+    m, n = invert(arm[first]) @ arm[second], invert(targets[first]) @ targets[second]
+    turns = [Rotation.from_matrix(motions[:, :3, :3]).as_rotvec() for motions in (m, n)]
     small = (np.linalg.norm(turns[0], axis=1) < np.pi - 0.1) & (np.linalg.norm(turns[1], axis=1) < np.pi - 0.1)
     if small.sum() < 3:
         raise np.linalg.LinAlgError("too few motions")
@@ -105,4 +105,4 @@ def by_park_martin(arm: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.nd
     matrix = (m[:, :3, :3] - np.eye(3)).reshape(-1, 3)
     target = (np.einsum("ij,mj->mi", x, n[:, :3, 3]) - m[:, :3, 3]).ravel()
     tool = pose(x, np.linalg.lstsq(matrix, target, rcond=1e-9)[0])
-    return average_pose(seen @ invert(arm @ tool)), tool
+    return average_pose(targets @ invert(arm @ tool)), tool
