@@ -80,6 +80,33 @@ def test_a_drift_is_told_from_a_step(code, growth):
     assert abs(found.values["size"]) == pytest.approx(size, abs=4 * found.values["sigma"])
 
 
+def test_a_scale_that_changes_between_rows_is_named():
+    truth = truth_of(2)
+    block = measured(truth, truth, random_joints(truth.chain, ROWS, 2), 2)
+    later = (np.arange(ROWS) >= CUT)[:, None]
+    (found,) = changes(replace(block, position=block.position * (1.0 + 5e-4 * later)))
+    assert (found.code, found.values["last"]) == ("scale-changed", CUT)
+    assert abs(found.values["size"]) == pytest.approx(5e-4, abs=4 * found.values["sigma"])
+
+
+@pytest.mark.parametrize("code", ["target-wanders", "zero-drifts"])
+def test_a_drift_of_target_or_zero_is_named(code):
+    truth = truth_of(2)
+    q = random_joints(truth.chain, ROWS, 2)
+    time = np.linspace(0.0, 1.0, ROWS)
+    if code == "zero-drifts":
+        driven = q.copy()
+        driven[:, 2] += 1.5e-3 * time
+        position = see(truth, driven).poses()[:, :3, 3]
+    else:
+        poses = see(truth, q).poses()
+        position = poses[:, :3, 3] + np.einsum("nij,n,j->ni", poses[:, :3, :3], time, [8e-4, 0.0, -5e-4])
+    position = position + NOISE * np.random.default_rng(2).standard_normal(position.shape)
+    block = PoseMeasurements.of(q, position, None, joint_names=truth.chain.joint_names, file="day.csv")
+    (found,) = changes(block)
+    assert found.code == code
+
+
 @pytest.mark.parametrize("seeds", [range(5), pytest.param(range(5, 40), marks=pytest.mark.slow)])
 def test_a_sound_file_changed_nowhere(seeds):
     for seed in seeds:

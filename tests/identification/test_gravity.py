@@ -11,6 +11,8 @@ from calib.dynamics.rigid_body import inverse_dynamics
 from calib.identification.checks.gravity import GravityHypotheses, gravity_of
 from calib.identification.checks.recorded_motion import MotionSamples
 from calib.identification.checks.recording_sizes import wrong_joints
+from calib.procedure.dynamic_stage.hypotheses import gravity_findings
+from calib.procedure.findings import sentence
 from calib.robot.library import load
 
 STATED = np.array([0.0, 0.0, -9.81])
@@ -67,6 +69,16 @@ def test_torques_without_gravity_are_called_that():
 
 def test_two_joints_compensated_are_the_ones_named():
     assert said(STATED, masses=True, without=(1, 2)).absent == (1, 2)
+
+
+def test_what_was_found_is_said_with_the_option_to_write():
+    joints = load("lwr4plus").joint_names
+    (mounted,) = gravity_findings(said(np.array(MOUNTS["wall"]), masses=True), joints)
+    assert mounted.code == "gravity-direction"
+    assert [float(value) for value in mounted.values["option"].split(", ")] == pytest.approx([9.81, 0, 0], abs=0.5)
+    (missing,) = gravity_findings(said(STATED, masses=True, without=(1, 2)), joints)
+    assert missing.code == "gravity-absent" and list(missing.values["joints"]) == [joints[1], joints[2]]
+    assert joints[1] in sentence(missing) and gravity_findings(said(STATED, masses=True), joints) == []
 
 
 def test_axes_along_the_vertical_tell_nothing():
