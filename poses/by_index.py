@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from calib.poses.indices import Index, index_of_singular_values, log_slope
+from .indices import Index, index_of_singular_values, log_slope
 
 
 def exchanged_by_index(

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.poses.errors import BadInput, NothingFeasible, require
+from .errors import BadInput, NothingFeasible, require
 
 
 def draw_candidates(

@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.poses.space import PoseConstraint
+from .space import PoseConstraint
 
 Tool = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 ToolJacobian = Callable[[np.ndarray], np.ndarray]

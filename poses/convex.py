@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.poses.information import Candidates, log_det, prepared
+from .information import Candidates, log_det, prepared
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from calib.poses.information import log_det
+from .information import log_det
 
 # information added to every design, relative to the unit mean information of one candidate, so that sets without full
 # rank can be compared (our choice); values reported to the user never contain it

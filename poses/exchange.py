@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from calib.poses.design import Design, Pool, best_addition, best_removal, design_of, with_added, with_removed
+from .design import Design, Pool, best_addition, best_removal, design_of, with_added, with_removed
 
 # called with each design of the requested size that is better than all before
 Report = Callable[[Design], None]

@@ -23,7 +23,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.poses.errors import BadInput, require
+from .errors import BadInput, require
 
 Index = Literal["O1", "O2", "O3", "O4", "O5", "cond"]
 _POWERS = {"O2": (1.0, 1.0), "O3": (1.0, 0.0), "O4": (2.0, 1.0), "cond": (1.0, 1.0)}  # merit = a log sp − b log s1

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import solve_triangular
 
-from calib.poses.errors import BadInput, NotIdentifiable, TooFewCandidates, require
+from .errors import BadInput, NotIdentifiable, TooFewCandidates, require
 
 # smallest accepted ratio of singular values of the column-scaled candidates (our choice; Gram matrices see 1e-8)
 RANK_TOLERANCE = 1e-7

@@ -8,20 +8,20 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.poses.by_index import exchanged_by_index, merits
-from calib.poses.candidates import draw_candidates
-from calib.poses.continuous.global_local import mlsl_search
-from calib.poses.continuous.local import Improved, improved
-from calib.poses.continuous.multistart import multistart_search, random_starts
-from calib.poses.continuous.tabu import DEFAULT_RULE, TabuRule, tabu_search
-from calib.poses.convex import Bound, relaxed
-from calib.poses.design import Design, Pool, design_of
-from calib.poses.errors import BadInput, NotIdentifiable
-from calib.poses.exchange import detmax, exchanged, greedy, kicked
-from calib.poses.indices import Index, merit, observability
-from calib.poses.information import Candidates, checked, log_det, prepared
-from calib.poses.space import SearchSpace, is_feasible
-from calib.poses.whole_space import Ceiling, bound_over_space
+from .by_index import exchanged_by_index, merits
+from .candidates import draw_candidates
+from .continuous.global_local import mlsl_search
+from .continuous.local import Improved, improved
+from .continuous.multistart import multistart_search, random_starts
+from .continuous.tabu import DEFAULT_RULE, TabuRule, tabu_search
+from .convex import Bound, relaxed
+from .design import Design, Pool, design_of
+from .errors import BadInput, NotIdentifiable
+from .exchange import detmax, exchanged, greedy, kicked
+from .indices import Index, merit, observability
+from .information import Candidates, checked, log_det, prepared
+from .space import SearchSpace, is_feasible
+from .whole_space import Ceiling, bound_over_space
 
 Method = Literal["detmax", "polish", "local", "multistart", "mlsl", "tabu"]
 Progress = Callable[[int, int, str], None]

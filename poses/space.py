@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.poses.errors import BadInput
+from .errors import BadInput
 
 STEP = 1e-5
 """Step of central differences [rad or m]: our choice; truncation and rounding both cost about 1e-10 of the values."""

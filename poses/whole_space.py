@@ -20,11 +20,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.poses.candidates import draw_candidates
-from calib.poses.continuous.local import climb, restored
-from calib.poses.convex import information_of, relaxed, scores_of
-from calib.poses.information import log_det, prepared
-from calib.poses.space import SearchSpace, is_feasible, product
+from .candidates import draw_candidates
+from .continuous.local import climb, restored
+from .convex import information_of, relaxed, scores_of
+from .information import log_det, prepared
+from .space import SearchSpace, is_feasible, product
 
 # poses optimised together: few for a fast SLSQP, many for an efficient Jacobian (our choice)
 BLOCK = 8

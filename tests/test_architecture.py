@@ -117,6 +117,16 @@ def test_heavy_dependencies_stay_at_home():
     assert strays == []
 
 
+@pytest.mark.parametrize("package", ["poses", "trajectories"])
+def test_experiment_design_imports_no_calib(package):
+    """Neither by its installed name: what stands in these folders works wherever they are put."""
+    for path in sorted((ROOT / package).rglob("*.py")):
+        absolute = [node for node in statements(ast.parse(path.read_text())) if getattr(node, "level", 0) == 0]
+        modules = [node.module or "" for node in absolute if isinstance(node, ast.ImportFrom)]
+        modules += [alias.name for node in absolute if isinstance(node, ast.Import) for alias in node.names]
+        assert not {"calib", "poses", "trajectories"} & {module.split(".")[0] for module in modules}, path
+
+
 def test_the_walker_sees_every_form_of_import():
     inside = "def f():\n    from calib import cli\n    try: import poses.select as s\n    finally: import rerun\n"
     source = inside + "from ..robot import chain\nfrom . import columns\n"

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from calib.trajectories.errors import BadInput, require
-from calib.trajectories.setpoints import Setpoints
+from .errors import BadInput, require
+from .setpoints import Setpoints
 
 KINDS: tuple[str, ...] = ("velocity", "acceleration", "jerk")
 

@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 from scipy.linalg import null_space
 
-from calib.trajectories.errors import BadInput
+from .errors import BadInput
 
 ORDERS = ("position", "velocity", "acceleration", "jerk")
 

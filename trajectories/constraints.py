@@ -16,8 +16,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from calib.trajectories.basis import ORDERS, SampledMotion
-from calib.trajectories.errors import BadInput, require
+from .basis import ORDERS, SampledMotion
+from .errors import BadInput, require
 
 Regressor = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 Slopes = tuple[np.ndarray, np.ndarray, np.ndarray]

@@ -10,18 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.trajectories.basis import (
-    Basis,
-    Freedom,
-    aligned_period,
-    assemble,
-    counts_of_joints,
-    freedom,
-    holding,
-    joined,
-    projected,
-)
-from calib.trajectories.errors import BadInput, require
+from .basis import Basis, Freedom, aligned_period, assemble, counts_of_joints, freedom, holding, joined, projected
+from .errors import BadInput, require
 
 
 @dataclass(frozen=True, eq=False)

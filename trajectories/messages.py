@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from calib.trajectories.errors import BadInput, require
-from calib.trajectories.setpoints import Setpoints
+from .errors import BadInput, require
+from .setpoints import Setpoints
 
 DIGITS = 9  # after the point: 1e-9 rad, and whole nanoseconds
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.trajectories.basis import SampledMotion
+from .basis import SampledMotion
 
 # [m] by which a limit on the distance from the axis is divided at least
 MIN_RADIUS = 1e-3

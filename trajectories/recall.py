@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.fft import next_fast_len
 
-from calib.trajectories.errors import BadInput, require
+from .errors import BadInput, require
 
 LIKENESS = 0.9  # share of the reference's variance that a found period explains at least (our choice)
 

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from calib.trajectories.errors import BadInput, require
+from .errors import BadInput, require
 
 # of a joint [rad or m] at a seam between two tracks
 MAX_JUMP = 1e-6

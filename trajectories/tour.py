@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from calib.trajectories.errors import BadInput
+from .errors import BadInput
 
 # starts of a tour that may begin anywhere, about (our choice)
 STARTS = 12

@@ -13,9 +13,9 @@ from dataclasses import replace
 import nlopt
 import numpy as np
 
-from calib.poses.continuous.local import FEASIBLE, SHARPNESS, Improved, improved, merit_of, restored
-from calib.poses.indices import Index
-from calib.poses.space import SearchSpace, constraint_gradients, constraint_values, is_feasible
+from ..continuous.local import FEASIBLE, SHARPNESS, Improved, improved, merit_of, restored
+from ..indices import Index
+from ..space import SearchSpace, constraint_gradients, constraint_values, is_feasible
 
 CHARGE = 100.0  # of the merit, per squared unit of a violated constraint (our choice)
 POINTS = 4  # sampled between local searches (our choice)

@@ -2,9 +2,8 @@
 
 Sequential quadratic programming (SLSQP, Kraft 1988, in SciPy) on a smoothed index that is sharpened stage by stage (see
 `calib.poses.indices.merit`), each stage ended by stagnation. An iterate may leave the constraints a little, so that
-every
-stage ends with a restoration: Newton steps of least norm back onto what is violated, pose by pose. What is handed back
-is the best restored set by the index itself, unsmoothed.
+every stage ends with a restoration: Newton steps of least norm back onto what is violated, pose by pose. What is
+handed back is the best restored set by the index itself, unsmoothed.
 """
 
 import time
@@ -14,8 +13,8 @@ from functools import partial
 
 import numpy as np
 
-from calib.poses.indices import Index, has_kinks, merit
-from calib.poses.space import SearchSpace, constraint_gradients, constraint_values, is_feasible, product
+from ..indices import Index, has_kinks, merit
+from ..space import SearchSpace, constraint_gradients, constraint_values, is_feasible, product
 
 Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
 

@@ -6,9 +6,9 @@ from functools import partial
 
 import numpy as np
 
-from calib.poses.continuous.local import Improved, improved
-from calib.poses.indices import Index
-from calib.poses.space import SearchSpace
+from ..continuous.local import Improved, improved
+from ..indices import Index
+from ..space import SearchSpace
 
 
 def random_starts(q: np.ndarray, m: int, count: int, seed: int) -> list[np.ndarray]:

@@ -18,10 +18,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.poses.candidates import draw_candidates
-from calib.poses.continuous.local import Improved, improved
-from calib.poses.indices import Index, merit
-from calib.poses.space import SearchSpace, is_feasible
+from ..candidates import draw_candidates
+from ..continuous.local import Improved, improved
+from ..indices import Index, merit
+from ..space import SearchSpace, is_feasible
 
 
 @dataclass(frozen=True)

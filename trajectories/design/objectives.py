@@ -23,9 +23,9 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from calib.trajectories.basis import SampledMotion
-from calib.trajectories.constraints import TorqueProduct
-from calib.trajectories.errors import BadInput, NotExciting
+from ..basis import SampledMotion
+from ..constraints import TorqueProduct
+from ..errors import BadInput, NotExciting
 
 Index = Literal["cond", "logdet", "smallest", "trace"]
 Scaling = Literal["raw", "normalised"]

@@ -14,9 +14,9 @@ from typing import get_args
 
 import numpy as np
 
-from calib.trajectories.design.problem import ExcitationProblem, exact_values, stretched, unmet
-from calib.trajectories.design.search import STAGES, Method, SearchResult, Stage, Stuck, one_start
-from calib.trajectories.errors import BadInput, NotExciting, NothingFeasible, require
+from ..design.problem import ExcitationProblem, exact_values, stretched, unmet
+from ..design.search import STAGES, Method, SearchResult, Stage, Stuck, one_start
+from ..errors import BadInput, NotExciting, NothingFeasible, require
 
 # share of the starts which the last stages are for (our choice)
 KEPT = 1 / 3

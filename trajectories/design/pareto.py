@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.trajectories.design.objectives import Objective
-from calib.trajectories.design.optimise import design
-from calib.trajectories.design.problem import AttainmentGoal, ExcitationProblem, exact_values, stretched
-from calib.trajectories.design.search import STAGES, SearchResult, one_start
+from ..design.objectives import Objective
+from ..design.optimise import design
+from ..design.problem import AttainmentGoal, ExcitationProblem, exact_values, stretched
+from ..design.search import STAGES, SearchResult, one_start
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,10 +11,10 @@ from functools import cached_property
 
 import numpy as np
 
-from calib.trajectories.basis import Basis, Family, SampledMotion, sample_times
-from calib.trajectories.constraints import MotionConstraint, Product, Regressor, Smoothed, smoothed
-from calib.trajectories.design.objectives import Excitation, FrictionCoverage, Objective, Observed, TorqueSlack, Value
-from calib.trajectories.errors import BadInput, require
+from ..basis import Basis, Family, SampledMotion, sample_times
+from ..constraints import MotionConstraint, Product, Regressor, Smoothed, smoothed
+from ..design.objectives import Excitation, FrictionCoverage, Objective, Observed, TorqueSlack, Value
+from ..errors import BadInput, require
 
 _Matrix = tuple[int, int, int]
 INSTANTS = 2000  # over a period at which a motion is looked at between its samples (our choice)

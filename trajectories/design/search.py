@@ -15,18 +15,10 @@ import nlopt
 import numpy as np
 from scipy.optimize import minimize
 
-from calib.trajectories.basis import Basis
-from calib.trajectories.design.problem import (
-    Evaluation,
-    ExcitationProblem,
-    critical_times,
-    evaluate,
-    is_condition,
-    merit,
-    unmet,
-)
-from calib.trajectories.design.starts import random_start, shrunk
-from calib.trajectories.errors import NotExciting
+from ..basis import Basis
+from ..design.problem import Evaluation, ExcitationProblem, critical_times, evaluate, is_condition, merit, unmet
+from ..design.starts import random_start, shrunk
+from ..errors import NotExciting
 
 Method = Literal["slsqp", "auglag", "mma", "ccsaq"]
 

@@ -5,9 +5,9 @@ Also where they start again: smaller motions about a pose that keeps the limits.
 
 import numpy as np
 
-from calib.trajectories.basis import Basis, SampledMotion
-from calib.trajectories.constraints import BoxLimit
-from calib.trajectories.design.problem import ExcitationProblem, stretched
+from ..basis import Basis, SampledMotion
+from ..constraints import BoxLimit
+from ..design.problem import ExcitationProblem, stretched
 
 
 def random_start(problem: ExcitationProblem, basis: Basis, rng: np.random.Generator) -> np.ndarray:

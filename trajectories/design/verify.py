@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.trajectories.basis import Family, SampledMotion
-from calib.trajectories.constraints import BoxLimit, MotionConstraint
-from calib.trajectories.design.problem import ExcitationProblem, critical_times
-from calib.trajectories.design.search import STAGES, SearchResult, one_start
-from calib.trajectories.design.starts import shrunk
-from calib.trajectories.errors import NothingFeasible
+from ..basis import Family, SampledMotion
+from ..constraints import BoxLimit, MotionConstraint
+from ..design.problem import ExcitationProblem, critical_times
+from ..design.search import STAGES, SearchResult, one_start
+from ..design.starts import shrunk
+from ..errors import NothingFeasible
 
 
 @dataclass(frozen=True)

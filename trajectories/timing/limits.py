@@ -5,7 +5,7 @@ from typing import Protocol
 
 import numpy as np
 
-from calib.trajectories.errors import BadInput
+from ..errors import BadInput
 
 
 class Law(Protocol):

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.trajectories.errors import BadInput, NothingFeasible
-from calib.trajectories.timing.path import SAME, Path, through
+from ..errors import BadInput, NothingFeasible
+from ..timing.path import SAME, Path, through
 
 SAMPLES, MAX_SAMPLES, STEPS = 41, 641, 400
 REACHED, KEPT = 1e-9, 1e-6  # [m and rad] of the pose at the samples, and between them

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicSpline, make_interp_spline
 
-from calib.trajectories.errors import BadInput
+from ..errors import BadInput
 
 SAME = 1e-9  # waypoints nearer than this [rad or m] are one
 

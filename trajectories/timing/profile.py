@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.trajectories.setpoints import Setpoints
-from calib.trajectories.timing.path import Path
+from ..setpoints import Setpoints
+from ..timing.path import Path
 
 MIN_SPEED_SHARE = 1e-9  # share of a speed that stands for "just after rest", where friction has its direction already
 TorqueLaw = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from calib.trajectories.errors import BadInput, NothingFeasible
-from calib.trajectories.timing.limits import Law, TimingLimits
-from calib.trajectories.timing.path import Path
-from calib.trajectories.timing.profile import Profile
+from ..errors import BadInput, NothingFeasible
+from ..timing.limits import Law, TimingLimits
+from ..timing.path import Path
+from ..timing.profile import Profile
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.trajectories.errors import BadInput, NothingFeasible
-from calib.trajectories.timing.path import Path, checked, spline
+from ..errors import BadInput, NothingFeasible
+from ..timing.path import Path, checked, spline
 
 RATIO = 3.0  # knots lie at most this factor nearer or further apart than by chord length
 STEP = 0.3  # first step, of the range -1 to 1

@@ -17,11 +17,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from calib.trajectories.errors import BadInput, NothingFeasible
-from calib.trajectories.timing.limits import Law, TimingLimits
-from calib.trajectories.timing.path import Path, reversals
-from calib.trajectories.timing.profile import Profile, Sampled, dense, moved
-from calib.trajectories.timing.reachability import ConstraintRows, fastest
+from ..errors import BadInput, NothingFeasible
+from ..timing.limits import Law, TimingLimits
+from ..timing.path import Path, reversals
+from ..timing.profile import Profile, Sampled, dense, moved
+from ..timing.reachability import ConstraintRows, fastest
 
 # intervals: in all, between two knots where these are many, and at most
 GRID = 400
