@@ -235,8 +235,7 @@ def as_subclass(record: Any, kind: type[T]) -> T:
     """Return a record as an instance of a subclass of its type that adds methods, but no fields."""
     if not issubclass(kind, type(record)):
         raise TypeError(f"{kind.__name__} is no subclass of {type(record).__name__}")
-    values = {field.name: getattr(record, field.name) for field in fields(record)}
-    return kind(**values)
+    return kind(**field_values(record))
 
 
 class Frozen:

@@ -227,31 +227,22 @@ TLS = LeastSquares(
     source="Golub & Van Loan 1980; Van Huffel & Vandewalle 1991",
     tunes=("ratio of the columns' noise to the torques'",),
 )
-PC_OLS = _ConstrainedLeastSquares(
-    f"pc-{OLS.name}",
-    OLS.assumes + CONSISTENT,
-    OLS,
-    tunes=OLS.tunes,
-    version=OLS.version,
-    description=OLS.name + CONSTRAINED,
-    source="Sousa & Cortesão 2014; Wensing et al. 2018",
-)
-PC_WLS = _ConstrainedLeastSquares(
-    f"pc-{WLS.name}",
-    WLS.assumes + CONSISTENT,
-    WLS,
-    tunes=WLS.tunes,
-    version=WLS.version,
-    description=WLS.name + CONSTRAINED,
-    source="Sousa & Cortesão 2014; Wensing et al. 2018",
-)
-PC_IRLS = _ConstrainedLeastSquares(
-    f"pc-{IRLS.name}",
-    IRLS.assumes + CONSISTENT,
-    IRLS,
-    tunes=IRLS.tunes,
-    version=IRLS.version,
-    description=IRLS.name + CONSTRAINED,
-    source="Sousa & Cortesão 2014; Wensing et al. 2018",
-)
+
+
+def _constrained(method: LeastSquares) -> _ConstrainedLeastSquares:
+    """Return a least-squares method with the constraints of ``[constraints]``."""
+    return _ConstrainedLeastSquares(
+        f"pc-{method.name}",
+        method.assumes + CONSISTENT,
+        method,
+        tunes=method.tunes,
+        version=method.version,
+        description=method.name + CONSTRAINED,
+        source="Sousa & Cortesão 2014; Wensing et al. 2018",
+    )
+
+
+PC_OLS = _constrained(OLS)
+PC_WLS = _constrained(WLS)
+PC_IRLS = _constrained(IRLS)
 METHODS = (IRLS, TLS, PC_OLS, PC_WLS, PC_IRLS)

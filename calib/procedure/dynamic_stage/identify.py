@@ -26,6 +26,7 @@ from calib.procedure.dynamic_stage.hypotheses import gravity_hypotheses
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs, Progress, silent
 from calib.procedure.findings import Verdict, lines_of
 from calib.procedure.robot_kinds import stage_of
+from calib.records import field_values
 from calib.units import TORQUE, without_gains
 
 # share of states met in training from which on a validation file proves nothing (our choice)
@@ -312,18 +313,7 @@ def judged(
     )
     assessment = assess(inputs, found.dynamics, findings, errors, wrong, progress=say)
     return IdentificationOutcome(
-        fit=assessment.fit,
-        validation=assessment.validation,
-        predictions=assessment.predictions,
-        repeated=assessment.repeated,
-        excitation=assessment.excitation,
-        intervals=assessment.intervals,
-        verdict=assessment.verdict,
-        warnings=assessment.warnings,
-        noticed=assessment.noticed,
-        tracking=assessment.tracking,
-        tracking_failure=assessment.tracking_failure,
-        references=assessment.references,
+        **field_values(assessment),
         inputs=inputs,
         found=found,
         findings=findings,
@@ -341,22 +331,7 @@ def assessed(outcome: T, inputs: IdentificationInputs) -> T:
         assessment = stage.judge(inputs, outcome.found, outcome.findings)
     else:
         assessment = assess(inputs, outcome.found.dynamics, outcome.findings, outcome.errors)
-    return replace(
-        outcome,
-        inputs=inputs,
-        fit=assessment.fit,
-        validation=assessment.validation,
-        predictions=assessment.predictions,
-        repeated=assessment.repeated,
-        excitation=assessment.excitation,
-        intervals=assessment.intervals,
-        verdict=assessment.verdict,
-        warnings=assessment.warnings,
-        noticed=assessment.noticed,
-        tracking=assessment.tracking,
-        tracking_failure=assessment.tracking_failure,
-        references=assessment.references,
-    )
+    return replace(outcome, inputs=inputs, **field_values(assessment))
 
 
 def _carry(
