@@ -98,7 +98,7 @@ def parse(kind: type[T], table: Any, where: str, error: type[CalibError] = Usage
     try:
         return _adapter(kind).validate_python(table)
     except ValidationError as validation_error:
-        raise error(_complaint(validation_error.errors(include_url=False), kind, where)) from None
+        raise error(_complaint(validation_error.errors(include_url=False), kind, where, table)) from None
 
 
 def read(kind: type[T], source: Tables | None, name: str, foreign_tables: Collection[str] = ()) -> tuple[T, str]:
@@ -144,8 +144,12 @@ def schema(kind: type, title: str) -> dict[str, Any]:
     """Return the JSON schema (draft 2020-12) of files for the dataclass `kind`."""
     from pydantic.json_schema import GenerateJsonSchema
 
-    json_schema = _adapter(kind).json_schema()
-    return {"$schema": GenerateJsonSchema.schema_dialect, **_for_toml(json_schema), "title": title}
+    json_schema = _for_toml(_adapter(kind).json_schema())
+    # pydantic knows the docstring of the class alone, not those of the classes it extends
+    for key, description in described(kind).items():
+        if key in json_schema["properties"]:
+            json_schema["properties"][key].setdefault("description", description)
+    return {"$schema": GenerateJsonSchema.schema_dialect, **json_schema, "title": title}
 
 
 def _for_toml(json_schema: Any) -> Any:
@@ -248,22 +252,41 @@ def check_keys(
             raise error(f"{where}: {_no_key(key, keys)}")
 
 
-def located(loc: Sequence[Any]) -> str:
-    """Return a file location in TOML notation: ``sigma.position``, ``files."a.csv".kind``, ``[[term]] number 2``."""
+def located(loc: Sequence[Any], table: Any = None) -> str:
+    """Return a file location in TOML notation: ``sigma.position``, ``files."a.csv".kind``, ``[[term]] number 2``.
+
+    Args:
+        loc: keys, and indices in lists.
+        table: the file's content; tables in lists are named besides: ``[[joint]] number 2 ('elbow')``.
+    """
     result = ""
+    content = table
     for k, part in enumerate(loc):
+        content = _content(content, part)
         if isinstance(part, int):
             if k + 1 < len(loc) or k == 1:
                 result = f"[[{result}]] number {part + 1}"
+                name = _content(content, "name")
+                if isinstance(name, str):
+                    result = f"{result} ({shown(name)})"
             continue
         name = part if _BARE.fullmatch(part) else f'"{part}"'
         if not result:
             result = name
-        elif k > 1 and result[-1] in "0123456789":
+        elif k > 1 and isinstance(loc[k - 1], int):
             result = f"{result}, {name}"
         else:
             result = f"{result}.{name}"
     return result
+
+
+def _content(table: Any, key: Any) -> Any:
+    """Return the value under a key of a table or at an index of a list; None where there is none."""
+    if isinstance(table, Mapping):
+        return table.get(key)
+    if isinstance(table, (list, tuple)) and isinstance(key, int) and key < len(table):
+        return table[key]
+    return None
 
 
 def _no_key(key: str, keys: Collection[str]) -> str:
@@ -271,14 +294,14 @@ def _no_key(key: str, keys: Collection[str]) -> str:
     return f"there is no key '{key}'{suggestion(key, keys)}; {choices}"
 
 
-def _complaint(errors: list[Any], kind: type, source: str) -> str:
+def _complaint(errors: list[Any], kind: type, source: str, parsed_table: Any) -> str:
     """Return the message for pydantic's first error; an unknown key takes precedence over a missing one."""
     unknown = [error for error in errors if error["type"] == UNKNOWN]
     first = unknown[0] if unknown else errors[0]
     loc, name, value = tuple(first["loc"]), first["type"], first["input"]
 
     def message(location: Sequence[Any], text: str) -> str:
-        where = ": ".join(filter(None, (source, located(location))))
+        where = ": ".join(filter(None, (source, located(location, parsed_table))))
         return f"{where}: {text}"
 
     if name in ("missing", "too_long"):
