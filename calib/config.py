@@ -16,7 +16,7 @@ from inspect import cleandoc
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
-from calib.config_types import UNKNOWN, Hidden, shown
+from calib.config_types import UNKNOWN, Hidden, OneOf, shown
 from calib.errors import CalibError, UsageError, suggestion
 
 T = TypeVar("T")
@@ -34,6 +34,8 @@ _PLAIN = {
     "tuple": "a list",
     "too_short": "at least one number",
 }
+# Stands in a field's description for the texts that it may hold instead of its default.
+OTHERS = "{others}"
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 # Entry of a docstring: names, and their description.
 _ENTRY = re.compile(r"^ {4}(\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", re.M)
@@ -170,7 +172,8 @@ def _for_toml(json_schema: Any) -> Any:
                     continue
                 result[key][name] = _for_toml(item)
                 if key == "properties" and name in descriptions:
-                    result[key][name] |= {"description": descriptions[name]}
+                    others = [word for word in item.get("enum", ()) if word != item.get("default")]
+                    result[key][name] |= {"description": descriptions[name].replace(OTHERS, ", ".join(others))}
         elif key == "description" and isinstance(value, str):
             result[key] = value.partition("\n\nAttributes:")[0]
         elif key == "default" and value not in (None, [None]):  # None of a list: infinity, which JSON does not have
@@ -224,7 +227,20 @@ def described(source: Any) -> dict[str, str]:
     descriptions: dict[str, str] = {}
     for base in reversed(getattr(source, "__mro__", (source,))):
         descriptions |= _entries(base.__doc__ or "")
+    for name, text in descriptions.items():
+        if OTHERS in text:
+            descriptions[name] = text.replace(OTHERS, ", ".join(_others(source, name)))
     return descriptions
+
+
+def _others(kind: type, key: str) -> list[str]:
+    """Return the texts that a key may hold instead of its default, in their order."""
+    default = getattr(kind, key)
+    hint = get_type_hints(kind, include_extras=True)[key]
+    for annotation in hint.__metadata__:
+        if isinstance(annotation, OneOf):
+            return [word for word in annotation.names if word != default]
+    return []
 
 
 def _entries(docstring: str) -> dict[str, str]:
