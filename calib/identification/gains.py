@@ -114,9 +114,11 @@ class GainRecord:
     def of(cls, gains: DriveGains, unit: str) -> GainRecord:
         """Return the record of estimated gains; `unit` is the torques' unit."""
         status = np.array(gains.told)
+        values = np.where(status == "not told", np.nan, gains.gains)
+        sigma = np.where(status == "told", gains.sigma, np.nan)
         return cls(
-            values=np.where(status == "not told", np.nan, gains.gains),
-            sigma=np.where(status == "told", gains.sigma, np.nan),
+            values=values,
+            sigma=sigma,
             told=gains.told,
             covariance=gains.covariance,
             unit=f"{unit} per A",
@@ -250,7 +252,8 @@ def identify_relative_gains(data: Triangles, joints: int, inflation: np.ndarray,
         if doubt.max() <= 1.0:
             estimated = free & (formal_sigma > 0.0)
             factor = np.where(estimated, sigma / np.where(formal_sigma > 0.0, formal_sigma, 1.0), 1.0)
-            return replace(fit, covariance=frozen(fit.covariance * np.outer(factor, factor)))
+            covariance = frozen(fit.covariance * np.outer(factor, factor))
+            return replace(fit, covariance=covariance)
         unidentified = (*unidentified, int(np.argmax(doubt)))
 
 

@@ -119,16 +119,11 @@ def identify(
     if chain.inertias is not None and np.any(chain.inertias[:, 9] > 0.0):
         cad = standard_parameters(chain)
     moves = model.bodies.coordinates[:, None] >= 0
+    states = chain_states(chain, nominal or model, settings.seed)
+    shape = np.where(moves, rods(chain, model), 0.0).ravel()
+    effort = _torque_limits(chain)
     identification = identify_model(
-        model,
-        cases,
-        settings,
-        nominal=nominal,
-        states=chain_states(chain, nominal or model, settings.seed),
-        cad=cad,
-        shape=np.where(moves, rods(chain, model), 0.0).ravel(),
-        effort=_torque_limits(chain),
-        progress=progress,
+        model, cases, settings, nominal=nominal, states=states, cad=cad, shape=shape, effort=effort, progress=progress
     )
     # The model is that of the chain.
     return cast(Identification, identification)
@@ -222,13 +217,14 @@ def identify_model(
         prior = find(richer_rows, groups=groups, start=prior, tempering=prior.tempering)
         richer_rows = with_weights(richer_rows, prior.first.rest_weights)
 
+    terms = (*_terms_of(model, base), *friction.terms)
     problem = IdentificationProblem(
         model=model,
         base=base,
         cases=cases,
         decimator=decimator,
         rows=tuple(richer_rows),
-        terms=(*_terms_of(model, base), *friction.terms),
+        terms=terms,
         groups=column_groups,
         noise=noise,
         prior=prior,
@@ -364,6 +360,7 @@ def _identified(
     say("essential parameters")
     elimination = _essential(fit, settings)
     base_columns = problem.pooled.factors.reshape(-1, len(values) + 1)[:, : base.b]
+    condition = condition_numbers(base_columns)
     return Identification(
         dynamics=dynamics,
         base=base,
@@ -373,7 +370,7 @@ def _identified(
         settings=settings,
         rows=problem.rows,
         terms=problem.terms,
-        condition=condition_numbers(base_columns),
+        condition=condition,
         prior=problem.prior,
         ripples=ripples,
         loop=loop,
@@ -431,6 +428,7 @@ def _richer_friction(
     for term in model.columns:
         if len(term.acts) > 1:
             coupled.add(tuple(sorted({row for row, _ in term.acts})))
+    v0 = np.array(per_joint(settings.v0, model.n, "v0"))
     candidates = FrictionCandidates(
         cases=cases,
         rows=rows,
@@ -438,7 +436,7 @@ def _richer_friction(
         decimator=decimator,
         std=first.std,
         inflation=inflation,
-        v0=np.array(per_joint(settings.v0, model.n, "v0")),
+        v0=v0,
         linear=model.prismatic,
         prior=prior,
         apart=settings.apart,
@@ -495,7 +493,8 @@ def common_decimator(cases: Sequence[Case], settings: IdentificationSettings) ->
     widest = design_decimator(rates[0], min(case.motion.decimator.factor for case in cases))
     max_rows = widest.factor * settings.samples
     step = -(-total // max_rows)
-    return replace(widest, factor=step * widest.factor)
+    factor = step * widest.factor
+    return replace(widest, factor=factor)
 
 
 def _repeats_noise(cases: Sequence[Case], settings: IdentificationSettings) -> np.ndarray | None:
@@ -547,13 +546,15 @@ def _essential(fit: MethodEstimate, settings: IdentificationSettings) -> Elimina
     if settings.essential == "none":
         return None
     data, std, inflation = fit.testable()
+    keep = [bases.standard_name(name, data.names) for name in settings.keep]
+    drop = [bases.standard_name(name, data.names) for name in settings.drop]
     return eliminate(
         data,
         Rule(settings.essential),
         ratio=settings.ratio,
         level=settings.level,
-        keep=[bases.standard_name(name, data.names) for name in settings.keep],
-        drop=[bases.standard_name(name, data.names) for name in settings.drop],
+        keep=keep,
+        drop=drop,
         std=std,
         inflation=inflation,
     )

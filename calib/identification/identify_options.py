@@ -228,12 +228,9 @@ class IdentifyOptions:
         """Return the settings of a recording (or a cut of one), with the torques that the model's rows explain."""
         settings = own_table(self.files, parse_cut(str(path))[0]) or self.every
         rows = self.settings.torque_rows
+        samples = settings.recording.samples or USED
         recording = replace(
-            settings.recording,
-            samples=settings.recording.samples or USED,
-            rows=rows.name,
-            motors=rows.driven,
-            sensors=rows.sensed,
+            settings.recording, samples=samples, rows=rows.name, motors=rows.driven, sensors=rows.sensed
         )
         return replace(settings, recording=recording)
 
@@ -276,10 +273,11 @@ def options_of(keys: IdentifySettings, source: str = "settings") -> IdentifyOpti
     for number, row in enumerate(keys.term, 1):
         with refused_as(UsageError, CalibError, f"{source}: [[term]] number {number}: {{}}"):
             terms.append(term(row.name, row.shape, row.joint, *row.settings, side=row.side))
+    torque_rows = ROWS[keys.rows]
     settings = IdentificationSettings(
         **choices,
         sets=keys.drives,
-        torque_rows=ROWS[keys.rows],
+        torque_rows=torque_rows,
         couplings=keys.coupling,
         terms=tuple(terms),
         payloads=keys.payload,

@@ -46,7 +46,8 @@ def with_link_motion(robot: CalibratedChain, case: Case, settings: Identificatio
             bases = motion_of_bases(chosen, case.motion, torque)
             positions[:, :, j] = np.einsum("e,sen->sn", np.asarray(chosen.coefficients), bases)
     motion = case.motion
-    return replace(case, link=tuple(x + dx for x, dx in zip((motion.q, motion.v, motion.a), positions)))
+    link = tuple(x + dx for x, dx in zip((motion.q, motion.v, motion.a), positions))
+    return replace(case, link=link)
 
 
 def joint_terms(chain: Chain, deflection: Deflection) -> Deflection:
@@ -56,7 +57,8 @@ def joint_terms(chain: Chain, deflection: Deflection) -> Deflection:
 
 def chosen_terms(deflection: Deflection, mask: np.ndarray) -> Deflection:
     terms = tuple(term for term, chosen in zip(deflection.terms, mask) if chosen)
-    return replace(deflection, terms=terms, coefficients=np.asarray(deflection.coefficients)[mask])
+    coefficients = np.asarray(deflection.coefficients)[mask]
+    return replace(deflection, terms=terms, coefficients=coefficients)
 
 
 def bodies_torques(terms: Deflection, case: Case, settings: IdentificationSettings) -> np.ndarray | None:

@@ -205,11 +205,17 @@ class Controller:
 
     def scaled(self, factor: np.ndarray | float) -> Controller:
         """Return the controller with all gains times `factor`, one or (n,): the same bandwidth at another inertia."""
-        return replace(self, kp=self.kp * factor, kd=self.kd * factor, ki=self.ki * factor)
+        kp = self.kp * factor
+        kd = self.kd * factor
+        ki = self.ki * factor
+        return replace(self, kp=kp, kd=kd, ki=ki)
 
     def slower(self, factor: float) -> Controller:
         """Return the controller with its bandwidth divided by `factor`: kp by factor², kd by factor, ki by factor³."""
-        return replace(self, kp=self.kp / factor**2, kd=self.kd / factor, ki=self.ki / factor**3)
+        kp = self.kp / factor**2
+        kd = self.kd / factor
+        ki = self.ki / factor**3
+        return replace(self, kp=kp, kd=kd, ki=ki)
 
     def with_feedforward(self, ahead: np.ndarray) -> Controller:
         """Return the controller with a feedforward torque (N, n) added."""

@@ -193,7 +193,8 @@ def from_table(chain: Chain, table: Mapping[str, Any]) -> Dynamics:
     """Return the model of a chain from a table that `to_table` made."""
     bodies = bodies_of(chain).with_gravity(np.array(table["gravity"], dtype=float))
     for label in table.get("payloads", ()):
-        bodies = with_payload(bodies, np.asarray(chain.tail), label, on=chain.n - 1)
+        on = chain.n - 1
+        bodies = with_payload(bodies, np.asarray(chain.tail), label, on=on)
     terms = tuple(_term(entry) for entry in table["terms"])
     model = IdentificationModel(bodies, terms, torque_rows(table.get("kind", "motor")))
     inertial_values = table["bodies"]
@@ -212,7 +213,11 @@ def _term(entry: Mapping[str, Any]) -> DriveTerm:
         weights = tuple((int(joint), float(weight)) for joint, weight in motion)
         acts.append((int(row), weights))
     settings = tuple(float(setting) for setting in entry["settings"])
-    return DriveTerm(entry["name"], entry["shape"], tuple(acts), settings, entry["side"], bool(entry["linear"]))
+    name = entry["name"]
+    shape = entry["shape"]
+    side = entry["side"]
+    linear = bool(entry["linear"])
+    return DriveTerm(name, shape, tuple(acts), settings, side, linear)
 
 
 def identified_masses(folder: str | Path, chain: Chain) -> np.ndarray:

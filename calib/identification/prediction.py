@@ -186,16 +186,21 @@ def score(
         residuals.append(residual)
     raw, filtered, in_motion, at_rest = np.stack(sums, axis=1)
     step = motion.decimator.factor
+    standing = _prediction_errors(at_rest, apart)
+    above_band_percent = np.array(above)
+    whiteness = _whiteness(np.stack(residuals, axis=1), motion.segment[::step])
+    rate = motion.rate / step
+    motion_share = float(moves.mean())
     return Score(
         raw=_prediction_errors(raw, apart),
         filtered=_prediction_errors(filtered, apart),
         moving=_prediction_errors(in_motion, apart),
-        standing=_prediction_errors(at_rest, apart),
-        above_band_percent=np.array(above),
+        standing=standing,
+        above_band_percent=above_band_percent,
         r_squared=np.array(explained),
-        whiteness=_whiteness(np.stack(residuals, axis=1), motion.segment[::step]),
-        rate=motion.rate / step,
-        motion_share=float(moves.mean()),
+        whiteness=whiteness,
+        rate=rate,
+        motion_share=motion_share,
     )
 
 
@@ -244,7 +249,8 @@ def _prediction_errors(sums: np.ndarray, apart: Sequence[int]) -> PredictionErro
         rms = np.sqrt(square / count)
         total = float(100.0 * np.sqrt(square[same_unit].sum() / size[same_unit].sum()))
     relative = RelativeErrors(total, np.where(size > 0.0, joints, np.nan))
-    return PredictionErrors(relative, np.where(count > 0, rms, np.nan), int(count.sum()))
+    samples = int(count.sum())
+    return PredictionErrors(relative, np.where(count > 0, rms, np.nan), samples)
 
 
 def _whiteness(residual: np.ndarray, segment: np.ndarray) -> tuple[Whiteness | None, ...]:

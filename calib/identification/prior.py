@@ -243,12 +243,14 @@ def find_prior(
     common_root = columns[: base.b, -direction_count:] * deviations[-direction_count:]
     single_covariance = single_root @ single_root.T
     single_covariance[np.diag_indices(base.b)] *= 1.0 + 1e-9
+    deviation = frozen(np.sqrt(np.diag(single_covariance)))
+    first = FirstFit(frozen(std), frozen(inflation), frozen(values[: base.b]), rest_weights)
     return Prior(
         covariance=frozen(single_covariance + common_root @ common_root.T),
-        deviation=frozen(np.sqrt(np.diag(single_covariance))),
+        deviation=deviation,
         sizes={name: float(np.exp(log_size)) for name, log_size in zip(sizes.names, t) if name},
         source=source,
-        first=FirstFit(frozen(std), frozen(inflation), frozen(values[: base.b]), rest_weights),
+        first=first,
         tempering=tempering,
     )
 
@@ -313,7 +315,8 @@ def scaled(noise: np.ndarray | None, std: np.ndarray, counts: np.ndarray) -> np.
     """
     if noise is None:
         return std
-    mean_square_ratio = np.average((std / noise) ** 2, weights=np.maximum(counts, 1))
+    weights = np.maximum(counts, 1)
+    mean_square_ratio = np.average((std / noise) ** 2, weights=weights)
     return noise * np.sqrt(mean_square_ratio)
 
 
@@ -427,12 +430,13 @@ def _most_probable(factor: np.ndarray, columns: np.ndarray, sizes: _Sizes, start
         evidence_slope = (whitened @ whitened_root) ** 2 - np.einsum("ij,ij->j", whitened_root, whitened_root)
         return value, deviation / sizes.width - np.bincount(sizes.member, evidence_slope, len(t))
 
+    bounds = np.column_stack([sizes.lower, sizes.upper])
     solution = scipy.optimize.minimize(
         cost,
         np.clip(start, sizes.lower, sizes.upper),
         jac=True,
         method="L-BFGS-B",
-        bounds=np.column_stack([sizes.lower, sizes.upper]),
+        bounds=bounds,
         options={"maxiter": 60, "ftol": 1e-8},
     )
     return np.asarray(solution.x)

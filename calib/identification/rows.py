@@ -99,14 +99,10 @@ def make_case(
         factor = 1.0 if gains is None else np.abs(gains)
         noise = frozen(np.sqrt(motion.effort_variance) * factor)
     valid = np.repeat(motion.weight[:, None] > 0.5, motion.n, axis=1)
+    target = frozen(rows.target(effort, motion.tau_link, motion.q, motion.v))
+    present = frozen(rows.of_joints(valid), bool)
     return Case(
-        name=name,
-        motion=motion,
-        target=frozen(rows.target(effort, motion.tau_link, motion.q, motion.v)),
-        carried=tuple(carried),
-        present=frozen(rows.of_joints(valid), bool),
-        noise=noise,
-        torque_rows=rows,
+        name=name, motion=motion, target=target, carried=tuple(carried), present=present, noise=noise, torque_rows=rows
     )
 
 
@@ -206,16 +202,23 @@ class ObservationRows:
         So that recordings are weighed separately, as joints are where a sample has a row for each.
         """
         filled = np.arange(count) == recording
+        matrix = np.where(filled[:, None], self.matrix, 0.0)
+        target = np.where(filled, self.target, 0.0)
+        present = self.present & filled
+        standing = np.repeat(self.standing, count, axis=1)
+        swing = np.repeat(self.swing, count, axis=1)
+        slowness = np.repeat(self.slowness, count, axis=1)
+        coulomb = np.repeat(self.coulomb, count, axis=0)
         return replace(
             self,
-            matrix=np.where(filled[:, None], self.matrix, 0.0),
-            target=np.where(filled, self.target, 0.0),
-            present=self.present & filled,
-            standing=np.repeat(self.standing, count, axis=1),
-            swing=np.repeat(self.swing, count, axis=1),
-            slowness=np.repeat(self.slowness, count, axis=1),
+            matrix=matrix,
+            target=target,
+            present=present,
+            standing=standing,
+            swing=swing,
+            slowness=slowness,
             rest=_no_rest(count),
-            coulomb=np.repeat(self.coulomb, count, axis=0),
+            coulomb=coulomb,
         )
 
     def extend(self, terms: Sequence[DriveTerm], columns: np.ndarray) -> ObservationRows:
@@ -230,12 +233,13 @@ class ObservationRows:
         columns = np.where(at_rest & undecided_at_rest, 0.0, columns)
         names = [term.name for term in terms]
         units = [term.unit for term in terms]
+        matrix = np.concatenate([self.matrix, columns], axis=2)
         return replace(
             self,
             coulomb=np.hstack([self.coulomb, coulomb]),
             names=(*self.names, *names),
             units=(*self.units, *units),
-            matrix=np.concatenate([self.matrix, columns], axis=2),
+            matrix=matrix,
         )
 
 
@@ -282,19 +286,25 @@ def observe(model: RegressorModel, columns: np.ndarray, case: Case, decimator: D
     target = decimate(case.target, decimator, segment)
     names = tuple(model.names[column] for column in columns)
     units = tuple(model.units[column] for column in columns)
+    present = thinned(case.present, segment, decimator)
+    rate = motion.rate / decimator.factor
+    standing = np.zeros(target.shape)
+    swing = np.zeros(target.shape)
+    slowness = np.ones(target.shape)
+    coulomb = np.zeros((model.rows, len(columns)), dtype=bool)
     return ObservationRows(
         names=names,
         units=units,
         matrix=matrix,
         target=target,
-        present=thinned(case.present, segment, decimator),
+        present=present,
         block=np.zeros(len(target), dtype=int),
-        rate=motion.rate / decimator.factor,
-        standing=np.zeros(target.shape),
-        swing=np.zeros(target.shape),
-        slowness=np.ones(target.shape),
+        rate=rate,
+        standing=standing,
+        swing=swing,
+        slowness=slowness,
         rest=_no_rest(model.rows),
-        coulomb=np.zeros((model.rows, len(columns)), dtype=bool),
+        coulomb=coulomb,
     )
 
 
@@ -309,7 +319,10 @@ def _entry_blocks(
 
 def _no_rest(rows: int) -> RestWeights:
     """Return the weights of standstills before any estimate: each is a row."""
-    return RestWeights(np.ones(rows), np.ones(rows), np.full(rows, np.inf))
+    worth = np.ones(rows)
+    count = np.ones(rows)
+    reach = np.full(rows, np.inf)
+    return RestWeights(worth, count, reach)
 
 
 def observe_terms(

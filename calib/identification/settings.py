@@ -149,7 +149,8 @@ def make_model(chain: Chain, settings: IdentificationSettings) -> Identification
             first_row, _ = term.acts[0]
             term = replace(term, linear=linear[first_row])
         terms.append(term)
-    return IdentificationModel(make_bodies(chain, settings), tuple(terms), settings.torque_rows)
+    bodies = make_bodies(chain, settings)
+    return IdentificationModel(bodies, tuple(terms), settings.torque_rows)
 
 
 def make_bodies(chain: Chain, settings: IdentificationSettings) -> Bodies:
@@ -158,7 +159,8 @@ def make_bodies(chain: Chain, settings: IdentificationSettings) -> Bodies:
     if settings.gravity is not None:
         bodies = bodies.with_gravity(np.array(settings.gravity))
     for label in settings.payloads:
-        bodies = with_payload(bodies, np.asarray(chain.tail), label, on=chain.n - 1)
+        on = chain.n - 1
+        bodies = with_payload(bodies, np.asarray(chain.tail), label, on=on)
     return bodies
 
 

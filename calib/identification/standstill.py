@@ -188,7 +188,8 @@ class DividedRows:
         reach = np.maximum(2.0 * np.sqrt(3.0 * (noise + spread)), 1e-300)
         values_of_friction = 1.0 + self.swing / reach
         variance = np.maximum(noise * values_of_friction / self.length + spread, 1e-300)
-        return RestWeights(frozen(noise / variance), frozen(tau * (std**2 + spread) / variance), frozen(reach))
+        worth = frozen(noise / variance)
+        return RestWeights(worth, frozen(tau * (std**2 + spread) / variance), frozen(reach))
 
     def joined(self, weights: RestWeights) -> Triangles:
         """Return the R factors of all rows, standstills with these weights."""
@@ -200,7 +201,8 @@ class DividedRows:
         frictions = self.standstills * (1.0 + self.swing / weights.reach)
         counted = np.round(frictions * weights.count)
         factors = frozen(np.stack([retriangulate(stacked) for stacked in both]))
-        return replace(self.moving, factors=factors, rows=frozen(self.moving.rows + counted, int))
+        rows = frozen(self.moving.rows + counted, int)
+        return replace(self.moving, factors=factors, rows=rows)
 
 
 def divided(all_rows: Sequence[ObservationRows]) -> DividedRows:

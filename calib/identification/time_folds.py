@@ -251,7 +251,8 @@ def _regularised(square: np.ndarray, rows: int, group: np.ndarray, kinds: np.nda
     # Free columns without data stay at zero.
     scaled[np.diag_indices(len(group))] += np.where(group < 0, 1e-9 * rows, 0.0)
     cross = square[:-1, -1] / scale
-    data = Gram(scaled, cross, float(square[-1, -1]), rows)
+    total = float(square[-1, -1])
+    data = Gram(scaled, cross, total, rows)
     fit = relevance(data, group, np.ones(len(group)), RELEVANCE_ITERATIONS)
     ridge = np.where(np.isfinite(fit.ridge), fit.ridge / scale, np.inf)
     return fit.values / scale, ridge

@@ -96,14 +96,17 @@ def locate(recording: Recording, motion: DesignedMotion) -> LocatedMotion | None
     designed = np.tile(reference, (recalled.periods, 1))[: len(recorded)]
     tracking = np.sqrt(np.mean((recorded - designed) ** 2, axis=0))
     relative = tracking / np.maximum(np.std(reference, axis=0), 1e-9)
+    began = start + STEP * recalled.lag
+    likeness = min(recalled.likeness)
+    loosest = int(np.argmax(relative))
     return LocatedMotion(
         start=max(float(recording.t[0]), start - EDGE_TIME),
         stop=min(float(recording.t[-1]), stop + EDGE_TIME),
-        began=start + STEP * recalled.lag,
+        began=began,
         periods=recalled.periods,
         tracking=tuple(tracking.tolist()),
-        likeness=min(recalled.likeness),
-        loosest=int(np.argmax(relative)),
+        likeness=likeness,
+        loosest=loosest,
     )
 
 

@@ -115,7 +115,8 @@ def _ratio_to(robot: np.ndarray, samples: MotionSamples) -> ClockRatio | None:
     mass, mass_sigma = common_factor(samples.torque, of_gravity @ robot, beside_gravity)
     if inertia < MIN_FACTOR_SIGMAS * inertia_sigma or mass < MIN_FACTOR_SIGMAS * mass_sigma:
         return None
-    return ClockRatio(inertia / mass, float(np.hypot(inertia_sigma / inertia, mass_sigma / mass)))
+    relative_sigma = float(np.hypot(inertia_sigma / inertia, mass_sigma / mass))
+    return ClockRatio(inertia / mass, relative_sigma)
 
 
 def common_factor(torque: np.ndarray, common: np.ndarray, free: np.ndarray) -> tuple[float, float]:
@@ -342,6 +343,7 @@ def compare_sizes(
         clock = clock_ratio(samples, chain)
     if of_motors and has_masses and samples is not None:
         other = rearranged(samples, chain)
+    counted = motion.sampling.clock.kind == "counted"
     return RecordingSizes(
         name=case.name,
         masses=masses,
@@ -349,7 +351,7 @@ def compare_sizes(
         speed=speed,
         speed_sigma=speed_sigma,
         follows=follows,
-        counted=motion.sampling.clock.kind == "counted",
+        counted=counted,
         rate=motion.rate,
         lag=lag,
         clock=clock,

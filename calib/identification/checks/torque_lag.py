@@ -101,7 +101,9 @@ def lag_of(samples: MotionSamples, rate: float) -> Lag | None:
     lag = _lag_in(total)
     half_lags = [_lag_in(first), _lag_in(second)]
     difference = abs(half_lags[0].seconds - half_lags[1].seconds) / 2.0
-    return replace(lag, sigma=float(np.hypot(lag.sigma, difference)), joint=_single_joint(lag, half_lags))
+    sigma = float(np.hypot(lag.sigma, difference))
+    joint = _single_joint(lag, half_lags)
+    return replace(lag, sigma=sigma, joint=joint)
 
 
 def _single_joint(lag: Lag, half_lags: Sequence[Lag]) -> int | None:
@@ -165,12 +167,15 @@ def _lag_in(rows: _Rows) -> Lag:
     ratio = fit.common[RECORDED] / max(fit.common[best], 1e-300)
     separate = fit.separate_lags(np.full(n, best))
     gains = [fit.gain(separate, joint, best) for joint in range(n)]
+    seconds = float(SHIFTS[best] + between_steps)
+    sigma = float(np.hypot(fit.sigma(best), LAG_SIGMA))
+    factor = float(np.sqrt(ratio))
     return Lag(
-        seconds=float(SHIFTS[best] + between_steps),
-        sigma=float(np.hypot(fit.sigma(best), LAG_SIGMA)),
+        seconds=seconds,
+        sigma=sigma,
         before=fit.unexplained_share(np.full(n, RECORDED), spread),
         after=fit.unexplained_share(np.full(n, best), spread),
-        factor=float(np.sqrt(ratio)),
+        factor=factor,
         own=SHIFTS[separate],
         gains=np.array(gains),
         joint=None,

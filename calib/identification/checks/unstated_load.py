@@ -92,7 +92,8 @@ def unstated_load(samples: Mapping[str, MotionSamples]) -> UnstatedLoad | None:
     if not explained or mass < MIN_SIGMAS * fit.sigma or reach > MAX_REACH:
         return None
     torque = _size([part[:, :, -1] for part in rows])
-    return UnstatedLoad(names[best], mass, fit.sigma, reach, before / torque, after / torque)
+    name = names[best]
+    return UnstatedLoad(name, mass, fit.sigma, reach, before / torque, after / torque)
 
 
 @dataclass(frozen=True, eq=False)

@@ -196,7 +196,8 @@ def identify_controller(
         joint_gains.append(_read(past, errors, rate, band, integral))
         explained.append(_explained(joint_error, joint_tau, joint_gains[-1], rate, band))
     gains = np.array(joint_gains)
-    controller = pd(gains[:, 0], gains[:, 1], ki=gains[:, 2])
+    ki = gains[:, 2]
+    controller = pd(gains[:, 0], gains[:, 1], ki=ki)
     return IdentifiedController(controller, frozen(explained))
 
 

@@ -243,9 +243,11 @@ def identify_instrumental(
     observed, friction = _observed_with_friction(model, base, cases, decimator, terms)
     data = pool(triangulate(observed), model.rows)
     if constraints is None and positive:
-        settings = ConstraintSettings(signs=False, inertia=0, bounds=dict.fromkeys(positive, (0.0, np.inf)))
+        bounds = dict.fromkeys(positive, (0.0, np.inf))
+        settings = ConstraintSettings(signs=False, inertia=0, bounds=bounds)
         constraints = make_constraints(settings, model, base, base.names, [None] * base.b)
-    task = _Fixed(model, base, cases, decimator, observed, ROUNDS[method], constraints, friction)
+    estimator = ROUNDS[method]
+    task = _Fixed(model, base, cases, decimator, observed, estimator, constraints, friction)
     ordinary = wls(data, settled_std(data, 1e-3))
     plant = _regular(model, friction.terms, cases[0][1], inertia)
     std = ordinary.group_std
@@ -345,7 +347,8 @@ class _Fixed:
         """Return the settings of the next iteration, which starts from the postures whose constraints are binding."""
         if self.constraints is None or estimate.bound is None:
             return self
-        return replace(self, constraints=replace(self.constraints, likely=estimate.bound.tight))
+        constraints = replace(self.constraints, likely=estimate.bound.tight)
+        return replace(self, constraints=constraints)
 
     def plant(self, old: Plant, estimate: _Found) -> Plant:
         """Return the simulated robot with an estimate; without motor torques, its motor inertias J are unchanged."""
@@ -408,7 +411,8 @@ def _with_signs(
         sign_rows = observe(task.model, columns[signs], case_at_speed, task.decimator)
         simulated = simulated.copy()
         simulated[:, :, drowned] = sign_rows.matrix
-    return replace(rows, matrix=np.where(drowned, simulated, rows.matrix))
+    matrix = np.where(drowned, simulated, rows.matrix)
+    return replace(rows, matrix=matrix)
 
 
 def sign_noise(model: Any, motion: Motion) -> np.ndarray:
@@ -458,6 +462,8 @@ def _result(
             rows.append((case, observed, simulated))
         else:
             rows.append((simulated_case(case, run, loop), replace(observed, matrix=simulated), simulated))
+    distance = _distance(runs)
+    stray = _stray(runs)
     return Instrumental(
         fit,
         ordinary,
@@ -467,8 +473,8 @@ def _result(
         verdict,
         frozen(std),
         estimate.tau,
-        _distance(runs),
-        _stray(runs),
+        distance,
+        stray,
         bound,
         problem,
         task.estimator,
@@ -606,7 +612,8 @@ def _held_fit(task: _Fixed, problem: Instruments, std: np.ndarray, tau: float) -
         data = problem.least_squares()
     else:
         data = _simulated(problem)
-    return hold(fit, estimator.triangle(problem, std), data, std, task.constraints, stated_noise=not estimator.measured)
+    stated_noise = not estimator.measured
+    return hold(fit, estimator.triangle(problem, std), data, std, task.constraints, stated_noise=stated_noise)
 
 
 def _change(before: LinearFit | None, after: LinearFit) -> float:

@@ -88,7 +88,8 @@ class Instruments:
         factor = np.zeros((1, p + 1, p + 1))
         factor[0, :p] = projected(self, sigma)[:p]
         factor[0, p, p] = np.sqrt(np.sum(squares / sigma**2))
-        return replace(empty(self.names, self.data.units[p:], 1), factors=factor, rows=self.data.rows.sum()[None])
+        rows = self.data.rows.sum()[None]
+        return replace(empty(self.names, self.data.units[p:], 1), factors=factor, rows=rows)
 
 
 def instrument(
@@ -119,12 +120,14 @@ def instrument(
             units = ("",) * len(names)
         groups = int(np.max(group, initial=0)) + 1
         before = unseen(tuple(names), units, groups)
-    return replace(before, data=absorb(before.data, np.hstack([instruments, matrix]), target, group))
+    data = absorb(before.data, np.hstack([instruments, matrix]), target, group)
+    return replace(before, data=data)
 
 
 def unseen(names: Sequence[str], units: Sequence[str], groups: int) -> Instruments:
     """Return empty R factors of [Z W y], for columns of W with these names and units."""
-    return Instruments(empty([*(f"Z {name}" for name in names), *names], [*units, *units], groups))
+    data = empty([*(f"Z {name}" for name in names), *names], [*units, *units], groups)
+    return Instruments(data)
 
 
 def iv(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1.0) -> LinearFit:
@@ -193,7 +196,8 @@ def strength(problem: Instruments, std: np.ndarray | None = None) -> InstrumentS
     with np.errstate(divide="ignore", invalid="ignore"):
         donald = float((rows - p) / p * np.divide(minimum, 1.0 - minimum))
     partial_r2 = _shea(explained / norms, factor[:, p : 2 * p] / norms)
-    return InstrumentStrength(problem.names, correlations, partial_r2, donald, np.linalg.cond(cross))
+    condition = np.linalg.cond(cross)
+    return InstrumentStrength(problem.names, correlations, partial_r2, donald, condition)
 
 
 def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1.0) -> ExogeneityTest:
@@ -228,7 +232,9 @@ def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: f
         f = (first - second) / k / (second / (rows - p - k)) / inflation
     else:
         f = np.inf
-    return ExogeneityTest(float(f), (k, dof), float(fdtrc(k, dof, f)))
+    statistic = float(f)
+    degrees = (k, dof)
+    return ExogeneityTest(statistic, degrees, float(fdtrc(k, dof, f)))
 
 
 def projected(problem: Instruments, std: np.ndarray | None = None) -> np.ndarray:

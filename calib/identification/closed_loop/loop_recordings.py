@@ -111,14 +111,18 @@ def close_loops(
         if loop.reference_velocity == "difference":
             # by half a period
             rates = np.diff(reference.q, axis=0) / reference.period
-            reference = replace(reference, v=np.vstack([reference.v[:1], rates]))
+            v = np.vstack([reference.v[:1], rates])
+            reference = replace(reference, v=v)
         pairs.append((take(part, _inside(part.motion)), Loop(feed_forward, reference, every, design)))
     return ClosedLoops(tuple(pairs), controller, identified, notes)
 
 
 def take(case: Case, part: slice) -> Case:
     """Return the part of a case in the slice `part`."""
-    return replace(case, motion=case.motion.part(part), target=case.target[part], present=case.present[part])
+    motion = case.motion.part(part)
+    target = case.target[part]
+    present = case.present[part]
+    return replace(case, motion=motion, target=target, present=present)
 
 
 def _check_reference(motion: Motion) -> None:
@@ -355,7 +359,8 @@ def simulated_case(case: Case, run: SimulatedRun, loop: Loop) -> Case:
     what tells W from Z is noise.
     """
     q, v, a = followed(run.q, case.motion, simulated_samples(case, run.t, loop))
-    return replace(case, motion=replace(case.motion, q=q, v=v, a=a))
+    motion = replace(case.motion, q=q, v=v, a=a)
+    return replace(case, motion=motion)
 
 
 def followed(q: np.ndarray, motion: Motion, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

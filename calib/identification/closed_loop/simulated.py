@@ -81,7 +81,8 @@ class _Simulated(Method):
             return replace(plain, method=self.name)
         richer = [term for term in problem.terms[problem.base.b :] if term is not None]
         estimate = self.beside(problem, plain, richer)
-        return replace(estimate, seconds=plain.seconds + estimate.seconds)
+        seconds = plain.seconds + estimate.seconds
+        return replace(estimate, seconds=seconds)
 
     def beside(
         self, problem: IdentificationProblem, plain: MethodEstimate, terms: Sequence[DriveTerm] = ()
@@ -101,12 +102,13 @@ class _Simulated(Method):
             constraints = constraints_of(problem)
 
         def estimate() -> LoopEstimate:
+            method = self.instruments or loop.instruments
             identification = identify_instrumental(
                 model,
                 problem.base,
                 loops.pairs,
                 problem.decimator,
-                method=self.instruments or loop.instruments,
+                method=method,
                 inertia=inertia,
                 positive=loop.positive,
                 terms=terms,
@@ -115,12 +117,13 @@ class _Simulated(Method):
             simulations = 0
             for iteration in identification.rounds:
                 simulations += len(loops.pairs) * (1 + iteration.retreats)
+            iterations = len(identification.rounds)
             result = replace(
                 plain,
                 method=self.name,
                 solution=identification.fit,
                 std=identification.std,
-                iterations=len(identification.rounds),
+                iterations=iterations,
                 simulations=simulations,
                 beforehand=None,
                 held=identification.constrained,
@@ -203,7 +206,8 @@ def compare_with_loop(problem: IdentificationProblem, estimate: MethodEstimate) 
         try:
             loop_estimate = IV.beside(problem, estimate)
         except CalibError as error:
-            return LoopTest(failure=str(error))
+            failure = str(error)
+            return LoopTest(failure=failure)
     return LoopTest(
         loop_estimate.instrumental, loop_estimate.loops, "" if loop_estimate.found else str(loop_estimate.failure)
     )
@@ -319,15 +323,10 @@ def disagreement(problem: IdentificationProblem, estimate: MethodEstimate, test:
     if away[worst] < SIGMAS or not np.any(own_errors > limit * beside):
         return None
     factors = _factors(problem, own_estimate.values, iv_estimate.values)
-    return LoopDisagreement(
-        estimate.method,
-        name,
-        iv_estimate.names[worst],
-        float(away[worst]),
-        tuple(own_errors.tolist()),
-        tuple(beside.tolist()),
-        factors,
-    )
+    parameter = iv_estimate.names[worst]
+    sigmas = float(away[worst])
+    beside_left = tuple(beside.tolist())
+    return LoopDisagreement(estimate.method, name, parameter, sigmas, tuple(own_errors.tolist()), beside_left, factors)
 
 
 def _factors(problem: IdentificationProblem, estimate: np.ndarray, reference: np.ndarray) -> tuple[float, ...]:
@@ -369,24 +368,28 @@ def _metrics(test: LoopTest, beside: bool) -> LoopMetrics:
             f"with the instruments of unbound parameters alone (Janot's slides) the estimate is at most "
             f"{distance.max():.2g} σ away, at {identification.names[int(np.argmax(distance))]}",
         )
+    rounds = len(identification.rounds)
+    largest_shift_sigma = float(identification.shift.max())
+    least_partial_r2 = float(strength.partial_r2.min())
+    controller_explains_percent = identified and identified.explained
     return LoopMetrics(
         "",
         notes,
         identification.estimator.name,
         beside,
-        len(identification.rounds),
+        rounds,
         identification.verdict,
-        float(identification.shift.max()),
+        largest_shift_sigma,
         strength.cragg_donald,
         strength.weak,
-        float(strength.partial_r2.min()),
+        least_partial_r2,
         identification.distance,
         identification.direct,
         identification.stray,
         identification.valid,
         identification.explains,
         loops.controller,
-        identified and identified.explained,
+        controller_explains_percent,
     )
 
 

@@ -228,7 +228,8 @@ def simulate(
     else:
         t = reference.t[0] + tick * reference.period
     q, v, a, measured, torque = [frozen(series) for series in out]
-    return SimulatedRun(t, q, v, a, measured, frozen(out[4] + heard), torque)
+    tau = frozen(out[4] + heard)
+    return SimulatedRun(t, q, v, a, measured, tau, torque)
 
 
 def sample_ticks(count: int, every: float) -> np.ndarray:

@@ -320,7 +320,8 @@ class _Bench:
         joints_percent = tuple(np.nan_to_num(percent).tolist())
         kept_at_joints = tuple(1 + joint for joint in at)
         parameters = len(self._with_base(columns))
-        return FrictionTrial(name, parameters, float(total), joints_percent, kept_at_joints, note, terms)
+        cross_validated_percent = float(total)
+        return FrictionTrial(name, parameters, cross_validated_percent, joints_percent, kept_at_joints, note, terms)
 
 
 def _joints(term: DriveTerm) -> tuple[int, ...]:

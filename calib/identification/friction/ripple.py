@@ -109,7 +109,8 @@ class Ripple:
     def found(self) -> RippleWaves:
         """Record of the waves and of the share of the residual that they explain."""
         waves = tuple(GearWave(gear + 1, order) for gear, order in self.waves)
-        return RippleWaves(self.joint + 1, waves, self.share)
+        joint = self.joint + 1
+        return RippleWaves(joint, waves, self.share)
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,7 +222,8 @@ def find(joint: int, track: GearTravel, residual: np.ndarray, turns: Mapping[int
     if fine_share > best:
         nodes, best, ridge = FINE, fine_share, fine_ridge
     _, values = validation.fit(waves, nodes, ridge)
-    return Ripple(joint, waves, _terms(joint, waves, nodes, track), frozen(values), best)
+    terms = _terms(joint, waves, nodes, track)
+    return Ripple(joint, waves, terms, frozen(values), best)
 
 
 def _family(turns: int) -> tuple[tuple[int, ...], ...]:

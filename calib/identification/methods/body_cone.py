@@ -99,7 +99,8 @@ class BodyCone(Frozen):
         max_on_border = 1e-4
         border = eigenvalues[:, 0] < max_on_border * np.maximum(eigenvalues[:, -1], max_on_border)
         labels = tuple(label for label, touches in zip(self.labels, border) if touches)
-        return _Plane(normal * unit / size, float(normal @ b), labels)
+        bound = float(normal @ b)
+        return _Plane(normal * unit / size, bound, labels)
 
 
 def cone_of(model: RegressorModel, base: Base) -> BodyCone:

@@ -158,7 +158,8 @@ def make_curved(constraint: CurvedConstraint, row: Callable[[Mapping[str, float]
         step = 1e-30
         return np.array([np.imag(value(u + 1j * step * direction)) / step for direction in np.eye(len(u))])
 
-    return Curved(name, names, _rows(names, row), value, derivatives, False)
+    rows = _rows(names, row)
+    return Curved(name, names, rows, value, derivatives, False)
 
 
 def _called(function: Callable[..., Any], location: str, count: int) -> Callable[[np.ndarray], np.ndarray]:

@@ -196,7 +196,8 @@ def _reweighted(
     problem: IdentificationProblem, tau: np.ndarray, solve: Callable[[np.ndarray], np.ndarray] | None = None
 ) -> SampleFit:
     """Return the IRLS fit over whole samples, with the variance inflation of the most correlated row."""
-    return irls(samples_of(problem), inflation=float(np.max(tau)), solve=solve)
+    inflation = float(np.max(tau))
+    return irls(samples_of(problem), inflation=inflation, solve=solve)
 
 
 def samples_of(problem: IdentificationProblem) -> Samples:
@@ -231,13 +232,14 @@ TLS = LeastSquares(
 
 def _constrained(method: LeastSquares) -> _ConstrainedLeastSquares:
     """Return a least-squares method with the constraints of ``[constraints]``."""
+    description = method.name + CONSTRAINED
     return _ConstrainedLeastSquares(
         f"pc-{method.name}",
         method.assumes + CONSISTENT,
         method,
         tunes=method.tunes,
         version=method.version,
-        description=method.name + CONSTRAINED,
+        description=description,
         source="Sousa & Cortesão 2014; Wensing et al. 2018",
     )
 

@@ -174,7 +174,8 @@ class MethodEstimate:
         prior_factor = retriangulate(np.pad(self.beforehand, ((0, 0), (0, 1))))
         factors = np.concatenate([self.pooled.factors, prior_factor[None]])
         counts = [*self.pooled.rows, len(self.beforehand)]
-        data = replace(self.pooled, factors=frozen(factors), rows=frozen(counts, int))
+        rows = frozen(counts, int)
+        data = replace(self.pooled, factors=frozen(factors), rows=rows)
         return data, np.append(self.std, 1.0), np.append(self.inflation, 1.0)
 
 
@@ -186,7 +187,9 @@ def _equivalent_triangle(estimate: Estimate) -> Triangles:
     factor[0, :p] = retriangulate(whitened(estimate.values, estimate.covariance))[:p]
     factor[0, p, p] = np.sqrt(freedom)
     no_rows = empty(estimate.names, estimate.units, 1)
-    return replace(no_rows, factors=frozen(factor), rows=frozen([freedom + p], int))
+    factors = frozen(factor)
+    rows = frozen([freedom + p], int)
+    return replace(no_rows, factors=factors, rows=rows)
 
 
 @dataclass(frozen=True)

@@ -127,13 +127,12 @@ class Constraints(Frozen):
         def solve(triangle: np.ndarray, rows: np.ndarray, lower: np.ndarray) -> Constrained:
             """Return the optimum of parameters and m further unknowns, with further inequalities."""
             wider = np.pad(self.matrix, ((0, 0), (0, m)))
+            names = ("",) * len(rows) + self.names
+            matrix = np.vstack([rows, wider])
+            upper = np.append(np.full(len(lower), np.inf), self.upper)
+            inertia = np.pad(self.inertia, ((0, 0), (0, 0), (0, 0), (0, m)))
             further = replace(
-                linear,
-                names=("",) * len(rows) + self.names,
-                matrix=np.vstack([rows, wider]),
-                lower=np.append(lower, self.lower),
-                upper=np.append(np.full(len(lower), np.inf), self.upper),
-                inertia=np.pad(self.inertia, ((0, 0), (0, 0), (0, 0), (0, m))),
+                linear, names=names, matrix=matrix, lower=np.append(lower, self.lower), upper=upper, inertia=inertia
             )
             return further.solve(triangle, free)
 
@@ -290,7 +289,8 @@ def _binding(constraints: Constraints, solution: Constrained, free: LinearFit) -
         binding.append(Binding(name, multiplier, value, sigma, float(bound - origin), bool(equal[places[k]])))
     tight = frozen(np.flatnonzero(solution.binding[places < 0]), int)
     findings = tuple(_findings(constraints, binding, len(tight)))
-    return Held(constraints.names, tuple(binding), tight, free, solution.normals[solution.binding], findings)
+    normals = solution.normals[solution.binding]
+    return Held(constraints.names, tuple(binding), tight, free, normals, findings)
 
 
 def _findings(constraints: Constraints, binding: Sequence[Binding], postures: int) -> Iterator[Finding]:
@@ -380,4 +380,5 @@ def _definite(inertia: np.ndarray, free: np.ndarray, least: float, likely: np.nd
         return None
     size = np.abs(np.einsum("kiip,p->ki", inertia, free)).mean(axis=0)
     scale = 1.0 / np.sqrt(np.maximum(size, 1e-6 * size.max()))
-    return Definite(inertia * scale[:, None, None] * scale[None, :, None], least, likely)
+    matrices = inertia * scale[:, None, None] * scale[None, :, None]
+    return Definite(matrices, least, likely)

@@ -77,6 +77,8 @@ def of(identification: Identification, chain: Chain) -> Information:
     """Return the information of the data of an identification in memory."""
     estimate = identification.fitted.estimate
     standard = identification.dynamics.model.names
+    transform = _transform(identification.names, regrouping(identification.base), standard)
+    factor = _information(identification)
     return Information(
         chain=chain,
         dynamics=identification.dynamics,
@@ -84,8 +86,8 @@ def of(identification: Identification, chain: Chain) -> Information:
         units=estimate.units,
         values=estimate.values,
         covariance=estimate.covariance,
-        transform=_transform(identification.names, regrouping(identification.base), standard),
-        factor=_information(identification),
+        transform=transform,
+        factor=factor,
     )
 
 

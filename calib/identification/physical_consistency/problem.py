@@ -164,14 +164,16 @@ def make_problem(information: Information, references: PriorBodies) -> BodyCost:
     for k, term in enumerate(model.columns):
         if term.shape == "acceleration" and positive[k]:
             sizes[k] = min(sizes[k], mass * ROTOR**2)
+    factor = np.column_stack([columns, target])
+    fixed = information.dynamics.values[inertial:]
     return BodyCost(
-        factor=np.column_stack([columns, target]),
+        factor=factor,
         bodies=model.bodies.count,
         references=pseudo_inertia.from_standard(references.parameters),
         drawn=references.drawn,
         sizes=np.where(identified, sizes, 0.0),
         positive=positive,
-        fixed=information.dynamics.values[inertial:],
+        fixed=fixed,
     )
 
 

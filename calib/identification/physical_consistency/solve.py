@@ -205,9 +205,12 @@ def find_possible(information: Information, weight: float | None = None, prior: 
             values = nearest(problem, pull=gamma) if euclidean else solve(problem, gamma)
     curvature_at = _reference(problem) if euclidean else values
     margins = [pseudo_inertia.margin(body) for body in _bodies(problem, values)]
+    dynamics = Dynamics(model, values)
+    covariance = _covariance(problem, gamma, curvature_at)
+    notes = (*best.references.notes, *_notes(model, problem, values))
     return PossibleBodies(
-        dynamics=Dynamics(model, values),
-        covariance=_covariance(problem, gamma, curvature_at),
+        dynamics=dynamics,
+        covariance=covariance,
         weight=gamma,
         doubt=doubt,
         margins=np.array(margins),
@@ -217,13 +220,14 @@ def find_possible(information: Information, weight: float | None = None, prior: 
         blamed=blamed,
         source=best.references.source,
         prior=prior,
-        notes=(*best.references.notes, *_notes(model, problem, values)),
+        notes=notes,
     )
 
 
 def _candidates(references: PriorBodies, problem: BodyCost, weight: float | None, doubt: float) -> Iterator[_Candidate]:
     """Yield the optimum for each prior weight with its evidence; the data's sigmas are widened by `doubt`."""
-    widened = replace(problem, factor=problem.factor / doubt)
+    factor = problem.factor / doubt
+    widened = replace(problem, factor=factor)
     weights: Sequence[float] = WEIGHTS[4::3]
     if weight is not None:
         weights = [weight]
@@ -439,4 +443,5 @@ def contradiction(identification: Identification, chain: Chain) -> Contradiction
     if not np.isfinite(distance):
         return None
     torque = float(np.linalg.norm(information.factor[:, -1]))
-    return Contradiction(float(distance), allowed, 100.0 * float(distance) / torque)
+    unexplained = 100.0 * float(distance) / torque
+    return Contradiction(float(distance), allowed, unexplained)

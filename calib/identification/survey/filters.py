@@ -68,7 +68,8 @@ class _KalmanFilter(Method):
         wide = np.maximum(start_sigmas * sigma, np.abs(start - values))
         # of one sample of the torques
         noise = plain.std / np.sqrt(np.sum(np.square(problem.decimator.taps)))
-        state = _State(robot, self.kind, start, np.diag(wide**2), [], 0)
+        covariance = np.diag(wide**2)
+        state = _State(robot, self.kind, start, covariance, [], 0)
         for case in problem.cases:
             for first, last in segments(case.motion.segment):
                 state = _pass(state, case, slice(first, last), noise)
@@ -178,7 +179,8 @@ def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
     moving = np.maximum(motion.velocity_noise(), 1e-3 * np.abs(motion.v).max(axis=0))
     first = np.concatenate([motion.q[part.start], motion.v[part.start], before.mean])
     belief = believe(first, np.concatenate([position_noise, moving, np.ones(p)]), before.kind)
-    belief = replace(belief, spread=_joined(belief, before.covariance, 2 * n))
+    spread = _joined(belief, before.covariance, 2 * n)
+    belief = replace(belief, spread=spread)
     full = _Stepping(robot_stepper, before.kind, n, len(before.robot.plant.parameters), columns, carried)
     sizes = []
     for q, tau in _steps(case, part):
@@ -190,7 +192,8 @@ def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
     mean = belief.mean[2 * n :]
     covariance = belief.covariance[2 * n :, 2 * n :]
     all_sizes = [*before.sizes, *settled]
-    return replace(before, mean=mean, covariance=covariance, sizes=all_sizes, count=before.count + 1)
+    count = before.count + 1
+    return replace(before, mean=mean, covariance=covariance, sizes=all_sizes, count=count)
 
 
 def _joined(belief: Belief, parameters: np.ndarray, first: int) -> np.ndarray:

@@ -75,7 +75,8 @@ class Belief:
 
 def believe(mean: np.ndarray, sigma: np.ndarray, kind: Filter) -> Belief:
     """Return the belief with a mean (L,) and independent components of standard deviation sigma (L,)."""
-    return Belief(np.array(mean, dtype=float), np.diag(sigma if kind.root else sigma**2), kind.root)
+    spread = np.diag(sigma if kind.root else sigma**2)
+    return Belief(np.array(mean, dtype=float), spread, kind.root)
 
 
 def points(before: Belief, kind: Filter, narrower: float = 1.0) -> np.ndarray:
@@ -132,7 +133,8 @@ def corrected(before: Belief, measured: np.ndarray, rows: int, std: np.ndarray) 
     remainder = np.eye(size)
     remainder[:, :rows] -= gain
     spread = remainder @ before.spread @ remainder.T + (gain * std**2) @ gain.T
-    after = Belief(before.mean + gain @ innovation, 0.5 * (spread + spread.T), False)
+    mean = before.mean + gain @ innovation
+    after = Belief(mean, 0.5 * (spread + spread.T), False)
     return after, float(innovation @ np.linalg.solve(innovation_covariance, innovation))
 
 
@@ -147,7 +149,8 @@ def _packed(
     wide = np.hstack([deviations, noise, np.sqrt(weight) * extra[:, None]])
     if kind.root:
         return Belief(mean, _triangle(wide), True)
-    return Belief(mean, wide @ wide.T, False)
+    spread = wide @ wide.T
+    return Belief(mean, spread, False)
 
 
 def _triangle(wide: np.ndarray) -> np.ndarray:

@@ -80,13 +80,15 @@ class _MaximumLikelihood(Method):
                 f"maximum likelihood still changes by {steps[-1]:.2g} standard deviations after {max_steps} rounds",
                 values,
             )
+        solution = _packed(problem, iteration, noise)
+        inflation = residual_inflation(problem.rows, values)
         return MethodEstimate(
             self.name,
             EstimateStatus.FOUND,
-            _packed(problem, iteration, noise),
+            solution,
             problem.pooled,
             np.sqrt(noise),
-            residual_inflation(problem.rows, values),
+            inflation,
             iterations=count,
             alone=True,
         )

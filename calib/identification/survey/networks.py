@@ -158,7 +158,8 @@ def _off(fit: LinearFit, values: np.ndarray, group_std: np.ndarray) -> LinearFit
     """Return a fit moved to other values, by the distance less certain."""
     away = values - fit.estimate.values
     covariance = fit.estimate.covariance + np.outer(away, away)
-    return replace(fit, estimate=replace(fit.estimate, values=values, covariance=covariance), group_std=group_std)
+    estimate = replace(fit.estimate, values=values, covariance=covariance)
+    return replace(fit, estimate=estimate, group_std=group_std)
 
 
 _LIKE_OLS = "the torques of all joints are equally noisy; q, v and a exact; enough steps"

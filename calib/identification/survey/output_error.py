@@ -109,6 +109,7 @@ class _OutputError(Method):
         step = np.linalg.norm(_gradient(residual / std, slopes / std[:, None]))
         if not solution.status.good and step > 0.5:
             raise NotConverged(f"{self.name}: {solution.status.value} ({step:.2g} standard deviations from rest)", fit)
+        simulations = task.count[0]
         return replace(
             plain,
             method=self.name,
@@ -116,7 +117,7 @@ class _OutputError(Method):
             solution=fit,
             std=std if self.torques else plain.std,
             iterations=count,
-            simulations=task.count[0],
+            simulations=simulations,
             beforehand=None,
             alone=True,
         )

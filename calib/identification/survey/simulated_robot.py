@@ -198,7 +198,9 @@ def stepper(plant: Plant, columns: np.ndarray) -> Stepper:
     """Return the stepper of a robot, with derivatives with respect to the parameters `columns` (c,)."""
     find = np.full(len(plant.parameters), -1)
     find[np.asarray(columns, dtype=int)] = 2 * plant.bodies.n + np.arange(len(columns))
-    return Stepper(packed(plant), (*layout_of(plant), find))
+    parts = packed(plant)
+    layout = (*layout_of(plant), find)
+    return Stepper(parts, layout)
 
 
 # shares of least squares, the rest being a regular robot, that are tried until one can be simulated
@@ -248,7 +250,8 @@ class BelievedRobot:
         carried = self.carried(case)
         by_q = sensitivities.by_q * carried
         by_v = sensitivities.by_v * carried
-        return replace(sensitivities, by_q=by_q, by_v=by_v, by_torque=sensitivities.by_torque * carried)
+        by_torque = sensitivities.by_torque * carried
+        return replace(sensitivities, by_q=by_q, by_v=by_v, by_torque=by_torque)
 
     def carried(self, case: Case) -> np.ndarray:
         """Return a factor (p,) per parameter of a serial arm: 0 for payloads not attached in a case, otherwise 1."""
@@ -295,7 +298,8 @@ def believed_robot(problem: IdentificationProblem, method: Method, steps: np.nda
         terms = (*terms, *(replace(motor, name=f"motor {motor.name}") for motor in motors))
         columns = np.append(columns, np.arange(size, size + len(motors)))
     with refused_as(CannotSimulate, CalibError, "{}"):
-        plant = Plant(model.bodies, terms, np.zeros(model.inertial + len(terms)))
+        parameters = np.zeros(model.inertial + len(terms))
+        plant = Plant(model.bodies, terms, parameters)
     return BelievedRobot(model, columns, plant)
 
 

@@ -93,7 +93,8 @@ def estimator(identification: Identification[Any]) -> _Estimator:
     deviation = np.array(fitted.std) if fitted.weighted else np.ones(len(fitted.std))
     prior_rows = fitted.beforehand
     if prior_rows is None:
-        return _Estimator(deviation, np.zeros((0, p)), np.zeros(p))
+        beforehand = np.zeros((0, p))
+        return _Estimator(deviation, beforehand, np.zeros(p))
     deviation = deviation * np.sqrt(fitted.inflation)
     factors = (fitted.pooled.factors / deviation[:, None, None]).reshape(-1, p + 1)
     matrix = factors[:, :p]
@@ -134,15 +135,22 @@ def rows_on(identification: Identification, chain: Chain, cases: Sequence[Case])
 
 def cut(rows: ObservationRows, part: slice) -> ObservationRows:
     """Return the part of the rows in a slice."""
+    matrix = rows.matrix[part]
+    target = rows.target[part]
+    present = rows.present[part]
+    block = rows.block[part]
+    standing = rows.standing[part]
+    swing = rows.swing[part]
+    slowness = rows.slowness[part]
     return replace(
         rows,
-        matrix=rows.matrix[part],
-        target=rows.target[part],
-        present=rows.present[part],
-        block=rows.block[part],
-        standing=rows.standing[part],
-        swing=rows.swing[part],
-        slowness=rows.slowness[part],
+        matrix=matrix,
+        target=target,
+        present=present,
+        block=block,
+        standing=standing,
+        swing=swing,
+        slowness=slowness,
     )
 
 
@@ -256,10 +264,12 @@ def propagate(
         geometry = frozen(by_geometry @ covariance @ by_geometry.T)
         element_deviations = np.sqrt(np.clip(np.diag(covariance)[:element_count], 0.0, None))
         deviations[:element_count] = np.where(element_deviations > 0.0, element_deviations, np.nan)
+    elements = (*chain.names, *TILTS)
+    units = (*chain.units, *(["rad"] * len(TILTS)))
     return GeometryUncertainty(
         names=identification.names,
-        elements=(*chain.names, *TILTS),
-        units=(*chain.units, *(["rad"] * len(TILTS))),
+        elements=elements,
+        units=units,
         sensitivity=matrix,
         torque=identification.fitted.estimate.covariance,
         deviations=deviations,
@@ -510,12 +520,14 @@ def compare(
             variance += np.sum((nominal_gain * row_noise) ** 2, axis=1)
             difference_variance += np.sum(((nominal_gain - calibrated_gain) * row_noise) ** 2, axis=1)
     values = np.asarray(fitted.estimate.values)
+    sigma = frozen(np.stack([np.sqrt(variance), uncertainty.sigma]))
+    difference = frozen(np.sqrt(difference_variance))
     return GeometryComparison(
         identification.names,
         fitted.estimate.units,
         frozen(np.stack([values + nominal_values - calibrated_values, values])),
-        frozen(np.stack([np.sqrt(variance), uncertainty.sigma])),
-        frozen(np.sqrt(difference_variance)),
+        sigma,
+        difference,
     )
 
 

@@ -414,13 +414,14 @@ def learn_torque_errors(
     weights = weights * factors[:, None] ** 2
     rest = _rest_floors(folds[: len(runs)], friction, weights)
     parameters, floor, beyond = weights.T.tolist()
+    standing = tuple(standing_speeds.tolist())
     discrepancy = replace(
         samples.training_range(),
         parameters=tuple(parameters),
         floor=tuple(floor),
         beyond=tuple(beyond),
         rest=tuple(rest.tolist()),
-        standing=tuple(standing_speeds.tolist()),
+        standing=standing,
     )
     if covariance is None:
         covariance = identification.fitted.estimate.covariance
@@ -525,14 +526,17 @@ def _collect_samples(identification: Identification, cases: Sequence[Case]) -> _
     triangles = triangulate(identification.rows)
     all_blocks = range(triangles.groups // len(identification.fitted.std))
     values, _ = _estimate(identification, triangles, all_blocks)
+    block = np.concatenate(blocks)
+    trajectory = np.concatenate(trajectories)
+    trajectory_block = np.concatenate(trajectory_blocks)
     return _Samples(
         states=np.concatenate(states, axis=1),
         torque=np.concatenate(torques),
         error=np.concatenate(errors),
         matrix=np.concatenate(matrices),
-        block=np.concatenate(blocks),
-        trajectory=np.concatenate(trajectories),
-        trajectory_block=np.concatenate(trajectory_blocks),
+        block=block,
+        trajectory=trajectory,
+        trajectory_block=trajectory_block,
         triangles=triangles,
         values=values,
     )
@@ -634,8 +638,10 @@ def _hold_out(
     training_range = samples.training_range(~held_out)
     distance = training_range.distance(q, v, a, rows)
     variance_terms = np.stack([by_parameters, np.ones_like(by_parameters), distance], axis=2)
-    with_rest = replace(training_range, rest=(0.0,) * rows, standing=tuple(standing_speeds.tolist()))
-    return _HeldOut(errors.clip(-torque_rms, torque_rms), variance_terms, ~with_rest.at_rest(v, rows))
+    standing = tuple(standing_speeds.tolist())
+    with_rest = replace(training_range, rest=(0.0,) * rows, standing=standing)
+    moves = ~with_rest.at_rest(v, rows)
+    return _HeldOut(errors.clip(-torque_rms, torque_rms), variance_terms, moves)
 
 
 def _rest_floors(folds: Sequence[_HeldOut], friction: np.ndarray, weights: np.ndarray) -> np.ndarray:
