@@ -24,7 +24,7 @@ import numpy as np
 from calib.data.signals.filtering import Decimator, low_pass, slope
 from calib.data.signals.motion import Motion
 from calib.dynamics.base import Base
-from calib.dynamics.drives import DriveTerm, standard
+from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.torque_rows import POWER
 from calib.errors import CalibError, CannotSimulate, Diverged, NotConverged, UsageError, one_of
@@ -33,8 +33,19 @@ from calib.estimation.triangles import Triangles, combine
 from calib.estimation.whiteness import inflation
 from calib.identification.closed_loop import instrumental_variables
 from calib.identification.closed_loop.instrumental_variables import Instruments, InstrumentStrength
-from calib.identification.closed_loop.loop_recordings import Loop, low_passed, simulated_case, simulated_samples
-from calib.identification.closed_loop.simulation import Plant, Sensing, SimulatedRun, plant_of
+from calib.identification.closed_loop.loop_recordings import Loop, simulated_case
+from calib.identification.closed_loop.simulated_runs import (
+    MAX_GAIN_RATIO,
+    MAX_RETREATS,
+    Runs,
+    between,
+    distance_percent,
+    error_ratio,
+    nearer,
+    regular_plant,
+    simulated_runs,
+)
+from calib.identification.closed_loop.simulation import Plant
 from calib.identification.loop import ExogeneityTest
 from calib.identification.methods.constraint_settings import ConstraintSettings, Held
 from calib.identification.methods.parameter_constraints import Constraints, hold, make_constraints
@@ -43,12 +54,8 @@ from calib.records import frozen
 
 # iterations; 3 to 6 are usual
 MAX_ROUNDS = 10
-# halvings of a step to parameters that cannot be simulated (our choice)
-MAX_RETREATS = 6
 # times the speed's noise, by which the simulated motion may be off the measured one (our choice)
 MAX_FOLLOWING = 1.25
-# of distances from the reference, recorded and simulated: beyond, gains are others (our choice)
-MAX_GAIN_RATIO = 1.25
 
 
 @dataclass(frozen=True)
@@ -66,9 +73,6 @@ class _RoundEstimator:
     fit: Callable[[Instruments, np.ndarray, float], LinearFit]
     triangle: Callable[[Instruments, np.ndarray], np.ndarray]
     measured: bool
-
-
-Runs = list[tuple[tuple[Case, Loop], SimulatedRun]]
 
 
 @dataclass(frozen=True)
@@ -249,12 +253,12 @@ def identify_instrumental(
     estimator = ROUNDS[method]
     task = _Fixed(model, base, cases, decimator, observed, estimator, constraints, friction)
     ordinary = wls(data, settled_std(data, 1e-3))
-    plant = _regular(model, friction.terms, cases[0][1], inertia)
+    plant = regular_plant(model, friction.terms, cases[0][1], inertia)
     std = ordinary.group_std
     before: LinearFit | None = None
     rounds: list[Round] = []
     try:
-        runs = _runs(plant, cases)
+        runs = simulated_runs(plant, cases)
         retreats = 0
         tau = 1.0
     except NotConverged as error:
@@ -275,7 +279,7 @@ def identify_instrumental(
             returns += 1
             if returns > MAX_RETREATS or plant is start:
                 raise
-            plant, runs = _nearer(start, plant, cases)
+            plant, runs = nearer(start, plant, cases)
             retreats = returns
         before = estimate.fit
         std = estimate.fit.group_std
@@ -462,8 +466,8 @@ def _result(
             rows.append((case, observed, simulated))
         else:
             rows.append((simulated_case(case, run, loop), replace(observed, matrix=simulated), simulated))
-    distance = _distance(runs)
-    stray = _stray(runs)
+    distance = distance_percent(runs)
+    stray = error_ratio(runs)
     return Instrumental(
         fit,
         ordinary,
@@ -482,30 +486,6 @@ def _result(
     )
 
 
-def _regular(model: IdentificationModel, terms: Sequence[DriveTerm], loop: Loop, inertia: np.ndarray | None) -> Plant:
-    """Return the robot of the first simulation: joint inertias J (its last n parameters), no bodies, no gravity."""
-    if inertia is None:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            inertia = loop.controller.kd**2 / (2.0 * loop.controller.kp)
-        if not np.all(np.isfinite(inertia)) or not np.all(inertia > 0.0):
-            raise UsageError("kd² / (2 kp) of these gains is no inertia above 0; give the inertia (n,) [kg m²]")
-    extra = tuple(replace(motor, name=f"regular {motor.name}") for motor in standard(["Ia"] * model.n))
-    values = np.concatenate([np.zeros(model.p + len(terms)), inertia])
-    return plant_of(model, values, (*terms, *extra))
-
-
-def _runs(plant: Plant, cases: Sequence[tuple[Case, Loop]]) -> Runs:
-    """Return the noise-free simulation of every recording's loop."""
-    result: Runs = []
-    for case, loop in cases:
-        robot = plant.carrying(case.carried)
-        controller = loop.controller
-        if loop.design is not None:
-            controller = controller.scaled(robot.inertia_diagonal(loop.reference.q[::200]) / loop.design)
-        result.append(((case, loop), robot.run(controller, loop.reference, Sensing(every=loop.every))))
-    return result
-
-
 def _simulate_new(
     task: _Fixed, estimate: _Found, old: Plant, std: np.ndarray, tau: float
 ) -> tuple[_Fixed, _Found, Plant, Runs, int]:
@@ -515,9 +495,9 @@ def _simulate_new(
     """
     retreats = 0
     while retreats < MAX_RETREATS:
-        candidate = _between(old, task.plant(old, estimate), 0.5**retreats)
+        candidate = between(old, task.plant(old, estimate), 0.5**retreats)
         try:
-            return task, estimate, candidate, _runs(candidate, task.cases), retreats
+            return task, estimate, candidate, simulated_runs(candidate, task.cases), retreats
         except CalibError as error:
             problem = error
         if task.constraints and estimate.bound and estimate.bound.postures:
@@ -534,27 +514,6 @@ def _simulate_new(
         retreats += 1
     message = f"neither the estimate nor smaller steps can be simulated: {problem}{_if_weak(task, estimate, std)}"
     raise CannotSimulate(message, task.plant(old, estimate))
-
-
-def _between(start: Plant, end: Plant, share: float) -> Plant:
-    """Return the plant whose parameters are a share of the way from one plant to another."""
-    return end.with_parameters(share * end.parameters + (1.0 - share) * start.parameters)
-
-
-def _nearer(start: Plant, end: Plant, cases: Sequence[tuple[Case, Loop]]) -> tuple[Plant, Runs]:
-    """Return the plant halfway from `start` to `end`, or nearer where that cannot be simulated, and its runs.
-
-    Raises:
-        CannotSimulate: where none near `start` can.
-    """
-    problem: CalibError | None = None
-    for halvings in range(1, MAX_RETREATS + 1):
-        candidate = _between(start, end, 0.5**halvings)
-        try:
-            return candidate, _runs(candidate, cases)
-        except CalibError as error:
-            problem = error
-    raise CannotSimulate(f"no robot on the way to the estimate can be simulated: {problem}", start)
 
 
 def _if_weak(task: _Fixed, estimate: _Found, std: np.ndarray) -> str:
@@ -621,39 +580,6 @@ def _change(before: LinearFit | None, after: LinearFit) -> float:
         return float("inf")
     size = np.maximum(np.abs(before.estimate.values), 8.0 * after.estimate.sigma)
     return float(np.max(np.abs(after.estimate.values - before.estimate.values) / np.maximum(size, 1e-300)))
-
-
-def _distance(runs: Runs) -> np.ndarray:
-    """Return the position difference of simulated and recorded robot (n,), relative to the travel [%]."""
-    away, size = np.zeros((2, runs[0][0][0].motion.n))
-    for (case, loop), run in runs:
-        motion = case.motion
-        simulated = low_passed(run.q, motion)[simulated_samples(case, run.t, loop)]
-        away += np.sum((motion.q - simulated) ** 2, axis=0)
-        size += np.sum((motion.q - motion.q.mean(axis=0)) ** 2, axis=0)
-    return frozen(100.0 * np.sqrt(away / size))
-
-
-def _stray(runs: Runs) -> np.ndarray:
-    """Return the ratios (n,) of recorded to simulated tracking errors, by regression; NaN where noise hides them."""
-    measured_errors = []
-    expected_errors = []
-    for (case, loop), run in runs:
-        motion = case.motion
-        samples = simulated_samples(case, run.t, loop)
-        reference = loop.reference.at(np.arange(len(run.t)) * loop.every)[0]
-        reference = low_passed(reference, motion)[samples]
-        position = low_passed(run.q, motion)[samples]
-        measured_errors.append(reference - motion.q)
-        expected_errors.append(reference - position)
-    measured = np.concatenate(measured_errors)
-    expected = np.concatenate(expected_errors)
-    size = np.maximum(np.sum(expected**2, axis=0), 1e-300)
-    slope = np.sum(measured * expected, axis=0) / size
-    residual = measured - slope * expected
-    inflations = np.array([inflation(joint) for joint in residual.T])
-    sigma = np.sqrt(inflations * np.mean(residual**2, axis=0) / size)
-    return frozen(np.where(5.0 * sigma < np.abs(slope) * np.log(MAX_GAIN_RATIO), slope, np.nan))
 
 
 def _fit_simulated(problem: Instruments, std: np.ndarray, tau: float) -> LinearFit:
