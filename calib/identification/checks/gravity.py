@@ -215,14 +215,16 @@ class _Sums:
         def squares(gravity: np.ndarray) -> float:
             change = self._under(gravity)
             square = change.T @ total @ change
-            return float(square[-1, -1] - square[-1, :-1] @ _solved(square))
+            explained = square[-1, :-1] @ _solved(square)
+            return float(square[-1, -1] - explained)
 
         return squares
 
     def _under(self, gravity: np.ndarray) -> np.ndarray:
         """Return the matrix (k, p + 1) from the columns of bodies under a gravity vector (3,) to all columns."""
         inertial = np.eye(10 * self.bodies)
-        masses = inertial.reshape(self.bodies, 10, -1)[:, MASSES].reshape(4 * self.bodies, -1)
+        by_body = inertial.reshape(self.bodies, 10, -1)
+        masses = by_body[:, MASSES].reshape(4 * self.bodies, -1)
         heavy = [component * masses for component in gravity]
         bodies = np.vstack([inertial, *heavy])
         drives = np.eye(4 * self.n + 1)
@@ -252,13 +254,15 @@ def _columns(motion: MotionSamples) -> np.ndarray:
     m, n = motion.q.shape
     zero = np.zeros_like(motion.v)
     weightless = motion.bodies.with_gravity(np.zeros(3))
-    columns = [regressor(weightless, motion.q, motion.v, motion.a).reshape(m, n, -1)]
+    body_columns = regressor(weightless, motion.q, motion.v, motion.a)
+    columns = [body_columns.reshape(m, n, -1)]
     for axis in np.eye(3):
         at_rest = regressor(motion.bodies.with_gravity(axis), motion.q, zero, zero)
         heavy = at_rest.reshape(m, n, -1, 10)[..., MASSES]
         columns.append(heavy.reshape(m, n, -1))
     torque = motion.torque - motion.torque.mean(axis=0)
-    return np.concatenate([*columns, motion.drives, torque[:, :, None]], axis=2)
+    target = torque[:, :, None]
+    return np.concatenate([*columns, motion.drives, target], axis=2)
 
 
 def _solved(square: np.ndarray) -> np.ndarray:
@@ -267,7 +271,8 @@ def _solved(square: np.ndarray) -> np.ndarray:
     scale = np.where(size > 1e-9 * size.max(), size, np.inf)
     scaled = square[:-1, :-1] / (scale[:, None] * scale)
     scaled.flat[:: len(scaled) + 1] += 1e-9
-    return np.asarray(np.linalg.solve(scaled, square[:-1, -1] / scale) / scale)
+    solution = np.linalg.solve(scaled, square[:-1, -1] / scale)
+    return np.asarray(solution / scale)
 
 
 def _mean(ratios: np.ndarray) -> float:
@@ -343,7 +348,8 @@ def _gravity_factors(
     if has_masses:
         reference = standard_parameters(chain)
     else:
-        reference = np.asarray(rods(chain, IdentificationModel(motions[0].bodies, ()))).ravel()
+        bodies_alone = IdentificationModel(motions[0].bodies, ())
+        reference = np.asarray(rods(chain, bodies_alone)).ravel()
     scale = 1.0
     if not (has_masses and newtons):
         scale = _inertia_factor(motions, reference)
@@ -388,5 +394,8 @@ def _inertia_factor(motions: Sequence[MotionSamples], reference: np.ndarray) -> 
         moving.append(columns[:, :, : len(reference)] @ reference)
         free.append(columns[:, :, len(reference) : -1])
         torque.append(columns[:, :, -1])
-    factor, sigma = common_factor(np.concatenate(torque), np.concatenate(moving), np.concatenate(free))
+    torques = np.concatenate(torque)
+    moving_torques = np.concatenate(moving)
+    free_torques = np.concatenate(free)
+    factor, sigma = common_factor(torques, moving_torques, free_torques)
     return factor if factor > MIN_SIGMAS * sigma else np.nan

@@ -94,7 +94,8 @@ def clock_ratio(samples: MotionSamples, chain: Chain) -> ClockRatio | None:
     """
     if chain.n < MIN_JOINTS:
         return None
-    robots = [np.asarray(rods(chain, IdentificationModel(bodies_of(chain), ()))).ravel()]
+    bodies_alone = IdentificationModel(bodies_of(chain), ())
+    robots = [np.asarray(rods(chain, bodies_alone)).ravel()]
     if chain.inertias is not None and chain.inertias[:, 9].any():
         robots.append(standard_parameters(chain))
     ratios = []
@@ -128,7 +129,8 @@ def common_factor(torque: np.ndarray, common: np.ndarray, free: np.ndarray) -> t
     alpha = power = 0.0
     for _ in range(ROUNDS):
         scale = np.repeat(weight, m)
-        free_basis = basis(free.transpose(1, 0, 2).reshape(m * n, -1) * scale[:, None])
+        flat = free.transpose(1, 0, 2).reshape(m * n, -1)
+        free_basis = basis(flat * scale[:, None])
         torque_part = _without(free_basis, torque.T.ravel() * scale)
         common_part = _without(free_basis, common.T.ravel() * scale)
         power = float(common_part @ common_part)
@@ -187,7 +189,8 @@ def _unexplained_function(samples: MotionSamples) -> Callable[[np.ndarray], np.n
     scale = 1.0 / np.maximum(samples.torque.std(axis=0), 1e-12)
 
     def weighted_rows(columns: np.ndarray) -> np.ndarray:
-        return (columns * scale[:, None]).transpose(1, 0, 2).reshape(n * m, -1)
+        scaled = (columns * scale[:, None]).transpose(1, 0, 2)
+        return scaled.reshape(n * m, -1)
 
     # Bodies and offsets are free, the drives' other parameters not negative.
     drives = samples.drives.reshape(m, n, n, 4)
@@ -264,8 +267,10 @@ def _unexplained_by_masses(samples: MotionSamples, masses: np.ndarray) -> np.nda
     centred = samples.torque - samples.torque.mean(axis=0)
     shares = []
     for joint, torque in enumerate(centred.T):
-        neighbours = drives[:, max(joint - 1, 0) : joint + 2].reshape(len(torque), -1)
-        orthonormal = basis(np.column_stack([of_gravity[:, joint], of_motion[:, joint], neighbours]))
+        near = drives[:, max(joint - 1, 0) : joint + 2]
+        neighbours = near.reshape(len(torque), -1)
+        joint_columns = np.column_stack([of_gravity[:, joint], of_motion[:, joint], neighbours])
+        orthonormal = basis(joint_columns)
         explained = ((torque @ orthonormal) ** 2).sum()
         shares.append(1.0 - explained / max(float(torque @ torque), 1e-300))
     return np.maximum(shares, 1e-9)
@@ -319,7 +324,9 @@ def compare_sizes(
     motion = case.motion
     unknown = np.full(chain.n, np.nan)
     of_motors = newtons and case.target.shape[1] == chain.n
-    has_masses = chain.inertias is not None and bool(np.any(chain.inertias[:, 9] > 0.0))
+    has_masses = False
+    if chain.inertias is not None:
+        has_masses = bool(np.any(chain.inertias[:, 9] > 0.0))
 
     masses, limits = unknown, unknown
     if of_motors and has_masses:
@@ -381,10 +388,14 @@ def _speed_ratio(
         part = slice(start, stop)
         step = np.diff(t[part])[:, None]
         mean_velocity = (v[start + 1 : stop] + v[start : stop - 1]) / 2
-        integral[part] = np.concatenate([0.0 * v[start : start + 1], np.cumsum(mean_velocity * step, axis=0)])
-        trend = np.column_stack([np.ones(stop - start), t[part] - t[part].mean()])
-        position[part] -= trend @ np.linalg.lstsq(trend, position[part], rcond=None)[0]
-        integral[part] -= trend @ np.linalg.lstsq(trend, integral[part], rcond=None)[0]
+        travelled = np.cumsum(mean_velocity * step, axis=0)
+        integral[part] = np.concatenate([0.0 * v[start : start + 1], travelled])
+        centred = t[part] - t[part].mean()
+        trend = np.column_stack([np.ones(stop - start), centred])
+        position_trend = np.linalg.lstsq(trend, position[part], rcond=None)[0]
+        position[part] -= trend @ position_trend
+        integral_trend = np.linalg.lstsq(trend, integral[part], rcond=None)[0]
+        integral[part] -= trend @ integral_trend
     power = np.maximum((position**2).sum(axis=0), 1e-300)
     integral_power = np.maximum((integral**2).sum(axis=0), 1e-300)
     ratio = (position * integral).sum(axis=0) / power
@@ -392,6 +403,7 @@ def _speed_ratio(
     travels = travel > MIN_TRAVEL
     follows = np.where(travels, ratio * np.sqrt(power / integral_power), np.nan)
     by_dates = DATE_ERROR * travel / np.maximum(np.ptp(position, axis=0), 1e-300)
-    by_noise = np.sqrt(((integral - ratio * position) ** 2).sum(axis=0) / power / INDEPENDENT_ERRORS)
+    squares = ((integral - ratio * position) ** 2).sum(axis=0)
+    by_noise = np.sqrt(squares / power / INDEPENDENT_ERRORS)
     sigma = np.hypot(by_noise, by_dates)
     return np.where(travels & (follows > FOLLOWS), ratio, np.nan), sigma, follows

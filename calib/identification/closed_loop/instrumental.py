@@ -140,19 +140,22 @@ class Instrumental:
 
     def simulated_error(self, values: np.ndarray) -> np.ndarray:
         """Return the relative torque errors (n,) on the simulated motion, of values (p,): 100 ‖y - Z x‖ / ‖y‖ [%]."""
-        return self.problem.data.relative_errors(np.concatenate([values, np.zeros(len(self.names))]))
+        with_instruments = np.concatenate([values, np.zeros(len(self.names))])
+        return self.problem.data.relative_errors(with_instruments)
 
     @property
     def own(self) -> np.ndarray:
         """Relative error of the measured motion's torque (n,): 100 ‖y - W x‖ / ‖y‖ [%]."""
-        return self.problem.data.relative_errors(np.concatenate([np.zeros(len(self.names)), self.fit.estimate.values]))
+        by_measured = np.concatenate([np.zeros(len(self.names)), self.fit.estimate.values])
+        return self.problem.data.relative_errors(by_measured)
 
     @property
     def off(self) -> np.ndarray:
         """Joints (from 0) whose given gains are wrong: recorded and simulated tracking errors differ."""
         estimate = self.fit.estimate
         simulated = self.problem.data.factors[:, :, : len(self.names)]
-        sizes = np.maximum(np.sum((simulated @ estimate.values) ** 2, axis=1), 1e-300)
+        explained = np.sum((simulated @ estimate.values) ** 2, axis=1)
+        sizes = np.maximum(explained, 1e-300)
         # the torques' share that is unsure makes e_s = q_ref - q_s unsure, too
         unsure = np.sqrt(np.einsum("gij,jk,gik->g", simulated, estimate.covariance, simulated) / sizes)
         # rows of the motors
@@ -160,7 +163,8 @@ class Instrumental:
             unsure = unsure[-len(self.stray) :]
         else:
             unsure = unsure.max()
-        away = np.abs(np.log(np.maximum(np.nan_to_num(self.stray, nan=1.0), 1e-3)))
+        ratio = np.maximum(np.nan_to_num(self.stray, nan=1.0), 1e-3)
+        away = np.abs(np.log(ratio))
         return np.flatnonzero(away > np.log(MAX_GAIN_RATIO) + 5.0 * unsure)
 
     @property
@@ -182,7 +186,9 @@ class Instrumental:
         The test finds any bias that the data can detect; this says whether it matters.
         """
         estimate = self.fit.estimate
-        return np.abs(self.ordinary.estimate.values - estimate.values) / np.where(estimate.sigma > 0, estimate.sigma, 1)
+        difference = np.abs(self.ordinary.estimate.values - estimate.values)
+        sigma = np.where(estimate.sigma > 0, estimate.sigma, 1)
+        return difference / sigma
 
     @property
     def apart(self) -> np.ndarray:
@@ -331,7 +337,8 @@ class _Friction:
             return rows
         motion = case.motion
         load = self.model.transmitted(self.loads, motion.q, motion.v, motion.a, case.carried)
-        return rows.extend(self.terms, observe_terms(self.terms, case, self.decimator, load, self.model.torque_rows))
+        columns = observe_terms(self.terms, case, self.decimator, load, self.model.torque_rows)
+        return rows.extend(self.terms, columns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -358,7 +365,8 @@ class _Fixed:
         """Return the simulated robot with an estimate; without motor torques, its motor inertias J are unchanged."""
         estimated = estimate.fit.estimate.values
         b = self.base.b
-        values = np.concatenate([self.base.to_standard(estimated[:b]), estimated[b:]])
+        standard = self.base.to_standard(estimated[:b])
+        values = np.concatenate([standard, estimated[b:]])
         regular = old.parameters[len(values) :] * (not self.model.torque_rows.driven)
         return old.with_parameters(np.concatenate([values, regular]))
 
@@ -550,7 +558,8 @@ def _stack(observed: Sequence[ObservationRows], simulated: Sequence[np.ndarray],
 
 def _simulated(problem: Instruments) -> Triangles:
     """Return the R factors of [Z y], selected from those of [Z W y]."""
-    return replace(problem.data.select(np.arange(len(problem.names))), names=problem.names)
+    instruments = np.arange(len(problem.names))
+    return replace(problem.data.select(instruments), names=problem.names)
 
 
 def _inflation(observed: Sequence[ObservationRows], fit: LinearFit) -> float:
@@ -579,7 +588,8 @@ def _change(before: LinearFit | None, after: LinearFit) -> float:
     if before is None:
         return float("inf")
     size = np.maximum(np.abs(before.estimate.values), 8.0 * after.estimate.sigma)
-    return float(np.max(np.abs(after.estimate.values - before.estimate.values) / np.maximum(size, 1e-300)))
+    change = np.abs(after.estimate.values - before.estimate.values)
+    return float(np.max(change / np.maximum(size, 1e-300)))
 
 
 def _fit_simulated(problem: Instruments, std: np.ndarray, tau: float) -> LinearFit:

@@ -84,7 +84,8 @@ class Instruments:
         """
         p = len(self.names)
         sigma = np.ones(self.data.groups) if std is None else std
-        squares = self.data.residual_squares(np.concatenate([np.zeros(p), fit.estimate.values]))
+        by_measured = np.concatenate([np.zeros(p), fit.estimate.values])
+        squares = self.data.residual_squares(by_measured)
         factor = np.zeros((1, p + 1, p + 1))
         factor[0, :p] = projected(self, sigma)[:p]
         factor[0, p, p] = np.sqrt(np.sum(squares / sigma**2))
@@ -153,14 +154,16 @@ def iv(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1
     factor = combine(problem.data, sigma)
     values, inverse, _ = solve_triangle(_projected(factor, problem.names), problem.names)
     squares = problem.data.residual_squares(np.concatenate([np.zeros(p), values]))
-    degrees = problem.data.rows - inflation * p * problem.data.rows / problem.data.rows.sum()
+    rows = problem.data.rows
+    degrees = rows - inflation * p * rows / rows.sum()
     dof = int(problem.data.rows.sum() / inflation) - p
     require(dof > 0, "fewer independent rows than parameters; record longer motion", Unidentifiable, problem.names)
     residual_std = float(np.sqrt(np.sum(squares / sigma**2) / degrees.sum()))
     covariance = inflation * residual_std**2 * inverse @ inverse.T
     units = problem.data.units[p:]
     estimate = Estimate(problem.names, units, values, covariance, residual_std, dof)
-    return LinearFit(estimate, np.sqrt(squares / degrees), *condition_numbers(factor[:, p : 2 * p]))
+    group_std = np.sqrt(squares / degrees)
+    return LinearFit(estimate, group_std, *condition_numbers(factor[:, p : 2 * p]))
 
 
 def settled(before: LinearFit, after: LinearFit, change: float = 0.025, residual: float = 0.025) -> bool:
@@ -171,9 +174,11 @@ def settled(before: LinearFit, after: LinearFit, change: float = 0.025, residual
     one near zero never meets a relative rule).
     """
     parameter_change = np.abs(after.estimate.values - before.estimate.values)
-    allowed = np.maximum(change * np.abs(before.estimate.values), 0.2 * after.estimate.sigma)
+    by_value = change * np.abs(before.estimate.values)
+    allowed = np.maximum(by_value, 0.2 * after.estimate.sigma)
     sizes = before.estimate.residual_std, after.estimate.residual_std
-    return bool(np.all(parameter_change <= allowed) and abs(sizes[1] - sizes[0]) <= residual * sizes[0])
+    residual_change = abs(sizes[1] - sizes[0])
+    return bool(np.all(parameter_change <= allowed) and residual_change <= residual * sizes[0])
 
 
 def strength(problem: Instruments, std: np.ndarray | None = None) -> InstrumentStrength:
@@ -188,9 +193,12 @@ def strength(problem: Instruments, std: np.ndarray | None = None) -> InstrumentS
     factor = combine(problem.data, std)
     explained = factor[:p, p : 2 * p]
     norms = np.linalg.norm(factor[:, p : 2 * p], axis=0)
-    basis = np.linalg.qr(factor[: 2 * p, p : 2 * p] / norms)[0]
-    correlations = np.clip(np.linalg.svd(basis[:p], compute_uv=False), 0.0, 1.0)
-    instruments = factor[:p, :p] / np.linalg.norm(factor[:p, :p], axis=0)
+    normalised = factor[: 2 * p, p : 2 * p] / norms
+    basis = np.linalg.qr(normalised)[0]
+    singular_values = np.linalg.svd(basis[:p], compute_uv=False)
+    correlations = np.clip(singular_values, 0.0, 1.0)
+    instrument_norms = np.linalg.norm(factor[:p, :p], axis=0)
+    instruments = factor[:p, :p] / instrument_norms
     cross = instruments.T @ (explained / norms)
     minimum = correlations[-1] ** 2
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -218,7 +226,8 @@ def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: f
     instrument_rows = factor[:, p : 2 * p]
     norms = np.linalg.norm(instrument_rows, axis=0)
     require_rank(instrument_rows / np.where(norms > 0.0, norms, 1.0), problem.names)
-    part = np.vstack([np.zeros((p, p)), factor[p:, p : 2 * p]])
+    unused = np.zeros((p, p))
+    part = np.vstack([unused, factor[p:, p : 2 * p]])
     size = np.linalg.norm(part, axis=0) > 1e-8 * norms
     columns = np.hstack([instrument_rows, part[:, size]])
     split = split_columns(columns, [np.arange(p)], 1e-8)
@@ -269,21 +278,23 @@ def by_free_instruments(
     z = factor[:p, :p] @ free
     w = factor[:p, p : 2 * p] @ free
     residual = factor[:p, -1] - factor[:p, p : 2 * p] @ constrained
-    return np.asarray(constrained + free @ np.linalg.solve(z.T @ w, z.T @ residual))
+    by_free = np.linalg.solve(z.T @ w, z.T @ residual)
+    return np.asarray(constrained + free @ by_free)
 
 
 def _projected(factor: np.ndarray, names: Sequence[str]) -> np.ndarray:
     """Return the R factor of P_Z [W y]; refuse Z and Zᵀ W without full rank."""
     p = len(names)
     size = np.linalg.norm(factor[:p, :p], axis=0)
+    normalised = factor[:p, :p] / np.where(size > 0.0, size, 1.0)
+    labels = [f"instrument of {name}" for name in names]
     require_rank(
-        factor[:p, :p] / np.where(size > 0.0, size, 1.0),
-        [f"instrument of {name}" for name in names],
-        "the simulated motion does not excite them: simulate the reference of this recording",
+        normalised, labels, "the simulated motion does not excite them: simulate the reference of this recording"
     )
     norms = np.linalg.norm(factor[:, p : 2 * p], axis=0)
+    normalised = factor[:p, p : 2 * p] / np.where(norms > 0.0, norms, 1.0)
     require_rank(
-        factor[:p, p : 2 * p] / np.where(norms > 0.0, norms, 1.0),
+        normalised,
         names,
         "the instruments do not distinguish them: W has dependent columns, or the simulated motion differs",
     )
@@ -299,4 +310,5 @@ def _shea(explained: np.ndarray, total: np.ndarray) -> np.ndarray:
 def _rss(matrix: np.ndarray, target: np.ndarray) -> float:
     """Return the residual sum of squares of the regression of target on the columns."""
     size = matrix.shape[1]
-    return float(np.sum(retriangulate(np.column_stack([matrix, target]))[size:, size] ** 2))
+    triangle = retriangulate(np.column_stack([matrix, target]))
+    return float(np.sum(triangle[size:, size] ** 2))

@@ -99,7 +99,8 @@ def close_loops(
     # the longest part of each recording tells
     for part in ordered:
         if part.name not in shifts and loop.timing != "stated":
-            shifts[part.name], note = _shift(part, loop, partial(_fed_forward, controller, loop, cad, model))
+            feed_forward_of = partial(_fed_forward, controller, loop, cad, model)
+            shifts[part.name], note = _shift(part, loop, feed_forward_of)
             notes += note
     design = None
     if loop.design:
@@ -113,7 +114,8 @@ def close_loops(
             rates = np.diff(reference.q, axis=0) / reference.period
             v = np.vstack([reference.v[:1], rates])
             reference = replace(reference, v=v)
-        pairs.append((take(part, _inside(part.motion)), Loop(feed_forward, reference, every, design)))
+        inner = take(part, _inside(part.motion))
+        pairs.append((inner, Loop(feed_forward, reference, every, design)))
     return ClosedLoops(tuple(pairs), controller, identified, notes)
 
 
@@ -199,7 +201,8 @@ def _shift(part: Case, loop: LoopSettings, fed_forward: Callable[..., Controller
             )
         return 0.0, ()
     reference, every = _make_reference(motion, loop.rate)
-    band = min(loop.band, 0.5 * float(motion.cutoff.min()), 0.2 * motion.rate)
+    lowest_cutoff = float(motion.cutoff.min())
+    band = min(loop.band, 0.5 * lowest_cutoff, 0.2 * motion.rate)
     shift = reference_shift(part, reference, every, fed_forward(motion, reference, every), band)
     text = f"{1e3 * abs(shift.seconds):.3g} ± {1e3 * shift.sigma:.2g} ms"
     if estimated:
@@ -277,7 +280,8 @@ def _inside(motion: Motion, settling_time: float = 0.2) -> slice:
     `settling_time`: [s] our choice.
     """
     edge = max(border(motion.rate, float(motion.cutoff.min())), 4)
-    return slice(max(edge, int(np.ceil(settling_time * motion.rate))), len(motion) - edge)
+    settling_samples = int(np.ceil(settling_time * motion.rate))
+    return slice(max(edge, settling_samples), len(motion) - edge)
 
 
 def _controller(loop: LoopSettings, case: Case) -> tuple[Controller, IdentifiedController | None, tuple[str, ...]]:
@@ -345,10 +349,13 @@ def _fed_forward(
         if motion.tau_ff is None:
             refuse_data(motion.file, "[loop] feedforward: the recording has no column tau_ff")
         grid = np.arange(len(motion))
-        return controller.with_feedforward(CubicSpline(grid, motion.tau_ff)(np.arange(len(reference.t)) / every))
+        samples = np.arange(len(reference.t)) / every
+        torque = CubicSpline(grid, motion.tau_ff)(samples)
+        return controller.with_feedforward(torque)
     if cad is None:
         raise UsageError("[loop] feedforward = 'cad': the robot's description states no masses")
-    believed = plant_of(model, np.append(cad, np.zeros(model.p - len(cad))))
+    no_drives = np.zeros(model.p - len(cad))
+    believed = plant_of(model, np.append(cad, no_drives))
     return controller.with_feedforward(believed.feed_forward(reference))
 
 
@@ -358,7 +365,8 @@ def simulated_case(case: Case, run: SimulatedRun, loop: Loop) -> Case:
     The same low-pass and differences: what they do to a motion (they round off reversals) is in W and in Z alike, and
     what tells W from Z is noise.
     """
-    q, v, a = followed(run.q, case.motion, simulated_samples(case, run.t, loop))
+    samples = simulated_samples(case, run.t, loop)
+    q, v, a = followed(run.q, case.motion, samples)
     motion = replace(case.motion, q=q, v=v, a=a)
     return replace(case, motion=motion)
 
@@ -372,7 +380,9 @@ def followed(q: np.ndarray, motion: Motion, index: np.ndarray) -> tuple[np.ndarr
     """
     positions = low_passed(q, motion, motion.cutoff)
     less = low_passed(q, motion, motion.velocity_cutoff)
-    return positions[index], slope(less, motion.rate)[index], curvature(positions, motion.rate)[index]
+    velocity = slope(less, motion.rate)[index]
+    acceleration = curvature(positions, motion.rate)[index]
+    return positions[index], velocity, acceleration
 
 
 def simulated_samples(case: Case, t: np.ndarray, loop: Loop) -> np.ndarray:

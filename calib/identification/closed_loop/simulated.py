@@ -37,11 +37,9 @@ class LoopEstimate(MethodEstimate):
         identification = self.instrumental
         if identification is None:
             return super().testable()
-        return (
-            identification.problem.testable(identification.fit, identification.std),
-            np.ones(1),
-            np.array([identification.inflation]),
-        )
+        residuals = identification.problem.testable(identification.fit, identification.std)
+        inflation = np.array([identification.inflation])
+        return residuals, np.ones(1), inflation
 
 
 def attempted_in_loop(
@@ -190,7 +188,8 @@ class LoopTest:
         """Return the findings for a user of this estimate, or (`taken` False) of a least-squares one."""
         if self.found is None or self.loops is None:
             return [finding("loop-test-failed", why=self.failure)]
-        noticed = [*_weakness(self.found), *(_distance(self.found) or _gains(self.found) or _torques(self.found))]
+        causes = _distance(self.found) or _gains(self.found) or _torques(self.found)
+        noticed = [*_weakness(self.found), *causes]
         return noticed + (_blurred(self.found, self.loops) if is_estimate else _biased(self.found))
 
 
@@ -275,7 +274,10 @@ def _blurred(identification: Instrumental, loops: ClosedLoops) -> list[Finding]:
     noise = sign_noise(identification.plant, loops.pairs[0][0].motion)
     max_blur = 3.0
     signs = [term for term in identification.plant.terms if term.shape == "sign"]
-    blurred = {sign.name: noise[sign.acts[0][0]] / sign.settings[-1] for sign in signs}
+    blurred = {}
+    for sign in signs:
+        joint = sign.acts[0][0]
+        blurred[sign.name] = noise[joint] / sign.settings[-1]
     joints = [f"{size:.2g} at {name}" for name, size in blurred.items() if size > max_blur]
     if joints:
         return [finding("noisy-signs", joints=joints)]
@@ -399,4 +401,5 @@ def _table(identification: Instrumental) -> tuple[tuple[Any, ...], ...]:
     ordinary = identification.ordinary.estimate.values
     explained = 100.0 * identification.strength.partial_r2
     columns = (estimate.values, estimate.sigma, ordinary, identification.shift, explained)
-    return tuple(zip(estimate.names, estimate.units, *[column.tolist() for column in columns]))
+    columns_of_numbers = [column.tolist() for column in columns]
+    return tuple(zip(estimate.names, estimate.units, *columns_of_numbers))

@@ -50,7 +50,8 @@ def simulated_runs(plant: Plant, cases: Sequence[tuple[Case, Loop]]) -> Runs:
         controller = loop.controller
         if loop.design is not None:
             controller = controller.scaled(robot.inertia_diagonal(loop.reference.q[::200]) / loop.design)
-        result.append(((case, loop), robot.run(controller, loop.reference, Sensing(every=loop.every))))
+        run = robot.run(controller, loop.reference, Sensing(every=loop.every))
+        result.append(((case, loop), run))
     return result
 
 
@@ -77,12 +78,14 @@ def nearer(start: Plant, end: Plant, cases: Sequence[tuple[Case, Loop]]) -> tupl
 
 def distance_percent(runs: Runs) -> np.ndarray:
     """Return the position difference of simulated and recorded robot (n,), relative to the travel [%]."""
-    away, size = np.zeros((2, runs[0][0][0].motion.n))
+    n = runs[0][0][0].motion.n
+    away, size = np.zeros((2, n))
     for (case, loop), run in runs:
         motion = case.motion
         simulated = low_passed(run.q, motion)[simulated_samples(case, run.t, loop)]
         away += np.sum((motion.q - simulated) ** 2, axis=0)
-        size += np.sum((motion.q - motion.q.mean(axis=0)) ** 2, axis=0)
+        deviation = motion.q - motion.q.mean(axis=0)
+        size += np.sum(deviation**2, axis=0)
     return frozen(100.0 * np.sqrt(away / size))
 
 
@@ -93,7 +96,8 @@ def error_ratio(runs: Runs) -> np.ndarray:
     for (case, loop), run in runs:
         motion = case.motion
         samples = simulated_samples(case, run.t, loop)
-        reference = loop.reference.at(np.arange(len(run.t)) * loop.every)[0]
+        ticks = np.arange(len(run.t)) * loop.every
+        reference, *_ = loop.reference.at(ticks)
         reference = low_passed(reference, motion)[samples]
         position = low_passed(run.q, motion)[samples]
         measured_errors.append(reference - motion.q)
@@ -105,4 +109,5 @@ def error_ratio(runs: Runs) -> np.ndarray:
     residual = measured - slope * expected
     inflations = np.array([inflation(joint) for joint in residual.T])
     sigma = np.sqrt(inflations * np.mean(residual**2, axis=0) / size)
-    return frozen(np.where(5.0 * sigma < np.abs(slope) * np.log(MAX_GAIN_RATIO), slope, np.nan))
+    clear = 5.0 * sigma < np.abs(slope) * np.log(MAX_GAIN_RATIO)
+    return frozen(np.where(clear, slope, np.nan))

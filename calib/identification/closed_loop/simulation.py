@@ -84,7 +84,8 @@ class Plant:
     def carrying(self, carried: Collection[str]) -> Plant:
         """Return the robot model with these payloads alone."""
         carried_columns = IdentificationModel(self.bodies).carried_columns(carried)
-        return self.with_parameters(self.parameters * np.append(carried_columns, np.ones(len(self.terms))))
+        factors = np.append(carried_columns, np.ones(len(self.terms)))
+        return self.with_parameters(self.parameters * factors)
 
     def run(self, controller: Controller, reference: Reference, sensing: Sensing | None = None) -> SimulatedRun:
         """Return the simulated motion of the robot that follows a reference; see `simulate`."""
@@ -263,7 +264,8 @@ def forward_dynamics(
     else:
         values = shaped(parameters, (len(q), count), "parameters")
     layout = layout_of(plant)
-    failed = loop_kernels.forward_dynamics(*packed(plant), *layout, np.ascontiguousarray(values), q, v, tau, out)
+    contiguous = np.ascontiguousarray(values)
+    failed = loop_kernels.forward_dynamics(*packed(plant), *layout, contiguous, q, v, tau, out)
     require(failed < 0, f"sample {failed}: the inertia matrix is not positive definite", CannotSimulate)
     return out
 
@@ -280,15 +282,18 @@ def _coloured(white: np.ndarray, step: float) -> np.ndarray:
     if not len(white):
         return white
     pole = float(np.exp(-step))
-    bands = np.array([[1.0], [-pole]]) * np.ones(len(white))
-    return np.ascontiguousarray(solve_banded((1, 0), bands, np.sqrt(1.0 - pole**2) * white))
+    filter_bands = np.array([[1.0], [-pole]])
+    bands = filter_bands * np.ones(len(white))
+    scaled_noise = np.sqrt(1.0 - pole**2) * white
+    return np.ascontiguousarray(solve_banded((1, 0), bands, scaled_noise))
 
 
 def layout_of(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the index arrays by which `loop_kernels.set_parameters` writes parameters into the output of `packed`."""
     n = plant.bodies.n
     first = plant.inertial
-    order = np.ascontiguousarray(np.broadcast_to(plant.bodies.order, (plant.bodies.count, 10)), dtype=np.int64)
+    orders = np.broadcast_to(plant.bodies.order, (plant.bodies.count, 10))
+    order = np.ascontiguousarray(orders, dtype=np.int64)
     entries: list[tuple[int, int, int]] = []
     shares: list[float] = []
     owners: list[int] = []
@@ -335,9 +340,11 @@ def body_rows(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:
             before = np.eye(3)
         else:
             before = turns[parent].T
-        result[i, :9] = (before @ bodies.placements[i, :3, :3] @ turns[i]).ravel()
+        rotation = before @ bodies.placements[i, :3, :3] @ turns[i]
+        result[i, :9] = rotation.ravel()
         result[i, 9:12] = before @ bodies.placements[i, :3, 3]
-        result[i, 12:22] = parameters[10 * i : 10 * i + 10][bodies.order[i]]
+        standard = parameters[10 * i : 10 * i + 10]
+        result[i, 12:22] = standard[bodies.order[i]]
     result[:-1, 22] = bodies.scales
     return result
 
@@ -365,7 +372,8 @@ def _drives(terms: Sequence[DriveTerm], values: np.ndarray, n: int, ramp: float 
                 else:
                     settings = [*term.settings]
                 code = getattr(shape_kernels, term.shape.upper())
-                acts.append((row, code, value, [*settings, *[0.0] * (7 - len(settings))], weights))
+                padding = [0.0] * (7 - len(settings))
+                acts.append((row, code, value, [*settings, *padding], weights))
             else:
                 first = 0 if term.shape == "acceleration" else n
                 linear[row, first : first + n] += value * weights
