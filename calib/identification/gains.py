@@ -173,7 +173,8 @@ def identify_gains(
     else:
         gains = _start(columns, load, current)
     x = _parameters(columns, load, current, gains)
-    moving = np.array([joint for joint in range(n) if joint != reference and joint not in own], dtype=int)
+    fitted = [joint for joint in range(n) if joint != reference and joint not in own]
+    moving = np.array(fitted, dtype=int)
     for _ in range(MAX_ROUNDS):
         torque = columns @ x + load
         residual = torque / gains[:, None] - current
@@ -187,7 +188,8 @@ def identify_gains(
         rows = rows / noise[:, None, None]
         triangle = retriangulate(rows.reshape(-1, rows.shape[2]))
         upper = triangle[:-1, :-1]
-        step = -np.linalg.lstsq(upper, triangle[:-1, -1], rcond=1e-12)[0]
+        solution = np.linalg.lstsq(upper, triangle[:-1, -1], rcond=1e-12)[0]
+        step = -solution
         x_step = step[: len(free)]
         gain_step = step[len(free) :]
         largest = float(np.abs(gain_step).max())
@@ -206,7 +208,8 @@ def identify_gains(
             gains,
         )
     inverse = np.linalg.pinv(upper, rcond=1e-12)
-    covariance = (inverse @ inverse.T)[len(free) :, len(free) :] * np.outer(gains, gains)
+    relative = (inverse @ inverse.T)[len(free) :, len(free) :]
+    covariance = relative * np.outer(gains, gains)
     values = np.zeros(len(names))
     values[free] = x / norms
     values[fixed] = fixed_values
@@ -248,7 +251,8 @@ def identify_relative_gains(data: Triangles, joints: int, inflation: np.ndarray,
         free[[reference, *unidentified]] = False
         log_gains = np.log(fit.gains)
         distance = np.abs(log_gains - np.median(log_gains))
-        doubt = np.where(free, np.maximum(sigma / MAX_SIGMA, distance / np.log(MAX_FACTOR)), 0.0)
+        by_distance = distance / np.log(MAX_FACTOR)
+        doubt = np.where(free, np.maximum(sigma / MAX_SIGMA, by_distance), 0.0)
         if doubt.max() <= 1.0:
             estimated = free & (formal_sigma > 0.0)
             factor = np.where(estimated, sigma / np.where(formal_sigma > 0.0, formal_sigma, 1.0), 1.0)
@@ -280,7 +284,8 @@ def _jackknife(
     with np.errstate(invalid="ignore"):
         deviation = np.array(log_gains) - np.mean(log_gains, axis=0)
     squares = np.nan_to_num(deviation, nan=np.inf) ** 2
-    return np.sqrt((len(blocks) - 1) / len(blocks) * np.sum(squares, axis=0))
+    factor = (len(blocks) - 1) / len(blocks)
+    return np.sqrt(factor * np.sum(squares, axis=0))
 
 
 def _most_distant(error: NotConverged, reference: int, unidentified: Sequence[int]) -> int:
@@ -305,7 +310,8 @@ def _start(columns: np.ndarray, load: np.ndarray, current: np.ndarray) -> np.nda
     for joint in range(n):
         matrix[joint, :, joint] = current[joint]
     matrix[:, :, n:] = -columns
-    solution, *_ = np.linalg.lstsq(matrix.reshape(-1, n + p), load.ravel(), rcond=1e-12)
+    flat = matrix.reshape(-1, n + p)
+    solution, *_ = np.linalg.lstsq(flat, load.ravel(), rcond=1e-12)
     gains = np.abs(solution[:n])
     median = float(np.median(gains))
     return np.where(gains > MIN_START * median, gains, max(median, 1e-3))
@@ -315,5 +321,6 @@ def _parameters(columns: np.ndarray, load: np.ndarray, current: np.ndarray, gain
     """Return the least-squares parameters (p,) at these gains."""
     matrix = columns / gains[:, None, None]
     target = current - load / gains[:, None]
-    x, *_ = np.linalg.lstsq(matrix.reshape(-1, columns.shape[2]), target.ravel(), rcond=1e-12)
+    flat = matrix.reshape(-1, columns.shape[2])
+    x, *_ = np.linalg.lstsq(flat, target.ravel(), rcond=1e-12)
     return x

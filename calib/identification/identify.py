@@ -359,7 +359,8 @@ def _identified(
 
     say("essential parameters")
     elimination = _essential(fit, settings)
-    base_columns = problem.pooled.factors.reshape(-1, len(values) + 1)[:, : base.b]
+    stacked = problem.pooled.factors.reshape(-1, len(values) + 1)
+    base_columns = stacked[:, : base.b]
     condition = condition_numbers(base_columns)
     return Identification(
         dynamics=dynamics,

@@ -272,7 +272,8 @@ def options_of(keys: IdentifySettings, source: str = "settings") -> IdentifyOpti
     terms = []
     for number, row in enumerate(keys.term, 1):
         with refused_as(UsageError, CalibError, f"{source}: [[term]] number {number}: {{}}"):
-            terms.append(term(row.name, row.shape, row.joint, *row.settings, side=row.side))
+            drive_term = term(row.name, row.shape, row.joint, *row.settings, side=row.side)
+            terms.append(drive_term)
     torque_rows = ROWS[keys.rows]
     settings = IdentificationSettings(
         **choices,
@@ -284,9 +285,10 @@ def options_of(keys: IdentifySettings, source: str = "settings") -> IdentifyOpti
     )
     for name, file in keys.files.items():
         check_keys(dict.fromkeys(file.payload), keys.payload, f'{source}: files."{name}".payload')
+    every = FileSettings(keys.recording, keys.filter, gains=keys.gains)
     return IdentifyOptions(
         settings=settings,
-        every=FileSettings(keys.recording, keys.filter, gains=keys.gains),
+        every=every,
         files=keys.files,
         slow=keys.slow,
         gain_pair=keys.gain_identification,

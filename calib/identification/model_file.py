@@ -154,6 +154,7 @@ def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, An
     for term, value in zip(model.columns, dynamics.values[inertial:]):
         acts = [[row, [list(pair) for pair in motion]] for row, motion in term.acts]
         settings = [float(setting) if np.isfinite(setting) else "inf" for setting in term.settings]
+        term_unit = per_ampere(term.unit, unit)
         terms.append(
             {
                 "name": term.name,
@@ -163,18 +164,20 @@ def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, An
                 "side": term.side,
                 "linear": term.linear,
                 "value": float(value),
-                "unit": per_ampere(term.unit, unit),
+                "unit": term_unit,
             }
         )
+    bodies = dict(zip(model.names[:inertial], dynamics.values[:inertial].tolist()))
+    base_expressions = dict(zip(base.names, expressions(base)))
     return {
         "robot": ROBOT,
         "kind": model.torque_rows.name,
         "unit": unit,
         "gravity": model.bodies.gravity.tolist(),
         "payloads": payloads,
-        "bodies": dict(zip(model.names[:inertial], dynamics.values[:inertial].tolist())),
+        "bodies": bodies,
         "terms": terms,
-        "base": dict(zip(base.names, expressions(base))),
+        "base": base_expressions,
         "regrouping": regrouping(base),
         "covariance": folders.COVARIANCE,
         "note": NOTE,
@@ -185,7 +188,8 @@ def regrouping(base: Base) -> dict[str, dict[str, float]]:
     """Return for each base parameter its standard parameters and their coefficients."""
     coefficients = {}
     for name, row in zip(base.names, base.transform):
-        coefficients[name] = {base.standard[column]: float(row[column]) for column in np.flatnonzero(row)}
+        used = np.flatnonzero(row)
+        coefficients[name] = {base.standard[column]: float(row[column]) for column in used}
     return coefficients
 
 

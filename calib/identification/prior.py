@@ -245,8 +245,9 @@ def find_prior(
     single_covariance[np.diag_indices(base.b)] *= 1.0 + 1e-9
     deviation = frozen(np.sqrt(np.diag(single_covariance)))
     first = FirstFit(frozen(std), frozen(inflation), frozen(values[: base.b]), rest_weights)
+    prior_covariance = single_covariance + common_root @ common_root.T
     return Prior(
-        covariance=frozen(single_covariance + common_root @ common_root.T),
+        covariance=frozen(prior_covariance),
         deviation=deviation,
         sizes={name: float(np.exp(log_size)) for name, log_size in zip(sizes.names, t) if name},
         source=source,
@@ -297,7 +298,8 @@ def weighing(
     parameters_of_row = np.einsum("gik,gik->g", columns @ covariance, columns) / (std**2 * inflation)
     inflation = np.minimum(residual_inflation(rows, values), MAX_INFLATION)
     counts = np.maximum(data.rows, 1)
-    squares = np.sum((data.factors @ np.append(values, -1.0)) ** 2, axis=1)
+    residual = data.factors @ np.append(values, -1.0)
+    squares = np.sum(residual**2, axis=1)
     freedom = np.maximum(data.rows - inflation * parameters_of_row, 0.1 * counts)
     std = np.sqrt(squares / freedom)
     torque_squares = np.sum(data.factors[:, :, -1] ** 2, axis=1)
@@ -376,14 +378,16 @@ def _sizes(
     # Logarithms of the sizes that explain all torque, each alone; of what no torque shows, nothing is known.
     torque_columns = data.factors[:, :, :-1] @ columns
     squares = np.sum(torque_columns**2, axis=(0, 1))
-    total = max(float(np.sum(data.factors[:, :, -1] ** 2)), 1e-300)
+    target_square = np.sum(data.factors[:, :, -1] ** 2)
+    total = max(float(target_square), 1e-300)
     size_squares = np.bincount(member, squares, len(names))
     min_squares = max(1e-12 * float(size_squares.max()), 1e-300)
     explaining = 0.5 * np.log(total / np.maximum(size_squares, min_squares))
 
     # Sizes of the bodies' parameters are within factors of the robot's own parameters of their kind.
     count = np.maximum(np.bincount(member, minlength=len(names)), 1)
-    mean_square = np.bincount(member[: model.p], shared[:, 0] ** 2, len(names)) / count
+    shared_squares = np.bincount(member[: model.p], shared[:, 0] ** 2, len(names))
+    mean_square = shared_squares / count
     of_robot = explaining[single_count] + 0.5 * np.log(np.maximum(mean_square, 1e-300))
     has_robot = mean_square > 0.0
     lower = np.where(has_robot, of_robot + np.log(MIN_CAD_DEVIATION), -np.inf)
@@ -406,7 +410,8 @@ def _posterior(factor: np.ndarray, columns: np.ndarray, deviations: np.ndarray) 
     stacked[:b, p] = factor[:b, b]
     stacked[b:, :p] = np.eye(p)
     upper = retriangulate(stacked, overwrite=True)
-    inverse = np.asarray(scipy.linalg.solve_triangular(upper[:p, :p], np.eye(p)))
+    identity = np.eye(p)
+    inverse = np.asarray(scipy.linalg.solve_triangular(upper[:p, :p], identity))
     root = whitened @ inverse
     return root @ upper[:p, p], root @ root.T
 
@@ -421,7 +426,8 @@ def _most_probable(factor: np.ndarray, columns: np.ndarray, sizes: _Sizes, start
         """Return the negative logarithm of evidence times prior, and its gradient."""
         root = unscaled * sizes.deviations(t)
         # Inverse of the root of the covariance of y.
-        inverse, _ = dtrtri(np.linalg.cholesky(root @ root.T + np.eye(b)), lower=1)
+        information = root @ root.T + np.eye(b)
+        inverse, _ = dtrtri(np.linalg.cholesky(information), lower=1)
         whitened_root = inverse @ root
         whitened = inverse @ target
         deviation = (t - sizes.centre) / sizes.width
@@ -431,13 +437,9 @@ def _most_probable(factor: np.ndarray, columns: np.ndarray, sizes: _Sizes, start
         return value, deviation / sizes.width - np.bincount(sizes.member, evidence_slope, len(t))
 
     bounds = np.column_stack([sizes.lower, sizes.upper])
+    clipped_start = np.clip(start, sizes.lower, sizes.upper)
     solution = scipy.optimize.minimize(
-        cost,
-        np.clip(start, sizes.lower, sizes.upper),
-        jac=True,
-        method="L-BFGS-B",
-        bounds=bounds,
-        options={"maxiter": 60, "ftol": 1e-8},
+        cost, clipped_start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60, "ftol": 1e-8}
     )
     return np.asarray(solution.x)
 
@@ -446,7 +448,8 @@ def rods(chain: Chain, model: IdentificationModel, total: float = 1.0) -> np.nda
     """Return parameters (B, 10) of rods from each body's frame to the next, mass by length and thickness."""
     bodies = model.bodies
     moves = bodies.coordinates >= 0
-    ends = np.array([np.asarray(chain.tail)[:3, 3]] * bodies.count)
+    tail_end = np.asarray(chain.tail)[:3, 3]
+    ends = np.array([tail_end] * bodies.count)
     for i, parent in enumerate(bodies.parents):
         if parent >= 0 and moves[i]:
             ends[parent] = bodies.placements[i][:3, 3]

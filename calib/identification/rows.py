@@ -189,7 +189,8 @@ class ObservationRows:
     @property
     def counted(self) -> np.ndarray:
         """How many rows each one counts as (M, rows), where residuals are averaged."""
-        return np.where(self.standing > 0.0, self._frictions * self.rest.count, 1.0) * self.present
+        counted = self._frictions * self.rest.count
+        return np.where(self.standing > 0.0, counted, 1.0) * self.present
 
     @property
     def _frictions(self) -> np.ndarray:
@@ -234,12 +235,9 @@ class ObservationRows:
         names = [term.name for term in terms]
         units = [term.unit for term in terms]
         matrix = np.concatenate([self.matrix, columns], axis=2)
+        all_coulomb = np.hstack([self.coulomb, coulomb])
         return replace(
-            self,
-            coulomb=np.hstack([self.coulomb, coulomb]),
-            names=(*self.names, *names),
-            units=(*self.units, *units),
-            matrix=matrix,
+            self, coulomb=all_coulomb, names=(*self.names, *names), units=(*self.units, *units), matrix=matrix
         )
 
 
@@ -261,7 +259,8 @@ def observe(model: RegressorModel, columns: np.ndarray, case: Case, decimator: D
 
     # Transposed, because readers take the columns of one row.
     sample_count = len(kept(segment, decimator))
-    matrix = np.zeros((model.rows, len(columns), sample_count)).transpose(2, 0, 1)
+    storage = np.zeros((model.rows, len(columns), sample_count))
+    matrix = storage.transpose(2, 0, 1)
     states = segmented_states(model.columns, case)
     step = max(1, BLOCK // decimator.factor) * decimator.factor
     first = 0
@@ -292,13 +291,14 @@ def observe(model: RegressorModel, columns: np.ndarray, case: Case, decimator: D
     swing = np.zeros(target.shape)
     slowness = np.ones(target.shape)
     coulomb = np.zeros((model.rows, len(columns)), dtype=bool)
+    block = np.zeros(len(target), dtype=int)
     return ObservationRows(
         names=names,
         units=units,
         matrix=matrix,
         target=target,
         present=present,
-        block=np.zeros(len(target), dtype=int),
+        block=block,
         rate=rate,
         standing=standing,
         swing=swing,
@@ -358,7 +358,9 @@ def term_columns(term: DriveTerm, case: Case, load: np.ndarray | None = None) ->
 def segmented_states(terms: Sequence[DriveTerm], case: Case) -> np.ndarray:
     """Return the states (s, N) of friction with hysteresis, zero at the start of each segment."""
     motion = case.motion
-    states = [drives.friction_states(terms, motion.q[start:stop].T) for start, stop in segments(motion.segment)]
+    states = []
+    for start, stop in segments(motion.segment):
+        states.append(drives.friction_states(terms, motion.q[start:stop].T))
     return np.concatenate(states, axis=1)
 
 
@@ -422,10 +424,12 @@ def pool(data: Triangles, rows: int, blocks: Sequence[int] | None = None) -> Tri
     if blocks is None:
         blocks = range(data.groups // rows)
     # Groups of each row (rows, blocks).
-    index = np.add.outer(np.arange(rows), rows * np.array(blocks, dtype=int))
+    first_rows = rows * np.array(blocks, dtype=int)
+    index = np.add.outer(np.arange(rows), first_rows)
     size = data.parameters + 1
     factors = [retriangulate(data.factors[groups].reshape(-1, size)) for groups in index]
-    return replace(data, factors=np.stack(factors), rows=data.rows[index].sum(axis=1))
+    counts = data.rows[index].sum(axis=1)
+    return replace(data, factors=np.stack(factors), rows=counts)
 
 
 def _regressor(model: RegressorModel, case: Case, part: slice, states: np.ndarray) -> np.ndarray:
@@ -434,7 +438,8 @@ def _regressor(model: RegressorModel, case: Case, part: slice, states: np.ndarra
     q = motion.q[part]
     v = motion.v[part]
     a = motion.a[part]
-    return model.regressor(q, v, a, None, case.carried, states[:, part], **case.deflected(part))
+    deflected = case.deflected(part)
+    return model.regressor(q, v, a, None, case.carried, states[:, part], **deflected)
 
 
 def power_block(
@@ -450,7 +455,9 @@ def power_block(
     motion = case.motion
     start = max(segment.start, part.start - DIFFERENCE_REACH)
     stop = min(segment.stop, part.stop + DIFFERENCE_REACH)
-    all_energies = model.energy_columns(motion.q[start:stop], motion.v[start:stop], case.carried)
+    q = motion.q[start:stop]
+    v = motion.v[start:stop]
+    all_energies = model.energy_columns(q, v, case.carried)
     energies = all_energies[:, columns]
     power = slope(energies, motion.rate)
     plain_power = np.zeros_like(energies)
@@ -461,7 +468,8 @@ def power_block(
 
     q = motion.q[part]
     v = motion.v[part]
-    regressor = model.regressor(q, v, np.zeros_like(v), None, case.carried, states[:, part])
+    no_acceleration = np.zeros_like(v)
+    regressor = model.regressor(q, v, no_acceleration, None, case.carried, states[:, part])
     losses = regressor.transpose(2, 1, 0)[columns, 0]
     stores_energy = []
     for column in columns:

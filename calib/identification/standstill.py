@@ -93,7 +93,8 @@ def with_standstills(
     for part, case in zip(all_rows, cases):
         stands = thinned(model.torque_rows.of_joints(standing_joints(case, v0)), case.motion.segment, decimator)
         masks.append(stands & part.present & held)
-    moving = np.sum([(part.present & ~mask).sum(axis=0) for part, mask in zip(all_rows, masks)], axis=0)
+    counts = [(part.present & ~mask).sum(axis=0) for part, mask in zip(all_rows, masks)]
+    moving = np.sum(counts, axis=0)
     result = []
     for part, case, mask in zip(all_rows, cases, masks):
         segment = case.motion.segment[kept(case.motion.segment, decimator)]
@@ -129,7 +130,8 @@ def _acted(acts: Sequence[tuple[int, object]], torque_rows: TorqueRows, side: st
 
 def _runs(mask: np.ndarray) -> list[tuple[int, int]]:
     """Return (start, stop) of each run of true values."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
+    padded = np.concatenate([[0], mask.astype(int), [0]])
+    edges = np.flatnonzero(np.diff(padded))
     return [(int(start), int(stop)) for start, stop in edges.reshape(-1, 2)]
 
 
@@ -196,7 +198,8 @@ class DividedRows:
         if not self.standstills.any():
             return self.moving
         scaled = self.standing.factors * np.sqrt(weights.worth)[:, None, None]
-        renewed = self.swinging.factors * np.sqrt(weights.worth / weights.reach)[:, None, None]
+        scale = np.sqrt(weights.worth / weights.reach)
+        renewed = self.swinging.factors * scale[:, None, None]
         both = np.concatenate([self.moving.factors, scaled, renewed], axis=1)
         frictions = self.standstills * (1.0 + self.swing / weights.reach)
         counted = np.round(frictions * weights.count)
@@ -253,9 +256,12 @@ def with_slowness(
     Args:
         values: (p,) of a fit, whose residuals are taken.
     """
-    peak = np.max([np.abs(case.motion.v).max(axis=0) for case in cases], axis=0)
+    peaks = [np.abs(case.motion.v).max(axis=0) for case in cases]
+    peak = np.max(peaks, axis=0)
     slow_masks = []
-    squares, counts = np.zeros((2, all_rows[0].target.shape[1])), np.zeros((2, all_rows[0].target.shape[1]))
+    shape = (2, all_rows[0].target.shape[1])
+    squares = np.zeros(shape)
+    counts = np.zeros(shape)
     for part, case in zip(all_rows, cases):
         slow = torque_rows.of_joints(np.abs(case.motion.v) < SLOW * peak)
         slow = thinned(slow, case.motion.segment, decimator)
@@ -267,11 +273,13 @@ def with_slowness(
         slow_masks.append(slow)
     fast, slow = squares / np.maximum(counts, 1.0)
     differ = (counts.min(axis=0) >= MIN_SLOW) & (slow > fast)
-    factor = np.where(differ, np.sqrt(fast / np.where(differ, slow, 1.0)), 1.0)
-    return [
-        replace(part, slowness=frozen(np.where(slow_mask, factor, 1.0)))
-        for part, slow_mask in zip(all_rows, slow_masks)
-    ]
+    ratio = fast / np.where(differ, slow, 1.0)
+    factor = np.where(differ, np.sqrt(ratio), 1.0)
+    result = []
+    for part, slow_mask in zip(all_rows, slow_masks):
+        slowness = frozen(np.where(slow_mask, factor, 1.0))
+        result.append(replace(part, slowness=slowness))
+    return result
 
 
 def left_out_error(

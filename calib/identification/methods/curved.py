@@ -89,7 +89,8 @@ class Curved:
         return self.rows.T @ (0.5 * np.nan_to_num(bend + bend.T)) @ self.rows
 
     def _compare(self, u: np.ndarray, slope: np.ndarray) -> None:
-        differences = np.ravel(_differences(lambda x: np.array([self.h(x)]), u))
+        slopes = _differences(lambda x: np.array([self.h(x)]), u)
+        differences = np.ravel(slopes)
         size = _sizes(u)
         analytic = slope * size
         numeric = differences * size
@@ -113,7 +114,8 @@ class Curved:
 
 def _sizes(u: np.ndarray) -> np.ndarray:
     """Return the size (k,) of each argument, of at least a thousandth of the largest."""
-    return np.maximum(np.abs(u), max(1e-3 * float(np.abs(u).max()), 1e-9))
+    smallest = max(1e-3 * float(np.abs(u).max()), 1e-9)
+    return np.maximum(np.abs(u), smallest)
 
 
 def _differences(function: Callable[[np.ndarray], np.ndarray], u: np.ndarray) -> np.ndarray:
@@ -156,7 +158,11 @@ def make_curved(constraint: CurvedConstraint, row: Callable[[Mapping[str, float]
     # by complex steps, without rounding (Squire & Trapp 1998)
     def derivatives(u: np.ndarray) -> np.ndarray:
         step = 1e-30
-        return np.array([np.imag(value(u + 1j * step * direction)) / step for direction in np.eye(len(u))])
+        slopes = []
+        for direction in np.eye(len(u)):
+            shifted = value(u + 1j * step * direction)
+            slopes.append(np.imag(shifted) / step)
+        return np.array(slopes)
 
     rows = _rows(names, row)
     return Curved(name, names, rows, value, derivatives, False)
@@ -188,7 +194,9 @@ def _parsed(text: str, location: str) -> tuple[ast.expr, tuple[str, ...]]:
         refuse_option(location, f"is not a formula of at most {MAX_FORMULA} characters: 'XX2 * ZZ2 >= XZ2**2'")
     if isinstance(tree, ast.Compare) and len(tree.ops) == 1 and isinstance(tree.ops[0], (ast.GtE, ast.LtE)):
         ends = (tree.left, tree.comparators[0])
-        larger, less = ends if isinstance(tree.ops[0], ast.GtE) else ends[::-1]
+        larger, less = ends
+        if not isinstance(tree.ops[0], ast.GtE):
+            larger, less = ends[::-1]
         tree = ast.BinOp(larger, ast.Sub(), less)
     try:
         with np.errstate(all="ignore"):

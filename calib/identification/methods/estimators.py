@@ -66,12 +66,16 @@ def tls(
     if inflation is not None:
         scale = np.sqrt(inflation - 1.0) / (1.0 if std is None else std)
         group_scale = np.broadcast_to(scale, (data.groups,))
-        prior_rows = (data.factors[:, :, :p] * group_scale[:, None, None]).reshape(-1, p)
+        scaled = data.factors[:, :, :p] * group_scale[:, None, None]
+        prior_rows = scaled.reshape(-1, p)
         independent = int(np.sum(data.rows / inflation))
-    covariance = _covariance(factor[:p, :p], noise, values, variance, count, data.names, prior_rows)
+    upper = factor[:p, :p]
+    covariance = _covariance(upper, noise, values, variance, count, data.names, prior_rows)
     dof = max(independent - p, 1)
-    estimate = Estimate(data.names, data.units, values, covariance, float(np.sqrt(variance)), dof)
-    group_std = np.sqrt(data.residual_squares(values) / np.maximum(data.rows * (1.0 - p / count), 1e-300))
+    residual_std = float(np.sqrt(variance))
+    estimate = Estimate(data.names, data.units, values, covariance, residual_std, dof)
+    freedoms = np.maximum(data.rows * (1.0 - p / count), 1e-300)
+    group_std = np.sqrt(data.residual_squares(values) / freedoms)
     return LinearFit(estimate, group_std, *condition_numbers(factor[:p, :p]))
 
 
@@ -101,7 +105,8 @@ def _null_direction(
     if k:
         if np.abs(np.diag(upper)[:k]).min() <= 1e-12 * np.abs(upper).max():
             raise Unidentifiable("the exact columns are dependent", [names[c] for c in exact if c < len(names)])
-        direction[exact] = -scipy.linalg.solve_triangular(upper[:k, :k], upper[:k, k:] @ direction[noisy])
+        coupled = upper[:k, k:] @ direction[noisy]
+        direction[exact] = -scipy.linalg.solve_triangular(upper[:k, :k], coupled)
     return direction, float(values[-1])
 
 
@@ -127,7 +132,9 @@ def _covariance(
     total = variance * noise[-1] ** 2 + column_noise @ x**2
     middle = np.diag(column_noise) * total - np.outer(column_noise * x, column_noise * x)
     extra = (prior_rows / norms) @ inverse
-    return (inverse * total + rows * inverse @ middle @ inverse + total * extra.T @ extra) / np.outer(norms, norms)
+    noise_part = rows * inverse @ middle @ inverse
+    extra_part = total * extra.T @ extra
+    return (inverse * total + noise_part + extra_part) / np.outer(norms, norms)
 
 
 CONSISTENT, CONSTRAINED = "; parameters satisfy [constraints]", " under constraints on its parameters"
@@ -148,7 +155,8 @@ def scaled_tls(pooled: Triangles, std: np.ndarray, exact: np.ndarray, inflation:
         inflation: (rows,) of the residuals; None: every row counts.
     """
     p = pooled.parameters
-    stacked = np.sum((pooled.factors / std[:, None, None]) ** 2, axis=(0, 1))
+    weighted = pooled.factors / std[:, None, None]
+    stacked = np.sum(weighted**2, axis=(0, 1))
     size = np.sqrt(stacked / max(float(pooled.rows.sum()), 1.0))
     noise = np.append(np.where(exact, 0.0, COLUMN_NOISE * size[:p]), 1.0)
     return tls(pooled, noise, std, inflation)
@@ -203,7 +211,8 @@ def _reweighted(
 def samples_of(problem: IdentificationProblem) -> Samples:
     """Return the rows of all recordings, grouped by sample."""
     rows = problem.rows
-    matrix = np.concatenate([part.matrix * part.weight[:, :, None] for part in rows])
+    weighted = [part.matrix * part.weight[:, :, None] for part in rows]
+    matrix = np.concatenate(weighted)
     target = np.concatenate([part.target * part.weight for part in rows])
     present = np.concatenate([part.present for part in rows])
     return stack(matrix, target, present, rows[0].names, rows[0].units)

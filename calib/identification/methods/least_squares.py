@@ -89,7 +89,8 @@ def _regularised(
     covariance = np.diag(variances)
     if prior is not None:
         covariance[:base_count, :base_count] = prior.covariance / tempering
-    fit = ridge(pooled, np.zeros(len(ridges)), covariance, std * np.sqrt(inflation))
+    weighted_std = std * np.sqrt(inflation)
+    fit = ridge(pooled, np.zeros(len(ridges)), covariance, weighted_std)
     finite = np.isfinite(np.diag(covariance))
     root = np.linalg.cholesky(covariance[np.ix_(finite, finite)])
     whitened = np.zeros((len(root), len(ridges)))
@@ -119,7 +120,8 @@ def _settled(problem: IdentificationProblem, prior: Prior) -> tuple[LinearFit, n
         fit, covariance, prior_rows = _regularised(problem, prior, std, inflation, tempering)
     values = _braking(problem, fit.estimate.values, std * np.sqrt(inflation), prior_rows)
     covariance[:base_count, :base_count] *= tempering
-    untempered = ridge(pooled, np.zeros(len(values)), covariance, std * np.sqrt(inflation))
+    weighted_std = std * np.sqrt(inflation)
+    untempered = ridge(pooled, np.zeros(len(values)), covariance, weighted_std)
     fit = replace(untempered, estimate=replace(untempered.estimate, values=values))
     return fit, prior_rows, std, inflation
 
@@ -156,7 +158,8 @@ def _driving(problem: IdentificationProblem, values: np.ndarray) -> np.ndarray:
         return np.zeros(0, dtype=bool)
     richer_terms = [term for term in problem.terms[base.b :] if term is not None]
     richer_model = model.with_terms(*richer_terms)
-    standard = np.concatenate([base.to_standard(values[: base.b]), values[base.b :]])
+    base_standard = base.to_standard(values[: base.b])
+    standard = np.concatenate([base_standard, values[base.b :]])
     return driving(Dynamics(richer_model, standard), problem.cases)
 
 

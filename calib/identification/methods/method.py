@@ -97,7 +97,8 @@ class IdentificationProblem:
     @property
     def exact(self) -> np.ndarray:
         """Mask (p,) of columns that have no noise from measured positions: constants and signs."""
-        return np.array([term is not None and term.form.exact for term in self.terms], dtype=bool)
+        exact = [term is not None and term.form.exact for term in self.terms]
+        return np.array(exact, dtype=bool)
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +172,8 @@ class MethodEstimate:
         if self.beforehand is None:
             return self.pooled, self.std, self.inflation
         # The prior is one more group of rows.
-        prior_factor = retriangulate(np.pad(self.beforehand, ((0, 0), (0, 1))))
+        with_target = np.pad(self.beforehand, ((0, 0), (0, 1)))
+        prior_factor = retriangulate(with_target)
         factors = np.concatenate([self.pooled.factors, prior_factor[None]])
         counts = [*self.pooled.rows, len(self.beforehand)]
         rows = frozen(counts, int)

@@ -44,7 +44,9 @@ def tuning(joints: int, efficiency: float = 0.95) -> float:
 
     def excess(constant: float) -> float:
         w = weights(np.sqrt(square), "huber", constant)
-        return float(np.mean(w * square) ** 2 / np.mean(w**2 * square) / joints - efficiency)
+        mean_square = np.mean(w * square) ** 2
+        fourth = np.mean(w**2 * square)
+        return float(mean_square / fourth / joints - efficiency)
 
     return float(brentq(excess, 0.05, 20.0 * np.sqrt(joints)))  # type: ignore[arg-type]
 
@@ -80,8 +82,10 @@ def variance_factor(size: np.ndarray, joints: np.ndarray) -> float:
     n = np.maximum(joints, 1)
     w = weigh(size, joints)
     h = 1e-4
-    above = np.where(w > 0.0, weigh(size * (1.0 + h), joints, False), 0.0)
-    below = np.where(w > 0.0, weigh(size * (1.0 - h), joints, False), 0.0)
+    larger = weigh(size * (1.0 + h), joints, False)
+    above = np.where(w > 0.0, larger, 0.0)
+    smaller = weigh(size * (1.0 - h), joints, False)
+    below = np.where(w > 0.0, smaller, 0.0)
     # w' d
     slope = (above - below) / (2.0 * h)
     share = joints / joints.sum()
@@ -222,7 +226,8 @@ def row_irls(data: Samples) -> LinearFit:
     for _ in range(ROUNDS):
         residual = data.target - data.matrix @ values
         std = _spreads(data, residual)
-        fit = wls(_triangles(data, robust.weights(np.abs(residual) / std, "cauchy")), std)
+        row_weights = robust.weights(np.abs(residual) / std, "cauchy")
+        fit = wls(_triangles(data, row_weights), std)
         step = fit.estimate.values - values
         values = fit.estimate.values
         if np.all(np.abs(step) <= 1e-3 * fit.estimate.sigma):
@@ -268,7 +273,8 @@ def _roots(noise: np.ndarray, present: np.ndarray) -> tuple[np.ndarray, np.ndarr
     for k, pattern in enumerate(patterns):
         block = np.ix_(pattern, pattern)
         lower = np.linalg.cholesky(noise[block])
-        roots[k][block] = scipy.linalg.solve_triangular(lower, np.eye(len(lower)), lower=True)
+        identity = np.eye(len(lower))
+        roots[k][block] = scipy.linalg.solve_triangular(lower, identity, lower=True)
     return roots, pattern_index.reshape(-1)
 
 
@@ -281,7 +287,8 @@ def _factor(data: Samples, noise: np.ndarray, weights: np.ndarray) -> np.ndarray
         part = slice(start, start + CHUNK)
         root = roots[pattern[part]] * np.sqrt(weights[part])[:, None, None]
         target = np.einsum("kij,kj->ki", root, data.target[part])
-        total = absorb(total, (root @ data.matrix[part]).reshape(-1, p), target.reshape(-1))
+        whitened = (root @ data.matrix[part]).reshape(-1, p)
+        total = absorb(total, whitened, target.reshape(-1))
     return total.factors[0]
 
 

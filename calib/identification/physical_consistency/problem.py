@@ -166,12 +166,14 @@ def make_problem(information: Information, references: PriorBodies) -> BodyCost:
             sizes[k] = min(sizes[k], mass * ROTOR**2)
     factor = np.column_stack([columns, target])
     fixed = information.dynamics.values[inertial:]
+    reference_bodies = pseudo_inertia.from_standard(references.parameters)
+    unidentified_sizes = np.where(identified, sizes, 0.0)
     return BodyCost(
         factor=factor,
         bodies=model.bodies.count,
-        references=pseudo_inertia.from_standard(references.parameters),
+        references=reference_bodies,
         drawn=references.drawn,
-        sizes=np.where(identified, sizes, 0.0),
+        sizes=unidentified_sizes,
         positive=positive,
         fixed=fixed,
     )
@@ -222,7 +224,8 @@ def _euclidean_prior(problem: BodyCost, pull: float) -> np.ndarray:
         root = np.sqrt(0.5 * weight)
         blocks.append(root * basis)
         targets.append(root * identity)
-    terms = np.sqrt(np.where(problem.positive, 0.5 * DRIVE, 1.0)) * (problem.sizes > 0.0)
+    weights = np.sqrt(np.where(problem.positive, 0.5 * DRIVE, 1.0))
+    terms = weights * (problem.sizes > 0.0)
     blocks.append(np.diag(terms))
     targets.append(terms * problem.positive)
     matrix = np.asarray(scipy.linalg.block_diag(*blocks))

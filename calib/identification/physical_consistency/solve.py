@@ -208,13 +208,15 @@ def find_possible(information: Information, weight: float | None = None, prior: 
     dynamics = Dynamics(model, values)
     covariance = _covariance(problem, gamma, curvature_at)
     notes = (*best.references.notes, *_notes(model, problem, values))
+    distance = information.distance(values)
+    reached_margins = np.array(margins)
     return PossibleBodies(
         dynamics=dynamics,
         covariance=covariance,
         weight=gamma,
         doubt=doubt,
-        margins=np.array(margins),
-        distance=information.distance(values),
+        margins=reached_margins,
+        distance=distance,
         nearest=nearest_distance,
         allowed=allowed,
         blamed=blamed,
@@ -346,12 +348,15 @@ def _evidence(problem: BodyCost, gamma: float, values: np.ndarray) -> float:
     curvature = curvature[np.ix_(free, free)]
     unit = np.sqrt(np.diag(curvature))
     root = np.linalg.cholesky(curvature / np.outer(unit, unit))
-    half_log_det = float(np.log(np.diag(root)).sum() + np.log(unit).sum())
+    log_diagonal = np.log(np.diag(root)).sum()
+    half_log_det = float(log_diagonal + np.log(unit).sum())
     nu = gamma + 5.0
-    norm = 2.0 * nu * np.log(gamma) - 2.0 * gamma - 2.0 * nu * np.log(2.0) - float(multigammaln(nu / 2.0, 4))
+    log_gamma = float(multigammaln(nu / 2.0, 4))
+    norm = 2.0 * nu * np.log(gamma) - 2.0 * gamma - 2.0 * nu * np.log(2.0) - log_gamma
     # The scale of P⁰ counts where references compete.
     scale = 2.5 * float(np.linalg.slogdet(problem.references)[1].sum())
-    return -cost(problem, gamma, values) - half_log_det + norm * float(problem.drawn.sum()) - scale
+    drawn_norm = norm * float(problem.drawn.sum())
+    return -cost(problem, gamma, values) - half_log_det + drawn_norm - scale
 
 
 def _covariance(problem: BodyCost, gamma: float, values: np.ndarray) -> np.ndarray:
@@ -359,7 +364,8 @@ def _covariance(problem: BodyCost, gamma: float, values: np.ndarray) -> np.ndarr
     free = np.ix_(problem.free, problem.free)
     _, curvature = derivatives(problem, gamma, values)
     covariance = np.zeros((len(values), len(values)))
-    covariance[free] = _solved(curvature[free], np.eye(int(problem.free.sum())))
+    identity = np.eye(int(problem.free.sum()))
+    covariance[free] = _solved(curvature[free], identity)
     return 0.5 * (covariance + covariance.T)
 
 
