@@ -77,7 +77,8 @@ def hopfield(
     bias = factor[:p, :p].T @ factor[:p, p]
     # of the sigmoid, as the survey's
     width = 5.0
-    step = rate * width / bound / np.linalg.norm(factor[:p, :p], 2) ** 2
+    largest = np.linalg.norm(factor[:p, :p], 2)
+    step = rate * width / bound / largest**2
     u = width * np.arctanh(np.asarray(start) / bound)
     x = np.asarray(start, dtype=float)
     count = 0
@@ -149,7 +150,9 @@ class _Hopfield(_Network):
         largest = float(np.abs(start).max())
         # without start values: what the weakest column needs to explain all torques
         if not largest:
-            needed = np.linalg.norm(factor[:-1, -1]) / np.linalg.norm(factor[:-1, :-1], axis=0)
+            target_norm = np.linalg.norm(factor[:-1, -1])
+            column_norms = np.linalg.norm(factor[:-1, :-1], axis=0)
+            needed = target_norm / column_norms
             largest = float(needed.max())
         return hopfield(factor, start, 1.5 * largest, self.rate, self.steps)
 

@@ -121,7 +121,9 @@ def simulate_tangents(
     if not np.abs(slopes[:, -1]).max(initial=0.0) < max_slope:
         raise Diverged(f"the loop is unstable, its derivatives diverge: {LOWER}", None)
     t = reference.t[0] + tick * reference.period
-    return Sensitivities(t, *(frozen(x) for x in out), *(frozen(x) for x in slopes))
+    run = [frozen(values) for values in out]
+    run_slopes = [frozen(values) for values in slopes]
+    return Sensitivities(t, *run, *run_slopes)
 
 
 def simulate_differences(
@@ -144,7 +146,8 @@ def simulate_differences(
     differences = [(moved(values + shift) - nominal) / step for shift, step in zip(shifts, steps)]
     slopes = np.stack(differences, axis=-1)
     tick = sample_ticks(len(reference.t), every)
-    return Sensitivities(reference.t[0] + tick * reference.period, *map(frozen, (*nominal, *slopes)))
+    t = reference.t[0] + tick * reference.period
+    return Sensitivities(t, *map(frozen, (*nominal, *slopes)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,7 +170,9 @@ class Stepper:
         """
         from calib.identification.closed_loop import loop_kernels
 
-        q, v, gain = np.array(q), np.array(v), np.empty((q.shape[1], q.shape[1]))
+        q = np.array(q)
+        v = np.array(v)
+        gain = np.empty((q.shape[1], q.shape[1]))
         order, entries, shares, owners, _ = self.layout
         where = (order, entries, shares, owners, np.ascontiguousarray(parameters), q, v, tau, period, gain)
         status, reached = loop_kernels.advance_points(*self.parts, *where)
@@ -197,7 +202,8 @@ class Stepper:
 def stepper(plant: Plant, columns: np.ndarray) -> Stepper:
     """Return the stepper of a robot, with derivatives with respect to the parameters `columns` (c,)."""
     find = np.full(len(plant.parameters), -1)
-    find[np.asarray(columns, dtype=int)] = 2 * plant.bodies.n + np.arange(len(columns))
+    numbers = 2 * plant.bodies.n + np.arange(len(columns))
+    find[np.asarray(columns, dtype=int)] = numbers
     parts = packed(plant)
     layout = (*layout_of(plant), find)
     return Stepper(parts, layout)
@@ -287,12 +293,17 @@ def believed_robot(problem: IdentificationProblem, method: Method, steps: np.nda
     """
     if steps is not None and not isinstance(problem.model, IdentificationModel):
         columns = np.array(problem.base.kept)
-        return BelievedRobot(problem.model, columns, plant_of(problem.model, np.zeros(problem.model.p)), steps)
+        plant = plant_of(problem.model, np.zeros(problem.model.p))
+        return BelievedRobot(problem.model, columns, plant, steps)
     model, columns = with_friction(problem, serial_arm(problem, method))
     terms = model.columns
     size = model.p
     if not model.torque_rows.with_motors:
-        widths = {term.acts[0][0]: term.settings[-1] for term in terms if term.shape == "sign"}
+        widths = {}
+        for term in terms:
+            if term.shape == "sign":
+                joint = term.acts[0][0]
+                widths[joint] = term.settings[-1]
         width = [widths.get(joint, V0) for joint in range(model.n)]
         motors = standard(["Ia Fvm Fcm offm"] * model.n, width, model.prismatic.tolist())
         terms = (*terms, *(replace(motor, name=f"motor {motor.name}") for motor in motors))
@@ -307,7 +318,8 @@ def with_friction(problem: IdentificationProblem, model: IdentificationModel) ->
     """Return a problem's model with all friction terms, and the index (p,) of each parameter in it."""
     extra = [term for term in problem.terms[problem.base.b :] if term is not None]
     model = model.with_terms(*extra)
-    columns = [*problem.base.kept, *range(model.p - len(extra), model.p)]
+    extra_columns = range(model.p - len(extra), model.p)
+    columns = [*problem.base.kept, *extra_columns]
     return model, np.array(columns, dtype=int)
 
 
@@ -338,7 +350,8 @@ def start_of(
             standard[motors[joint]] = own_inertia
     regular = np.append(problem.base.transform @ standard, np.zeros(len(plain) - base_count))
     if serial and not np.any(standard):
-        regular = np.append(problem.base.transform @ _hubs(model, inertia), np.zeros(len(plain) - base_count))
+        base_values = problem.base.transform @ _hubs(model, inertia)
+        regular = np.append(base_values, np.zeros(len(plain) - base_count))
     failure: CalibError | None = None
     for share in SHARES:
         values = share * plain + (1.0 - share) * regular

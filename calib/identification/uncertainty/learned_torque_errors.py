@@ -144,7 +144,8 @@ def _interval_factors(folds: Sequence[_HeldOut], weights: np.ndarray, run_count:
         row_log_sizes, row_errors = _normalised_errors(folds, row, row_weights)
         log_sizes.append(row_log_sizes)
         normalised.append(row_errors)
-    variance = np.array([np.var(log_size[:run_count], ddof=1) for log_size in log_sizes])
+    variances = [np.var(log_size[:run_count], ddof=1) for log_size in log_sizes]
+    variance = np.array(variances)
     freedom = run_count - 1 + BORROWED
     variance = ((run_count - 1) * variance + BORROWED * variance.mean()) / freedom
     variance_of_next_run = variance * (1.0 + 1.0 / run_count)
@@ -299,7 +300,8 @@ def _estimate(identification: Identification, data: Triangles, blocks: Sequence[
     unit = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     eigenvalues, vectors = np.linalg.eigh(information * np.outer(unit, unit))
     root = np.zeros((len(group), len(active)))
-    root[active] = unit[:, None] * vectors / np.sqrt(np.maximum(eigenvalues, 1e-10))
+    size = np.sqrt(np.maximum(eigenvalues, 1e-10))
+    root[active] = unit[:, None] * vectors / size
     return values, root
 
 
@@ -388,7 +390,8 @@ def _variance_weights(folds: Sequence[_HeldOut], run_count: int) -> np.ndarray:
     # A joint that never moves is assessed at rest.
     counts[counts.sum(axis=1) < 0.5 * run_count] = 1.0
 
-    mean_square = np.maximum(np.sum(squares * counts, axis=1) / counts.sum(axis=1), 1e-300)
+    weighted = np.sum(squares * counts, axis=1)
+    mean_square = np.maximum(weighted / counts.sum(axis=1), 1e-300)
     squares = np.maximum(squares / mean_square[:, None], MIN_ERROR**2)
     terms[:, :, 0] /= mean_square[:, None]
 

@@ -110,7 +110,8 @@ def parameter_variances(
         if load_dependent:
             load = model.transmitted(dynamics.values, q_block, v_block, a_block, carried)
         regressor = model.regressor(q_block, v_block, a_block, load, carried, states[:, block])
-        variances.append(np.sum((regressor[:, :, columns] @ root) ** 2, axis=2))
+        by_parameter = regressor[:, :, columns] @ root
+        variances.append(np.sum(by_parameter**2, axis=2))
     return np.concatenate(variances)
 
 
@@ -289,13 +290,10 @@ class TorqueIntervals:
 
     def coverage(self) -> IntervalCoverage:
         """Return the record of the shares of errors within their intervals."""
+        samples = int(self.valid.sum())
+        beyond_percent = 100.0 * float(self.beyond.mean())
         return IntervalCoverage(
-            100.0 * self.covered,
-            100.0 * self.joints,
-            self.median,
-            int(self.valid.sum()),
-            100.0 * float(self.beyond.mean()),
-            self.median_at_rest,
+            100.0 * self.covered, 100.0 * self.joints, self.median, samples, beyond_percent, self.median_at_rest
         )
 
     def ways(self, joints: Sequence[str]) -> list[str]:
