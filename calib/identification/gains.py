@@ -186,7 +186,8 @@ def identify_gains(
         rows = np.concatenate([by_x, by_gain, residual[:, :, None]], axis=2)
         noise = std * np.sqrt(inflation)
         rows = rows / noise[:, None, None]
-        triangle = retriangulate(rows.reshape(-1, rows.shape[2]))
+        stacked = rows.reshape(-1, rows.shape[2])
+        triangle = retriangulate(stacked)
         upper = triangle[:-1, :-1]
         solution = np.linalg.lstsq(upper, triangle[:-1, -1], rcond=1e-12)[0]
         step = -solution
@@ -240,7 +241,8 @@ def identify_relative_gains(data: Triangles, joints: int, inflation: np.ndarray,
     unidentified: tuple[int, ...] = ()
     while True:
         try:
-            fit = identify_gains(pool(data, joints, blocks), {}, inflation, reference=reference, own=unidentified)
+            currents = pool(data, joints, blocks)
+            fit = identify_gains(currents, {}, inflation, reference=reference, own=unidentified)
         except NotConverged as error:
             unidentified = (*unidentified, _most_distant(error, reference, unidentified))
             continue
@@ -277,7 +279,8 @@ def _jackknife(
     for block in blocks:
         remaining = pool(data, joints, [other for other in blocks if other != block])
         try:
-            part = identify_gains(remaining, {}, inflation, fit.gains.tolist(), reference, unidentified)
+            start = fit.gains.tolist()
+            part = identify_gains(remaining, {}, inflation, start, reference, unidentified)
             log_gains.append(np.log(part.gains))
         except NotConverged:
             log_gains.append(np.where(np.arange(joints) == reference, 0.0, np.inf))

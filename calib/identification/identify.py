@@ -190,7 +190,8 @@ def identify_model(
     marks_standstills = isinstance(method, LeastSquares) and isinstance(model, IdentificationModel)
     if any(part.standing.any() for part in rows):
         as_moving = _first_fit(rows_as_moving, find, takes_prior, noise)
-        error = _left_out_error((rows, prior, first), rows, settings)
+        fitted = (rows, prior, first)
+        error = _left_out_error(fitted, rows, settings)
         error_as_moving = _left_out_error(as_moving, rows, settings)
         if error_as_moving < CLEARLY_LESS**2 * error:
             rows, prior, first = as_moving
@@ -491,7 +492,8 @@ def common_decimator(cases: Sequence[Case], settings: IdentificationSettings) ->
     message = f"recordings of {min(rates):.4g} Hz and {max(rates):.4g} Hz cannot be combined; resample one of them"
     require(max(rates) <= MAX_RATE_RATIO * min(rates), message, MeasurementError)
     total = sum(len(case.motion) for case in cases)
-    widest = design_decimator(rates[0], min(case.motion.decimator.factor for case in cases))
+    rate = rates[0]
+    widest = design_decimator(rate, min(case.motion.decimator.factor for case in cases))
     max_rows = widest.factor * settings.samples
     step = -(-total // max_rows)
     factor = step * widest.factor
@@ -549,15 +551,9 @@ def _essential(fit: MethodEstimate, settings: IdentificationSettings) -> Elimina
     data, std, inflation = fit.testable()
     keep = [bases.standard_name(name, data.names) for name in settings.keep]
     drop = [bases.standard_name(name, data.names) for name in settings.drop]
+    rule = Rule(settings.essential)
     return eliminate(
-        data,
-        Rule(settings.essential),
-        ratio=settings.ratio,
-        level=settings.level,
-        keep=keep,
-        drop=drop,
-        std=std,
-        inflation=inflation,
+        data, rule, ratio=settings.ratio, level=settings.level, keep=keep, drop=drop, std=std, inflation=inflation
     )
 
 

@@ -249,7 +249,8 @@ def read_options(path: str | Path | None = None) -> IdentifyOptions:
 def parse_options(table: Mapping[str, Any], source: str = "options") -> IdentifyOptions:
     """Return the options in a parsed TOML table; `source` names the file in messages."""
     for key in table.keys() & REMOVED.keys():
-        refuse_option(f"{source}: {key}", REMOVED[key])
+        message = REMOVED[key]
+        refuse_option(f"{source}: {key}", message)
     # Payloads are bodies here and their labels in [files], so that they are not handed down.
     handed_down = {key: value for key, value in table.items() if key != "payload"}
     keys = inherited(handed_down, FileSettings)

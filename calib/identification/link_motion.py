@@ -53,7 +53,8 @@ def with_link_motion(robot: CalibratedChain, case: Case, settings: Identificatio
 
 def joint_terms(chain: Chain, deflection: Deflection) -> Deflection:
     """Return the terms that move joints, which the dynamics follow."""
-    return chosen_terms(deflection, np.isin(target_elements(chain, deflection), chain.moving))
+    mask = np.isin(target_elements(chain, deflection), chain.moving)
+    return chosen_terms(deflection, mask)
 
 
 def chosen_terms(deflection: Deflection, mask: np.ndarray) -> Deflection:

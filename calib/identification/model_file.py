@@ -198,7 +198,8 @@ def from_table(chain: Chain, table: Mapping[str, Any]) -> Dynamics:
     bodies = bodies_of(chain).with_gravity(np.array(table["gravity"], dtype=float))
     for label in table.get("payloads", ()):
         on = chain.n - 1
-        bodies = with_payload(bodies, np.asarray(chain.tail), label, on=on)
+        placement = np.asarray(chain.tail)
+        bodies = with_payload(bodies, placement, label, on=on)
     terms = tuple(_term(entry) for entry in table["terms"])
     model = IdentificationModel(bodies, terms, torque_rows(table.get("kind", "motor")))
     inertial_values = table["bodies"]

@@ -190,7 +190,8 @@ def score(
     step = motion.decimator.factor
     standing = _prediction_errors(at_rest, apart)
     above_band_percent = np.array(above)
-    whiteness = _whiteness(np.stack(residuals, axis=1), motion.segment[::step])
+    segment = motion.segment[::step]
+    whiteness = _whiteness(np.stack(residuals, axis=1), segment)
     rate = motion.rate / step
     motion_share = float(moves.mean())
     raw_errors = _prediction_errors(raw, apart)

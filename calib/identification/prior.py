@@ -228,7 +228,8 @@ def find_prior(
         previous_values, previous_std = values, std
         tempered = tempering * inflation
         noise_of_row = (std * np.sqrt(tempered))[:, None, None]
-        factor = retriangulate((data.factors / noise_of_row).reshape(-1, len(columns) + 1))
+        stacked = (data.factors / noise_of_row).reshape(-1, len(columns) + 1)
+        factor = retriangulate(stacked)
         t = _most_probable(factor, columns, sizes, t)
         values, covariance = _posterior(factor, columns, sizes.deviations(t))
         std, inflation = weighing(rows, data, values, covariance, std, tempered, noise)

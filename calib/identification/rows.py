@@ -401,7 +401,8 @@ def triangulate(all_rows: Sequence[ObservationRows]) -> Triangles:
     row_count = all_rows[0].target.shape[1]
     last_blocks = [int(rows.block.max(initial=-1)) for rows in all_rows]
     block_count = 1 + max(last_blocks, default=-1)
-    result = empty(all_rows[0].names, all_rows[0].units, (block_count + 1) * row_count)
+    groups = (block_count + 1) * row_count
+    result = empty(all_rows[0].names, all_rows[0].units, groups)
     counts = np.zeros(result.groups)
     for rows in all_rows:
         block = np.where(rows.block < 0, block_count, rows.block)

@@ -130,7 +130,8 @@ def make_model(chain: Chain, settings: IdentificationSettings) -> Identification
     require(not (settings.passive or settings.identical_legs), "passive, identical_legs: arms have no legs", UsageError)
     _check_joints(chain.n, settings)
     linear = [joint.kind == "prismatic" for joint in chain.joints]
-    sets = per_joint(settings.sets or (settings.torque_rows.drives,), chain.n, "drives")
+    values = settings.sets or (settings.torque_rows.drives,)
+    sets = per_joint(values, chain.n, "drives")
     v0 = per_joint(settings.v0, chain.n, "v0")
     terms = list(drives.standard(sets, v0, linear))
     for coupling in settings.couplings:
@@ -160,7 +161,8 @@ def make_bodies(chain: Chain, settings: IdentificationSettings) -> Bodies:
         bodies = bodies.with_gravity(np.array(settings.gravity))
     for label in settings.payloads:
         on = chain.n - 1
-        bodies = with_payload(bodies, np.asarray(chain.tail), label, on=on)
+        placement = np.asarray(chain.tail)
+        bodies = with_payload(bodies, placement, label, on=on)
     return bodies
 
 

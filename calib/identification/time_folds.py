@@ -261,6 +261,7 @@ def _regularised(square: np.ndarray, rows: int, group: np.ndarray, kinds: np.nda
     cross = square[:-1, -1] / scale
     total = float(square[-1, -1])
     data = Gram(scaled, cross, total, rows)
-    fit = relevance(data, group, np.ones(len(group)), RELEVANCE_ITERATIONS)
+    start = np.ones(len(group))
+    fit = relevance(data, group, start, RELEVANCE_ITERATIONS)
     ridge = np.where(np.isfinite(fit.ridge), fit.ridge / scale, np.inf)
     return fit.values / scale, ridge

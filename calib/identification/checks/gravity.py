@@ -125,7 +125,8 @@ def gravity_of(motions: Sequence[MotionSamples], chain: Chain, newtons: bool = T
                 factors = -factors
     # Outweighed: the whole torque varies less than gravity's alone would.
     certain = np.isfinite(factors) & (np.abs(factors) + 2.0 * sigmas < MAX_FACTOR) & outweighed
-    absent = _without_gravity(sums, gravity, after, np.flatnonzero(certain).tolist())
+    candidates = np.flatnonzero(certain).tolist()
+    absent = _without_gravity(sums, gravity, after, candidates)
     return GravityHypotheses(stated, before, direction, after, ambiguous, absent, factors, sigmas)
 
 
@@ -315,7 +316,8 @@ def _refined(cost: Callable[[np.ndarray], float], start: np.ndarray) -> np.ndarr
         return np.asarray(size * vector / np.linalg.norm(vector))
 
     def turned_cost(amounts: np.ndarray) -> float:
-        return cost(turned(amounts))
+        problem = turned(amounts)
+        return cost(problem)
 
     corners = [[0.0, 0.0], [0.1, 0.0], [0.0, 0.1]]
     options = {"initial_simplex": corners, "xatol": 1e-4, "fatol": 1e-4 * cost(start), "maxfev": 80}
@@ -370,7 +372,8 @@ def _gravity_factors(
     size = expected.std(axis=0)
     min_size = MIN_SHARE * max(float(size.max()), 1e-9)
     for joint in np.flatnonzero(size > min_size):
-        free = basis(np.column_stack([inertia[:, joint], drives[:, joint]]))
+        columns = np.column_stack([inertia[:, joint], drives[:, joint]])
+        free = basis(columns)
         expected_part = expected[:, joint] - free @ (free.T @ expected[:, joint])
         torque_part = torque[:, joint] - free @ (free.T @ torque[:, joint])
         if np.sqrt(np.mean(expected_part**2)) < MIN_CORRELATED * size[joint]:

@@ -94,7 +94,8 @@ def clock_ratio(samples: MotionSamples, chain: Chain) -> ClockRatio | None:
     """
     if chain.n < MIN_JOINTS:
         return None
-    bodies_alone = IdentificationModel(bodies_of(chain), ())
+    bodies = bodies_of(chain)
+    bodies_alone = IdentificationModel(bodies, ())
     robots = [np.asarray(rods(chain, bodies_alone)).ravel()]
     if chain.inertias is not None and chain.inertias[:, 9].any():
         robots.append(standard_parameters(chain))
@@ -130,7 +131,8 @@ def common_factor(torque: np.ndarray, common: np.ndarray, free: np.ndarray) -> t
     for _ in range(ROUNDS):
         scale = np.repeat(weight, m)
         flat = free.transpose(1, 0, 2).reshape(m * n, -1)
-        free_basis = basis(flat * scale[:, None])
+        columns = flat * scale[:, None]
+        free_basis = basis(columns)
         torque_part = _without(free_basis, torque.T.ravel() * scale)
         common_part = _without(free_basis, common.T.ravel() * scale)
         power = float(common_part @ common_part)
@@ -369,7 +371,8 @@ def compare_sizes(
 
 def signs_of(case: Case, chain: Chain, gravity: Sequence[float] | None = None) -> Explanation | None:
     """Return the joints of a recording with reversed torques or coupled positions; None if it is too short."""
-    samples = take_samples(case, bodies_under(chain, gravity), MAX_SAMPLES)
+    bodies = bodies_under(chain, gravity)
+    samples = take_samples(case, bodies, MAX_SAMPLES)
     return None if samples is None else wrong_joints(samples)
 
 

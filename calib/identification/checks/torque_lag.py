@@ -202,7 +202,8 @@ class _Fit:
         self.rows = rows
         self.weight = weight
         squares = weight**2
-        self.spanning = spanning(np.tensordot(squares, rows.square, 1))
+        square = np.tensordot(squares, rows.square, 1)
+        self.spanning = spanning(square)
         projected = np.matmul(rows.cross.transpose(0, 2, 1), self.spanning)
         self.parts = projected * squares[:, None, None]
         self.power = rows.power * squares[:, None]

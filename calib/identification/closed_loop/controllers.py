@@ -34,7 +34,8 @@ class Reference:
     def __post_init__(self) -> None:
         object.__setattr__(self, "t", frozen(self.t))
         for name in ("q", "v", "a"):
-            values = shaped(getattr(self, name), np.shape(self.q), name)
+            shape = np.shape(self.q)
+            values = shaped(getattr(self, name), shape, name)
             object.__setattr__(self, name, frozen(values))
         if len(self.t) != len(self.q) or len(self.t) < 2:
             raise CalibError(
@@ -143,7 +144,8 @@ def stated_controller(loop: LoopSettings, n: int) -> Controller:
     kp = loop.per_joint("kp", n)
     kd = loop.per_joint("kd", n)
     ki = loop.per_joint("ki", n)
-    return completed(pd(kp, kd, ki=ki), loop, n)
+    controller = pd(kp, kd, ki=ki)
+    return completed(controller, loop, n)
 
 
 # [Hz] the usual bandwidth of an industrial position loop
@@ -188,7 +190,8 @@ def identify_controller(
         MeasurementError: where reference and log do not fit together, or the error is zero.
     """
     error = _error(reference, measured, rate)
-    tau = shaped(tau, np.shape(measured), "torques")
+    shape = np.shape(measured)
+    tau = shaped(tau, shape, "torques")
     error = low_pass(error, rate, band)
     tau = low_pass(tau, rate, band)
     edge = border(rate, band)
@@ -202,12 +205,15 @@ def identify_controller(
         explained.append(_explained(joint_error, joint_tau, joint_gains[-1], rate, band))
     gains = np.array(joint_gains)
     ki = gains[:, 2]
-    controller = pd(gains[:, 0], gains[:, 1], ki=ki)
+    kp = gains[:, 0]
+    kd = gains[:, 1]
+    controller = pd(kp, kd, ki=ki)
     return IdentifiedController(controller, frozen(explained))
 
 
 def _error(reference: Reference, measured: np.ndarray, rate: float) -> np.ndarray:
-    tick = _ticks(reference, rate, len(measured))
+    count = len(measured)
+    tick = _ticks(reference, rate, count)
     if rate * reference.period > 1.0 + 1e-3 or tick[-1] > len(reference.t) - 1:
         raise MeasurementError(
             f"a log of {len(measured)} samples at {rate:g} Hz does not match a reference of {len(reference.t)} samples "

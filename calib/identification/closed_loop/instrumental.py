@@ -259,7 +259,8 @@ def identify_instrumental(
     estimator = ROUNDS[method]
     task = _Fixed(model, base, cases, decimator, observed, estimator, constraints, friction)
     ordinary = wls(data, settled_std(data, 1e-3))
-    plant = regular_plant(model, friction.terms, cases[0][1], inertia)
+    loop = cases[0][1]
+    plant = regular_plant(model, friction.terms, loop, inertia)
     std = ordinary.group_std
     before: LinearFit | None = None
     rounds: list[Round] = []
@@ -315,7 +316,8 @@ def _observed_with_friction(
     if not terms:
         return observed, _Friction((), model, decimator, None)
     data = pool(triangulate(observed), model.rows)
-    ordinary = wls(data, settled_std(data, 1e-3))
+    std = settled_std(data, 1e-3)
+    ordinary = wls(data, std)
     loads = base.to_standard(ordinary.estimate.values)
     friction = _Friction(tuple(terms), model, decimator, loads)
     richer = [friction.added(part, case) for part, (case, _) in zip(observed, cases)]
@@ -413,7 +415,8 @@ def _with_signs(
         return rows
     motion = case.motion
     band = 0.5 * case.motion.band
-    measured = slope(low_pass(case.motion.q, motion.rate, band), motion.rate)
+    values = low_pass(case.motion.q, motion.rate, band)
+    measured = slope(values, motion.rate)
     expected = slope(low_pass(simulated_case.motion.q, motion.rate, band), motion.rate)
     away = np.sqrt(np.nanmean((measured - expected) ** 2, axis=0))
     followed = away <= MAX_FOLLOWING * motion.velocity_noise(band)
@@ -503,7 +506,8 @@ def _simulate_new(
     """
     retreats = 0
     while retreats < MAX_RETREATS:
-        candidate = between(old, task.plant(old, estimate), 0.5**retreats)
+        end = task.plant(old, estimate)
+        candidate = between(old, end, 0.5**retreats)
         try:
             return task, estimate, candidate, simulated_runs(candidate, task.cases), retreats
         except CalibError as error:
@@ -581,7 +585,8 @@ def _held_fit(task: _Fixed, problem: Instruments, std: np.ndarray, tau: float) -
     else:
         data = _simulated(problem)
     stated_noise = not estimator.measured
-    return hold(fit, estimator.triangle(problem, std), data, std, task.constraints, stated_noise=stated_noise)
+    factor = estimator.triangle(problem, std)
+    return hold(fit, factor, data, std, task.constraints, stated_noise=stated_noise)
 
 
 def _change(before: LinearFit | None, after: LinearFit) -> float:
@@ -593,11 +598,13 @@ def _change(before: LinearFit | None, after: LinearFit) -> float:
 
 
 def _fit_simulated(problem: Instruments, std: np.ndarray, tau: float) -> LinearFit:
-    return wls(_simulated(problem), std, np.full(problem.data.groups, tau))
+    data = _simulated(problem)
+    return wls(data, std, np.full(problem.data.groups, tau))
 
 
 def _combine_simulated(problem: Instruments, std: np.ndarray) -> np.ndarray:
-    return combine(_simulated(problem), std)
+    data = _simulated(problem)
+    return combine(data, std)
 
 
 ROUNDS = {

@@ -112,7 +112,8 @@ def instrument(
         names, units: of W's columns.
         before: earlier rows of the same problem.
     """
-    matrix = shaped(matrix, (None, None), "observation matrix W")
+    shape = (None, None)
+    matrix = shaped(matrix, shape, "observation matrix W")
     instruments = shaped(instruments, matrix.shape, "instruments Z")
     if before is None:
         if names is None:
@@ -150,7 +151,8 @@ def iv(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1
     if std is None:
         sigma = np.ones(problem.data.groups)
     else:
-        sigma = shaped(std, (problem.data.groups,), "std per group")
+        shape = (problem.data.groups,)
+        sigma = shaped(std, shape, "std per group")
     factor = combine(problem.data, sigma)
     values, inverse, _ = solve_triangle(_projected(factor, problem.names), problem.names)
     squares = problem.data.residual_squares(np.concatenate([np.zeros(p), values]))
@@ -203,7 +205,8 @@ def strength(problem: Instruments, std: np.ndarray | None = None) -> InstrumentS
     minimum = correlations[-1] ** 2
     with np.errstate(divide="ignore", invalid="ignore"):
         donald = float((rows - p) / p * np.divide(minimum, 1.0 - minimum))
-    partial_r2 = _shea(explained / norms, factor[:, p : 2 * p] / norms)
+    total = factor[:, p : 2 * p] / norms
+    partial_r2 = _shea(explained / norms, total)
     condition = np.linalg.cond(cross)
     return InstrumentStrength(problem.names, correlations, partial_r2, donald, condition)
 
@@ -225,7 +228,8 @@ def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: f
     factor = combine(problem.data, std)
     instrument_rows = factor[:, p : 2 * p]
     norms = np.linalg.norm(instrument_rows, axis=0)
-    require_rank(instrument_rows / np.where(norms > 0.0, norms, 1.0), problem.names)
+    scaled = instrument_rows / np.where(norms > 0.0, norms, 1.0)
+    require_rank(scaled, problem.names)
     unused = np.zeros((p, p))
     part = np.vstack([unused, factor[p:, p : 2 * p]])
     size = np.linalg.norm(part, axis=0) > 1e-8 * norms
@@ -236,7 +240,8 @@ def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: f
     require(k > 0 and dof > 0, "nothing to test: the instruments equal the columns, or there are too few rows")
     target = factor[:, -1]
     first = _rss(instrument_rows, target)
-    second = _rss(columns[:, split.kept], target)
+    matrix = columns[:, split.kept]
+    second = _rss(matrix, target)
     if second > 0.0:
         f = (first - second) / k / (second / (rows - p - k)) / inflation
     else:
@@ -298,7 +303,8 @@ def _projected(factor: np.ndarray, names: Sequence[str]) -> np.ndarray:
         names,
         "the instruments do not distinguish them: W has dependent columns, or the simulated motion differs",
     )
-    return retriangulate(factor[:p, p:])
+    stacked = factor[:p, p:]
+    return retriangulate(stacked)
 
 
 def _shea(explained: np.ndarray, total: np.ndarray) -> np.ndarray:
@@ -310,5 +316,6 @@ def _shea(explained: np.ndarray, total: np.ndarray) -> np.ndarray:
 def _rss(matrix: np.ndarray, target: np.ndarray) -> float:
     """Return the residual sum of squares of the regression of target on the columns."""
     size = matrix.shape[1]
-    triangle = retriangulate(np.column_stack([matrix, target]))
+    stacked = np.column_stack([matrix, target])
+    triangle = retriangulate(stacked)
     return float(np.sum(triangle[size:, size] ** 2))

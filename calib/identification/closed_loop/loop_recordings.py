@@ -107,7 +107,8 @@ def close_loops(
         design = loop.per_joint("design", model.n)
     pairs = []
     for part in stretches:
-        reference, every = _make_reference(part.motion, loop.rate, shifts.get(part.name, 0.0))
+        shift = shifts.get(part.name, 0.0)
+        reference, every = _make_reference(part.motion, loop.rate, shift)
         feed_forward = _fed_forward(controller, loop, cad, model, part.motion, reference, every)
         if loop.reference_velocity == "difference":
             # by half a period
@@ -143,9 +144,11 @@ def _check_reference(motion: Motion) -> None:
             motion.file, f"the reference of {motion.joint_names[joint]} (joint {joint + 1}) is not finite everywhere"
         )
     for j in np.flatnonzero(np.ptp(motion.q, axis=0) > 1e-3):
-        _compare(motion, motion.q_ref[:, j], int(j))
+        reference = motion.q_ref[:, j]
+        _compare(motion, reference, int(j))
     if motion.located is None:
-        check_no_copy(motion, low_passed(np.asarray(motion.q_ref), motion))
+        reference_q = low_passed(np.asarray(motion.q_ref), motion)
+        check_no_copy(motion, reference_q)
 
 
 def _compare(motion: Motion, reference: np.ndarray, joint: int, max_difference: float = 0.3) -> None:
@@ -203,7 +206,8 @@ def _shift(part: Case, loop: LoopSettings, fed_forward: Callable[..., Controller
     reference, every = _make_reference(motion, loop.rate)
     lowest_cutoff = float(motion.cutoff.min())
     band = min(loop.band, 0.5 * lowest_cutoff, 0.2 * motion.rate)
-    shift = reference_shift(part, reference, every, fed_forward(motion, reference, every), band)
+    controller = fed_forward(motion, reference, every)
+    shift = reference_shift(part, reference, every, controller, band)
     text = f"{1e3 * abs(shift.seconds):.3g} ± {1e3 * shift.sigma:.2g} ms"
     if estimated:
         begin = (motion.located or 0.0) + shift.seconds
@@ -217,13 +221,13 @@ def _shift(part: Case, loop: LoopSettings, fed_forward: Callable[..., Controller
     min_shift, min_gain, max_left = 1.5e-3, 2.0, 0.5
     significant = abs(shift.seconds) > max(5.0 * shift.sigma, min_shift)
     if significant and shift.left < max_left and shift.before > min_gain * shift.left:
-        refuse_data(
-            motion.file,
+        message = (
             f"its reference (q_ref) is {'late' if shift.seconds < 0.0 else 'early'} by {text}: so "
             f"moved, the controller of [loop] explains {100 * (1 - shift.left):.3g} % of the torques, as logged "
             f"{100 * (1 - min(shift.before, 1.0)):.2g} %. Set [loop] timing = 'estimated' to move it; or correct kd "
-            "and share, which may look like this; timing = 'stated' takes it as it is",
+            "and share, which may look like this; timing = 'stated' takes it as it is"
         )
+        refuse_data(motion.file, message)
     return 0.0, ()
 
 
@@ -355,7 +359,8 @@ def _fed_forward(
     if cad is None:
         raise UsageError("[loop] feedforward = 'cad': the robot's description states no masses")
     no_drives = np.zeros(model.p - len(cad))
-    believed = plant_of(model, np.append(cad, no_drives))
+    values = np.append(cad, no_drives)
+    believed = plant_of(model, values)
     return controller.with_feedforward(believed.feed_forward(reference))
 
 

@@ -183,7 +183,8 @@ def simulate(
         sigma = np.broadcast_to(getattr(sensing, name), (n,))
         drawn[name] = _draw(rng, sigma, count)
     if sensing.q_band is not None:
-        drawn["sigma_q"] = _coloured(drawn["sigma_q"], 2.0 * np.pi * sensing.q_band * reference.period)
+        step = 2.0 * np.pi * sensing.q_band * reference.period
+        drawn["sigma_q"] = _coloured(drawn["sigma_q"], step)
     if sensing.push_band is not None:
         drawn["push"] = _coloured(drawn["push"], 2.0 * np.pi * sensing.push_band * reference.period)
     if push is not None:
@@ -324,7 +325,8 @@ def packed(plant: Plant) -> Packed:
     for row, code, amount, settings, weights in acts:
         kinds.append([row, code])
         values.append([amount, *settings, *weights])
-    body = body_rows(plant.bodies, plant.parameters[: 10 * bodies])
+    parameters = plant.parameters[: 10 * bodies]
+    body = body_rows(plant.bodies, parameters)
     kind_rows = np.array(kinds, dtype=np.int64).reshape(-1, 2)
     value_rows = np.array(values).reshape(-1, 8 + n)
     return np.ascontiguousarray(links), body, linear, kind_rows, value_rows

@@ -58,7 +58,8 @@ def reference_shift(
         NotConverged: where no shift within `MAX_SHIFT` explains the torques best.
     """
     law = _Law(case, reference, every, controller, band)
-    shift = _by_positions(law.asked, law.measured, law.t[law.rows])
+    t = law.t[law.rows]
+    shift = _by_positions(law.asked, law.measured, t)
     for _ in range(30):
         residual, slopes = law.linearised(shift)
         weighted = slopes / np.maximum(residual.var(axis=0), 1e-300)
@@ -214,7 +215,8 @@ def check_no_copy(motion: Motion, reference_q: np.ndarray) -> None:
     rms = np.sqrt(np.mean(residual**2, axis=0))
     rounding = 1e-7 * measured(rows).std(axis=0)
     exact = rms < np.maximum(share * noise, rounding)
-    shares = _noise_shares(motion, measured(rows), residual, np.flatnonzero(moves))
+    joints = np.flatnonzero(moves)
+    shares = _noise_shares(motion, measured(rows), residual, joints)
     # of the noise's power in the distance from a copy; from a commanded motion it is all (our choice)
     max_share = 0.1
     if exact.all() or (len(shares) and np.median(shares) < max_share):

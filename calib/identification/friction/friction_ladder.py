@@ -271,7 +271,9 @@ class _Bench:
             improved = []
             for joint_set in at:
                 rows = self._rows(joint_set, side)
-                pays = _pays(self._whitened(error, rows), self._whitened(new_error, rows))
+                before = self._whitened(error, rows)
+                after = self._whitened(new_error, rows)
+                pays = _pays(before, after)
                 carries = pays and _carries(self._whitened(halves_error, rows), self._whitened(new_halves_error, rows))
                 if carries and _extrapolates(
                     self._whitened(ranges_error, rows), self._whitened(new_ranges_error, rows)

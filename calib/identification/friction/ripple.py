@@ -171,7 +171,8 @@ def find_turns(track: GearTravel, residuals: np.ndarray) -> dict[int, int]:
     scores: dict[int, np.ndarray] = {}
     total = np.zeros(len(TURNS))
     for joint in track.moving:
-        score = _lobes(coherence(track, joint, residuals[:, joint]))
+        power = coherence(track, joint, residuals[:, joint])
+        score = _lobes(power)
         scores[joint] = score
         total = total + score / max(float(score.max()), 1e-300)
 

@@ -150,7 +150,8 @@ def within(
         NotConverged: where inequalities contradict each other, or no point makes the matrices definite.
     """
     p = len(factor) - 1
-    matrix = shaped(matrix, (None, p), "constraint matrix A")
+    shape = (None, p)
+    matrix = shaped(matrix, shape, "constraint matrix A")
     lower = np.asarray(lower, dtype=float)
     upper = np.asarray(upper, dtype=float)
     has_length = lower.shape == (len(matrix),) == upper.shape
@@ -185,7 +186,8 @@ class _Planes:
         p = len(factor) - 1
         norms = np.linalg.norm(factor[:p, :p], axis=0)
         self.upper = factor[:p, :p] / np.where(norms > 0.0, norms, 1.0)
-        require_rank(self.upper, [f"x{k + 1}" for k in range(p)])
+        names = [f"x{k + 1}" for k in range(p)]
+        require_rank(self.upper, names)
         self.length = float(np.linalg.norm(factor[:p, p])) or 1.0
         self.unit = self.length / norms
         self.target = factor[:p, p] / self.length

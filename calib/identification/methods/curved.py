@@ -148,9 +148,11 @@ def make_curved(constraint: CurvedConstraint, row: Callable[[Mapping[str, float]
         refuse_option(location, "'slope' states the derivatives of a function; a formula has its own")
     if callable(h) and constraint.slope is not None:
         function = _called(h, location, 1)
-        slope = _called(constraint.slope, location, len(names))
+        count = len(names)
+        slope = _called(constraint.slope, location, count)
         return Curved(name, names, _rows(names, row), lambda u: float(function(u)[0]), slope, True)
-    tree, names = _parsed(str(h), location)
+    text = str(h)
+    tree, names = _parsed(text, location)
 
     def value(u: np.ndarray) -> Any:
         return evaluated(tree, _KNOWN | dict(zip(names, u)), _OPERATIONS)

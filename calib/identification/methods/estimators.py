@@ -47,7 +47,8 @@ def tls(
     """
     p = data.parameters
     count = int(data.rows.sum())
-    noise = shaped(noise, (p + 1,), "noise of the columns and of y")
+    shape = (p + 1,)
+    noise = shaped(noise, shape, "noise of the columns and of y")
     if (noise < 0.0).any() or not noise.any():
         raise CalibError("noise of the columns and of y: no entry may be negative and at least one must be positive")
     factor = combine(data, std)
@@ -89,7 +90,8 @@ def _null_direction(
     """
     exact = np.flatnonzero(noise == 0.0)
     noisy = np.flatnonzero(noise > 0.0)
-    upper = retriangulate(factor[:, np.concatenate([exact, noisy])])
+    stacked = factor[:, np.concatenate([exact, noisy])]
+    upper = retriangulate(stacked)
     k = len(exact)
     _, values, vt = np.linalg.svd(upper[k:, k:] / noise[noisy])
     edge = min(np.sqrt(len(noisy) / rows), 0.5)
@@ -205,7 +207,8 @@ def _reweighted(
 ) -> SampleFit:
     """Return the IRLS fit over whole samples, with the variance inflation of the most correlated row."""
     inflation = float(np.max(tau))
-    return irls(samples_of(problem), inflation=inflation, solve=solve)
+    data = samples_of(problem)
+    return irls(data, inflation=inflation, solve=solve)
 
 
 def samples_of(problem: IdentificationProblem) -> Samples:

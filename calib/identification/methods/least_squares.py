@@ -90,7 +90,8 @@ def _regularised(
     if prior is not None:
         covariance[:base_count, :base_count] = prior.covariance / tempering
     weighted_std = std * np.sqrt(inflation)
-    fit = ridge(pooled, np.zeros(len(ridges)), covariance, weighted_std)
+    mean = np.zeros(len(ridges))
+    fit = ridge(pooled, mean, covariance, weighted_std)
     finite = np.isfinite(np.diag(covariance))
     root = np.linalg.cholesky(covariance[np.ix_(finite, finite)])
     whitened = np.zeros((len(root), len(ridges)))
@@ -121,7 +122,8 @@ def _settled(problem: IdentificationProblem, prior: Prior) -> tuple[LinearFit, n
     values = _braking(problem, fit.estimate.values, std * np.sqrt(inflation), prior_rows)
     covariance[:base_count, :base_count] *= tempering
     weighted_std = std * np.sqrt(inflation)
-    untempered = ridge(pooled, np.zeros(len(values)), covariance, weighted_std)
+    mean = np.zeros(len(values))
+    untempered = ridge(pooled, mean, covariance, weighted_std)
     fit = replace(untempered, estimate=replace(untempered.estimate, values=values))
     return fit, prior_rows, std, inflation
 
@@ -132,8 +134,10 @@ def _braking(problem: IdentificationProblem, free: np.ndarray, std: np.ndarray, 
     speeds = [np.abs(case.motion.v).max(axis=0) for case in problem.cases]
     fastest = np.max(speeds, axis=0)
     augmented_prior = np.pad(prior_rows, ((0, 0), (0, 1)))
-    factor = retriangulate(np.vstack([combine(pooled, std), augmented_prior]))
-    values = bounded(factor, braking(terms, fastest))
+    stacked = np.vstack([combine(pooled, std), augmented_prior])
+    factor = retriangulate(stacked)
+    rows = braking(terms, fastest)
+    values = bounded(factor, rows)
     contradicted = _driving(problem, free)
     if contradicted.any():
         n = len(contradicted)
@@ -160,7 +164,8 @@ def _driving(problem: IdentificationProblem, values: np.ndarray) -> np.ndarray:
     richer_model = model.with_terms(*richer_terms)
     base_standard = base.to_standard(values[: base.b])
     standard = np.concatenate([base_standard, values[base.b :]])
-    return driving(Dynamics(richer_model, standard), problem.cases)
+    dynamics = Dynamics(richer_model, standard)
+    return driving(dynamics, problem.cases)
 
 
 OLS = LeastSquares(

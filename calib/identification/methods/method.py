@@ -87,7 +87,9 @@ class IdentificationProblem:
     @cached_property
     def pooled(self) -> Triangles:
         """R factors of all rows, one group per torque row."""
-        return pool(triangulate(self.rows), self.rows[0].target.shape[1])
+        data = triangulate(self.rows)
+        rows = self.rows[0].target.shape[1]
+        return pool(data, rows)
 
     @property
     def nonnegative(self) -> np.ndarray:

@@ -342,7 +342,8 @@ def _row(weights: Mapping[str, float], base: Base, names: Sequence[str]) -> np.n
         elif name in base.standard:
             standard[base.standard.index(name)] += weight
         else:
-            similar = suggestion(name, (*names, *base.standard))
+            choices = (*names, *base.standard)
+            similar = suggestion(name, choices)
             message = f"'{name}' is not a parameter of this model{similar}; its parameters: {', '.join(names)}"
             refuse_option("[constraints]", message)
     # T of the kept columns is the identity

@@ -69,7 +69,8 @@ def weigh(size: np.ndarray, joints: np.ndarray, gated: bool = True) -> np.ndarra
 def consistency(joints: int) -> float:
     """Return c = E w / E[w d² / n], so that c Σ w e eᵀ / Σ w estimates S for normal residuals."""
     square = _quantiles(joints)
-    w = _weights(np.sqrt(square), joints)
+    size = np.sqrt(square)
+    w = _weights(size, joints)
     return float(np.mean(w) / np.mean(w * square) * joints)
 
 
@@ -166,7 +167,8 @@ def stack(
     units: Sequence[str] | None = None,
 ) -> Samples:
     """Return samples checked for shape and finiteness, without a copy; see `Samples`."""
-    matrix = shaped(matrix, (None, None, None), "observation matrices W")
+    shape = (None, None, None)
+    matrix = shaped(matrix, shape, "observation matrices W")
     target = shaped(target, matrix.shape[:2], "target y")
     if present is None:
         present = np.ones(target.shape, dtype=bool)
@@ -204,7 +206,8 @@ def irls(data: Samples, inflation: float = 1.0, solve: Callable[[np.ndarray], np
         residual = np.where(data.present, data.target - data.matrix @ values, 0.0) / shares
         size = _sizes(residual, covariance, data.present)
         weights = weigh(size, data.joints)
-        covariance = _scatter(data, residual, weights * _consistent(data), weights)
+        scaled = weights * _consistent(data)
+        covariance = _scatter(data, residual, scaled, weights)
         factor = _factor(data, covariance, weights)
         last = values
         if solve is None:
@@ -295,13 +298,15 @@ def _factor(data: Samples, noise: np.ndarray, weights: np.ndarray) -> np.ndarray
 def _triangles(data: Samples, weights: np.ndarray) -> Triangles:
     """Return the R factors (QR) of all rows that are not missing, one group per joint, weighted by `weights` (N, n)."""
     root = np.sqrt(weights)
-    total = empty(data.names, data.units, data.target.shape[1])
+    groups = data.target.shape[1]
+    total = empty(data.names, data.units, groups)
     for start in range(0, len(data.target), CHUNK):
         part = slice(start, start + CHUNK)
         sample, joint = np.nonzero(data.present[part])
         scale = root[part][sample, joint]
         matrix = data.matrix[part][sample, joint] * scale[:, None]
-        total = absorb(total, matrix, data.target[part][sample, joint] * scale, joint)
+        target = data.target[part][sample, joint] * scale
+        total = absorb(total, matrix, target, joint)
     return total
 
 
@@ -317,7 +322,8 @@ def _spreads(data: Samples, residual: np.ndarray) -> np.ndarray:
 def _share_left(data: Samples, std: np.ndarray) -> np.ndarray:
     """Return 1 - h_j / r_j (n,), the share of joint j's noise variance that remains in its residuals."""
     triangles = _triangles(data, np.ones(data.target.shape))
-    leverages = leverage(triangles, std, solve_triangle(combine(triangles, std), data.names)[1])
+    inverse = solve_triangle(combine(triangles, std), data.names)[1]
+    leverages = leverage(triangles, std, inverse)
     return np.maximum(1.0 - leverages / np.maximum(triangles.rows, 1), 1e-3)
 
 

@@ -78,7 +78,8 @@ def of(identification: Identification, chain: Chain) -> Information:
     """Return the information of the data of an identification in memory."""
     estimate = identification.fitted.estimate
     standard = identification.dynamics.model.names
-    transform = _transform(identification.names, regrouping(identification.base), standard)
+    groups = regrouping(identification.base)
+    transform = _transform(identification.names, groups, standard)
     factor = _information(identification)
     return Information(
         chain=chain,
@@ -116,7 +117,8 @@ def _information(identification: Identification) -> np.ndarray:
         richer_ridges = np.maximum(ridges[base_count:], 1e-12)
         ridge_rows[:, base_count:-1] = np.diag(1.0 / richer_ridges)
         factors.append(ridge_rows)
-    return retriangulate(np.vstack(factors))
+    stacked = np.vstack(factors)
+    return retriangulate(stacked)
 
 
 def read(folder: str | Path, model: tuple[Chain, Dynamics] | None = None) -> Information:

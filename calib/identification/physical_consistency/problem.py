@@ -90,7 +90,8 @@ def _cad(chain: Chain, model: IdentificationModel, is_payload: np.ndarray) -> Pr
             drawn[i] = False
             notes.append(f"body {label} has no mass in the CAD: weakly regularised towards {light_mass:.2g} kg")
         elif pseudo_inertia.margin(described[i]) < THIN:
-            bodies[i] = _thickened(described[i])
+            body = described[i]
+            bodies[i] = _thickened(body)
             if pseudo_inertia.margin(described[i]) < 0.0:
                 notes.append(
                     f"CAD inertia of body {label} is physically inconsistent: the nearest consistent one is used"
@@ -209,7 +210,8 @@ def nearest(problem: BodyCost, spared: int | None = None, pull: float = 0.0) -> 
     rows = np.vstack([traces, term_rows[positive]])
     offset = np.repeat([1.0, 0.0], [count, len(positive)])
     lower = np.where(np.arange(count) == spared, -4.0 * MAX_TRACE, 0.0)
-    solution = minimise(goal[:, :-1], goal[:, -1], rows, offset, bodies, lower)
+    upper = goal[:, :-1]
+    solution = minimise(upper, goal[:, -1], rows, offset, bodies, lower)
     parameters = coordinates @ solution.values
     parameters[inertial:] += fixed_values
     return np.asarray(parameters)

@@ -63,7 +63,8 @@ class _KalmanFilter(Method):
     def _estimate(self, problem: IdentificationProblem, plain: MethodEstimate, robot: BelievedRobot) -> MethodEstimate:
         values = plain.estimate.values
         sigma = plain.estimate.sigma
-        start = start_of(problem, values, _inertia(problem), lambda x: _moves(robot, problem, x))
+        inertia = _inertia(problem)
+        start = start_of(problem, values, inertia, lambda x: _moves(robot, problem, x))
         # standard deviations of least squares that the parameters are uncertain by at first
         start_sigmas = 5.0
         wide = np.maximum(start_sigmas * sigma, np.abs(start - values))
@@ -73,7 +74,8 @@ class _KalmanFilter(Method):
         state = _State(robot, self.kind, start, covariance, [], 0)
         for case in problem.cases:
             for first, last in segments(case.motion.segment):
-                state = _pass(state, case, slice(first, last), noise)
+                part = slice(first, last)
+                state = _pass(state, case, part, noise)
         if state.sizes:
             innovation = float(np.mean(state.sizes))
         else:
@@ -172,7 +174,8 @@ def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
         return before
     columns = before.robot.columns
     p = len(before.mean)
-    robot_stepper = stepper(before.robot.at(before.mean, case), columns)
+    plant = before.robot.at(before.mean, case)
+    robot_stepper = stepper(plant, columns)
     carried = before.robot.carried(case)
     least_noise = 1e-9 * np.ptp(motion.q, axis=0).max()
     position_noise = np.maximum(motion.cutoffs.noise / np.sqrt(thin), least_noise)

@@ -67,7 +67,8 @@ class _MaximumLikelihood(Method):
         # standard deviations of the estimate
         tolerance = 0.01
         for count in range(1, max_steps + 1):
-            noise = _torque_noise(task, values, noise, (min_noise * std) ** 2)
+            minimum = (min_noise * std) ** 2
+            noise = _torque_noise(task, values, noise, minimum)
             iteration = _step(task, values, noise)
             relative_steps = np.abs(iteration.values - values) / iteration.sigma
             steps.append(float(np.max(relative_steps)))
@@ -301,7 +302,8 @@ def changed(task: NoisyStates, part: _Recording, error: np.ndarray) -> np.ndarra
 
 def _packed(problem: IdentificationProblem, iteration: _Round, noise: np.ndarray) -> LinearFit:
     """Return the fit of the last round; its covariance allows for residuals correlated in time."""
-    plain = wls(problem.pooled, np.sqrt(noise))
+    std = np.sqrt(noise)
+    plain = wls(problem.pooled, std)
     p = len(iteration.values)
     rows = int(problem.pooled.rows.sum())
     meat = sum(scatter(white, residual) for white, residual in zip(iteration.white, iteration.residual))

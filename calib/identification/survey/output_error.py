@@ -79,7 +79,8 @@ class _OutputError(Method):
             return replace(plain, method=self.name)
         # of the differences of a robot without tangents, in standard deviations (our choice)
         step = 0.01
-        robot = believed_robot(problem, self, step * np.asarray(plain.estimate.sigma))
+        steps = step * np.asarray(plain.estimate.sigma)
+        robot = believed_robot(problem, self, steps)
         loops = close_loops(robot.model, problem.cases, problem.decimator, problem.loop, problem.cad)
         task = _Comparison(problem, robot, loops, self.torques)
         return attempted_in_loop(self.name, problem, loops, lambda: self._estimate(problem, plain, task))

@@ -20,7 +20,8 @@ def scatter(white: np.ndarray, residual: np.ndarray, covariance: np.ndarray | No
         covariance: C (p, p) of the estimate behind the residuals: σ_j² and ρ_j are then those of r and of what the fit
             took out, E[e_k e_l] = r_k r_l + w_k C w_lᵀ; on a short record least of all is left where W is large.
     """
-    white = shaped(white, (None, None, None), "rows")
+    shape = (None, None, None)
+    white = shaped(white, shape, "rows")
     residual = shaped(residual, white.shape[:2], "residuals")
     count = len(white)
     p = white.shape[2]

@@ -145,7 +145,8 @@ def simulate_differences(
     shifts = np.eye(len(values))[columns] * steps[:, None]
     differences = [(moved(values + shift) - nominal) / step for shift, step in zip(shifts, steps)]
     slopes = np.stack(differences, axis=-1)
-    tick = sample_ticks(len(reference.t), every)
+    count = len(reference.t)
+    tick = sample_ticks(count, every)
     t = reference.t[0] + tick * reference.period
     return Sensitivities(t, *map(frozen, (*nominal, *slopes)))
 
@@ -293,7 +294,8 @@ def believed_robot(problem: IdentificationProblem, method: Method, steps: np.nda
     """
     if steps is not None and not isinstance(problem.model, IdentificationModel):
         columns = np.array(problem.base.kept)
-        plant = plant_of(problem.model, np.zeros(problem.model.p))
+        values = np.zeros(problem.model.p)
+        plant = plant_of(problem.model, values)
         return BelievedRobot(problem.model, columns, plant, steps)
     model, columns = with_friction(problem, serial_arm(problem, method))
     terms = model.columns
@@ -305,7 +307,9 @@ def believed_robot(problem: IdentificationProblem, method: Method, steps: np.nda
                 joint = term.acts[0][0]
                 widths[joint] = term.settings[-1]
         width = [widths.get(joint, V0) for joint in range(model.n)]
-        motors = standard(["Ia Fvm Fcm offm"] * model.n, width, model.prismatic.tolist())
+        sets = ["Ia Fvm Fcm offm"] * model.n
+        linear = model.prismatic.tolist()
+        motors = standard(sets, width, linear)
         terms = (*terms, *(replace(motor, name=f"motor {motor.name}") for motor in motors))
         columns = np.append(columns, np.arange(size, size + len(motors)))
     with refused_as(CannotSimulate, CalibError, "{}"):

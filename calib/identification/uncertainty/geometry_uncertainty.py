@@ -114,7 +114,8 @@ def estimate(estimator: _Estimator, all_rows: Sequence[ObservationRows]) -> tupl
         augmented = np.column_stack([stacked(rows), rows.target.ravel()])
         whitened = augmented * weights(estimator, rows)[:, None]
         factor = retriangulate(np.vstack([factor, whitened]))
-    inverse = inverted(factor[:p, :p])
+    upper = factor[:p, :p]
+    inverse = inverted(upper)
     solution = factor[:p, p]
     return inverse @ (solution + inverse.T @ estimator.pull), inverse @ inverse.T
 
@@ -367,7 +368,8 @@ def solve_sensitivity(
         prior_rows = np.sqrt(share) * np.pad(weighting.beforehand, padding)
         whitened = np.hstack([matrix, change]) * scale[:, None]
         factor = retriangulate(np.vstack([prior_rows, whitened]))
-        inverse = inverted(factor[:p, :p])
+        upper = factor[:p, :p]
+        inverse = inverted(upper)
         base_rows = inverse[: identification.base.b]
         slopes = inverse @ (base_rows.T @ pull - factor[:p, p:])
     used = scale > 0.0
@@ -522,7 +524,8 @@ def compare(
     for nominal_part, calibrated_part in zip(nominal_rows, identification.rows):
         for start in range(0, len(nominal_part.target), CHUNK):
             chunk = slice(start, start + CHUNK)
-            nominal_gain = _gain(nominal_inverse, weighting, cut(nominal_part, chunk))
+            rows = cut(nominal_part, chunk)
+            nominal_gain = _gain(nominal_inverse, weighting, rows)
             calibrated_gain = _gain(calibrated_inverse, weighting, cut(calibrated_part, chunk))
             row_noise = np.tile(noise, len(nominal_part.target[chunk]))
             variance += np.sum((nominal_gain * row_noise) ** 2, axis=1)
@@ -578,7 +581,8 @@ def deflection_sensitivity(found: Identification, robot: CalibratedChain, cases:
             bases = motion_of_bases(chosen_terms(terms, own), case.motion, torque)
             for span, felt in spans:
                 link_motion = [x[span] for x in case.links]
-                slopes = _torque_slopes(model.bodies, values, link_motion, int(j))
+                joint = int(j)
+                slopes = _torque_slopes(model.bodies, values, link_motion, joint)
                 pull[:, own] += np.einsum("nip,sni,sen->pe", felt, slopes, bases[:, :, span], optimize=True)
     row_count = sum(np.count_nonzero(part.present) for part in found.rows)
     return -inverse @ pull * (row_count / seen)

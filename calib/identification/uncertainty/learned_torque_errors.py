@@ -113,7 +113,8 @@ def learn_torque_errors(
     standing_speeds = _standing_speeds(identification, friction)
     folds = [_hold_out(identification, samples, run, standing_speeds) for run in (*runs, *halves)]
 
-    weights = _variance_weights(folds, len(runs))
+    run_count = len(runs)
+    weights = _variance_weights(folds, run_count)
     factors = _interval_factors(folds, weights, len(runs))
     weights = weights * factors[:, None] ** 2
     rest = _rest_floors(folds[: len(runs)], friction, weights)
@@ -285,7 +286,8 @@ def _estimate(identification: Identification, data: Triangles, blocks: Sequence[
         prior_rows = identification.prior.widened(len(group) - base_count)
         if prior_rows is not None:
             tempered_rows = np.sqrt(identification.prior.tempering) * prior_rows
-    pooled = pool(data, len(fitted.std), blocks)
+    rows = len(fitted.std)
+    pooled = pool(data, rows, blocks)
     values, ridges = time_folds.estimate(pooled, fitted.std, fitted.inflation, group, tempered_rows)
 
     # The covariance of the columns that no ridge has switched off, inverted in units of a diagonal of 1.

@@ -309,7 +309,8 @@ class TorqueIntervals:
 def intervals(errors: TorqueErrorModel, dynamics: Dynamics, case: Case, predicted: np.ndarray) -> TorqueIntervals:
     """Return a model's 95 % error bounds on a recording, and which errors of `predicted` (N, rows) lie within them."""
     motion = case.motion
-    index = evenly(len(motion), MAX_INTERVAL_SAMPLES)
+    count = len(motion)
+    index = evenly(count, MAX_INTERVAL_SAMPLES)
     q = np.asarray(motion.q[index])
     v = np.asarray(motion.v[index])
     a = np.asarray(motion.a[index])
