@@ -257,7 +257,8 @@ def identify_relative_gains(data: Triangles, joints: int, inflation: np.ndarray,
         doubt = np.where(free, np.maximum(sigma / MAX_SIGMA, by_distance), 0.0)
         if doubt.max() <= 1.0:
             estimated = free & (formal_sigma > 0.0)
-            factor = np.where(estimated, sigma / np.where(formal_sigma > 0.0, formal_sigma, 1.0), 1.0)
+            safe_sigma = np.where(formal_sigma > 0.0, formal_sigma, 1.0)
+            factor = np.where(estimated, sigma / safe_sigma, 1.0)
             covariance = frozen(fit.covariance * np.outer(factor, factor))
             return replace(fit, covariance=covariance)
         unidentified = (*unidentified, int(np.argmax(doubt)))

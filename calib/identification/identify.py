@@ -530,7 +530,8 @@ def _repeats_noise(cases: Sequence[Case], settings: IdentificationSettings) -> n
             )
         variances.append(case.noise**2)
         lengths.append(len(case.motion))
-    return np.asarray(np.sqrt(np.average(variances, axis=0, weights=lengths)))
+    variance = np.average(variances, axis=0, weights=lengths)
+    return np.asarray(np.sqrt(variance))
 
 
 def _takes_prior(method: Method, model: RegressorModel, settings: IdentificationSettings, source: str) -> bool:

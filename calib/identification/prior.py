@@ -208,7 +208,8 @@ def find_prior(
         robot_direction[: len(robot)] = robot
     shared = _shared_directions(model, robot_direction, effort)
     direction_count = shared.shape[1]
-    single = np.asarray(scipy.linalg.block_diag(transform, np.eye(len(groups))))
+    identity = np.eye(len(groups))
+    single = np.asarray(scipy.linalg.block_diag(transform, identity))
     common = np.vstack([transform @ shared, np.zeros((len(groups), direction_count))])
     columns = np.column_stack([single, common])
     sizes = _sizes(model, data, columns, shared, groups)

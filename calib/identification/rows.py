@@ -98,7 +98,8 @@ def make_case(
     if motion.effort_variance is not None and rows.motors_alone:
         factor = 1.0 if gains is None else np.abs(gains)
         noise = frozen(np.sqrt(motion.effort_variance) * factor)
-    valid = np.repeat(motion.weight[:, None] > 0.5, motion.n, axis=1)
+    in_use = motion.weight[:, None] > 0.5
+    valid = np.repeat(in_use, motion.n, axis=1)
     target = frozen(rows.target(effort, motion.tau_link, motion.q, motion.v))
     present = frozen(rows.of_joints(valid), bool)
     return Case(

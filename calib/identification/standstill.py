@@ -91,7 +91,8 @@ def with_standstills(
     held = coulomb.any(axis=1)
     masks = []
     for part, case in zip(all_rows, cases):
-        stands = thinned(model.torque_rows.of_joints(standing_joints(case, v0)), case.motion.segment, decimator)
+        standing = model.torque_rows.of_joints(standing_joints(case, v0))
+        stands = thinned(standing, case.motion.segment, decimator)
         masks.append(stands & part.present & held)
     counts = [(part.present & ~mask).sum(axis=0) for part, mask in zip(all_rows, masks)]
     moving = np.sum(counts, axis=0)

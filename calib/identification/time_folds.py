@@ -208,7 +208,8 @@ class CrossValidation:
         """Products [W y]ᵀ[W y] of the whitened rows of each block (blocks, p + 1, p + 1)."""
         factors = self.data.factors[: self.blocks * self.rows]
         weight = np.tile(1.0 / (self.std**2 * self.inflation), self.blocks)
-        squares = (factors.transpose(0, 2, 1) * weight[:, None, None]) @ factors
+        weighted = factors.transpose(0, 2, 1) * weight[:, None, None]
+        squares = weighted @ factors
         by_block = squares.reshape(self.blocks, self.rows, *squares.shape[1:])
         return by_block.sum(axis=1)
 
@@ -254,7 +255,8 @@ def _regularised(square: np.ndarray, rows: int, group: np.ndarray, kinds: np.nda
     largest = np.zeros(kinds.max(initial=-1) + 2)
     np.maximum.at(largest, kinds, size)
     size = np.where(group < 0, size, np.maximum(size, largest[kinds] / MAX_DEVIATION_RATIO))
-    scale = np.where(size > 0.0, size, 1.0) / np.sqrt(max(rows, 1))
+    safe_size = np.where(size > 0.0, size, 1.0)
+    scale = safe_size / np.sqrt(max(rows, 1))
     scaled = square[:-1, :-1] / (scale[:, None] * scale)
     # Free columns without data stay at zero.
     scaled[np.diag_indices(len(group))] += np.where(group < 0, 1e-9 * rows, 0.0)

@@ -88,7 +88,8 @@ class GravityHypotheses:
     @property
     def factor(self) -> float:
         """Ratio of the rms residuals with the other direction and with the stated one, their geometric mean."""
-        return float(np.exp(np.mean(np.log(self.after / self.before))))
+        ratio = self.after / self.before
+        return float(np.exp(np.mean(np.log(ratio))))
 
     @property
     def refuted(self) -> bool:

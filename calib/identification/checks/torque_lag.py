@@ -151,7 +151,8 @@ def _rows(samples: MotionSamples, rate: float) -> tuple[np.ndarray, np.ndarray]:
     times = np.arange(len(samples.effort))
     shifted_efforts = [np.interp(shifted, times, effort) for effort in samples.effort.T]
     torque = np.stack(shifted_efforts)
-    columns = np.concatenate([samples.inertial, samples.drives, *_turning(samples, rate)], axis=2)
+    turning = _turning(samples, rate)
+    columns = np.concatenate([samples.inertial, samples.drives, *turning], axis=2)
     return np.ascontiguousarray(columns.transpose(1, 0, 2)), torque
 
 

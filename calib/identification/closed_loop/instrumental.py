@@ -275,7 +275,9 @@ def identify_instrumental(
     for _ in range(limit):
         estimate = _estimate_round(task, runs, std, tau)
         task = task.after(estimate)
-        rounds.append(Round(_change(before, estimate.fit), estimate.fit.estimate.residual_std, retreats))
+        residual_std = estimate.fit.estimate.residual_std
+        iteration = Round(_change(before, estimate.fit), residual_std, retreats)
+        rounds.append(iteration)
         if before is not None and retreats == 0 and instrumental_variables.settled(before, estimate.fit):
             return _result(task, estimate, ordinary, task.plant(plant, estimate), rounds, std, runs)
         try:

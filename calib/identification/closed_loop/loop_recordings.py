@@ -249,7 +249,8 @@ def _make_reference(
     cutoff = min(cutoff_factor * float(motion.cutoff.max()), USABLE * motion.rate / 2)
     smooth = low_pass(np.asarray(motion.q_ref), motion.rate, cutoff)
     spline = CubicSpline(np.arange(len(smooth)), smooth)
-    indices = np.arange(int((len(smooth) - 1) * every + 1e-9) + 1) / every
+    count = int((len(smooth) - 1) * every + 1e-9) + 1
+    indices = np.arange(count) / every
     times = np.clip(indices - shift * motion.rate, 0.0, len(smooth) - 1.0)
     q, v, a = (spline(times, order) * motion.rate**order for order in range(3))
     return Reference(motion.t[0] + indices / motion.rate, q, v, a), every
@@ -297,7 +298,8 @@ def _controller(loop: LoopSettings, case: Case) -> tuple[Controller, IdentifiedC
     tau = motor_torques(case)
     if tau is None:
         raise UsageError(f"[loop] controller = 'identify' needs motor torques, not rows = '{case.torque_rows.name}'")
-    band = min(loop.band, float(motion.cutoff.min()), 0.4 * motion.rate)
+    lowest_cutoff = float(motion.cutoff.min())
+    band = min(loop.band, lowest_cutoff, 0.4 * motion.rate)
 
     def identified(shift: float) -> IdentifiedController:
         reference, _ = _make_reference(motion, loop.rate, shift)

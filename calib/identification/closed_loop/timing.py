@@ -250,5 +250,6 @@ def _noise_shares(motion: Motion, measured: np.ndarray, residual: np.ndarray, jo
         quiet = (power[:, column] < above * floor[column]) & in_band
         octave = quiet & (f <= 2.0 * f[np.argmax(quiet)])
         if octave.sum() >= min_bins:
-            result.append(spectrum[octave, column].sum() / power[octave, column].sum())
+            share = spectrum[octave, column].sum() / power[octave, column].sum()
+            result.append(share)
     return np.array(result)

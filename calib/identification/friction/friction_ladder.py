@@ -179,7 +179,8 @@ def select_friction(
 
     say("friction: standard")
     error = bench.errors([])
-    steps = [bench.trial("standard", [], error, tuple(range(candidates.n)))]
+    joints = tuple(range(candidates.n))
+    steps = [bench.trial("standard", [], error, joints)]
     selected: list[int] = []
     waiting = list(offered)
     for second_round in (False, True):
@@ -380,7 +381,8 @@ def _terms(candidates: FrictionCandidates, names: Sequence[str]) -> dict[str, li
             continue
         for name in names:
             if name in STEPS:
-                terms[name] += drives.offered(name, joint, joint_range, bool(candidates.linear[joint]))
+                linear = bool(candidates.linear[joint])
+                terms[name] += drives.offered(name, joint, joint_range, linear)
     return terms
 
 

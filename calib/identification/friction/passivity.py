@@ -35,7 +35,8 @@ def _dissipated(dynamics: Dynamics, cases: Sequence[Case]) -> np.ndarray:
     for case in cases:
         v = case.motion.v
         load = dynamics.transmitted(case) if needs_load else None
-        total += np.abs(v * case.target[:, -n:]).sum(axis=0)
+        measured = case.target[:, -n:]
+        total += np.abs(v * measured).sum(axis=0)
         moves |= moving(case.motion).any(axis=0)
         for term, value in terms:
             for row, column in term_columns(term, case, load):

@@ -335,7 +335,8 @@ def coherence(track: GearTravel, gear: int, residual: np.ndarray) -> np.ndarray:
     edges = np.quantile(speed, np.linspace(0.1, 1.0, SPEED_BINS + 1))[:-1]
     direction = np.where(v > 0.0, 1, -1)
     speed_bin = np.searchsorted(edges, speed, side="right") * direction
-    cell = np.floor(q / (2.0 * np.pi) * CELLS).astype(int) % CELLS
+    turns = q / (2.0 * np.pi) * CELLS
+    cell = np.floor(turns).astype(int) % CELLS
     numbers, block = np.unique(track.block, return_inverse=True)
     result = np.zeros(CELLS // 2 + 1)
     # Bin 0 holds the slowest tenth, which is left out.

@@ -40,7 +40,8 @@ class Definite:
         """Return the smallest eigenvalues minus `least` (K,), and their derivatives (K, p) with respect to b (p,)."""
         size, n, _, p = self.matrices.shape
         flat = self.matrices.reshape(size, n * n, p)
-        values, vectors = np.linalg.eigh((flat @ b).reshape(size, n, n))
+        combined = flat @ b
+        values, vectors = np.linalg.eigh(combined.reshape(size, n, n))
         pairs = vectors[:, :, None, 0] * vectors[:, None, :, 0]
         products = pairs.reshape(size, 1, n * n) @ flat
         return values[:, 0] - self.least, np.asarray(products[:, 0])
@@ -185,7 +186,8 @@ class _Planes:
     def __init__(self, factor: np.ndarray, rows: np.ndarray, sides: np.ndarray, equal: np.ndarray, fixed: np.ndarray):
         p = len(factor) - 1
         norms = np.linalg.norm(factor[:p, :p], axis=0)
-        self.upper = factor[:p, :p] / np.where(norms > 0.0, norms, 1.0)
+        safe_norms = np.where(norms > 0.0, norms, 1.0)
+        self.upper = factor[:p, :p] / safe_norms
         names = [f"x{k + 1}" for k in range(p)]
         require_rank(self.upper, names)
         self.length = float(np.linalg.norm(factor[:p, p])) or 1.0
@@ -237,7 +239,8 @@ class _Planes:
             slope = self.upper.T @ (self.upper @ (values / self.unit) - self.target)
             multipliers[binding] = np.linalg.lstsq(self.scaled[binding].T, slope)[0]
         slack = np.where(binding, 0.0, self.normals @ values - self.sides)
-        return _frozen(values, multipliers * self.length**2 / self.sizes, slack, binding, self.normals)
+        scaled_multipliers = multipliers * self.length**2 / self.sizes
+        return _frozen(values, scaled_multipliers, slack, binding, self.normals)
 
     def bounded(self) -> Constrained:
         """Return the optimum under the inequalities, exact on the binding ones.

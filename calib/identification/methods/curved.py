@@ -300,7 +300,8 @@ def _elastic(factor: np.ndarray, b: np.ndarray, bend: np.ndarray, unit: np.ndarr
     m = len(price)
     length = float(np.linalg.norm(factor[:-1, -1])) or 1.0
     values, vectors = np.linalg.eigh(bend * np.outer(unit, unit))
-    root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T / unit
+    root_values = np.sqrt(np.maximum(values, 0.0))
+    root = root_values[:, None] * vectors.T / unit
     stacked = np.zeros((2 * p + 1 + m, p + m + 1))
     rows = slice(p + 1)
     bent = slice(p + 1, 2 * p + 1)

@@ -160,7 +160,8 @@ def scaled_tls(pooled: Triangles, std: np.ndarray, exact: np.ndarray, inflation:
     weighted = pooled.factors / std[:, None, None]
     stacked = np.sum(weighted**2, axis=(0, 1))
     size = np.sqrt(stacked / max(float(pooled.rows.sum()), 1.0))
-    noise = np.append(np.where(exact, 0.0, COLUMN_NOISE * size[:p]), 1.0)
+    column_noise = np.where(exact, 0.0, COLUMN_NOISE * size[:p])
+    noise = np.append(column_noise, 1.0)
     return tls(pooled, noise, std, inflation)
 
 

@@ -85,7 +85,8 @@ def _regularised(
     if prior is not None:
         prior_rows = np.sqrt(tempering) * prior.widened(pooled.parameters - base_count)
     _, ridges = estimate(pooled, std, inflation, group, prior_rows)
-    variances = np.where(group < 0, np.inf, np.maximum(ridges, 1e-12) ** 2)
+    ridge_variances = np.maximum(ridges, 1e-12) ** 2
+    variances = np.where(group < 0, np.inf, ridge_variances)
     covariance = np.diag(variances)
     if prior is not None:
         covariance[:base_count, :base_count] = prior.covariance / tempering

@@ -188,7 +188,8 @@ def _equivalent_triangle(estimate: Estimate) -> Triangles:
     p = len(estimate.values)
     freedom = max(estimate.dof, 1)
     factor = np.zeros((1, p + 1, p + 1))
-    factor[0, :p] = retriangulate(whitened(estimate.values, estimate.covariance))[:p]
+    triangle = retriangulate(whitened(estimate.values, estimate.covariance))
+    factor[0, :p] = triangle[:p]
     factor[0, p, p] = np.sqrt(freedom)
     no_rows = empty(estimate.names, estimate.units, 1)
     factors = frozen(factor)

@@ -76,7 +76,8 @@ class Constraints(Frozen):
             return self.touched(factor).solve(factor, free)
         p = len(factor) - 1
         if free is None:
-            free = np.linalg.solve(factor[:p, :p], factor[:p, p])
+            upper_triangle = factor[:p, :p]
+            free = np.linalg.solve(upper_triangle, factor[:p, p])
         postures = f"M(q) positive definite in {len(self.inertia)} postures"
         with _unsatisfied(f"no estimate satisfies {self} with {postures}: remove bounds, or record other motion"):
             definite = _definite(self.inertia, free, self.least, self.likely)

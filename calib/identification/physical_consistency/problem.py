@@ -200,7 +200,8 @@ def nearest(problem: BodyCost, spared: int | None = None, pull: float = 0.0) -> 
     goal = retriangulate(np.column_stack([columns, target]))[:-1]
     if pull > 0.0:
         goal = np.vstack([goal, _euclidean_prior(problem, pull)])
-    goal = goal / max(1.0, float(np.linalg.norm(goal[:, -1])))
+    target_norm = float(np.linalg.norm(goal[:, -1]))
+    goal = goal / max(1.0, target_norm)
 
     # Bounds: the trace of each body, except of the spared one, and positive terms.
     bodies = pseudo_inertia.unknown_bodies(count, len(problem.sizes))

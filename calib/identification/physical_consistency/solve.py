@@ -276,7 +276,8 @@ def _descend(problem: BodyCost, gamma: float, values: np.ndarray) -> np.ndarray:
     for _ in range(MAX_STEPS):
         slope, curvature = derivatives(problem, gamma, values)
         step = np.zeros_like(values)
-        step[free] = -_solved(curvature[np.ix_(free, free)], slope[free])
+        free_curvature = curvature[np.ix_(free, free)]
+        step[free] = -_solved(free_curvature, slope[free])
         decrement = -float(slope @ step)
         if decrement < settled:
             return values + step
@@ -308,7 +309,8 @@ def cost(problem: BodyCost, gamma: float, values: np.ndarray) -> float:
         bodies = bodies + weight * pseudo_inertia.divergence(body, reference)
     drives = problem.lift * DRIVE * float(np.sum(ratio - np.log(ratio) - 1.0))
     unbounded = estimated & ~problem.positive
-    unbounded_terms = float(np.sum((terms[unbounded] / problem.sizes[unbounded]) ** 2))
+    relative = terms[unbounded] / problem.sizes[unbounded]
+    unbounded_terms = float(np.sum(relative**2))
     return 0.5 * (float(residual @ residual) + bodies + drives + unbounded_terms)
 
 

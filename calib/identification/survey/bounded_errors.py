@@ -111,7 +111,8 @@ class _SetMembership(Method):
         std, tau = weighed(problem)
         plain = wls(problem.pooled, std)
         data = samples_of(problem)
-        residual = np.where(data.present, data.target - data.matrix @ plain.estimate.values, 0.0)
+        predicted = data.matrix @ plain.estimate.values
+        residual = np.where(data.present, data.target - predicted, 0.0)
         bound = np.maximum(np.abs(residual).max(axis=0), 1e-9 * std)
         rows = (data.matrix / bound[:, None])[data.present]
         ends = (residual / bound)[data.present]

@@ -124,7 +124,8 @@ def _inertia(problem: IdentificationProblem) -> np.ndarray:
         tau = case.target - case.target.mean(axis=0)
         cross += np.sum(a * tau, axis=0)
         size += np.sum(a**2, axis=0)
-    return np.maximum(cross / size, 0.1 * np.max(np.abs(cross) / size))
+    ratio = cross / size
+    return np.maximum(ratio, 0.1 * np.max(np.abs(cross) / size))
 
 
 def _moves(robot: BelievedRobot, problem: IdentificationProblem, values: np.ndarray) -> None:

@@ -160,7 +160,8 @@ class _Comparison:
             plant = self.robot.at(values, case)
             controller = loop.controller
             if loop.design is not None:
-                controller = controller.scaled(plant.inertia_diagonal(loop.reference.q[::200]) / loop.design)
+                diagonal = plant.inertia_diagonal(loop.reference.q[::200])
+                controller = controller.scaled(diagonal / loop.design)
             self.count[0] += 1
             plant.run(controller, loop.reference, Sensing(every=loop.every))
 

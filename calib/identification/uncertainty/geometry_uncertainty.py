@@ -438,7 +438,8 @@ def _differences(
     n = model.bodies.n
     inertial = model.inertial
     onboard = model.carried_columns(case.carried)
-    parameters = base.to_standard(identification.fitted.estimate.values[: base.b])[:inertial] * onboard
+    base_values = identification.fitted.estimate.values[: base.b]
+    parameters = base.to_standard(base_values)[:inertial] * onboard
     q, v, a = (np.asarray(series[span]) for series in case.links)
 
     # The residuals as torques of the joints at the full rate.

@@ -298,7 +298,8 @@ def _estimate(identification: Identification, data: Triangles, blocks: Sequence[
     if prior_rows is not None:
         whitened = np.vstack([whitened, prior_rows[:, :-1]])
     square = whitened.T @ whitened
-    information = square[np.ix_(active, active)] + np.diag(ridges[active] ** -2.0)
+    prior_information = np.diag(ridges[active] ** -2.0)
+    information = square[np.ix_(active, active)] + prior_information
     unit = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     eigenvalues, vectors = np.linalg.eigh(information * np.outer(unit, unit))
     root = np.zeros((len(group), len(active)))
@@ -430,7 +431,8 @@ def _normalised_errors(folds: Sequence[_HeldOut], row: int, weights: np.ndarray)
         selected = moves if moves.any() else slice(None)
         squares.append(fold.errors[selected, row] ** 2)
         variances.append(fold.variance_terms[selected, row] @ weights)
-    min_variance = max(MIN_ERROR**2 * float(np.mean(np.concatenate(squares))), 1e-30)
+    mean_square = float(np.mean(np.concatenate(squares)))
+    min_variance = max(MIN_ERROR**2 * mean_square, 1e-30)
 
     log_sizes, normalised = [], []
     for square, variance in zip(squares, variances):
