@@ -6,7 +6,6 @@ import numpy as np
 
 from calib import files
 from calib.apps.cell_demo.summary import PICTURE
-from calib.apps.viewer import scene
 from calib.procedure.export.delivery import prediction
 from calib.procedure.report import fit_report
 from calib.procedure.report.charts import Chart, Panel, line, picture, text
@@ -15,6 +14,7 @@ from calib.procedure.report.style import AFTER, BEFORE, BROWN, INK, QUIET
 from calib.procedure.session.folder import Session
 from calib.procedure.session.geometry_steps import chain_of
 from calib.procedure.session.results import position_errors, torque_error
+from calib.results import scene
 
 AZIMUTH, ELEVATION = np.deg2rad([-60.0, 20.0])  # from where the cell is seen
 HEIGHT = 2.5  # [in]

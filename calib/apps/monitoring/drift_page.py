@@ -20,6 +20,7 @@ from calib.procedure.kinematic_stage import inputs
 from calib.procedure.report.page import Column, Section, Text, table
 from calib.procedure.session.drift import Trend, noise_of_difference, repeats, trends
 from calib.records import plain
+from calib.result_kinds import BY_NAME
 
 if TYPE_CHECKING:
     from calib.procedure.report.charts import Chart
@@ -41,6 +42,7 @@ class DriftFound(Drawn, Judged):
     trends: tuple[Trend, ...]
     noticed: tuple[Finding, ...]
 
+    kind = BY_NAME["drift"]
     tab = "trends noticed plot save"
 
     @property

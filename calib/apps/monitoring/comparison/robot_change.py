@@ -25,8 +25,8 @@ from calib.arguments import checked
 from calib.errors import Finding, UsageError, require
 from calib.procedure.findings import LEVELS, Verdict
 from calib.procedure.report.page import Section
-from calib.procedure.robot_kinds import stage_of
 from calib.records import plain
+from calib.result_kinds import BY_NAME
 
 if TYPE_CHECKING:
     from calib.procedure.report.charts import Chart
@@ -44,6 +44,7 @@ class RobotChange(Drawn, Judged):
 
     parts: tuple[ChangePart, ...]
 
+    kind = BY_NAME["comparison"]
     tab = "verdict geometry dynamics noticed plot save to_dict"
 
     @property
@@ -135,8 +136,6 @@ def diff(before: Compared, after: Compared, settings: DiffSettings = DEFAULT_DIF
         RobotError: where they are of different robots.
     """
     with saved(before) as first, saved(after) as second:
-        for path in (first, second):
-            stage_of(path, "diff")
         earlier, later = place_of(first), place_of(second)
         parts = [*_tool_parts(earlier, later, settings), *_torque_parts(earlier, later, settings)]
     if earlier.nominal and later.nominal:

@@ -1,0 +1,159 @@
+"""The kinds of results, each registered once, and `open_result`, which opens what a person names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from calib.data.csv_table import Table, read_table
+from calib.errors import UsageError
+from calib.procedure.excitation.coefficients import PLANNED, RUN, SAMPLES
+from calib.procedure.report.page import Picture
+from calib.result_kinds import BY_NAME, kind_of, refusal
+from calib.results.calibrations import CalibratedRobot, StoredFit, StoredIdentification, StoredSession
+from calib.results.result import StoredResult, Viewed
+
+if TYPE_CHECKING:
+    from calib.results.scene import Scene
+
+
+class StoredMotion(Viewed):
+    """A motion to play."""
+
+    def motion(self) -> Path:
+        """Return the file to play: the whole run where there is one."""
+        for name in (RUN, PLANNED, SAMPLES):
+            path = self.path / name
+            if path.is_file():
+                return path
+        self.refuse("program")
+
+
+class StoredExcitation(StoredMotion):
+    """A motion of `calib excite`."""
+
+    kind = BY_NAME["excitation"]
+
+
+class StoredPlan(StoredMotion):
+    """A motion of `calib plan`."""
+
+    kind = BY_NAME["plan"]
+
+
+class StoredSelection(Viewed):
+    """Poses of `calib select`: a CSV with its prediction and figures beside it."""
+
+    kind = BY_NAME["selection"]
+
+    def figures(self) -> dict[str, Picture]:
+        """Return the figures beside the list, by name."""
+        start = f"{self.path.stem}_"
+        paths = sorted(self.path.parent.glob(f"{start}*.png"))
+        return {path.stem.removeprefix(start): Picture(path.read_bytes(), "") for path in paths}
+
+    def tables(self) -> dict[str, Table]:
+        """Return the poses."""
+        return {self.path.stem: read_table(self.path)}
+
+
+class StoredRecall(StoredResult):
+    """One averaged period of a played motion: an archive of arrays, a recording to identify from."""
+
+    kind = BY_NAME["recall"]
+
+
+class StoredComparison(StoredResult):
+    """What changed between two calibrations."""
+
+    kind = BY_NAME["comparison"]
+
+
+class StoredDrift(StoredResult):
+    """Drift during a measurement."""
+
+    kind = BY_NAME["drift"]
+
+
+class StoredLog(StoredResult):
+    """The calibrations of one robot."""
+
+    kind = BY_NAME["log"]
+
+
+class StoredFleet(StoredResult):
+    """The calibrations of many arms."""
+
+    kind = BY_NAME["fleet"]
+
+
+class StoredStudy(StoredResult):
+    """Trials of identification methods, and what they say."""
+
+    kind = BY_NAME["study"]
+
+
+class StoredExport(StoredResult):
+    """A calibrated robot in the forms that other programs read."""
+
+    kind = BY_NAME["export"]
+
+
+class StoredPackage(StoredResult):
+    """A ROS 2 package."""
+
+    kind = BY_NAME["package"]
+
+
+REGISTERED: tuple[type[StoredResult], ...] = (
+    StoredFit,
+    StoredIdentification,
+    StoredExcitation,
+    StoredPlan,
+    StoredSelection,
+    StoredRecall,
+    StoredComparison,
+    StoredDrift,
+    StoredLog,
+    StoredFleet,
+    StoredSession,
+    StoredStudy,
+    StoredExport,
+    StoredPackage,
+    CalibratedRobot,
+)
+
+
+def open_result(path: str | Path, verb: str = "result") -> StoredResult:
+    """Return the result in a folder or a file.
+
+    Args:
+        path: what a command wrote, or a session.
+        verb: what asks, for the message (`calib.result_kinds.TAKES`).
+
+    Raises:
+        UsageError: where there is no result.
+    """
+    path = Path(path)
+    kind = kind_of(path)
+    if kind is None:
+        raise UsageError(refusal(path, verb))
+    opened = {stored.kind.name: stored for stored in REGISTERED}
+    return opened[kind.name](path)
+
+
+def drawn(path: str | Path, robot: str | None = None) -> Scene:
+    """Return what the viewer draws of a result, of any CSV of poses, or of a folder with several results.
+
+    Args:
+        path: of the result, file or folder.
+        robot: the robot to draw; None for the result's.
+
+    Raises:
+        UsageError: where there is nothing to see.
+    """
+    if kind_of(path) is not None:
+        return open_result(path, "view").scene(robot)
+    from calib.results import scene
+
+    return scene.read(path, robot)
