@@ -5,12 +5,6 @@ from calib.api.kinematic import GeometryFit
 from calib.api.rendering import Drawn, Judged, saved
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.dynamic_stage.metrics import UnseenReport
-from calib.procedure.excitation.coefficients import ARM as ARM_FILE
-from calib.procedure.excitation.coefficients import NAME as TRAJECTORY_FILE
-from calib.procedure.excitation.coefficients import PLANNED as PLANNED_FILE
-from calib.procedure.excitation.coefficients import RUN as RUN_FILE
-from calib.procedure.excitation.coefficients import SAMPLES as SAMPLES_FILE
-from calib.procedure.excitation.coefficients import read as read_trajectory
 from calib.procedure.export.delivery import prediction, verdicts
 from calib.procedure.export.geometry import read as read_exported
 from calib.procedure.export.geometry import results as geometry_results
@@ -24,13 +18,8 @@ from calib.procedure.kinematic_stage.tables import read_covariance
 from calib.procedure.robot_kinds import joints_of, stage_of
 
 __all__ = [
-    "ARM_FILE",
     "IN_SESSION",
     "LEVELS",
-    "PLANNED_FILE",
-    "RUN_FILE",
-    "SAMPLES_FILE",
-    "TRAJECTORY_FILE",
     "URDF",
     "VALIDATED",
     "ComparedRows",
@@ -56,7 +45,6 @@ __all__ = [
     "read_covariance",
     "read_exported",
     "read_measured_file",
-    "read_trajectory",
     "saved",
     "sentence",
     "settle",

@@ -13,7 +13,11 @@ from calib.simulation.cell import (
     write_log,
     write_measured,
 )
+from calib.simulation.known_robots import controller as published_controller
+from calib.simulation.known_robots import model as plant_model
+from calib.simulation.known_robots import plant as known_plant
 from calib.simulation.known_robots import random_fourier
+from calib.simulation.known_robots import truth as known_truth
 from calib.simulation.truth import TRUTH, share_within, true_base
 from calib.simulation.truth import position_errors as true_position_errors
 from calib.simulation.truth import torque_errors as true_torque_errors
@@ -34,12 +38,16 @@ __all__ = [
     "SimulatedInstrument",
     "SimulatedRun",
     "feed_forward",
+    "known_plant",
+    "known_truth",
     "limits_of",
     "measure",
     "moving_arm",
     "perturbed_cell",
     "planned_poses",
+    "plant_model",
     "play",
+    "published_controller",
     "random_fourier",
     "record",
     "rigid",

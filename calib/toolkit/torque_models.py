@@ -7,8 +7,6 @@ from calib.dynamics.drives import term as drive_term
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.pseudo_inertia import ball, margin
 from calib.dynamics.torque_rows import MOTOR, ROWS
-from calib.identification.identify import Identification, identify
-from calib.identification.identify_options import read_options as read_identify_options
 from calib.identification.methods.constraint_settings import ConstraintSettings
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate
 from calib.identification.model_file import MODEL, read_dynamics
@@ -18,10 +16,6 @@ from calib.identification.registry import METHODS, VERSIONS, method_named
 from calib.identification.rows import Case, make_case, observe
 from calib.identification.settings import IdentificationSettings
 from calib.identification.uncertainty.torque_errors import estimated_columns, parameter_variances
-from calib.procedure.dynamic_stage.identify import judged, overlaps, repeated_motion
-from calib.procedure.dynamic_stage.inputs import IdentificationInputs
-from calib.procedure.dynamic_stage.inputs import gather as gather_recordings
-from calib.procedure.dynamic_stage.verdict import motion_findings
 
 __all__ = [
     "METHODS",
@@ -34,8 +28,6 @@ __all__ = [
     "ConstraintSettings",
     "Dynamics",
     "EstimateStatus",
-    "Identification",
-    "IdentificationInputs",
     "IdentificationModel",
     "IdentificationProblem",
     "IdentificationSettings",
@@ -46,22 +38,15 @@ __all__ = [
     "drive_term",
     "estimated_columns",
     "find_base",
-    "gather_recordings",
-    "identify",
-    "judged",
     "make_case",
     "margin",
     "method_named",
-    "motion_findings",
     "observe",
-    "overlaps",
     "parameter_variances",
     "predict",
     "read_dynamics",
-    "read_identify_options",
     "read_model_table",
     "regroup",
-    "repeated_motion",
     "standard_name",
     "with_payload",
 ]

@@ -23,19 +23,19 @@ INNER_IMPORTS = {
     #
     "controller_programs": 30,
     #
-    "fleet": 17,
+    "fleet": 0,
     #
     "joining": 50,
     #
-    "monitoring": 72,
+    "monitoring": 0,
     #
     "registration": 8,
     #
-    "serve": 9,
+    "serve": 0,
     #
-    "studies": 55,
+    "studies": 0,
     #
-    "viewer": 19,
+    "viewer": 0,
 }
 
 

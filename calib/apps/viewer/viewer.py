@@ -17,8 +17,7 @@ from calib import files
 from calib.apps.viewer import scene as viewing
 from calib.apps.viewer.scene import Drawn, ErrorSizes, Measured, Played, Scene, Torques
 from calib.errors import CalibError, UsageError, command_line, refused_as
-from calib.robot.chain import Chain
-from calib.robot.kinematics import joint_frames
+from calib.toolkit.chains import Chain, joint_frames
 from calib.transforms import to_quaternion
 
 ARM, BEFORE, AFTER, SEEN, LIMIT = ([90, 100, 115], [213, 94, 0], [0, 130, 90], [40, 90, 180], [200, 60, 60])

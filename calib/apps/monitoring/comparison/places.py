@@ -9,13 +9,11 @@ import numpy as np
 
 from calib.errors import RobotError, UsageError, command_line, listing, require
 from calib.folders import COVARIANCE, METRICS, SESSION
-from calib.identification.model_file import MODEL
-from calib.procedure.dynamic_stage.folder import IdentificationFolder
-from calib.procedure.kinematic_stage.folder import FitFolder
-from calib.procedure.session.folder import Session, open_session
 from calib.result_kinds import refusal
-from calib.robot.calibrated import CalibratedChain
-from calib.robot.chain import Element
+from calib.toolkit.chains import CalibratedChain, Element
+from calib.toolkit.result_folders import FitFolder, IdentificationFolder
+from calib.toolkit.sessions import Session, open_session
+from calib.toolkit.torque_models import MODEL
 
 SAME = 1e-9  # of two nominal descriptions: largest difference [m, rad] that rounding in files explains
 
