@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from calib import files, folders
-from calib.api.rendering import Judged
 from calib.apps.fleet import prior
 from calib.apps.fleet.prior import ParameterSpread
 from calib.apps.fleet.tools import MIN_ARMS, MIN_TIMES, ToolUse, tools
@@ -23,11 +22,11 @@ from calib.apps.monitoring.comparison.places import check_same_robot
 from calib.apps.monitoring.comparison.robot_change import RobotChange, diff
 from calib.arguments import checked
 from calib.errors import Finding, RobotError, counted, finding
-from calib.geometry.fit import PLAUSIBLE
-from calib.procedure.findings import Verdict, lines_of, settle
-from calib.procedure.report.page import Block, Column, Section, Text, table
 from calib.records import plain
 from calib.result_kinds import BY_NAME
+from calib.toolkit.installations import PLAUSIBLE
+from calib.toolkit.report_pages import Block, Column, Section, Text, table
+from calib.toolkit.result_folders import Judged, Verdict, lines_of, settle
 from calib.units import small
 
 PAGE, PRIOR = "report.html", "prior"
@@ -116,11 +115,10 @@ class FleetReport(Judged):
         return out
 
     def _write(self, folder: Path) -> None:
-        from calib.procedure.report.certificate.record import report
-        from calib.procedure.report.certificate.rendering import html
+        from calib.toolkit.report_pages import as_html, report_page
 
         count = sum(len(arm_type.arms) for arm_type in self.types)
-        files.write(folder / PAGE, html(report("Fleet", f"{count} arms", (), [self.section()])))
+        files.write(folder / PAGE, as_html(report_page("Fleet", f"{count} arms", (), [self.section()])))
         arms = []
         for arm_type in self.types:
             usable = [arm.name for arm in arm_type.plausible]

@@ -8,7 +8,7 @@ from pathlib import Path
 from calib.apps.monitoring.comparison.calibrations import Calibration, read_fit
 from calib.apps.monitoring.comparison.places import Place, place_of
 from calib.errors import Finding, UsageError, finding, listing, require
-from calib.procedure.session.results import folders_of
+from calib.toolkit.sessions import folders_of
 
 Visit = tuple[Place, Calibration]
 

@@ -9,21 +9,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calib.api.rendering import Drawn, Judged, Unjudged
 from calib.apps.monitoring import pages
 from calib.apps.monitoring.comparison.change_part import plus_minus
 from calib.apps.monitoring.comparison.change_test import ParameterChange
 from calib.apps.monitoring.comparison.geometry_change import GeometryChange
 from calib.apps.monitoring.comparison.robot_change import diff
 from calib.errors import SessionError, UsageError, command_line, require
-from calib.procedure.report.page import Column, Section, table
-from calib.procedure.session.folder import Session, open_session
-from calib.procedure.session.results import folders_of, position_errors, torque_error
 from calib.records import plain
 from calib.result_kinds import BY_NAME
+from calib.toolkit.opened_results import Unjudged
+from calib.toolkit.report_pages import Column, Section, table
+from calib.toolkit.result_folders import Drawn, Judged
+from calib.toolkit.sessions import Session, folders_of, open_session, position_errors, torque_error
 
 if TYPE_CHECKING:
-    from calib.procedure.report.charts import Chart
+    from calib.toolkit.report_charts import Chart
 
 TABLE = "log.csv"
 HEADER = (
@@ -119,8 +119,7 @@ class RobotLog(Drawn, Judged, Unjudged):
 
     def charts(self) -> dict[str, Chart]:
         """Return what the figure shows: errors of each calibration, and the tool's motion since the one before."""
-        from calib.procedure.report.charts import Chart, Panel, line
-        from calib.procedure.report.style import AFTER, BEFORE
+        from calib.toolkit.report_charts import AFTER, BEFORE, Chart, Panel, line
 
         dates, panels = [log_line.date for log_line in self.lines], []
         values = {

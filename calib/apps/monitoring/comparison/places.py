@@ -8,13 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from calib.errors import RobotError, UsageError, command_line, listing, require
-from calib.procedure.dynamic_stage.folder import IdentificationFolder
-from calib.procedure.kinematic_stage.folder import FitFolder
-from calib.procedure.session.folder import Session
 from calib.result_kinds import refusal
-from calib.results.registry import open_result
-from calib.robot.calibrated import CalibratedChain
-from calib.robot.chain import Element
+from calib.toolkit.chains import CalibratedChain, Element
+from calib.toolkit.opened_results import open_result
+from calib.toolkit.result_folders import FitFolder, IdentificationFolder
+from calib.toolkit.sessions import Session
 
 SAME = 1e-9  # of two nominal descriptions: largest difference [m, rad] that rounding in files explains
 
