@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from calib import files
 from calib.data.csv_table import Table, read_table
-from calib.errors import UsageError
+from calib.errors import UsageError, require
 from calib.procedure.excitation.coefficients import PLANNED, RUN, SAMPLES
 from calib.procedure.report.page import Picture
 from calib.result_kinds import BY_NAME, kind_of, refusal
@@ -15,6 +16,8 @@ from calib.results.result import StoredResult, Viewed
 
 if TYPE_CHECKING:
     from calib.results.scene import Scene
+
+PICTURE_SUFFIX = ".png"
 
 
 class StoredMotion(Viewed):
@@ -41,23 +44,59 @@ class StoredPlan(StoredMotion):
     kind = BY_NAME["plan"]
 
 
-class StoredSelection(Viewed):
+class StoredFile(StoredResult):
+    """A result that is a file, with others beside it."""
+
+    def beside(self) -> list[Path]:
+        """Return the files that belong to it."""
+        return []
+
+    def tables(self) -> dict[str, Table]:
+        """Return the table of a CSV file."""
+        return {self.path.stem: read_table(self.path)} if self.path.suffix == ".csv" else {}
+
+    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+        """Copy the file, and those beside it under its new name; without figures where `plots` is False.
+
+        Raises:
+            UsageError: where one of them is there.
+        """
+        out = Path(out)
+        copies = {self.path: out}
+        for path in self.beside():
+            if plots or path.suffix != PICTURE_SUFFIX:
+                copies[path] = out.with_name(out.stem + path.name.removeprefix(self.path.stem))
+        for copy in copies.values():
+            require(not copy.exists(), f"{copy} is there already; give another name", UsageError)
+        for path, copy in copies.items():
+            files.write(copy, path.read_bytes())
+        return out
+
+
+class StoredSelection(StoredFile):
     """Poses of `calib select`: a CSV with its prediction and figures beside it."""
 
     kind = BY_NAME["selection"]
 
+    def beside(self) -> list[Path]:
+        """Return prediction and figures."""
+        start = self.path.with_suffix("")
+        return [Path(f"{start}{self.kind.companion}"), *sorted(start.parent.glob(f"{start.name}_*{PICTURE_SUFFIX}"))]
+
     def figures(self) -> dict[str, Picture]:
         """Return the figures beside the list, by name."""
         start = f"{self.path.stem}_"
-        paths = sorted(self.path.parent.glob(f"{start}*.png"))
+        paths = [path for path in self.beside() if path.suffix == PICTURE_SUFFIX]
         return {path.stem.removeprefix(start): Picture(path.read_bytes(), "") for path in paths}
 
-    def tables(self) -> dict[str, Table]:
-        """Return the poses."""
-        return {self.path.stem: read_table(self.path)}
+    def scene(self, robot: str | None = None) -> Scene:
+        """Return the poses, of a robot that has to be named."""
+        from calib.results import scene
+
+        return scene.read(self.path, robot)
 
 
-class StoredRecall(StoredResult):
+class StoredRecall(StoredFile):
     """One averaged period of a played motion: an archive of arrays, a recording to identify from."""
 
     kind = BY_NAME["recall"]

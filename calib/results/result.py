@@ -87,6 +87,13 @@ class Exported(NamedTuple):
     remarks: Sequence[str]
 
 
+def _has_rows(path: Path) -> bool:
+    """Return whether a table that this toolkit wrote has a row below its header."""
+    with path.open(encoding="utf-8", errors="replace") as file:
+        lines = (line for line in file if not line.startswith("#"))
+        return next(lines, None) is not None and next(lines, None) is not None
+
+
 @dataclass(frozen=True)
 class StoredResult:
     """A result in its folder, or in its file.
@@ -151,8 +158,8 @@ class StoredResult:
         return {path.stem.removeprefix(start): Picture(path.read_bytes(), "") for path in paths}
 
     def tables(self) -> dict[str, Table]:
-        """Return the tables of the folder by name."""
-        return {path.stem: read_table(path) for path in sorted(self.path.glob("*.csv"))}
+        """Return the tables of the folder by name; those without rows are left out."""
+        return {path.stem: read_table(path) for path in sorted(self.path.glob("*.csv")) if _has_rows(path)}
 
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Copy the folder as it is, without its figures where `plots` is False.

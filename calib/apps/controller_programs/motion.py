@@ -25,7 +25,7 @@ def motion_file(path: Path) -> Path:
     Raises:
         UsageError: for a folder without a motion.
     """
-    if not path.is_dir():
+    if path.is_file() and path.suffix != ".npz":
         return path
     return open_result(path, "program").motion()
 

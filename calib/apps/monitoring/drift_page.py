@@ -91,7 +91,13 @@ class DriftFound(Drawn, Judged):
             ["Targets of repeated poses less the arm's prediction."],
             (TABLE, header, rows),
         )
-        numbers: dict[str, object] = {"robot": self.robot, "verdict": self.verdict.level, "noticed": self.noticed}
+        verdict = self.verdict
+        numbers: dict[str, object] = {
+            "robot": self.robot,
+            "verdict": verdict.level,
+            "reason": verdict.reason,
+            "noticed": self.noticed,
+        }
         for trend in self.trends:
             numbers[trend.what] = {
                 "slope": trend.slope,
