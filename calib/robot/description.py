@@ -41,6 +41,7 @@ from typing import Any
 import numpy as np
 
 from calib import files
+from calib.config_types import ParsedTable
 from calib.errors import RobotError, listing, refuse_robot, require
 from calib.robot import mdh, tables
 from calib.robot.chain import Chain, Element, Joint
@@ -160,7 +161,7 @@ def read(path: str | Path, propose_beta: bool = True) -> Chain:
     return read_whole(path, propose_beta)[0]
 
 
-def read_whole(path: str | Path, propose_beta: bool = True) -> tuple[Chain, dict[str, Any]]:
+def read_whole(path: str | Path, propose_beta: bool = True) -> tuple[Chain, ParsedTable]:
     """Return the robot of a file and its extra tables, as `read` and `read_extra` do."""
     table = tables.load(path)
     if "leg" in table or table.get("kind") == "parallel":
@@ -168,8 +169,8 @@ def read_whole(path: str | Path, propose_beta: bool = True) -> tuple[Chain, dict
             f"{path} is a parallel robot (legs and a platform), only serial arms are supported here; use "
             "calib fit, excite, identify or plan"
         )
-    robot: dict[str, Any] = {}
-    extra: dict[str, Any] = {}
+    robot: ParsedTable = {}
+    extra: ParsedTable = {}
     for key, value in table.items():
         target = extra if key in EXTRA else robot
         target[key] = value
@@ -178,12 +179,12 @@ def read_whole(path: str | Path, propose_beta: bool = True) -> tuple[Chain, dict
     return mdh.from_table(robot, str(path), propose_beta), extra
 
 
-def read_extra(path: str | Path) -> dict[str, Any]:
+def read_extra(path: str | Path) -> ParsedTable:
     """Return the extra tables of a robot file (`EXTRA`) as plain dictionaries."""
     return {key: value for key, value in tables.load(path).items() if key in EXTRA}
 
 
-def write(path: str | Path, chain: Chain, extra: Mapping[str, Any] | None = None, source: str = "") -> Path:
+def write(path: str | Path, chain: Chain, extra: Mapping[str, object] | None = None, source: str = "") -> Path:
     """Write a chain to a file from which `read` returns exactly the same chain.
 
     Args:
@@ -204,7 +205,7 @@ def write(path: str | Path, chain: Chain, extra: Mapping[str, Any] | None = None
     return files.write(path, tables.dumps(head | table | dict(extra or {})))
 
 
-def _from_elements(table: Mapping[str, Any], where: str) -> Chain:
+def _from_elements(table: Mapping[str, object], where: str) -> Chain:
     tables.check_keys(table, _TOP, where)
     joints, inertias, links = [], [], []
     for number, entry in enumerate(_tables(table, "joint", where), 1):
@@ -235,7 +236,7 @@ def _from_elements(table: Mapping[str, Any], where: str) -> Chain:
     )
 
 
-def _element(entry: Mapping[str, Any], n: int, where: str) -> Element:
+def _element(entry: ParsedTable, n: int, where: str) -> Element:
     tables.check_keys(entry, _ELEMENT, where)
     name = tables.word(entry, "name", where)
     where = f"{where} ('{name}')"
@@ -255,10 +256,10 @@ def _element(entry: Mapping[str, Any], n: int, where: str) -> Element:
     return Element(name, axis, value, entry.get("owner", 0), entry.get("joint"), ratio, sign, placement)
 
 
-def _to_elements(chain: Chain) -> dict[str, Any]:
+def _to_elements(chain: Chain) -> dict[str, object]:
     joints, elements = [], []
     for index, joint in enumerate(chain.joints):
-        entry: dict[str, Any] = {"name": joint.name, "kind": joint.kind, **tables.finite_limits(joint)}
+        entry: dict[str, object] = {"name": joint.name, "kind": joint.kind, **tables.finite_limits(joint)}
         if chain.links:
             entry["link"] = chain.links[index]
         if chain.inertias is not None:
@@ -276,7 +277,7 @@ def _to_elements(chain: Chain) -> dict[str, Any]:
     return tables.chain_table(chain, joint=joints, element=elements)
 
 
-def _tables(table: Mapping[str, Any], key: str, where: str) -> list[Mapping[str, Any]]:
+def _tables(table: Mapping[str, object], key: str, where: str) -> list[ParsedTable]:
     entries = table.get(key)
     if not isinstance(entries, list) or not entries or not all(isinstance(entry, Mapping) for entry in entries):
         refuse_robot(where, f"no [[{key}]] tables found")

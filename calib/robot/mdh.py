@@ -158,7 +158,7 @@ def is_table(chain: Chain) -> bool:
         return False
 
 
-def to_table(chain: Chain) -> dict[str, Any]:
+def to_table(chain: Chain) -> dict[str, object]:
     """Return the table (schema above) that `from_table` reads back exactly."""
     entries = [_entry(row, index + 1) for index, row in enumerate(rows(chain))]
     return tables.chain_table(chain, propose_beta=False, joint=entries)
@@ -196,7 +196,7 @@ def _parallel(rows: Iterable[Row]) -> set[int]:
     return indices
 
 
-def _row(entry: Any, index: int, where: str) -> Row:
+def _row(entry: object, index: int, where: str) -> Row:
     """Return the row of one [[joint]] table."""
     if not isinstance(entry, Mapping):
         refuse_robot(where, f"expected a table, found {entry!r}")
@@ -215,7 +215,9 @@ def _row(entry: Any, index: int, where: str) -> Row:
         for key in (*tables.LIMITS, "inertia"):
             if key in entry:
                 refuse_robot(where, f"a fixed row cannot have '{key}': remove the key")
-    numbers = {key: tables.number(entry[key], f"{where}, {key}", quantity[key]) for key in quantity if key in entry}
+    numbers: dict[str, Any] = {
+        key: tables.number(entry[key], f"{where}, {key}", quantity[key]) for key in quantity if key in entry
+    }
     inertia = None
     if "inertia" in entry:
         inertia = tuple(tables.vector(entry["inertia"], 10, f"{where}, inertia").tolist())
@@ -235,9 +237,9 @@ def _regroup(chain: Chain, index: int, group: list[Element]) -> Row:
     return Row(name=joint.name, index=index, kind=joint.kind, inertia=inertia, **values, **limits)
 
 
-def _entry(row: Row, expected: int) -> dict[str, Any]:
+def _entry(row: Row, expected: int) -> dict[str, object]:
     """Return the [[joint]] table of a row, without default values (the four parameters are always written)."""
-    entry: dict[str, Any] = {"name": row.name}
+    entry: dict[str, object] = {"name": row.name}
     if row.kind != "revolute":
         entry["kind"] = row.kind
     if row.index != expected:
