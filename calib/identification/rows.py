@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -60,7 +60,7 @@ class Case:
         """Motion q, v, a (N, n) of the links: the motors' own, where joints do not deflect."""
         return self.link or (self.motion.q, self.motion.v, self.motion.a)
 
-    def deflected(self, part: slice) -> dict[str, Any]:
+    def deflected(self, part: slice) -> dict[str, object]:
         """Return the argument ``link`` of a model's regressor at a part of the samples; none where joints are stiff."""
         if self.link is None:
             return {}

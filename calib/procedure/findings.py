@@ -114,9 +114,9 @@ class Verdicts:
             text += "; do not use"
         return text
 
-    def table(self) -> dict[str, Any]:
+    def table(self) -> dict[str, object]:
         """Return the worst verdict, and each stage's verdict and reason, as a table for JSON."""
-        table: dict[str, Any] = {"verdict": self.level}
+        table: dict[str, object] = {"verdict": self.level}
         for stage, verdict in self.stages.items():
             table[stage] = {"verdict": verdict.level, "reason": verdict.reason}
         return table
@@ -275,7 +275,7 @@ def _with_unit(text: str, unit: str) -> str:
     return f"{text} {unit}"
 
 
-def _filled(template: str, values: Mapping[str, Any]) -> str:
+def _filled(template: str, values: Mapping[str, object]) -> str:
     """Return a template with values inserted; an optional part ``<…>`` is left out if its value is None or empty."""
 
     def part(match: re.Match[str]) -> str:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Protocol
 
 from calib.procedure.answers import CertificateSection
 from calib.procedure.report.certificate import rendering
 from calib.procedure.report.certificate.record import NO_DETAILS, Certificate, Entry, Page, records, report
-from calib.procedure.report.page import Picture
+from calib.procedure.report.page import Picture, Section
 from calib.procedure.report.templates import versions
 from calib.units import DEG
 
@@ -129,7 +129,13 @@ def of_model(
     return records(f"Calibration of {unseen.robot}", "Dynamics", setup, stages, unchecked, details=details)
 
 
-def notebook(result: Any) -> str:
+class SectionResult(Protocol):
+    """A result that is shown as a section of a report."""
+
+    def section(self) -> Section: ...
+
+
+def notebook(result: SectionResult) -> str:
     """Return a result as a page for a notebook: the first page of a fit's certificate, else its section of a report."""
     from calib.procedure.kinematic_stage.fit import Outcome
     from calib.procedure.report import fit_report
