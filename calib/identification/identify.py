@@ -30,10 +30,10 @@ from calib.identification.registry import METHODS, method_named
 from calib.identification.rows import Case, ObservationRows, observe, observe_terms, pool, triangulate, with_blocks
 from calib.identification.settings import IdentificationSettings, make_model, require_usable
 from calib.identification.standstill import (
+    BREAKAWAY_ROUNDS,
     CLEARLY_LESS,
-    LESS,
     left_out_error,
-    with_slowness,
+    with_breakaway,
     with_standstills,
     with_weights,
 )
@@ -214,18 +214,15 @@ def identify_model(
     groups = np.array(friction.groups, dtype=int)
     if prior is not None and marks_standstills:
         # richer friction explains slow motion, too: its residuals count
-        data = pool(triangulate(richer_rows), richer_rows[0].target.shape[1])
         inflation = prior.tempering * first.inflation
         column_groups = np.concatenate([np.full(base.b, -1), groups])
         prior_rows = prior.widened(len(groups))
-        values, _ = estimate(data, first.std, inflation, column_groups, prior_rows)
-        weighed = with_slowness(richer_rows, cases, decimator, model.torque_rows, values)
-        error = left_out_error(richer_rows, richer_rows, first.std, inflation, prior_rows, settings.apart)
-        error_weighed = left_out_error(weighed, richer_rows, first.std, inflation, prior_rows, settings.apart)
-        if error_weighed < LESS**2 * error:
-            richer_rows = weighed
-    slow_rows_weighed = any((part.slowness < 1.0).any() for part in richer_rows)
-    if prior is not None and (friction.terms or slow_rows_weighed):
+        for _ in range(BREAKAWAY_ROUNDS):
+            data = pool(triangulate(richer_rows), richer_rows[0].target.shape[1])
+            values, _ = estimate(data, first.std, inflation, column_groups, prior_rows)
+            richer_rows = with_breakaway(richer_rows, cases, decimator, model.torque_rows, values)
+    breakaway = any((part.breakaway < 1.0).any() for part in richer_rows)
+    if prior is not None and (friction.terms or breakaway):
         say("sizes beside richer friction")
         prior = find(richer_rows, groups=groups, start=prior, tempering=prior.tempering)
         richer_rows = with_weights(richer_rows, prior.first.rest_weights)
