@@ -30,10 +30,10 @@ from calib.identification.registry import METHODS, method_named
 from calib.identification.rows import Case, ObservationRows, observe, observe_terms, pool, triangulate, with_blocks
 from calib.identification.settings import IdentificationSettings, make_model, require_usable
 from calib.identification.standstill import (
+    BREAKAWAY_ROUNDS,
     CLEARLY_LESS,
-    LESS,
     left_out_error,
-    with_slowness,
+    with_breakaway,
     with_standstills,
     with_weights,
 )
@@ -209,11 +209,11 @@ def identify_model(
     groups = np.array(friction.groups, dtype=int)
     column_groups = np.concatenate([np.full(base.b, -1), groups])
     if prior is not None and marks_standstills:
-        richer_rows = _weighed_by_slowness(
-            richer_rows, cases, decimator, model.torque_rows, first, prior, column_groups, settings
+        richer_rows = _weighed_after_standstills(
+            richer_rows, cases, decimator, model.torque_rows, first, prior, column_groups
         )
-    slow_rows_weighed = any((part.slowness < 1.0).any() for part in richer_rows)
-    if prior is not None and (friction.terms or slow_rows_weighed):
+    breakaway = any((part.breakaway < 1.0).any() for part in richer_rows)
+    if prior is not None and (friction.terms or breakaway):
         say("sizes beside richer friction")
         prior = find(richer_rows, groups=groups, start=prior, tempering=prior.tempering)
         richer_rows = with_weights(richer_rows, prior.first.rest_weights)
@@ -257,7 +257,7 @@ def _left_out_error(
     return left_out_error(rows, reference_rows, first.std, first.inflation, prior_rows, settings.apart)
 
 
-def _weighed_by_slowness(
+def _weighed_after_standstills(
     rows: list[ObservationRows],
     cases: Sequence[Case],
     decimator: Decimator,
@@ -265,9 +265,8 @@ def _weighed_by_slowness(
     first: FirstFit,
     prior: Prior,
     column_groups: np.ndarray,
-    settings: IdentificationSettings,
 ) -> list[ObservationRows]:
-    """Return the rows with slow motion weighed down where that lowers the error on held-out time, else as they are.
+    """Return the rows weighed where friction at rest still fades after a standstill, as the residuals ask for.
 
     Richer friction explains slow motion, too: its residuals count.
 
@@ -277,15 +276,12 @@ def _weighed_by_slowness(
         prior: of the base parameters.
         column_groups: ridge group of each column; -1 for base parameters.
     """
-    data = pool(triangulate(rows), rows[0].target.shape[1])
     inflation = prior.tempering * first.inflation
     prior_rows = prior.widened(int((column_groups >= 0).sum()))
-    values, _ = estimate(data, first.std, inflation, column_groups, prior_rows)
-    weighed = with_slowness(rows, cases, decimator, torque_rows, values)
-    error = left_out_error(rows, rows, first.std, inflation, prior_rows, settings.apart)
-    error_weighed = left_out_error(weighed, rows, first.std, inflation, prior_rows, settings.apart)
-    if error_weighed < LESS**2 * error:
-        return weighed
+    for _ in range(BREAKAWAY_ROUNDS):
+        data = pool(triangulate(rows), rows[0].target.shape[1])
+        values, _ = estimate(data, first.std, inflation, column_groups, prior_rows)
+        rows = with_breakaway(rows, cases, decimator, torque_rows, values)
     return rows
 
 

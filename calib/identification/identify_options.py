@@ -93,7 +93,7 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from calib.arguments import checked
 from calib.config import check_keys, inherited, own_table, parse, read_toml, strict
@@ -111,7 +111,7 @@ USED = 600_000
 """Samples of a recording, unless stated: ten minutes at 1 kHz (our choice)."""
 
 
-def _no_zero(value: Any) -> Any:
+def _no_zero(value: object) -> object:
     """Refuse a list of numbers with a zero."""
     if isinstance(value, list):
         for number in value:
@@ -246,7 +246,7 @@ def read_options(path: str | Path | None = None) -> IdentifyOptions:
     return parse_options(read_toml(path), str(path))
 
 
-def parse_options(table: Mapping[str, Any], source: str = "options") -> IdentifyOptions:
+def parse_options(table: Mapping[str, object], source: str = "options") -> IdentifyOptions:
     """Return the options in a parsed TOML table; `source` names the file in messages."""
     for key in table.keys() & REMOVED.keys():
         message = REMOVED[key]

@@ -272,7 +272,9 @@ def identify_instrumental(
         raise CannotSimulate(str(error), error.last) from error
     # of the last step, and how often it was halved afterwards
     start, returns = plant, 0
-    for _ in range(limit):
+    round_count = 0
+    while True:
+        round_count += 1
         estimate = _estimate_round(task, runs, std, tau)
         task = task.after(estimate)
         residual_std = estimate.fit.estimate.residual_std
@@ -507,7 +509,7 @@ def _simulate_new(
     Then those on the way to them (our choice). A controller holds no robot of next to no inertia.
     """
     retreats = 0
-    while retreats < MAX_RETREATS:
+    while True:
         end = task.plant(old, estimate)
         candidate = between(old, end, 0.5**retreats)
         try:
@@ -526,6 +528,8 @@ def _simulate_new(
                 estimate = replace(estimate, fit=fit, bound=binding)
                 continue
         retreats += 1
+        if retreats >= MAX_RETREATS:
+            break
     message = f"neither the estimate nor smaller steps can be simulated: {problem}{_if_weak(task, estimate, std)}"
     raise CannotSimulate(message, task.plant(old, estimate))
 

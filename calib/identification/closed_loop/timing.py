@@ -60,7 +60,10 @@ def reference_shift(
     law = _Law(case, reference, every, controller, band)
     t = law.t[law.rows]
     shift = _by_positions(law.asked, law.measured, t)
-    for _ in range(30):
+    max_steps = 30
+    steps = 0
+    while True:
+        steps += 1
         residual, slopes = law.linearised(shift)
         weighted = slopes / np.maximum(residual.var(axis=0), 1e-300)
         information = float(np.sum(weighted * slopes))
@@ -70,6 +73,8 @@ def reference_shift(
             break
         if abs(shift) > MAX_SHIFT:
             raise NotConverged(f"{case.name}: no shift of the reference in time explains the torques: check [loop]")
+        if steps == max_steps:
+            break
     tau = np.mean([inflation(column) for column in residual.T])
     sigma = float(np.sqrt(tau / max(information, 1e-300)))
     torque = law.torque(law.t, 0)[law.rows]

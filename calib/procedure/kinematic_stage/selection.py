@@ -348,7 +348,7 @@ def bound_words(selection: Selection) -> str:
     return "of the candidates, not of all feasible poses"
 
 
-def record(chosen: Chosen) -> dict[str, Any]:
+def record(chosen: Chosen) -> dict[str, object]:
     """Return the results of the selection as numbers; `table` returns them as text."""
     selection = chosen.selection
     rms = chosen.outlook.poses.rms

@@ -65,7 +65,7 @@ def pdf(page: Certificate) -> tuple[bytes, list[str]]:
         return b"", [f"{PAGES[1]} was not written, since this process was forked: start processes by spawn"]
     images: dict[str, bytes] = {}
 
-    def named(value: Any) -> Any:
+    def named(value: Any) -> object:
         if not isinstance(value, bytes):
             return list(value)
         images[f"{len(images)}.svg"] = value
