@@ -21,7 +21,7 @@ from calib.geometry.installation import Installation, read_arms
 from calib.procedure.export.delivery import fit_verdicts
 from calib.procedure.export.geometry import read
 from calib.robot.calibrated import CalibratedChain, nominal_of
-from calib.toolkit.opened_results import open_result
+from calib.toolkit.result_folders import open_result
 from calib.transforms import invert
 
 DECIMALS = {"m": 7, "mm": 4}  # of frames, by the unit of lengths
