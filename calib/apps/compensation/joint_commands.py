@@ -124,7 +124,7 @@ def read(folder: str | Path) -> Fitted:
         UsageError: where it is none, or lacks something.
     """
     result = open_result(folder, "compensate")
-    fit = result.fit("compensate")
+    fit = result.fit
     if fit is None:
         result.refuse("compensate")
     proof = ValidationFolder(Path(folder) / VALIDATED)

@@ -41,7 +41,9 @@ def delivery_text(
     Raises:
         UsageError: for a folder without a fit.
     """
-    fit_folder = open_result(folder, "deliver").fit("deliver")
+    result = open_result(folder, "deliver")
+    result.check_arm("deliver")
+    fit_folder = result.fit
     fit = folder if fit_folder is None else fit_folder.path
     robot, (cell, nominal) = read(fit, "deliver"), read_arms(fit)
     arm = Description.of_fit(fit, nominal.chain)

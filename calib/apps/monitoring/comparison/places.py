@@ -60,7 +60,8 @@ def place_of(source: str | Path, verb: str = "diff") -> Place:
     if not path.is_dir():
         return Place(name)
     result = open_result(path, verb)
-    fit, identification = result.fit(verb), result.identification
+    result.check_arm(verb)
+    fit, identification = result.fit, result.identification
     require(result.session or fit or identification, refusal(path, verb), UsageError)
     return Place(name, result.session, fit, identification)
 
