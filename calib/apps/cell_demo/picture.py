@@ -14,7 +14,7 @@ from calib.procedure.report.style import AFTER, BEFORE, BROWN, INK, QUIET
 from calib.procedure.session.folder import Session
 from calib.procedure.session.geometry_steps import chain_of
 from calib.procedure.session.results import position_errors, torque_error
-from calib.toolkit.opened_results import drawn, skeleton
+from calib.toolkit.result_folders import drawn, skeleton
 
 AZIMUTH, ELEVATION = np.deg2rad([-60.0, 20.0])  # from where the cell is seen
 HEIGHT = 2.5  # [in]

@@ -37,7 +37,7 @@ from calib.procedure.kinematic_stage.folder import VALIDATED, ValidationFolder
 from calib.procedure.kinematic_stage.tables import read_covariance
 from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain
-from calib.toolkit.opened_results import open_result
+from calib.toolkit.result_folders import open_result
 from calib.transforms import from_xyz_rpy, invert, pose, rotation_vector
 
 TOLERANCE = (1e-6, 1e-5)  # position [m] and orientation [rad] that a command may leave; our choice, as what follows
@@ -124,7 +124,7 @@ def read(folder: str | Path) -> Fitted:
         UsageError: where it is none, or lacks something.
     """
     result = open_result(folder, "compensate")
-    fit = result.fit("compensate")
+    fit = result.fit
     if fit is None:
         result.refuse("compensate")
     proof = ValidationFolder(Path(folder) / VALIDATED)

@@ -21,7 +21,7 @@ from calib.geometry.installation import Installation, read_arms
 from calib.procedure.export.delivery import fit_verdicts
 from calib.procedure.export.geometry import read
 from calib.robot.calibrated import CalibratedChain, nominal_of
-from calib.toolkit.opened_results import open_result
+from calib.toolkit.result_folders import open_result
 from calib.transforms import invert
 
 DECIMALS = {"m": 7, "mm": 4}  # of frames, by the unit of lengths
@@ -41,7 +41,9 @@ def delivery_text(
     Raises:
         UsageError: for a folder without a fit.
     """
-    fit_folder = open_result(folder, "deliver").fit("deliver")
+    result = open_result(folder, "deliver")
+    result.check_arm("deliver")
+    fit_folder = result.fit
     fit = folder if fit_folder is None else fit_folder.path
     robot, (cell, nominal) = read(fit, "deliver"), read_arms(fit)
     arm = Description.of_fit(fit, nominal.chain)

@@ -14,7 +14,7 @@ from calib.apps.controller_programs.targets import number
 from calib.controllers.table import Controller
 from calib.data.csv_table import read_header, read_table
 from calib.errors import UsageError, require
-from calib.toolkit.opened_results import open_result
+from calib.toolkit.result_folders import open_result
 
 PREFIX = "q_"
 
