@@ -6,7 +6,6 @@ from calib.procedure.report.certificate.record import report as report_page
 from calib.procedure.report.certificate.rendering import html as as_html
 from calib.procedure.report.certificate.rendering import write as write_certificate
 from calib.procedure.report.certificate.rendering import write_figures
-from calib.procedure.report.certificate.results import read as read_certificate
 from calib.procedure.report.fit_report import FittedParameter
 from calib.procedure.report.fit_report import read as read_fit_report
 from calib.procedure.report.page import (
@@ -43,7 +42,6 @@ __all__ = [
     "issued",
     "met",
     "printed_section",
-    "read_certificate",
     "read_fit_report",
     "read_template",
     "rendered",

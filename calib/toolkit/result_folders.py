@@ -5,7 +5,7 @@ from calib.api.kinematic import GeometryFit
 from calib.api.rendering import Drawn, Judged, saved
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.dynamic_stage.metrics import UnseenReport
-from calib.procedure.export.delivery import prediction, verdicts
+from calib.procedure.export.delivery import fit_verdicts, prediction
 from calib.procedure.export.geometry import read as read_exported
 from calib.procedure.export.geometry import results as geometry_results
 from calib.procedure.findings import LEVELS, Verdict, limit, lines_of, sentence, settle
@@ -36,6 +36,7 @@ __all__ = [
     "ValidationFolder",
     "ValidationMetrics",
     "Verdict",
+    "fit_verdicts",
     "geometry_results",
     "joints_of",
     "limit",
@@ -49,5 +50,4 @@ __all__ = [
     "sentence",
     "settle",
     "stage_of",
-    "verdicts",
 ]

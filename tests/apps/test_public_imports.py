@@ -17,11 +17,11 @@ INNER_IMPORTS = {
     # (kept apart so that two branches can lower neighbours)
     "cell_demo": 31,
     #
-    "certificate": 4,
+    "certificate": 1,
     #
-    "compensation": 22,
+    "compensation": 21,
     #
-    "controller_programs": 30,
+    "controller_programs": 28,
     #
     "fleet": 0,
     #

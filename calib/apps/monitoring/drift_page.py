@@ -14,6 +14,7 @@ from calib.apps.monitoring.settings import DEFAULT_DRIFT, DriftSettings
 from calib.arguments import checked
 from calib.errors import Finding, UsageError, require
 from calib.records import plain
+from calib.result_kinds import BY_NAME
 from calib.toolkit.pose_data import FitOptions, read_fit_options
 from calib.toolkit.report_pages import Column, Section, Text, table
 from calib.toolkit.result_folders import Drawn, Judged, Verdict, lines_of, load_robot, read_measured_file, settle
@@ -41,6 +42,7 @@ class DriftFound(Drawn, Judged):
     trends: tuple[Trend, ...]
     noticed: tuple[Finding, ...]
 
+    kind = BY_NAME["drift"]
     tab = "trends noticed plot save"
 
     @property
@@ -91,7 +93,13 @@ class DriftFound(Drawn, Judged):
         if plots:
             charts = self.charts()
         part = pages.ResultPart(self.section(), charts, [CAPTION], (TABLE, HEADER, rows))
-        numbers: dict[str, object] = {"robot": self.robot, "verdict": self.verdict.level, "noticed": self.noticed}
+        verdict = self.verdict
+        numbers: dict[str, object] = {
+            "robot": self.robot,
+            "verdict": verdict.level,
+            "reason": verdict.reason,
+            "noticed": self.noticed,
+        }
         for trend in self.trends:
             numbers[trend.what] = {
                 "slope": trend.slope,

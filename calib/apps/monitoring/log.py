@@ -15,8 +15,9 @@ from calib.apps.monitoring.comparison.change_test import ParameterChange
 from calib.apps.monitoring.comparison.geometry_change import GeometryChange
 from calib.apps.monitoring.comparison.robot_change import diff
 from calib.errors import SessionError, UsageError, command_line, require
-from calib.folders import METRICS
 from calib.records import plain
+from calib.result_kinds import BY_NAME
+from calib.toolkit.opened_results import Unjudged
 from calib.toolkit.report_pages import Column, Section, table
 from calib.toolkit.result_folders import Drawn, Judged
 from calib.toolkit.sessions import Session, folders_of, open_session, position_errors, torque_error
@@ -99,12 +100,13 @@ class LogLine:
 
 
 @dataclass(frozen=True, eq=False)
-class RobotLog(Drawn, Judged):
+class RobotLog(Drawn, Judged, Unjudged):
     """The calibrations of one robot, oldest first. ``print`` shows a line for each."""
 
     robot: str
     lines: tuple[LogLine, ...]
 
+    kind = BY_NAME["log"]
     tab = "robot lines plot save"
 
     def section(self) -> Section:
@@ -202,7 +204,7 @@ def log(folders: Sequence[str | Path], *, mixed: bool = False) -> RobotLog:
     _check_same("robots", [session.settings.name for session in sessions], mixed)
     _check_same("serial numbers", [_serial(session) for session in sessions], mixed)
     for session in sessions:
-        finished = session.path("verdict.json").exists()
+        finished = session.concluded
         message = f"{session.folder} has no verdict yet: {command_line('next', session.folder)}"
         require(finished, message, SessionError)
 
@@ -210,7 +212,7 @@ def log(folders: Sequence[str | Path], *, mixed: bool = False) -> RobotLog:
     last_fitted: Path | None = None
     for session in sessions:
         change = None
-        if session.geometric and (session.fit.path / METRICS).exists():
+        if session.geometric and session.fit.numbers.exists():
             if last_fitted:
                 change = diff(last_fitted, session.folder).geometry
             last_fitted = session.folder

@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from calib.errors import RobotError, UsageError, command_line, listing, require
-from calib.folders import COVARIANCE, METRICS, SESSION
 from calib.result_kinds import refusal
 from calib.toolkit.chains import CalibratedChain, Element
+from calib.toolkit.opened_results import open_result
 from calib.toolkit.result_folders import FitFolder, IdentificationFolder
-from calib.toolkit.sessions import Session, open_session
-from calib.toolkit.torque_models import MODEL
+from calib.toolkit.sessions import Session
 
 # of two nominal descriptions: largest difference [m, rad] that rounding in files explains
 ROUNDING = 1e-9
@@ -69,21 +68,11 @@ def place_of(source: str | Path, verb: str = "diff") -> Place:
     name = str(source)
     if not path.is_dir():
         return Place(name)
-    if (path / SESSION).exists():
-        session = open_session(path)
-        fit = identification = None
-        geometry = session.fit.path
-        if session.geometric and (geometry / METRICS).exists() and (geometry / COVARIANCE).exists():
-            fit = session.fit
-        dynamics = session.identification
-        if session.dynamic and dynamics.numbers.exists() and dynamics.unseen.report.exists():
-            identification = dynamics
-        return Place(name, session, fit, identification)
-    if (path / MODEL).exists():
-        return Place(name, None, None, IdentificationFolder(path))
-    fitted = (path / METRICS).exists() and FitFolder(path).robot.exists()
-    require(fitted, refusal(path, verb), UsageError)
-    return Place(name, None, FitFolder(path))
+    result = open_result(path, verb)
+    fit = result.fit(verb)
+    identification = result.identification
+    require(result.session or fit or identification, refusal(path, verb), UsageError)
+    return Place(name, result.session, fit, identification)
 
 
 def check_same_robot(names: tuple[str, str], robots: tuple[CalibratedChain, CalibratedChain]) -> None:

@@ -21,8 +21,9 @@ from calib.apps.monitoring.settings import DEFAULT_DIFF, DiffSettings
 from calib.arguments import checked
 from calib.errors import Finding, UsageError, require
 from calib.records import plain
+from calib.result_kinds import BY_NAME
 from calib.toolkit.report_pages import Block, KeyFigure, Section
-from calib.toolkit.result_folders import LEVELS, Drawn, DynamicsModel, GeometryFit, Judged, Verdict, saved, stage_of
+from calib.toolkit.result_folders import LEVELS, Drawn, DynamicsModel, GeometryFit, Judged, Verdict, saved
 
 if TYPE_CHECKING:
     from calib.toolkit.report_charts import Chart
@@ -40,6 +41,7 @@ class RobotChange(Drawn, Judged):
 
     parts: tuple[ChangePart, ...]
 
+    kind = BY_NAME["comparison"]
     tab = "verdict geometry dynamics noticed plot save to_dict"
 
     @property
@@ -149,8 +151,6 @@ def diff(before: Compared, after: Compared, settings: DiffSettings = DEFAULT_DIF
         RobotError: where they are of different robots.
     """
     with saved(before) as first, saved(after) as second:
-        stage_of(first, "diff")
-        stage_of(second, "diff")
         earlier = place_of(first)
         later = place_of(second)
         parts = [*_tool_parts(earlier, later, settings), *_torque_parts(earlier, later, settings)]

@@ -11,38 +11,26 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from calib.config import read_toml
+from calib.data.csv_table import Table, read_table
+from calib.data.poses.pose_lists import read_poses
+from calib.data.schema import Joints
+from calib.dynamics.torque_rows import MOTOR, ROWS
 from calib.errors import CalibError, UsageError, refuse_option, require
+from calib.geometry import installation
+from calib.geometry.installation import Installation, see
+from calib.identification import model_file
+from calib.procedure.dynamic_stage.folder import IdentificationFolder
+from calib.procedure.excitation import coefficients
+from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
+from calib.procedure.robot_kinds import stage_of
 from calib.records import Frozen
 from calib.result_kinds import refusal
-from calib.toolkit.chains import (
-    ROBOT_FILE,
-    Chain,
-    Joint,
-    find_mesh,
-    forward,
-    is_urdf,
-    joint_frames,
-    joint_kinds,
-    load,
-    read_calibrated,
-    read_numbers,
-    read_origin,
-    resolve,
-    robot_names,
-    urdf_meshes,
-)
-from calib.toolkit.installations import Installation, read_arms, read_installation, see
-from calib.toolkit.planned_motions import ARM_FILE, PLANNED_FILE, SAMPLES_FILE, TRAJECTORY_FILE
-from calib.toolkit.pose_data import Joints, Table, read_poses, read_table
-from calib.toolkit.result_folders import (
-    IN_SESSION,
-    VALIDATED,
-    FitFolder,
-    IdentificationFolder,
-    ValidationFolder,
-    stage_of,
-)
-from calib.toolkit.torque_models import MOTOR, ROWS, read_model_table
+from calib.robot import calibrated, library
+from calib.robot.chain import Chain, Joint, joint_kinds
+from calib.robot.collision import find_mesh, urdf_meshes
+from calib.robot.formats.urdf_tree import is_urdf, numbers, origin
+from calib.robot.kinematics import forward, joint_frames
+from calib.robot.library import load, resolve
 from calib.transforms import invert
 
 DRAWABLE = (".stl", ".obj", ".dae", ".glb", ".gltf")  # meshes that the viewer shows
@@ -99,8 +87,8 @@ def visuals(path: str | Path) -> tuple[list[Visual], list[str]]:
         if file is None or file.suffix.lower() not in DRAWABLE:
             missing.append(name)
             continue
-        scale = read_numbers(mesh, "scale", str(path), "1 1 1")
-        meshes.append(Visual(link.attributes.get("name", ""), file, read_origin(visual, str(path)), scale))
+        scale = numbers(mesh, "scale", str(path), "1 1 1")
+        meshes.append(Visual(link.attributes.get("name", ""), file, origin(visual, str(path)), scale))
     return meshes, missing
 
 
@@ -250,7 +238,7 @@ def read(folder: str | Path, robot: str | None = None) -> Scene:
         if isinstance(chain, Chain) and is_run(path):
             t, q = rehearsed_samples(path, chain)
             played.append(Played(path.stem, t, q))
-    for name in (SAMPLES_FILE, PLANNED_FILE):
+    for name in (coefficients.SAMPLES, coefficients.PLANNED):
         played += [_played(path, folder) for path in _below(folder, name)]
 
     # A folder that also holds unseen motions shows those alone.
@@ -291,19 +279,19 @@ def _arm(folder: Path, robot: str | None) -> tuple[Chain | Drawn | None, Path | 
         return stage.run(), None
     if robot is not None:
         return load(robot), resolve(robot)
-    for path in (folder / ROBOT_FILE, folder / IN_SESSION / ROBOT_FILE, folder / ARM_FILE):
+    for path in (folder / calibrated.ROBOT, folder / IN_SESSION / calibrated.ROBOT, folder / coefficients.ARM):
         if path.is_file():
-            robot_file = read_calibrated(path)
+            robot_file = calibrated.read(path)
             return robot_file.complete, Path(robot_file.source) if robot_file.source and Path(
                 robot_file.source
             ).is_file() else None
     for path in sorted(folder.glob("1-robot/robot.*")):
         return load(str(path)), path
     try:
-        name = read_toml(folder / TRAJECTORY_FILE).get("robot", "")
+        name = read_toml(folder / coefficients.NAME).get("robot", "")
     except CalibError:
         return None, None
-    return (load(name), None) if name in robot_names() else (None, None)
+    return (load(name), None) if name in library.names() else (None, None)
 
 
 def _kinds(chain: Chain | Drawn) -> list[str]:
@@ -326,7 +314,7 @@ def _measured(folder: Path, chain: Chain | Drawn | None) -> Measured:
     """Return the measured positions of ``residuals.csv``, with the predictions of both arms."""
     if isinstance(chain, Drawn):
         return Measured(*chain.measured(folder))
-    after, before = read_arms(folder)
+    after, before = installation.read_arms(folder)
     table = read_table(FitFolder(folder).residuals)
     table = table.where(_placed(table, after))
     q = np.column_stack([table.numbers(joint.name, "joint") for joint in after.chain.joints])
@@ -356,7 +344,7 @@ def _unplaced(folder: Path, chain: Chain | Drawn | None) -> list[ErrorSizes]:
     """Return the errors of the rows of ``residuals.csv`` that `_measured` leaves out, by their kind."""
     if isinstance(chain, Drawn):
         return []
-    cell = read_installation(folder)
+    cell = installation.read(folder)
     table = read_table(FitFolder(folder).residuals)
     left_out = table.where(~_placed(table, cell))
     measured = ~np.isnan(left_out.numbers("dx", "length", gaps=True))
@@ -438,7 +426,7 @@ def _torque_rows(folder_: Path, chain: Chain | Drawn | None, count: int) -> tupl
     for folder in (IdentificationFolder(folder_), IdentificationFolder(folder_.parent)):
         if chain is None or not folder.model.is_file():
             continue
-        table = read_model_table(folder.path)
+        table = model_file.read_table(folder.path)
         unit = table.get("unit", "N m")
         if isinstance(chain, Drawn):
             titles, units = chain.torque_rows(table.get("kind", ""))
