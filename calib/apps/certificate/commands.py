@@ -5,7 +5,7 @@ from pathlib import Path
 import typer
 
 from calib.cli.shared import command, say
-from calib.errors import UsageError, command_line, require
+from calib.errors import UsageError, command_line
 from calib.procedure.answers import CertificateSection
 
 app = typer.Typer()
@@ -30,12 +30,15 @@ def certificate(folder: Path, details: CertificateSection, svg: Path | None = No
     from calib.procedure.session.folder import open_session
 
     if (folder / SESSION).exists():
-        redo = command_line("redo", folder, "certificate")
-        words = f"{folder / SESSION} has the details, under [certificate]; then: {redo}"
-        require(details == CertificateSection() and svg is not None, words, UsageError)
-        whole = session.pages(open_session(folder))[1]
+        if details != CertificateSection() or svg is None:
+            redo = command_line("redo", folder, "certificate")
+            raise UsageError(f"{folder / SESSION} has the details, under [certificate]; then: {redo}")
+        _, report = session.pages(open_session(folder))
     else:
-        one, whole = results.read(folder, plots, details)
-        say(*rendering.write(folder, one, whole), f"written: {', '.join(str(folder / name) for name in PAGES)}")
+        page, report = results.read(folder, plots, details)
+        notes = rendering.write(folder, page, report)
+        paths = ", ".join(str(folder / name) for name in PAGES)
+        say(*notes, f"written: {paths}")
     if svg is not None:
-        say(f"{rendering.write_figures(svg, whole)} figures written to {svg}")
+        count = rendering.write_figures(svg, report)
+        say(f"{count} figures written to {svg}")
