@@ -22,10 +22,12 @@ from calib.procedure.dynamic_stage import folder, identify, inputs, metrics
 from calib.procedure.excitation import coefficients
 from calib.procedure.robot_kinds import Mechanism, stage_of
 from calib.records import as_subclass, plain
+from calib.result_kinds import BY_NAME
 from calib.robot.calibrated import CalibratedChain
 from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
+    from calib.api.rendering import DataFrame
     from calib.procedure.report.charts import Chart
     from calib.procedure.report.page import Section
 
@@ -35,6 +37,7 @@ Recorded = str | Path | Recording
 class DynamicsModel(Drawn, Judged, identify.IdentificationOutcome):
     """Identified dynamics with covariance and verdict. ``print`` shows errors on other motion, friction and verdict."""
 
+    kind = BY_NAME["identification"]
     tab = (
         "robot verdict warnings validation estimate residuals torques torque_sigma predictions plot save to_dict "
         "to_dataframe"
@@ -103,11 +106,11 @@ class DynamicsModel(Drawn, Judged, identify.IdentificationOutcome):
 
         return dynamics_figures.figures(self)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the metrics as in ``metrics.json``."""
         return plain(metrics.metrics(self))
 
-    def to_dataframe(self) -> Any:
+    def to_dataframe(self) -> DataFrame:
         """Return the base parameters as a pandas DataFrame: name, unit, value, sigma (NaN: constraint active)."""
         estimate = self.estimate
         on_bounds = np.isin(self.found.names, metrics.on_bounds(self.found))

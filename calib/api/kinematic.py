@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 import numpy as np
 
 from calib import files
-from calib.api.rendering import Drawn, Judged, Progress, data_frame, listed, optional
+from calib.api.rendering import Drawn, Judged, Progress, Unjudged, data_frame, listed, optional
 from calib.arguments import checked
 from calib.config import Tables
 from calib.data.poses.fit_options import FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements
-from calib.errors import UsageError, as_ours
+from calib.errors import TaskLost, UsageError, as_ours
 from calib.estimation.estimate import Estimate
 from calib.geometry.observation import pose_sigmas
 from calib.procedure.kinematic_stage import fit, folder, inputs, selection
@@ -26,10 +26,12 @@ from calib.procedure.measuring import prediction
 from calib.procedure.measuring.run import write_run
 from calib.procedure.robot_kinds import Mechanism, stage_of
 from calib.records import as_subclass, plain, shaped
+from calib.result_kinds import BY_NAME
 from calib.robot.calibrated import CalibratedChain
 from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
+    from calib.api.rendering import DataFrame
     from calib.procedure.report.charts import Chart
     from calib.procedure.report.page import Section
 
@@ -37,9 +39,10 @@ Measured = str | Path | PoseMeasurements
 Several = Measured | Sequence[Measured | Sequence[Measured]]
 
 
-class PoseSelection(Drawn, selection.Chosen):
+class PoseSelection(Drawn, Unjudged, selection.Chosen):
     """Poses that determine a robot's geometry best. ``print`` shows index, bound and what random poses reach."""
 
+    kind = BY_NAME["selection"]
     tab = "q chain selection outlook run notes plot save save_run to_dict to_dataframe"
 
     @property
@@ -88,11 +91,11 @@ class PoseSelection(Drawn, selection.Chosen):
                 result[name] = outlook_figure(curve, point, "poses", "σ of the tool's position [mm]")
         return result
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the results of the selection: index, its value, that of random sets, efficiency, seconds, notes."""
         return selection.record(self)
 
-    def to_dataframe(self) -> Any:
+    def to_dataframe(self) -> DataFrame:
         """Return the joint values as a pandas DataFrame, a row per pose."""
         header = [f"{joint.name} [{joint.unit}]" for joint in self.chain.joints]
         return data_frame(self.q.tolist(), header)
@@ -117,6 +120,7 @@ class PredictedPoses(NamedTuple):
 class GeometryFit(Drawn, Judged, fit.Outcome):
     """A fitted geometry with covariance and verdict. ``print`` shows the ladder, errors on unseen poses and verdict."""
 
+    kind = BY_NAME["fit"]
     tab = (
         "robot verdict warnings validation estimate residuals outliers predict position_sigma plot save to_dict "
         "to_dataframe"
@@ -135,7 +139,7 @@ class GeometryFit(Drawn, Judged, fit.Outcome):
         return self.selection.fit.estimate
 
     @one_blas_thread()
-    def predict(self, q: Any, tool: int = 0) -> PredictedPoses:
+    def predict(self, q: object, tool: int = 0) -> PredictedPoses:
         """Return the tool poses of the calibrated robot at given joint values, in its base frame, with their σ.
 
         σ of the position is all that is to be expected (`position_sigma`) where the fit states it, else that of the
@@ -154,7 +158,7 @@ class GeometryFit(Drawn, Judged, fit.Outcome):
         return PredictedPoses(tool_poses, sigma)
 
     @one_blas_thread()
-    def position_sigma(self, q: Any, tool: int = 0) -> np.ndarray:
+    def position_sigma(self, q: object, tool: int = 0) -> np.ndarray:
         """Return the standard deviation (m,) [m] of the tool position error (norm over the axes) at given poses.
 
         Parameters' covariance and unmodelled effects, estimated on held-out rows: it grows with the distance from the
@@ -171,7 +175,7 @@ class GeometryFit(Drawn, Judged, fit.Outcome):
             raise UsageError("this fit has no expected errors: they need at least 20 measured positions")
         return self.expected.position_sigma(self._poses(q), tool=tool)
 
-    def _poses(self, q: Any) -> PoseMeasurements:
+    def _poses(self, q: object) -> PoseMeasurements:
         """Return poses at joint values (m, n), with gravity torques (m, n) [N m] if masses are known."""
         chain = self.inputs.chain
         q = shaped(np.atleast_2d(np.asarray(q, dtype=float)), (None, chain.n), "q")
@@ -192,11 +196,11 @@ class GeometryFit(Drawn, Judged, fit.Outcome):
         captioned = geometry_figures.captioned(collect(self))
         return {name: chart for name, (chart, _) in captioned.items()}
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the metrics as in ``metrics.json``."""
         return plain(folder.metrics(self))
 
-    def to_dataframe(self) -> Any:
+    def to_dataframe(self) -> DataFrame:
         """Return the fitted parameters as a pandas DataFrame: name, unit, nominal, value, sigma, RSD [%]."""
         from calib.procedure.kinematic_stage.tables import HEADER, estimate_table
 
@@ -246,7 +250,7 @@ def select_poses(
     from calib.workers import workers as opened
 
     stage_of(robot, "choosing poses")
-    lost_workers: list[Any] = []
+    lost_workers: list[TaskLost] = []
 
     def show(done: int, total: int, task: str) -> None:
         if progress is not None:

@@ -10,16 +10,17 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from calib.api.dynamic import DynamicsModel
-from calib.api.rendering import Drawn, Progress, optional, saved
+from calib.api.rendering import Drawn, Progress, Unjudged, optional, saved
 from calib.arguments import checked
 from calib.config import Tables
 from calib.data.poses.pose_lists import Targets
-from calib.errors import as_ours
+from calib.errors import TaskLost, as_ours
 from calib.identification.identify_options import IdentifyOptions, IdentifySettings, options_of, read_options
 from calib.procedure.excitation import design, folder, planning
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, DEFAULT_PLAN, ExcitationSettings, PlanSettings
 from calib.procedure.robot_kinds import Mechanism, MechanismResult, stage_of
 from calib.records import as_subclass
+from calib.result_kinds import BY_NAME
 from calib.robot.calibrated import CalibratedChain
 from calib.trajectories.setpoints import Setpoints
 
@@ -33,9 +34,10 @@ def _columns(track: Setpoints) -> Sampled:
     return track.times, track.q, track.v, track.a
 
 
-class ExcitationDesign(Drawn, design.Designed):
+class ExcitationDesign(Drawn, Unjudged, design.Designed):
     """A motion that excites a robot's dynamics, verified within limits. ``print`` shows condition numbers, margins."""
 
+    kind = BY_NAME["excitation"]
     tab = "period condition goals proof outlook predicted front notes sampled plot save to_dict"
 
     def sampled(self, rate: float | None = None) -> Sampled:
@@ -60,7 +62,7 @@ class ExcitationDesign(Drawn, design.Designed):
 
         return motion_figures.design_figures(self)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the metrics as ``metrics.json`` holds them."""
         return folder.design_metrics(self)
 
@@ -71,9 +73,10 @@ class ExcitationDesign(Drawn, design.Designed):
         return "\n".join(folder.design_lines(self))
 
 
-class MotionPlan(Drawn, planning.Planned):
+class MotionPlan(Drawn, Unjudged, planning.Planned):
     """The fastest motion through waypoints, within speeds and torques. ``print`` shows duration and margins."""
 
+    kind = BY_NAME["plan"]
     tab = "duration track margins deviation sigma notes sampled plot save to_dict"
 
     @property
@@ -99,7 +102,7 @@ class MotionPlan(Drawn, planning.Planned):
 
         return motion_figures.plan_figures(self)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the metrics as ``metrics.json`` holds them."""
         return folder.plan_metrics(self)
 
@@ -151,7 +154,7 @@ def design_excitation(
     """
     from calib.workers import workers as opened
 
-    lost_workers: list[Any] = []
+    lost_workers: list[TaskLost] = []
     stage = stage_of(robot, "excite", base, tip)
     with as_ours(), ExitStack() as stack:
         model_folder = None if model is None else stack.enter_context(saved(model))

@@ -15,13 +15,18 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, ClassVar, Self, overload
 
 from calib.errors import UsageError, one_of, refused_as
+from calib.procedure.findings import NOT_JUDGED, Verdict
+from calib.result_kinds import ResultKind
 from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from pandas import DataFrame  # pyright: ignore[reportMissingImports]
 
+    from calib.data.csv_table import Table
     from calib.procedure.report.charts import Chart
-    from calib.procedure.report.page import Section
+    from calib.procedure.report.page import Picture, Section
+    from calib.results.scene import Scene
 
 Progress = Callable[[str], None]
 # Letters of a line of text.
@@ -38,13 +43,13 @@ def listed(value: object | Sequence[object]) -> list:
     return result
 
 
-def optional(value: Any) -> Any:
+def optional(value: object) -> Any:
     """Return a text as a path, and any other value unchanged."""
     return Path(value) if isinstance(value, str) else value
 
 
 @contextmanager
-def saved(result: Any) -> Iterator[Path]:
+def saved(result: object) -> Iterator[Path]:
     """Yield the folder of a result: a given path unchanged, or a temporary folder of a result in memory."""
     if isinstance(result, (str, Path)):
         yield Path(result)
@@ -53,7 +58,7 @@ def saved(result: Any) -> Iterator[Path]:
             yield result.save(Path(folder) / "result", plots=False)
 
 
-def as_text(renderables: Iterable[Any]) -> str:
+def as_text(renderables: Iterable[object]) -> str:
     """Return rich renderables as plain text."""
     from rich.console import Console
 
@@ -71,12 +76,63 @@ class Shown:
     def __dir__(self) -> list[str]:
         return self.tab.split()
 
-    def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, str]:
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
         return {"text/plain": str(self)}
 
 
-class Drawn(Shown, ABC):
+class Kept(Shown, ABC):
+    """A result that is written to a folder, and a `calib.Result`: what its folder holds it reads there.
+
+    Attributes:
+        kind: one of `calib.result_kinds.KINDS`.
+    """
+
+    kind: ClassVar[ResultKind]
+
+    @abstractmethod
+    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+        """Write the result's folder."""
+
+    def figures(self) -> Mapping[str, Picture]:
+        """Return the figures by name, as PNG."""
+        return {}
+
+    def tables(self) -> Mapping[str, Table]:
+        """Return the tables by name, as the files that `save` writes hold them."""
+        from calib.results.registry import open_result
+
+        with saved(self) as folder:
+            return open_result(folder).tables()
+
+    def scene(self, robot: str | None = None) -> Scene:
+        """Return what the viewer draws: robot, poses, motions, torques.
+
+        Args:
+            robot: the robot to draw; None for the result's.
+        """
+        from calib.results.registry import open_result
+
+        with saved(self) as folder:
+            return open_result(folder, "view").scene(robot)
+
+
+class Unjudged(Kept):
+    """A result that keeps what was asked of it, and has no verdict."""
+
+    @property
+    def verdict(self) -> Verdict:
+        """Not judged."""
+        return Verdict(NOT_JUDGED, f"{self.kind.noun} has no verdict")
+
+
+class Drawn(Kept):
     """A result with figures."""
+
+    def figures(self) -> Mapping[str, Picture]:
+        """Return the figures by name, as PNG."""
+        from calib.procedure.report.charts import picture
+
+        return {name: picture(chart, "") for name, chart in self.charts().items()}
 
     @abstractmethod
     def charts(self) -> Mapping[str, Chart]:
@@ -98,7 +154,7 @@ class Drawn(Shown, ABC):
         return charts.figure(charts_by_name[name])
 
 
-class Judged(Shown, ABC):
+class Judged(Kept):
     """A result shown as a section of a report: on a console, by ``print``, and as a page in a notebook."""
 
     @abstractmethod
@@ -110,7 +166,7 @@ class Judged(Shown, ABC):
         """The result itself (for compatibility with earlier versions)."""
         return self
 
-    def renderables(self) -> Iterator[Any]:
+    def renderables(self) -> Iterator[object]:
         """Yield the rich renderables that ``print`` shows."""
         from calib.procedure.report import page
 
@@ -125,7 +181,7 @@ class Judged(Shown, ABC):
 
         return notebook(self)
 
-    def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, str]:
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
         """Return the page in a frame of its own, so that its style does not become the notebook's."""
         bundle = super()._repr_mimebundle_()
         page = self._repr_html_()
@@ -135,7 +191,7 @@ class Judged(Shown, ABC):
         return bundle
 
 
-def data_frame(rows: Iterable[Any], columns: Sequence[str]) -> Any:
+def data_frame(rows: Iterable[object], columns: Sequence[str]) -> DataFrame:
     """Return rows as a pandas DataFrame.
 
     Raises:

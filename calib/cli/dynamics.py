@@ -1,13 +1,16 @@
 """Commands for dynamics: excite, recall, identify, and plan (motions)."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from calib.cli.completion import Robot
 from calib.cli.shared import Out, Seed, check_destination, command, progress, say, say_written
 from calib.procedure.excitation.settings import ExcitationSettings, PlanSettings
+
+if TYPE_CHECKING:
+    from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 
 app = typer.Typer()
 
@@ -105,8 +108,7 @@ def identify_dynamics(
         out: folder for the identified model and its report
         validate: recording of other motion; may be repeated
         method: wls or another one of calib formats identify-options
-        friction: auto, standard, or one step: coupling, load, presliding, stribeck, asymmetric, root, cubic, ripple,
-            cable
+        friction: auto, standard, or one step of the ladder; calib formats identify-options names them
         options: TOML: drives, payloads, gains, filters, identification
         excitation: folder of calib excite: its prediction is compared with the result; its motion is the reference of
             recordings that have none (methods with a [loop])
@@ -116,7 +118,7 @@ def identify_dynamics(
 
     check_destination("identify", robot, out, [options, *recordings, *(validate or [])])
 
-    def read(inputs: Any) -> None:
+    def read(inputs: "IdentificationInputs") -> None:
         check_destination("identify", robot, out, [inputs.source, inputs.source.parent])
         say(*read_lines(inputs))
 

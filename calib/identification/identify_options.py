@@ -2,8 +2,8 @@
 
 TOML; every key is optional, and a key that is none of these is refused. SI units; joints are counted from 1::
 
-    friction = "auto"                # auto, standard, or a rung: coupling, load, presliding, stribeck, asymmetric,
-                                     # root, cubic, ripple; with rows = "both" also cable
+    friction = "auto"                # auto, standard, or one rung of the ladder; all names: below; auto tries cable
+                                     # where rows = "both"
     method = "wls"                   # ols, wls, irls, tls, gtls, ml, adaline, hopfield, set-membership; ekf, ukf, cdkf
                                      # and their square-root forms srekf …; iv, didim (called CLIE elsewhere), cloe,
                                      # clie (the survey's) simulate the closed loop, see [loop]; pc-ols, pc-wls,
@@ -93,7 +93,7 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from calib.arguments import checked
 from calib.config import check_keys, inherited, own_table, parse, read_toml, strict
@@ -111,7 +111,7 @@ USED = 600_000
 """Samples of a recording, unless stated: ten minutes at 1 kHz (our choice)."""
 
 
-def _no_zero(value: Any) -> Any:
+def _no_zero(value: object) -> object:
     """Refuse a list of numbers with a zero."""
     if isinstance(value, list):
         for number in value:
@@ -249,7 +249,7 @@ def read_options(path: str | Path | None = None) -> IdentifyOptions:
     return parse_options(read_toml(path), str(path))
 
 
-def parse_options(table: Mapping[str, Any], source: str = "options") -> IdentifyOptions:
+def parse_options(table: Mapping[str, object], source: str = "options") -> IdentifyOptions:
     """Return the options in a parsed TOML table; `source` names the file in messages."""
     for key in table.keys() & REMOVED.keys():
         refuse_option(f"{source}: {key}", REMOVED[key])

@@ -51,7 +51,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, TypeVar
 
 import numpy as np
 
@@ -137,13 +137,15 @@ def per_joint(values: Sequence[T], n: int, name: str) -> tuple[T, ...]:
     return tuple(values)
 
 
-def check_loop(table: Any) -> Any:
+def check_loop(table: object) -> object:
     """Return the parsed table [loop] unchanged after a check that its gains fit its controller.
 
     Raises:
         ValueError: for a missing controller, gains of another controller, or missing gains.
     """
-    kind = table.get("controller") if isinstance(table, Mapping) else ""
+    if not isinstance(table, Mapping):
+        return table
+    kind = table.get("controller")
     if kind is None:
         raise ValueError(f"'controller' is missing; expected one of {', '.join(CONTROLLERS)}")
     if not isinstance(kind, str) or kind not in OWNED:
@@ -310,7 +312,7 @@ class LoopResults:
 
     metrics: LoopMetrics | None = None
     findings: tuple[Finding, ...] = ()
-    table: tuple[tuple[Any, ...], ...] = ()
+    table: tuple[tuple[object, ...], ...] = ()
     controller: Controller | None = None
     disagreement: LoopDisagreement | None = None
 

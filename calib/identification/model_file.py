@@ -43,13 +43,12 @@ after the unseen ones.
 """
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from calib import folders
+from calib.config_types import ParsedTable
 from calib.dynamics.base import Base, expressions
 from calib.dynamics.bodies import bodies_of, with_payload
 from calib.dynamics.drives import DriveTerm
@@ -85,7 +84,7 @@ def read_dynamics(folder: str | Path) -> tuple[Chain, Dynamics]:
         return chain, from_table(chain, table)
 
 
-def read_table(folder: Path) -> dict[str, Any]:
+def read_table(folder: Path) -> ParsedTable:
     """Return the content of ``dynamics.json`` as a table for `from_table`.
 
     Raises:
@@ -142,7 +141,7 @@ def refuse_other_arm(folder: Path, chain: Chain) -> None:
         )
 
 
-def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, Any]:
+def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, object]:
     """Return the model as a table for JSON; `unit`: that of its torques."""
     model = dynamics.model
     inertial = model.inertial
@@ -189,7 +188,7 @@ def regrouping(base: Base) -> dict[str, dict[str, float]]:
     return coefficients
 
 
-def from_table(chain: Chain, table: Mapping[str, Any]) -> Dynamics:
+def from_table(chain: Chain, table: ParsedTable) -> Dynamics:
     """Return the model of a chain from a table that `to_table` made."""
     bodies = bodies_of(chain).with_gravity(np.array(table["gravity"], dtype=float))
     for label in table.get("payloads", ()):
@@ -205,7 +204,7 @@ def from_table(chain: Chain, table: Mapping[str, Any]) -> Dynamics:
     return Dynamics(model, np.array(values))
 
 
-def _term(entry: Mapping[str, Any]) -> DriveTerm:
+def _term(entry: ParsedTable) -> DriveTerm:
     """Return the drive term of an entry of the table."""
     acts = []
     for row, motion in entry["acts"]:

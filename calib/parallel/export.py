@@ -21,9 +21,10 @@ of a serial arm; payloads are not part of the robot.
 """
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -67,6 +68,7 @@ from calib.robot.formats.simulators import mjcf_text, pinocchio_model, pose_attr
 from calib.robot.formats.urdf_tree import transform_body, with_comment
 from calib.robot.formats.urdf_write import add_joint, centred, numbers_text, put, write_new, xml_text
 from calib.robot.kinematics import joint_frames
+from calib.robot.native import NativeModel
 from calib.transforms import invert
 
 PLATFORM, CLOSURES = "platform", "robot.yaml"
@@ -246,7 +248,7 @@ class _Source:
     """What an export is made of: the robot with its dynamics, all parameters as a table, and notes."""
 
     opened: OpenedRobot
-    parameters: dict[str, Any]
+    parameters: dict[str, object]
     notes: tuple[str, ...]
 
 
@@ -265,13 +267,13 @@ class _ArmModel:
     """What `find_possible` reads of the model of an arm."""
 
     bodies: _ArmBodies
-    columns: tuple[Any, ...]
+    columns: tuple[object, ...]
     names: tuple[str, ...]
     inertial: int
     torque_rows: Any
 
 
-def _side_by_side(model: ParallelModel, bodies: np.ndarray | None) -> tuple[Any, Any]:
+def _side_by_side(model: ParallelModel, bodies: np.ndarray | None) -> tuple[Chain, Any]:
     """Return the bodies of a model in the form that `find_possible` reads of serial arms: parameters and labels alone.
 
     Bodies without known masses are rods of 1 kg each, a leg's between its joints.
@@ -368,7 +370,7 @@ def _calibrated(robot: ParallelMechanism, folder: Path) -> _Source:
     prior_bodies = next(find_prior_bodies(chain, arm))
     estimate = read_estimate(folder)
     covariance = read_covariance(folder / COVARIANCE)[1]
-    table: dict[str, Any] = {
+    table: dict[str, object] = {
         "names": [row.name for row in estimate],
         "units": [row.unit for row in estimate],
         "values": [row.value for row in estimate],
@@ -428,7 +430,7 @@ def export_parallel(robot: ParallelMechanism, folder: Path, into: Path, prior: s
     return (*([remark] if remark else []), message, *source.notes)
 
 
-def check_export_target(out: Path, inputs: Any = ()) -> None:
+def check_export_target(out: Path, inputs: Iterable[str | Path | None] = ()) -> None:
     """Raise an error if an output folder has other content or contains an input file."""
     check_target(out, tuple(USES), (PARAMETERS,), "export", inputs)
 
@@ -494,7 +496,7 @@ def _check(opened: OpenedRobot, text: str, where: str, postures: int = 5) -> Non
         raise RobotError(f"{where}: forces differ by {off:.2g} of the largest when Pinocchio reads it; nothing written")
 
 
-def _models(text: str) -> list[Any]:
+def _models(text: str) -> list[NativeModel]:
     """Return Pinocchio's models of each leg and of a floating platform of an MJCF text: it reads one tree at a time.
 
     The keyframe is left out, since for joints without limits Pinocchio wants cosine and sine there.
@@ -511,11 +513,11 @@ def _models(text: str) -> list[Any]:
     return models
 
 
-def _forces(opened: OpenedRobot, model: Any, motion: LoopMotion, m: int, frames: dict[str, np.ndarray]) -> np.ndarray:
+def _forces(
+    opened: OpenedRobot, model: NativeModel, motion: LoopMotion, m: int, frames: dict[str, np.ndarray]
+) -> np.ndarray:
     """Return the forces (r,) of a Pinocchio model on the platform's coordinates in sample m; its frames are added."""
-    import pinocchio
-
-    pin: Any = pinocchio
+    pin = import_module("pinocchio")
     data = model.createData()
     mechanism = opened.mechanism
     model.gravity = pin.Motion(np.array(mechanism.robot.gravity), np.zeros(3))

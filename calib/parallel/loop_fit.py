@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -44,10 +44,12 @@ from calib.parallel.robots import ParallelMechanism, refuse_unread
 from calib.procedure.findings import Verdict
 from calib.procedure.kinematic_stage.folder import RESIDUALS
 from calib.procedure.kinematic_stage.settings import FitSettings
+from calib.result_kinds import BY_NAME
 from calib.robot import calibrated
 from calib.robot.calibrated import ROBOT
 
 if TYPE_CHECKING:
+    from calib.api.rendering import DataFrame
     from calib.procedure.report.charts import Chart
     from calib.procedure.report.page import Section
 
@@ -75,6 +77,8 @@ class ParallelFit(Drawn, Judged):
         unseen_rows: the unseen rows themselves, by name, but those of a cross-validation.
         settings: what was asked for.
     """
+
+    kind = BY_NAME["fit"]
 
     nominal: ParallelMechanism
     files: tuple[Path, ...]
@@ -203,11 +207,11 @@ class ParallelFit(Drawn, Judged):
             rows += [[name, *row] for row in table.tolist()]
         return head, rows
 
-    def to_dataframe(self) -> Any:
+    def to_dataframe(self) -> DataFrame:
         """Return the estimate as a pandas DataFrame: name, unit, value, sigma."""
         return data_frame(self._table(), HEADER)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the content of ``metrics.json``."""
         fit = self.fit
         verdict = self.verdict

@@ -6,7 +6,6 @@ import numpy as np
 
 from calib import files
 from calib.apps.cell_demo.summary import PICTURE
-from calib.apps.viewer import scene
 from calib.procedure.export.delivery import prediction
 from calib.procedure.report import fit_report
 from calib.procedure.report.charts import Chart, Panel, line, picture, text
@@ -15,6 +14,7 @@ from calib.procedure.report.style import AFTER, BEFORE, BROWN, INK, QUIET
 from calib.procedure.session.folder import Session
 from calib.procedure.session.geometry_steps import chain_of
 from calib.procedure.session.results import position_errors, torque_error
+from calib.toolkit.opened_results import drawn, skeleton
 
 # from where the cell is seen
 AZIMUTH, ELEVATION = np.deg2rad([-60.0, 20.0])
@@ -42,10 +42,10 @@ def _seen_from(points: np.ndarray) -> np.ndarray:
 def _cell(session: Session) -> Panel:
     """Return the arm at one of its poses, and the errors at all poses before and after, enlarged."""
     chain = chain_of(session)
-    (measured,) = scene.read(session.folder).measured
+    (measured,) = drawn(session.folder).measured
     scale = measured.arrow_scale(chain)
     # the pose that reaches farthest to the side and up
-    arms = _seen_from(scene.skeleton(chain, measured.q))
+    arms = _seen_from(skeleton(chain, measured.q))
     tips = arms[:, -1]
     farthest = int(np.argmax(tips[:, 1] + np.abs(tips[:, 0])))
     x, y = arms[farthest].T

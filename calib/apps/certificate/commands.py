@@ -5,7 +5,6 @@ from pathlib import Path
 import typer
 
 from calib.cli.shared import command, say
-from calib.errors import UsageError, command_line
 from calib.procedure.answers import CertificateSection
 
 app = typer.Typer()
@@ -24,21 +23,6 @@ def certificate(folder: Path, details: CertificateSection, svg: Path | None = No
         folder: of a fit, an identification, or a finished session
         svg: folder for all figures of the report as SVG
     """
-    from calib.folders import PAGES, SESSION
-    from calib.procedure.report.certificate import rendering, results
-    from calib.procedure.session import certificate as session
-    from calib.procedure.session.folder import open_session
+    from calib.toolkit.opened_results import open_result
 
-    if (folder / SESSION).exists():
-        if details != CertificateSection() or svg is None:
-            redo = command_line("redo", folder, "certificate")
-            raise UsageError(f"{folder / SESSION} has the details, under [certificate]; then: {redo}")
-        _, report = session.pages(open_session(folder))
-    else:
-        page, report = results.read(folder, plots, details)
-        notes = rendering.write(folder, page, report)
-        paths = ", ".join(str(folder / name) for name in PAGES)
-        say(*notes, f"written: {paths}")
-    if svg is not None:
-        count = rendering.write_figures(svg, report)
-        say(f"{count} figures written to {svg}")
+    say(*open_result(folder, "certificate").certify(details, plots, svg))

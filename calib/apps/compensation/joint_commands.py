@@ -32,13 +32,12 @@ from calib.geometry.error_model import Discrepancy, ErrorModel, outside
 from calib.geometry.installation import Installation, see
 from calib.geometry.inverse import Goal
 from calib.geometry.observation import layout, pose_sigmas
-from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.findings import lines_of, sentence
-from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
+from calib.procedure.kinematic_stage.folder import VALIDATED, ValidationFolder
 from calib.procedure.kinematic_stage.tables import read_covariance
-from calib.result_kinds import refusal
 from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain
+from calib.toolkit.opened_results import open_result
 from calib.transforms import from_xyz_rpy, invert, pose, rotation_vector
 
 # Thresholds are our choice.
@@ -147,20 +146,16 @@ def read(folder: str | Path) -> Fitted:
     Raises:
         UsageError: where it is none, or lacks something.
     """
-    session = Path(folder)
-    fit = FitFolder(session)
-    in_session = FitFolder(session / IN_SESSION)
-    if in_session.robot.is_file() and not fit.robot.is_file():
-        fit = in_session
-    identified = IdentificationFolder(fit.path).model.is_file()
-    if identified or not fit.robot.is_file():
-        raise UsageError(refusal(session, "compensate"))
+    result = open_result(folder, "compensate")
+    fit = result.fit("compensate")
+    if fit is None:
+        result.refuse("compensate")
     cell, nominal = installation.read_arms(fit.path)
     free, covariance = read_covariance(fit.path, cell)
 
     metrics = fit.metrics()
     validation_metrics = metrics
-    validation = ValidationFolder(session / VALIDATED)
+    validation = ValidationFolder(Path(folder) / VALIDATED)
     if validation.judged.is_file():
         validation_metrics = validation.metrics()
     unseen_rms = []

@@ -240,14 +240,8 @@ def identify_instrumental(
             "instruments from simulation need a recording with its reference, and rows motor, link or both (of a "
             f"parallel robot motor or platform); found '{rows.name}'"
         )
-    observed = [replace(observe(model, base.kept, case, decimator), names=base.names) for case, _ in cases]
+    observed, friction = _observed_with_friction(model, base, cases, decimator, terms)
     data = pool(triangulate(observed), model.rows)
-    friction = _Friction((), model, decimator, None)
-    if terms:
-        loads = base.to_standard(wls(data, settled_std(data, 1e-3)).estimate.values)
-        friction = _Friction(tuple(terms), model, decimator, loads)
-        observed = [friction.added(part, case) for part, (case, _) in zip(observed, cases)]
-        data = pool(triangulate(observed), model.rows)
     if constraints is None and positive:
         settings = ConstraintSettings(signs=False, inertia=0, bounds=dict.fromkeys(positive, (0.0, np.inf)))
         constraints = make_constraints(settings, model, base, base.names, [None] * base.b)
@@ -265,7 +259,9 @@ def identify_instrumental(
         raise CannotSimulate(str(error), error.last) from error
     # of the last step, and how often it was halved afterwards
     start, returns = plant, 0
-    for _ in range(limit):
+    round_count = 0
+    while True:
+        round_count += 1
         estimate = _estimate_round(task, runs, std, tau)
         task = task.after(estimate)
         rounds.append(Round(_change(before, estimate.fit), estimate.fit.estimate.residual_std, retreats))
@@ -284,14 +280,36 @@ def identify_instrumental(
         before = estimate.fit
         std = estimate.fit.group_std
         tau = estimate.tau
-    kind = NotConverged
-    if len(rounds) > 2 and rounds[-1].change > rounds[1].change:
-        kind = Diverged
-    raise kind(
-        f"instruments from simulation: parameters still change by {100 * rounds[-1].change:.3g} % after {limit} "
-        f"iterations; estimate fewer (essential ones), or check the controller's gains{_if_weak(task, estimate, std)}",
-        before,
+    change_percent = 100 * rounds[-1].change
+    message = (
+        f"instruments from simulation: parameters still change by {change_percent:.3g} % after {limit} "
+        f"iterations; estimate fewer (essential ones), or check the controller's gains{_if_weak(task, estimate, std)}"
     )
+    if len(rounds) > 2 and rounds[-1].change > rounds[1].change:
+        raise Diverged(message, before)
+    raise NotConverged(message, before)
+
+
+def _observed_with_friction(
+    model: IdentificationModel,
+    base: Base,
+    cases: Sequence[tuple[Case, Loop]],
+    decimator: Decimator,
+    terms: Sequence[DriveTerm],
+) -> tuple[list[ObservationRows], _Friction]:
+    """Return the rows of all cases, and their richer friction, whose loads are those by least squares without it."""
+    observed = []
+    for case, _ in cases:
+        rows = observe(model, base.kept, case, decimator)
+        observed.append(replace(rows, names=base.names))
+    if not terms:
+        return observed, _Friction((), model, decimator, None)
+    data = pool(triangulate(observed), model.rows)
+    ordinary = wls(data, settled_std(data, 1e-3))
+    loads = base.to_standard(ordinary.estimate.values)
+    friction = _Friction(tuple(terms), model, decimator, loads)
+    richer = [friction.added(part, case) for part, (case, _) in zip(observed, cases)]
+    return richer, friction
 
 
 @dataclass(frozen=True, eq=False)
@@ -492,7 +510,7 @@ def _simulate_new(
     Then those on the way to them (our choice). A controller holds no robot of next to no inertia.
     """
     retreats = 0
-    while retreats < MAX_RETREATS:
+    while True:
         candidate = _between(old, task.plant(old, estimate), 0.5**retreats)
         try:
             return task, estimate, candidate, _runs(candidate, task.cases), retreats
@@ -510,6 +528,8 @@ def _simulate_new(
                 estimate = replace(estimate, fit=fit, bound=binding)
                 continue
         retreats += 1
+        if retreats >= MAX_RETREATS:
+            break
     message = f"neither the estimate nor smaller steps can be simulated: {problem}{_if_weak(task, estimate, std)}"
     raise CannotSimulate(message, task.plant(old, estimate))
 

@@ -113,8 +113,8 @@ class _Simulated(Method):
                 constraints=constraints,
             )
             simulations = 0
-            for round_ in identification.rounds:
-                simulations += len(loops.pairs) * (1 + round_.retreats)
+            for iteration in identification.rounds:
+                simulations += len(loops.pairs) * (1 + iteration.retreats)
             result = replace(
                 plain,
                 method=self.name,
@@ -345,7 +345,7 @@ def loop_results(problem: IdentificationProblem, estimate: MethodEstimate) -> Lo
     """Return the results of an estimate's loop test, in the form that is stored and printed."""
     test = compare_with_loop(problem, estimate)
     is_estimate = isinstance(estimate, LoopEstimate) and estimate.instrumental is not None
-    table: tuple[tuple[Any, ...], ...] = ()
+    table: tuple[tuple[object, ...], ...] = ()
     if test.found is not None:
         table = _table(test.found)
     metrics = _metrics(test, not is_estimate)
@@ -390,7 +390,7 @@ def _metrics(test: LoopTest, beside: bool) -> LoopMetrics:
     )
 
 
-def _table(identification: Instrumental) -> tuple[tuple[Any, ...], ...]:
+def _table(identification: Instrumental) -> tuple[tuple[object, ...], ...]:
     """Return the rows of both estimates of the standard model, one for each parameter."""
     estimate = identification.fit.estimate
     ordinary = identification.ordinary.estimate.values

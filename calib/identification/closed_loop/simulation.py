@@ -55,7 +55,7 @@ class Plant:
     Attributes:
         bodies: rigid bodies of the robot.
         terms: drive terms of the robot; signs have a smoothing above zero.
-        parameters: (10 B + k,) standard parameters of the bodies, then one value per term. Any values that give a
+        parameters: (10 B + k,) standard parameters of the bodies, then one value per term. object values that give a
             positive definite inertia are valid, also base parameters with zeros for the others.
     """
 
@@ -425,6 +425,6 @@ def plant_of(model: Any, values: np.ndarray, terms: Sequence[DriveTerm] = ()) ->
     return model.plant(values, terms)
 
 
-def simulable(model: Any) -> bool:
+def simulable(model: object) -> bool:
     """Return whether a model's motion can be simulated."""
     return isinstance(model, IdentificationModel) or hasattr(model, "plant")

@@ -59,7 +59,10 @@ def reference_shift(
     """
     law = _Law(case, reference, every, controller, band)
     shift = _by_positions(law.asked, law.measured, law.t[law.rows])
-    for _ in range(30):
+    max_steps = 30
+    steps = 0
+    while True:
+        steps += 1
         residual, slopes = law.linearised(shift)
         weighted = slopes / np.maximum(residual.var(axis=0), 1e-300)
         information = float(np.sum(weighted * slopes))
@@ -69,6 +72,8 @@ def reference_shift(
             break
         if abs(shift) > MAX_SHIFT:
             raise NotConverged(f"{case.name}: no shift of the reference in time explains the torques: check [loop]")
+        if steps == max_steps:
+            break
     tau = np.mean([inflation(column) for column in residual.T])
     sigma = float(np.sqrt(tau / max(information, 1e-300)))
     torque = law.torque(law.t, 0)[law.rows]
@@ -176,13 +181,13 @@ def motor_torques(case: Case) -> np.ndarray | None:
     return None
 
 
-def check_no_copy(motion: Motion, reference_: np.ndarray) -> None:
+def check_no_copy(motion: Motion, reference_q: np.ndarray) -> None:
     """Refuse a reference that is the measured motion itself, perhaps shifted in time, rounded or low-passed.
 
     Where the motion has died away the positions hold noise alone: a reference that holds it, too, comes from them.
 
     Args:
-        asked: the reference (N, n), filtered like the measured positions.
+        reference_q: the reference (N, n), filtered like the measured positions.
 
     Raises:
         MeasurementError: naming the shift.
@@ -195,7 +200,7 @@ def check_no_copy(motion: Motion, reference_: np.ndarray) -> None:
     if len(rows) < 10 or not moves.any():
         return
     measured = CubicSpline(t, motion.q[:, moves])
-    reference = CubicSpline(t, reference_[:, moves])
+    reference = CubicSpline(t, reference_q[:, moves])
     shift = _by_positions(reference, measured, rows)
     residual = measured(rows) - reference(np.clip(rows - shift, t[0], t[-1]))
     # of the positions' noise in the band; no commanded motion has that of the encoders

@@ -11,7 +11,6 @@ the bias of least squares in a loop.
 """
 
 from dataclasses import dataclass
-from itertools import count
 
 import numpy as np
 import scipy.linalg
@@ -266,7 +265,8 @@ class _Planes:
         max_entering = 8
         # rounds in which what does not bind may go: rounding could let it come back
         max_drops = 30
-        for rounds in count():
+        rounds = 0
+        while True:
             if not len(active):
                 active = np.argsort(small.least_eigenvalues(self.free / self.unit)[0])[:max_entering]
             goal = self.upper, self.target, rows[:c], -edges[:c]
@@ -286,6 +286,7 @@ class _Planes:
             if rounds < max_drops:
                 active = active[bind]
             active = np.union1d(active, worst[margins[worst] < 0.0])
+            rounds += 1
         held_by = np.einsum("kij,kijp->kp", pushes[bind], small.matrices[active[bind]])
         normals[active[bind]] = held_by / traces[bind, None]
         force = np.zeros(len(small.matrices))

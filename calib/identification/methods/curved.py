@@ -161,7 +161,7 @@ def make_curved(constraint: CurvedConstraint, row: Callable[[Mapping[str, float]
     return Curved(name, names, _rows(names, row), value, derivatives, False)
 
 
-def _called(function: Callable[..., Any], location: str, count: int) -> Callable[[np.ndarray], np.ndarray]:
+def _called(function: Callable[..., object], location: str, count: int) -> Callable[[np.ndarray], np.ndarray]:
     def call(u: np.ndarray) -> np.ndarray:
         values = np.ravel(np.asarray(function(*map(float, u)), dtype=float))
         if len(values) != count:

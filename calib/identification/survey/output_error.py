@@ -95,15 +95,17 @@ class _OutputError(Method):
         std = task.spread(first, 0)
         count = 1
         # of weighing joints by what the last estimate leaves
-        rounds = 3
-        for _ in range(rounds):
+        max_rounds = 3
+        rounds = 0
+        while True:
+            rounds += 1
             solution = task.solved(values, std)
             values = solution.state
             count = count + solution.iterations
             residual, slopes = task.linearised(values)
             before = std
             std = task.spread(residual, len(values))
-            if np.all(np.abs(std / before - 1.0) < 0.1):
+            if rounds == max_rounds or np.all(np.abs(std / before - 1.0) < 0.1):
                 break
         fit = _packed(task, plain, values, residual, slopes, std)
         step = np.linalg.norm(_gradient(residual / std, slopes / std[:, None]))

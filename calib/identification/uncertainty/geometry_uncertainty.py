@@ -31,7 +31,6 @@ with the noise. (`didim`: W is Z.) For other methods the sensitivity is that of 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -40,6 +39,7 @@ from scipy.spatial.transform import Rotation
 from calib.data.signals.filtering import Decimator, decimate, kept, spread
 from calib.dynamics import rigid_body
 from calib.dynamics.bodies import Bodies
+from calib.dynamics.regressor_model import RegressorModel
 from calib.dynamics.torque_rows import BODIES
 from calib.estimation.triangles import retriangulate
 from calib.identification.identify import Identification, common_decimator
@@ -86,7 +86,7 @@ class _Estimator:
     pull: np.ndarray
 
 
-def estimator(identification: Identification[Any]) -> _Estimator:
+def estimator(identification: Identification[RegressorModel]) -> _Estimator:
     """Return an identification's estimator: weights of its rows and prior."""
     fitted = identification.fitted
     p = fitted.pooled.parameters
@@ -142,7 +142,7 @@ def cut(rows: ObservationRows, part: slice) -> ObservationRows:
         block=rows.block[part],
         standing=rows.standing[part],
         swing=rows.swing[part],
-        slowness=rows.slowness[part],
+        breakaway=rows.breakaway[part],
     )
 
 
@@ -285,7 +285,7 @@ def sensitivity(
 
 
 def solve_sensitivity(
-    identification: Identification[Any],
+    identification: Identification[RegressorModel],
     cases: Sequence[Case],
     differences: Callable[..., tuple[np.ndarray, np.ndarray]],
     samples: int,

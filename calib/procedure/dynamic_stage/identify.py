@@ -7,11 +7,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from os.path import realpath
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from calib.data.signals.persistency import ExcitationReport, repeats, report_excitation
+from calib.dynamics.regressor_model import RegressorModel
 from calib.errors import Finding, finding
 from calib.identification.friction.passivity import driven
 from calib.identification.identify import Identification, identify
@@ -129,7 +130,7 @@ def overlaps(cases: Sequence[Case], unseen: Sequence[Case]) -> list[Finding]:
 
 def errors_of(
     inputs: IdentificationInputs,
-    dynamics: Dynamics[Any],
+    dynamics: Dynamics[RegressorModel],
     errors: torque_errors.TorqueErrorModel | None = None,
     say: Progress = silent,
 ) -> Errors:

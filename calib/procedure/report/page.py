@@ -49,26 +49,26 @@ class Column(NamedTuple):
     """A column of a table of records: name, format of a cell (``{0.sigma:.2g}``), and alignment."""
 
     name: str
-    cell: str | Callable[[Any], str]
+    cell: str | Callable[..., str]
     number: bool = True
 
-    def of(self, record: Any) -> str:
+    def of(self, record: object) -> str:
         """Return the text of a record's cell."""
         if isinstance(self.cell, str):
             return self.cell.format(record)
         return self.cell(record)
 
 
-def _never(record: Any) -> bool:
+def _never(record: object) -> bool:
     return False
 
 
 def table(
     title: str,
     columns: Sequence[Column],
-    records: Sequence[Any],
+    records: Sequence[object],
     note: str = "",
-    strong: Callable[[Any], bool] = _never,
+    strong: Callable[..., bool] = _never,
     most: int | None = None,
 ) -> Table:
     """Return a table of records, one row per record up to `most`, with the `strong` ones in bold."""

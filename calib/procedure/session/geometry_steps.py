@@ -9,7 +9,6 @@ from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -64,7 +63,7 @@ CAMERA_ADVICE = "add [camera] to the limits file, see `calib formats constraints
 # [rad or m]: joints closer to the commanded ones were not read back
 MIN_READBACK_DIFFERENCE = 1e-8
 
-WRITE_PROGRAM: Point[Callable[[Path, Path, str], Any]] = Point(
+WRITE_PROGRAM: Point[Callable[[Path, Path, str], object]] = Point(
     "write_program", "files of a program of the poses in a CSV"
 )
 

@@ -8,7 +8,7 @@ from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from operator import attrgetter
 from pathlib import Path, PurePath
 from textwrap import wrap
-from typing import Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, get_type_hints
 
 import rtoml
 
@@ -41,6 +41,9 @@ from calib.procedure.kinematic_stage.settings import (
     Stations,
 )
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
 # version of ``session.toml``, and those that can be read: a session of schema 1 knows no dynamics; it goes on as
 # geometry alone
 SCHEMA = 2
@@ -61,7 +64,7 @@ _HEAD = (
 )
 
 
-def _beside(value: Any) -> Any:
+def _beside(value: object) -> object:
     """Check that a name is a valid relative path, and return it."""
     if not isinstance(value, str):
         return value
@@ -141,8 +144,8 @@ class FitSection:
     """Section ``[fit]``: fit and validation of the geometry.
 
     Attributes:
-        model: or frames, offsets, geometry, stiffness, bending, coupling, harmonics, wobble
-        loss: or none, huber, cauchy; auto: robust if rows are grossly wrong
+        model: or {others}
+        loss: or {others}; auto: robust if rows are grossly wrong
         options: a TOML file next to this one: column names, units; see `calib formats options`
         stations: base placements of the robot: each (one per measured file) or one (the same for all files)
         validation_frames: base and tool placement of validation files: fit (as fitted) or own (fitted anew)
@@ -183,7 +186,7 @@ class DynamicsSection:
         evaluations: largest number of motions that are evaluated per start
         limits: a TOML file next to this one; see `calib formats limits`
         torques: motor, link (sensors behind the gears), or both
-        friction: or standard, or one step of the ladder; see calib identify --friction
+        friction: or standard, or one step of the ladder; see `calib formats identify-options`
         method: or ols, irls, tls, …; see calib study --list-methods
         options: a TOML file next to this one; see `calib formats identify-options`; for methods with a [loop] the
             designed motion is the reference of recordings without columns q_ref
@@ -271,7 +274,7 @@ def read_settings(path: Path) -> SessionSettings:
     return settings
 
 
-def check_schema(path: Path, schema: Any) -> None:
+def check_schema(path: Path, schema: object) -> None:
     """Raise an error for a schema number that this version cannot read.
 
     Raises:
@@ -289,7 +292,7 @@ def check_schema(path: Path, schema: Any) -> None:
     raise SessionError(f"{path}: schema {shown(schema)} is unknown, this version reads {readable}; make a new session")
 
 
-def default_keys(section: str) -> dict[str, Any]:
+def default_keys(section: str) -> dict[str, object]:
     """Return the defaults of a section by key; empty for a key outside sections."""
     kind = get_type_hints(SessionSettings).get(section)
     keys = fields(kind) if is_dataclass(kind) else ()
@@ -304,7 +307,7 @@ def written(settings: SessionSettings) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _lines(section: Any, prefix: str = "") -> Iterator[str]:
+def _lines(section: "DataclassInstance", prefix: str = "") -> Iterator[str]:
     """Yield the lines of a section, with the comments of keys aligned in one column, and tables last."""
     comments = described(type(section))
     tables = []

@@ -14,7 +14,6 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 from calib.errors import SessionError
 from calib.extensions import Point
@@ -443,7 +442,7 @@ def changed_inputs(before: Mapping[str, str], after: Mapping[str, str]) -> str:
     return ", ".join(parts)
 
 
-def _comparable(name: str, mark: str) -> Any:
+def _comparable(name: str, mark: str) -> object:
     """Return a fingerprint in comparable form: settings as values (3 equals 3.0), missing keys as their defaults."""
     if not name.startswith(folder.SETTINGS):
         return mark

@@ -71,7 +71,7 @@ def pdf(page: Certificate) -> tuple[bytes, list[str]]:
         return b"", [f"{PAGES[1]} was not written, since this process was forked: start processes by spawn"]
     images: dict[str, bytes] = {}
 
-    def as_json(value: Any) -> Any:
+    def as_json(value: Any) -> object:
         if not isinstance(value, bytes):
             return list(value)
         name = f"{len(images)}.svg"

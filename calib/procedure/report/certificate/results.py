@@ -5,16 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Protocol
 
-from calib.errors import UsageError, command_line
-from calib.folders import SESSION
 from calib.procedure.answers import CertificateSection
 from calib.procedure.report.certificate import rendering
 from calib.procedure.report.certificate.record import NO_DETAILS, Certificate, Entry, Page, records, report
-from calib.procedure.report.page import Picture
+from calib.procedure.report.page import Picture, Section
 from calib.procedure.report.templates import versions
-from calib.result_kinds import refusal
 from calib.units import DEG
 
 if TYPE_CHECKING:
@@ -34,25 +31,12 @@ def write_fit(fit_report: Report, drawn: Mapping[str, Picture], folder: Path) ->
     rendering.write(folder, *of_fit(fit_report, drawn))
 
 
-def read(folder: Path, plots: bool, details: CertificateSection) -> tuple[Certificate, Page]:
-    """Return certificate and report of the fit or identification in a folder.
-
-    Raises:
-        UsageError: where there is none, or it is a session's, which has a certificate of its own.
-    """
-    from calib.procedure.dynamic_stage.folder import IdentificationFolder
+def read_fit(folder: Path, plots: bool, details: CertificateSection) -> tuple[Certificate, Page]:
+    """Return certificate and report of the fit in a folder."""
     from calib.procedure.kinematic_stage.folder import FitFolder
     from calib.procedure.report import fit_report
 
-    if (folder.absolute().parent / SESSION).exists():
-        redo = command_line("redo", folder.parent, "certificate")
-        raise UsageError(f"{folder} belongs to a session, which has the certificate: {redo}")
-    if IdentificationFolder(folder).model.exists():
-        return _read_model(folder, plots, details)
-    path = FitFolder(folder).report
-    if not path.exists():
-        raise UsageError(refusal(folder, "certificate"))
-    fit = fit_report.read(path)
+    fit = fit_report.read(FitFolder(folder).report)
     drawn = {}
     if plots:
         from calib.procedure.report.charts import pictures
@@ -123,7 +107,8 @@ def write_model(model_report: DynamicReport, drawn: Mapping[str, Picture], folde
     rendering.write(folder, *of_model(model_report, drawn))
 
 
-def _read_model(folder: Path, plots: bool, details: CertificateSection) -> tuple[Certificate, Page]:
+def read_model(folder: Path, plots: bool, details: CertificateSection) -> tuple[Certificate, Page]:
+    """Return certificate and report of the identification in a folder."""
     from calib.procedure.report import dynamics_section
 
     model_report = dynamics_section.read(folder)
@@ -160,7 +145,13 @@ def of_model(
     return records(f"Calibration of {unseen.robot}", "Dynamics", setup, stages, unchecked, details=details)
 
 
-def notebook(result: Any) -> str:
+class SectionResult(Protocol):
+    """A result that is shown as a section of a report."""
+
+    def section(self) -> Section: ...
+
+
+def notebook(result: SectionResult) -> str:
     """Return a result as a page for a notebook: the first page of a fit's certificate, else its section of a report."""
     from calib.procedure.kinematic_stage.fit import Outcome
     from calib.procedure.report import fit_report
