@@ -140,6 +140,10 @@ class StoredResult:
     def check_arm(self, verb: str) -> None:
         """Refuse a robot of another kind than a serial arm, of which the verb does not take results."""
 
+    def require_session(self) -> Session:
+        """Refuse: this is no session."""
+        self.refuse("session", SessionError)
+
     def motion(self) -> Path:
         """Refuse: there is no motion to play."""
         self.refuse("program")
