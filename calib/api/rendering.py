@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from html import escape
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, ClassVar, Self, overload
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, overload
 
 from calib.errors import UsageError, one_of, refused_as
 from calib.procedure.findings import NOT_JUDGED, Verdict
@@ -33,6 +33,14 @@ Progress = Callable[[str], None]
 WIDTH = 120
 
 
+class Savable(Protocol):
+    """What writes itself."""
+
+    def save(self, out: str | Path, /, *, plots: bool = True) -> Path:
+        """Write a folder or a file, and return its path."""
+        ...
+
+
 def listed(value: object | Sequence[object]) -> list:
     """Return a single value as a list of one, and nested sequences as a flat list."""
     if isinstance(value, (str, Path)) or not isinstance(value, Sequence):
@@ -49,13 +57,16 @@ def optional(value: object) -> Any:
 
 
 @contextmanager
-def saved(result: object) -> Iterator[Path]:
-    """Yield the folder of a result: a given path unchanged, or a temporary folder of a result in memory."""
+def saved(result: str | Path | Savable) -> Iterator[Path]:
+    """Yield the folder of a result: a given path unchanged, or a temporary folder (or file) of a result in memory."""
     if isinstance(result, (str, Path)):
         yield Path(result)
-    else:
-        with TemporaryDirectory() as folder:
-            yield result.save(Path(folder) / "result", plots=False)
+        return
+    name = "result"
+    if isinstance(result, Kept) and result.kind.companion:
+        name = "result.csv"
+    with TemporaryDirectory() as folder:
+        yield result.save(Path(folder) / name, plots=False)
 
 
 def as_text(renderables: Iterable[object]) -> str:
@@ -90,7 +101,7 @@ class Kept(Shown, ABC):
     kind: ClassVar[ResultKind]
 
     @abstractmethod
-    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+    def save(self, out: str | Path, /, *, plots: bool = True) -> Path:
         """Write the result's folder."""
 
     def figures(self) -> Mapping[str, Picture]:

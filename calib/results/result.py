@@ -48,7 +48,7 @@ class Result(Protocol):
         """The verdict; its level is `NOT_JUDGED` for what has none, as a motion."""
         ...
 
-    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+    def save(self, out: str | Path, /, *, plots: bool = True) -> Path:
         """Write the result's folder (of a list of poses its files), and return its path."""
         ...
 
