@@ -186,7 +186,7 @@ def _for_toml(json_schema: object) -> Any:
     return result
 
 
-def inherited(table: Mapping[str, Any], kind: type) -> dict[str, object]:
+def inherited(table: Mapping[str, Any], kind: type) -> ParsedTable:
     """Return a file's table whose ``[files.NAME]`` tables inherit missing keys from the table for all files.
 
     Args:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -27,7 +27,6 @@ from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
     from calib.api.rendering import DataFrame
-
     from calib.procedure.report.charts import Chart
     from calib.procedure.report.page import Section
 
@@ -43,7 +42,7 @@ class DynamicsModel(Drawn, Judged, identify.IdentificationOutcome):
     )
 
     @property
-    def residuals(self) -> Any:
+    def residuals(self) -> DataFrame:
         """Measured minus predicted torques of every recording, fitted or unseen, as a pandas DataFrame."""
         titles = self.found.settings.torque_rows.titles(self.inputs.chain.joint_names)
         header = ["file", "t [s]"]
@@ -204,7 +203,7 @@ def identify_dynamics(
             progress=progress,
         )
     identification_inputs = inputs.gather(
-        cast(Any, robot),
+        cast(str | Path | CalibratedChain, robot),
         listed(recordings),
         listed(validate),
         options=options,

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 
@@ -31,7 +31,6 @@ from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
     from calib.api.rendering import DataFrame
-
     from calib.procedure.report.charts import Chart
     from calib.procedure.report.page import Section
 
@@ -125,7 +124,7 @@ class GeometryFit(Drawn, Judged, fit.Outcome):
     )
 
     @property
-    def residuals(self) -> Any:
+    def residuals(self) -> DataFrame:
         """Residuals of every row, fitted or unseen, with weight and expected error, as a pandas DataFrame."""
         from calib.procedure.kinematic_stage.tables import residuals
 
@@ -318,7 +317,13 @@ def fit_geometry(
     if progress is not None:
         progress("reading")
     fit_inputs = inputs.gather(
-        cast(Any, robot), listed(measured), listed(validate), options=options, settings=settings, base=base, tip=tip
+        cast(str | Path | CalibratedChain, robot),
+        listed(measured),
+        listed(validate),
+        options=options,
+        settings=settings,
+        base=base,
+        tip=tip,
     )
     if on_read is not None:
         on_read(fit_inputs)

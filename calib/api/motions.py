@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -169,7 +169,7 @@ def design_excitation(
             )
         identify_settings = None if options is None else _read(options).settings
         designed = design.excite(
-            cast(Any, robot),
+            cast(str | Path | CalibratedChain, robot),
             settings,
             model=model_folder,
             limits=optional(limits),
@@ -226,7 +226,7 @@ def plan_motion(
                 progress=progress,
             )
         planned = planning.plan(
-            cast(Any, robot),
+            cast(str | Path | CalibratedChain, robot),
             optional(waypoints),
             settings,
             model=model_folder,

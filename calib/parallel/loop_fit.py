@@ -49,7 +49,6 @@ from calib.robot.calibrated import ROBOT
 
 if TYPE_CHECKING:
     from calib.api.rendering import DataFrame
-
     from calib.procedure.report.charts import Chart
     from calib.procedure.report.page import Section
 

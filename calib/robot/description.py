@@ -36,13 +36,13 @@ Implausible values of a description are reported: invalid limits, impossible bod
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from calib import files
 from calib.config_types import ParsedTable
 from calib.errors import RobotError, listing, refuse_robot, require
+from calib.records import FieldValues
 from calib.robot import mdh, tables
 from calib.robot.chain import Chain, Element, Joint
 
@@ -211,7 +211,7 @@ def _from_elements(table: Mapping[str, object], where: str) -> Chain:
     for number, entry in enumerate(_tables(table, "joint", where), 1):
         joint_where = f"{where}, [[joint]] number {number}"
         tables.check_keys(entry, _JOINT, joint_where)
-        limits: dict[str, Any] = {}
+        limits: FieldValues = {}
         for key in tables.LIMITS:
             if key in entry:
                 limits[key] = tables.number(entry[key], f"{joint_where}, {key}")

@@ -48,7 +48,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from calib.config_types import ParsedTable
 from calib.errors import RobotError, one_of, refuse_robot, require
+from calib.records import FieldValues
 from calib.robot import tables
 from calib.robot.chain import Chain, Element, Joint
 
@@ -82,7 +84,7 @@ class Row:
         one_of(self.kind, KINDS, f"row '{self.name}': kind", RobotError)
 
 
-def from_table(table: Mapping[str, Any], where: str, propose_beta: bool = True) -> Chain:
+def from_table(table: ParsedTable, where: str, propose_beta: bool = True) -> Chain:
     """Return the chain of a parsed table; `where` names it in messages."""
     tables.check_keys(table, TOP, where)
     proposed = table.get("propose_beta", True)
@@ -215,7 +217,7 @@ def _row(entry: object, index: int, where: str) -> Row:
         for key in (*tables.LIMITS, "inertia"):
             if key in entry:
                 refuse_robot(where, f"a fixed row cannot have '{key}': remove the key")
-    numbers: dict[str, Any] = {
+    numbers: FieldValues = {
         key: tables.number(entry[key], f"{where}, {key}", quantity[key]) for key in quantity if key in entry
     }
     inertia = None
@@ -226,7 +228,7 @@ def _row(entry: object, index: int, where: str) -> Row:
 
 def _regroup(chain: Chain, index: int, group: list[Element]) -> Row:
     """Return the MDH row of a group of elements with one number; the caller checks order and completeness."""
-    values: dict[str, Any] = {element.name.removesuffix(str(index)): element.value for element in group}
+    values: FieldValues = {element.name.removesuffix(str(index)): element.value for element in group}
     moving = [element for element in group if element.joint is not None]
     if not moving:
         return Row(name=f"joint{index}", index=index, kind="fixed", **values)

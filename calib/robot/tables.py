@@ -7,7 +7,6 @@ behind it: ``"-pi/2"``, ``"90 deg"``, ``"110 deg/s"``, ``"-313 mm"`` (`calib.con
 import math
 from collections.abc import Mapping
 from functools import partial
-from typing import Any
 
 import numpy as np
 import rtoml
@@ -15,6 +14,7 @@ import rtoml
 from calib import config, config_types
 from calib.config_types import shown
 from calib.errors import RobotError, refuse_robot
+from calib.records import FieldValues
 from calib.robot.chain import Chain
 from calib.transforms import from_xyz_rpy, to_xyz_rpy
 
@@ -82,9 +82,9 @@ def spelled(angle: float) -> float | str:
     return _PI.get(angle, angle)
 
 
-def chain_head(table: Mapping[str, object], where: str) -> dict[str, Any]:
+def chain_head(table: Mapping[str, object], where: str) -> FieldValues:
     """Return the fields of a `Chain` in a robot's table except its joints: name, ends, tail, gravity, floor."""
-    head: dict[str, Any] = {"name": word(table, "name", where)}
+    head: FieldValues = {"name": word(table, "name", where)}
     for key in ("base", "tip"):
         if key in table:
             head[key] = word(table, key, where)

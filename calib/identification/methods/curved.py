@@ -14,7 +14,6 @@ import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from inspect import signature
-from typing import Any
 
 import numpy as np
 
@@ -150,7 +149,7 @@ def make_curved(constraint: CurvedConstraint, row: Callable[[Mapping[str, float]
         return Curved(name, names, _rows(names, row), lambda u: float(function(u)[0]), slope, True)
     tree, names = _parsed(str(h), location)
 
-    def value(u: np.ndarray) -> Any:
+    def value(u: np.ndarray) -> float:
         return evaluated(tree, _KNOWN | dict(zip(names, u)), _OPERATIONS)
 
     # by complex steps, without rounding (Squire & Trapp 1998)

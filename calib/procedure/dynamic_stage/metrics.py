@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -29,7 +28,7 @@ from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.identify import Assessment, IdentificationOutcome, ModelFindings
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.plain import PlainReferences
-from calib.records import Array, Number, Unbounded, evenly
+from calib.records import Array, FieldValues, Number, Unbounded, evenly
 from calib.units import TORQUE
 
 # of metrics.json, and of unseen/report.json
@@ -117,7 +116,7 @@ class JudgedMetrics:
     references: Mapping[str, PlainReferences] = field(default_factory=dict)
 
 
-def _judged(assessment: Assessment) -> dict[str, Any]:
+def _judged(assessment: Assessment) -> FieldValues:
     """Return the entries of an assessment common to both records, without the names of the rows."""
     return {
         "verdict": assessment.verdict.level,

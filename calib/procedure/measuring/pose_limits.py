@@ -25,6 +25,7 @@ from calib.procedure.measuring.camera_view import camera_view
 from calib.procedure.measuring.constraints_file import CameraTable, CollisionTable, ConstraintsFile, InstrumentTable
 from calib.procedure.measuring.moveit import limit_tables
 from calib.procedure.measuring.sight import SeenOnly, Sight, sight_of
+from calib.records import FieldValues
 from calib.robot.beside import links_of
 from calib.robot.capsules import DistanceModel, Obstacle, Wall, signed_distance
 from calib.robot.chain import Chain
@@ -437,7 +438,7 @@ def _model(
             one_of(name, links, "collision.ignored: link", RobotError)
     posture = _posture(table.posture, chain, source)
     posture_name = "the stated posture" if posture else "zero of their joints"
-    common: dict[str, Any] = {
+    common: FieldValues = {
         "walls": walls,
         "targets": cell.tools[:, :3, 3],
         "margin": table.margin,

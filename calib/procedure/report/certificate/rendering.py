@@ -7,7 +7,7 @@ computer's own fonts are looked through only for letters that it lacks.
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -65,7 +65,7 @@ def pdf(page: Certificate) -> tuple[bytes, list[str]]:
         return b"", [f"{PAGES[1]} was not written, since this process was forked: start processes by spawn"]
     images: dict[str, bytes] = {}
 
-    def named(value: Any) -> object:
+    def named(value: bytes | Iterable[object]) -> object:
         if not isinstance(value, bytes):
             return list(value)
         images[f"{len(images)}.svg"] = value
@@ -95,9 +95,9 @@ def _typeset(given: Mapping[str, bytes], dense: bool) -> tuple[bytes, list[str]]
     for families, standard in _fonts():
         setting = json.dumps({"fonts": families, "dense": dense}).encode()
         try:
-            whole: Any = {**given, "setting.json": setting}
+            files: dict[str, bytes] = {**given, "setting.json": setting}
             ours = families == [FONT]
-            made: Any = typst.compile(whole, font_paths=[OURS], ignore_system_fonts=ours, pdf_standards=standard)
+            made: Any = typst.compile(files, font_paths=[OURS], ignore_system_fonts=ours, pdf_standards=standard)
             return made, notes
         except typst.TypstError as error:
             lacking = re.search('the text `"(.*)"` could not be displayed', str(error))
