@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from calib.api.rendering import Drawn, Judged, Progress, data_frame, listed, optional
+from calib.api.rendering import ChartedResult, Judged, Progress, data_frame, listed, optional
 from calib.arguments import checked
 from calib.data.recordings.recording import Recording
 from calib.errors import UsageError, require
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 Recorded = str | Path | Recording
 
 
-class DynamicsModel(Drawn, Judged, identify.IdentificationOutcome):
+class DynamicsModel(ChartedResult, Judged, identify.IdentificationOutcome):
     """Identified dynamics with covariance and verdict. ``print`` shows errors on other motion, friction and verdict."""
 
     tab = (

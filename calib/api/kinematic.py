@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 import numpy as np
 
 from calib import files
-from calib.api.rendering import Drawn, Judged, Progress, data_frame, listed, optional
+from calib.api.rendering import ChartedResult, Judged, Progress, data_frame, listed, optional
 from calib.arguments import checked
 from calib.config import Tables
 from calib.data.poses.fit_options import FitOptions, read_options
@@ -38,7 +38,7 @@ Measured = str | Path | PoseMeasurements
 Several = Measured | Sequence[Measured | Sequence[Measured]]
 
 
-class PoseSelection(Drawn, selection.Chosen):
+class PoseSelection(ChartedResult, selection.Chosen):
     """Poses that determine a robot's geometry best. ``print`` shows index, bound and what random poses reach."""
 
     tab = "q chain selection outlook run notes plot save save_run to_dict to_dataframe"
@@ -115,7 +115,7 @@ class PredictedPoses(NamedTuple):
     sigma: np.ndarray
 
 
-class GeometryFit(Drawn, Judged, fit.Outcome):
+class GeometryFit(ChartedResult, Judged, fit.Outcome):
     """A fitted geometry with covariance and verdict. ``print`` shows the ladder, errors on unseen poses and verdict."""
 
     tab = (

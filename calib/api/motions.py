@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from calib.api.dynamic import DynamicsModel
-from calib.api.rendering import Drawn, Progress, optional, saved
+from calib.api.rendering import ChartedResult, Progress, optional, saved
 from calib.arguments import checked
 from calib.config import Tables
 from calib.data.poses.pose_lists import Targets
@@ -33,7 +33,7 @@ def _columns(track: Setpoints) -> Sampled:
     return track.times, track.q, track.v, track.a
 
 
-class ExcitationDesign(Drawn, design.Designed):
+class ExcitationDesign(ChartedResult, design.Designed):
     """A motion that excites a robot's dynamics, verified within limits. ``print`` shows condition numbers, margins."""
 
     tab = "period condition goals proof outlook predicted front notes sampled plot save to_dict"
@@ -71,7 +71,7 @@ class ExcitationDesign(Drawn, design.Designed):
         return "\n".join(folder.design_lines(self))
 
 
-class MotionPlan(Drawn, planning.Planned):
+class MotionPlan(ChartedResult, planning.Planned):
     """The fastest motion through waypoints, within speeds and torques. ``print`` shows duration and margins."""
 
     tab = "duration track margins deviation sigma notes sampled plot save to_dict"

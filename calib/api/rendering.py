@@ -76,7 +76,7 @@ class Shown:
         return {"text/plain": str(self)}
 
 
-class Drawn(Shown, ABC):
+class ChartedResult(Shown, ABC):
     """A result with figures."""
 
     @abstractmethod

@@ -62,7 +62,7 @@ class Command(_Spelt, TyperCommand):
                     formatter.write_dl(rows, col_max=min(MAX_COLUMN, formatter.width // 3))
 
 
-class Group(_Spelt, TyperGroup):
+class CommandGroup(_Spelt, TyperGroup):
     """The list of commands in `GROUPS`, each stated where the command is (`calib.cli.shared.command`)."""
 
     def format_commands(self, ctx: object, formatter: object) -> None:

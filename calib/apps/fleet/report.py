@@ -25,7 +25,7 @@ from calib.arguments import checked
 from calib.errors import Finding, RobotError, counted, finding
 from calib.geometry.fit import PLAUSIBLE
 from calib.procedure.findings import Verdict, lines_of, settle
-from calib.procedure.report.page import Block, Column, Section, Text, table
+from calib.procedure.report.page import Block, RecordColumn, Section, Text, table
 from calib.records import plain
 from calib.units import small
 
@@ -79,13 +79,13 @@ class FleetReport(Judged):
     def section(self) -> Section:
         """Return the report's section."""
         drift = [
-            Column("arm", "{0[0]}", number=False),
-            Column("from", lambda arm_type: Path(arm_type[1].parts[0].before.name).name, False),
-            Column("to", lambda arm_type: Path(arm_type[1].parts[0].after.name).name, False),
-            Column("tool moved, mm rms", lambda arm_type: f"{1e3 * _moved(arm_type[1]).rms:.3g}"),
-            Column("σ of that", lambda arm_type: f"{1e3 * _moved(arm_type[1]).expected:.2g}"),
-            Column("p", lambda arm_type: f"{arm_type[1].geometry.probability:.1g}"),
-            Column("", "{0[1].verdict.level}", number=False),
+            RecordColumn("arm", "{0[0]}", number=False),
+            RecordColumn("from", lambda arm_type: Path(arm_type[1].parts[0].before.name).name, False),
+            RecordColumn("to", lambda arm_type: Path(arm_type[1].parts[0].after.name).name, False),
+            RecordColumn("tool moved, mm rms", lambda arm_type: f"{1e3 * _moved(arm_type[1]).rms:.3g}"),
+            RecordColumn("σ of that", lambda arm_type: f"{1e3 * _moved(arm_type[1]).expected:.2g}"),
+            RecordColumn("p", lambda arm_type: f"{arm_type[1].geometry.probability:.1g}"),
+            RecordColumn("", "{0[1].verdict.level}", number=False),
         ]
         blocks: list[Block] = [
             Text("Notes", lines_of(self.noticed), "note"),
@@ -139,27 +139,27 @@ class FleetReport(Judged):
 
 
 def _tables(arm_type: ArmType) -> list[Block]:
-    def cell(name: str) -> Column:
-        return Column(name, lambda row: small(getattr(row, name), row.unit, 3))
+    def cell(name: str) -> RecordColumn:
+        return RecordColumn(name, lambda row: small(getattr(row, name), row.unit, 3))
 
     parameters = [
-        Column("parameter", "{0.name}", number=False),
-        Column("arms", "{0.arms}"),
+        RecordColumn("parameter", "{0.name}", number=False),
+        RecordColumn("arms", "{0.arms}"),
         *map(cell, ("mean", "sigma", "width")),
     ]
     tool_columns = [
-        Column("tool", "{0.tool}", number=False),
-        Column("arms", lambda row: f"{len(row.arms)}"),
-        Column("from the others' mm", lambda row: f"{1e3 * row.moved:.3g}"),
-        Column("σ", "{0.moved_sigmas:.1f}"),
-        Column("error, times the others'", "{0.times:.3g}"),
-        Column("σ ", lambda row: f"{row.times_sigmas:.1f}" if row.times > MIN_TIMES else ""),
+        RecordColumn("tool", "{0.tool}", number=False),
+        RecordColumn("arms", lambda row: f"{len(row.arms)}"),
+        RecordColumn("from the others' mm", lambda row: f"{1e3 * row.moved:.3g}"),
+        RecordColumn("σ", "{0.moved_sigmas:.1f}"),
+        RecordColumn("error, times the others'", "{0.times:.3g}"),
+        RecordColumn("σ ", lambda row: f"{row.times_sigmas:.1f}" if row.times > MIN_TIMES else ""),
     ]
     arms = [
-        Column("arm", lambda row: row.serial or row.name, number=False),
-        Column("calibrated", "{0.name}", number=False),
-        Column("verdict", "{0.judged[0]}", number=False),
-        Column("rms mm", lambda row: f"{1e3 * row.left:.3g}"),
+        RecordColumn("arm", lambda row: row.serial or row.name, number=False),
+        RecordColumn("calibrated", "{0.name}", number=False),
+        RecordColumn("verdict", "{0.judged[0]}", number=False),
+        RecordColumn("rms mm", lambda row: f"{1e3 * row.left:.3g}"),
     ]
     note = "Deviations from nominal; the next arm is expected within width of the mean."
     compared = [row for row in arm_type.tools if row.moved is not None]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calib.api.rendering import Drawn, Judged
+from calib.api.rendering import ChartedResult, Judged
 from calib.apps.monitoring import pages
 from calib.apps.monitoring.settings import DEFAULT_DRIFT, DriftSettings
 from calib.arguments import checked
@@ -17,7 +17,7 @@ from calib.data.poses.fit_options import FitOptions, read_options
 from calib.errors import Finding, UsageError, require
 from calib.procedure.findings import Verdict, lines_of, settle
 from calib.procedure.kinematic_stage import inputs
-from calib.procedure.report.page import Column, Section, Text, table
+from calib.procedure.report.page import RecordColumn, Section, Text, table
 from calib.procedure.session.drift import Trend, noise_of_difference, repeats, trends
 from calib.records import plain
 
@@ -28,7 +28,7 @@ TABLE = "trends.csv"
 
 
 @dataclass(frozen=True, eq=False)
-class DriftFound(Drawn, Judged):
+class DriftFound(ChartedResult, Judged):
     """Drift of the target over a measurement. ``print`` shows verdict, trends and repeated poses.
 
     Attributes:
@@ -52,13 +52,13 @@ class DriftFound(Drawn, Judged):
     def section(self) -> Section:
         """Return a report section with the trends, and how far repeated poses are apart."""
         columns = [
-            Column("with", "{0.what}", number=False),
-            Column("poses", "{0.poses}"),
-            Column("visits", "{0.x.size}"),
-            Column("slope", _rate),
-            *(Column(f"{axis} mm", _of_axis(k)) for k, axis in enumerate("xyz")),
-            Column("in all mm", lambda trend: f"{1e3 * trend.total:.3g}"),
-            Column("σ", lambda trend: f"{trend.sigmas:.1f}"),
+            RecordColumn("with", "{0.what}", number=False),
+            RecordColumn("poses", "{0.poses}"),
+            RecordColumn("visits", "{0.x.size}"),
+            RecordColumn("slope", _rate),
+            *(RecordColumn(f"{axis} mm", _of_axis(k)) for k, axis in enumerate("xyz")),
+            RecordColumn("in all mm", lambda trend: f"{1e3 * trend.total:.3g}"),
+            RecordColumn("σ", lambda trend: f"{trend.sigmas:.1f}"),
         ]
         blocks = [Text("Notes", lines_of(self.noticed), "note"), table("Drift of the target", columns, self.trends)]
         return Section("Drift", blocks, self.verdict.level, self.verdict.reason)

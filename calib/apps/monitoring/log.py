@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calib.api.rendering import Drawn, Judged
+from calib.api.rendering import ChartedResult, Judged
 from calib.apps.monitoring import pages
 from calib.apps.monitoring.comparison.change_part import plus_minus
 from calib.apps.monitoring.comparison.change_test import ParameterChange
@@ -17,7 +17,7 @@ from calib.apps.monitoring.comparison.geometry_change import GeometryChange
 from calib.apps.monitoring.comparison.robot_change import diff
 from calib.errors import SessionError, UsageError, command_line, require
 from calib.folders import METRICS
-from calib.procedure.report.page import Column, Section, table
+from calib.procedure.report.page import RecordColumn, Section, table
 from calib.procedure.session.folder import Session, open_session
 from calib.procedure.session.results import folders_of, position_errors, torque_error
 from calib.records import plain
@@ -93,7 +93,7 @@ class LogLine:
 
 
 @dataclass(frozen=True, eq=False)
-class RobotLog(Drawn, Judged):
+class RobotLog(ChartedResult, Judged):
     """The calibrations of one robot, oldest first. ``print`` shows a line for each."""
 
     robot: str
@@ -104,15 +104,15 @@ class RobotLog(Drawn, Judged):
     def section(self) -> Section:
         """Return a report section with a line per calibration."""
         columns = [
-            *(Column(name, f"{{0.{name}}}", number=False) for name in ("date", "folder", "serial", "verdict")),
-            Column("nominal mm", lambda log_line: f"{log_line.errors[0]:.3g}" if log_line.errors else ""),
-            Column("calibrated mm", lambda log_line: f"{log_line.errors[1]:.3g}" if log_line.errors else ""),
-            Column("torque %", lambda log_line: "" if log_line.torque is None else f"{log_line.torque:.3g}"),
-            Column(
+            *(RecordColumn(name, f"{{0.{name}}}", number=False) for name in ("date", "folder", "serial", "verdict")),
+            RecordColumn("nominal mm", lambda log_line: f"{log_line.errors[0]:.3g}" if log_line.errors else ""),
+            RecordColumn("calibrated mm", lambda log_line: f"{log_line.errors[1]:.3g}" if log_line.errors else ""),
+            RecordColumn("torque %", lambda log_line: "" if log_line.torque is None else f"{log_line.torque:.3g}"),
+            RecordColumn(
                 "tool moved mm",
                 lambda log_line: f"{log_line.moved[0]:.3g} (σ {log_line.moved[1]:.2g})" if log_line.moved else "",
             ),
-            Column("most by", "{0.parameter}", number=False),
+            RecordColumn("most by", "{0.parameter}", number=False),
         ]
         return Section("Log", [table(f"Calibrations of {self.robot}", columns, self.lines)])
 

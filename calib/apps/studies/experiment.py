@@ -30,7 +30,7 @@ from calib.geometry import fit as geometry
 from calib.geometry.first_guess import install
 from calib.identification.closed_loop.controllers import Reference
 from calib.identification.closed_loop.simulation import Plant, Sensing, SimulatedRun, feed_forward, simulate
-from calib.identification.loop import Controller, LoopSettings
+from calib.identification.loop import LoopController, LoopSettings
 from calib.identification.methods.constraint_settings import ConstraintSettings
 from calib.identification.methods.method import IdentificationProblem
 from calib.identification.rows import Case, make_case, observe
@@ -270,7 +270,7 @@ def _robots(condition: Condition, setup: Setup, seed: int) -> _Robots:
     return robots
 
 
-def _recorded(condition: Condition, setup: Setup, true: Plant, controller: Controller, seed: int) -> Case:
+def _recorded(condition: Condition, setup: Setup, true: Plant, controller: LoopController, seed: int) -> Case:
     """Return the recording of one noisy run of the true robot, as a case."""
     sensing = Sensing(condition.sigma_q, 0.0, condition.sigma_tau, every=setup.every)
 
@@ -294,7 +294,7 @@ def _recorded(condition: Condition, setup: Setup, true: Plant, controller: Contr
     return make_case(condition.name, replace(motion, decimator=decimator, band=decimator.band))
 
 
-def _loop(condition: Condition, controller: Controller) -> LoopSettings:
+def _loop(condition: Condition, controller: LoopController) -> LoopSettings:
     """Return the loop settings for the methods, with the errors of the condition."""
     kp, kd = BELIEVED if condition.mismatch == "controller" else (1.0, 1.0)
     truth = known_robots.truth(condition.robot)

@@ -30,7 +30,7 @@ from calib.procedure.dynamic_stage.identify import judged, overlaps, repeated_mo
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.verdict import motion_findings
 from calib.procedure.findings import Verdict, lines_of
-from calib.procedure.report.page import Block, Column, Section, Text, table
+from calib.procedure.report.page import Block, RecordColumn, Section, Text, table
 
 # Of the rule above (our choices).
 MAX_SIGMAS, MAX_SHARE, MAX_TIMES, FAST_SECONDS = 2.0, 0.05, 2.0, 1.0
@@ -361,18 +361,18 @@ def _choice(method: ComparedMethod) -> str:
 
 
 COLUMNS = (
-    Column("rank", "{0.rank}"),
-    Column("method", "{0.name}", number=False),
-    Column("unseen [%]", "{0.unseen:.3g} ± {0.sigma:.2g}"),
-    Column("behind the best", _behind),
-    Column("raw [%]", "{0.raw:.3g}"),
-    Column("training [%]", "{0.training:.3g}"),
-    Column("worst joint", "{0.worst[0]}: {0.worst[1]:.3g} %"),
-    Column("parameters", "{0.parameters}"),
-    Column("rounds", "{0.iterations}"),
-    Column("simulations", "{0.simulations}"),
-    Column("seconds", "{0.seconds:.2g}"),
-    Column("choice", _choice, number=False),
+    RecordColumn("rank", "{0.rank}"),
+    RecordColumn("method", "{0.name}", number=False),
+    RecordColumn("unseen [%]", "{0.unseen:.3g} ± {0.sigma:.2g}"),
+    RecordColumn("behind the best", _behind),
+    RecordColumn("raw [%]", "{0.raw:.3g}"),
+    RecordColumn("training [%]", "{0.training:.3g}"),
+    RecordColumn("worst joint", "{0.worst[0]}: {0.worst[1]:.3g} %"),
+    RecordColumn("parameters", "{0.parameters}"),
+    RecordColumn("rounds", "{0.iterations}"),
+    RecordColumn("simulations", "{0.simulations}"),
+    RecordColumn("seconds", "{0.seconds:.2g}"),
+    RecordColumn("choice", _choice, number=False),
 )
 
 

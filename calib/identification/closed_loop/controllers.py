@@ -13,7 +13,7 @@ import numpy as np
 
 from calib.data.signals.filtering import border, low_pass
 from calib.errors import CalibError, MeasurementError
-from calib.identification.loop import Controller, LoopSettings
+from calib.identification.loop import LoopController, LoopSettings
 from calib.records import frozen, shaped
 
 
@@ -66,9 +66,11 @@ class Reference:
         return q, v, a
 
 
-def pd(kp: np.ndarray, kd: np.ndarray, limit: np.ndarray | float = np.inf, ki: np.ndarray | float = 0.0) -> Controller:
+def pd(
+    kp: np.ndarray, kd: np.ndarray, limit: np.ndarray | float = np.inf, ki: np.ndarray | float = 0.0
+) -> LoopController:
     """Return a PD (or PID) controller."""
-    return Controller(kp, kd, np.asarray(ki), np.asarray(1.0), np.asarray(limit), np.asarray(np.inf))
+    return LoopController(kp, kd, np.asarray(ki), np.asarray(1.0), np.asarray(limit), np.asarray(np.inf))
 
 
 def cascade(
@@ -77,7 +79,7 @@ def cascade(
     reset: np.ndarray | float = np.inf,
     limit: np.ndarray | float = np.inf,
     share: float = 1.0,
-) -> Controller:
+) -> LoopController:
     """Return a cascade P-PI: v_c = share v_r + P e, tau = K [(v_c - v) + ∫ (v_c - v) / Ti], as a single law.
 
     (v_c - v) integrates to share q_r - q + P ∫ e (start aside): with share = 1 that is kp = K (P + 1/Ti), kd = K,
@@ -94,12 +96,12 @@ def cascade(
     velocity = np.asarray(velocity, dtype=float)
     ki = velocity * position / np.asarray(reset, dtype=float)
     kp = velocity * (position + 1.0 / np.asarray(reset, dtype=float))
-    return Controller(kp, velocity, ki, np.asarray(share), np.asarray(limit), np.asarray(np.inf))
+    return LoopController(kp, velocity, ki, np.asarray(share), np.asarray(limit), np.asarray(np.inf))
 
 
 def computed_torque(
     model: np.ndarray, frequency: float, damping: float, n: int, limit: np.ndarray | float = np.inf
-) -> Controller:
+) -> LoopController:
     """Return a computed-torque controller with error dynamics ë + 2 ζ ω ė + ω² e = 0 for an exact model.
 
     Args:
@@ -108,12 +110,12 @@ def computed_torque(
     """
     kp = np.full(n, frequency**2)
     kd = np.full(n, 2 * damping * frequency)
-    return Controller(kp, kd, np.zeros(n), np.ones(n), np.asarray(limit), np.asarray(np.inf), model=frozen(model))
+    return LoopController(kp, kd, np.zeros(n), np.ones(n), np.asarray(limit), np.asarray(np.inf), model=frozen(model))
 
 
-def completed(controller: Controller, loop: LoopSettings, n: int) -> Controller:
+def completed(controller: LoopController, loop: LoopSettings, n: int) -> LoopController:
     """Return the controller with the saturation, delay and velocity filter given in the settings."""
-    return Controller(
+    return LoopController(
         controller.kp,
         controller.kd,
         controller.ki,
@@ -125,7 +127,7 @@ def completed(controller: Controller, loop: LoopSettings, n: int) -> Controller:
     )
 
 
-def stated_controller(loop: LoopSettings, n: int) -> Controller:
+def stated_controller(loop: LoopSettings, n: int) -> LoopController:
     """Return the controller of n joints that the table [loop] describes.
 
     Raises:
@@ -157,7 +159,7 @@ class IdentifiedController:
         explained: (n,) share of the low-passed torque by the PID's feedback, 100 (1 - ‖tau - τ̂‖ / ‖tau - mean‖) [%].
     """
 
-    controller: Controller
+    controller: LoopController
     explained: np.ndarray
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from calib.data.signals.motion import moving
 from calib.dynamics.drives import DriveTerm
-from calib.dynamics.shapes import Joined
+from calib.dynamics.shapes import TermMotion
 from calib.errors import refuse_data
 from calib.identification.prediction import Dynamics
 from calib.identification.rows import Case, term_columns
@@ -72,7 +72,7 @@ def braking(terms: Sequence[DriveTerm | None], fastest: np.ndarray) -> np.ndarra
             continue
         speeds = fastest[joint] * np.append(np.geomspace(0.02, 1.0, SPEEDS_PER_DIRECTION), 10.0)
         v = np.concatenate([-speeds, speeds])
-        motion = Joined(np.zeros_like(v), v, np.zeros_like(v), np.ones_like(v), None)
+        motion = TermMotion(np.zeros_like(v), v, np.zeros_like(v), np.ones_like(v), None)
         power = np.zeros((len(v), p))
         for column, term in group_terms:
             power[:, column] = term.values(motion) * np.sign(v)

@@ -17,7 +17,7 @@ from calib.config import Tables, check_keys, read
 from calib.config_types import number
 from calib.errors import RobotError, UsageError, listing, one_of, refused_as, require
 from calib.geometry.installation import Installation
-from calib.geometry.observability import Observation, Target, TargetJacobian
+from calib.geometry.observability import Observation, TargetJacobian, TargetPose
 from calib.poses import constraints
 from calib.poses.space import PoseConstraint, SearchSpace
 from calib.procedure.measuring import constraints_file
@@ -295,7 +295,7 @@ def _span(value: tuple[object, object], where: str, quantity: str) -> tuple[floa
 
 def _target(settings: ConstraintsFile, cell: Installation) -> list[PoseConstraint]:
     table = settings.target
-    target = Target(cell)
+    target = TargetPose(cell)
     jacobian = TargetJacobian(cell)
     result = []
     low, high = table.heights
@@ -315,7 +315,7 @@ def _orientation(settings: ConstraintsFile, cell: Installation, where: str) -> l
     stand = placement(table.stated, where)
     roll = _span(table.roll or (-np.pi, np.pi), f"{where}.roll", "angle")
     pitch = _span(table.pitch or (-np.pi / 2, np.pi / 2), f"{where}.pitch", "angle")
-    return [constraints.orientation(Target(cell), stand[:3, :3], roll, pitch, TargetJacobian(cell))]
+    return [constraints.orientation(TargetPose(cell), stand[:3, :3], roll, pitch, TargetJacobian(cell))]
 
 
 def _sight(settings: ConstraintsFile, cell: Installation, where: str, model: DistanceModel | None) -> Sight | None:

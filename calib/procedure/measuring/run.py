@@ -99,7 +99,7 @@ def _silent(stage: str) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class MeasuringRun:
     """A run through m poses: order, paths between poses, and times.
 
     Attributes:
@@ -156,7 +156,7 @@ def plan_run(
     seed: int = 0,
     progress: Progress | None = None,
     clear: Ways | None = None,
-) -> Run:
+) -> MeasuringRun:
     """Return the run through poses q (m, n) [rad or m]: their order, and the paths between them.
 
     Where an order is left with a pair that no clear way was found for, the ways found so far serve: from one pose to
@@ -168,7 +168,7 @@ def plan_run(
         settings: speed and dwell.
         seed: of the search for ways around.
         progress: called with a few words now and then.
-        clear: clear ways from an earlier run, see `Run.found_ways`; those between other postures are left out.
+        clear: clear ways from an earlier run, see `MeasuringRun.found_ways`; those between other postures are left out.
     """
     show = progress or _silent
     velocity, acceleration = _speeds(chain, settings.speed)
@@ -218,7 +218,7 @@ def plan_run(
         paths.append(path)
         if len(path) > 2:
             around += 1
-    return Run(
+    return MeasuringRun(
         order=order,
         ways=tuple(paths),
         times=np.array([duration(path) for path in paths]),
@@ -336,7 +336,7 @@ def _clear_at_places(room: Room, q: np.ndarray) -> np.ndarray:
     return clear
 
 
-def lines(run: Run, settings: RunSettings) -> list[str]:
+def lines(run: MeasuringRun, settings: RunSettings) -> list[str]:
     """Return the lines on a run: duration, paths around obstacles, and poses without a clear path."""
     minutes, before = run.seconds / 60, run.found / 60
     result = [
@@ -351,7 +351,7 @@ def lines(run: Run, settings: RunSettings) -> list[str]:
     return result
 
 
-def write_run(path: Path, run: Run, chain: Chain) -> Path:
+def write_run(path: Path, run: MeasuringRun, chain: Chain) -> Path:
     """Write the file of a run (format: see the module), its poses numbered in visiting order."""
     header, factors = joint_columns(chain.joint_names, [joint.kind for joint in chain.joints])
     velocity, acceleration = _speeds(chain, 1.0)
@@ -461,7 +461,7 @@ class Drivable:
     """
 
     q: np.ndarray
-    run: Run
+    run: MeasuringRun
     replaced: Mapping[int, int]
     value: tuple[float, float]
     gain: float
@@ -516,7 +516,13 @@ def drivable(
 
 
 def _rejoined(
-    chain: Chain, q: np.ndarray, run: Run, exchange: Exchange, limits: MoveLimits, settings: RunSettings, seed: int
+    chain: Chain,
+    q: np.ndarray,
+    run: MeasuringRun,
+    exchange: Exchange,
+    limits: MoveLimits,
+    settings: RunSettings,
+    seed: int,
 ) -> tuple[np.ndarray, dict[int, int], Ways]:
     """Return the poses (m, n) with unreachable ones replaced, the replacements (place -> candidate), and all paths."""
     q = q.copy()

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.geometry.installation import Installation
-from calib.geometry.observability import Observation, Target, TargetJacobian
+from calib.geometry.observability import Observation, TargetJacobian, TargetPose
 from calib.poses import constraints
 from calib.poses.space import PoseConstraint, constraint_gradient
 from calib.robot.capsules import ALWAYS, SAMPLES, DistanceModel
@@ -35,7 +35,7 @@ class _Behind:
     """
 
     arm: DistanceModel
-    target: Target
+    target: TargetPose
     velocity: TargetJacobian
     instrument: np.ndarray
     links: np.ndarray
@@ -147,7 +147,7 @@ def sight_of(
     nearest, largest = span
     targets = []
     for number, direction in enumerate(directions):
-        target = Target(cell, number)
+        target = TargetPose(cell, number)
         velocity = TargetJacobian(cell, number)
         parts: list[PoseConstraint] = []
         if half_angle is not None:
@@ -164,7 +164,7 @@ def sight_of(
     return Sight(tuple(targets))
 
 
-def _blocking_links(arm: DistanceModel, chain: Chain, target: Target) -> np.ndarray:
+def _blocking_links(arm: DistanceModel, chain: Chain, target: TargetPose) -> np.ndarray:
     """Return the indices of links that can block the view: all except those next to the target in every posture."""
     q = random_joints(chain, SAMPLES)
     position = target(q)[1]

@@ -13,7 +13,7 @@ import numpy as np
 from calib.apps.monitoring.comparison.change_test import ChangeTest
 from calib.errors import Finding, finding
 from calib.procedure.findings import Verdict, lines_of, settle
-from calib.procedure.report.page import Block, Column, KeyFigure, Section, Text, met, table
+from calib.procedure.report.page import Block, KeyFigure, RecordColumn, Section, Text, met, table
 from calib.units import SMALL
 
 if TYPE_CHECKING:
@@ -151,14 +151,18 @@ def _value(value: float, unit: str) -> str:
 
 
 _PARAMETERS = [
-    Column("parameter", "{0.name}", number=False),
-    Column("before", lambda parameter: _value(parameter.before, parameter.unit)),
-    Column("after", lambda parameter: _value(parameter.after, parameter.unit)),
-    Column("change", lambda parameter: plus_minus(parameter.after - parameter.before, parameter.sigma, parameter.unit)),
-    Column(
+    RecordColumn("parameter", "{0.name}", number=False),
+    RecordColumn("before", lambda parameter: _value(parameter.before, parameter.unit)),
+    RecordColumn("after", lambda parameter: _value(parameter.after, parameter.unit)),
+    RecordColumn(
+        "change", lambda parameter: plus_minus(parameter.after - parameter.before, parameter.sigma, parameter.unit)
+    ),
+    RecordColumn(
         "σ",
         lambda parameter: f"{abs(parameter.after - parameter.before) / parameter.sigma:.1f}" if parameter.sigma else "",
     ),
-    Column("if it changed alone", lambda parameter: plus_minus(parameter.alone, parameter.alone_sigma, parameter.unit)),
-    Column("χ² explained", lambda parameter: f"{parameter.explained:.3g}"),
+    RecordColumn(
+        "if it changed alone", lambda parameter: plus_minus(parameter.alone, parameter.alone_sigma, parameter.unit)
+    ),
+    RecordColumn("χ² explained", lambda parameter: f"{parameter.explained:.3g}"),
 ]

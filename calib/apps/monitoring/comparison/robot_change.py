@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from calib.api.dynamic import DynamicsModel
 from calib.api.kinematic import GeometryFit
-from calib.api.rendering import Drawn, Judged, saved
+from calib.api.rendering import ChartedResult, Judged, saved
 from calib.apps.monitoring import pages
 from calib.apps.monitoring.comparison import geometry_change, torque_change
 from calib.apps.monitoring.comparison.calibrations import read_fits
@@ -35,7 +35,7 @@ TABLES = (ToolPart.table, TorquePart.table)
 
 
 @dataclass(frozen=True, eq=False)
-class RobotChange(Drawn, Judged):
+class RobotChange(ChartedResult, Judged):
     """What changed between two calibrations of a robot. ``print`` shows the verdict, what moved, the parameters.
 
     Attributes:

@@ -14,7 +14,7 @@ from calib.apps.monitoring.comparison.geometry_change import ToolMotion
 from calib.apps.monitoring.settings import DEFAULT_DIFF, DiffSettings
 from calib.errors import Finding, finding
 from calib.procedure.report.fit_report import FittedParameter
-from calib.procedure.report.page import Block, Column, Text, table
+from calib.procedure.report.page import Block, RecordColumn, Text, table
 from calib.units import JOINT
 
 if TYPE_CHECKING:
@@ -90,17 +90,20 @@ class ToolPart(ChangePart):
     def blocks(self) -> list[Block]:
         joints = self.before.chain.joints
         motions = [
-            Column("target's motion at", "{0.where}", number=False),
-            Column("poses", lambda motion: f"{len(motion.q)}"),
-            Column("median mm", lambda motion: f"{1e3 * np.median(motion.position):.3g}"),
-            Column("rms mm", lambda motion: f"{1e3 * motion.rms:.3g}"),
-            Column("σ of that mm", lambda motion: f"{1e3 * motion.expected:.2g}"),
-            Column("worst mm", lambda motion: f"{1e3 * motion.position.max():.3g}"),
-            Column("median mrad", lambda motion: f"{1e3 * np.median(motion.orientation):.3g}"),
-            Column("worst mrad", lambda motion: f"{1e3 * motion.orientation.max():.3g}"),
-            Column("worst at", lambda motion: _joints(motion, joints), number=False),
+            RecordColumn("target's motion at", "{0.where}", number=False),
+            RecordColumn("poses", lambda motion: f"{len(motion.q)}"),
+            RecordColumn("median mm", lambda motion: f"{1e3 * np.median(motion.position):.3g}"),
+            RecordColumn("rms mm", lambda motion: f"{1e3 * motion.rms:.3g}"),
+            RecordColumn("σ of that mm", lambda motion: f"{1e3 * motion.expected:.2g}"),
+            RecordColumn("worst mm", lambda motion: f"{1e3 * motion.position.max():.3g}"),
+            RecordColumn("median mrad", lambda motion: f"{1e3 * np.median(motion.orientation):.3g}"),
+            RecordColumn("worst mrad", lambda motion: f"{1e3 * motion.orientation.max():.3g}"),
+            RecordColumn("worst at", lambda motion: _joints(motion, joints), number=False),
         ]
-        by_joint = [Column("joint", "{0[0]}", number=False), Column("rms mm", lambda motion: f"{1e3 * motion[1]:.3g}")]
+        by_joint = [
+            RecordColumn("joint", "{0[0]}", number=False),
+            RecordColumn("rms mm", lambda motion: f"{1e3 * motion[1]:.3g}"),
+        ]
         return [
             Text("Motion", self._motion()),
             table("Motion of the tool", motions, self.found.motions),

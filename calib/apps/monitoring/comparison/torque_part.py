@@ -11,7 +11,7 @@ import numpy as np
 from calib.apps.monitoring.comparison.change_part import ChangePart
 from calib.apps.monitoring.comparison.torque_change import TorqueChange
 from calib.errors import Finding, finding
-from calib.procedure.report.page import Block, Column, Text, table
+from calib.procedure.report.page import Block, RecordColumn, Text, table
 
 if TYPE_CHECKING:
     from calib.procedure.report.charts import Chart
@@ -90,18 +90,18 @@ class TorquePart(ChangePart):
         unit, names = self.unit, self.after.rows
         rows = [(change, j) for change in self.found.torques for j in range(len(names))]
         torques = [
-            Column("motion", lambda row: row[0].where, number=False),
-            Column("torque of", lambda row: names[row[1]], number=False),
-            Column(f"change rms {unit}", lambda row: f"{_rms(row[0].change[:, row[1]]):.3g}"),
-            Column("σ of that", lambda row: f"{_rms(row[0].expected[:, row[1]]):.2g}"),
-            Column("worst", lambda row: f"{np.abs(row[0].change[:, row[1]]).max():.3g}"),
-            Column("torque rms", lambda row: f"{_rms(row[0].torque[:, row[1]]):.3g}"),
+            RecordColumn("motion", lambda row: row[0].where, number=False),
+            RecordColumn("torque of", lambda row: names[row[1]], number=False),
+            RecordColumn(f"change rms {unit}", lambda row: f"{_rms(row[0].change[:, row[1]]):.3g}"),
+            RecordColumn("σ of that", lambda row: f"{_rms(row[0].expected[:, row[1]]):.2g}"),
+            RecordColumn("worst", lambda row: f"{np.abs(row[0].change[:, row[1]]).max():.3g}"),
+            RecordColumn("torque rms", lambda row: f"{_rms(row[0].torque[:, row[1]]):.3g}"),
         ]
         parts = [
-            Column("part", "{0.name}", number=False),
-            Column("χ² explained", "{0.explained:.3g}"),
-            Column("of combinations", "{0.count}"),
-            Column(f"torque if it changed alone, rms {unit}", "{0.rms:.3g}"),
+            RecordColumn("part", "{0.name}", number=False),
+            RecordColumn("χ² explained", "{0.explained:.3g}"),
+            RecordColumn("of combinations", "{0.count}"),
+            RecordColumn(f"torque if it changed alone, rms {unit}", "{0.rms:.3g}"),
         ]
         return [
             Text("Torque", [self._words(change) for change in self.found.torques]),

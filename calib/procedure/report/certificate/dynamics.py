@@ -12,9 +12,9 @@ import numpy as np
 from calib.folders import METRICS
 from calib.procedure.excitation import coefficients
 from calib.procedure.findings import sentence
-from calib.procedure.report.certificate.record import Stage
+from calib.procedure.report.certificate.record import StageRecord
 from calib.procedure.report.dynamics_section import DynamicReport, percent, proof_of, rms_words, warnings_of
-from calib.procedure.report.page import Picture, Pictures, Section, Table, Text
+from calib.procedure.report.page import Picture, Pictures, ReportTable, Section, Text
 from calib.records import read_json
 from calib.robot.chain import Joint
 
@@ -31,7 +31,7 @@ NOTE = (
 )
 
 
-def stage(found: DynamicReport, section: Section, plots: bool, tolerance: float = 0.0) -> Stage:
+def stage(found: DynamicReport, section: Section, plots: bool, tolerance: float = 0.0) -> StageRecord:
     """Return the stage of an identification.
 
     Args:
@@ -42,7 +42,7 @@ def stage(found: DynamicReport, section: Section, plots: bool, tolerance: float 
     order = _worst_first(found)
     curves = Pictures("Torques", list(_curves(found, order)) if plots else [])
     blocks = [_torque_table(found, order), curves, Text("Uncertainty", list(_uncertainty(found)))]
-    return Stage(section, blocks, [*_unchecked(found, tolerance)], _findings(found))
+    return StageRecord(section, blocks, [*_unchecked(found, tolerance)], _findings(found))
 
 
 def _unchecked(found: DynamicReport, tolerance: float) -> Iterator[str]:
@@ -71,7 +71,7 @@ def _worst_first(found: DynamicReport) -> np.ndarray:
     return np.argsort(-(rms / limits if np.isfinite(limits).all() else rms), kind="stable")
 
 
-def _torque_table(found: DynamicReport, order: np.ndarray) -> Table:
+def _torque_table(found: DynamicReport, order: np.ndarray) -> ReportTable:
     unseen, (name, proof, where) = found.unseen, proof_of(found.unseen)
     held = proof.interval95
     inside = "–" if held is None else f"{held.coverage_percent:.1f} %"
@@ -84,7 +84,7 @@ def _torque_table(found: DynamicReport, order: np.ndarray) -> Table:
     left = len(order) - MAX_ROWS
     note = NOTE + (f" The {MAX_ROWS} largest of {len(order)}; all: see report.html." if left > 0 else "")
     header = ("torque", "rms error", "of limit", "unexplained", "in band", "95 % interval", "within it")
-    return Table(f"Torque errors on {where} ({name})", header, rows, note, frozenset({0}), range(1, 7))
+    return ReportTable(f"Torque errors on {where} ({name})", header, rows, note, frozenset({0}), range(1, 7))
 
 
 def _curves(found: DynamicReport, order: np.ndarray) -> Iterator[Picture]:

@@ -8,7 +8,7 @@ import numpy as np
 from calib.procedure.findings import sentence
 from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics
 from calib.procedure.kinematic_stage.validation import ARM
-from calib.procedure.report.certificate.record import Stage
+from calib.procedure.report.certificate.record import StageRecord
 from calib.procedure.report.fit_report import Report, RowErrors
 from calib.procedure.report.geometry_section import (
     deciding,
@@ -29,14 +29,14 @@ NO_ISO = (
 )
 
 
-def stage(report: Report, drawn: Mapping[str, Picture]) -> Stage:
+def stage(report: Report, drawn: Mapping[str, Picture]) -> StageRecord:
     """Return the stage of a fit.
 
     Args:
         drawn: figures of the report by name; without any the certificate has none either.
     """
     blocks = [*_blocks(report, bool(drawn))]
-    return Stage(report_section(report, drawn), blocks, [*_unchecked(report)], _findings(report.metrics))
+    return StageRecord(report_section(report, drawn), blocks, [*_unchecked(report)], _findings(report.metrics))
 
 
 def _blocks(report: Report, plots: bool) -> Iterator[Block]:

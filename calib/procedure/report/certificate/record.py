@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields
 
 from calib.config import described
 from calib.procedure.answers import CertificateSection
-from calib.procedure.report.page import Block, FileRow, KeyFigure, Section, Table, Text, shortened
+from calib.procedure.report.page import Block, FileRow, KeyFigure, ReportTable, Section, Text, shortened
 from calib.procedure.report.templates import issued
 
 MAX_PAGES = 4
@@ -104,14 +104,14 @@ class Certificate(Page):
     number: Entry
     alert: str
     verdicts: Sequence[Judgement]
-    asked: Table
+    asked: ReportTable
     known: Sequence[Entry]
     stated: Sequence[Entry]
     signatures: Sequence[str]
 
 
 @dataclass(frozen=True)
-class Stage:
+class StageRecord:
     """A stage of a calibration, as report and certificate show it.
 
     Attributes:
@@ -131,7 +131,7 @@ def records(
     title: str,
     subtitle: str,
     setup: Sequence[Entry],
-    stages: Sequence[Stage],
+    stages: Sequence[StageRecord],
     unchecked: Sequence[str] = (),
     files: Sequence[FileRow] = (),
     details: CertificateSection = NO_DETAILS,
@@ -180,12 +180,12 @@ def judgement(section: Section, most: int | None = None) -> Judgement:
     return Judgement(section.title, level, word, shortened(_local(reason), most) if most else reason)
 
 
-def key_table(sections: Sequence[Section]) -> Table:
+def key_table(sections: Sequence[Section]) -> ReportTable:
     """Return the table of what verdicts rest on: before, after, tolerance asked, and whether it is met."""
     header = ("quantity", "nominal", "after", "standard error", "on", "tolerance asked", "met")
     rows = [row for one in sections if one.figures for row in ((one.title,), *map(_cells, one.figures))]
     judged = frozenset(k for k, row in enumerate(rows) if len(row) > 1 and row[5] != "–")
-    return Table("Tolerance asked and met", header, rows, strong=judged, numbers=(1, 2, 3, 5))
+    return ReportTable("Tolerance asked and met", header, rows, strong=judged, numbers=(1, 2, 3, 5))
 
 
 def _cells(one: KeyFigure) -> tuple[str, ...]:
@@ -204,14 +204,14 @@ def _local(text: str) -> str:
     return re.sub(r"(?<![\w.~/])/(?:[^/\s]+/)+(?=[^/\s])", "", text)
 
 
-def files_table(files: Sequence[FileRow], most: int | None = None) -> Table:
+def files_table(files: Sequence[FileRow], most: int | None = None) -> ReportTable:
     """Return the table of files with their SHA-256, those edited by hand first; at most `most`, with short ones."""
     if most is None:
-        return Table("", ("file", "what it is", "bytes", "SHA-256"), files, numbers=(2,))
+        return ReportTable("", ("file", "what it is", "bytes", "SHA-256"), files, numbers=(2,))
     first = sorted(files, key=lambda row: row[1] != EDITED)  # what was edited by hand is not hidden among the rest
     rows = [(name, role, f"{digest[:DIGEST_DIGITS]}…") for name, role, _, digest in first[:most]]
     note = f"{len(files) - most} more, and whole digests: see {WHOLE}." if len(files) > most else ""
-    return Table("Files", ("file", "what it is", "SHA-256"), rows, note)
+    return ReportTable("Files", ("file", "what it is", "SHA-256"), rows, note)
 
 
 def report(
@@ -223,7 +223,7 @@ def report(
     behind = [Section("Result", [reasons, key_table(sections)]), *sections]
     if setup:
         rows = [(one.label, one.value) for one in setup]
-        behind.append(Section("Setup", [Table("", ("what", "value"), rows)]))
+        behind.append(Section("Setup", [ReportTable("", ("what", "value"), rows)]))
     if files:
         behind.append(Section("Files", [files_table(files)]))
     behind.append(Section("Limitations and conventions", NOTES))
