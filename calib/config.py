@@ -350,7 +350,7 @@ def _type_at(kind: Any, loc: Sequence[int | str]) -> Any:
     """Return the dataclass that describes the table at a location."""
     for part in loc:
         if is_dataclass(kind):
-            kind = get_type_hints(kind)[part]
+            kind = get_type_hints(kind)[str(part)]
         else:
             # The values of a mapping, the items of a list.
             kind = get_args(kind)[-1 if isinstance(part, str) else 0]

@@ -240,7 +240,7 @@ def read_only(values: np.ndarray) -> np.ndarray:
     return values
 
 
-def as_subclass(record: DataclassInstance, kind: type[T]) -> T:
+def as_subclass(record: Any, kind: type[T]) -> T:
     """Return a record as an instance of a subclass of its type that adds methods, but no fields."""
     if not issubclass(kind, type(record)):
         raise TypeError(f"{kind.__name__} is no subclass of {type(record).__name__}")

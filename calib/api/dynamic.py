@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from calib.api.rendering import ChartedResult, Judged, Progress, data_frame, listed, optional
+from calib.api.rendering import ChartedResult, DataFrame, Judged, Progress, data_frame, listed, optional
 from calib.arguments import checked
 from calib.data.recordings.recording import Recording
 from calib.errors import UsageError, require
@@ -26,7 +26,6 @@ from calib.robot.calibrated import CalibratedChain
 from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
-    from calib.api.rendering import DataFrame
     from calib.procedure.report.charts import Chart
     from calib.procedure.report.page import Section
 

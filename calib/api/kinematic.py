@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 import numpy as np
 
 from calib import files
-from calib.api.rendering import ChartedResult, Judged, Progress, data_frame, listed, optional
+from calib.api.rendering import ChartedResult, DataFrame, Judged, Progress, data_frame, listed, optional
 from calib.arguments import checked
 from calib.config import Tables
 from calib.data.poses.fit_options import FitOptions, read_options
@@ -30,7 +30,6 @@ from calib.robot.calibrated import CalibratedChain
 from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
-    from calib.api.rendering import DataFrame
     from calib.procedure.report.charts import Chart
     from calib.procedure.report.page import Section
 

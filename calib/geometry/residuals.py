@@ -28,6 +28,11 @@ MIN_CHANGE = 1e-13
 class CommonNoise(Protocol):
     """Errors that several rows share, see `calib.geometry.camera.pixel_residuals.ImageNoise`."""
 
+    @property
+    def factor(self) -> float:
+        """Factor of the stated sigmas."""
+        ...
+
     def near(self, noise: Self) -> bool:
         """Return whether two estimates agree, so that the fit is not repeated."""
         ...

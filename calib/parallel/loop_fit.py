@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calib import files
-from calib.api.rendering import ChartedResult, Judged, data_frame
+from calib.api.rendering import ChartedResult, DataFrame, Judged, data_frame
 from calib.arguments import checked
 from calib.data.csv_table import Table, read_table
 from calib.data.poses.fit_options import FitOptions
@@ -48,7 +48,6 @@ from calib.robot import calibrated
 from calib.robot.calibrated import ROBOT
 
 if TYPE_CHECKING:
-    from calib.api.rendering import DataFrame
     from calib.procedure.report.charts import Chart
     from calib.procedure.report.page import Section
 

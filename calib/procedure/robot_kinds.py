@@ -90,7 +90,7 @@ class Mechanism(Protocol):
         """Write ``robot.toml`` into a folder, so that the folder can be given as this robot."""
         ...
 
-    def model_table(self, dynamics: object, base: object, unit: str) -> dict[str, object]:
+    def model_table(self, dynamics: Any, base: Any, unit: str) -> dict[str, object]:
         """Return an identified model in the form of ``dynamics.json``."""
         ...
 

@@ -154,6 +154,7 @@ class PixelPart(ResidualPart):
     depth: np.ndarray
     axes: np.ndarray
     carried: np.ndarray
+    noise: ImageNoise | None = field(default=None, kw_only=True)
 
     @property
     def height(self) -> int:

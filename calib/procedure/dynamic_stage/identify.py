@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from os.path import realpath
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import numpy as np
 
@@ -148,7 +148,9 @@ def errors_of(
     if errors is not None:
         for case in inputs.unseen or inputs.cases[:1]:
             say(f"estimating the errors of {case.name}")
-            intervals[case.name] = torque_errors.intervals(errors, dynamics, case, predictions[case.name])
+            intervals[case.name] = torque_errors.intervals(
+                errors, cast(Dynamics, dynamics), case, predictions[case.name]
+            )
     repeated = repeated_motion(inputs.cases, inputs.unseen)
     validation = {}
     for case in inputs.unseen:

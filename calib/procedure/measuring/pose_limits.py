@@ -5,11 +5,13 @@ between the arm's own links, and the floor that the arm stands on: `Limits.check
 `Limits.unchecked` names what could not be, since nobody has stated it.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,13 +29,16 @@ from calib.procedure.measuring.moveit import limit_tables
 from calib.procedure.measuring.sight import SeenOnly, Sight, sight_of
 from calib.records import FieldValues
 from calib.robot.beside import links_of
-from calib.robot.capsules import DistanceModel, Obstacle, Wall, signed_distance
+from calib.robot.capsules import Obstacle, Wall, signed_distance
 from calib.robot.chain import Chain
 from calib.robot.description import MAX_TURN, remarks
 from calib.robot.formats.urdf_tree import is_urdf, text
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.tables import load as load_table
 from calib.robot.tables import placement
+
+if TYPE_CHECKING:
+    from calib.robot.collision import DistanceModel
 
 # times the arm's reach: no cell is that large (our choice)
 MAX_REACHES = 100.0

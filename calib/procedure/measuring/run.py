@@ -13,12 +13,14 @@ joints comes first. Of the candidates the one is taken that leaves most of the c
 move reaches, or, where there are none, among the best few by via-points.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import pairwise, product
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -28,10 +30,12 @@ from calib.poses.by_index import merits
 from calib.poses.indices import Index, observability
 from calib.poses.information import log_det
 from calib.procedure.measuring import DEFAULT_RUN, RunSettings
-from calib.robot.capsules import DistanceModel
 from calib.robot.chain import Chain
 from calib.trajectories.tour import move_times, tour
 from calib.trajectories.ways import Room, way
+
+if TYPE_CHECKING:
+    from calib.robot.collision import DistanceModel
 
 Progress = Callable[[str], None]
 # by the numbers of two poses, the smaller one first

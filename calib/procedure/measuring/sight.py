@@ -4,8 +4,11 @@ With several targets (reflectors on one plate, each with a direction of its own)
 and only the rows of those that are seen count in the observation Jacobian: what faces away counts for nothing.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,8 +16,11 @@ from calib.geometry.installation import Installation
 from calib.geometry.observability import Observation, TargetJacobian, TargetPose
 from calib.poses import constraints
 from calib.poses.space import PoseConstraint, constraint_gradient
-from calib.robot.capsules import ALWAYS, SAMPLES, DistanceModel
+from calib.robot.capsules import ALWAYS, SAMPLES
 from calib.robot.chain import Chain, random_joints
+
+if TYPE_CHECKING:
+    from calib.robot.collision import DistanceModel
 
 # distance [m] of a link from the line of sight below which it blocks it: about a tracker beam's radius (our choice)
 BEAM = 0.01
