@@ -2,13 +2,13 @@
 
 from calib.api.dynamic import DynamicsModel
 from calib.api.kinematic import GeometryFit
-from calib.api.rendering import Drawn, Judged, Unjudged, saved
+from calib.api.rendering import ChartedResult, Judged, Unjudged, saved
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.dynamic_stage.metrics import UnseenReport
-from calib.procedure.export.delivery import fit_verdicts, prediction
+from calib.procedure.export.delivery import prediction
 from calib.procedure.export.geometry import read as read_exported
 from calib.procedure.export.geometry import results as geometry_results
-from calib.procedure.findings import LEVELS, Verdict, limit, lines_of, sentence, settle
+from calib.procedure.findings import LEVELS, Verdict, limit, lines_of, notes_of, sentence, settle
 from calib.procedure.kinematic_stage.folder import IN_SESSION, URDF, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.kinematic_stage.inputs import load_robot
 from calib.procedure.kinematic_stage.inputs import read_file as read_measured_file
@@ -26,8 +26,8 @@ __all__ = [
     "LEVELS",
     "URDF",
     "VALIDATED",
+    "ChartedResult",
     "ComparedRows",
-    "Drawn",
     "DrawnRobot",
     "DynamicsModel",
     "ErrorSizes",
@@ -50,12 +50,12 @@ __all__ = [
     "ValidationMetrics",
     "Verdict",
     "drawn",
-    "fit_verdicts",
     "geometry_results",
     "joints_of",
     "limit",
     "lines_of",
     "load_robot",
+    "notes_of",
     "open_result",
     "prediction",
     "read_covariance",

@@ -17,7 +17,6 @@ from calib.apps.controller_programs.frames import ControllerFrame, Description, 
 from calib.apps.controller_programs.targets import number, pose_values
 from calib.controllers.table import Controller
 from calib.geometry.installation import Installation, read_arms
-from calib.procedure.export.delivery import fit_verdicts
 from calib.procedure.export.geometry import read
 from calib.robot.calibrated import CalibratedChain, nominal_of
 from calib.toolkit.result_folders import open_result
@@ -49,7 +48,8 @@ def delivery_text(
     cell, nominal = read_arms(fit)
     arm = Description.of_fit(fit, nominal.chain)
     frames = base_frame(controller, arm, world), flange_frame(controller, arm, flange)
-    lines = [f"{controller.title}: calibration of {robot.chain.name}", str(fit_verdicts(fit)), ""]
+    verdicts = open_result(fit, "deliver").verdicts
+    lines = [f"{controller.title}: calibration of {robot.chain.name}", str(verdicts), ""]
     lines += [f"It takes: {controller.takes}.", f"It does not: {controller.closed}.", ""]
     if len(nominal.tools):
         lines += [

@@ -12,7 +12,7 @@ import numpy as np
 
 from calib.apps.monitoring.comparison.change_test import ChangeTest, ParameterChange
 from calib.errors import Finding, finding
-from calib.toolkit.report_pages import Block, Column, KeyFigure, Section, Text, met, table
+from calib.toolkit.report_pages import Block, KeyFigure, RecordColumn, Section, Text, met, table
 from calib.toolkit.result_folders import Verdict, notes_of, settle
 from calib.units import SMALL
 
@@ -183,11 +183,11 @@ def _change_alone(parameter: ParameterChange) -> str:
 
 
 _PARAMETERS = [
-    Column("parameter", "{0.name}", number=False),
-    Column("before", _before),
-    Column("after", _after),
-    Column("change", _change),
-    Column("σ", _sigmas),
-    Column("if it changed alone", _change_alone),
-    Column("χ² explained", "{0.explained:.3g}"),
+    RecordColumn("parameter", "{0.name}", number=False),
+    RecordColumn("before", _before),
+    RecordColumn("after", _after),
+    RecordColumn("change", _change),
+    RecordColumn("σ", _sigmas),
+    RecordColumn("if it changed alone", _change_alone),
+    RecordColumn("χ² explained", "{0.explained:.3g}"),
 ]
