@@ -309,6 +309,10 @@ def test_a_result_in_memory_has_what_its_folder_has(results):
     assert plan.tables()["motion"].header == stored.tables()["motion"].header
     assert len(plan.scene().played[0].t) == len(stored.scene().played[0].t)
     assert plan.verdict == stored.verdict and plan.figures()
+    with pytest.raises(
+        CalibError, match=r"^<MotionPlan for tx40.*> is a motion of calib plan; give the folder of a fit"
+    ):
+        calib.export(plan, results / "none")  # type: ignore[arg-type]
 
 
 def test_advice_is_for_verbs_that_exist():

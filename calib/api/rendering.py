@@ -14,7 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, TypeAlias, overload
 
-from calib.errors import UsageError, one_of, refused_as
+from calib.errors import CalibError, UsageError, one_of, refused_as
 from calib.procedure.findings import NOT_JUDGED, Verdict
 from calib.result_kinds import ResultKind
 from calib.workers.threads import one_blas_thread
@@ -65,7 +65,20 @@ def saved(result: str | Path | SavedResult) -> Iterator[Path]:
     if isinstance(result, Kept) and result.kind.companion:
         name = "result.csv"
     with TemporaryDirectory() as folder:
-        yield result.save(Path(folder) / name, plots=False)
+        path = result.save(Path(folder) / name, plots=False)
+        try:
+            yield path
+        except CalibError as error:
+            # Messages name the result, not a folder that is gone.
+            error.args = tuple(_renamed(argument, str(path), repr(result)) for argument in error.args)
+            raise
+
+
+def _renamed(argument: object, path: str, name: str) -> object:
+    """Return an error's argument with a path in its text replaced by a name."""
+    if isinstance(argument, str):
+        return argument.replace(path, name)
+    return argument
 
 
 def as_text(renderables: Iterable[object]) -> str:
