@@ -163,4 +163,5 @@ def checked(session: Session, kind: str) -> list[str]:
     blocks = read_measured(session, chain, paths)
     if kind == "drift":
         return [f"{name}: {len(block)} rows" for name, block in blocks]
-    return notes_on(session, chain, blocks, POSES if kind == "measured" else UNSEEN)
+    folder = POSES if kind == "measured" else UNSEEN
+    return [str(note) for note in notes_on(session, chain, blocks, folder)]
