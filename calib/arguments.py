@@ -46,11 +46,11 @@ def checked(target: C) -> C:
     return target
 
 
-def _read_by_type(kind: Any) -> Any:
+def _read_by_type(kind: type) -> Callable[..., None]:
     init = kind.__init__
 
     @wraps(init)
-    def call(self: Any, *args: Any, **kwargs: Any) -> None:
+    def call(self: object, *args: object, **kwargs: object) -> None:
         from calib.config import parse, plain_values
         from calib.errors import quiet
 
@@ -67,7 +67,7 @@ def _read_by_type(kind: Any) -> Any:
     return call
 
 
-def _bound(function_signature: Signature, name: str, args: tuple, kwargs: dict[str, Any]) -> dict[str, Any]:
+def _bound(function_signature: Signature, name: str, args: tuple, kwargs: dict[str, object]) -> dict[str, object]:
     from calib.errors import UsageError
 
     try:
@@ -76,13 +76,13 @@ def _bound(function_signature: Signature, name: str, args: tuple, kwargs: dict[s
         raise UsageError(f"{name}: {error}") from None
 
 
-def _checked(function: Callable[..., Any]) -> Any:
+def _checked(function: Any) -> Any:
     @cache
-    def expected() -> tuple[Any, dict[str, Any]]:  # at the first call: modules load each other no more
+    def expected() -> tuple[Signature, dict[str, object]]:  # at the first call: modules load each other no more
         return signature(function), get_type_hints(function)
 
     @wraps(function)
-    def call(*args: Any, **kwargs: Any) -> Any:
+    def call(*args: object, **kwargs: object) -> object:
         from calib.errors import quiet
         from calib.workers.threads import limited_steps, one_blas_thread
 
@@ -95,7 +95,7 @@ def _checked(function: Callable[..., Any]) -> Any:
 
 
 @contextmanager
-def _reporter(function_signature: Signature, arguments: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+def _reporter(function_signature: Signature, arguments: Mapping[str, object]) -> Iterator[dict[str, object]]:
     """Yield a notebook's reporter as an argument for a function that takes one and was given none; otherwise {}."""
     notebook = sys.modules.get("IPython")
     lacks_reporter = "progress" in function_signature.parameters and arguments.get("progress") is None
@@ -114,7 +114,7 @@ def _reporter(function_signature: Signature, arguments: Mapping[str, Any]) -> It
 
 
 def _refuse_other_types(
-    name: str, function_signature: Signature, hints: dict[str, Any], args: tuple, kwargs: dict
+    name: str, function_signature: Signature, hints: dict[str, object], args: tuple, kwargs: dict
 ) -> None:
     from calib.config_types import shown
     from calib.errors import UsageError
@@ -152,7 +152,7 @@ def _fits(value: Any, hint: Any) -> bool:
     return isinstance(value, _PLAIN.get(hint, (hint,)))
 
 
-def _words(hint: Any) -> str:
+def _words(hint: object) -> str:
     """Return the description of an annotated type, for messages."""
     kind, inner = get_origin(hint), get_args(hint)
     if kind in (Union, UnionType):

@@ -8,11 +8,13 @@ best change counts.
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
 from calib.errors import Finding, finding
+
+Data = TypeVar("Data")
 
 # Ratio of the residuals of two changes up to which nobody can tell which of them it is (our choice).
 MAX_RIVAL_RATIO = 1.2
@@ -22,7 +24,7 @@ MAX_TIE_RATIO = 1.0001
 
 
 @dataclass(frozen=True, eq=False)
-class Change:
+class Change(Generic[Data]):
     """One possible error in the meaning of columns.
 
     Attributes:
@@ -34,7 +36,7 @@ class Change:
     """
 
     code: str
-    make: Callable[[Any], Any]
+    make: Callable[[Data], Data]
     joints: tuple[int, ...] = ()
     values: Mapping[str, Any] = field(default_factory=dict)
     max_left: float = 1.0
@@ -73,10 +75,10 @@ class Explanation:
         """Ratio of the rms residual with the changes to that without."""
         return _share(self.after, self.before)
 
-    def finding(self, names: Sequence[str], **values: Any) -> Finding:
+    def finding(self, names: Sequence[str], **values: object) -> Finding:
         """Return the finding on these changes, with joint names and other values."""
         joints = [names[j] for j in self.joints]
-        details: dict[str, Any] = {"joints": joints}
+        details: dict[str, object] = {"joints": joints}
         if joints:
             details |= {"joint": joints[0], "other": joints[-1]}
         rival = None
@@ -87,10 +89,10 @@ class Explanation:
 
 
 def best_changes(
-    data: Any,
-    table: Iterable[Change],
-    left: Callable[[Any], np.ndarray],
-    at_least: Callable[[Any], np.ndarray] | None = None,
+    data: Data,
+    table: Iterable[Change[Data]],
+    left: Callable[[Data], np.ndarray],
+    at_least: Callable[[Data], np.ndarray] | None = None,
     max_changes: int = 1,
 ) -> Explanation | None:
     """Return the changes that explain the data best, chosen one by one; None if no change is significant.

@@ -14,14 +14,18 @@ from dataclasses import fields, is_dataclass
 from functools import cache
 from inspect import cleandoc
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_hints
 
-from calib.config_types import UNKNOWN, Hidden, OneOf, shown
+from calib.config_types import UNKNOWN, Hidden, OneOf, ParsedTable, shown
 from calib.errors import CalibError, UsageError, suggestion
+
+if TYPE_CHECKING:
+    from pydantic import TypeAdapter
+    from pydantic_core import ErrorDetails
 
 T = TypeVar("T")
 # A TOML file, or its content.
-Tables = str | Path | Mapping[str, Any]
+Tables = str | Path | Mapping[str, object]
 # Levels of tables in tables, and bytes of a file (our choices).
 MAX_LEVELS = 32
 MAX_BYTES = 8_000_000
@@ -41,7 +45,7 @@ _BARE = re.compile(r"[A-Za-z0-9_-]+")
 _ENTRY = re.compile(r"^ {4}(\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", re.M)
 
 
-def read_toml(path: str | Path, error: type[CalibError] = UsageError) -> dict[str, Any]:
+def read_toml(path: str | Path, error: type[CalibError] = UsageError) -> ParsedTable:
     """Return the tables of the TOML file at `path`.
 
     Raises:
@@ -68,9 +72,9 @@ def read_toml(path: str | Path, error: type[CalibError] = UsageError) -> dict[st
     return tables
 
 
-def _check_size(tables: Any, where: str, error: type[CalibError]) -> None:
+def _check_size(tables: object, where: str, error: type[CalibError]) -> None:
     """Raise an error for tables nested too deeply and for integers of more than 64 bits."""
-    todo: list[tuple[tuple[Any, ...], Any]] = [((), tables)]
+    todo: list[tuple[tuple[int | str, ...], object]] = [((), tables)]
     while todo:
         loc, value = todo.pop()
         if len(loc) > MAX_LEVELS:
@@ -83,7 +87,7 @@ def _check_size(tables: Any, where: str, error: type[CalibError]) -> None:
             todo += [((*loc, index), item) for index, item in enumerate(value)]
 
 
-def parse(kind: type[T], table: Any, where: str, error: type[CalibError] = UsageError) -> T:
+def parse(kind: type[T], table: object, where: str, error: type[CalibError] = UsageError) -> T:
     """Return a parsed table as a checked instance of the dataclass `kind`.
 
     Args:
@@ -118,10 +122,11 @@ def read(kind: type[T], source: Tables | None, name: str, foreign_tables: Collec
     return parse(kind, own_tables, where), where
 
 
-def plain_values(value: Any) -> Any:
+def plain_values(value: object) -> Any:
     """Return a value with numpy numbers, arrays and tuples converted to plain numbers and lists."""
-    if hasattr(value, "tolist"):
-        return value.tolist()
+    to_list = getattr(value, "tolist", None)
+    if to_list is not None:
+        return to_list()
     if isinstance(value, Mapping):
         return {key: plain_values(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -136,13 +141,13 @@ def strict(kind: type[T]) -> type[T]:
 
 
 @cache
-def _adapter(kind: Any) -> Any:
+def _adapter(kind: type[T]) -> "TypeAdapter[T]":
     from pydantic import TypeAdapter
 
     return TypeAdapter(kind)
 
 
-def schema(kind: type, title: str) -> dict[str, Any]:
+def schema(kind: type, title: str) -> ParsedTable:
     """Return the JSON schema (draft 2020-12) of files for the dataclass `kind`."""
     from pydantic.json_schema import GenerateJsonSchema
 
@@ -154,13 +159,13 @@ def schema(kind: type, title: str) -> dict[str, Any]:
     return {"$schema": GenerateJsonSchema.schema_dialect, **json_schema, "title": title}
 
 
-def _for_toml(json_schema: Any) -> Any:
+def _for_toml(json_schema: object) -> Any:
     """Return a schema without nulls (TOML has none), hidden fields and redundant titles."""
     if isinstance(json_schema, list):
         return [_for_toml(item) for item in json_schema]
     if not isinstance(json_schema, dict):
         return json_schema
-    result: dict[str, Any] = {}
+    result: ParsedTable = {}
     description = json_schema.get("description")
     descriptions = _entries(description) if isinstance(description, str) else {}
     for key, value in json_schema.items():
@@ -188,7 +193,7 @@ def _for_toml(json_schema: Any) -> Any:
     return result
 
 
-def inherited(table: Mapping[str, Any], kind: type) -> dict[str, Any]:
+def inherited(table: Mapping[str, Any], kind: type) -> dict[str, object]:
     """Return a file's table whose ``[files.NAME]`` tables inherit missing keys from the table for all files.
 
     Args:
@@ -200,7 +205,7 @@ def inherited(table: Mapping[str, Any], kind: type) -> dict[str, Any]:
         return dict(table)
     common = {key: table[key] for key in _keys(kind) if key in table}
 
-    def filled(file_table: Any) -> Any:
+    def filled(file_table: object) -> Any:
         if not isinstance(file_table, Mapping):
             return file_table
         result = {**common, **file_table}
@@ -222,7 +227,7 @@ def own_table(files: Mapping[str, T], path: str | Path) -> T | None:
     return None
 
 
-def described(source: Any) -> dict[str, str]:
+def described(source: object) -> dict[str, str]:
     """Return the description of each argument or attribute from the docstrings of a function or class."""
     descriptions: dict[str, str] = {}
     for base in reversed(getattr(source, "__mro__", (source,))):
@@ -260,7 +265,7 @@ def _entries(docstring: str) -> dict[str, str]:
 
 
 def check_keys(
-    table: Mapping[str, Any], keys: Collection[str], where: str, error: type[CalibError] = UsageError
+    table: Mapping[str, object], keys: Collection[str], where: str, error: type[CalibError] = UsageError
 ) -> None:
     """Raise an error for a key that is not in `keys`; its message suggests the most similar key."""
     for key in table:
@@ -268,7 +273,7 @@ def check_keys(
             raise error(f"{where}: {_no_key(key, keys)}")
 
 
-def located(loc: Sequence[Any], table: Any = None) -> str:
+def located(loc: Sequence[int | str], table: object = None) -> str:
     """Return a file location in TOML notation: ``sigma.position``, ``files."a.csv".kind``, ``[[term]] number 2``.
 
     Args:
@@ -310,13 +315,13 @@ def _no_key(key: str, keys: Collection[str]) -> str:
     return f"there is no key '{key}'{suggestion(key, keys)}; {choices}"
 
 
-def _complaint(errors: list[Any], kind: type, source: str, parsed_table: Any) -> str:
+def _complaint(errors: "list[ErrorDetails]", kind: type, source: str, parsed_table: object) -> str:
     """Return the message for pydantic's first error; an unknown key takes precedence over a missing one."""
     unknown = [error for error in errors if error["type"] == UNKNOWN]
     first = unknown[0] if unknown else errors[0]
     loc, name, value = tuple(first["loc"]), first["type"], first["input"]
 
-    def message(location: Sequence[Any], text: str) -> str:
+    def message(location: Sequence[int | str], text: str) -> str:
         where = ": ".join(filter(None, (source, located(location, parsed_table))))
         return f"{where}: {text}"
 
@@ -330,7 +335,7 @@ def _complaint(errors: list[Any], kind: type, source: str, parsed_table: Any) ->
         table_location = loc[:-1]
         table = _type_at(kind, table_location)
         # A dot in a file's name makes a table in a table of it.
-        is_unquoted = len(loc) == 3 and loc[0] == "files" and isinstance(value, dict) and "." not in loc[1]
+        is_unquoted = len(loc) == 3 and loc[0] == "files" and isinstance(value, dict) and "." not in str(loc[1])
         if name == UNKNOWN and is_unquoted:
             return message(table_location, f'the dot needs quotes: [files."{loc[1]}.{loc[2]}"]')
         if name == UNKNOWN:
@@ -340,21 +345,21 @@ def _complaint(errors: list[Any], kind: type, source: str, parsed_table: Any) ->
     if name != "dataclass_type":
         location = _without_index(loc)
     if name == "value_error":
-        return message(location, str(first["ctx"]["error"]))
+        return message(location, str(first.get("ctx", {})["error"]))
     expected = _PLAIN.get(name, _PLAIN.get(name.split("_")[0], "a table"))
     if name == "tuple_type" and is_dataclass(_type_at(kind, (*loc, 0))):
         expected = f"a list of tables, [[{loc[-1]}]]"
     return message(location, f"expected {expected}, found {shown(value)}")
 
 
-def _without_index(loc: tuple[Any, ...]) -> tuple[Any, ...]:
+def _without_index(loc: tuple[int | str, ...]) -> tuple[int | str, ...]:
     """Return the location of the list of values that holds the value at a location."""
     while loc and isinstance(loc[-1], int):
         loc = loc[:-1]
     return loc
 
 
-def _fixed_length(kind: Any, loc: Sequence[Any], name: str) -> int:
+def _fixed_length(kind: object, loc: Sequence[int | str], name: str) -> int:
     """Return how many values the list of fixed length at a location has; 0 where there is no such list.
 
     Args:
@@ -367,7 +372,7 @@ def _fixed_length(kind: Any, loc: Sequence[Any], name: str) -> int:
     return 0 if Ellipsis in value_types else len(value_types)
 
 
-def _keys(kind: Any) -> list[str]:
+def _keys(kind: object) -> list[str]:
     """Return the keys of the table that a dataclass describes."""
     hints = get_type_hints(kind, include_extras=True)
     return [key for key, hint in hints.items() if Hidden() not in getattr(hint, "__metadata__", ())]
@@ -380,7 +385,7 @@ def _needed(kind: Any) -> str:
     return f"; needed are {', '.join(needed)}" if len(needed) > 1 else ""
 
 
-def _type_at(kind: Any, loc: Sequence[Any]) -> Any:
+def _type_at(kind: Any, loc: Sequence[int | str]) -> Any:
     """Return the dataclass that describes the table at a location."""
     for part in loc:
         if is_dataclass(kind):

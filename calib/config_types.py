@@ -4,6 +4,8 @@ pydantic checks by them and `calib.config` makes its complaints readable; it is 
 before.
 """
 
+from __future__ import annotations
+
 import ast
 import datetime
 import math
@@ -14,16 +16,25 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
-from typing import Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeAlias, get_args
 
 from calib.errors import CalibError, UsageError, suggestion
 from calib.units import QUANTITIES
+
+if TYPE_CHECKING:
+    from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
+    from pydantic_core import CoreSchema
+
+ParsedTable: TypeAlias = dict[str, Any]
+"""A table of a TOML or JSON file as its parser returns it; who reads a value checks it."""
 
 # Pydantic's name of the error.
 UNKNOWN = "unexpected_keyword_argument"
 # Signs of an expression (our choice).
 MAX_LETTERS = 200
-_BINARY = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv}
+# Class of an operation, as `ast` has it, and its function of two values.
+Operations = Mapping[type[ast.operator], Callable[[Any, Any], Any]]
+_BINARY: Operations = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv}
 _NAMES = {"pi": math.pi, "inf": math.inf}
 
 
@@ -44,7 +55,7 @@ class _Short(reprlib.Repr):
 _SHORT = _Short()
 
 
-def shown(value: Any) -> str:
+def shown(value: object) -> str:
     """Return a value as text for messages, at most one line long."""
     try:
         return _SHORT.repr(value)
@@ -52,7 +63,7 @@ def shown(value: Any) -> str:
         return "a whole number with thousands of digits"
 
 
-def number(value: Any, place: str, quantity: str = "", error: type[CalibError] = UsageError) -> float:
+def number(value: object, place: str, quantity: str = "", error: type[CalibError] = UsageError) -> float:
     """Return a number in SI, from a number of TOML or a text: an expression with pi, followed by a unit.
 
     Args:
@@ -70,7 +81,7 @@ def number(value: Any, place: str, quantity: str = "", error: type[CalibError] =
 
 
 def numbers(
-    value: Any, count: int, place: str, quantity: str = "", error: type[CalibError] = UsageError
+    value: object, count: int, place: str, quantity: str = "", error: type[CalibError] = UsageError
 ) -> tuple[float, ...]:
     """Return a list of `count` numbers in SI; see `number`."""
     if not isinstance(value, (list, tuple)) or len(value) != count:
@@ -78,7 +89,7 @@ def numbers(
     return tuple(number(item, place, quantity, error) for item in value)
 
 
-def _number(value: Any, quantity: str) -> float:
+def _number(value: object, quantity: str) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
         raise ValueError(f"{shown(value)} is not a number")
     try:
@@ -107,7 +118,7 @@ def _expression(text: str, quantity: str) -> float:
     return evaluated(ast.parse(text, mode="eval").body) * factor
 
 
-def evaluated(node: ast.expr, names: Mapping[str, Any] = _NAMES, operations: Mapping[Any, Any] = _BINARY) -> Any:
+def evaluated(node: ast.expr, names: Mapping[str, Any] = _NAMES, operations: Operations = _BINARY) -> Any:
     """Return the value of an expression of numbers, names, signs and operations; refuse anything else.
 
     Args:
@@ -134,7 +145,7 @@ def evaluated(node: ast.expr, names: Mapping[str, Any] = _NAMES, operations: Map
     raise ValueError(ast.unparse(node))
 
 
-def _float(value: Any) -> float:
+def _float(value: object) -> float:
     """Return a number of TOML as a float; NaN for anything else."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return math.nan
@@ -147,7 +158,7 @@ def _float(value: Any) -> float:
 class _Refused(ValueError):
     """Error that states the expected and the given value."""
 
-    def __init__(self, expected: str, value: Any, hint: str = "") -> None:
+    def __init__(self, expected: str, value: object, hint: str = "") -> None:
         super().__init__(f"expected {expected}, found {shown(value)}{hint and f'; {hint}'}")
 
 
@@ -155,18 +166,18 @@ class _Read(ABC):
     """Type of a key: pydantic passes the value to `read`, which returns it converted or raises an error."""
 
     @abstractmethod
-    def read(self, value: Any) -> Any: ...
+    def read(self, value: object) -> object: ...
 
     @property
     @abstractmethod
-    def json(self) -> Mapping[str, Any]: ...
+    def json(self) -> Mapping[str, object]: ...
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+    def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> CoreSchema:
         from pydantic_core import core_schema as core
 
         return core.no_info_plain_validator_function(self.read)
 
-    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, object]:
         return dict(self.json)
 
 
@@ -193,7 +204,7 @@ class Real(_Read):
     zero: bool = False
     words: str = ""
 
-    def read(self, value: Any) -> float:
+    def read(self, value: object) -> float:
         result = _number(value, self.quantity) if self.quantity and isinstance(value, str) else _float(value)
         if self.zero and result == 0.0:
             return result
@@ -216,7 +227,7 @@ class Real(_Read):
         return f"a number{self.unit and f' [{self.unit}]'}, {low}at most {upper:g}{hint}"
 
     @property
-    def json(self) -> Mapping[str, Any]:
+    def json(self) -> Mapping[str, object]:
         bounds = {"exclusiveMinimum": self.above, "minimum": self.least, "maximum": self.most}
         if self.zero:
             bounds = {"minimum": 0.0, "maximum": self.most}
@@ -235,14 +246,14 @@ class Whole(_Read):
     of: str = ""
     start: int = 0
 
-    def read(self, value: Any) -> int:
+    def read(self, value: object) -> int:
         if type(value) is int and self.least <= value <= self.most:
             return value - self.start
         span = f", {self.least} or more" if self.most == Whole.most else f" from {self.least} to {self.most}"
         raise _Refused(f"a whole number{self.of}{span}", value)
 
     @property
-    def json(self) -> Mapping[str, Any]:
+    def json(self) -> Mapping[str, object]:
         return {"type": "integer", "minimum": self.least, "maximum": self.most}
 
 
@@ -272,14 +283,14 @@ class OneOf(_Read):
             return ""
         return f"{', '.join(self.allowed[:-1])} or {self.allowed[-1]}"
 
-    def read(self, value: Any) -> str:
+    def read(self, value: object) -> str:
         if isinstance(value, str) and value in self.names:
             return value
         near = suggestion(value, self.names) if isinstance(value, str) else ""
         raise _Refused(f"one of {', '.join(self.names)}{near}", value, self.hint)
 
     @property
-    def json(self) -> Mapping[str, Any]:
+    def json(self) -> Mapping[str, object]:
         return {"enum": [*self.names], "type": "string"}
 
 
@@ -289,11 +300,11 @@ class Expect:
 
     words: str
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+    def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> CoreSchema:
         from pydantic_core import ValidationError
         from pydantic_core import core_schema as core
 
-        def read(value: Any, inner: Callable[[Any], Any]) -> Any:
+        def read(value: object, inner: Callable[[object], object]) -> object:
             try:
                 return inner(value)
             except ValidationError:
@@ -322,19 +333,19 @@ class Checked:
         json: JSON schema that replaces that of the annotations to its left.
     """
 
-    read: Callable[[Any], Any]
-    json: Mapping[str, Any] | None = field(default=None, hash=False)
+    read: Callable[[object], object]
+    json: Mapping[str, object] | None = field(default=None, hash=False)
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+    def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> CoreSchema:
         return self.around(handler(source))
 
-    def around(self, inner: Any) -> Any:
+    def around(self, inner: CoreSchema) -> CoreSchema:
         """Return pydantic's schema `inner`, applied after the function."""
         from pydantic_core import core_schema as core
 
         return core.no_info_before_validator_function(self.read, inner)
 
-    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, object]:
         return handler(schema) if self.json is None else dict(self.json)
 
 
@@ -345,15 +356,15 @@ class Spread:
     count: int | None = None
     words: str = "a number, or a list with one per joint"
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+    def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> CoreSchema:
         return Checked(self._read).around(handler(source))
 
-    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, object]:
         several = handler(schema)
         one = several["items"] if "items" in several else several["prefixItems"][0]
         return {"anyOf": [one, several]}
 
-    def _read(self, value: Any) -> Any:
+    def _read(self, value: object) -> object:
         if not isinstance(value, (list, tuple)):
             return [value] * (self.count or 1)
         if not value or len(value) != (self.count or len(value)):
@@ -365,16 +376,16 @@ class Spread:
 class Hidden:
     """A field that files cannot set: its name is an unknown key."""
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+    def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> CoreSchema:
         from pydantic_core import PydanticCustomError
         from pydantic_core import core_schema as core
 
-        def refuse(value: Any) -> Any:
+        def refuse(value: object) -> NoReturn:
             raise PydanticCustomError(UNKNOWN, "unknown")
 
         return core.no_info_before_validator_function(refuse, core.any_schema())
 
-    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, object]:
         return {"not": {}}
 
 
@@ -392,7 +403,7 @@ class OneOrMany(_Read):
 
     of: Real
 
-    def read(self, value: Any) -> Any:
+    def read(self, value: object) -> object:
         if not isinstance(value, (list, tuple)):
             return self.of.read(value)
         if not value:
@@ -400,23 +411,23 @@ class OneOrMany(_Read):
         return tuple(map(self.of.read, value))
 
     @property
-    def json(self) -> Mapping[str, Any]:
+    def json(self) -> Mapping[str, object]:
         return {"anyOf": [self.of.json, {"type": "array", "items": self.of.json, "minItems": 1}]}
 
 
-def _label(value: Any) -> str:
+def _label(value: object) -> str:
     if isinstance(value, bool) or not isinstance(value, (str, int, float)):
         raise ValueError(f"expected a text or a number, found {shown(value)}")
     return f"{value:.12g}" if isinstance(value, float) else str(value)  # an integer of any length
 
 
-def _numeric(value: Any) -> Any:
+def _numeric(value: object) -> object:
     if isinstance(value, bool) or not isinstance(value, (str, int, float)):
         raise ValueError(f"expected a number, or a text with a unit, found {shown(value)}")
     return value
 
 
-def _filled(value: Any) -> Any:
+def _filled(value: object) -> object:
     if not isinstance(value, str) or not value.strip():
         raise ValueError(f"expected a text, found {shown(value)}")
     return value
@@ -434,5 +445,5 @@ NotNegative = Annotated[float, Real(least=0)]
 JointNumber = Annotated[int, Whole(1, 99, start=1)]
 Length = Annotated[float, Real(quantity="length")]
 Angle = Annotated[float, Real(quantity="angle")]
-Numeric = Annotated[Any, Checked(_numeric, {"type": ["number", "string"]})]
+Numeric = Annotated[object, Checked(_numeric, {"type": ["number", "string"]})]
 """A number, or a text with a unit, parsed by `number`; another key of the table gives the quantity, e.g. length."""

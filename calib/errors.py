@@ -17,11 +17,12 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 if TYPE_CHECKING:
     import numpy as np
 
+T = TypeVar("T")
 # Errors of a write, whatever the file.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
 # Share of common letters from which on a name is suggested.
@@ -46,14 +47,15 @@ class Finding:
     accepted: bool = False
 
 
-def finding(code: str, **values: Any) -> Finding:
+def finding(code: str, **values: object) -> Finding:
     """Return a finding with plain values: numpy numbers converted to Python's, sequences to tuples."""
     return Finding(code, {name: _plain(value) for name, value in values.items()})
 
 
-def _plain(value: Any) -> Any:
-    if hasattr(value, "tolist"):
-        value = value.tolist()
+def _plain(value: object) -> object:
+    to_list = getattr(value, "tolist", None)
+    if to_list is not None:
+        value = to_list()
     return tuple(value) if isinstance(value, list) else value
 
 
@@ -153,7 +155,7 @@ class Busy(SessionError):
     """A session folder that another command works on."""
 
 
-def require(holds: object, message: str, kind: type[Exception] = CalibError, *details: Any) -> None:
+def require(holds: object, message: str, kind: type[Exception] = CalibError, *details: object) -> None:
     """Raise `kind(message, *details)` unless `holds` is true."""
     if not holds:
         raise kind(message, *details)
@@ -174,7 +176,7 @@ def refuse_option(where: object, message: str) -> NoReturn:
     raise UsageError(f"{where}: {message}")
 
 
-def one_of(name: Any, choices: Collection[str], role: str, kind: type[Exception] = CalibError, *details: Any) -> Any:
+def one_of(name: T, choices: Collection[str], role: str, kind: type[Exception] = CalibError, *details: object) -> T:
     """Return `name` if it is among `choices`, else raise ``role 'name' is not one of ... (did you mean ...?)``."""
     if name not in choices:
         raise kind(f"{role} '{name}' is not one of {', '.join(choices)}{suggestion(str(name), choices)}", *details)
@@ -183,7 +185,7 @@ def one_of(name: Any, choices: Collection[str], role: str, kind: type[Exception]
 
 @contextmanager
 def refused_as(
-    kind: type[Exception], kinds: type[BaseException] | tuple[type[BaseException], ...], message: str, *details: Any
+    kind: type[Exception], kinds: type[BaseException] | tuple[type[BaseException], ...], message: str, *details: object
 ) -> Iterator[None]:
     """Convert exceptions of `kinds` in the block to `kind(message, *details)`; ``{}`` in it: the original message.
 

@@ -20,7 +20,7 @@ from contextvars import ContextVar
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from calib.errors import CalibError, UsageError, refuse_option, refused_as, require
 from calib.records import plain, shielded
@@ -347,7 +347,7 @@ def _digest(path: Path, *_: int) -> str:
     return digest.hexdigest()
 
 
-def write_json(path: str | Path, value: Any) -> Path:
+def write_json(path: str | Path, value: object) -> Path:
     """Write a record (`calib.records`), or any nesting of records, mappings and lists, as indented JSON.
 
     Raises:
@@ -366,7 +366,7 @@ def write_json(path: str | Path, value: Any) -> Path:
     return write(path, content + "\n")
 
 
-def _not_finite(value: Any, path: str) -> Iterator[str]:
+def _not_finite(value: object, path: str) -> Iterator[str]:
     """Yield the paths of numbers that are not finite, as ``fit.nominal.position_mm.rms``."""
     if isinstance(value, Mapping):
         for key, item in value.items():
@@ -379,7 +379,7 @@ def _not_finite(value: Any, path: str) -> Iterator[str]:
 
 
 def write_table(
-    path: str | Path, header: Sequence[str], rows: Iterable[Sequence[Any]], notes: Sequence[str] = ()
+    path: str | Path, header: Sequence[str], rows: Iterable[Sequence[object]], notes: Sequence[str] = ()
 ) -> Path:
     """Write a CSV table below comment lines `notes`; floats have 12 significant digits, None and NaN are empty.
 
@@ -431,7 +431,7 @@ def remarks(notes: Sequence[str]) -> str:
     return "".join(f"# {note}\n" for note in notes)
 
 
-def _cell(value: Any) -> Any:
+def _cell(value: object) -> object:
     if isinstance(value, float):
         return "" if math.isnan(value) else f"{value:.12g}"
     return shielded(value) if isinstance(value, str) else value

@@ -11,13 +11,15 @@ import tempfile
 from collections.abc import Callable, Collection, Iterable, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar, overload
 
 import numpy as np
 
 from calib import files
 from calib.errors import CalibError, RobotError, UsageError, refuse_robot, refused_as, require
 from calib.records import plain_text, read_rows
+
+Row = TypeVar("Row")
 
 METRICS, SESSION, STATE = "metrics.json", "session.toml", "state.json"
 """Files that identify results and sessions; the metrics are written last and mark a folder as complete."""
@@ -137,7 +139,11 @@ class EstimateRow(NamedTuple):
     sigma: float | None
 
 
-def read_estimate(folder: Path, kind: Any = EstimateRow) -> tuple[Any, ...]:
+@overload
+def read_estimate(folder: Path) -> tuple[EstimateRow, ...]: ...
+@overload
+def read_estimate(folder: Path, kind: type[Row]) -> tuple[Row, ...]: ...
+def read_estimate(folder: Path, kind: type = EstimateRow) -> tuple[object, ...]:
     """Return the rows of ``estimate.csv`` in a folder as named tuples `kind`, whose fields are columns.
 
     Raises:

@@ -9,6 +9,8 @@ that is not finite is a mistake, which `calib.files.write_json`, the writer of a
 are read-only (`Frozen`).
 """
 
+from __future__ import annotations
+
 import csv
 import json
 import math
@@ -17,13 +19,18 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from calib.errors import CalibError, UsageError
 from calib.units import is_number
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+    from pydantic import GetCoreSchemaHandler, TypeAdapter
+    from pydantic_core import CoreSchema
 
 T = TypeVar("T")
 # What a spreadsheet's formula begins with, and our own mark.
@@ -38,7 +45,7 @@ def shielded(text: str) -> str:
     return text if text[:1] not in _FORMULA or is_number(text) else f"'{text}"
 
 
-def field_values(record: Any) -> dict[str, Any]:
+def field_values(record: DataclassInstance) -> dict[str, Any]:
     """Return the values of a dataclass's fields by name, as they are: for a record of a class that has more fields."""
     return {field.name: getattr(record, field.name) for field in fields(record) if field.init}
 
@@ -60,7 +67,7 @@ def read_rows(kind: type[T], path: Path) -> tuple[T, ...]:
         # Without units.
         columns = [name.partition(" [")[0] for name in rows.fieldnames or ()]
         rows.fieldnames = columns
-        optional_columns: Mapping[str, Any] = kind._field_defaults  # type: ignore[attr-defined]  # of named tuples
+        optional_columns: Mapping[str, object] = kind._field_defaults  # type: ignore[attr-defined]  # of named tuples
         missing = optional_columns.keys() - set(columns)
         hints = {name: hint for name, hint in get_type_hints(kind).items() if name not in missing}
         result = []
@@ -70,7 +77,7 @@ def read_rows(kind: type[T], path: Path) -> tuple[T, ...]:
         return tuple(result)
 
 
-def _cell(hint: Any, row: Mapping[str, str], name: str, where: str) -> Any:
+def _cell(hint: type, row: Mapping[str, str], name: str, where: str) -> Any:
     text = row.get(name)
     if text is None:
         raise ValueError(f"{where}: column {name} is missing")
@@ -85,7 +92,7 @@ def _cell(hint: Any, row: Mapping[str, str], name: str, where: str) -> Any:
 
 
 def read_json(
-    path: Path, advice: str = "make it again", kind: Any = dict, current: Callable[[Any], Any] | None = None
+    path: Path, advice: str = "make it again", kind: Any = dict, current: Callable[[Any], object] | None = None
 ) -> Any:
     """Return the content of a JSON file of this toolkit as a value of type `kind` (see `read_record`).
 
@@ -118,14 +125,14 @@ class _Null:
     value: float = math.nan
     array: bool = False
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+    def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> CoreSchema:
         from pydantic_core import core_schema
 
         if self.array:
             return core_schema.no_info_plain_validator_function(self._filled)
         return core_schema.no_info_before_validator_function(lambda x: self.value if x is None else x, handler(source))
 
-    def _filled(self, content: Any) -> np.ndarray:
+    def _filled(self, content: object) -> np.ndarray:
         values = np.array(content, dtype=float)
         return frozen(np.where(np.isnan(values), self.value, values))
 
@@ -142,7 +149,7 @@ class stored(property):
     """A property that `plain` writes in addition to the fields; it is computed again, not read back."""
 
 
-def plain(value: Any, null: bool = False) -> Any:
+def plain(value: object, null: bool = False) -> Any:
     """Return a record, or any nesting of records, arrays, mappings and lists, as plain JSON values.
 
     Args:
@@ -176,14 +183,14 @@ def _keys(kind: type) -> dict[str, bool]:
     return keys
 
 
-def _nullable(hint: Any) -> bool:
+def _nullable(hint: object) -> bool:
     metadata = getattr(hint, "__metadata__", ())
     if any(isinstance(item, _Null) for item in metadata):
         return True
     return any(_nullable(inner) for inner in get_args(hint))
 
 
-def read_record(kind: type[T], content: Any, where: str = "") -> T:
+def read_record(kind: type[T], content: object, where: str = "") -> T:
     """Return plain JSON `content` as a value of the record type `kind`.
 
     Keys that a record does not name are left out, so that a newer version may write more; a field with a default may be
@@ -209,7 +216,7 @@ def read_record(kind: type[T], content: Any, where: str = "") -> T:
 
 
 @cache
-def _adapter(kind: Any) -> Any:
+def _adapter(kind: type[T]) -> TypeAdapter[T]:
     from pydantic import TypeAdapter
 
     return TypeAdapter(kind)
@@ -231,7 +238,7 @@ def read_only(values: np.ndarray) -> np.ndarray:
     return values
 
 
-def as_subclass(record: Any, kind: type[T]) -> T:
+def as_subclass(record: DataclassInstance, kind: type[T]) -> T:
     """Return a record as an instance of a subclass of its type that adds methods, but no fields."""
     if not issubclass(kind, type(record)):
         raise TypeError(f"{kind.__name__} is no subclass of {type(record).__name__}")

@@ -5,7 +5,7 @@ SI stands in every file that we write, unless a header or a key names another.
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Protocol
 
 DEG = math.pi / 180
 ANGLES = {"rad": 1.0, "deg": DEG, "mrad": 1e-3, "°": DEG, "degrees": DEG}
@@ -58,6 +58,16 @@ def small(value: float, unit: str, digits: int = 3) -> str:
     return f"{factor * value:.{digits}g} {printed}"
 
 
+class NamedJoint(Protocol):
+    """A joint of any robot, or of a recording: its name, and ``revolute`` or ``prismatic``."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def kind(self) -> str: ...
+
+
 def motion_units(kinds: Iterable[str]) -> tuple[str, str, str, str]:
     """Return the SI units of position, velocity, acceleration and torque of joints of these kinds."""
     distinct_kinds = set(kinds)
@@ -70,7 +80,7 @@ def motion_units(kinds: Iterable[str]) -> tuple[str, str, str, str]:
     return position, f"{position}/s", f"{position}/s²", torque
 
 
-def headings(series: str, joints: Sequence[Any]) -> list[str]:
+def headings(series: str, joints: Sequence[NamedJoint]) -> list[str]:
     """Return the headers of joints' columns in a table of motion: ``q_joint1 [rad]``, v_, a_, current_, torques."""
     result = []
     for joint in joints:

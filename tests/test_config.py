@@ -72,7 +72,7 @@ def known_to_json(value: Any) -> bool:
     if isinstance(value, datetime.date | datetime.time):
         return False
     inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
-    return all(map(not_finite, inner)) and not (isinstance(value, float) and not math.isfinite(value))
+    return all(map(known_to_json, inner)) and not (isinstance(value, float) and not math.isfinite(value))
 
 
 def validator(kind: str) -> Draft202012Validator:

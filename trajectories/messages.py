@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -12,7 +11,9 @@ from .setpoints import Setpoints
 DIGITS = 9  # after the point: 1e-9 rad, and whole nanoseconds
 
 
-def joint_trajectory(track: Setpoints, joint_names: Sequence[str], every: int = 1, frame: str = "") -> dict[str, Any]:
+def joint_trajectory(
+    track: Setpoints, joint_names: Sequence[str], every: int = 1, frame: str = ""
+) -> dict[str, object]:
     """Return the message as plain dictionaries; joints in rad or m, effort in N m or N if torques are known.
 
     Args:
@@ -32,7 +33,7 @@ def joint_trajectory(track: Setpoints, joint_names: Sequence[str], every: int = 
     }
 
 
-def to_json(message: dict[str, Any]) -> str:
+def to_json(message: dict[str, object]) -> str:
     """Return the message as JSON, one point per line."""
     lines = ["    " + json.dumps(point, allow_nan=False) for point in message["points"]]
     points = ",\n".join(lines)
@@ -41,7 +42,7 @@ def to_json(message: dict[str, Any]) -> str:
     return f'{head},\n  "points": [\n{points}\n  ]\n}}\n'
 
 
-def to_yaml(message: dict[str, Any]) -> str:
+def to_yaml(message: dict[str, object]) -> str:
     """Return the message as YAML; numbers always with a decimal point, since YAML 1.1 reads 1e-05 as text."""
     stamp = message["header"]["stamp"]
     quoted = [json.dumps(name) for name in message["joint_names"]]
@@ -65,7 +66,7 @@ def to_yaml(message: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _point(track: Setpoints, k: int) -> dict[str, Any]:
+def _point(track: Setpoints, k: int) -> dict[str, object]:
     nanoseconds = round(k / track.rate * 1e9)
     effort = []
     if track.tau is not None:

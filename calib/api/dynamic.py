@@ -27,6 +27,7 @@ from calib.robot.calibrated import CalibratedChain
 from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
+    from calib.api.rendering import DataFrame
     from calib.procedure.report.charts import Chart
     from calib.procedure.report.page import Section
 
@@ -105,11 +106,11 @@ class DynamicsModel(Drawn, Judged, identify.IdentificationOutcome):
 
         return dynamics_figures.figures(self)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the metrics as in ``metrics.json``."""
         return plain(metrics.metrics(self))
 
-    def to_dataframe(self) -> Any:
+    def to_dataframe(self) -> DataFrame:
         """Return the base parameters as a pandas DataFrame: name, unit, value, sigma (NaN: constraint active)."""
         estimate = self.estimate
         on_bounds = np.isin(self.found.names, metrics.on_bounds(self.found))

@@ -6,7 +6,7 @@ Validation compares a result with measurements that it was not estimated from.
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, overload
+from typing import overload
 
 from calib.api.dynamic import DynamicsModel, Recorded
 from calib.api.kinematic import GeometryFit, Measured, Several
@@ -26,12 +26,12 @@ def validate(result: GeometryFit, unseen: Several) -> GeometryFit: ...
 @overload
 def validate(result: DynamicsModel, unseen: Recorded | Sequence[Recorded]) -> DynamicsModel: ...
 @overload
-def validate(result: MechanismResult, unseen: Any) -> Any: ...
+def validate(result: MechanismResult, unseen: Several | Recorded | Sequence[Recorded]) -> MechanismResult: ...
 @checked
 def validate(
     result: GeometryFit | DynamicsModel | MechanismResult,
     unseen: Measured | Recorded | Sequence[Measured | Recorded | Sequence[Measured]],
-) -> Any:
+) -> GeometryFit | DynamicsModel | MechanismResult:
     """Validate a result on unseen poses or motion, and update its verdict.
 
     Args:

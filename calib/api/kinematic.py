@@ -16,7 +16,7 @@ from calib.arguments import checked
 from calib.config import Tables
 from calib.data.poses.fit_options import FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements
-from calib.errors import UsageError, as_ours
+from calib.errors import TaskLost, UsageError, as_ours
 from calib.estimation.estimate import Estimate
 from calib.geometry.observation import pose_sigmas
 from calib.procedure.kinematic_stage import fit, folder, inputs, selection
@@ -31,6 +31,7 @@ from calib.robot.calibrated import CalibratedChain
 from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
+    from calib.api.rendering import DataFrame
     from calib.procedure.report.charts import Chart
     from calib.procedure.report.page import Section
 
@@ -80,7 +81,7 @@ class PoseSelection(Drawn, Unjudged, selection.Chosen):
         from calib.procedure.report.geometry_figures import outlook_figure, predicted_map
 
         result: dict[str, Chart] = {}
-        for name in self.figures:
+        for name in self.figure_names:
             if name == "predicted":
                 selected = self.outlook.poses
                 result[name] = predicted_map(selected.points, selected.spread)
@@ -90,11 +91,11 @@ class PoseSelection(Drawn, Unjudged, selection.Chosen):
                 result[name] = outlook_figure(curve, point, "poses", "σ of the tool's position [mm]")
         return result
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the results of the selection: index, its value, that of random sets, efficiency, seconds, notes."""
         return selection.record(self)
 
-    def to_dataframe(self) -> Any:
+    def to_dataframe(self) -> DataFrame:
         """Return the joint values as a pandas DataFrame, a row per pose."""
         header = [f"{joint.name} [{joint.unit}]" for joint in self.chain.joints]
         return data_frame(self.q.tolist(), header)
@@ -138,7 +139,7 @@ class GeometryFit(Drawn, Judged, fit.Outcome):
         return self.selection.fit.estimate
 
     @one_blas_thread()
-    def predict(self, q: Any, tool: int = 0) -> PredictedPoses:
+    def predict(self, q: object, tool: int = 0) -> PredictedPoses:
         """Return the tool poses of the calibrated robot at given joint values, in its base frame, with their σ.
 
         σ of the position is all that is to be expected (`position_sigma`) where the fit states it, else that of the
@@ -157,7 +158,7 @@ class GeometryFit(Drawn, Judged, fit.Outcome):
         return PredictedPoses(tool_poses, sigma)
 
     @one_blas_thread()
-    def position_sigma(self, q: Any, tool: int = 0) -> np.ndarray:
+    def position_sigma(self, q: object, tool: int = 0) -> np.ndarray:
         """Return the standard deviation (m,) [m] of the tool position error (norm over the axes) at given poses.
 
         Parameters' covariance and unmodelled effects, estimated on held-out rows: it grows with the distance from the
@@ -174,7 +175,7 @@ class GeometryFit(Drawn, Judged, fit.Outcome):
             raise UsageError("this fit has no expected errors: they need at least 20 measured positions")
         return self.expected.position_sigma(self._poses(q), tool=tool)
 
-    def _poses(self, q: Any) -> PoseMeasurements:
+    def _poses(self, q: object) -> PoseMeasurements:
         """Return poses at joint values (m, n), with gravity torques (m, n) [N m] if masses are known."""
         chain = self.inputs.chain
         q = shaped(np.atleast_2d(np.asarray(q, dtype=float)), (None, chain.n), "q")
@@ -195,11 +196,11 @@ class GeometryFit(Drawn, Judged, fit.Outcome):
         captioned = geometry_figures.captioned(collect(self))
         return {name: chart for name, (chart, _) in captioned.items()}
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the metrics as in ``metrics.json``."""
         return plain(folder.metrics(self))
 
-    def to_dataframe(self) -> Any:
+    def to_dataframe(self) -> DataFrame:
         """Return the fitted parameters as a pandas DataFrame: name, unit, nominal, value, sigma, RSD [%]."""
         from calib.procedure.kinematic_stage.tables import HEADER, estimate_table
 
@@ -249,7 +250,7 @@ def select_poses(
     from calib.workers import workers as opened
 
     stage_of(robot, "choosing poses")
-    lost_workers: list[Any] = []
+    lost_workers: list[TaskLost] = []
 
     def show(done: int, total: int, task: str) -> None:
         if progress is not None:

@@ -14,7 +14,7 @@ from calib.api.rendering import Drawn, Progress, Unjudged, optional, saved
 from calib.arguments import checked
 from calib.config import Tables
 from calib.data.poses.pose_lists import Targets
-from calib.errors import as_ours
+from calib.errors import TaskLost, as_ours
 from calib.identification.identify_options import IdentifyOptions, IdentifySettings, options_of, read_options
 from calib.procedure.excitation import design, folder, planning
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, DEFAULT_PLAN, ExcitationSettings, PlanSettings
@@ -62,7 +62,7 @@ class ExcitationDesign(Drawn, Unjudged, design.Designed):
 
         return motion_figures.design_figures(self)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the metrics as ``metrics.json`` holds them."""
         return folder.design_metrics(self)
 
@@ -102,7 +102,7 @@ class MotionPlan(Drawn, Unjudged, planning.Planned):
 
         return motion_figures.plan_figures(self)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the metrics as ``metrics.json`` holds them."""
         return folder.plan_metrics(self)
 
@@ -154,7 +154,7 @@ def design_excitation(
     """
     from calib.workers import workers as opened
 
-    lost_workers: list[Any] = []
+    lost_workers: list[TaskLost] = []
     stage = stage_of(robot, "excite", base, tip)
     with as_ours(), ExitStack() as stack:
         model_folder = None if model is None else stack.enter_context(saved(model))

@@ -21,6 +21,7 @@ from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from pandas import DataFrame  # pyright: ignore[reportMissingImports]
 
     from calib.data.csv_table import Table
     from calib.procedure.report.charts import Chart
@@ -42,13 +43,13 @@ def listed(value: object | Sequence[object]) -> list:
     return result
 
 
-def optional(value: Any) -> Any:
+def optional(value: object) -> Any:
     """Return a text as a path, and any other value unchanged."""
     return Path(value) if isinstance(value, str) else value
 
 
 @contextmanager
-def saved(result: Any) -> Iterator[Path]:
+def saved(result: object) -> Iterator[Path]:
     """Yield the folder of a result: a given path unchanged, or a temporary folder of a result in memory."""
     if isinstance(result, (str, Path)):
         yield Path(result)
@@ -57,7 +58,7 @@ def saved(result: Any) -> Iterator[Path]:
             yield result.save(Path(folder) / "result", plots=False)
 
 
-def as_text(renderables: Iterable[Any]) -> str:
+def as_text(renderables: Iterable[object]) -> str:
     """Return rich renderables as plain text."""
     from rich.console import Console
 
@@ -75,7 +76,7 @@ class Shown:
     def __dir__(self) -> list[str]:
         return self.tab.split()
 
-    def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, str]:
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
         return {"text/plain": str(self)}
 
 
@@ -165,7 +166,7 @@ class Judged(Kept):
         """The result itself (for compatibility with earlier versions)."""
         return self
 
-    def renderables(self) -> Iterator[Any]:
+    def renderables(self) -> Iterator[object]:
         """Yield the rich renderables that ``print`` shows."""
         from calib.procedure.report import page
 
@@ -180,7 +181,7 @@ class Judged(Kept):
 
         return notebook(self)
 
-    def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, str]:
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
         """Return the page in a frame of its own, so that its style does not become the notebook's."""
         bundle = super()._repr_mimebundle_()
         page = self._repr_html_()
@@ -190,7 +191,7 @@ class Judged(Kept):
         return bundle
 
 
-def data_frame(rows: Iterable[Any], columns: Sequence[str]) -> Any:
+def data_frame(rows: Iterable[object], columns: Sequence[str]) -> DataFrame:
     """Return rows as a pandas DataFrame.
 
     Raises:

@@ -1,13 +1,16 @@
 """Commands for dynamics: excite, recall, identify, and plan (motions)."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from calib.cli.completion import Robot
 from calib.cli.shared import Out, Seed, check_destination, command, progress, say, say_written
 from calib.procedure.excitation.settings import ExcitationSettings, PlanSettings
+
+if TYPE_CHECKING:
+    from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 
 app = typer.Typer()
 
@@ -115,7 +118,7 @@ def identify_dynamics(
 
     check_destination("identify", robot, out, [options, *recordings, *(validate or [])])
 
-    def read(inputs: Any) -> None:
+    def read(inputs: "IdentificationInputs") -> None:
         check_destination("identify", robot, out, [inputs.source, inputs.source.parent])
         say(*read_lines(inputs))
 

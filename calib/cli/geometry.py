@@ -1,13 +1,16 @@
 """Commands for geometry: select, fit; and export."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from calib.cli.completion import Robot
 from calib.cli.shared import Out, check_destination, command, exit_failed, progress, say, say_written
 from calib.procedure.kinematic_stage.settings import FitSettings, SelectionSettings
+
+if TYPE_CHECKING:
+    from calib.procedure.kinematic_stage.inputs import Inputs
 
 app = typer.Typer()
 
@@ -49,7 +52,7 @@ def select(
     from calib.procedure.measuring.constraints_file import beside
     from calib.procedure.robot_kinds import stage_of
 
-    sources: list[Any] = [robot, existing, constraints]
+    sources: list[str | Path | None] = [robot, existing, constraints]
     if constraints and constraints.suffix == ".toml":
         sources += beside(constraints).values()
     stage_of(robot, "choosing poses")
@@ -118,7 +121,7 @@ def fit(
 
     check_destination("fit", robot, out, [options, *measured, *(validate or [])])
 
-    def read(inputs: Any) -> None:
+    def read(inputs: "Inputs") -> None:
         check_destination("fit", robot, out, [inputs.source])
         say(*read_lines(inputs))
 

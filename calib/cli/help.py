@@ -18,7 +18,7 @@ _SPELT = {"·": " ", "×": "x", "±": "+-", "→": "->", "–": "-", "≤": "<="
 _WORDS = {int: "N", float: "NUMBER", Path: "PATH"}
 
 
-def type_word(kind: Any, choices: tuple[str, ...] | str = ()) -> str | None:
+def type_word(kind: object, choices: tuple[str, ...] | str = ()) -> str | None:
     """Return what stands behind an option's name for its value: the choices where they are short; None for a flag.
 
     Args:
@@ -38,7 +38,7 @@ def type_word(kind: Any, choices: tuple[str, ...] | str = ()) -> str | None:
 class _Spelt(_ClickCommand):
     """Help in letters that the console has, which Typer would write as UTF-8 all the same."""
 
-    def get_help(self, ctx: Any) -> str:
+    def get_help(self, ctx: object) -> str:
         console = sys.stdout.encoding or "utf-8"
         return super().get_help(ctx).encode(console, "spelt").decode(console)
 
@@ -46,10 +46,10 @@ class _Spelt(_ClickCommand):
 class Command(_Spelt, TyperCommand):
     """A command whose help names arguments as its text does (ROBOT, MEASURED...), without Python's types."""
 
-    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+    def collect_usage_pieces(self, ctx: object) -> list[str]:
         return [piece.replace("{", "").replace("}", "") for piece in super().collect_usage_pieces(ctx)]
 
-    def format_options(self, ctx: Any, formatter: Any) -> None:
+    def format_options(self, ctx: object, formatter: object) -> None:
         for title, kind in (("Arguments", "argument"), ("Options", "option")):
             rows = []
             for parameter in self.get_params(ctx):
@@ -65,7 +65,7 @@ class Command(_Spelt, TyperCommand):
 class Group(_Spelt, TyperGroup):
     """The list of commands in `GROUPS`, each stated where the command is (`calib.cli.shared.command`)."""
 
-    def format_commands(self, ctx: Any, formatter: Any) -> None:
+    def format_commands(self, ctx: object, formatter: object) -> None:
         groups: dict[str, list[tuple[str, str]]] = {title: [] for title in GROUPS}
         for name, command in self.commands.items():
             group = str(command.rich_help_panel)  # type: ignore[attr-defined]
@@ -75,7 +75,7 @@ class Group(_Spelt, TyperGroup):
                 formatter.write_dl(rows)
 
 
-def spelt(error: Any) -> tuple[str, int]:
+def spelt(error: object) -> tuple[str, int]:
     """Return letters that an encoding lacks in ASCII (sigma, ^2, ...), or by their number; see `codecs`."""
     letters = error.object[error.start : error.end]
     return "".join(map(_in_ascii, letters)), error.end

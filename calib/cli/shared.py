@@ -1,5 +1,7 @@
 """Shared parts of the commands: function signatures as options, the console, progress, checks of the output folder."""
 
+from __future__ import annotations
+
 import logging
 import os
 import re
@@ -15,7 +17,7 @@ from inspect import Parameter, cleandoc, signature
 from math import inf, isfinite
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Annotated, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import typer
 from typer.models import ArgumentInfo, OptionInfo, ParameterInfo
@@ -26,6 +28,9 @@ from calib.config import described, parse
 from calib.config_types import OneOf, Typed
 from calib.errors import UsageError, require
 from calib.units import plain_number
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 
 def check_destination(verb: str, robot: object, out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
@@ -65,14 +70,15 @@ Out = Annotated[Path, typer.Option()]
 Seed = Annotated[int, typer.Option(min=0, help="reproduces everything random")]
 
 
-def make_console(**options: Any) -> Any:
+def make_console(stderr: bool = False) -> Console:
     from rich.console import Console
 
-    stream = sys.stderr if options.get("stderr") else sys.stdout
+    stream = sys.stderr if stderr else sys.stdout
+    width = None
     # Rich takes 80, and cuts the files' names.
     if not stream.isatty() and "COLUMNS" not in os.environ:
-        options.setdefault("width", PIPED)
-    return Console(highlight=False, **options)
+        width = PIPED
+    return Console(highlight=False, stderr=stderr, width=width)
 
 
 class _Output:
@@ -83,9 +89,9 @@ class _Output:
         self.printed = 0
         self.left_out = 0
         # Lines that may be printed at the end: each with its console, and whether it has to be.
-        self.last: list[tuple[Any, Any, bool]] = []
+        self.last: list[tuple[object, Console, bool]] = []
 
-    def show(self, line: Any, console: Any, result: bool) -> None:
+    def show(self, line: object, console: Console, result: bool) -> None:
         is_table = hasattr(line, "add_column")
         text = " " if is_table else str(line)
         if self.verbose or result or re.match(r"\s*(verdict|warning)\b", text):
@@ -153,7 +159,7 @@ def printing(verbose: bool) -> Iterator[None]:
         output.end()
 
 
-def say(*lines: Any, console: Any = None, result: bool = False) -> None:
+def say(*lines: object, console: Console | None = None, result: bool = False) -> None:
     """Print texts and rich renderables; those given as a `result` are always printed in full."""
     console = console or make_console()
     output = _OUTPUT.get() or _Output(verbose=True)
@@ -161,7 +167,7 @@ def say(*lines: Any, console: Any = None, result: bool = False) -> None:
         output.show(line, console, result)
 
 
-def say_written(lines: Iterable[Any], out: Path, verdict: str = "") -> None:
+def say_written(lines: Iterable[object], out: Path, verdict: str = "") -> None:
     """Print the lines of a result and the path that it was written to.
 
     Raises:
@@ -178,7 +184,7 @@ def exit_failed(verdict: str) -> None:
 
 
 @contextmanager
-def progress(console: Any = None) -> Iterator[Any]:
+def progress(console: Console | None = None) -> Iterator[Callable[[str], None]]:
     """Show the progress on a console, by default stderr, if it is a terminal."""
     from rich.markup import escape
 
@@ -207,7 +213,7 @@ def _now_and_then(period: float) -> Callable[[str], None]:
 
 
 @contextmanager
-def reporting(logged: float = inf) -> Iterator[tuple[Any, Any]]:
+def reporting(logged: float = inf) -> Iterator[tuple[Callable[..., None], Callable[[str], None]]]:
     """Yield two functions: one for permanent lines, one for progress messages.
 
     Args:
@@ -232,7 +238,8 @@ def numbers(text: str, count: int, option: str) -> list[float]:
     return values
 
 
-F = TypeVar("F", bound=Callable[..., Any])
+F = TypeVar("F", bound=Callable[..., object])
+S = TypeVar("S")
 
 
 class Common:
@@ -279,7 +286,7 @@ def command(app: typer.Typer, group: str, name: str | None = None, listing: bool
             options.append(verbose.replace(annotation=annotation))
 
         @wraps(function)
-        def call(**values: Any) -> Any:
+        def call(**values: object) -> object:
             try:
                 arguments = {key: _built(kind, values) for key, kind in settings.items()}
                 with printing(values.get("verbose", True)):
@@ -298,12 +305,12 @@ def command(app: typer.Typer, group: str, name: str | None = None, listing: bool
     return add
 
 
-def _with_help(parameter: Parameter, hint: Any, description: str, names: Sequence[str]) -> Any:
+def _with_help(parameter: Parameter, hint: object, description: str, names: Sequence[str]) -> object:
     """Return an annotation with help and type word of the parameter's option or argument, and metadata for Typer."""
     kind, *metadata = get_args(hint) if get_origin(hint) is Annotated else (hint,)
     stated = [item for item in metadata if isinstance(item, ParameterInfo)]
     if stated:
-        option: Any = copy(stated[0])
+        option = copy(stated[0])
     elif parameter.default is Parameter.empty:
         option = typer.Argument()
     else:
@@ -315,7 +322,7 @@ def _with_help(parameter: Parameter, hint: Any, description: str, names: Sequenc
     return Annotated[kind, option]
 
 
-def _options(kind: Any) -> Iterator[Parameter]:
+def _options(kind: type) -> Iterator[Parameter]:
     """Yield the options of a settings dataclass, including nested settings."""
     hints = get_type_hints(kind, include_extras=True)
     descriptions = described(kind)
@@ -349,7 +356,7 @@ def _options(kind: Any) -> Iterator[Parameter]:
         yield Parameter(field.name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[value_type, option])
 
 
-def _typed(metadata: Sequence[Any]) -> Typed:
+def _typed(metadata: Sequence[object]) -> Typed:
     """Return how a setting is typed on the command line."""
     for item in metadata:
         if isinstance(item, Typed):
@@ -373,7 +380,7 @@ def _as_typed(message: str, options: Sequence[Parameter]) -> str:
     return message
 
 
-def _plain(hint: Any) -> tuple[Any, tuple[Any, ...]]:
+def _plain(hint: object) -> tuple[object, tuple[object, ...]]:
     """Return a type without None, and its metadata."""
     if get_origin(hint) is Annotated:
         plain, metadata = _plain(get_args(hint)[0])
@@ -384,13 +391,13 @@ def _plain(hint: Any) -> tuple[Any, tuple[Any, ...]]:
     return hint, ()
 
 
-def _is_repeated(plain: Any) -> bool:
+def _is_repeated(plain: object) -> bool:
     """Return whether an option is given once per item; a list of numbers is given as one comma-separated text."""
     first, last = get_args(plain)[0], get_args(plain)[-1]
     return last is ... and _plain(first)[0] is not float
 
 
-def _built(kind: Any, values: dict[str, Any]) -> Any:
+def _built(kind: type[S], values: dict[str, object]) -> S:
     """Return settings from the values of the command line; missing values take the defaults."""
     chosen = _chosen(kind, values)
     if not chosen:
@@ -403,7 +410,7 @@ def _built(kind: Any, values: dict[str, Any]) -> Any:
         raise
 
 
-def _chosen(kind: Any, values: dict[str, Any]) -> dict[str, Any]:
+def _chosen(kind: type, values: dict[str, object]) -> dict[str, object]:
     result = {}
     hints = get_type_hints(kind, include_extras=True)
     for field in fields(kind):
@@ -416,7 +423,7 @@ def _chosen(kind: Any, values: dict[str, Any]) -> dict[str, Any]:
     return result
 
 
-def _read(hint: Any, value: Any) -> Any:
+def _read(hint: object, value: object) -> object:
     """Return a value as in an option file: comma-separated texts as lists, numbers with their unit."""
     plain, metadata = _plain(hint)
     unit = _typed(metadata).unit

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -107,7 +106,7 @@ class Condensed:
         return Gram(np.concatenate(parts, axis=1), self.columns(data.cross), data.total, data.rows)
 
 
-def condensed(square: Callable[[np.ndarray], Any], groups: np.ndarray, start: np.ndarray) -> Condensed:
+def condensed(square: Callable[[np.ndarray], np.ndarray], groups: np.ndarray, start: np.ndarray) -> Condensed:
     """Return coordinates of p columns with statistics WᵀW, with equal prior magnitude within a group.
 
     Args:

@@ -20,7 +20,7 @@ an inverse, which no placement S, X brings to the arm's S A_i X.
 import math
 from collections.abc import Callable, Sequence
 from functools import singledispatch
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -39,7 +39,7 @@ from calib.units import DEG
 if TYPE_CHECKING:
     from calib.data.images.optics import Optics
 
-OPTICS: "Point[Callable[[Sequence[Any]], Optics]]" = Point(
+OPTICS: "Point[Callable[[Sequence[object]], Optics]]" = Point(
     "optics", "optics of kinds that are not the core's; loading it registers guesses and residuals"
 )
 

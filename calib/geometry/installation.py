@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,6 +29,9 @@ from calib.robot.calibrated import Deflection, extra_displacements, nominal_of
 from calib.robot.chain import Chain
 from calib.robot.kinematics import Sweep, sweep
 from calib.robot.tables import placement, placement_table
+
+if TYPE_CHECKING:
+    from calib.data.images.optics import View
 
 FRAME_AXES = ("x", "y", "z", "rx", "ry", "rz")
 
@@ -44,15 +47,15 @@ class NoOptics:
     def __len__(self) -> int:
         return 0
 
-    def like(self, optics: Any) -> NoOptics:
+    def like(self, optics: object) -> NoOptics:
         """Return these instruments with the parameter values of `optics`."""
         return self
 
-    def view(self, measured: PoseMeasurements, free: np.ndarray) -> Any:
+    def view(self, measured: PoseMeasurements, free: np.ndarray) -> View | None:
         """Return what these instruments add to a block's prediction; `free` counts from their first parameter."""
         return None
 
-    def tables(self) -> Mapping[str, Any]:
+    def tables(self) -> Mapping[str, object]:
         """Return the tables of ``robot.toml`` with these parameters."""
         return {}
 
@@ -119,7 +122,7 @@ class Seen:
     walked: Sweep
     point: np.ndarray
     rotation: np.ndarray
-    view: Any = None
+    view: View | None = None
 
     def poses(self) -> np.ndarray:
         """Return the target poses (m, 4, 4) in the station's frame."""
@@ -168,13 +171,13 @@ def see(
 class _Frames:
     """Tables of stations, tools, cameras and boards; each entry has a name and a placement."""
 
-    station: tuple[Mapping[str, Any], ...] = ()
-    tool: tuple[Mapping[str, Any], ...] = ()
-    camera: tuple[Mapping[str, Any], ...] = ()
-    board: tuple[Mapping[str, Any], ...] = ()
+    station: tuple[Mapping[str, object], ...] = ()
+    tool: tuple[Mapping[str, object], ...] = ()
+    camera: tuple[Mapping[str, object], ...] = ()
+    board: tuple[Mapping[str, object], ...] = ()
 
 
-def frame_tables(cell: Installation) -> dict[str, Any]:
+def frame_tables(cell: Installation) -> dict[str, object]:
     """Return the tables ``station`` and ``tool`` of an installation, and those of its cameras and boards."""
     stations = [{"name": name, **placement_table(pose)} for name, pose in zip(cell.station_names, cell.stations)]
     tools = [{"name": name, **placement_table(pose)} for name, pose in zip(cell.tool_names, cell.tools)]
@@ -210,7 +213,9 @@ def read_arms(path: str | Path) -> tuple[Installation, Installation]:
     return _placed(robot.complete, extra, str(path), robot.deflection), nominal
 
 
-def _placed(chain: Chain, tables: Mapping[str, Any], source: str, deflection: Deflection | None = None) -> Installation:
+def _placed(
+    chain: Chain, tables: Mapping[str, object], source: str, deflection: Deflection | None = None
+) -> Installation:
     """Return a chain with the stations and tools of the tables; identity frames for an empty list.
 
     `source`: of the tables, with which messages begin.
@@ -232,7 +237,7 @@ def _placed(chain: Chain, tables: Mapping[str, Any], source: str, deflection: De
     return cell
 
 
-def _placements(entries: tuple[Mapping[str, Any], ...], source: str) -> tuple[tuple[str, ...], np.ndarray]:
+def _placements(entries: tuple[Mapping[str, object], ...], source: str) -> tuple[tuple[str, ...], np.ndarray]:
     """Return names and placements (k, 4, 4) of the entries of a table; without a name their number."""
     names = []
     placements = []

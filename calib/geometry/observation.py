@@ -9,7 +9,6 @@ deflection coefficients (E).
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from calib.data.poses.measurements import PoseMeasurements, Positions, take
 from calib.errors import UsageError, require
 from calib.estimation.nonlinear import Rows
 from calib.geometry.installation import FRAME_AXES, Installation, Seen, see
-from calib.geometry.residuals import Part, joined, parts
+from calib.geometry.residuals import CommonNoise, Part, joined, parts
 from calib.robot.calibrated import evaluate, extra_displacements, target_elements
 from calib.robot.kinematics import element_jacobian
 from calib.transforms import displace
@@ -283,7 +282,11 @@ def _observe(cell: Installation, block: Block, free: np.ndarray) -> list[Part]:
 
 
 def whitened(
-    cell: Installation, block: Block, free: np.ndarray, scales: Sequence[np.ndarray], noises: Sequence[Any] = ()
+    cell: Installation,
+    block: Block,
+    free: np.ndarray,
+    scales: Sequence[np.ndarray],
+    noises: Sequence[CommonNoise | None] = (),
 ) -> Iterator[Rows]:
     """Yield residuals and Jacobians of a block piece by piece, whitened.
 

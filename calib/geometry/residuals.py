@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import singledispatch
-from typing import Any
+from typing import Protocol, Self
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -23,6 +23,18 @@ from calib.geometry.installation import Seen
 # steps of Gauss–Newton for the centre of a bar, and length of the last one [m]
 CENTRE_STEPS = 20
 MIN_CHANGE = 1e-13
+
+
+class CommonNoise(Protocol):
+    """Errors that several rows share, see `calib.geometry.camera.pixel_residuals.ImageNoise`."""
+
+    def near(self, noise: Self) -> bool:
+        """Return whether two estimates agree, so that the fit is not repeated."""
+        ...
+
+    def unweighted(self, images: int) -> Self:
+        """Return this noise for another number of images, with all weights equal to 1."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +58,7 @@ class Part:
     nuisances: int
     index: np.ndarray
     _: KW_ONLY
-    noise: Any = None
+    noise: CommonNoise | None = None
 
     @property
     def height(self) -> int:
@@ -82,7 +94,9 @@ class Part:
         """Return the part with one column per measured row, in m or rad."""
         return self
 
-    def common_noise(self, sigma: np.ndarray, unknowns: int, loss: str, scale: float | None, start: bool) -> Any:
+    def common_noise(
+        self, sigma: np.ndarray, unknowns: int, loss: str, scale: float | None, start: bool
+    ) -> CommonNoise | None:
         """Return the errors that rows share, estimated from the residuals; None for kinds without shared errors.
 
         Args:

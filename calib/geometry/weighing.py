@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from calib.estimation.relevance import Gram
 from calib.geometry.installation import Installation
 from calib.geometry.many_corrections import row_statistics, separable
 from calib.geometry.observation import Block, layout, observe, parameter_values, whitened
-from calib.geometry.residuals import Part
+from calib.geometry.residuals import CommonNoise, Part
 from calib.records import frozen
 from calib.robot.calibrated import CalibratedChain, CorrectedChain
 from calib.robot.chain import Chain
@@ -155,9 +154,9 @@ class GeometricFit:
             np.minimum.at(result[piece.block], *piece.part.row_weights(piece.weight))
         return result
 
-    def used_noises(self) -> list[Any]:
+    def used_noises(self) -> list[CommonNoise | None]:
         """Return the noise that each block's rows share; None for a block without shared noise."""
-        result: list[Any] = [None] * len(self.blocks)
+        result: list[CommonNoise | None] = [None] * len(self.blocks)
         for piece in self.pieces:
             if piece.part.noise:
                 result[piece.block] = piece.part.noise
@@ -270,7 +269,7 @@ class Weigher:
         self.noise = self.noise_of_pass = 1.0
 
     @property
-    def noises(self) -> list[Any]:
+    def noises(self) -> list[CommonNoise | None]:
         """Noise that the rows of each part share; None for a part without."""
         return [piece.part.noise for piece in self.pieces]
 
@@ -344,7 +343,7 @@ class Weigher:
             return solution
         return replace(solution, factor=solution.factor / common, cost=solution.cost / common**2)
 
-    def _steady(self, before: list[Piece], noises: list[Any]) -> bool:
+    def _steady(self, before: list[Piece], noises: list[CommonNoise | None]) -> bool:
         """Return whether robust weights, shared noises and the prior's weight are those of the last pass."""
         for piece, earlier in zip(self.pieces, before):
             change = np.abs(piece.weight - earlier.weight).max(initial=0.0)

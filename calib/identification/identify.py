@@ -30,10 +30,10 @@ from calib.identification.registry import METHODS, method_named
 from calib.identification.rows import Case, ObservationRows, observe, observe_terms, pool, triangulate, with_blocks
 from calib.identification.settings import IdentificationSettings, make_model, require_usable
 from calib.identification.standstill import (
+    BREAKAWAY_ROUNDS,
     CLEARLY_LESS,
-    LESS,
     left_out_error,
-    with_slowness,
+    with_breakaway,
     with_standstills,
     with_weights,
 )
@@ -119,16 +119,11 @@ def identify(
     if chain.inertias is not None and np.any(chain.inertias[:, 9] > 0.0):
         cad = standard_parameters(chain)
     moves = model.bodies.coordinates[:, None] >= 0
+    states = chain_states(chain, nominal or model, settings.seed)
+    shape = np.where(moves, rods(chain, model), 0.0).ravel()
+    effort = _torque_limits(chain)
     identification = identify_model(
-        model,
-        cases,
-        settings,
-        nominal=nominal,
-        states=chain_states(chain, nominal or model, settings.seed),
-        cad=cad,
-        shape=np.where(moves, rods(chain, model), 0.0).ravel(),
-        effort=_torque_limits(chain),
-        progress=progress,
+        model, cases, settings, nominal=nominal, states=states, cad=cad, shape=shape, effort=effort, progress=progress
     )
     # The model is that of the chain.
     return cast(Identification, identification)
@@ -195,7 +190,8 @@ def identify_model(
     marks_standstills = isinstance(method, LeastSquares) and isinstance(model, IdentificationModel)
     if any(part.standing.any() for part in rows):
         as_moving = _first_fit(rows_as_moving, find, takes_prior, noise)
-        error = _left_out_error((rows, prior, first), rows, settings)
+        fitted = (rows, prior, first)
+        error = _left_out_error(fitted, rows, settings)
         error_as_moving = _left_out_error(as_moving, rows, settings)
         if error_as_moving < CLEARLY_LESS**2 * error:
             rows, prior, first = as_moving
@@ -213,22 +209,23 @@ def identify_model(
     groups = np.array(friction.groups, dtype=int)
     column_groups = np.concatenate([np.full(base.b, -1), groups])
     if prior is not None and marks_standstills:
-        richer_rows = _weighed_by_slowness(
-            richer_rows, cases, decimator, model.torque_rows, first, prior, column_groups, settings
+        richer_rows = _weighed_after_standstills(
+            richer_rows, cases, decimator, model.torque_rows, first, prior, column_groups
         )
-    slow_rows_weighed = any((part.slowness < 1.0).any() for part in richer_rows)
-    if prior is not None and (friction.terms or slow_rows_weighed):
+    breakaway = any((part.breakaway < 1.0).any() for part in richer_rows)
+    if prior is not None and (friction.terms or breakaway):
         say("sizes beside richer friction")
         prior = find(richer_rows, groups=groups, start=prior, tempering=prior.tempering)
         richer_rows = with_weights(richer_rows, prior.first.rest_weights)
 
+    terms = (*_terms_of(model, base), *friction.terms)
     problem = IdentificationProblem(
         model=model,
         base=base,
         cases=cases,
         decimator=decimator,
         rows=tuple(richer_rows),
-        terms=(*_terms_of(model, base), *friction.terms),
+        terms=terms,
         groups=column_groups,
         noise=noise,
         prior=prior,
@@ -260,7 +257,7 @@ def _left_out_error(
     return left_out_error(rows, reference_rows, first.std, first.inflation, prior_rows, settings.apart)
 
 
-def _weighed_by_slowness(
+def _weighed_after_standstills(
     rows: list[ObservationRows],
     cases: Sequence[Case],
     decimator: Decimator,
@@ -268,9 +265,8 @@ def _weighed_by_slowness(
     first: FirstFit,
     prior: Prior,
     column_groups: np.ndarray,
-    settings: IdentificationSettings,
 ) -> list[ObservationRows]:
-    """Return the rows with slow motion weighed down where that lowers the error on held-out time, else as they are.
+    """Return the rows weighed where friction at rest still fades after a standstill, as the residuals ask for.
 
     Richer friction explains slow motion, too: its residuals count.
 
@@ -280,15 +276,12 @@ def _weighed_by_slowness(
         prior: of the base parameters.
         column_groups: ridge group of each column; -1 for base parameters.
     """
-    data = pool(triangulate(rows), rows[0].target.shape[1])
     inflation = prior.tempering * first.inflation
     prior_rows = prior.widened(int((column_groups >= 0).sum()))
-    values, _ = estimate(data, first.std, inflation, column_groups, prior_rows)
-    weighed = with_slowness(rows, cases, decimator, torque_rows, values)
-    error = left_out_error(rows, rows, first.std, inflation, prior_rows, settings.apart)
-    error_weighed = left_out_error(weighed, rows, first.std, inflation, prior_rows, settings.apart)
-    if error_weighed < LESS**2 * error:
-        return weighed
+    for _ in range(BREAKAWAY_ROUNDS):
+        data = pool(triangulate(rows), rows[0].target.shape[1])
+        values, _ = estimate(data, first.std, inflation, column_groups, prior_rows)
+        rows = with_breakaway(rows, cases, decimator, torque_rows, values)
     return rows
 
 
@@ -363,7 +356,9 @@ def _identified(
 
     say("essential parameters")
     elimination = _essential(fit, settings)
-    base_columns = problem.pooled.factors.reshape(-1, len(values) + 1)[:, : base.b]
+    stacked = problem.pooled.factors.reshape(-1, len(values) + 1)
+    base_columns = stacked[:, : base.b]
+    condition = condition_numbers(base_columns)
     return Identification(
         dynamics=dynamics,
         base=base,
@@ -373,7 +368,7 @@ def _identified(
         settings=settings,
         rows=problem.rows,
         terms=problem.terms,
-        condition=condition_numbers(base_columns),
+        condition=condition,
         prior=problem.prior,
         ripples=ripples,
         loop=loop,
@@ -431,6 +426,7 @@ def _richer_friction(
     for term in model.columns:
         if len(term.acts) > 1:
             coupled.add(tuple(sorted({row for row, _ in term.acts})))
+    v0 = np.array(per_joint(settings.v0, model.n, "v0"))
     candidates = FrictionCandidates(
         cases=cases,
         rows=rows,
@@ -438,7 +434,7 @@ def _richer_friction(
         decimator=decimator,
         std=first.std,
         inflation=inflation,
-        v0=np.array(per_joint(settings.v0, model.n, "v0")),
+        v0=v0,
         linear=model.prismatic,
         prior=prior,
         apart=settings.apart,
@@ -492,10 +488,12 @@ def common_decimator(cases: Sequence[Case], settings: IdentificationSettings) ->
     message = f"recordings of {min(rates):.4g} Hz and {max(rates):.4g} Hz cannot be combined; resample one of them"
     require(max(rates) <= MAX_RATE_RATIO * min(rates), message, MeasurementError)
     total = sum(len(case.motion) for case in cases)
-    widest = design_decimator(rates[0], min(case.motion.decimator.factor for case in cases))
+    rate = rates[0]
+    widest = design_decimator(rate, min(case.motion.decimator.factor for case in cases))
     max_rows = widest.factor * settings.samples
     step = -(-total // max_rows)
-    return replace(widest, factor=step * widest.factor)
+    factor = step * widest.factor
+    return replace(widest, factor=factor)
 
 
 def _repeats_noise(cases: Sequence[Case], settings: IdentificationSettings) -> np.ndarray | None:
@@ -528,7 +526,8 @@ def _repeats_noise(cases: Sequence[Case], settings: IdentificationSettings) -> n
             )
         variances.append(case.noise**2)
         lengths.append(len(case.motion))
-    return np.asarray(np.sqrt(np.average(variances, axis=0, weights=lengths)))
+    variance = np.average(variances, axis=0, weights=lengths)
+    return np.asarray(np.sqrt(variance))
 
 
 def _takes_prior(method: Method, model: RegressorModel, settings: IdentificationSettings, source: str) -> bool:
@@ -547,15 +546,11 @@ def _essential(fit: MethodEstimate, settings: IdentificationSettings) -> Elimina
     if settings.essential == "none":
         return None
     data, std, inflation = fit.testable()
+    keep = [bases.standard_name(name, data.names) for name in settings.keep]
+    drop = [bases.standard_name(name, data.names) for name in settings.drop]
+    rule = Rule(settings.essential)
     return eliminate(
-        data,
-        Rule(settings.essential),
-        ratio=settings.ratio,
-        level=settings.level,
-        keep=[bases.standard_name(name, data.names) for name in settings.keep],
-        drop=[bases.standard_name(name, data.names) for name in settings.drop],
-        std=std,
-        inflation=inflation,
+        data, rule, ratio=settings.ratio, level=settings.level, keep=keep, drop=drop, std=std, inflation=inflation
     )
 
 

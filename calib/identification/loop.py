@@ -51,7 +51,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, TypeVar
 
 import numpy as np
 
@@ -137,13 +137,15 @@ def per_joint(values: Sequence[T], n: int, name: str) -> tuple[T, ...]:
     return tuple(values)
 
 
-def check_loop(table: Any) -> Any:
+def check_loop(table: object) -> object:
     """Return the parsed table [loop] unchanged after a check that its gains fit its controller.
 
     Raises:
         ValueError: for a missing controller, gains of another controller, or missing gains.
     """
-    kind = table.get("controller") if isinstance(table, Mapping) else ""
+    if not isinstance(table, Mapping):
+        return table
+    kind = table.get("controller")
     if kind is None:
         raise ValueError(f"'controller' is missing; expected one of {', '.join(CONTROLLERS)}")
     if not isinstance(kind, str) or kind not in OWNED:
@@ -190,7 +192,8 @@ class Controller:
     def __post_init__(self) -> None:
         n = len(np.atleast_1d(self.kp))
         for name in ("kp", "kd", "ki", "share", "limit", "windup"):
-            value = np.broadcast_to(np.asarray(getattr(self, name), dtype=float), (n,))
+            stated = np.asarray(getattr(self, name), dtype=float)
+            value = np.broadcast_to(stated, (n,))
             object.__setattr__(self, name, frozen(np.array(value)))
         require(self.delay >= 0, f"a delay of {self.delay} control periods is invalid")
 
@@ -201,15 +204,24 @@ class Controller:
 
     def smoothing(self, period: float) -> float:
         """Return the weight of a new velocity sample in the low-pass."""
-        return 1.0 if self.cutoff is None else float(1.0 - np.exp(-2.0 * np.pi * self.cutoff * period))
+        if self.cutoff is None:
+            return 1.0
+        decay = np.exp(-2.0 * np.pi * self.cutoff * period)
+        return float(1.0 - decay)
 
     def scaled(self, factor: np.ndarray | float) -> Controller:
         """Return the controller with all gains times `factor`, one or (n,): the same bandwidth at another inertia."""
-        return replace(self, kp=self.kp * factor, kd=self.kd * factor, ki=self.ki * factor)
+        kp = self.kp * factor
+        kd = self.kd * factor
+        ki = self.ki * factor
+        return replace(self, kp=kp, kd=kd, ki=ki)
 
     def slower(self, factor: float) -> Controller:
         """Return the controller with its bandwidth divided by `factor`: kp by factor², kd by factor, ki by factor³."""
-        return replace(self, kp=self.kp / factor**2, kd=self.kd / factor, ki=self.ki / factor**3)
+        kp = self.kp / factor**2
+        kd = self.kd / factor
+        ki = self.ki / factor**3
+        return replace(self, kp=kp, kd=kd, ki=ki)
 
     def with_feedforward(self, ahead: np.ndarray) -> Controller:
         """Return the controller with a feedforward torque (N, n) added."""
@@ -310,7 +322,7 @@ class LoopResults:
 
     metrics: LoopMetrics | None = None
     findings: tuple[Finding, ...] = ()
-    table: tuple[tuple[Any, ...], ...] = ()
+    table: tuple[tuple[object, ...], ...] = ()
     controller: Controller | None = None
     disagreement: LoopDisagreement | None = None
 
@@ -341,4 +353,5 @@ class Replay:
     @stored
     def feedback_over_model(self) -> float:
         """Ratio of the tracking errors without and with the model as feedforward, geometric mean over the joints."""
-        return float(np.exp(np.mean(np.log(self.rms[FEEDBACK] / np.maximum(self.rms[IDENTIFIED], 1e-12)))))
+        ratio = self.rms[FEEDBACK] / np.maximum(self.rms[IDENTIFIED], 1e-12)
+        return float(np.exp(np.mean(np.log(ratio))))

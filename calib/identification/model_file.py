@@ -43,13 +43,12 @@ after the unseen ones.
 """
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from calib import folders
+from calib.config_types import ParsedTable
 from calib.dynamics.base import Base, expressions
 from calib.dynamics.bodies import bodies_of, with_payload
 from calib.dynamics.drives import DriveTerm
@@ -85,7 +84,7 @@ def read_dynamics(folder: str | Path) -> tuple[Chain, Dynamics]:
         return chain, from_table(chain, table)
 
 
-def read_table(folder: Path) -> dict[str, Any]:
+def read_table(folder: Path) -> ParsedTable:
     """Return the content of ``dynamics.json`` as a table for `from_table`.
 
     Raises:
@@ -142,7 +141,7 @@ def refuse_other_arm(folder: Path, chain: Chain) -> None:
         )
 
 
-def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, Any]:
+def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, object]:
     """Return the model as a table for JSON; `unit`: that of its torques."""
     model = dynamics.model
     inertial = model.inertial
@@ -154,6 +153,7 @@ def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, An
     for term, value in zip(model.columns, dynamics.values[inertial:]):
         acts = [[row, [list(pair) for pair in motion]] for row, motion in term.acts]
         settings = [float(setting) if np.isfinite(setting) else "inf" for setting in term.settings]
+        term_unit = per_ampere(term.unit, unit)
         terms.append(
             {
                 "name": term.name,
@@ -163,18 +163,20 @@ def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, An
                 "side": term.side,
                 "linear": term.linear,
                 "value": float(value),
-                "unit": per_ampere(term.unit, unit),
+                "unit": term_unit,
             }
         )
+    bodies = dict(zip(model.names[:inertial], dynamics.values[:inertial].tolist()))
+    base_expressions = dict(zip(base.names, expressions(base)))
     return {
         "robot": ROBOT,
         "kind": model.torque_rows.name,
         "unit": unit,
         "gravity": model.bodies.gravity.tolist(),
         "payloads": payloads,
-        "bodies": dict(zip(model.names[:inertial], dynamics.values[:inertial].tolist())),
+        "bodies": bodies,
         "terms": terms,
-        "base": dict(zip(base.names, expressions(base))),
+        "base": base_expressions,
         "regrouping": regrouping(base),
         "covariance": folders.COVARIANCE,
         "note": NOTE,
@@ -185,15 +187,18 @@ def regrouping(base: Base) -> dict[str, dict[str, float]]:
     """Return for each base parameter its standard parameters and their coefficients."""
     coefficients = {}
     for name, row in zip(base.names, base.transform):
-        coefficients[name] = {base.standard[column]: float(row[column]) for column in np.flatnonzero(row)}
+        used = np.flatnonzero(row)
+        coefficients[name] = {base.standard[column]: float(row[column]) for column in used}
     return coefficients
 
 
-def from_table(chain: Chain, table: Mapping[str, Any]) -> Dynamics:
+def from_table(chain: Chain, table: ParsedTable) -> Dynamics:
     """Return the model of a chain from a table that `to_table` made."""
     bodies = bodies_of(chain).with_gravity(np.array(table["gravity"], dtype=float))
     for label in table.get("payloads", ()):
-        bodies = with_payload(bodies, np.asarray(chain.tail), label, on=chain.n - 1)
+        on = chain.n - 1
+        placement = np.asarray(chain.tail)
+        bodies = with_payload(bodies, placement, label, on=on)
     terms = tuple(_term(entry) for entry in table["terms"])
     model = IdentificationModel(bodies, terms, torque_rows(table.get("kind", "motor")))
     inertial_values = table["bodies"]
@@ -205,14 +210,18 @@ def from_table(chain: Chain, table: Mapping[str, Any]) -> Dynamics:
     return Dynamics(model, np.array(values))
 
 
-def _term(entry: Mapping[str, Any]) -> DriveTerm:
+def _term(entry: ParsedTable) -> DriveTerm:
     """Return the drive term of an entry of the table."""
     acts = []
     for row, motion in entry["acts"]:
         weights = tuple((int(joint), float(weight)) for joint, weight in motion)
         acts.append((int(row), weights))
     settings = tuple(float(setting) for setting in entry["settings"])
-    return DriveTerm(entry["name"], entry["shape"], tuple(acts), settings, entry["side"], bool(entry["linear"]))
+    name = entry["name"]
+    shape = entry["shape"]
+    side = entry["side"]
+    linear = bool(entry["linear"])
+    return DriveTerm(name, shape, tuple(acts), settings, side, linear)
 
 
 def identified_masses(folder: str | Path, chain: Chain) -> np.ndarray:

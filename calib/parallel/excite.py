@@ -182,7 +182,7 @@ class ParallelExcitation(ExcitationDesign):
         rate = self.settings.rate
         return coefficients.Periodic(robot.joint_names, kinds, self.period, rate, 1, "fourier", tuple(series))
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the metrics of ``metrics.json``."""
         torque, acceleration = self.peaks
         return super().to_dict() | {
@@ -347,7 +347,7 @@ def write_motion(
     track: Setpoints,
     coordinates: np.ndarray,
     bounds: MotionBounds,
-    metrics: dict[str, Any],
+    metrics: dict[str, object],
     write_files: Callable[[Path], None],
 ) -> Path:
     """Write the folder of a motion: ``robot.toml``, ``motion.csv``, ``metrics.json`` and what `write_files` adds.

@@ -21,9 +21,10 @@ of a serial arm; payloads are not part of the robot.
 """
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -58,15 +59,16 @@ from calib.parallel.mechanism.velocities import LoopMotion, of_platform
 from calib.parallel.robots import ParallelMechanism
 from calib.procedure.export.delivery import DRIVES, MJCF, README, TO_SIMULATE, write_drives
 from calib.procedure.export.identified import Drives, drive_table
-from calib.procedure.findings import LEVELS
+from calib.procedure.findings import NOT_JUDGED
 from calib.procedure.kinematic_stage.folder import URDF
-from calib.result_kinds import refusal
+from calib.results.registry import open_result
 from calib.robot.calibrated import ROBOT
 from calib.robot.chain import Chain, Element, Joint
 from calib.robot.formats.simulators import mjcf_text, pinocchio_model, pose_attributes
 from calib.robot.formats.urdf_tree import transform_body, with_comment
 from calib.robot.formats.urdf_write import add_joint, centred, numbers_text, put, write_new, xml_text
 from calib.robot.kinematics import joint_frames
+from calib.robot.native import NativeModel
 from calib.transforms import invert
 
 PLATFORM, CLOSURES = "platform", "robot.yaml"
@@ -246,7 +248,7 @@ class _Source:
     """What an export is made of: the robot with its dynamics, all parameters as a table, and notes."""
 
     opened: OpenedRobot
-    parameters: dict[str, Any]
+    parameters: dict[str, object]
     notes: tuple[str, ...]
 
 
@@ -265,13 +267,13 @@ class _ArmModel:
     """What `find_possible` reads of the model of an arm."""
 
     bodies: _ArmBodies
-    columns: tuple[Any, ...]
+    columns: tuple[object, ...]
     names: tuple[str, ...]
     inertial: int
     torque_rows: Any
 
 
-def _side_by_side(model: ParallelModel, bodies: np.ndarray | None) -> tuple[Any, Any]:
+def _side_by_side(model: ParallelModel, bodies: np.ndarray | None) -> tuple[Chain, Any]:
     """Return the bodies of a model in the form that `find_possible` reads of serial arms: parameters and labels alone.
 
     Bodies without known masses are rods of 1 kg each, a leg's between its joints.
@@ -368,7 +370,7 @@ def _calibrated(robot: ParallelMechanism, folder: Path) -> _Source:
     prior_bodies = next(find_prior_bodies(chain, arm))
     estimate = read_estimate(folder)
     covariance = read_covariance(folder / COVARIANCE)[1]
-    table: dict[str, Any] = {
+    table: dict[str, object] = {
         "names": [row.name for row in estimate],
         "units": [row.unit for row in estimate],
         "values": [row.value for row in estimate],
@@ -394,16 +396,21 @@ def export_parallel(robot: ParallelMechanism, folder: Path, into: Path, prior: s
     Raises:
         RobotError: where Pinocchio reads other loops or other forces; nothing is written.
     """
-    if not any((folder / name).is_file() for name in (MODEL, ESTIMATE)):
-        raise UsageError(refusal(folder, "export"))
+    result = open_result(folder, "export")
+    if result.identification is None and not (folder / ESTIMATE).is_file():
+        result.refuse("export")
     check_export_target(
         into, [robot.source, *(folder / name for name in (ROBOT, METRICS, MODEL, ESTIMATE, COVARIANCE))]
     )
-    if (folder / MODEL).is_file():
+    if result.identification is not None:
         source = _identified(robot, folder, prior)
     else:
         source = _calibrated(robot, folder)
-    opened, (level, verdict) = source.opened, _verdict(folder)
+    opened = source.opened
+    level = result.verdict.level
+    verdict = "" if level == NOT_JUDGED else str(result.verdict)
+    if level == "fail":
+        verdict += "; do not use"
     remark = verdict if level in ("marginal", "fail") else ""
     texts = {URDF: opened.urdf(), MJCF: opened.mjcf()}
     for name, text in texts.items():
@@ -428,31 +435,13 @@ def export_parallel(robot: ParallelMechanism, folder: Path, into: Path, prior: s
     return (*([remark] if remark else []), message, *source.notes)
 
 
-def check_export_target(out: Path, inputs: Any = ()) -> None:
+def check_export_target(out: Path, inputs: Iterable[str | Path | None] = ()) -> None:
     """Raise an error if an output folder has other content or contains an input file."""
     check_target(out, tuple(USES), (PARAMETERS,), "export", inputs)
 
 
 def _uses() -> Iterator[str]:
     return (f"{name}: {use}" for name, use in USES.items() if use)
-
-
-def _verdict(folder: Path) -> tuple[str, str]:
-    """Return the verdict on a fit or an identification: its level, and a sentence; both empty where none is known."""
-    if (folder / METRICS).is_file():
-        table = json.loads((folder / METRICS).read_text(encoding="utf-8"))
-    else:
-        table = {}
-    verdict = table.get("verdict", "")
-    if isinstance(verdict, Mapping):
-        level = verdict["level"]
-        reason = verdict["reason"]
-    else:
-        level = verdict
-        reason = table.get("reason", "")
-    if level not in LEVELS:
-        return "", ""
-    return level, f"verdict {level}: {reason}" + ("; do not use" if level == "fail" else "")
 
 
 def _check(opened: OpenedRobot, text: str, where: str, postures: int = 5) -> None:
@@ -494,7 +483,7 @@ def _check(opened: OpenedRobot, text: str, where: str, postures: int = 5) -> Non
         raise RobotError(f"{where}: forces differ by {off:.2g} of the largest when Pinocchio reads it; nothing written")
 
 
-def _models(text: str) -> list[Any]:
+def _models(text: str) -> list[NativeModel]:
     """Return Pinocchio's models of each leg and of a floating platform of an MJCF text: it reads one tree at a time.
 
     The keyframe is left out, since for joints without limits Pinocchio wants cosine and sine there.
@@ -511,11 +500,11 @@ def _models(text: str) -> list[Any]:
     return models
 
 
-def _forces(opened: OpenedRobot, model: Any, motion: LoopMotion, m: int, frames: dict[str, np.ndarray]) -> np.ndarray:
+def _forces(
+    opened: OpenedRobot, model: NativeModel, motion: LoopMotion, m: int, frames: dict[str, np.ndarray]
+) -> np.ndarray:
     """Return the forces (r,) of a Pinocchio model on the platform's coordinates in sample m; its frames are added."""
-    import pinocchio
-
-    pin: Any = pinocchio
+    pin = import_module("pinocchio")
     data = model.createData()
     mechanism = opened.mechanism
     model.gravity = pin.Motion(np.array(mechanism.robot.gravity), np.zeros(3))

@@ -144,7 +144,9 @@ def _total_least_squares(
     x = np.linalg.lstsq(flat, target.ravel(), rcond=1e-12)[0]
     tau = residual_inflation(rows, x / size[:-1])
     max_rounds = 100
-    for _ in range(max_rounds):
+    rounds = 0
+    while True:
+        rounds += 1
         gain = x[:n] / size[:n]
         scatter = squares @ gain**2
         residual = matrix @ x - target
@@ -158,8 +160,9 @@ def _total_least_squares(
         x = x + step
         if np.abs(step[:n]).max() < 1e-9 * np.abs(x[:n]).max():
             break
-    else:
-        raise NotConverged("the drive gains do not converge; check that the payload moves with every actuator", gain)
+        if rounds == max_rounds:
+            message = "the drive gains do not converge; check that the payload moves with every actuator"
+            raise NotConverged(message, gain)
     if np.linalg.matrix_rank(flat, rtol=1e-10) < len(x):
         raise Unidentifiable("these runs do not identify the drive gains: record richer motion", data.names[:n])
     inverse = np.linalg.pinv(flat) / size[:-1, None]

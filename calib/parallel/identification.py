@@ -274,7 +274,9 @@ def _encoders(mechanism: ClosedRobot, cases: Sequence[Case]) -> Iterator[Finding
             yield finding("passive-joints-unread", file=case.name, joints=unread_names)
 
 
-def _payloads(model: ParallelModel, identification: Identification[Any], cases: Sequence[Case]) -> Iterator[Finding]:
+def _payloads(
+    model: ParallelModel, identification: Identification[RegressorModel], cases: Sequence[Case]
+) -> Iterator[Finding]:
     """Yield findings on each payload: always or never attached in the recordings, or identified with negative mass."""
     estimate = identification.fitted.estimate
     masses = dict(zip(identification.base.names, zip(estimate.values, estimate.sigma)))

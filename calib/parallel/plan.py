@@ -104,7 +104,7 @@ class ParallelPlan(MotionPlan):
         metrics = self.to_dict()
         return write_motion(self.robot, Path(out), self.track, self.coordinates, self.bounds, metrics, write_figures)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the metrics of ``metrics.json``."""
         track: Any = self.track
         return super().to_dict() | {

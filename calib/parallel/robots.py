@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from calib.errors import UsageError
 from calib.folders import read_covariance, write_covariance
@@ -16,6 +16,8 @@ from calib.parallel.mechanism.parallel_robot import ParallelRobot
 from calib.robot.calibrated import COVARIANCE, ROBOT
 
 if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
     from calib.dynamics.base import Base
     from calib.identification.prediction import Dynamics
     from calib.parallel.mechanism.parallel_model import ParallelModel
@@ -64,7 +66,7 @@ class ParallelMechanism:
         if self.covariance is not None:
             write_covariance(folder / COVARIANCE, self.covariance.names, self.covariance.matrix)
 
-    def model_table(self, dynamics: Dynamics[ParallelModel], base: Base, unit: str) -> dict[str, Any]:
+    def model_table(self, dynamics: Dynamics[ParallelModel], base: Base, unit: str) -> dict[str, object]:
         """Return the model as the content of ``dynamics.json``; `calib.parallel.design_goal.read_model` reads it."""
         # slow to load, as are the others; finding a robot needs none
         from calib.dynamics.base import expressions
@@ -124,7 +126,7 @@ def find(robot: object) -> ParallelMechanism | None:
     return ParallelMechanism(closed(parallel_robot.read(path)), path, covariance)
 
 
-def refuse_unread(settings: Any, plain: Any, read: Collection[str], where: object = "") -> None:
+def refuse_unread(settings: DataclassInstance, plain: object, read: Collection[str], where: object = "") -> None:
     """Raise an error for settings that a stage does not use, unless their values are default or False.
 
     Args:

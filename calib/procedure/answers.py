@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 from unicodedata import category
 
 from calib.config import strict
@@ -18,7 +18,7 @@ Tolerance = Annotated[float, Real(least=0.0, quantity="1")]
 MAX_LETTERS = 200
 
 
-def _entry(value: Any) -> Any:
+def _entry(value: object) -> object:
     """Check an entry of a certificate (a text, number or date), and return it as a text of one line."""
     if not isinstance(value, str | int | float | date) or isinstance(value, bool):
         return value
@@ -124,6 +124,6 @@ class Answers:
     certificate: CertificateSection = field(default_factory=CertificateSection)
 
     @property
-    def cell(self) -> dict[str, Any]:
+    def cell(self) -> dict[str, object]:
         """The answers that describe the cell: option name -> answer."""
         return {name: value for name in CELL if (value := getattr(self, name)) is not None}

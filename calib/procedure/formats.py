@@ -3,9 +3,9 @@
 import json
 from collections.abc import Iterator, Mapping
 from importlib import import_module
-from typing import Any
 
 from calib.config import schema
+from calib.config_types import ParsedTable
 from calib.errors import UsageError, one_of
 from calib.extensions import Point, merged
 
@@ -125,7 +125,7 @@ def json_schema(topic: str) -> str:
     return json.dumps(_schema(topic), indent=2, ensure_ascii=False) + "\n"
 
 
-def _schema(topic: str) -> dict[str, Any]:
+def _schema(topic: str) -> ParsedTable:
     module, name = SCHEMAS[topic]
     return schema(getattr(import_module(module), name), f"{TOPICS[topic][0]} (armature-calib)")
 
@@ -136,7 +136,7 @@ def keys(topic: str) -> Iterator[tuple[str, str, str, str]]:
     return _keys(table, table.get("$defs", {}))
 
 
-def _keys(table: Mapping[str, Any], tables: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str, str, str]]:
+def _keys(table: ParsedTable, tables: ParsedTable, prefix: str = "") -> Iterator[tuple[str, str, str, str]]:
     for key, value in table.get("properties", {}).items():
         # the same keys, for one file
         if key == "files":
@@ -153,7 +153,7 @@ def _keys(table: Mapping[str, Any], tables: Mapping[str, Any], prefix: str = "")
         yield prefix + key, _allowed(value), default, value.get("description", "")
 
 
-def _allowed(value: Mapping[str, Any]) -> str:
+def _allowed(value: ParsedTable) -> str:
     """Return the allowed values of a key as text."""
     if "anyOf" in value:
         alternatives = dict.fromkeys(_allowed(alternative) for alternative in value["anyOf"])

@@ -37,7 +37,12 @@ class RobotKind(Protocol):
         ...
 
     def drive_gains(
-        self, robot: Any, cases: Sequence[Any], settings: Any, known: Mapping[str, float], reference: int | None
+        self,
+        robot: object,
+        cases: Sequence[object],
+        settings: object,
+        known: Mapping[str, float],
+        reference: int | None,
     ) -> Any:
         """Return the drive gains (`calib.identification.gains.DriveGains`) of a robot's recordings in amperes."""
         ...
@@ -85,7 +90,7 @@ class Mechanism(Protocol):
         """Write ``robot.toml`` into a folder, so that the folder can be given as this robot."""
         ...
 
-    def model_table(self, dynamics: Any, base: Any, unit: str) -> dict[str, Any]:
+    def model_table(self, dynamics: object, base: object, unit: str) -> dict[str, object]:
         """Return an identified model in the form of ``dynamics.json``."""
         ...
 
@@ -101,7 +106,7 @@ class MechanismResult(Protocol):
         """Write the result folder in the form of `calib fit` or `calib identify`."""
         ...
 
-    def with_unseen(self, unseen: Sequence[Any]) -> MechanismResult:
+    def with_unseen(self, unseen: Sequence[object]) -> MechanismResult:
         """Return the result with its verdict extended to more unseen files; nothing is fitted or identified again."""
         ...
 
@@ -147,7 +152,7 @@ def stage_of(robot: object, verb: str, base: str | None = None, tip: str | None 
     return replace(stage, run=partial(_run, stage.run, machine))
 
 
-def _run(run: Callable[..., Any], machine: Mechanism, *args: Any, **options: Any) -> Any:
+def _run(run: Callable[..., object], machine: Mechanism, *args: object, **options: object) -> object:
     """Return the result of a command; raise UsageError for an argument that is stated but only serial arms have."""
     parameters = signature(run).parameters
     run_options = {}

@@ -39,11 +39,11 @@ import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from calib.config_types import ParsedTable
 from calib.errors import CalibError, RobotError, one_of, refuse_robot
 from calib.folders import read_covariance, write_covariance
 from calib.records import frozen, shaped
@@ -312,7 +312,7 @@ def read(path: str | Path) -> CalibratedChain:
     return read_whole(path)[0]
 
 
-def read_whole(path: str | Path) -> tuple[CalibratedChain, dict[str, Any]]:
+def read_whole(path: str | Path) -> tuple[CalibratedChain, ParsedTable]:
     """Return the calibrated robot, as `read`, and the extra tables of its file (`calib.robot.description.EXTRA`)."""
     path = Path(path)
     if path.is_dir():
@@ -345,8 +345,8 @@ def read_whole(path: str | Path) -> tuple[CalibratedChain, dict[str, Any]]:
 def write(
     folder: Path,
     robot: CalibratedChain,
-    tables: Mapping[str, Any] | None = None,
-    record: Mapping[str, Any] | None = None,
+    tables: Mapping[str, object] | None = None,
+    record: Mapping[str, object] | None = None,
     comment: str = "",
 ) -> None:
     """Write a calibrated robot to ``robot.toml`` and ``chain_covariance.csv``; `read` returns the same robot.
@@ -360,7 +360,7 @@ def write(
     """
     nominal = None if robot.nominal is None else robot.nominal.values
     rigid = None if robot.corrections is None else robot.chain.values
-    extra: dict[str, Any] = dict(tables or {})
+    extra: dict[str, object] = dict(tables or {})
     if robot.corrections is not None:
         extra["deflection"] = _deflection_table(robot.corrections)
     extra["provenance"] = {**(record or {}), "robot": robot.source, "nominal": nominal, "rigid": rigid}
@@ -396,7 +396,7 @@ def _covariance(path: Path, names: tuple[str, ...]) -> np.ndarray | None:
     return result
 
 
-def _deflection_table(corrections: CorrectedChain) -> dict[str, Any]:
+def _deflection_table(corrections: CorrectedChain) -> dict[str, object]:
     deflection, names = corrections.deflection, corrections.chain.joint_names
     terms = []
     for term, coefficient in zip(deflection.terms, np.asarray(deflection.coefficients)):
@@ -412,7 +412,7 @@ def _deflection_table(corrections: CorrectedChain) -> dict[str, Any]:
     reference = deflection.reference
     if reference is None:
         return {"term": terms}
-    table: dict[str, Any] = {"reference": reference.values.tolist()}
+    table: dict[str, object] = {"reference": reference.values.tolist()}
     # Masses are written only where they differ from those of the chain, which stand in the file already.
     chain_masses = corrections.chain.inertias
     masses = reference.inertias
@@ -422,7 +422,7 @@ def _deflection_table(corrections: CorrectedChain) -> dict[str, Any]:
     return table
 
 
-def _deflection(table: Any, chain: Chain, where: str) -> Deflection:
+def _deflection(table: ParsedTable, chain: Chain, where: str) -> Deflection:
     where = f"{where}, deflection"
     check_keys(table, ("reference", "masses", "term"), where)
     terms, coefficients = [], []

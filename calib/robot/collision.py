@@ -13,19 +13,21 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from types import ModuleType
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.errors import refuse_robot
 from calib.records import shaped
-from calib.robot.capsules import MIN_LENGTH, SAMPLES, TARGET_RADIUS, Obstacle, Wall, closing_speed, inseparable
+from calib.robot.capsules import MIN_LENGTH, SAMPLES, TARGET_RADIUS, closing_speed, inseparable
 from calib.robot.chain import Chain, random_joints
 from calib.robot.formats import urdf
 from calib.robot.formats.simulators import configurations, driven_joints, link_frame
 from calib.robot.formats.urdf_tree import Node, is_urdf, numbers, origin, parse, text
 from calib.robot.kinematics import sweep
+from calib.robot.native import NativeModel, NativeShape
+from calib.robot.obstacles import Obstacle, Wall
 from calib.transforms import pose
 
 PACKAGE_PATH = "ROS_PACKAGE_PATH"
@@ -46,8 +48,8 @@ class Collision:
     pairs: tuple[tuple[str, str], ...]
     excluded: tuple[tuple[str, str], ...]
     missing: tuple[str, ...]
-    _model: Any
-    _geometry: Any
+    _model: NativeModel
+    _geometry: NativeShape
     _chain: Chain
     _links: int
     _posture: Mapping[str, float]
@@ -125,7 +127,7 @@ class Collision:
         sight_speed = (1.0 - shares)[..., None] * (normals @ slope)
         return distances, link_speed - sight_speed
 
-    def _distance_results(self, q: np.ndarray) -> Iterator[Any]:
+    def _distance_results(self, q: np.ndarray) -> Iterator[Sequence[NativeShape]]:
         """Yield coal's distance results of all pairs, for each row of joint values q (m, n)."""
         pin, _ = _libraries()
         data = self._model.createData()
@@ -149,7 +151,7 @@ class Collision:
         return closing_speed(self._chain, axes, origins, normal, point, self._bodies[shapes])
 
     @cached_property
-    def _base_pose(self) -> Any:
+    def _base_pose(self) -> NativeShape:
         """Pose of the base in Pinocchio's world."""
         return _link_pose(self._model, self._chain.base, self._posture)
 
@@ -245,7 +247,9 @@ def from_urdf(
     return _without_inseparable(collision, margin, seed)
 
 
-def _add_targets(model: Any, geometry: Any, chain: Chain, targets: np.ndarray | Sequence[Sequence[float]]) -> None:
+def _add_targets(
+    model: NativeModel, geometry: NativeShape, chain: Chain, targets: np.ndarray | Sequence[Sequence[float]]
+) -> None:
     """Attach targets (T, 3) [m] to the tip's frame, as thin capsules."""
     _, coal = _libraries()
     for number, position in enumerate(np.asarray(targets, dtype=float).reshape(-1, 3), 1):
@@ -268,12 +272,14 @@ def _without_inseparable(collision: Collision, margin: float, seed: int) -> Coll
     return replace(collision, pairs=_pair_names(geometry), excluded=excluded)
 
 
-def _pair_names(geometry: Any) -> tuple[tuple[str, str], ...]:
+def _pair_names(geometry: NativeShape) -> tuple[tuple[str, str], ...]:
     shapes = geometry.geometryObjects
     return tuple((shapes[pair.first].name, shapes[pair.second].name) for pair in geometry.collisionPairs)
 
 
-def _attach(model: Any, geometry: Any, link: str, name: str, placed: np.ndarray, shape: Any) -> None:
+def _attach(
+    model: NativeModel, geometry: NativeShape, link: str, name: str, placed: np.ndarray, shape: NativeShape
+) -> None:
     """Add a shape to `geometry`, attached to a link's frame."""
     pin, _ = _libraries()
     index = link_frame(model, link)
@@ -282,11 +288,13 @@ def _attach(model: Any, geometry: Any, link: str, name: str, placed: np.ndarray,
     geometry.addGeometryObject(pin.GeometryObject(name, frame.parentJoint, index, placement, shape))
 
 
-def _surround(geometry: Any, base_pose: Any, walls: Sequence[Wall], obstacles: Sequence[Obstacle]) -> None:
+def _surround(
+    geometry: NativeShape, base_pose: NativeShape, walls: Sequence[Wall], obstacles: Sequence[Obstacle]
+) -> None:
     """Add walls and obstacles to `geometry`, fixed relative to the base."""
     pin, coal = _libraries()
 
-    def add(name: str, shape: Any, T_base_shape: np.ndarray) -> None:
+    def add(name: str, shape: NativeShape, T_base_shape: np.ndarray) -> None:
         placement = base_pose * pin.SE3(T_base_shape[:3, :3], T_base_shape[:3, 3])
         geometry.addGeometryObject(pin.GeometryObject(name, 0, 0, placement, shape))
 
@@ -296,13 +304,13 @@ def _surround(geometry: Any, base_pose: Any, walls: Sequence[Wall], obstacles: S
         add(obstacle.name, _solid(obstacle.kind, obstacle.size), obstacle.placement)
 
 
-def _solid(kind: str, sizes: Sequence[float]) -> Any:
+def _solid(kind: str, sizes: Sequence[float]) -> NativeShape:
     _, coal = _libraries()
     makers = {"box": coal.Box, "sphere": coal.Sphere, "cylinder": coal.Cylinder, "capsule": coal.Capsule}
     return makers[kind](*map(float, sizes))
 
 
-def set_still(model: Any, configurations: np.ndarray, posture: Mapping[str, float]) -> None:
+def set_still(model: NativeModel, configurations: np.ndarray, posture: Mapping[str, float]) -> None:
     """Write the values of the joints of a posture [rad or m] into Pinocchio's configurations (m, nq)."""
     for name, value in posture.items():
         joint = model.joints[model.getJointId(name)]
@@ -310,7 +318,7 @@ def set_still(model: Any, configurations: np.ndarray, posture: Mapping[str, floa
         configurations[:, joint.idx_q : joint.idx_q + joint.nq] = values
 
 
-def _link_pose(model: Any, link: str, posture: Mapping[str, float]) -> Any:
+def _link_pose(model: NativeModel, link: str, posture: Mapping[str, float]) -> NativeShape:
     """Return the pose of a link in Pinocchio's world, at zero joints but those of a posture."""
     pin, _ = _libraries()
     data = model.createData()
@@ -320,7 +328,7 @@ def _link_pose(model: Any, link: str, posture: Mapping[str, float]) -> Any:
     return data.oMf[link_frame(model, link)].copy()
 
 
-def _shape(node: Node | None, folders: Sequence[Path], missing: list[str], where: str) -> Any | None:
+def _shape(node: Node | None, folders: Sequence[Path], missing: list[str], where: str) -> NativeShape | None:
     """Return the coal shape of a <geometry>; None, with an entry in `missing`, for an unreadable mesh."""
     kind = node.children[0] if node is not None and node.children else None
     if kind is None:
@@ -337,7 +345,7 @@ def _shape(node: Node | None, folders: Sequence[Path], missing: list[str], where
     return _solid(kind.tag, sizes)
 
 
-def _hull(node: Node, folders: Sequence[Path], missing: list[str], where: str) -> Any | None:
+def _hull(node: Node, folders: Sequence[Path], missing: list[str], where: str) -> NativeShape | None:
     """Return the scaled convex hull of a mesh file; None, with an entry in `missing`, if unreadable."""
     _, coal = _libraries()
     name = node.attributes.get("filename", "")
@@ -409,7 +417,7 @@ def urdf_meshes(path: str | Path, tag: str) -> list[tuple[Node, Node, Node]]:
     return meshes
 
 
-def _libraries() -> tuple[Any, Any]:
+def _libraries() -> tuple[ModuleType, ModuleType]:
     """Return the modules pinocchio and coal, imported only when collisions are computed."""
     import coal
     import pinocchio

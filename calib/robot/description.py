@@ -42,7 +42,7 @@ import numpy as np
 
 from calib import files
 from calib.config import parse, strict
-from calib.config_types import Name, Numeric, OneOf, Whole
+from calib.config_types import Name, Numeric, OneOf, ParsedTable, Whole
 from calib.errors import RobotError, listing, refuse_robot, require
 from calib.robot import mdh, tables
 from calib.robot.chain import AXES, Chain, Element, Joint
@@ -224,7 +224,7 @@ def read(path: str | Path, propose_beta: bool = True) -> Chain:
     return read_whole(path, propose_beta)[0]
 
 
-def read_whole(path: str | Path, propose_beta: bool = True) -> tuple[Chain, dict[str, Any]]:
+def read_whole(path: str | Path, propose_beta: bool = True) -> tuple[Chain, ParsedTable]:
     """Return the robot of a file and its extra tables, as `read` and `read_extra` do."""
     table = tables.load(path)
     if "leg" in table or table.get("kind") == "parallel":
@@ -232,8 +232,8 @@ def read_whole(path: str | Path, propose_beta: bool = True) -> tuple[Chain, dict
             f"{path} is a parallel robot (legs and a platform), only serial arms are supported here; use "
             "calib fit, excite, identify or plan"
         )
-    robot: dict[str, Any] = {}
-    extra: dict[str, Any] = {}
+    robot: ParsedTable = {}
+    extra: ParsedTable = {}
     for key, value in table.items():
         target = extra if key in EXTRA else robot
         target[key] = value
@@ -242,12 +242,12 @@ def read_whole(path: str | Path, propose_beta: bool = True) -> tuple[Chain, dict
     return mdh.from_table(robot, str(path), propose_beta), extra
 
 
-def read_extra(path: str | Path) -> dict[str, Any]:
+def read_extra(path: str | Path) -> ParsedTable:
     """Return the extra tables of a robot file (`EXTRA`) as plain dictionaries."""
     return {key: value for key, value in tables.load(path).items() if key in EXTRA}
 
 
-def write(path: str | Path, chain: Chain, extra: Mapping[str, Any] | None = None, source: str = "") -> Path:
+def write(path: str | Path, chain: Chain, extra: Mapping[str, object] | None = None, source: str = "") -> Path:
     """Write a chain to a file from which `read` returns exactly the same chain.
 
     Args:
@@ -311,10 +311,10 @@ def _element(entry: ElementTable, n: int, where: str) -> Element:
     return Element(entry.name, entry.axis, value, entry.owner, entry.joint, entry.ratio, entry.sign, placement)
 
 
-def _to_elements(chain: Chain) -> dict[str, Any]:
+def _to_elements(chain: Chain) -> dict[str, object]:
     joints, elements = [], []
     for index, joint in enumerate(chain.joints):
-        entry: dict[str, Any] = {"name": joint.name, "kind": joint.kind, **tables.finite_limits(joint)}
+        entry: dict[str, object] = {"name": joint.name, "kind": joint.kind, **tables.finite_limits(joint)}
         if chain.links:
             entry["link"] = chain.links[index]
         if chain.inertias is not None:

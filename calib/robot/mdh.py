@@ -204,7 +204,7 @@ def is_table(chain: Chain) -> bool:
         return False
 
 
-def to_table(chain: Chain) -> dict[str, Any]:
+def to_table(chain: Chain) -> dict[str, object]:
     """Return the table (schema above) that `from_table` reads back exactly."""
     entries = [_entry(row, index + 1) for index, row in enumerate(rows(chain))]
     return tables.chain_table(chain, propose_beta=False, joint=entries)
@@ -288,9 +288,9 @@ def _regroup(chain: Chain, index: int, group: list[Element]) -> Row:
     return Row(name=joint.name, index=index, kind=joint.kind, inertia=inertia, **values, **limits)
 
 
-def _entry(row: Row, expected: int) -> dict[str, Any]:
+def _entry(row: Row, expected: int) -> dict[str, object]:
     """Return the [[joint]] table of a row, without default values (the four parameters are always written)."""
-    entry: dict[str, Any] = {"name": row.name}
+    entry: dict[str, object] = {"name": row.name}
     if row.kind != "revolute":
         entry["kind"] = row.kind
     if row.index != expected:

@@ -127,7 +127,7 @@ check_keys = partial(config.check_keys, error=RobotError)
 number = partial(config_types.number, error=RobotError)
 
 
-def word(table: Mapping[str, Any], key: str, where: str, default: str | None = None) -> str:
+def word(table: Mapping[str, object], key: str, where: str, default: str | None = None) -> str:
     """Return a non-empty text from a table.
 
     Raises:
@@ -141,12 +141,12 @@ def word(table: Mapping[str, Any], key: str, where: str, default: str | None = N
     return value
 
 
-def vector(value: Any, count: int, where: str, quantity: str = "") -> np.ndarray:
+def vector(value: object, count: int, where: str, quantity: str = "") -> np.ndarray:
     """Return (count,) numbers in SI units from a TOML list."""
     return np.array(config_types.numbers(value, count, where, quantity, RobotError))
 
 
-def placement(table: Any, where: str) -> np.ndarray:
+def placement(table: object, where: str) -> np.ndarray:
     """Return a transform (4, 4) from a table ``{xyz, rpy}`` [m, rad] or ``{matrix}`` (three or four rows)."""
     if not isinstance(table, Mapping):
         refuse_robot(where, f"expected xyz and rpy, or matrix; found {shown(table)}")
@@ -169,9 +169,9 @@ def spelled(angle: float) -> float | str:
     return _PI.get(angle, angle)
 
 
-def chain_table(chain: Chain, **rows: Any) -> dict[str, Any]:
+def chain_table(chain: Chain, **rows: object) -> dict[str, object]:
     """Return the table of a chain that `RobotTable` reads back exactly; `rows` stand before its tail."""
-    table: dict[str, Any] = {"name": chain.name, "base": chain.base, "tip": chain.tip}
+    table: dict[str, object] = {"name": chain.name, "base": chain.base, "tip": chain.tip}
     table["gravity"] = chain.gravity.tolist()
     if chain.floor:
         table["floor"] = chain.floor
@@ -181,12 +181,12 @@ def chain_table(chain: Chain, **rows: Any) -> dict[str, Any]:
     return table
 
 
-def finite_limits(joint: Any) -> dict[str, float]:
+def finite_limits(joint: object) -> dict[str, float]:
     """Return the known (finite) limits of a joint or MDH row, by name."""
     limits = {key: getattr(joint, key) for key in LIMITS}
     return {key: limit for key, limit in limits.items() if np.isfinite(limit)}
 
 
-def dumps(table: Mapping[str, Any]) -> str:
+def dumps(table: Mapping[str, object]) -> str:
     """Return a table as TOML text, with floats in full precision; None is left out."""
     return rtoml.dumps(config.plain_values(table), none_value=None)

@@ -42,7 +42,7 @@ class Workers:
     _stream: Stream
     here: bool = True
 
-    def completed(self, function: Callable[[Any], Any], tasks: Iterable[Any]) -> Iterator[tuple[int, Any]]:
+    def completed(self, function: Callable[..., Any], tasks: Iterable[object]) -> Iterator[tuple[int, Any]]:
         """Yield (number of the task, its result) as tasks complete; tasks are read from the iterable as needed.
 
         The result of a task lost for good is a `TaskLost`, yielded as the others are. What a task raises is raised.
@@ -53,7 +53,7 @@ class Workers:
                     raise error
                 yield number, result if error is None else error
 
-    def map(self, function: Callable, *items: Iterable[Any]) -> Iterator[Any]:
+    def map(self, function: Callable, *items: Iterable[object]) -> Iterator[Any]:
         """Yield results in the order of the tasks, like the builtin; after Ctrl-C the available results, then raise.
 
         Raises:
@@ -68,8 +68,8 @@ class Workers:
         """
         return partial(self._in_order, lost)
 
-    def _in_order(self, lost: list[TaskLost] | None, function: Callable, *items: Iterable[Any]) -> Iterator[Any]:
-        early: dict[int, tuple[Any, BaseException | None]] = {}
+    def _in_order(self, lost: list[TaskLost] | None, function: Callable, *items: Iterable[object]) -> Iterator[object]:
+        early: dict[int, tuple[object, BaseException | None]] = {}
         turn = 0
         missing = 0
 
@@ -135,7 +135,7 @@ def finishing() -> Iterator[None]:
         return
     before, heard = signal.getsignal(signal.SIGINT), []
 
-    def note(number: int, frame: Any) -> None:
+    def note(number: int, frame: object) -> None:
         if heard:
             raise KeyboardInterrupt
         heard.append(number)

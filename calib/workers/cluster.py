@@ -9,11 +9,15 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from queue import Empty, SimpleQueue
 from threading import Lock
-from typing import Any
+from typing import TYPE_CHECKING, TypeVar
 
 from calib.errors import CalibError, UsageError, refused_as
 from calib.workers.processes import Answer, Died, run_call
 
+if TYPE_CHECKING:
+    from distributed import Client, Future  # pyright: ignore[reportMissingImports]
+
+T = TypeVar("T")
 ANSWER = 10.0  # [s] that a Dask scheduler has to answer (our choice)
 NO_WORKERS = 60.0  # [s] without any worker at a scheduler (our choice)
 
@@ -23,9 +27,9 @@ class _Cluster:
 
     attempts = 1
 
-    def __init__(self, address: str, client: Any) -> None:
-        self.address, self.client, self.done, self.busy = address, client, SimpleQueue[Any](), Lock()
-        self.under_way = dict[str, tuple[int, Any]]()
+    def __init__(self, address: str, client: "Client") -> None:
+        self.address, self.client, self.done, self.busy = address, client, SimpleQueue["Future"](), Lock()
+        self.under_way = dict[str, tuple[int, "Future"]]()
         self.threads, self.asked, self.manned = 1, -1.0, time.monotonic()
 
     def free(self) -> int:
@@ -43,7 +47,7 @@ class _Cluster:
                 raise CalibError(f"the Dask scheduler at {self.address} has had no workers for {NO_WORKERS:g} s")
         return self.threads
 
-    def _said(self, ask: Callable[[], Any]) -> Any:
+    def _said(self, ask: Callable[[], T]) -> T:
         """Return the scheduler's answer to `ask`; raise CalibError if the scheduler is gone."""
         error = None
         try:
@@ -107,7 +111,7 @@ class _Cluster:
         self.under_way.clear()
 
 
-def _cloudpickled(value: Any) -> bytes:
+def _cloudpickled(value: object) -> bytes:
     import cloudpickle  # comes with Dask; a script's own functions are not on the workers
 
     return cloudpickle.dumps(value)
@@ -136,7 +140,7 @@ def dask(address: str) -> Iterator[_Cluster]:
     with refused_as(UsageError, (OSError, ValueError), f"no Dask scheduler answers at {address}: {{}}"):
         with ThreadPoolExecutor(1) as executor:  # a notebook has a loop of its own
             executor.submit(asyncio.run, _answers(address)).result()
-        client: Any = Client(address, timeout=ANSWER, set_as_default=False)
+        client = Client(address, timeout=ANSWER, set_as_default=False)
     log = logging.getLogger("distributed.client")
     before = log.level
     log.setLevel(logging.CRITICAL)  # what goes wrong is said here, once

@@ -17,12 +17,12 @@ from functools import partial
 from multiprocessing import connection, get_context, parent_process, resource_tracker
 from reprlib import repr as shortened
 from threading import Lock, Thread
-from typing import Any, Protocol
+from typing import Protocol
 
 from calib.errors import CalibError, TaskLost, quiet
 from calib.workers.threads import limit_worker
 
-Answer = tuple[int, Any, BaseException | None]  # task, result, or what the task raised
+Answer = tuple[int, object, BaseException | None]  # task, result, or what the task raised
 Stream = Callable[[Callable, Iterable[tuple], Callable[[int], bool]], Generator[Answer]]
 
 
@@ -121,7 +121,7 @@ def _lost(number: int, task: _Task, error: Died) -> TaskLost:
 
 
 def run_call(
-    call: bytes, hear: Callable[[], Any], dumps: Callable[[Any], bytes], hush: Callable[[], Any] = lambda: None
+    call: bytes, hear: Callable[[], object], dumps: Callable[[object], bytes], hush: Callable[[], object] = lambda: None
 ) -> bytes:
     """Run a pickled call in a worker; return (result, raised exception), pickled.
 
@@ -194,7 +194,7 @@ class Processes:
 
     def __init__(self, count: int) -> None:
         self.count, self.stillborn, self.stopping, self.busy = count, 0, False, Lock()
-        self.all, self.idle, self.working = list[_Process](), list[_Process](), dict[Any, _Process]()
+        self.all, self.idle, self.working = list[_Process](), list[_Process](), dict[object, _Process]()
 
     def free(self) -> int:
         return self.count - len(self.working)
@@ -213,7 +213,7 @@ class Processes:
         process.run(number, call)
 
     def ended(self, timeout: float | None = None) -> Iterator[Answer]:
-        for pipe in connection.wait(list(self.working), timeout):
+        for pipe in connection.wait([process.pipe for process in self.working.values()], timeout):
             process = self.working[pipe]
             try:
                 answer, interrupted = process.pipe.recv()
@@ -283,7 +283,7 @@ def _serve(pipe: connection.Connection) -> None:
     """Answer calls in a worker process until the pipe is closed. Ctrl-C has an effect only during a task."""
     heard = list[int]()
 
-    def interrupt(number: int, frame: Any) -> None:
+    def interrupt(number: int, frame: object) -> None:
         heard.append(number)
         raise KeyboardInterrupt
 
@@ -304,7 +304,7 @@ def _serve(pipe: connection.Connection) -> None:
             heard.clear()
 
 
-def _unheard(unraisable: Any) -> None:
+def _unheard(unraisable: "sys.UnraisableHookArgs") -> None:
     """Suppress the message of a Ctrl-C inside a library's callback, which cannot raise KeyboardInterrupt."""
     if not isinstance(unraisable.exc_value, KeyboardInterrupt):
         sys.__unraisablehook__(unraisable)

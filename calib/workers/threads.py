@@ -11,11 +11,14 @@ from collections.abc import Generator, Iterator
 from contextlib import closing, contextmanager
 from functools import cache
 from threading import Lock
-from typing import Any
+from typing import TYPE_CHECKING, Never
+
+if TYPE_CHECKING:
+    from threadpoolctl import LibController
 
 VARIABLES = tuple(f"{name}_NUM_THREADS" for name in ("OPENBLAS", "OMP", "MKL", "BLIS"))
 
-_changing, _before, _largest = Lock(), dict[Any, int](), dict[Any, int]()
+_changing, _before, _largest = Lock(), dict["LibController", int](), dict["LibController", int]()
 _calls = 0
 
 
@@ -37,7 +40,7 @@ def one_blas_thread() -> Iterator[None]:
                 _before.clear()
 
 
-def limited_steps(steps: Generator[Any, Any, Any]) -> Iterator[Any]:
+def limited_steps(steps: Generator[object, Never, object]) -> Iterator[object]:
     """Yield a generator's values, with one BLAS thread inside the generator and the caller's number outside."""
     ended = object()
     with closing(steps):
@@ -87,7 +90,7 @@ def _limit_for_good() -> None:
         _set(dict.fromkeys(_libraries(), 1))
 
 
-def _set(threads: dict[Any, int]) -> None:
+def _set(threads: dict["LibController", int]) -> None:
     """Set the thread numbers of libraries, from any thread: threadpoolctl 3.8 heeds one alone until it is cleared."""
     for library, number in threads.items():
         clear = getattr(library, "clear_controlling_thread", lambda force: None)
@@ -97,7 +100,7 @@ def _set(threads: dict[Any, int]) -> None:
 
 
 @cache
-def _libraries() -> list[Any]:
+def _libraries() -> list["LibController"]:
     """Return all loaded BLAS libraries: looking for them takes milliseconds, setting their threads microseconds."""
     from threadpoolctl import ThreadpoolController
 

@@ -258,7 +258,7 @@ def _constraint(rows: _Bounded, s: np.ndarray) -> Any:
             super().__init__()
             self.identical = True
 
-        def compute_constraint_params(self, path: Any, gridpoints: Any, *args: Any, **kwargs: Any) -> Any:
+        def compute_constraint_params(self, path: object, gridpoints: object, *args: object, **kwargs: Any) -> Any:
             rows_given = (*last, signs, limit) if m else (None,) * 5
             return (*rows_given, None, speeds)
 

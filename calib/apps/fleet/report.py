@@ -26,7 +26,7 @@ from calib.records import plain
 from calib.result_kinds import BY_NAME
 from calib.toolkit.installations import PLAUSIBLE
 from calib.toolkit.report_pages import Block, Column, Section, Text, table
-from calib.toolkit.result_folders import Judged, Verdict, lines_of, settle
+from calib.toolkit.result_folders import Judged, Verdict, notes_of, settle
 from calib.units import small
 
 PAGE, PRIOR = "report.html", "prior"
@@ -93,7 +93,7 @@ class FleetReport(Judged):
             Column("", "{0[1].verdict.level}", number=False),
         ]
         blocks: list[Block] = [
-            Text("Notes", lines_of(self.noticed), "note"),
+            Text("Notes", notes_of(self.noticed), "note"),
             table("Arms calibrated more than once", drift, self.changes),
         ]
         for arm_type in self.types:

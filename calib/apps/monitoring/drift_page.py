@@ -17,7 +17,7 @@ from calib.records import plain
 from calib.result_kinds import BY_NAME
 from calib.toolkit.pose_data import FitOptions, read_fit_options
 from calib.toolkit.report_pages import Column, Section, Text, table
-from calib.toolkit.result_folders import Drawn, Judged, Verdict, lines_of, load_robot, read_measured_file, settle
+from calib.toolkit.result_folders import Drawn, Judged, Verdict, load_robot, notes_of, read_measured_file, settle
 from calib.toolkit.sessions import Trend, noise_of_difference, repeats, trends
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ class DriftFound(Drawn, Judged):
             Column("in all mm", lambda trend: f"{1e3 * trend.total:.3g}"),
             Column("σ", lambda trend: f"{trend.sigmas:.1f}"),
         ]
-        blocks = [Text("Notes", lines_of(self.noticed), "note"), table("Drift of the target", columns, self.trends)]
+        blocks = [Text("Notes", notes_of(self.noticed), "note"), table("Drift of the target", columns, self.trends)]
         return Section("Drift", blocks, self.verdict.level, self.verdict.reason)
 
     def charts(self) -> dict[str, Chart]:

@@ -17,9 +17,8 @@ from calib.apps.monitoring.comparison.robot_change import diff
 from calib.errors import SessionError, UsageError, command_line, require
 from calib.records import plain
 from calib.result_kinds import BY_NAME
-from calib.toolkit.opened_results import Unjudged
 from calib.toolkit.report_pages import Column, Section, table
-from calib.toolkit.result_folders import Drawn, Judged
+from calib.toolkit.result_folders import Drawn, Judged, Unjudged
 from calib.toolkit.sessions import Session, folders_of, open_session, position_errors, torque_error
 
 if TYPE_CHECKING:

@@ -16,8 +16,8 @@ import numpy as np
 from calib import files
 from calib.errors import CalibError, UsageError, command_line, refused_as
 from calib.toolkit.chains import Chain, Joint, joint_frames
-from calib.toolkit.opened_results import DrawnRobot as Drawn
-from calib.toolkit.opened_results import ErrorSizes, Measured, Played, Scene, Torques, drawn, strips, thinned
+from calib.toolkit.result_folders import DrawnRobot as Drawn
+from calib.toolkit.result_folders import ErrorSizes, Measured, Played, Scene, Torques, drawn, strips, thinned
 from calib.transforms import to_quaternion
 
 # colours, red, green and blue

@@ -212,7 +212,7 @@ def _fitted(board: Board, pixel: np.ndarray, size: tuple[int, int], model: str) 
         length = np.linalg.norm(matrix, axis=0) + 1e-300
         padded = np.concatenate([matrix / length, np.sqrt(damping) * np.eye(FITTED)])
         step = np.linalg.lstsq(padded, np.append(residual, np.zeros(FITTED)), rcond=None)[0] / length
-        trial_rows = rows
+        trial_lens, trial_rows = lens, rows
         with suppress(CalibError):  # a focal length below zero
             trial_lens = lens.with_values(lens.values + np.append(step, np.zeros(len(lens.values) - FITTED)))
             trial_rows = _beside_poses(trial_lens, board, pixel)

@@ -6,10 +6,12 @@ at one stop of the arm the first `max_per_stop` are kept. What is kept is writte
 --board board.toml --out FOLDER``): ``joints.csv``, ``corners.csv``, ``board.toml``, no images.
 """
 
-from collections.abc import Callable
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,6 +23,10 @@ from calib.data.images.pixels import Found, write_corners
 from calib.data.poses import BOARD, CORNERS, JOINTS
 from calib.data.recordings.bags import JOINT_STATE, connections_of, header_stamp, joint_states, opened
 from calib.errors import MeasurementError, require
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+    from rosbags.interfaces import Connection
 
 IMAGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/Image", "sensor_msgs/CompressedImage")
 
@@ -77,12 +83,12 @@ def read_image_bag(
     return ImageBag(tuple(labels), names, q, detections, tuple(notes))
 
 
-def _image_stamps(reader: Any, connections: list[Any]) -> np.ndarray:
+def _image_stamps(reader: AnyReader, connections: list[Connection]) -> np.ndarray:
     messages = reader.messages(connections=connections)
     return np.array([header_stamp(reader.deserialize(raw, c.msgtype)) or logged for c, logged, raw in messages])
 
 
-def _images(reader: Any, connections: list[Any], numbers: set[int]) -> Any:
+def _images(reader: AnyReader, connections: list[Connection], numbers: set[int]) -> Iterator[np.ndarray]:
     """Yield the images with the given numbers as 8-bit grey levels, in the bag's order."""
     for number, (connection, _, raw) in enumerate(reader.messages(connections=connections)):
         if number in numbers:

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -204,14 +203,14 @@ def read_lens(path: str | Path) -> Lens:
         return Lens(MODELS[name], np.concatenate([matrix[[0, 4, 2, 5]], full]), size)
 
 
-def _whole(table: dict[str, Any], keys: tuple[str, ...], path: str | Path) -> int:
+def _whole(table: dict[str, object], keys: tuple[str, ...], path: str | Path) -> int:
     value = next((table[key] for key in keys if key in table), None)
     if not isinstance(value, int) or not 0 < value < 100_000:
         raise MeasurementError(f"{keys[0]}: expected a number of pixels, found {shown(value)}", path)
     return value
 
 
-def _numbers(table: dict[str, Any], keys: tuple[str, ...], path: str | Path) -> np.ndarray:
+def _numbers(table: dict[str, object], keys: tuple[str, ...], path: str | Path) -> np.ndarray:
     value = next((table[key] for key in keys if key in table), None)
     value = value.get("data") if isinstance(value, dict) else value
     try:

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -144,7 +143,7 @@ class Optics:
         _, in_view, in_free = np.intersect1d(parameters, free, return_indices=True)
         return View(self.lenses[lens], self.boards[board], in_view, in_free)
 
-    def tables(self) -> dict[str, Any]:
+    def tables(self) -> dict[str, object]:
         """Return the tables ``camera`` and ``board`` of ``robot.toml``; `read_optics` reads them."""
         cameras = []
         for name, lens in zip(self.lens_names, self.lenses):
@@ -170,7 +169,7 @@ class _Board(BoardShape):
     name: str = ""
 
 
-def read_optics(cameras: Sequence[Mapping[str, Any]], boards: Sequence[Mapping[str, Any]]) -> Optics:
+def read_optics(cameras: Sequence[Mapping[str, object]], boards: Sequence[Mapping[str, object]]) -> Optics:
     """Return the cameras and boards of the tables ``camera`` and ``board`` of a fit's ``robot.toml``.
 
     Raises:

@@ -50,7 +50,7 @@ TOML; every key is optional, and an unknown key is refused. Lengths in m, angles
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from calib.config import inherited, own_table, parse, read_toml, strict
 from calib.config_types import Expect, Flag, Hidden, Label, Name, Names, OneOf, Positive, Real, Spread
@@ -173,7 +173,7 @@ def read_options(path: str | Path | None = None) -> FitOptions:
     return FitOptions() if path is None else parse_options(read_toml(path), str(path))
 
 
-def parse_options(table: Mapping[str, Any], source: str = "options") -> FitOptions:
+def parse_options(table: Mapping[str, object], source: str = "options") -> FitOptions:
     """Return the options in a parsed TOML table; `source` names the file in messages."""
     options = parse(FitOptions, inherited(table, FileOptions), source)
     if "free" in table and not options.free:

@@ -281,7 +281,7 @@ Block = TypeVar("Block", bound=PoseMeasurements)
 def take(block: Block, index: Sequence[int] | np.ndarray) -> Block:
     """Return the rows at `index`; groups keep their numbers, so that links stay valid."""
     index = np.asarray(index)
-    rows: dict[str, Any] = {}
+    rows: dict[str, object] = {}
     for name in block.per_row:
         values = getattr(block, name)
         rows[name] = None if values is None else values[index]

@@ -10,10 +10,12 @@ Read by `rosbags` (pure Python, Apache-2.0; its wheels' C parts exist for Linux 
 imported when a bag is read (75 ms). Memory grows with the joint states alone, time with their number.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,6 +23,10 @@ from calib.data.recordings.recording import Recording
 from calib.data.recordings.recording_options import RecordingOptions
 from calib.data.schema import Joints
 from calib.errors import MeasurementError, refuse_data, refused_as, require, suggestion
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+    from rosbags.interfaces import Connection
 
 JOINT_STATE = ("sensor_msgs/msg/JointState", "sensor_msgs/JointState")
 FRANKA_STATE = "franka_msgs/msg/FrankaRobotState"  # of franka_ros2: a joint state, measured_joint_state, among others
@@ -53,7 +59,7 @@ def read_bag(path: Path, joints: Joints | None, options: RecordingOptions) -> Re
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[Any]:
+def opened(path: Path) -> Iterator[AnyReader]:
     """Yield a reader of a bag; convert all errors of `rosbags` to `MeasurementError`."""
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
@@ -67,8 +73,8 @@ def opened(path: Path) -> Iterator[Any]:
 
 
 def connections_of(
-    reader: Any, kinds: Sequence[str], topic: str, path: Path, what: str, option: str, usual: str = ""
-) -> list[Any]:
+    reader: AnyReader, kinds: Sequence[str], topic: str, path: Path, what: str, option: str, usual: str = ""
+) -> list[Connection]:
     """Return a bag's connections of one topic with messages of the given types.
 
     Args:
@@ -95,15 +101,15 @@ def connections_of(
 
 
 def joint_states(
-    reader: Any, connections: list[Any], joints: Joints | None, path: Path
+    reader: AnyReader, connections: list[Connection], joints: Joints | None, path: Path
 ) -> tuple[tuple[str, ...], dict[str, np.ndarray], int]:
     """Return the joint names, arrays of stamps [ns], q, v and effort, and the number of unused messages."""
     names = joints.names if joints else ()
     order: dict[tuple[str, ...], list[int] | None] = {}
-    rows: dict[str, list[Any]] = {"header": [], "logged": [], "q": [], "v": [], "effort": []}
+    rows: dict[str, list[object]] = {"header": [], "logged": [], "q": [], "v": [], "effort": []}
     skipped = 0
     for connection, logged, raw in reader.messages(connections=connections):
-        message = reader.deserialize(raw, connection.msgtype)
+        message: Any = reader.deserialize(raw, connection.msgtype)
         message = getattr(message, "measured_joint_state", message)
         message_names = tuple(message.name)
         names = names or message_names
@@ -130,7 +136,7 @@ def header_stamp(message: Any) -> int:
     return message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
 
 
-def _stack(values: list[Any], series: str, path: Path) -> np.ndarray:
+def _stack(values: list[object], series: str, path: Path) -> np.ndarray:
     """Return the rows as one array; an empty array if no message has the quantity."""
     missing = [k for k, value in enumerate(values) if value is None]
     if len(missing) == len(values):

@@ -20,8 +20,8 @@ import tomllib
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
 
+from calib.config_types import ParsedTable
 from calib.files import shipped_text
 
 # Letters of a line of names (our choice).
@@ -37,7 +37,7 @@ class Log(io.StringIO):
 
 
 @cache
-def logs() -> dict[str, dict[str, Any]]:
+def logs() -> dict[str, ParsedTable]:
     """Return the known logs by name."""
     return tomllib.loads(shipped_text("calib.data.recordings", "logs.toml"))
 
@@ -70,7 +70,7 @@ def translated(path: str | Path) -> Log | None:
     return log
 
 
-def _form(head: str) -> dict[str, Any] | None:
+def _form(head: str) -> ParsedTable | None:
     """Return the known log with this first line; None where it is none."""
     for form in logs().values():
         if re.search(form["header"], head):

@@ -140,7 +140,7 @@ class Recording:
 
     def take(self, index: slice | np.ndarray) -> Recording:
         """Return the recording of the samples at `index`, a slice or a mask (N,), with their times and row numbers."""
-        series: dict[str, Any] = {}
+        series: dict[str, object] = {}
         for name in SERIES:
             values = getattr(self, name)
             series[name] = None if values is None else values[index]
@@ -214,7 +214,7 @@ def earlier(recording: Recording, lag: float) -> Recording:
         covered = (t >= recording.t[0]) & (t <= recording.t[-1])
     if not covered.any():
         refuse_data(recording.file, f"a lag of {lag:g} s leaves no sample of a recording of {recording.duration:.3g} s")
-    shifted: dict[str, Any] = {}
+    shifted: dict[str, object] = {}
     for name in LATE:
         values = getattr(recording, name)
         if values is not None:

@@ -238,7 +238,7 @@ def _described(recording: Recording, controller: str) -> Recording:
         as_described: ("q", "v", "q_link", "q_ref"),
         motors_as_described: ("effort", "tau_link", "tau_motor", "tau_ff"),
     }
-    changes: dict[str, Any] = {}
+    changes: dict[str, object] = {}
     for conversion, names in series_of.items():
         for name in names:
             values = getattr(recording, name)

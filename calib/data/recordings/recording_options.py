@@ -26,7 +26,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from calib.config import strict
 from calib.config_types import Checked, Flag, Hidden, Name, OneOf, Positive, Real, Text, Whole, shown
@@ -82,7 +82,7 @@ SCALES = {
 }
 
 
-def _ours(names: Any) -> Any:
+def _ours(names: object) -> object:
     """Return `names` unchanged; refuse names of series that this toolkit does not know."""
     if not isinstance(names, Mapping):
         return names
@@ -92,11 +92,12 @@ def _ours(names: Any) -> Any:
     return names
 
 
-def _known(units: Any) -> Any:
+def _known(units: object) -> object:
     """Return `units` unchanged; refuse a unit that does not suit its series."""
     if not isinstance(units, Mapping):
         return units
-    for name, unit in _ours(units).items():
+    _ours(units)
+    for name, unit in units.items():
         if unit and (not isinstance(unit, str) or unit.lower() not in SCALES[name]):
             raise ValueError(f"unit {shown(unit)} of {name} is unknown; expected one of {', '.join(SCALES[name])}")
     return units

@@ -78,6 +78,7 @@ def propose_cutoffs(sampled: Resampled, dynamics: float | None = None) -> Cutoff
     longest = max(rows.stop - rows.start for rows in parts)
     size = min(longest, max(64, int(WINDOW_LENGTH * sampled.rate)))
     blocks = [sampled.series["q"][rows] for rows in parts if rows.stop - rows.start >= size]
+    f = np.zeros(0)
     spectra = []
     for q in blocks:
         f, spectrum = welch(q, sampled.rate, "hann", size, size - size // 2, detrend="linear", axis=0)

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, repeat
-from typing import Any
 
 import numpy as np
 
@@ -21,6 +20,7 @@ from calib.geometry.installation import Installation
 from calib.geometry.many_corrections import row_statistics, separable
 from calib.geometry.model_choice.folds import Folds
 from calib.geometry.observation import layout, observe, prepare, sampled
+from calib.geometry.residuals import CommonNoise
 from calib.geometry.weighing import GeometricFit
 from calib.robot.calibrated import Deflection, Term
 from calib.robot.chain import Chain
@@ -330,7 +330,7 @@ class _Rows:
     free: np.ndarray
     sigmas: Sequence[dict[str, float]]
     weights: Sequence[np.ndarray]
-    noises: Sequence[Any]
+    noises: Sequence[CommonNoise | None]
 
     def statistics(
         self, block_rows: Sequence[np.ndarray], placed_anew: Sequence[bool] | None = None

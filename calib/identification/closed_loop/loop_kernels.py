@@ -249,6 +249,7 @@ def _under_load(linear, kinds, acts, memory, q, v, tau, matrix, loads, out):
     plain, extra, change = out.copy(), np.zeros(n), np.empty(n)
     left = tau.copy()
     _friction(linear, kinds, acts, memory, q, v, left)
+    size, moved = 0.0, 0.0
     for _ in range(200):
         size, moved = 0.0, 0.0
         for j in range(n):

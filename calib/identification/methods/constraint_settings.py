@@ -6,7 +6,7 @@ The methods with constraints are in `calib.identification.methods.estimators` an
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 
@@ -20,7 +20,7 @@ POSTURES = 50
 """Postures at which M(q) must be positive definite (our choice)."""
 
 
-def _in_order(value: Any) -> Any:
+def _in_order(value: object) -> object:
     """Refuse a lower bound above the upper."""
     match value:
         case [int() | float() as low, int() | float() as high] if low > high:
@@ -66,7 +66,7 @@ class CurvedConstraint:
     """
 
     h: Annotated[str | Callable[..., float], Expect("a formula, or in Python a function"), _Json({"type": "string"})]
-    slope: Annotated[Callable[..., Any] | None, Expect("a function, in Python alone"), _Json({"not": {}})] = None
+    slope: Annotated[Callable[..., object] | None, Expect("a function, in Python alone"), _Json({"not": {}})] = None
     name: Text = ""
 
 

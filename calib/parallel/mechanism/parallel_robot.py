@@ -32,7 +32,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -251,7 +251,7 @@ def read(path: str | Path) -> ParallelRobot:
     return _from_table(load(path), str(path))
 
 
-def _from_table(table: Mapping[str, Any], where: str) -> ParallelRobot:
+def _from_table(table: Mapping[str, object], where: str) -> ParallelRobot:
     """Return the robot of a parsed table; `where` names it in messages."""
     check_keys(table, TOP, where)
     if table.get("kind") != KIND:
@@ -290,7 +290,7 @@ def _from_table(table: Mapping[str, Any], where: str) -> ParallelRobot:
 
 
 def write(
-    path: str | Path, robot: ParallelRobot, source: str = "", provenance: Mapping[str, Any] | None = None
+    path: str | Path, robot: ParallelRobot, source: str = "", provenance: Mapping[str, object] | None = None
 ) -> Path:
     """Write a parallel robot as a TOML file that `read` reproduces to the last bit."""
     table = to_table(robot, source)
@@ -299,9 +299,9 @@ def write(
     return files.write(path, dumps(table))
 
 
-def to_table(robot: ParallelRobot, source: str = "") -> dict[str, Any]:
+def to_table(robot: ParallelRobot, source: str = "") -> dict[str, object]:
     """Return the table (schema above) that `_from_table` reads back exactly."""
-    table: dict[str, Any] = {"kind": KIND, "name": robot.name, "gravity": robot.gravity.tolist()}
+    table: dict[str, object] = {"kind": KIND, "name": robot.name, "gravity": robot.gravity.tolist()}
     if source:
         table["source"] = source
     table["platform"] = {
@@ -316,7 +316,7 @@ def to_table(robot: ParallelRobot, source: str = "") -> dict[str, Any]:
     return table
 
 
-def _leg(entry: Mapping[str, Any], number_: int, gravity: np.ndarray, where: str) -> Leg:
+def _leg(entry: Mapping[str, object], number_: int, gravity: np.ndarray, where: str) -> Leg:
     location = f"{where}, [[leg]] number {number_ + 1}"
     check_keys(entry, _LEG, location)
     name = word(entry, "name", location, f"leg{number_ + 1}")
@@ -339,7 +339,7 @@ def _based(chain: Chain, base: np.ndarray) -> Chain:
     return replace(chain, elements=(first, *chain.elements[1:]))
 
 
-def _actuated(entry: Mapping[str, Any], chain: Chain, location: str) -> tuple[int, ...]:
+def _actuated(entry: Mapping[str, object], chain: Chain, location: str) -> tuple[int, ...]:
     names = _words(entry.get("actuated", []), f"{location}, actuated")
     for name in names:
         if name not in chain.joint_names:
@@ -350,13 +350,13 @@ def _actuated(entry: Mapping[str, Any], chain: Chain, location: str) -> tuple[in
     return tuple(sorted({chain.joint_names.index(name) for name in names}))
 
 
-def _words(value: Any, where: str) -> tuple[str, ...]:
+def _words(value: object, where: str) -> tuple[str, ...]:
     if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
         refuse_robot(where, f"expected a list of names, found {shown(value)}")
     return tuple(value)
 
 
-def _values(values: Any, turns: Sequence[bool], location: str, quantity: str) -> np.ndarray:
+def _values(values: object, turns: Sequence[bool], location: str, quantity: str) -> np.ndarray:
     """Return a list of values [rad where `turns`, else m], one per `each`."""
     if not isinstance(values, list) or len(values) != len(turns):
         refuse_robot(location, f"expected one value per {quantity}, {len(turns)}; found {shown(values)}")
@@ -367,10 +367,10 @@ def _values(values: Any, turns: Sequence[bool], location: str, quantity: str) ->
     return np.array(parsed)
 
 
-def _leg_table(leg: Leg) -> dict[str, Any]:
+def _leg_table(leg: Leg) -> dict[str, object]:
     base = leg.chain.elements[0].placement
     chain_table = mdh.to_table(_based(leg.chain, np.eye(4)))
-    table: dict[str, Any] = {"name": leg.name}
+    table: dict[str, object] = {"name": leg.name}
     if base is not None:
         table["base"] = placement_table(base)
     table |= {"attachment": placement_table(leg.attachment), "end": leg.end}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -247,7 +247,7 @@ def read_torques(path: Path) -> dict[str, np.ndarray]:
     return blocks if "v" in blocks else {}
 
 
-def _estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:
+def _estimate_rows(outcome: IdentificationOutcome) -> list[tuple[object, ...]]:
     """Return a row of ``estimate.csv`` for each parameter, with the columns `HEADER`; RSD in percent.
 
     σ is the total; the geometry's part is left out where the geometry is taken as exact. Terms that the evidence

@@ -7,11 +7,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from os.path import realpath
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from calib.data.signals.persistency import ExcitationReport, repeats, report_excitation
+from calib.dynamics.regressor_model import RegressorModel
 from calib.errors import Finding, finding
 from calib.identification.friction.passivity import driven
 from calib.identification.identify import Identification, identify
@@ -20,6 +21,7 @@ from calib.identification.physical_consistency.solve import Contradiction, contr
 from calib.identification.prediction import Dynamics, Score, predict, score
 from calib.identification.rows import Case
 from calib.identification.uncertainty import geometry_uncertainty, torque_errors
+from calib.identification.uncertainty.learned_torque_errors import learn_torque_errors
 from calib.procedure.dynamic_stage import plain, plausibility
 from calib.procedure.dynamic_stage import verdict as judging
 from calib.procedure.dynamic_stage.hypotheses import gravity_hypotheses
@@ -129,7 +131,7 @@ def overlaps(cases: Sequence[Case], unseen: Sequence[Case]) -> list[Finding]:
 
 def errors_of(
     inputs: IdentificationInputs,
-    dynamics: Dynamics[Any],
+    dynamics: Dynamics[RegressorModel],
     errors: torque_errors.TorqueErrorModel | None = None,
     say: Progress = silent,
 ) -> Errors:
@@ -301,7 +303,7 @@ def judged(
     wrong = driven(found.dynamics, inputs.cases)
     carried, geometries = _carry(inputs, found, say)
     say("errors on held-out time")
-    errors = torque_errors.learn_torque_errors(found, inputs.cases, carried.covariance)
+    errors = learn_torque_errors(found, inputs.cases, carried.covariance)
     findings = ModelFindings(
         rests=judging.resting_parameters(found),
         noticed=judging.model_findings(inputs.cases, found),

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from calib.config_types import ParsedTable
 from calib.data.signals.motion import Motion
 from calib.errors import Finding
 from calib.estimation.essential import EliminationStep
@@ -308,7 +309,7 @@ _WHITENESS = ("pacf", "bound", "ljung_box_p", "kurtosis", "normal_p")
 _STEP = ("ratio", "f", "p", "p_total")
 
 
-def with_current_keys(content: Mapping[str, Any]) -> dict[str, Any]:
+def with_current_keys(content: ParsedTable) -> ParsedTable:
     """Return the content of an earlier version's ``metrics.json`` or ``unseen/report.json`` with today's keys."""
     if content.get("schema", UNSEEN_SCHEMA - 1) >= UNSEEN_SCHEMA:
         return dict(content)
@@ -342,14 +343,14 @@ def with_current_keys(content: Mapping[str, Any]) -> dict[str, Any]:
     return result
 
 
-def _score(score: Mapping[str, Any]) -> dict[str, Any]:
+def _score(score: ParsedTable) -> ParsedTable:
     """Return a score of an earlier version with today's keys."""
     missing = {"acf": [], **dict.fromkeys(_WHITENESS)}
     rows = [whiteness and missing | whiteness for whiteness in score["whiteness"]]
     return {"rate": None, "r_squared": [], "motion_share": 1.0} | dict(score) | {"whiteness": rows}
 
 
-def _replay(replay: Mapping[str, Any]) -> dict[str, Any]:
+def _replay(replay: ParsedTable) -> ParsedTable:
     """Return a replay of an earlier version with today's keys."""
     stored = replay["controller"]
     controller = None

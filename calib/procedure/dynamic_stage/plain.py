@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from calib.data.signals.motion import moving
 from calib.dynamics.bodies import standard_parameters
+from calib.dynamics.regressor_model import RegressorModel
 from calib.errors import Finding, finding
 from calib.estimation.triangles import Triangles
 from calib.identification.identify import Identification
@@ -48,7 +48,7 @@ class PlainReferences:
     nominal: Number
 
 
-def plain_values(identification: Identification[Any]) -> np.ndarray:
+def plain_values(identification: Identification[RegressorModel]) -> np.ndarray:
     """Return the parameters (p,) of the identified model by plain weighted least squares.
 
     Terms beyond the standard model are zero; a payload that no training recording carries keeps its known parameters.
@@ -88,7 +88,7 @@ def truncated(data: Triangles) -> np.ndarray:
     return values
 
 
-def nominal_values(chain: Chain, dynamics: Dynamics[Any]) -> np.ndarray | None:
+def nominal_values(chain: Chain, dynamics: Dynamics[RegressorModel]) -> np.ndarray | None:
     """Return the model's parameters (p,) by the robot's description, without friction.
 
     None where it states no masses, or the torques are drives' alone, which hold no bodies.
@@ -104,7 +104,7 @@ def nominal_values(chain: Chain, dynamics: Dynamics[Any]) -> np.ndarray | None:
 def references(
     cases: Sequence[Case],
     scores: Mapping[str, Score],
-    dynamics: Dynamics[Any],
+    dynamics: Dynamics[RegressorModel],
     plain: np.ndarray,
     nominal: np.ndarray | None,
     slow: float | tuple[float, ...] | None = None,

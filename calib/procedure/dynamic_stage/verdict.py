@@ -8,11 +8,11 @@ band, and while it moves. `calib explain torque-unexplained` prints the limits, 
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from calib.data.signals.persistency import ExcitationReport
+from calib.dynamics.regressor_model import RegressorModel
 from calib.errors import Finding, finding
 from calib.identification.identify import Identification
 from calib.identification.prediction import Score
@@ -214,7 +214,7 @@ def model_findings(cases: Sequence[Case], identification: Identification) -> tup
     )
 
 
-def parameter_findings(identification: Identification[Any]) -> tuple[Finding, ...]:
+def parameter_findings(identification: Identification[RegressorModel]) -> tuple[Finding, ...]:
     """Return the findings on the parameters, for any robot: condition, bounds, signs, prior."""
     removed = []
     if identification.elimination is not None:
@@ -253,7 +253,7 @@ def beyond(case: Case, chain: Chain) -> list[Finding]:
     return [finding("beyond-joint-limits", file=case.name, joints=joints)] if joints else []
 
 
-def resting_parameters(identification: Identification[Any]) -> Resting:
+def resting_parameters(identification: Identification[RegressorModel]) -> Resting:
     """Return the base parameters that the motion does not identify."""
     count, prior = identification.base.b, identification.prior
     if prior is None:
@@ -263,7 +263,7 @@ def resting_parameters(identification: Identification[Any]) -> Resting:
     return Resting(names, count, prior.source)
 
 
-def _negative(identification: Identification[Any]) -> list[Finding]:
+def _negative(identification: Identification[RegressorModel]) -> list[Finding]:
     """Return the finding on drive inertias and friction that are negative by more than `SURELY` sigmas."""
     estimate = identification.fitted.estimate
     names = []

@@ -125,10 +125,10 @@ class Periodic:
         return q, v, a
 
 
-def table(motion: Periodic, robot: str, limits: Sequence[str]) -> dict[str, Any]:
+def table(motion: Periodic, robot: str, limits: Sequence[str]) -> dict[str, object]:
     """Return the content of ``trajectory.toml`` for a motion; `limits`: text lines on its limits."""
     fourier = motion.kind == "fourier"
-    content: dict[str, Any] = {
+    content: dict[str, object] = {
         "robot": robot,
         "family": motion.kind,
         "period": motion.period,
@@ -141,7 +141,7 @@ def table(motion: Periodic, robot: str, limits: Sequence[str]) -> dict[str, Any]
         content["degree"] = motion.degree
     joints = []
     for name, kind, values in zip(motion.joint_names, motion.kinds, motion.coefficients):
-        joint: dict[str, Any] = {"name": name, "kind": kind}
+        joint: dict[str, object] = {"name": name, "kind": kind}
         if fourier:
             half = len(values) // 2
             joint |= {"q0": values[0], "a": values[1 : 1 + half], "b": values[1 + half :]}

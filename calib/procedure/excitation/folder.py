@@ -6,7 +6,6 @@ Each folder is written completely under another name, then moved to its place.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -167,7 +166,7 @@ def one_period(designed: Designed, rate: float | None = None) -> Setpoints:
     return Setpoints(count / designed.period, motion.q, motion.v, motion.a)
 
 
-def design_metrics(designed: Designed) -> dict[str, Any]:
+def design_metrics(designed: Designed) -> dict[str, object]:
     """Return the content of ``metrics.json`` of a designed motion."""
     motion, inputs, settings = designed.found, designed.inputs, designed.settings
     family, playback, proof = designed.family, designed.playback, designed.proof
@@ -270,7 +269,7 @@ def design_lines(designed: Designed) -> list[str]:
     return [*lines, *(f"note: {note}" for note in designed.notes)]
 
 
-def plan_metrics(planned: Planned) -> dict[str, Any]:
+def plan_metrics(planned: Planned) -> dict[str, object]:
     """Return the content of ``metrics.json`` of a planned motion."""
     timings, shaped = planned.timings, planned.shaped
     line_deviation = None

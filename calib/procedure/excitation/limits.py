@@ -32,7 +32,7 @@ waypoints keeps what is stated only. Besides, per joint or ``all``::
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 
@@ -481,7 +481,7 @@ def _position_constraints(settings: LimitsFile, pose_limits: Limits, points: Poi
 
 
 def _per_joint(
-    values: Mapping[str, Any],
+    values: Mapping[str, object],
     where: str,
     chain: Chain,
     default: np.ndarray | None = None,

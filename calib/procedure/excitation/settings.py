@@ -2,7 +2,7 @@
 
 import re
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Literal, get_args
 
 from calib.arguments import checked
 from calib.config_types import Checked, Flag, OneOf, Real, Seed, Text, Typed, Whole
@@ -38,7 +38,7 @@ def split_goal(text: str) -> tuple[str, float]:
     return name, value
 
 
-def _goal(text: Any, aims: tuple[str, ...] = AIMS) -> Any:
+def _goal(text: object, aims: tuple[str, ...] = AIMS) -> object:
     if isinstance(text, str) and text not in aims:
         split_goal(text)
     return text

@@ -6,7 +6,6 @@ URDF and MJCF are verified by reading them with Pinocchio.
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -180,7 +179,7 @@ def notes_of(robot: IdentifiedRobot) -> list[str]:
     return [*lines_of(findings), *solution.notes]
 
 
-def parameters(robot: IdentifiedRobot) -> dict[str, Any]:
+def parameters(robot: IdentifiedRobot) -> dict[str, object]:
     """Return the content of ``parameters.json``."""
     estimate, solution, chain = robot.information, robot.found, robot.chain
     model = solution.dynamics.model

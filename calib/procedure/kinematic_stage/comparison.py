@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -162,7 +161,11 @@ def compare(
     arms = (cells[0], cells[1])
     pairs_nominal = pair_errors(arms[0], blocks, seed=seed)
     pairs_calibrated = pair_errors(arms[1], blocks, seed=seed)
-    corners: Any = (reprojection(arms[0], blocks), reprojection(arms[1], blocks))
+    nominal_pixels = reprojection(arms[0], blocks)
+    calibrated_pixels = reprojection(arms[1], blocks)
+    pixels = None
+    if nominal_pixels is not None and calibrated_pixels is not None:
+        pixels = (nominal_pixels, calibrated_pixels)
     return Comparison(
         blocks=tuple(blocks),
         cells=arms,
@@ -173,7 +176,7 @@ def compare(
         proves=proves,
         alone=urdf_alone[0] if urdf_alone else None,
         repeated=repeated_poses(arms, blocks),
-        reprojection=None if None in corners else corners,
+        reprojection=pixels,
     )
 
 

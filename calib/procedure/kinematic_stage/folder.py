@@ -7,11 +7,12 @@ import csv
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from calib import files, folders
+from calib.config_types import ParsedTable
 from calib.errors import UsageError, refused_as
 from calib.folders import COVARIANCE, ESTIMATE, METRICS, PAGES, REPORT, InFolder
 from calib.geometry import installation
@@ -138,7 +139,7 @@ class ValidationFolder:
     rows = InFolder("rows.json")  # errors of all rows, for figures
     report = InFolder(REPORT)  # data of the certificate
 
-    def write(self, assessment: Assessment, inputs: Inputs, rows: Sequence[Any]) -> ValidationMetrics:
+    def write(self, assessment: Assessment, inputs: Inputs, rows: Sequence[object]) -> ValidationMetrics:
         """Write errors, rows and, last, the metrics; return the metrics."""
         tables.write_errors(self.errors, inputs.chain, assessment.validation)
         files.write_json(self.rows, rows)
@@ -160,7 +161,7 @@ def _read(kind: type[T], path: Path) -> T:
         return read_record(kind, content | {"schema": content.get("schema", 1)})
 
 
-def _current_form(findings: dict[str, Any]) -> dict[str, Any]:
+def _current_form(findings: ParsedTable) -> ParsedTable:
     """Return findings of schema 1 or 2, which stored sentences, in the current form."""
     if "odd" not in findings and "notes" not in findings:
         return findings

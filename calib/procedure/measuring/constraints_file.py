@@ -98,7 +98,7 @@ _PAIR = {"type": "array", "minItems": 2, "maxItems": 2, "items": {"type": ["numb
 _SPAN_OR_MARGIN = {"anyOf": [_PAIR, {"type": ["number", "string"]}]}
 
 
-def _directions(value: Any) -> Any:
+def _directions(value: object) -> object:
     """Return directions as a list; a single direction or an axis name becomes a list of one."""
     if isinstance(value, str):
         value = AXES.get(value, value)
@@ -144,7 +144,7 @@ class PlacedTable:
     matrix: Rows | None = None
 
     @property
-    def stated(self) -> dict[str, Any]:
+    def stated(self) -> dict[str, object]:
         """The placement keys of the table that have a value."""
         placement = {"xyz": self.xyz, "rpy": self.rpy, "matrix": self.matrix}
         return {key: value for key, value in placement.items() if value is not None}
@@ -189,11 +189,12 @@ class ObstacleTable(PlacedTable):
     name: Name = "obstacle"
 
 
-def _span_or_margin(value: Any) -> Any:
+def _span_or_margin(value: object) -> object:
     """Return the value after a check that it is a range (two numbers or texts with units) or a single margin."""
-    parts = (value,)
-    pair = isinstance(value, list | tuple) and len(value) == 2
-    if pair:
+    parts: tuple[object, ...] = (value,)
+    pair = False
+    if isinstance(value, list | tuple) and len(value) == 2:
+        pair = True
         parts = tuple(value)
     for part in parts:
         if isinstance(part, bool) or not isinstance(part, str | int | float):
@@ -201,7 +202,7 @@ def _span_or_margin(value: Any) -> Any:
     return parts if pair else value
 
 
-def _place_or_unknown(value: Any) -> Any:
+def _place_or_unknown(value: object) -> object:
     if value != UNKNOWN and not isinstance(value, Mapping):
         raise ValueError(f'expected a table with xyz and rpy, or "{UNKNOWN}", found {shown(value)}')
     return value

@@ -16,17 +16,22 @@ Joints and links of the robot's file that are not part of the arm (a gripper's) 
 does not have is refused, and so is an SRDF of which no pair of links is the robot's.
 """
 
-from collections.abc import Collection, Mapping
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
 from math import radians
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-from calib.config_types import number, shown
+from calib.config_types import ParsedTable, number, shown
 from calib.errors import UsageError, one_of, refused_as, require
 from calib.robot.beside import links_of
 from calib.robot.chain import Chain
 from calib.robot.formats.urdf_tree import is_urdf, parse, text
 from calib.robot.formats.urdf_tree import read as read_tree
+
+if TYPE_CHECKING:
+    from ruamel.yaml.nodes import ScalarNode
 
 JOINT_LIMITS = "joint_limits.yaml"
 SRDF = ".srdf"
@@ -57,7 +62,7 @@ def moveit_files(path: Path) -> list[Path]:
     return [*limits[:1], *srdf]
 
 
-def limit_tables(path: Path, chain: Chain, source: Path | None) -> dict[str, Any] | None:
+def limit_tables(path: Path, chain: Chain, source: Path | None) -> ParsedTable | None:
     """Return the tables of a limits file from MoveIt's files; None where the path names none.
 
     Args:
@@ -67,7 +72,7 @@ def limit_tables(path: Path, chain: Chain, source: Path | None) -> dict[str, Any
     Raises:
         UsageError: for files that cannot be read, or that are another robot's.
     """
-    tables: dict[str, Any] = {}
+    tables: ParsedTable = {}
     for file in moveit_files(path):
         if file.suffix == SRDF:
             tables["collision"] = _pairs(file, chain, source)
@@ -76,10 +81,10 @@ def limit_tables(path: Path, chain: Chain, source: Path | None) -> dict[str, Any
     return tables or None
 
 
-def _limits(path: Path, chain: Chain, source: Path | None) -> dict[str, Any]:
+def _limits(path: Path, chain: Chain, source: Path | None) -> ParsedTable:
     """Return the tables [joints], [velocity] … of a ``joint_limits.yaml``."""
     content = _yaml(path)
-    entries: Any = None
+    entries = None
     if isinstance(content, dict):
         entries = content.get("joint_limits")
     if not isinstance(entries, dict) or not all(isinstance(entry, dict) for entry in entries.values()):
@@ -90,7 +95,7 @@ def _limits(path: Path, chain: Chain, source: Path | None) -> dict[str, Any]:
     for name in entries:
         one_of(name, robot_joints, f"{path}: joint", UsageError)
 
-    tables: dict[str, Any] = {}
+    tables: ParsedTable = {}
     for joint in chain.joints:
         limits = entries.get(joint.name, {})
         where = f"{path}: {joint.name}"
@@ -112,7 +117,7 @@ def _limits(path: Path, chain: Chain, source: Path | None) -> dict[str, Any]:
     return tables
 
 
-def _limit(limits: Mapping[str, Any], quantity: str, end: str, where: str) -> float | None:
+def _limit(limits: Mapping[str, object], quantity: str, end: str, where: str) -> float | None:
     """Return a joint's limit; None where it is not stated, or switched off."""
     key = f"{end}_{quantity}"
     if not limits.get(f"has_{quantity}_limits", True) or key not in limits:
@@ -120,7 +125,7 @@ def _limit(limits: Mapping[str, Any], quantity: str, end: str, where: str) -> fl
     return number(limits[key], f"{where}.{key}")
 
 
-def _yaml(path: Path) -> Any:
+def _yaml(path: Path) -> object:
     from ruamel.yaml import YAML
     from ruamel.yaml.constructor import SafeConstructor
     from ruamel.yaml.error import YAMLError
@@ -128,7 +133,7 @@ def _yaml(path: Path) -> Any:
     class Angles(SafeConstructor):
         """Numbers and texts, and angles with ``!degrees`` or ``!radians``."""
 
-    def angle(factor: float) -> Any:
+    def angle(factor: float) -> Callable[[object, ScalarNode], float]:
         return lambda loader, node: factor * number(node.value.strip(), f"{path}: {node.tag}")
 
     Angles.add_constructor("!degrees", angle(radians(1.0)))
@@ -139,7 +144,7 @@ def _yaml(path: Path) -> Any:
         return reader.load(path.read_text(encoding="utf-8"))
 
 
-def _pairs(path: Path, chain: Chain, source: Path | None) -> dict[str, Any]:
+def _pairs(path: Path, chain: Chain, source: Path | None) -> ParsedTable:
     """Return the table [collision] of an SRDF: its disabled pairs, of links that the robot has."""
     with refused_as(UsageError, (OSError, UnicodeDecodeError), f"{path}: cannot be read: {{}}"):
         root = parse(path.read_text(encoding="utf-8"), str(path))

@@ -26,11 +26,12 @@ from calib.procedure.measuring.constraints_file import CameraTable, CollisionTab
 from calib.procedure.measuring.moveit import limit_tables
 from calib.procedure.measuring.sight import SeenOnly, Sight, sight_of
 from calib.robot.beside import links_of
-from calib.robot.capsules import Obstacle, Wall, signed_distance
+from calib.robot.capsules import DistanceModel
 from calib.robot.chain import Chain
 from calib.robot.description import MAX_TURN, remarks
 from calib.robot.formats.urdf_tree import is_urdf, text
 from calib.robot.formats.urdf_tree import read as read_tree
+from calib.robot.obstacles import Obstacle, Wall, signed_distance
 from calib.robot.tables import load as load_table
 from calib.robot.tables import placement
 
@@ -66,7 +67,7 @@ class Limits:
     upper: np.ndarray
     constraints: tuple[PoseConstraint, ...] = ()
     notes: tuple[str, ...] = field(default=())
-    collision: Any = None
+    collision: DistanceModel | None = None
     clearance: float = constraints_file.MARGIN
     sight: Sight | None = None
     checked: tuple[str, ...] = ()
@@ -99,11 +100,11 @@ class Limits:
         return SearchSpace(rows, self.lower, self.upper, rows.product, tuple(constraints))
 
 
-def _shortfall(model: Any, clearance: float, q: np.ndarray) -> np.ndarray:
+def _shortfall(model: DistanceModel, clearance: float, q: np.ndarray) -> np.ndarray:
     return clearance - np.sort(model.distances(q), axis=1)[:, :DISTANCES]
 
 
-def _shortfall_gradient(model: Any, q: np.ndarray) -> np.ndarray:
+def _shortfall_gradient(model: DistanceModel, q: np.ndarray) -> np.ndarray:
     order = np.argsort(model.distances(q), axis=1)[:, :DISTANCES]
     return -np.take_along_axis(model.gradients(q), order[:, :, None], axis=1)
 
@@ -240,7 +241,7 @@ def _unchecked(settings: ConstraintsFile, absent: set[str], measured: bool) -> t
     return tuple(name for name, is_missing in missing.items() if is_missing)
 
 
-def _joint_margin(spans: Mapping[str, Any], where: str) -> float:
+def _joint_margin(spans: Mapping[str, object], where: str) -> float:
     share = number(spans.get("margin", constraints_file.JOINT_MARGIN), f"{where}: joints.margin")
     if not 0.0 <= share < 0.5:
         raise UsageError(f"{where}: joints.margin: expected a share of the range from 0 to below 0.5, found {share:g}")
@@ -248,7 +249,7 @@ def _joint_margin(spans: Mapping[str, Any], where: str) -> float:
 
 
 def _joints(
-    spans: Mapping[str, Any], cell: Installation, where: str, margin: float
+    spans: Mapping[str, object], cell: Installation, where: str, margin: float
 ) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
     """Return lower and upper joint limits (n,), and notes on given ranges that have no effect."""
     chain = cell.chain
@@ -283,7 +284,7 @@ def _joints(
     return lower, upper, tuple(notes)
 
 
-def _span(value: tuple[Any, Any], where: str, quantity: str) -> tuple[float, float]:
+def _span(value: tuple[object, object], where: str, quantity: str) -> tuple[float, float]:
     lower, upper = value
     low = number(lower, where, quantity)
     high = number(upper, where, quantity)
@@ -317,7 +318,7 @@ def _orientation(settings: ConstraintsFile, cell: Installation, where: str) -> l
     return [constraints.orientation(Target(cell), stand[:3, :3], roll, pitch, TargetJacobian(cell))]
 
 
-def _sight(settings: ConstraintsFile, cell: Installation, where: str, model: Any) -> Sight | None:
+def _sight(settings: ConstraintsFile, cell: Installation, where: str, model: DistanceModel | None) -> Sight | None:
     """Return the lines of sight: cone and range if given, and no link of the arm in between.
 
     An instrument with roll and pitch alone is a camera whose view these state.
@@ -340,7 +341,7 @@ def _sight(settings: ConstraintsFile, cell: Installation, where: str, model: Any
 
 def _collision(
     settings: ConstraintsFile, cell: Installation, source: Path | None, where: str, absent: set[str]
-) -> tuple[Any, tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
+) -> tuple[DistanceModel, tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
     """Return the collision model, the names of its checks, notes, and what it does not check."""
     table = settings.collision or CollisionTable()
     floor = table.floor
@@ -424,7 +425,7 @@ def _model(
     walls: Sequence[Wall],
     self_collision: bool,
     floor: float | None,
-) -> tuple[Any, str, tuple[str, ...], tuple[str, ...]]:
+) -> tuple[DistanceModel, str, tuple[str, ...], tuple[str, ...]]:
     """Return the collision model, the name of its link shapes, notes, and links that it does not hold."""
     from calib.robot import capsules, collision
     from calib.robot.beside import links_beside
@@ -479,7 +480,7 @@ def _model(
     return model, shapes, notes, unchecked
 
 
-def _posture(values: Mapping[str, Any], chain: Chain, source: Path | None) -> dict[str, float]:
+def _posture(values: Mapping[str, object], chain: Chain, source: Path | None) -> dict[str, float]:
     """Return the values [rad or m] of joints outside the arm.
 
     Raises:
@@ -521,7 +522,7 @@ def _description(source: Path | None, chain: Chain) -> Path | None:
     return None
 
 
-def _walls(box: tuple[Any, ...] | None, where: str) -> list[Wall]:
+def _walls(box: tuple[tuple[object, object], ...] | None, where: str) -> list[Wall]:
     """Return the two walls across each axis."""
     walls = []
     for axis, normal, span in zip("xyz", np.eye(3), box or ()):

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import pairwise, product
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from calib.poses.by_index import merits
 from calib.poses.indices import Index, observability
 from calib.poses.information import log_det
 from calib.procedure.measuring import DEFAULT_RUN, RunSettings
+from calib.robot.capsules import DistanceModel
 from calib.robot.chain import Chain
 from calib.trajectories.tour import move_times, tour
 from calib.trajectories.ways import Room, way
@@ -83,7 +84,7 @@ class MoveLimits(Protocol):
         ...
 
     @property
-    def collision(self) -> Any:
+    def collision(self) -> DistanceModel | None:
         """Collision model, or None."""
         ...
 

@@ -6,7 +6,6 @@ and only the rows of those that are seen count in the observation Jacobian: what
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from calib.geometry.installation import Installation
 from calib.geometry.observability import Observation, Target, TargetJacobian
 from calib.poses import constraints
 from calib.poses.space import PoseConstraint, constraint_gradient
-from calib.robot.capsules import ALWAYS, SAMPLES
+from calib.robot.capsules import ALWAYS, SAMPLES, DistanceModel
 from calib.robot.chain import Chain, random_joints
 
 # distance [m] of a link from the line of sight below which it blocks it: about a tracker beam's radius (our choice)
@@ -35,7 +34,7 @@ class _Behind:
             the direction it faces is there for.
     """
 
-    arm: Any
+    arm: DistanceModel
     target: Target
     velocity: TargetJacobian
     instrument: np.ndarray
@@ -130,7 +129,7 @@ def sight_of(
     facing: Sequence[Sequence[float]],
     half_angle: float | None,
     span: tuple[float, float],
-    arm: Any | None,
+    arm: DistanceModel | None,
 ) -> Sight | None:
     """Return the lines of sight to the targets of an arm; None if no condition is stated.
 
@@ -165,7 +164,7 @@ def sight_of(
     return Sight(tuple(targets))
 
 
-def _blocking_links(arm: Any, chain: Chain, target: Target) -> np.ndarray:
+def _blocking_links(arm: DistanceModel, chain: Chain, target: Target) -> np.ndarray:
     """Return the indices of links that can block the view: all except those next to the target in every posture."""
     q = random_joints(chain, SAMPLES)
     position = target(q)[1]

@@ -13,9 +13,11 @@ from typing import Any, Concatenate, Literal, ParamSpec
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import XAxis, YAxis
+from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator, NullLocator
+from numpy.typing import ArrayLike
 
 from calib import files
 from calib.procedure.report import style
@@ -52,15 +54,15 @@ def layer(draw: Callable[Concatenate[Axes, P], None]) -> Callable[P, Layer]:
 @layer
 def line(
     axes: Axes,
-    x: Any,
-    y: Any,
+    x: ArrayLike,
+    y: ArrayLike,
     form: str = "-",
     colour: str = AFTER,
     width: float = 0.9,
     size: float = 3.5,
     hollow: bool = False,
     label: str = "",
-    spread: Any = None,
+    spread: ArrayLike | None = None,
 ) -> None:
     """Draw a curve or points (k,) in a matplotlib format (``-``, ``o``, ``o-``); long curves are thinned.
 
@@ -87,13 +89,13 @@ def line(
 @layer
 def bars(
     axes: Axes,
-    values: Any,
-    colours: Any = AFTER,
+    values: ArrayLike,
+    colours: str | Sequence[str] = AFTER,
     upright: bool = False,
     shift: float = 0.0,
     thick: float = 0.7,
     base: float = 0.0,
-    spread: Any = None,
+    spread: ArrayLike | None = None,
     label: str = "",
 ) -> None:
     """Draw bars (k,) from `base` at 0, 1, …, in one colour or one each; `spread` (k,): half the error bars' length."""
@@ -168,7 +170,7 @@ def text(
 
 
 @layer
-def dots(axes: Axes, x: Any, y: Any, values: Any, least: float, most: float, unit: str = "") -> None:
+def dots(axes: Axes, x: ArrayLike, y: ArrayLike, values: ArrayLike, least: float, most: float, unit: str = "") -> None:
     """Draw points (k,) coloured by their values (k,) from `least` to `most`, with a colour bar if `unit` is given."""
     # the largest on top
     order = np.argsort(values)
@@ -183,7 +185,7 @@ def dots(axes: Axes, x: Any, y: Any, values: Any, least: float, most: float, uni
 @layer
 def heat(
     axes: Axes,
-    values: Any,
+    values: ArrayLike,
     unit: str = "",
     extent: tuple[float, float, float, float] | None = None,
     limits: tuple[float, float | None] = (0.0, None),
@@ -208,14 +210,14 @@ def heat(
 
 
 @layer
-def histogram(axes: Axes, counts: Any, edges: Any, colour: str = AFTER) -> None:
+def histogram(axes: Axes, counts: ArrayLike, edges: ArrayLike, colour: str = AFTER) -> None:
     """Draw a histogram of counts (k,) between edges (k + 1,)."""
     axes.stairs(counts, edges, fill=True, color=colour, alpha=0.9)
     axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
 
 
 @layer
-def box(axes: Axes, values: Any, place: float, colour: str = AFTER) -> None:
+def box(axes: Axes, values: ArrayLike, place: float, colour: str = AFTER) -> None:
     """Draw a box plot of values (k,) at a place on y: quartiles and median, 5th and 95th percentile, points beyond."""
     axes.boxplot(
         [values],
@@ -233,7 +235,7 @@ def box(axes: Axes, values: Any, place: float, colour: str = AFTER) -> None:
     )
 
 
-def _scale(axes: Axes, mappable: Any, unit: str, **options: Any) -> None:
+def _scale(axes: Axes, mappable: ScalarMappable, unit: str, **options: Any) -> None:
     """Draw the colour bar of a layer, with its unit."""
     figure: Any = axes.get_figure()
     scale = figure.colorbar(mappable, ax=axes, pad=0.02, aspect=30, **options)

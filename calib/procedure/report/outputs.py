@@ -42,9 +42,9 @@ def write_model(outcome: IdentificationOutcome, folder: Path, plots: bool = True
     from calib.procedure.report import dynamics_section
 
     drawn: Mapping[str, Picture] = {}
-    if plots:
-        from calib.procedure.report import charts, dynamics_figures
+    from calib.procedure.report import charts, dynamics_figures
 
+    if plots:
         charts.save_all(dynamics_figures.friction(outcome), folder)
     if not pages:
         return

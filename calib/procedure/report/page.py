@@ -12,7 +12,7 @@ from rich.console import RenderableType
 from rich.table import Table as RichTable
 from rich.text import Text as RichText
 
-from calib.procedure.findings import LEVELS, Warned
+from calib.procedure.findings import LEVELS, Note
 
 # name, what it is, bytes, SHA-256
 FileRow = tuple[str, str, str, str]
@@ -49,26 +49,26 @@ class Column(NamedTuple):
     """A column of a table of records: name, format of a cell (``{0.sigma:.2g}``), and alignment."""
 
     name: str
-    cell: str | Callable[[Any], str]
+    cell: str | Callable[..., str]
     number: bool = True
 
-    def of(self, record: Any) -> str:
+    def of(self, record: object) -> str:
         """Return the text of a record's cell."""
         if isinstance(self.cell, str):
             return self.cell.format(record)
         return self.cell(record)
 
 
-def _never(record: Any) -> bool:
+def _never(record: object) -> bool:
     return False
 
 
 def table(
     title: str,
     columns: Sequence[Column],
-    records: Sequence[Any],
+    records: Sequence[object],
     note: str = "",
-    strong: Callable[[Any], bool] = _never,
+    strong: Callable[..., bool] = _never,
     most: int | None = None,
 ) -> Table:
     """Return a table of records, one row per record up to `most`, with the `strong` ones in bold."""
@@ -113,10 +113,10 @@ def shortened(text: str, max_letters: int) -> str:
 
 @dataclass(frozen=True)
 class Text:
-    """A list of sentences; on the console, `label` is printed before each."""
+    """A list of sentences; on the console, `label` is printed before each, or that it is a warning."""
 
     title: str
-    lines: Sequence[str]
+    lines: Sequence[str | Note]
     label: str = ""
     kind: str = "text"
 
@@ -212,12 +212,14 @@ def rendered(blocks: Iterable[Block]) -> Iterator[RenderableType]:
             yield _rich_table(block)
         elif isinstance(block, Text):
             for line in block.lines:
-                label = "warning" if isinstance(line, Warned) else block.label
+                label = block.label
+                if isinstance(line, Note) and line.is_warning:
+                    label = "warning"
                 printed = RichText()
                 if label:
                     printed.append(label, "yellow")
                     printed.append(": ")
-                yield printed.append(single_colons(line))
+                yield printed.append(single_colons(str(line)))
 
 
 def single_colons(line: str) -> str:

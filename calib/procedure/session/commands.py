@@ -6,7 +6,6 @@ A waiting session prints two lines: what to do at the robot, and which file to p
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 from rich.console import RenderableType
 from rich.table import Table
@@ -14,6 +13,7 @@ from rich.text import Text
 
 from calib.arguments import checked
 from calib.config import parse
+from calib.config_types import ParsedTable
 from calib.controllers.table import check_controller
 from calib.data.csv_table import read_table
 from calib.data.poses import IMAGES
@@ -207,15 +207,15 @@ def new_session(
     poses: int = 40,
     validation: int = 20,
     tool: Sequence[float] | None = None,
-    limits: str | Path | Mapping[str, Any] | None = None,
+    limits: str | Path | Mapping[str, object] | None = None,
     dynamics: bool = True,
     base: str = "",
     tip: str = "",
     seed: int = 0,
     program: str = "",
     tolerance_mm: float = 0.0,
-    certificate: Mapping[str, Any] | None = None,
-    **motion: Any,
+    certificate: Mapping[str, object] | None = None,
+    **motion: object,
 ) -> Path:
     """Create the folder of a guided session for a robot, like `calib new`.
 
@@ -264,7 +264,7 @@ def new_session(
 
 
 def _limits(
-    limits: str | Path | Mapping[str, Any] | None, chain: Chain, source: Path, motions: bool
+    limits: str | Path | Mapping[str, object] | None, chain: Chain, source: Path, motions: bool
 ) -> tuple[dict[str, Path | str], str]:
     """Return the files of the given limits (name -> path or text) after checking them, and the limits file's name."""
     if limits is None:
@@ -277,7 +277,7 @@ def _limits(
     content, _ = tables_of(limits, chain, source, "")
     if isinstance(content, str | Path):
         return {LIMITS: Path(content), **beside(Path(content))}, LIMITS
-    tables = dict(content or {})
+    tables: ParsedTable = dict(content or {})
     camera = tables.get("camera", {})
     files: dict[str, Path | str] = {}
     for key, name in CAMERA_FILES.items():

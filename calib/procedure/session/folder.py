@@ -138,7 +138,7 @@ class Session:
     @property
     def links(self) -> dict[str, Any]:
         """The arm's first and last link: as given to `calib new`, else as its fit has them; None: to be chosen."""
-        links = {"base": self.settings.robot.base or None, "tip": self.settings.robot.tip or None}
+        links: dict[str, Any] = {"base": self.settings.robot.base or None, "tip": self.settings.robot.tip or None}
         fitted = self.fit.path / ROBOT
         if links["tip"] is None and is_urdf(self.robot_file) and fitted.is_file():
             links["tip"] = tables.load(fitted).get("tip")

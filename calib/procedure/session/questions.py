@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.config import described, parse
-from calib.config_types import OneOf, Real
+from calib.config_types import OneOf, ParsedTable, Real
 from calib.data.images.board import read_board
 from calib.data.images.lens import read_lens
 from calib.data.poses import BOARD, IMAGES, IN_HAND, TO_HAND
@@ -141,7 +141,7 @@ def with_answer(answers: Answers, question: Question, text: str) -> Answers:
         entry = getattr(parse(CertificateSection, {name: text}, ""), name)
         return replace(answers, certificate=replace(answers.certificate, **{name: entry}))
 
-    value: Any = text
+    value: object = text
     is_empty = text.lower() in ("", "none", "-")
     match name:
         case "tool":
@@ -179,7 +179,7 @@ def checked(answers: Answers) -> dict[str, Any]:
     if not dynamics and (answers.payloads or answers.torques):
         raise UsageError("--payload and --torques apply to the dynamics, which --geometry-only excludes")
 
-    limits: Path | dict[str, Any] | None = answers.limits
+    limits: Path | dict[str, object] | None = answers.limits
     if answers.limits is None:
         limits = cell_tables(**answers.cell) or None
     else:
@@ -221,7 +221,7 @@ MAX_FAR, MAX_WIDE, MAX_HELD = 100.0, 10.0, 3.0
 ABSENT = {"instrument_at": "instrument", "box": "box", "obstacles": "obstacles"}
 
 
-def cell_tables(**answers: str | Sequence[str] | None) -> dict[str, Any]:
+def cell_tables(**answers: str | Sequence[str] | None) -> dict[str, object]:
     """Return the content of a limits file, from the answers on the cell; empty without such answers.
 
     Every question may be answered by "unknown": the subject is then not checked, and the certificate says so. "none"
@@ -243,7 +243,7 @@ def cell_tables(**answers: str | Sequence[str] | None) -> dict[str, Any]:
             texts[name] = text.strip()
     require("cone" not in texts or "instrument_at" in texts, "--cone needs --instrument-at, too", UsageError)
 
-    tables: dict[str, Any] = {}
+    tables: ParsedTable = {}
     if absent:
         tables["without"] = absent
     for name, text in texts.items():
@@ -275,7 +275,7 @@ def _lengths(text: str, count: int, most: float, expected: str = "x,y,z in metre
     return values
 
 
-def _direction(text: str) -> Any:
+def _direction(text: str) -> str | list[float]:
     """Return the name of an axis, or a direction of three numbers."""
     if text.lower() in AXES:
         return text.lower()
@@ -295,7 +295,7 @@ def _box(text: str) -> list[list[float]]:
     return ranges
 
 
-def _obstacles(text: str) -> list[dict[str, Any]]:
+def _obstacles(text: str) -> list[dict[str, object]]:
     """Return the tables of obstacles, given as texts between semicolons."""
     form = "NAME box|sphere|cylinder SIZES at X,Y,Z in metres, e.g. table box 1.2,0.8,0.05 at 0.7,0,-0.03"
     length = Real(above=0, most=MAX_WIDE, unit="m", quantity="length")
@@ -352,7 +352,7 @@ def _cone(text: str) -> str:
     return text if any(map(str.isalpha, text)) else f"{text} deg"
 
 
-_KEYS: dict[str, tuple[str, Any]] = {  # of the limits file, and how the answer is read
+_KEYS: dict[str, tuple[str, Callable[..., object]]] = {  # of the limits file, and how the answer is read
     "instrument_at": ("instrument.xyz", partial(_lengths, count=3, most=MAX_FAR)),
     "cone": ("instrument.sight", _cone),
     "facing": ("target.facing", _direction),

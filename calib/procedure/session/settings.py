@@ -8,7 +8,7 @@ from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from operator import attrgetter
 from pathlib import Path, PurePath
 from textwrap import wrap
-from typing import Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, get_type_hints
 
 import rtoml
 
@@ -41,6 +41,9 @@ from calib.procedure.kinematic_stage.settings import (
     Stations,
 )
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
 # version of ``session.toml``, and those that can be read: a session of schema 1 knows no dynamics; it goes on as
 # geometry alone
 SCHEMA = 2
@@ -61,7 +64,7 @@ _HEAD = (
 )
 
 
-def _beside(value: Any) -> Any:
+def _beside(value: object) -> object:
     """Check that a name is a valid relative path, and return it."""
     if not isinstance(value, str):
         return value
@@ -271,7 +274,7 @@ def read_settings(path: Path) -> SessionSettings:
     return settings
 
 
-def check_schema(path: Path, schema: Any) -> None:
+def check_schema(path: Path, schema: object) -> None:
     """Raise an error for a schema number that this version cannot read.
 
     Raises:
@@ -289,7 +292,7 @@ def check_schema(path: Path, schema: Any) -> None:
     raise SessionError(f"{path}: schema {shown(schema)} is unknown, this version reads {readable}; make a new session")
 
 
-def default_keys(section: str) -> dict[str, Any]:
+def default_keys(section: str) -> dict[str, object]:
     """Return the defaults of a section by key; empty for a key outside sections."""
     kind = get_type_hints(SessionSettings).get(section)
     keys = fields(kind) if is_dataclass(kind) else ()
@@ -304,7 +307,7 @@ def written(settings: SessionSettings) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _lines(section: Any, prefix: str = "") -> Iterator[str]:
+def _lines(section: "DataclassInstance", prefix: str = "") -> Iterator[str]:
     """Yield the lines of a section, with the comments of keys aligned in one column, and tables last."""
     comments = described(type(section))
     tables = []

@@ -9,12 +9,11 @@ are kept and reported. A running step is marked; if its command was killed, the 
 import json
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 from calib.errors import SessionError
 from calib.extensions import Point
@@ -22,7 +21,7 @@ from calib.files import fingerprint
 from calib.folders import COVARIANCE, ESTIMATE, METRICS, REPORT
 from calib.identification.model_file import MODEL
 from calib.procedure.excitation.coefficients import NAME as MOTION
-from calib.procedure.findings import Warned
+from calib.procedure.findings import Note
 from calib.procedure.kinematic_stage.folder import URDF
 from calib.procedure.report.templates import versions
 from calib.procedure.session import dynamics_steps, folder, geometry_steps
@@ -142,7 +141,7 @@ class SessionStep:
 
     name: str
     purpose: str
-    make: Callable[[Session, Say], list[str]]
+    make: Callable[[Session, Say], Sequence[str | Note]]
     reads: tuple[Input, ...]
     makes: tuple[str, ...]
     settings: tuple[Setting, ...]
@@ -443,7 +442,7 @@ def changed_inputs(before: Mapping[str, str], after: Mapping[str, str]) -> str:
     return ", ".join(parts)
 
 
-def _comparable(name: str, mark: str) -> Any:
+def _comparable(name: str, mark: str) -> object:
     """Return a fingerprint in comparable form: settings as values (3 equals 3.0), missing keys as their defaults."""
     if not name.startswith(folder.SETTINGS):
         return mark
@@ -500,12 +499,14 @@ def _run(session: Session, step: SessionStep, say: Say, progress: Say, command: 
         command=command,
         seed=session.settings.seed,
         toolkit=versions(),
-        notes=tuple(notes),
+        notes=tuple(str(note) for note in notes),
     )
     session.write_state(StateFile({**recorded.steps, step.name: record}))
     say(f"{number} {step.name}: {notes[0] if notes else 'done'}")
     for note in notes[1:]:
-        warning = "warning: " if isinstance(note, Warned) else ""
+        warning = ""
+        if isinstance(note, Note) and note.is_warning:
+            warning = "warning: "
         say(f"    {warning}{note}")
 
 

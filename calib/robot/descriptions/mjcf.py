@@ -13,7 +13,7 @@ tendons that tie joints of the arm.
 from importlib import import_module
 from itertools import chain, combinations_with_replacement
 from pathlib import Path
-from typing import Any
+from types import ModuleType
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 from calib.errors import RobotError, refuse_robot
 from calib.robot.formats.urdf_tree import UNLIMITED
 from calib.robot.formats.urdf_write import MOMENTS, add_joint, numbers_text, xml_text
+from calib.robot.native import NativeModel
 from calib.transforms import from_quaternion, invert, pose
 
 WORLD = "world"
@@ -37,7 +38,7 @@ def convert(path: str) -> str:
     if "<robot" in text and "<mujoco" not in text.partition("<robot")[0]:
         return text
     try:
-        mujoco: Any = import_module("mujoco")
+        mujoco = import_module("mujoco")
     except ImportError:
         advice = "an MJCF file is read by MuJoCo: pip install mujoco (or 'armature-calib[mujoco]')"
         raise RobotError(f"{path}: {advice}") from None
@@ -49,7 +50,7 @@ def convert(path: str) -> str:
     return _Tree(model, mujoco, path, spec.modelname).text()
 
 
-def _compiled(spec: Any) -> Any:
+def _compiled(spec: NativeModel) -> NativeModel:
     """Return the model without meshes and pictures, whose files need not be there where masses are stated."""
     try:
         return spec.compile()
@@ -68,7 +69,7 @@ def _compiled(spec: Any) -> Any:
 class _Tree:
     """URDF of a compiled model, body by body."""
 
-    def __init__(self, model: Any, mujoco: Any, where: str, name: str) -> None:
+    def __init__(self, model: NativeModel, mujoco: ModuleType, where: str, name: str) -> None:
         self.model, self.mj, self.where = model, mujoco, where
         self.bodies = [WORLD, *(model.body(k).name or f"body_{k}" for k in range(1, model.nbody))]
         self.joints = [model.joint(k).name or f"joint_{k}" for k in range(model.njnt)]

@@ -23,7 +23,6 @@ from io import StringIO
 from itertools import chain
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 from xml.etree import ElementTree as ET
 
 from calib.errors import RobotError, refuse_robot, suggestion
@@ -72,7 +71,7 @@ def expand(path: str) -> str:
     Raises:
         RobotError: naming the file in which xacro failed, and what it says; for an argument that it does not have.
     """
-    xacro: Any = import_module("xacro")
+    xacro = import_module("xacro")
 
     file, stated_arguments = split(path)
     arguments = _Arguments(stated_arguments)
@@ -84,7 +83,7 @@ def expand(path: str) -> str:
         reason = "a macro that calls itself, or a file that includes itself"
         raise RobotError(f"{_location(xacro, file)}: nested without end: {reason}") from None
     except Exception as error:  # whatever xacro, its expressions and parsers raise
-        cause: Any = error
+        cause: BaseException | None = error
         while cause is not None and not isinstance(cause, RobotError):
             cause = getattr(cause, "exc", None)
         if cause is not None:
@@ -101,7 +100,7 @@ def expand(path: str) -> str:
     return urdf_text
 
 
-def _location(xacro: Any, file: str) -> str:
+def _location(xacro: ModuleType, file: str) -> str:
     open_files = [name for name in xacro.filestack or () if name]
     if not open_files or open_files[-1] == file:
         return file

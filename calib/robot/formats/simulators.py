@@ -9,8 +9,8 @@ import io
 import tempfile
 import warnings
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -20,6 +20,7 @@ from calib.errors import RobotError, refused_as
 from calib.robot.chain import AXES, Chain
 from calib.robot.formats.urdf_write import centred, numbers_text, xml_text
 from calib.robot.kinematics import moving_frames
+from calib.robot.native import NativeModel
 from calib.transforms import invert
 
 
@@ -92,9 +93,7 @@ def tip_poses(source: str, chain: Chain, q: np.ndarray) -> np.ndarray:
     Raises:
         RobotError: where Pinocchio cannot read the text.
     """
-    import pinocchio
-
-    pin: Any = pinocchio
+    pin = import_module("pinocchio")
     model = pinocchio_model(source)
     data = model.createData()
     base, tip = link_frame(model, chain.base), link_frame(model, chain.tip)
@@ -105,28 +104,24 @@ def tip_poses(source: str, chain: Chain, q: np.ndarray) -> np.ndarray:
     return result
 
 
-def link_frame(model: Any, link: str) -> int:
+def link_frame(model: NativeModel, link: str) -> int:
     """Return the number of a link's frame in Pinocchio's model; a joint may have the same name."""
-    import pinocchio
-
-    pin: Any = pinocchio
+    pin = import_module("pinocchio")
     return model.getFrameId(link, pin.FrameType.BODY)
 
 
-def driven_joints(model: Any, chain: Chain) -> list[Any]:
+def driven_joints(model: NativeModel, chain: Chain) -> list[NativeModel]:
     """Return Pinocchio's joints of a chain's moving elements, including mimic followers."""
     return [model.joints[model.getJointId(joint_name(chain, k))] for k in chain.driven.tolist()]
 
 
-def configurations(model: Any, chain: Chain, q: np.ndarray, from_zero: bool = False) -> np.ndarray:
+def configurations(model: NativeModel, chain: Chain, q: np.ndarray, from_zero: bool = False) -> np.ndarray:
     """Return Pinocchio's configurations (m, nq) at joint values q (m, n): cosine and sine for continuous joints.
 
     Args:
         from_zero: whether the model's frames at zero hold the chain's constant values.
     """
-    import pinocchio
-
-    pin: Any = pinocchio
+    pin = import_module("pinocchio")
     result = np.tile(pin.neutral(model), (len(q), 1))
     for k, joint in zip(chain.driven, driven_joints(model, chain)):
         element = chain.elements[k]
@@ -155,9 +150,7 @@ def motion_torques(
     Raises:
         RobotError: where Pinocchio cannot read the text.
     """
-    import pinocchio
-
-    pin: Any = pinocchio
+    pin = import_module("pinocchio")
     model = pinocchio_model(source, mjcf)
     data = model.createData()
     model.gravity = pin.Motion(np.array(chain.gravity), np.zeros(3))
@@ -173,16 +166,13 @@ def motion_torques(
     return torques, frames, model.damping[rows], model.friction[rows]
 
 
-def pinocchio_model(source: str, mjcf: bool = False) -> Any:
+def pinocchio_model(source: str, mjcf: bool = False) -> NativeModel:
     """Return Pinocchio's model of a URDF or MJCF text; it reads MJCF from a temporary file.
 
     Raises:
         RobotError: where Pinocchio cannot read the text.
     """
-    import pinocchio
-
-    # Its names come from C++, where no type checker sees them.
-    pin: Any = pinocchio
+    pin = import_module("pinocchio")
     file_format = "MJCF" if mjcf else "URDF"
     with refused_as(RobotError, (ValueError, RuntimeError), f"Pinocchio cannot read the {file_format}: {{}}"):
         if not mjcf:

@@ -13,7 +13,7 @@ import numpy as np
 from calib.apps.monitoring.comparison.change_test import ChangeTest, ParameterChange
 from calib.errors import Finding, finding
 from calib.toolkit.report_pages import Block, Column, KeyFigure, Section, Text, met, table
-from calib.toolkit.result_folders import Verdict, lines_of, settle
+from calib.toolkit.result_folders import Verdict, notes_of, settle
 from calib.units import SMALL
 
 if TYPE_CHECKING:
@@ -121,7 +121,7 @@ class ChangePart(ABC):
         compared = [parameter for parameter in self.found.parameters if parameter.sigma or parameter.explained]
         parameters = table(title, _PARAMETERS, compared[:MAX_PARAMETERS], f"All in {self.table}.")
         blocks = [*self.blocks(), parameters]
-        blocks.insert(1, Text("Notes", lines_of(self.noticed), "note"))
+        blocks.insert(1, Text("Notes", notes_of(self.noticed), "note"))
         return Section(f"Change of the {self.kind}", blocks, self.verdict.level, self.verdict.reason, [figure])
 
     @property

@@ -10,8 +10,7 @@ import numpy as np
 from calib.errors import RobotError, UsageError, command_line, listing, require
 from calib.result_kinds import refusal
 from calib.toolkit.chains import CalibratedChain, Element
-from calib.toolkit.opened_results import open_result
-from calib.toolkit.result_folders import FitFolder, IdentificationFolder
+from calib.toolkit.result_folders import FitFolder, IdentificationFolder, open_result
 from calib.toolkit.sessions import Session
 
 # of two nominal descriptions: largest difference [m, rad] that rounding in files explains
@@ -69,8 +68,8 @@ def place_of(source: str | Path, verb: str = "diff") -> Place:
     if not path.is_dir():
         return Place(name)
     result = open_result(path, verb)
-    fit = result.fit(verb)
-    identification = result.identification
+    result.check_arm(verb)
+    fit, identification = result.fit, result.identification
     require(result.session or fit or identification, refusal(path, verb), UsageError)
     return Place(name, result.session, fit, identification)
 
