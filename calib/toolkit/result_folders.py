@@ -1,8 +1,8 @@
 """Results: their folders, figures and verdicts, and how they are shown."""
 
 from calib.api.dynamic import DynamicsModel
-from calib.api.kinematic import GeometryFit
-from calib.api.rendering import Drawn, Judged, saved
+from calib.api.kinematic import GeometryFit, Several, fit_geometry
+from calib.api.rendering import Drawn, Judged, Progress, Shown, saved
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.dynamic_stage.metrics import UnseenReport
 from calib.procedure.export.delivery import fit_verdicts, prediction
@@ -31,11 +31,15 @@ __all__ = [
     "GeometryFit",
     "IdentificationFolder",
     "Judged",
+    "Progress",
+    "Several",
+    "Shown",
     "Tolerance",
     "UnseenReport",
     "ValidationFolder",
     "ValidationMetrics",
     "Verdict",
+    "fit_geometry",
     "fit_verdicts",
     "geometry_results",
     "joints_of",

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from calib.apps.controller_programs.targets import formatted
-from calib.controllers.table import Controller
-from calib.data.csv_table import read_header, read_table
 from calib.errors import UsageError
+from calib.toolkit.chains import Controller
 from calib.toolkit.opened_results import open_result
+from calib.toolkit.pose_data import read_header, read_table
 
 PREFIX = "q_"
 
