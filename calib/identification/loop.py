@@ -163,7 +163,7 @@ def check_loop(table: object) -> object:
 
 
 @dataclass(frozen=True, eq=False)
-class Controller:
+class LoopController:
     """A sampled controller for n joints.
 
     Attributes:
@@ -192,7 +192,8 @@ class Controller:
     def __post_init__(self) -> None:
         n = len(np.atleast_1d(self.kp))
         for name in ("kp", "kd", "ki", "share", "limit", "windup"):
-            value = np.broadcast_to(np.asarray(getattr(self, name), dtype=float), (n,))
+            stated = np.asarray(getattr(self, name), dtype=float)
+            value = np.broadcast_to(stated, (n,))
             object.__setattr__(self, name, frozen(np.array(value)))
         require(self.delay >= 0, f"a delay of {self.delay} control periods is invalid")
 
@@ -203,17 +204,26 @@ class Controller:
 
     def smoothing(self, period: float) -> float:
         """Return the weight of a new velocity sample in the low-pass."""
-        return 1.0 if self.cutoff is None else float(1.0 - np.exp(-2.0 * np.pi * self.cutoff * period))
+        if self.cutoff is None:
+            return 1.0
+        decay = np.exp(-2.0 * np.pi * self.cutoff * period)
+        return float(1.0 - decay)
 
-    def scaled(self, factor: np.ndarray | float) -> Controller:
+    def scaled(self, factor: np.ndarray | float) -> LoopController:
         """Return the controller with all gains times `factor`, one or (n,): the same bandwidth at another inertia."""
-        return replace(self, kp=self.kp * factor, kd=self.kd * factor, ki=self.ki * factor)
+        kp = self.kp * factor
+        kd = self.kd * factor
+        ki = self.ki * factor
+        return replace(self, kp=kp, kd=kd, ki=ki)
 
-    def slower(self, factor: float) -> Controller:
+    def slower(self, factor: float) -> LoopController:
         """Return the controller with its bandwidth divided by `factor`: kp by factor², kd by factor, ki by factor³."""
-        return replace(self, kp=self.kp / factor**2, kd=self.kd / factor, ki=self.ki / factor**3)
+        kp = self.kp / factor**2
+        kd = self.kd / factor
+        ki = self.ki / factor**3
+        return replace(self, kp=kp, kd=kd, ki=ki)
 
-    def with_feedforward(self, ahead: np.ndarray) -> Controller:
+    def with_feedforward(self, ahead: np.ndarray) -> LoopController:
         """Return the controller with a feedforward torque (N, n) added."""
         return replace(self, ahead=frozen(ahead))
 
@@ -274,7 +284,7 @@ class LoopMetrics:
     strays_times: Array = ()  # type: ignore[assignment]
     valid: bool = True
     explains: bool = True
-    controller: Controller | None = None
+    controller: LoopController | None = None
     controller_explains_percent: Array | None = None
 
 
@@ -313,7 +323,7 @@ class LoopResults:
     metrics: LoopMetrics | None = None
     findings: tuple[Finding, ...] = ()
     table: tuple[tuple[object, ...], ...] = ()
-    controller: Controller | None = None
+    controller: LoopController | None = None
     disagreement: LoopDisagreement | None = None
 
 
@@ -333,7 +343,7 @@ class Replay:
 
     name: str
     seconds: float
-    controller: Controller | None
+    controller: LoopController | None
     stated: bool
     terms_left_out: tuple[str, ...]
     inertia_added: Array
@@ -343,4 +353,5 @@ class Replay:
     @stored
     def feedback_over_model(self) -> float:
         """Ratio of the tracking errors without and with the model as feedforward, geometric mean over the joints."""
-        return float(np.exp(np.mean(np.log(self.rms[FEEDBACK] / np.maximum(self.rms[IDENTIFIED], 1e-12)))))
+        ratio = self.rms[FEEDBACK] / np.maximum(self.rms[IDENTIFIED], 1e-12)
+        return float(np.exp(np.mean(np.log(ratio))))

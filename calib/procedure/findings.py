@@ -130,7 +130,7 @@ class Verdicts:
 
 
 @dataclass(frozen=True)
-class Entry:
+class CatalogueEntry:
     """One entry of the catalogue; the module's docstring explains its fields."""
 
     says: str
@@ -142,10 +142,10 @@ class Entry:
 
 
 @cache
-def catalogue() -> Mapping[str, Entry]:
+def catalogue() -> Mapping[str, CatalogueEntry]:
     """Return the catalogue, code -> entry."""
     text = Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")
-    return {code: Entry(**entry) for code, entry in tomllib.loads(text).items()}
+    return {code: CatalogueEntry(**entry) for code, entry in tomllib.loads(text).items()}
 
 
 def level_of(finding: Finding) -> str:
@@ -189,22 +189,38 @@ def sentence(finding: Finding) -> str:
     return _filled(catalogue()[finding.code].says, finding.values)
 
 
-class Warned(str):
-    """Text of a finding that prevents the verdict pass; commands always print it."""
+@dataclass(frozen=True)
+class Note:
+    """A line for the user; a warning is of a finding that prevents the verdict pass, and commands always print it."""
+
+    text: str
+    is_warning: bool = False
+
+    def __str__(self) -> str:
+        return self.text
+
+
+def notes_of(findings: Iterable[Finding]) -> list[Note]:
+    """Return one note for each finding: its sentence, its advice, and how to accept it."""
+    notes = []
+    for finding in findings:
+        line = _line(finding, catalogue()[finding.code])
+        notes.append(Note(line, level_of(finding) in LEVELS))
+    return notes
 
 
 def lines_of(findings: Iterable[Finding]) -> list[str]:
-    """Return one line for each finding: its sentence, its advice, and how to accept it."""
-    lines = []
-    for finding in findings:
-        line = _line(finding, catalogue()[finding.code])
-        if level_of(finding) in LEVELS:
-            line = Warned(line)
-        lines.append(line)
-    return lines
+    """Return the text of the notes of findings."""
+    return [note.text for note in notes_of(findings)]
 
 
-def _line(finding: Finding, entry: Entry) -> str:
+def as_notes(lines: Iterable[str], findings: Iterable[Finding]) -> list[Note]:
+    """Return lines as notes; those of the findings that prevent the verdict pass are warnings."""
+    warnings = {note.text for note in notes_of(findings) if note.is_warning}
+    return [Note(line, line in warnings) for line in lines]
+
+
+def _line(finding: Finding, entry: CatalogueEntry) -> str:
     text = sentence(finding)
     if finding.accepted:
         return f"{text} (accepted by the options)"
@@ -220,7 +236,7 @@ def glossary() -> Mapping[str, str]:
     return tomllib.loads(Path(__file__).with_name("glossary.toml").read_text(encoding="utf-8"))
 
 
-def levels(entry: Entry) -> str:
+def levels(entry: CatalogueEntry) -> str:
     """Return in words what level a finding has, and from which values on; a limit below zero is exceeded always."""
     rules = []
     for value, limits in entry.limits.items():

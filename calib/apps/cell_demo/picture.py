@@ -6,7 +6,6 @@ import numpy as np
 
 from calib import files
 from calib.apps.cell_demo.summary import PICTURE
-from calib.toolkit.opened_results import drawn, skeleton
 from calib.toolkit.report_charts import (
     AFTER,
     BEFORE,
@@ -21,7 +20,7 @@ from calib.toolkit.report_charts import (
     text,
 )
 from calib.toolkit.report_pages import read_fit_report
-from calib.toolkit.result_folders import prediction
+from calib.toolkit.result_folders import drawn, prediction, skeleton
 from calib.toolkit.sessions import Session, chain_of, position_errors, torque_error
 
 # from where the cell is seen

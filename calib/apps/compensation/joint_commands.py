@@ -43,9 +43,8 @@ from calib.toolkit.installations import (
     read_arms,
     see,
 )
-from calib.toolkit.opened_results import open_result
 from calib.toolkit.pose_data import PoseMeasurements, Targets
-from calib.toolkit.result_folders import VALIDATED, ValidationFolder, lines_of, read_covariance, sentence
+from calib.toolkit.result_folders import VALIDATED, ValidationFolder, lines_of, open_result, read_covariance, sentence
 from calib.transforms import from_xyz_rpy, invert, pose, rotation_vector
 
 # Thresholds are our choice.
@@ -155,7 +154,7 @@ def read(folder: str | Path) -> Fitted:
         UsageError: where it is none, or lacks something.
     """
     result = open_result(folder, "compensate")
-    fit = result.fit("compensate")
+    fit = result.fit
     if fit is None:
         result.refuse("compensate")
     cell, nominal = read_arms(fit.path)

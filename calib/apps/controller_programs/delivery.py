@@ -17,8 +17,7 @@ from calib.apps.controller_programs.frames import ControllerFrame, Description, 
 from calib.apps.controller_programs.targets import number, pose_values
 from calib.toolkit.chains import CalibratedChain, Controller, nominal_of
 from calib.toolkit.installations import Installation, read_arms
-from calib.toolkit.opened_results import open_result
-from calib.toolkit.result_folders import fit_verdicts, read_exported
+from calib.toolkit.result_folders import fit_verdicts, open_result, read_exported
 from calib.transforms import invert
 
 # of frames, by the unit of lengths
@@ -39,7 +38,9 @@ def delivery_text(
     Raises:
         UsageError: for a folder without a fit.
     """
-    fit_folder = open_result(folder, "deliver").fit("deliver")
+    result = open_result(folder, "deliver")
+    result.check_arm("deliver")
+    fit_folder = result.fit
     fit = folder if fit_folder is None else fit_folder.path
     robot = read_exported(fit, "deliver")
     cell, nominal = read_arms(fit)

@@ -13,8 +13,8 @@ import numpy as np
 from calib.apps.controller_programs.targets import formatted
 from calib.errors import UsageError
 from calib.toolkit.chains import Controller
-from calib.toolkit.opened_results import open_result
 from calib.toolkit.pose_data import read_header, read_table
+from calib.toolkit.result_folders import open_result
 
 PREFIX = "q_"
 

@@ -88,7 +88,8 @@ class GravityHypotheses:
     @property
     def factor(self) -> float:
         """Ratio of the rms residuals with the other direction and with the stated one, their geometric mean."""
-        return float(np.exp(np.mean(np.log(self.after / self.before))))
+        ratio = self.after / self.before
+        return float(np.exp(np.mean(np.log(ratio))))
 
     @property
     def refuted(self) -> bool:
@@ -104,7 +105,7 @@ def gravity_of(motions: Sequence[MotionSamples], chain: Chain, newtons: bool = T
         chain: the arm, whose masses count where it has any.
         newtons: whether torques are in N m; of those in another unit only proportions count.
     """
-    sums = _Sums(motions)
+    sums = _GravitySums(motions)
     stated = np.array(motions[0].bodies.gravity)
     before = sums.unexplained(stated)
     direction = _another_direction(sums, stated, before)
@@ -125,11 +126,12 @@ def gravity_of(motions: Sequence[MotionSamples], chain: Chain, newtons: bool = T
                 factors = -factors
     # Outweighed: the whole torque varies less than gravity's alone would.
     certain = np.isfinite(factors) & (np.abs(factors) + 2.0 * sigmas < MAX_FACTOR) & outweighed
-    absent = _without_gravity(sums, gravity, after, np.flatnonzero(certain).tolist())
+    candidates = np.flatnonzero(certain).tolist()
+    absent = _without_gravity(sums, gravity, after, candidates)
     return GravityHypotheses(stated, before, direction, after, ambiguous, absent, factors, sigmas)
 
 
-def _another_direction(sums: "_Sums", stated: np.ndarray, before: np.ndarray) -> np.ndarray | None:
+def _another_direction(sums: "_GravitySums", stated: np.ndarray, before: np.ndarray) -> np.ndarray | None:
     """Return the gravity vector (3,) of the stated one's magnitude that explains the torques instead; None if it does.
 
     Args:
@@ -150,7 +152,7 @@ def _another_direction(sums: "_Sums", stated: np.ndarray, before: np.ndarray) ->
 
 
 def _without_gravity(
-    sums: "_Sums", gravity: np.ndarray, unexplained: np.ndarray, candidates: Sequence[int]
+    sums: "_GravitySums", gravity: np.ndarray, unexplained: np.ndarray, candidates: Sequence[int]
 ) -> tuple[int, ...]:
     """Return the joints whose torques hold no gravity: those that are better explained without.
 
@@ -179,7 +181,7 @@ def _without_gravity(
     return tuple(sorted(absent))
 
 
-class _Sums:
+class _GravitySums:
     """Products of the columns of motions by joint: bodies in motion without gravity, in each of x, y, z, and drives."""
 
     def __init__(self, motions: Sequence[MotionSamples]) -> None:
@@ -215,14 +217,16 @@ class _Sums:
         def squares(gravity: np.ndarray) -> float:
             change = self._under(gravity)
             square = change.T @ total @ change
-            return float(square[-1, -1] - square[-1, :-1] @ _solved(square))
+            explained = square[-1, :-1] @ _solved(square)
+            return float(square[-1, -1] - explained)
 
         return squares
 
     def _under(self, gravity: np.ndarray) -> np.ndarray:
         """Return the matrix (k, p + 1) from the columns of bodies under a gravity vector (3,) to all columns."""
         inertial = np.eye(10 * self.bodies)
-        masses = inertial.reshape(self.bodies, 10, -1)[:, MASSES].reshape(4 * self.bodies, -1)
+        by_body = inertial.reshape(self.bodies, 10, -1)
+        masses = by_body[:, MASSES].reshape(4 * self.bodies, -1)
         heavy = [component * masses for component in gravity]
         bodies = np.vstack([inertial, *heavy])
         drives = np.eye(4 * self.n + 1)
@@ -252,13 +256,15 @@ def _columns(motion: MotionSamples) -> np.ndarray:
     m, n = motion.q.shape
     zero = np.zeros_like(motion.v)
     weightless = motion.bodies.with_gravity(np.zeros(3))
-    columns = [regressor(weightless, motion.q, motion.v, motion.a).reshape(m, n, -1)]
+    body_columns = regressor(weightless, motion.q, motion.v, motion.a)
+    columns = [body_columns.reshape(m, n, -1)]
     for axis in np.eye(3):
         at_rest = regressor(motion.bodies.with_gravity(axis), motion.q, zero, zero)
         heavy = at_rest.reshape(m, n, -1, 10)[..., MASSES]
         columns.append(heavy.reshape(m, n, -1))
     torque = motion.torque - motion.torque.mean(axis=0)
-    return np.concatenate([*columns, motion.drives, torque[:, :, None]], axis=2)
+    target = torque[:, :, None]
+    return np.concatenate([*columns, motion.drives, target], axis=2)
 
 
 def _solved(square: np.ndarray) -> np.ndarray:
@@ -267,7 +273,8 @@ def _solved(square: np.ndarray) -> np.ndarray:
     scale = np.where(size > 1e-9 * size.max(), size, np.inf)
     scaled = square[:-1, :-1] / (scale[:, None] * scale)
     scaled.flat[:: len(scaled) + 1] += 1e-9
-    return np.asarray(np.linalg.solve(scaled, square[:-1, -1] / scale) / scale)
+    solution = np.linalg.solve(scaled, square[:-1, -1] / scale)
+    return np.asarray(solution / scale)
 
 
 def _mean(ratios: np.ndarray) -> float:
@@ -283,7 +290,7 @@ def _angle(first: np.ndarray, second: np.ndarray) -> float:
     return float(np.arccos(np.clip(first @ second / size, -1.0, 1.0)))
 
 
-def _best_direction(sums: _Sums, magnitude: float, unexplained: np.ndarray) -> np.ndarray:
+def _best_direction(sums: _GravitySums, magnitude: float, unexplained: np.ndarray) -> np.ndarray:
     """Return the gravity vector (3,) of a magnitude [m/s²] that leaves least unexplained, of both signs either.
 
     Joints are weighed by what masses of their own for each axis leave of them (n,), then by what the direction leaves.
@@ -310,7 +317,8 @@ def _refined(cost: Callable[[np.ndarray], float], start: np.ndarray) -> np.ndarr
         return np.asarray(size * vector / np.linalg.norm(vector))
 
     def turned_cost(amounts: np.ndarray) -> float:
-        return cost(turned(amounts))
+        problem = turned(amounts)
+        return cost(problem)
 
     corners = [[0.0, 0.0], [0.1, 0.0], [0.0, 0.1]]
     options = {"initial_simplex": corners, "xatol": 1e-4, "fatol": 1e-4 * cost(start), "maxfev": 80}
@@ -343,7 +351,8 @@ def _gravity_factors(
     if has_masses:
         reference = standard_parameters(chain)
     else:
-        reference = np.asarray(rods(chain, IdentificationModel(motions[0].bodies, ()))).ravel()
+        bodies_alone = IdentificationModel(motions[0].bodies, ())
+        reference = np.asarray(rods(chain, bodies_alone)).ravel()
     scale = 1.0
     if not (has_masses and newtons):
         scale = _inertia_factor(motions, reference)
@@ -364,7 +373,8 @@ def _gravity_factors(
     size = expected.std(axis=0)
     min_size = MIN_SHARE * max(float(size.max()), 1e-9)
     for joint in np.flatnonzero(size > min_size):
-        free = basis(np.column_stack([inertia[:, joint], drives[:, joint]]))
+        columns = np.column_stack([inertia[:, joint], drives[:, joint]])
+        free = basis(columns)
         expected_part = expected[:, joint] - free @ (free.T @ expected[:, joint])
         torque_part = torque[:, joint] - free @ (free.T @ torque[:, joint])
         if np.sqrt(np.mean(expected_part**2)) < MIN_CORRELATED * size[joint]:
@@ -388,5 +398,8 @@ def _inertia_factor(motions: Sequence[MotionSamples], reference: np.ndarray) -> 
         moving.append(columns[:, :, : len(reference)] @ reference)
         free.append(columns[:, :, len(reference) : -1])
         torque.append(columns[:, :, -1])
-    factor, sigma = common_factor(np.concatenate(torque), np.concatenate(moving), np.concatenate(free))
+    torques = np.concatenate(torque)
+    moving_torques = np.concatenate(moving)
+    free_torques = np.concatenate(free)
+    factor, sigma = common_factor(torques, moving_torques, free_torques)
     return factor if factor > MIN_SIGMAS * sigma else np.nan

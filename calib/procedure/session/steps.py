@@ -9,7 +9,7 @@ are kept and reported. A running step is marked; if its command was killed, the 
 import json
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime
@@ -21,7 +21,7 @@ from calib.files import fingerprint
 from calib.folders import COVARIANCE, ESTIMATE, METRICS, REPORT
 from calib.identification.model_file import MODEL
 from calib.procedure.excitation.coefficients import NAME as MOTION
-from calib.procedure.findings import Warned
+from calib.procedure.findings import Note
 from calib.procedure.kinematic_stage.folder import URDF
 from calib.procedure.report.templates import versions
 from calib.procedure.session import dynamics_steps, folder, geometry_steps
@@ -117,7 +117,7 @@ Input = SessionFile | FitFile | ExportedFile | NamedFile | UserFiles
 
 
 @dataclass(frozen=True)
-class Setting:
+class StepSetting:
     """A section or value of ``session.toml`` on which a step depends: all of it, or these keys of it."""
 
     section: str
@@ -141,10 +141,10 @@ class SessionStep:
 
     name: str
     purpose: str
-    make: Callable[[Session, Say], list[str]]
+    make: Callable[[Session, Say], Sequence[str | Note]]
     reads: tuple[Input, ...]
     makes: tuple[str, ...]
-    settings: tuple[Setting, ...]
+    settings: tuple[StepSetting, ...]
     stage: str = ""
     brings: tuple[str, str] = ("", "")
     kept: tuple[tuple[str, ...], str] = ((), "")
@@ -185,7 +185,7 @@ STEPS = (
         geometry_steps.describe,
         reads=(ROBOT,),
         makes=(folder.SUMMARY, f"{folder.AS_GIVEN}/*"),
-        settings=(Setting("robot"),),
+        settings=(StepSetting("robot"),),
     ),
     SessionStep(
         "select",
@@ -200,7 +200,7 @@ STEPS = (
             folder.PREDICTED,
             folder.PREDICTION,
         ),
-        settings=(Setting("robot"), Setting("instrument"), Setting("poses"), Setting("seed")),
+        settings=(StepSetting("robot"), StepSetting("instrument"), StepSetting("poses"), StepSetting("seed")),
         stage="geometry",
         kept=(("measured",), "these poses were already measured; `calib redo select` chooses new ones"),
     ),
@@ -216,7 +216,7 @@ STEPS = (
             UserFiles("drift"),
         ),
         makes=(folder.POSES_CHECKED,),
-        settings=(Setting("robot"), Setting("instrument"), Setting("poses"), Setting("fit")),
+        settings=(StepSetting("robot"), StepSetting("instrument"), StepSetting("poses"), StepSetting("fit")),
         stage="geometry",
         brings=("measured", "a file of measured poses"),
     ),
@@ -226,7 +226,7 @@ STEPS = (
         geometry_steps.fit,
         reads=(ROBOT, FIT_OPTIONS, UserFiles("measured"), SessionFile(f"{folder.MASSES}/{MODEL}", optional=True)),
         makes=("4-fit/*",),
-        settings=(Setting("robot"), Setting("instrument"), Setting("fit"), Setting("seed")),
+        settings=(StepSetting("robot"), StepSetting("instrument"), StepSetting("fit"), StepSetting("seed")),
         stage="geometry",
     ),
     SessionStep(
@@ -241,7 +241,13 @@ STEPS = (
             UserFiles("validation"),
         ),
         makes=("5-validation/*",),
-        settings=(Setting("robot"), Setting("instrument"), Setting("poses"), Setting("fit"), Setting("seed")),
+        settings=(
+            StepSetting("robot"),
+            StepSetting("instrument"),
+            StepSetting("poses"),
+            StepSetting("fit"),
+            StepSetting("seed"),
+        ),
         stage="geometry",
         brings=("validation", "a file of measured validation poses"),
     ),
@@ -251,7 +257,7 @@ STEPS = (
         dynamics_steps.excite,
         reads=(FITTED_ROBOT, NamedFile("dynamics", "limits")),
         makes=("6-excitation/training/*", "6-excitation/validation/*"),
-        settings=(Setting("dynamics", DESIGN_KEYS), Setting("seed")),
+        settings=(StepSetting("dynamics", DESIGN_KEYS), StepSetting("seed")),
         stage="dynamics",
         kept=(("training", "unseen"), "these motions were already recorded; `calib redo excite` designs new ones"),
     ),
@@ -266,7 +272,7 @@ STEPS = (
             UserFiles("training"),
         ),
         makes=(folder.MOTION_CHECKED, folder.CUTS),
-        settings=(Setting("dynamics", ("plan", "repeats", "torques", "options", "payloads", "holdout")),),
+        settings=(StepSetting("dynamics", ("plan", "repeats", "torques", "options", "payloads", "holdout")),),
         stage="dynamics",
         brings=("training", "a recording of the training motion"),
     ),
@@ -276,7 +282,7 @@ STEPS = (
         dynamics_steps.identify,
         reads=(FITTED_ROBOT, SessionFile(folder.CUTS), IDENTIFY_OPTIONS, UserFiles("training")),
         makes=("8-dynamics/*",),
-        settings=(Setting("dynamics", MODEL_KEYS), Setting("seed")),
+        settings=(StepSetting("dynamics", MODEL_KEYS), StepSetting("seed")),
         stage="dynamics",
     ),
     SessionStep(
@@ -295,8 +301,8 @@ STEPS = (
         ),
         makes=("8-dynamics/unseen/*",),
         settings=(
-            Setting("dynamics", ("plan", "validation", "repeats", "tolerance_percent", *MODEL_KEYS)),
-            Setting("seed"),
+            StepSetting("dynamics", ("plan", "validation", "repeats", "tolerance_percent", *MODEL_KEYS)),
+            StepSetting("seed"),
         ),
         stage="dynamics",
         brings=("unseen", "a recording of the validation motion"),
@@ -316,7 +322,7 @@ STEPS = (
             SessionFile(f"8-dynamics/unseen/{REPORT}"),
         ),
         makes=("6-export/*", "9-export/*", folder.VERDICT),
-        settings=(Setting("robot"),),
+        settings=(StepSetting("robot"),),
     ),
 )
 
@@ -499,12 +505,14 @@ def _run(session: Session, step: SessionStep, say: Say, progress: Say, command: 
         command=command,
         seed=session.settings.seed,
         toolkit=versions(),
-        notes=tuple(notes),
+        notes=tuple(str(note) for note in notes),
     )
     session.write_state(StateFile({**recorded.steps, step.name: record}))
     say(f"{number} {step.name}: {notes[0] if notes else 'done'}")
     for note in notes[1:]:
-        warning = "warning: " if isinstance(note, Warned) else ""
+        warning = ""
+        if isinstance(note, Note) and note.is_warning:
+            warning = "warning: "
         say(f"    {warning}{note}")
 
 
