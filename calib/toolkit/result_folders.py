@@ -1,8 +1,8 @@
 """Results: their folders, figures and verdicts, and how they are shown."""
 
 from calib.api.dynamic import DynamicsModel
-from calib.api.kinematic import GeometryFit
-from calib.api.rendering import ChartedResult, Judged, Unjudged, saved
+from calib.api.kinematic import GeometryFit, Several, fit_geometry
+from calib.api.rendering import ChartedResult, Judged, Progress, Shown, Unjudged, saved
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.dynamic_stage.metrics import UnseenReport
 from calib.procedure.export.delivery import fit_verdicts, prediction
@@ -39,8 +39,11 @@ __all__ = [
     "Judged",
     "Measured",
     "Played",
+    "Progress",
     "Result",
     "Scene",
+    "Several",
+    "Shown",
     "StoredResult",
     "Torques",
     "Unjudged",
@@ -49,6 +52,7 @@ __all__ = [
     "ValidationMetrics",
     "Verdict",
     "drawn",
+    "fit_geometry",
     "fit_verdicts",
     "geometry_results",
     "joints_of",

@@ -66,7 +66,7 @@ def compensate(
     from calib.apps.controller_programs.frames import stated_frame
     from calib.apps.controller_programs.targets import is_program, read_program, text_of
     from calib.errors import UsageError
-    from calib.procedure.export.geometry import results
+    from calib.toolkit.result_folders import geometry_results
 
     position_mm, turn_mrad = numbers(tolerance, 2, "--tolerance")
     fitted = api.read_fitted(folder)
@@ -81,7 +81,7 @@ def compensate(
         )
         raise UsageError(f"{targets}: {message}")
     written = [(out, (suffix,))]
-    files.check_results(written, [targets, *results(fitted.folder)], overwrite)
+    files.check_results(written, [targets, *geometry_results(fitted.folder)], overwrite)
     start_q = None
     if start:
         start_q = numbers(start, fitted.nominal.chain.n, "--start")

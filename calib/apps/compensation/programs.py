@@ -28,10 +28,9 @@ from calib.apps.controller_programs.configurations import (
     postures,
 )
 from calib.apps.controller_programs.targets import Program, pose_values
-from calib.data.poses.pose_lists import Targets
 from calib.errors import UsageError, listing
-from calib.geometry.installation import see
-from calib.geometry.inverse import Goal
+from calib.toolkit.installations import Goal, see
+from calib.toolkit.pose_data import Targets
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from calib.apps.controller_programs.targets import formatted
-from calib.controllers.table import Controller
-from calib.data.csv_table import read_header, read_table
 from calib.errors import UsageError
+from calib.toolkit.chains import Controller
+from calib.toolkit.pose_data import read_header, read_table
 from calib.toolkit.result_folders import open_result
 
 PREFIX = "q_"

@@ -13,15 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.api.kinematic import GeometryFit, Several, fit_geometry
-from calib.api.rendering import Progress
 from calib.apps.registration.settings import DEFAULT_PLACEMENT, PlacementSettings
-from calib.data.poses.fit_options import FitOptions
-from calib.estimation.estimate import Estimate
-from calib.geometry.installation import FRAME_AXES
-from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.records import as_subclass
-from calib.robot.calibrated import CalibratedChain
+from calib.toolkit.chains import CalibratedChain
+from calib.toolkit.installations import FRAME_AXES
+from calib.toolkit.pose_data import FitOptions
+from calib.toolkit.result_folders import FitSettings, GeometryFit, Progress, Several, fit_geometry
+from calib.toolkit.statistics import Estimate
 from calib.transforms import invert
 from calib.units import DEG
 
